@@ -1,0 +1,42 @@
+# `make demo` and `make test` need nothing but Python 3.10-3.13 with venv; they fetch uv into .uv/ themselves.
+PYTHON ?= $(firstword $(foreach v,python3 python3.13 python3.12 python3.11 python3.10,$(shell command -v $(v) 2>/dev/null)))
+UV := .uv/bin/uv
+export UV_PYTHON ?= $(PYTHON)
+export UV_PYTHON_DOWNLOADS ?= never
+RUN := $(UV) run --locked
+ARGS ?=
+
+.PHONY: demo test check bench clean
+.DEFAULT_GOAL := help
+
+help: ## show the targets
+	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' Makefile | expand -t 12
+
+$(UV):
+	@$(or $(PYTHON),$(error no python3 found; install Python 3.10-3.13 (Debian: apt-get install python3 python3-venv))) -c 'import sys; sys.exit(not (3, 10) <= sys.version_info < (3, 14))' \
+	  || { echo "$(PYTHON) is $$($(PYTHON) -V); TRADE needs Python 3.10-3.13: make PYTHON=/path/to/python3.12 $(MAKECMDGOALS)" >&2; exit 1; }
+	@$(PYTHON) -c 'import ensurepip' 2>/dev/null \
+	  || { echo "$(PYTHON) has no ensurepip; on Debian or Ubuntu: apt-get install python3-venv" >&2; exit 1; }
+	@echo "fetching uv into .uv/ (once)"
+	@$(PYTHON) -m venv .uv && .uv/bin/python -m pip install --quiet --disable-pip-version-check 'uv==0.13.8'
+
+demo: $(UV) ## a simulated pan-tilt head moves through remote service calls (ARGS=--stay keeps it up)
+	@$(RUN) python examples/demo.py $(ARGS)
+
+test: $(UV) ## the whole test suite
+	@$(RUN) pytest $(ARGS)
+
+check: $(UV) ## lint, formatting, types, import rules, isolated install of the core
+	@$(RUN) ruff check
+	@$(RUN) ruff format --check
+	@$(RUN) basedpyright
+	@$(RUN) lint-imports
+	@$(UV) run --isolated --no-project --with ./trade python -W error -c 'import trade, sys; \
+	  foreign = {"serial", "dynamixel_sdk", "typer", "termios", "fcntl"} & set(sys.modules); \
+	  sys.exit(f"the core alone imports {foreign}" if foreign else 0)'
+
+bench: $(UV) ## speed as ratios against peers in the same run
+	@$(RUN) python -m tests.bench $(ARGS)
+
+clean: ## remove environments and caches
+	rm -rf .uv .venv .pytest_cache .ruff_cache .hypothesis build dist

@@ -1,0 +1,201 @@
+"""The robot file: which devices make up a robot, on which bus, with which limits. Pure records, no I/O."""
+
+import re
+import sys
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal, TypeVar
+
+import msgspec
+from msgspec import Meta, Struct
+from trade.errors import ConfigurationError
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+__all__ = ["Bus", "Group", "Joint", "Robot", "parse"]
+
+_SEGMENTS = re.compile(r"[a-z][a-z0-9_]*(\.[a-z][a-z0-9_]*)*")
+_AT = re.compile(r" - at `\$\.?([^`]*)`$")
+
+Positive = Annotated[float, Meta(gt=0)]
+
+
+class Bus(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """One wire and the thread that owns it."""
+
+    name: str
+    driver: str
+    """Entry point of the group ``trade.drivers``: ``dynamixel``."""
+    port: str
+    """Serial device; prefer the stable name under /dev/serial/by-id."""
+    baud: Annotated[int, Meta(ge=9600, le=4_500_000)] = 1_000_000
+    rate_hz: Annotated[float, Meta(gt=0, le=1000)] = 100.0
+    """Cycles of reading and writing per second."""
+    fast_sync: bool = False
+    """Read all devices with one joined answer (needs firmware that knows it)."""
+    stale_after_s: Annotated[float, Meta(gt=0, le=2)] = 0.25
+    """A measured value older than this is an error, not a number."""
+    watchdog_s: Annotated[float, Meta(ge=0.1, le=2)] = 0.3
+    """The device's own watchdog: silent this long, it stops by itself."""
+    leave: Literal["hold", "relax"] = "hold"
+    """What to do with enabled devices when the driver leaves: hold the position, or switch torque off."""
+
+
+class Joint(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """One joint: its device on a bus, its zero and its limits."""
+
+    name: str
+    bus: str
+    id: Annotated[int, Meta(ge=0, le=252)]
+    model: str
+    """Model as printed on the device: ``XL430-W250``."""
+    reversed: bool = False
+    offset_rad: float = 0.0
+    """Joint angle when the device reads its centre."""
+    min_rad: float
+    max_rad: float
+    max_speed_rad_s: Positive
+    max_accel_rad_s2: Positive
+
+
+class Group(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Joints that move together, in the order their values are given."""
+
+    name: str
+    joints: Annotated[list[str], Meta(min_length=1)]
+
+
+class Robot(Struct, frozen=True, kw_only=True):
+    """A robot file, read and checked."""
+
+    name: str
+    buses: list[Bus]
+    joints: list[Joint]
+    groups: list[Group]
+    where: str
+    """The file the robot was read from."""
+
+    def joints_on(self, bus: str) -> list[Joint]:
+        """The joints on one bus, in file order."""
+        return [joint for joint in self.joints if joint.bus == bus]
+
+
+_Record = TypeVar("_Record", Bus, Joint, Group)
+
+
+def parse(text: str, where: str) -> Robot:
+    """Read a robot file's text.
+
+    Args:
+        text: the TOML.
+        where: the file's name, for messages.
+
+    Raises:
+        ConfigurationError: names file, key, value and what would be right.
+    """
+    try:
+        raw = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as bad:
+        raise ConfigurationError(where=where, problem=f"not valid TOML: {bad}") from None
+    _only_known(raw, where)
+    robot = Robot(
+        name=_robot_name(raw.get("robot"), where),
+        buses=_records(raw, "bus", Bus, where),
+        joints=_records(raw, "joint", Joint, where),
+        groups=_records(raw, "group", Group, where),
+        where=where,
+    )
+    _check_links(robot)
+    return robot
+
+
+def _wrong(where: str, key: str, problem: str) -> ConfigurationError:
+    return ConfigurationError(where=f"{where}: {key}", problem=problem)
+
+
+def _only_known(raw: Mapping[str, object], where: str) -> None:
+    known = ("robot", "bus", "joint", "group")
+    for key in raw:
+        if key not in known:
+            raise _wrong(where, f"[{key}]", f"unknown table; a robot file has {', '.join(f'[{k}]' for k in known)}")
+
+
+def _robot_name(table: object, where: str) -> str:
+    if not isinstance(table, dict) or not isinstance(table.get("name"), str):  # pyright: ignore[reportUnknownMemberType]
+        raise _wrong(where, "[robot]", 'missing; write [robot] and name = "rosie"')
+    extra: list[str] = [str(key) for key in table if key != "name"]  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]
+    if extra:
+        raise _wrong(where, f"robot.{extra[0]}", "unknown key; [robot] has only name")
+    name = str(table["name"])  # pyright: ignore[reportUnknownArgumentType]
+    _check_name(name, f"{where}: robot.name")
+    return name
+
+
+def _check_name(name: str, where: str) -> None:
+    if not _SEGMENTS.fullmatch(name):
+        problem = f"{name!r} is no name; use lower-case words joined by dots, such as neck.pan"
+        raise ConfigurationError(where=where, problem=problem)
+
+
+def _records(raw: Mapping[str, Any], section: str, record: type[_Record], where: str) -> list[_Record]:
+    tables = raw.get(section, {})
+    if not isinstance(tables, dict):
+        raise _wrong(where, section, f"must be tables: [{section}.NAME]")
+    if not tables and section != "group":
+        raise _wrong(where, f"[{section}.NAME]", "missing; a robot needs at least one")
+    return [_record(table, section, str(name), record, where) for name, table in tables.items()]  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]
+
+
+def _record(table: object, section: str, name: str, record: type[_Record], where: str) -> _Record:
+    key = f'{section}."{name}"' if "." in name else f"{section}.{name}"
+    _check_name(name, f"{where}: {key}")
+    if not isinstance(table, dict):
+        raise _wrong(where, key, f"must be a table: [{key}]")
+    if any(isinstance(value, dict) for value in table.values()):  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]
+        raise _wrong(where, key, f'a dotted name needs quotes: [{section}."{name}.{next(iter(table))}"]')  # pyright: ignore[reportUnknownArgumentType]
+    try:
+        return msgspec.convert({**table, "name": name}, record)
+    except msgspec.ValidationError as bad:
+        raise _explain(bad, table, key, record, where) from None  # pyright: ignore[reportUnknownArgumentType]
+
+
+def _explain(
+    bad: Exception, table: Mapping[str, object], key: str, record: type[Struct], where: str
+) -> ConfigurationError:
+    text = str(bad)
+    keys = ", ".join(name for name in record.__struct_fields__ if name != "name")
+    at = _AT.search(text)
+    if at is None:  # a missing or unknown key
+        return _wrong(where, key, f"{text.replace('Object', 'it').replace('field', 'key')}; the keys are {keys}")
+    field = re.split(r"[.\[]", at.group(1))[0]
+    return _wrong(where, f"{key}.{field}", f"{text[: at.start()]}, but it is {table.get(field)!r}")
+
+
+def _check_links(robot: Robot) -> None:
+    where, buses, seen = robot.where, {bus.name for bus in robot.buses}, dict[tuple[str, int], str]()
+    for joint in robot.joints:
+        key = f'joint."{joint.name}"'
+        if joint.bus not in buses:
+            raise _wrong(where, f"{key}.bus", f"there is no bus {joint.bus!r}; there is {', '.join(sorted(buses))}")
+        if not joint.min_rad < joint.max_rad:
+            problem = f"must be greater than min_rad, but {joint.max_rad} <= {joint.min_rad}"
+            raise _wrong(where, f"{key}.max_rad", problem)
+        if other := seen.get((joint.bus, joint.id)):
+            raise _wrong(where, f"{key}.id", f"{joint.id} is taken on bus {joint.bus!r} by joint {other!r}")
+        seen[joint.bus, joint.id] = joint.name
+    _check_groups(robot)
+
+
+def _check_groups(robot: Robot) -> None:
+    names = {joint.name for joint in robot.joints}
+    for group in robot.groups:
+        key = f"group.{group.name}.joints"
+        for joint in group.joints:
+            if joint not in names:
+                raise _wrong(robot.where, key, f"there is no joint {joint!r}; there is {', '.join(sorted(names))}")
+        if len(set(group.joints)) < len(group.joints):
+            raise _wrong(robot.where, key, f"names a joint twice: {group.joints}")
+        if group.name in names:
+            raise _wrong(robot.where, f"group.{group.name}", "a joint has this name already")

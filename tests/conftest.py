@@ -1,0 +1,98 @@
+"""What every test gets: a system of its own, and a failure if it leaves a thread, file, process or loop behind."""
+
+import asyncio
+import gc
+import os
+import secrets
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import psutil
+import pytest
+import trade
+from trade import Container, Settings
+
+_SETTLE_S = 5.0
+"""How long what a test has ended may take to be gone; far above what it takes."""
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _warm_up(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """The transport's runtime and the event loop's selector open files once a process; that is no leak."""
+    os.environ["TRADE_RUNTIME_DIR"] = str(tmp_path_factory.mktemp("runtime"))
+    with Container(Settings.read(system="warm-up")):
+        pass
+    asyncio.run(asyncio.sleep(0))
+
+
+@pytest.fixture(autouse=True)
+def _nothing_leaks(_warm_up: None) -> Iterator[None]:
+    threads, files, children = set(threading.enumerate()), _files(), _children()
+    yield
+    trade.close()
+    leaked = _wait_until_gone(
+        lambda: [
+            *(f"thread {thread.name}" for thread in set(threading.enumerate()) - threads if thread.is_alive()),
+            *(f"file {path}" for path in _files() - files),
+            *(f"process {name}" for name in _children() - children),
+        ]
+    )
+    assert not leaked, f"the test left behind: {', '.join(leaked)}"
+
+
+def _wait_until_gone(leaks: Callable[[], list[str]]) -> list[str]:
+    deadline = time.monotonic() + _SETTLE_S
+    while (leaked := leaks()) and time.monotonic() < deadline:
+        gc.collect()
+        threading.Event().wait(0.02)
+    return leaked
+
+
+def _files() -> set[str]:
+    """Open descriptors with what they stand for; the number alone is reused."""
+    found: set[str] = set()
+    for entry in Path("/proc/self/fd").iterdir() if Path("/proc/self/fd").exists() else ():
+        try:
+            found.add(f"{entry.name} -> {entry.readlink()}")
+        except OSError:  # the descriptor of the listing itself
+            continue
+    return found
+
+
+def _children() -> set[str]:
+    found: set[str] = set()
+    for child in psutil.Process().children(recursive=True):
+        try:
+            if child.status() != psutil.STATUS_ZOMBIE:
+                found.add(f"{child.pid} {' '.join(child.cmdline()[:4])}")
+        except psutil.NoSuchProcess:
+            continue
+    return found
+
+
+@pytest.fixture
+def system(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """A system id nobody else has, also for child processes and for the default container."""
+    name = f"test-{secrets.token_hex(4)}"
+    monkeypatch.setenv("TRADE_SYSTEM", name)
+    monkeypatch.setenv("TRADE_RUNTIME_DIR", str(tmp_path / "runtime"))
+    return name
+
+
+StartContainer = Callable[..., Container]
+
+
+@pytest.fixture
+def start_container(system: str) -> Iterator[StartContainer]:
+    """Starts containers of the test's system by name and closes them."""
+    started: list[Container] = []
+
+    def start(name: str, **settings: object) -> Container:
+        started.append(Container(Settings.read(container=name, **settings)))  # type: ignore[arg-type]
+        return started[-1]
+
+    yield start
+    for container in reversed(started):
+        container.close()

@@ -1,0 +1,333 @@
+"""The caller's side of a call: borrow a reply channel, put the request, wait until it is answered, lost or too late.
+
+The blocking caller itself waits on its reply channel: no hop. What ends a wait without an answer is a put of our own on
+the reply key, from the deadline thread or from whoever learns that the callee is gone.
+"""
+
+import itertools
+import logging
+import math
+import secrets
+import threading
+import time
+from collections.abc import Callable
+from typing import Final
+
+from msgspec import Raw
+
+from trade._transport import Channel, ChannelClosed, Message, Publisher, Transport
+from trade._wire import (
+    EMPTY,
+    PROTOCOL,
+    Address,
+    Call,
+    Malformed,
+    Reply,
+    Status,
+    call_key,
+    decode_reply,
+    encode_message,
+    reply_key,
+)
+
+_logger = logging.getLogger("trade")
+_NEVER: Final = math.inf
+_DRIFT: Final = 200e-6
+"""Two monotonic clocks run apart at most this fast (quartz is specified to 100 ppm)."""
+
+OnReply = Callable[[Reply], None]
+
+
+class Peer:
+    """Another container as callers see it: whether it is there, and how its clock runs against ours."""
+
+    def __init__(self, address: Address) -> None:
+        self.address = address
+        self.lost = False
+        self._low_ns = -_NEVER
+        self._high_ns = _NEVER
+        self._at_ns = 0
+
+    @property
+    def clock_known(self) -> bool:
+        return self._low_ns > -_NEVER
+
+    def heard(self, clock_ns: int, sent_ns: int, received_ns: int) -> None:
+        """Its clock stood at ``clock_ns`` some time between our sending and our receiving."""
+        slack = (received_ns - self._at_ns) * _DRIFT
+        low = max(self._low_ns - slack, clock_ns - received_ns)
+        high = min(self._high_ns + slack, clock_ns - sent_ns)
+        if low > high:  # its clock or ours was set or stood still: what was known is void
+            low, high = clock_ns - received_ns, clock_ns - sent_ns
+        self._low_ns, self._high_ns, self._at_ns = low, high, received_ns
+
+    def expiry_ns(self, deadline_ns: int) -> int:
+        """Our deadline in its clock, never later than it is meant."""
+        slack = (time.monotonic_ns() - self._at_ns) * _DRIFT
+        return int(deadline_ns + self._low_ns - slack)
+
+
+class _Box:
+    """A reply channel lent to one caller at a time."""
+
+    __slots__ = ("call_id", "channel", "deadline_ns", "name", "peer", "wake_key")
+
+    def __init__(self, name: str, wake_key: str, channel: Channel) -> None:
+        self.name = name
+        self.wake_key = wake_key
+        self.channel = channel
+        self.call_id = 0
+        self.deadline_ns: float = _NEVER
+        self.peer: Peer | None = None
+
+
+class _Pending:
+    """A started call that waits for its answer without a thread."""
+
+    __slots__ = ("deadline_ns", "on_reply", "peer", "sent_ns")
+
+    def __init__(self, peer: Peer, deadline_ns: int, on_reply: OnReply) -> None:
+        self.peer = peer
+        self.deadline_ns = deadline_ns
+        self.on_reply = on_reply
+        self.sent_ns = time.monotonic_ns()
+
+
+class Caller:
+    """Every outgoing call of one container."""
+
+    def __init__(self, transport: Transport, own: Address, session: str) -> None:
+        self._transport = transport
+        self._own = own
+        self._session = session
+        self._ids = itertools.count(secrets.randbits(38) << 24 | 1)
+        self._peers: dict[Address, Peer] = {}
+        self._publishers: dict[str, Publisher] = {}
+        self._lock = threading.Lock()
+        self._every: list[_Box] = []
+        self._free: list[_Box] = []
+        self._pending: dict[int, _Pending] = {}
+        self._shared: _Box | None = None
+        self._threads: list[threading.Thread] = []
+        self._closed = False
+        self._next_deadline_ns: float = _NEVER
+        self._sooner = threading.Event()
+        self.malformed = 0
+        self._spawn("trade-deadlines", self._watch_deadlines)
+
+    # --- what a call needs to know
+
+    def peer(self, address: Address) -> Peer:
+        with self._lock:
+            return self._peers.setdefault(address, Peer(address))
+
+    def publisher(self, callee: Address, domain: str, provider: str, *, stop: bool) -> Publisher:
+        """The declared key of one provider's calls, made once."""
+        key = call_key(self._own.identity, callee, domain, provider, stop=stop)
+        with self._lock:
+            found = self._publishers.get(key)
+            if found is None:
+                found = self._publishers[key] = self._transport.publish(key, urgent=stop)
+            return found
+
+    def forget(self, callee: Address, domain: str, provider: str) -> None:
+        """A provider is gone: its publishers with it."""
+        keys = [call_key(self._own.identity, callee, domain, provider, stop=stop) for stop in (False, True)]
+        with self._lock:
+            gone = [self._publishers.pop(key, None) for key in keys]
+        for publisher in gone:
+            if publisher is not None:
+                publisher.close()
+
+    # --- calling
+
+    def ask(
+        self,
+        peer: Peer,
+        publisher: Publisher,
+        service: str,
+        args: Raw,
+        deadline_ns: int,
+        expires_ns: int | None,
+        chain: tuple[str, ...],
+    ) -> Reply:
+        """Call and wait for the answer; it always comes, if only from ourselves at the deadline."""
+        box = self._borrow()
+        call_id = next(self._ids)
+        box.peer, box.deadline_ns, box.call_id = peer, deadline_ns, call_id
+        if deadline_ns < self._next_deadline_ns:
+            self._sooner.set()
+        try:
+            if peer.lost or self._closed:
+                return _ended(call_id, Status.LOST if peer.lost else Status.CLOSED)
+            sent_ns = time.monotonic_ns()
+            publisher.put(
+                encode_message(Call(PROTOCOL, call_id, service, box.name, self._session, expires_ns, chain, args))
+            )
+            return self._await_reply(box, call_id, sent_ns)
+        finally:
+            box.call_id, box.deadline_ns, box.peer = 0, _NEVER, None
+            self._free.append(box)
+
+    def _await_reply(self, box: _Box, call_id: int, sent_ns: int) -> Reply:
+        while True:
+            try:
+                message = box.channel.receive()
+            except ChannelClosed:
+                return _ended(call_id, Status.CLOSED)
+            reply = self._decode(message)
+            if (
+                reply is None
+                or reply.id != call_id
+                or box.peer is None
+                or not self._may_answer(message, box.peer, reply)
+            ):
+                continue
+            if reply.status < Status.TIMED_OUT:
+                box.peer.heard(reply.clock_ns, sent_ns, time.monotonic_ns())
+            return reply
+
+    def _may_answer(self, message: Message, peer: Peer, reply: Reply) -> bool:
+        """Only the callee may answer, and only ourselves may end the wait; who puts stands in the key."""
+        speaker = message.key.split("/", 2)[1]
+        return speaker == (self._own.identity if reply.status >= Status.TIMED_OUT else peer.address.identity)
+
+    def start(
+        self,
+        peer: Peer,
+        publisher: Publisher,
+        service: str,
+        args: Raw,
+        deadline_ns: int,
+        expires_ns: int | None,
+        chain: tuple[str, ...],
+        on_reply: OnReply,
+    ) -> None:
+        """Call without waiting; the answer goes to ``on_reply`` on a thread of ours."""
+        shared = self._shared_box()
+        call_id = next(self._ids)
+        self._pending[call_id] = _Pending(peer, deadline_ns, on_reply)
+        if deadline_ns < self._next_deadline_ns:
+            self._sooner.set()
+        if peer.lost or self._closed:
+            self._finish(_ended(call_id, Status.LOST if peer.lost else Status.CLOSED))
+            return
+        publisher.put(
+            encode_message(Call(PROTOCOL, call_id, service, shared.name, self._session, expires_ns, chain, args))
+        )
+
+    def _finish(self, reply: Reply) -> None:
+        pending = self._pending.pop(reply.id, None)
+        if pending is None:
+            return
+        if reply.status < Status.TIMED_OUT:
+            pending.peer.heard(reply.clock_ns, pending.sent_ns, time.monotonic_ns())
+        try:
+            pending.on_reply(reply)
+        except Exception:
+            _logger.exception("the receiver of an answer failed")
+
+    # --- reply channels
+
+    def _borrow(self) -> _Box:
+        try:
+            return self._free.pop()
+        except IndexError:
+            return self._new_box()
+
+    def _new_box(self) -> _Box:
+        with self._lock:
+            index = str(len(self._every))
+            key = reply_key("*", self._own.identity, self._own.container, index)
+            own = reply_key(self._own.identity, self._own.identity, self._own.container, index)
+            box = _Box(f"{self._own.container}/{index}", own, self._transport.subscribe(key))
+            self._every.append(box)
+            return box
+
+    def _shared_box(self) -> _Box:
+        if self._shared is None:
+            box = self._new_box()
+            with self._lock:
+                if self._shared is None:
+                    self._shared = box
+                    self._spawn("trade-replies", self._read_shared)
+                    return box
+            self._free.append(box)
+        return self._shared
+
+    def _read_shared(self) -> None:
+        assert self._shared is not None  # noqa: S101
+        while True:
+            try:
+                message = self._shared.channel.receive()
+            except ChannelClosed:
+                return
+            reply = self._decode(message)
+            pending = self._pending.get(reply.id) if reply is not None else None
+            if reply is not None and pending is not None and self._may_answer(message, pending.peer, reply):
+                self._finish(reply)
+
+    def _decode(self, message: Message) -> Reply | None:
+        try:
+            return decode_reply(message.payload or b"")
+        except Malformed as bad:
+            self.malformed += 1
+            if self.malformed == 1:
+                _logger.warning("dropped an answer on %s: %s", message.key, bad)
+            return None
+
+    # --- ends without an answer
+
+    def lost(self, address: Address, *, back: bool = False) -> None:
+        """The callee's container is gone (or back): end what waits for it."""
+        peer = self.peer(address)
+        peer.lost = not back
+        if not back:
+            self._end(lambda waiting, _: waiting is peer, Status.LOST)
+
+    def _watch_deadlines(self) -> None:
+        while not self._closed:
+            self._sooner.clear()
+            self._next_deadline_ns = _NEVER  # whoever starts during the scan wakes us
+            now = time.monotonic_ns()
+            self._end_overdue(now)
+            deadlines = [box.deadline_ns for box in list(self._every)]
+            deadlines += [pending.deadline_ns for pending in list(self._pending.values())]
+            soonest = min(deadlines, default=_NEVER)
+            self._next_deadline_ns = soonest
+            self._sooner.wait(None if soonest == _NEVER else max(0.0, (soonest - now) / 1e9))
+
+    def _end_overdue(self, now_ns: int) -> None:
+        self._end(lambda _, deadline_ns: deadline_ns <= now_ns, Status.TIMED_OUT)
+
+    def _end(self, meant: Callable[[Peer, float], bool], status: int) -> None:
+        for box in list(self._every):
+            peer, call_id = box.peer, box.call_id
+            if call_id and peer is not None and meant(peer, box.deadline_ns):
+                box.deadline_ns = _NEVER
+                self._transport.wake(box.wake_key, encode_message(_ended(call_id, status)))
+        for call_id, pending in list(self._pending.items()):
+            if meant(pending.peer, pending.deadline_ns):
+                self._finish(_ended(call_id, status))
+
+    def _spawn(self, name: str, target: Callable[[], None]) -> None:
+        thread = threading.Thread(target=target, name=name, daemon=True)
+        self._threads.append(thread)
+        thread.start()
+
+    def close(self) -> None:
+        """End every wait and every thread. Idempotent."""
+        self._closed = True
+        self._sooner.set()
+        self._end(lambda _peer, _deadline: True, Status.CLOSED)
+        for box in list(self._every):
+            box.channel.close()
+        for thread in self._threads:
+            if thread is not threading.current_thread():
+                thread.join(2)
+        for publisher in self._publishers.values():
+            publisher.close()
+
+
+def _ended(call_id: int, status: int) -> Reply:
+    return Reply(PROTOCOL, call_id, status, 0, EMPTY)

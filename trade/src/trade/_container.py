@@ -1,0 +1,450 @@
+"""One participant: starts, joins, hosts providers, looks up, leaves. Ties the other modules together."""
+
+import atexit
+import difflib
+import os
+import re
+import secrets
+import socket
+import threading
+import weakref
+from collections.abc import Callable, Sequence
+from typing import Any, Final
+
+import msgspec
+from msgspec import Struct, structs
+
+from trade._calls import Caller
+from trade._constraints import Constraint, where
+from trade._dispatch import Dispatcher, LocalService
+from trade._handle import Handle, Run
+from trade._invoke import LocalTarget, RemoteTarget, Request
+from trade._notifications import Callback, Notification, Notifier
+from trade._registry import Change, Record, Registry
+from trade._rendezvous import Rendezvous, free_endpoint
+from trade._service import marked_methods
+from trade._settings import Settings
+from trade._signature import Codec, Signature
+from trade._system import DOMAIN, PROVIDER, ContainerInfo, SystemServices
+from trade._transport import Publisher, Transport
+from trade._watch import Watch
+from trade._wire import (
+    Address,
+    ProviderInfo,
+    ServiceKey,
+    alive_key,
+    domain_of,
+    encode_message,
+    registry_key,
+)
+from trade._zenoh import ZenohTransport, configuration
+from trade.errors import ConfigurationError, NoSuchService, ServiceGone, TooManyServices
+
+__all__ = ["Container"]
+
+_GROUP: Final = re.compile(r"[A-Za-z0-9_-]+(\.[A-Za-z0-9_-]+)*")
+_HANDLE_EXT: Final = 1
+_PATIENCE_S: Final = 1.0
+"""How long a call waits for the registry to hear of a handle that came by message before its registry entry did."""
+
+_live: "weakref.WeakSet[Container]" = weakref.WeakSet()
+
+
+class _Registered(Struct, frozen=True):
+    """A provider of this container."""
+
+    provider: Any
+    name: str
+    groups: tuple[str, ...]
+    services: dict[str, LocalService]
+    announcement: Publisher
+
+
+class Container:
+    """A participant of a system; most programs use the default one through the functions of ``trade``.
+
+    Joins on construction. A context manager; ``close()`` leaves and is idempotent.
+
+    Raises:
+        ConfigurationError: a setting is wrong, the endpoint is taken, or this process was forked from one that has a
+            container.
+    """
+
+    def __init__(self, settings: Settings | None = None, *, transport: Transport | None = None) -> None:
+        _refuse_after_fork()
+        self._settings = settings or Settings.read()
+        self.address: Final = Address(self._settings.identity, self._settings.container, secrets.token_hex(6))
+        self.session: Final = secrets.token_hex(8)
+        self._host = socket.gethostname()
+        self._lock = threading.Lock()
+        self._closed = False
+        self._providers: dict[str, _Registered] = {}
+        self._names: dict[int, str] = {}
+        self._counter = 0
+        self._targets: dict[ServiceKey, LocalTarget | RemoteTarget] = {}
+        self._codec = Codec(self._handle_to_data, self._data_to_handle)
+        self._rendezvous: Rendezvous | None = None
+        self._registry = Registry(self.address)
+        self._transport = transport or self._join()
+        self._caller = Caller(self._transport, self.address, self.session)
+        self._notifier = Notifier(lambda record: Handle(self, record.key, record))
+        self._registry.listen(self._changed)
+        self._registry.listen(self._notifier.changed)
+        self._dispatcher = Dispatcher(self._transport, self.address, self._codec, self._lookup)
+        self._add(SystemServices(), (DOMAIN,), (), name=PROVIDER)
+        self._presence = self._transport.appear(alive_key(self.address))
+        self._watch = Watch(self._transport, self._registry, self.address, self._caller.lost)
+        _live.add(self)
+
+    def _join(self) -> Transport:
+        settings = self._settings
+        listen, connect = list(settings.listen) or [free_endpoint()], list(settings.connect)
+        if not settings.connect:
+            self._rendezvous = Rendezvous(settings.system)
+            connect = self._rendezvous.enter(listen[0])
+        try:
+            return ZenohTransport(
+                configuration(
+                    namespace=settings.system, listen=listen, connect=connect, credentials=settings.credentials
+                )
+            )
+        except BaseException:
+            if self._rendezvous is not None:
+                self._rendezvous.leave()
+            raise
+
+    # --- hosting
+
+    def register(
+        self, provider: object, groups: str | Sequence[str] = (), *, implements: Sequence[type] = ()
+    ) -> tuple[Handle, ...]:
+        """Offer an object's services to the whole system.
+
+        Args:
+            provider: an object whose class, bases or interfaces have ``@service`` methods.
+            groups: dotted labels such as ``"rosie.head"``.
+            implements: interfaces (protocols) the object fits without inheriting from them.
+
+        Returns:
+            Handles of its services.
+
+        Raises:
+            ConfigurationError: nothing to offer, a type that cannot be sent, a malformed group, or it is registered
+                already.
+        """
+        self._check_open()
+        named = (groups,) if isinstance(groups, str) else tuple(groups)
+        for group in named:
+            if not _GROUP.fullmatch(group) or group.split(".")[0] == DOMAIN:
+                problem = (
+                    f"{group!r} is no group; use words joined by dots, such as rosie.head ({DOMAIN!r} is reserved)"
+                )
+                raise ConfigurationError(where=type(provider).__qualname__, problem=problem)
+        return self._add(provider, named, implements)
+
+    def _add(
+        self, provider: object, groups: tuple[str, ...], implements: Sequence[type], name: str | None = None
+    ) -> tuple[Handle, ...]:
+        kind = type(provider).__qualname__
+        services = self._services_of(provider, groups, implements)
+        with self._lock:
+            if id(provider) in self._names:
+                raise ConfigurationError(where=kind, problem="this object is registered already; deregister it first")
+            self._counter += 1
+            chunk = name or f"{type(provider).__name__}-{self._counter}"
+            self._names[id(provider)] = chunk
+        infos = tuple(service.signature.info for service in services.values())
+        info = ProviderInfo(revision=1, groups=groups, kind=kind, host=self._host, pid=os.getpid(), services=infos)
+        domain = domain_of(groups)
+        announcement = self._transport.announce(registry_key(domain, self.address, chunk))
+        self._providers[chunk] = _Registered(provider, chunk, groups, services, announcement)
+        self._registry.put(self.address, domain, chunk, info)
+        announcement.put(encode_message(info))
+        return tuple(self.handle(ServiceKey(self.address, domain, chunk, info.name)) for info in infos)
+
+    def _services_of(
+        self, provider: object, groups: tuple[str, ...], implements: Sequence[type]
+    ) -> dict[str, LocalService]:
+        kind = type(provider).__qualname__
+        marked = marked_methods(type(provider), implements)
+        if not marked:
+            raise ConfigurationError(
+                where=kind, problem="it has no services; mark methods of its class with @trade.service"
+            )
+        resources = tuple(getattr(provider, "resources", ()))
+        services: dict[str, LocalService] = {}
+        for name, (mark, function) in marked.items():
+            label = f"{groups[0] if groups else kind}.{name}"
+            signature = Signature(label, name, mark, function, self._codec)
+            if mark.effect != "read":
+                signature.info = structs.replace(signature.info, uses=(*mark.uses, *resources))
+            services[name] = LocalService(label, signature, getattr(provider, name), mark.effect)
+        return services
+
+    def deregister(self, provider: object) -> None:
+        """Withdraw an object's services from the whole system; handles of them fail from now on.
+
+        Raises:
+            ConfigurationError: it is not registered here.
+        """
+        self._check_open()
+        with self._lock:
+            chunk = self._names.pop(id(provider), None)
+        if chunk is None:
+            raise ConfigurationError(
+                where=type(provider).__qualname__, problem="it is not registered in this container"
+            )
+        registered = self._providers.pop(chunk)
+        self._registry.remove(self.address, chunk)
+        registered.announcement.close()
+
+    def _lookup(self, provider: str, service: str) -> LocalService | None:
+        registered = self._providers.get(provider)
+        return None if registered is None else registered.services.get(service)
+
+    # --- looking up
+
+    def services(self, constraint: Constraint | None = None) -> list[Handle]:
+        """Handles of all services that match, ordered by group and name; without a constraint, of everything."""
+        self._check_open()
+        wanted = where() if constraint is None else constraint
+        return [Handle(self, record.key, record) for record in self._registry.select(wanted)]
+
+    def find(self, constraint: Constraint, *, wait_s: float = 2.0) -> Handle:
+        """The only service that matches; waits for it to appear.
+
+        Raises:
+            NoSuchService: none within ``wait_s`` seconds.
+            TooManyServices: more than one.
+        """
+        self._check_open()
+        matches: list[Record] = []
+
+        def found() -> bool:
+            matches[:] = self._registry.select(constraint)
+            return bool(matches)
+
+        if not self._registry.wait_for(found, wait_s):
+            raise NoSuchService(constraint=str(constraint), waited_s=wait_s, near=self._near(constraint))
+        if len(matches) > 1:
+            raise TooManyServices(
+                constraint=str(constraint), matches=[f"{match.label} in {match.container}" for match in matches]
+            )
+        return Handle(self, matches[0].key, matches[0])
+
+    def _near(self, constraint: Constraint) -> tuple[str, ...]:
+        """Labels that look like what was asked for, for the error's hint."""
+        asked = [term for clause in constraint.clauses for term in clause if not term.negated]
+        group = next((term.pattern for term in asked if term.field == "group"), "")
+        name = next((term.pattern for term in asked if term.field == "name"), "")
+        labels = {record.label for record in self._registry.select(where())}
+        return tuple(difflib.get_close_matches(".".join(filter(None, (group, name))), sorted(labels), n=2, cutoff=0.7))
+
+    def containers(self) -> list[ContainerInfo]:
+        """The containers of the system, this one included."""
+        self._check_open()
+        infos: list[ContainerInfo] = []
+        for state in self._registry.containers():
+            records = [record for _, provided in state.providers.values() for record in provided]
+            first = records[0] if records else None
+            infos.append(
+                ContainerInfo(
+                    name=state.address.container,
+                    identity=state.address.identity,
+                    epoch=state.address.epoch,
+                    host=first.host if first else "",
+                    pid=first.pid if first else 0,
+                    providers=len(state.providers),
+                    services=len(records),
+                )
+            )
+        return infos
+
+    def handle(self, key: ServiceKey) -> Handle:
+        """A handle of a service whose key is known."""
+        return Handle(self, key, self._registry.get(key))
+
+    def has(self, key: ServiceKey) -> bool:
+        """Whether the registry has the service now."""
+        return self._registry.get(key) is not None
+
+    def record(self, handle: Handle) -> Record:
+        """What is known of a service; raises ServiceGone if nothing ever was."""
+        record = self._registry.get(handle.key) or handle.last_record
+        if record is None:
+            raise self._gone(handle)
+        return record
+
+    # --- being told
+
+    def joined(self, constraint: Constraint, call: Callback, *, existing: bool = False) -> Notification:
+        """Call with the handle of every service that comes and matches.
+
+        Args:
+            constraint: which services.
+            call: a handle, or a function of this process.
+            existing: also once for each that is there already.
+        """
+        return self._notify("joined", constraint, call, existing=existing)
+
+    def left(self, constraint: Constraint, call: Callback) -> Notification:
+        """Call with the (dead) handle of every service that goes and matched."""
+        return self._notify("left", constraint, call, existing=False)
+
+    def _notify(self, occasion: str, constraint: Constraint, call: Callback, *, existing: bool) -> Notification:
+        self._check_open()
+        if not callable(call):
+            raise ConfigurationError(
+                where=f"trade.{occasion}", problem=f"call must be a handle or a function, not {call!r}"
+            )
+        notification = Notification(occasion, constraint, call)
+        self._registry.between_changes(
+            lambda: self._notifier.add(notification, self._registry.select(constraint) if existing else [])
+        )
+        return notification
+
+    def _changed(self, change: Change) -> None:
+        """Told by the registry: calls to what left must fail at once."""
+        for record in change[1]:
+            self._targets.pop(record.key, None)
+            if not record.local and not self._registry.is_alive(record.key.address):
+                self._caller.forget(record.key.address, record.key.domain, record.key.provider)
+
+    # --- calling
+
+    def invoke(self, handle: Handle, args: tuple[Any, ...], kwargs: dict[str, Any], deadline_s: float | None) -> Any:
+        """Call a service and wait; what ``handle(...)`` does."""
+        request = Request(deadline_s)
+        return self._target(handle).invoke(args, kwargs, request)
+
+    def begin(self, handle: Handle, args: tuple[Any, ...], kwargs: dict[str, Any], deadline_s: float | None) -> Run:
+        """Call a service without waiting; what ``handle.start(...)`` does."""
+        request, run = Request(deadline_s), Run(handle)
+        target = self._target(handle)
+        if isinstance(target, RemoteTarget):
+            target.begin(args, kwargs, request, run)
+        else:
+            work: Callable[[], None] = lambda: run.end(lambda: target.invoke(args, kwargs, request))  # noqa: E731
+            threading.Thread(target=work, name=f"trade-run-{handle.name}", daemon=True).start()
+        return run
+
+    def _target(self, handle: Handle) -> LocalTarget | RemoteTarget:
+        target = self._targets.get(handle.key)
+        return target if target is not None else self._new_target(handle)
+
+    def _new_target(self, handle: Handle) -> LocalTarget | RemoteTarget:
+        self._check_open()
+        key = handle.key
+        known = self._registry.get(key) is not None or handle.last_record is not None or self._registry.removed(key)
+        if not known:
+            self._registry.wait_for(lambda: self._registry.get(key) is not None, _PATIENCE_S)
+        record = self._registry.get(key)
+        if record is None:
+            raise self._gone(handle)
+        local = self._lookup(key.provider, key.name) if record.local else None
+        target: LocalTarget | RemoteTarget = (
+            LocalTarget(local, self._codec, self.address, self.session)
+            if local is not None
+            else RemoteTarget(record, self._caller, self._codec)
+        )
+        self._targets[key] = target
+        if self._registry.get(key) is None:  # it left in between
+            self._targets.pop(key, None)
+        return target
+
+    def _gone(self, handle: Handle) -> ServiceGone:
+        address = handle.key.address
+        if self._registry.is_alive(address):
+            reason = "its provider was deregistered" if self._registry.removed(handle.key) else "it is not known here"
+        else:
+            reason = f"container {address.container} has ended, restarted or cannot be reached"
+        return ServiceGone(service=handle.label, reason=reason)
+
+    def _handle_to_data(self, value: Any) -> Any:
+        if isinstance(value, Handle):
+            return msgspec.msgpack.Ext(_HANDLE_EXT, encode_message(value.key))
+        raise TypeError(f"a {type(value).__qualname__} is no plain data")
+
+    def _data_to_handle(self, code: int, data: memoryview) -> Any:
+        if code != _HANDLE_EXT:
+            raise ValueError(f"unknown extension {code}")
+        return self.handle(msgspec.msgpack.decode(data, type=ServiceKey))
+
+    # --- being
+
+    @property
+    def name(self) -> str:
+        """The container's name."""
+        return self.address.container
+
+    @property
+    def settings(self) -> Settings:
+        """What it was started with."""
+        return self._settings
+
+    @property
+    def dropped_messages(self) -> int:
+        """Messages that were malformed or of another protocol version."""
+        return self._dispatcher.malformed + self._caller.malformed + self._watch.malformed
+
+    def healthy(self) -> bool:
+        """Whether it can still take a call now; what feeds hardware watchdogs asks this."""
+        return not self._closed and self._dispatcher.draining
+
+    def _check_open(self) -> None:
+        _refuse_after_fork()
+        if self._closed:
+            raise ConfigurationError(where=self.name, problem="this container is closed; start another one")
+
+    def close(self) -> None:
+        """Leave: services, handles and notifications end; nothing stays behind. Idempotent."""
+        with self._lock:
+            if self._closed:
+                return
+            self._closed = True
+        self._presence.close()
+        for registered in self._providers.values():
+            registered.announcement.close()
+        self._dispatcher.close()
+        self._caller.close()
+        self._watch.close()
+        self._notifier.close()
+        self._transport.close()
+        if self._rendezvous is not None:
+            self._rendezvous.leave()
+
+    def __enter__(self) -> "Container":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def __repr__(self) -> str:
+        return f"<Container {self.address} of {self._settings.system}>"
+
+
+@atexit.register
+def _close_all() -> None:
+    """The interpreter must not end under threads that wait inside the transport."""
+    for container in list(_live):
+        container.close()
+
+
+_forked = False
+
+
+def _after_fork() -> None:
+    global _forked  # noqa: PLW0603 - a fact about the process
+    _forked = _forked or bool(_live)
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_after_fork)
+
+
+def _refuse_after_fork() -> None:
+    if _forked:
+        problem = (
+            "this process was forked from one with a container, which cannot work; start it with spawn instead of fork"
+        )
+        raise ConfigurationError(problem=problem)

@@ -1,0 +1,205 @@
+"""Handles: values that name one service of one boot, and calls that were started without waiting."""
+
+import asyncio
+import concurrent.futures
+from collections.abc import Callable, Generator, Mapping
+from typing import TYPE_CHECKING, Any
+
+from trade._wire import ServiceKey
+from trade.errors import ConfigurationError
+
+if TYPE_CHECKING:
+    from trade._container import Container
+    from trade._registry import Record
+
+__all__ = ["Handle", "Run"]
+
+
+class Run:
+    """A call under way. Wait with ``result()`` or ``await``; every one ends at its deadline at the latest."""
+
+    def __init__(self, handle: "Handle") -> None:
+        self._handle = handle
+        self._future: concurrent.futures.Future[Any] = concurrent.futures.Future()
+        self._future.set_running_or_notify_cancel()  # only its end ends it
+
+    def result(self, timeout_s: float | None = None) -> Any:
+        """The service's result, or its error raised.
+
+        Args:
+            timeout_s: give up waiting (not the call) after this long; raises TimeoutError.
+        """
+        try:
+            return self._future.result(timeout_s)
+        except concurrent.futures.TimeoutError:
+            if self._future.done():
+                raise
+            raise TimeoutError(f"{self._handle} has not ended after {timeout_s} s; it goes on") from None
+
+    def done(self) -> bool:
+        """Whether it has ended, well or not."""
+        return self._future.done()
+
+    def exception(self, timeout_s: float | None = None) -> BaseException | None:
+        """The error it ended with, or None."""
+        return self._future.exception(timeout_s)
+
+    def cancel(self) -> None:
+        """End it early by the service that its provider names for that; the result then tells how it ended.
+
+        Raises:
+            ConfigurationError: the provider names none.
+        """
+        self._handle.cancel_service()()
+
+    def end(self, outcome: Callable[[], Any]) -> None:
+        """Told by the container: the outcome is what this returns or raises."""
+        try:
+            self._future.set_result(outcome())
+        except BaseException as error:  # noqa: BLE001 - whatever the service raised belongs to who asks for the result
+            self._future.set_exception(error)
+
+    def __await__(self) -> Generator[Any, None, Any]:
+        return asyncio.wrap_future(self._future).__await__()
+
+
+class Handle:
+    """One service of one boot epoch: call it, compare it, keep it, pass it as argument or result.
+
+    A call raises ServiceGone once the service was deregistered or its container ended or restarted.
+    """
+
+    __slots__ = ("_container", "_deadline_s", "_record", "key")
+
+    def __init__(
+        self, container: "Container", key: ServiceKey, record: "Record | None", deadline_s: float | None = None
+    ) -> None:
+        self._container = container
+        self.key = key
+        """What the handle is over the wire."""
+        self._record = record
+        self._deadline_s = deadline_s
+
+    # --- calling
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        """Call and wait for the result, at most until the deadline."""
+        return self._container.invoke(self, args, kwargs, self._deadline_s)
+
+    def start(self, *args: Any, **kwargs: Any) -> Run:
+        """Call without waiting."""
+        return self._container.begin(self, args, kwargs, self._deadline_s)
+
+    async def acall(self, *args: Any, **kwargs: Any) -> Any:
+        """Call from asyncio."""
+        return await self.start(*args, **kwargs)
+
+    def with_(self, *, deadline_s: float) -> "Handle":
+        """The same service, called with other options.
+
+        Args:
+            deadline_s: how long a call may take, in seconds; greater than zero.
+        """
+        if not deadline_s > 0:
+            raise ConfigurationError(problem=f"deadline_s must be greater than 0, not {deadline_s}")
+        return Handle(self._container, self.key, self._record, deadline_s)
+
+    # --- telling
+
+    @property
+    def record(self) -> "Record":
+        """What the registry says of it now, or said last. Raises ServiceGone if it never knew the service."""
+        self._record = self._container.record(self)
+        return self._record
+
+    @property
+    def last_record(self) -> "Record | None":
+        """What the registry said of it last, if anything."""
+        return self._record
+
+    @property
+    def name(self) -> str:
+        """The service's name."""
+        return self.key.name
+
+    @property
+    def label(self) -> str:
+        """Group and name, as on the command line."""
+        return self._record.label if self._record else f"{self.key.domain}.{self.key.name}"
+
+    @property
+    def groups(self) -> tuple[str, ...]:
+        """The provider's groups."""
+        return self.record.groups
+
+    @property
+    def host(self) -> str:
+        """The computer it runs on."""
+        return self.record.host
+
+    @property
+    def container(self) -> str:
+        """The name of the container it lives in."""
+        return self.key.address.container
+
+    @property
+    def local(self) -> bool:
+        """Whether it lives in this very container."""
+        return self.key.address == self._container.address
+
+    @property
+    def alive(self) -> bool:
+        """Whether the registry has it now."""
+        return self._container.has(self.key)
+
+    @property
+    def signature(self) -> str:
+        """Name, arguments and result with their types."""
+        return self.record.info.signature
+
+    @property
+    def doc(self) -> str:
+        """The method's docstring."""
+        return self.record.info.doc
+
+    @property
+    def effect(self) -> str:
+        """``read``, ``actuate`` or ``stop``."""
+        return self.record.info.effect
+
+    @property
+    def resources(self) -> tuple[str, ...]:
+        """Physical things it needs for itself."""
+        return self.record.info.uses
+
+    @property
+    def roles(self) -> tuple[str, ...]:
+        """Roles a caller needs; none are asked for until a policy is loaded."""
+        return ()
+
+    @property
+    def schema(self) -> Mapping[str, Mapping[str, Any]]:
+        """JSON Schema of ``arguments`` and ``result``."""
+        info = self.record.info
+        return {"arguments": info.arguments_schema, "result": info.result_schema}
+
+    def cancel_service(self) -> "Handle":
+        """The service that ends this one early. Raises ConfigurationError if there is none."""
+        cancel = self.record.info.cancel
+        if cancel is None:
+            raise ConfigurationError(
+                where=self.label, problem="it cannot be cancelled: its provider names no service for that"
+            )
+        key = ServiceKey(self.key.address, self.key.domain, self.key.provider, cancel)
+        return Handle(self._container, key, None)
+
+    # --- being a value
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Handle) and self.key == other.key
+
+    def __hash__(self) -> int:
+        return hash(self.key)
+
+    def __repr__(self) -> str:
+        return f"<Handle {self.label} in {self.container}>"

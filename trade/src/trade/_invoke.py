@@ -1,0 +1,145 @@
+"""From a handle to a result: the same checks whether the service is here or elsewhere."""
+
+import time
+from collections.abc import Callable
+from typing import Any, Final
+
+import msgspec
+from msgspec import Raw
+
+from trade._calls import Caller, Peer
+from trade._context import CallContext, running
+from trade._dispatch import LocalService
+from trade._failures import unpack_error
+from trade._handle import Run
+from trade._records import type_from_schema
+from trade._registry import Record
+from trade._signature import Codec, encode_arguments
+from trade._system import CLOCK, DOMAIN, PROVIDER
+from trade._wire import EMPTY_ARGUMENTS, Address, ErrorInfo, Reply, ServiceInfo, Status
+from trade.errors import Busy, ContainerLost, DeadlineExceeded, InvalidResult, OutcomeUnknown, ServiceGone
+
+DEFAULT_DEADLINE_S: Final = 10.0
+
+_decode_error: Final = msgspec.msgpack.Decoder(ErrorInfo).decode
+
+
+class Request:
+    """One call on its way out: deadline and chain, inherited from the call that makes it."""
+
+    __slots__ = ("chain", "deadline_ns", "deadline_s")
+
+    def __init__(self, deadline_s: float | None) -> None:
+        now = time.monotonic_ns()
+        self.deadline_s = DEFAULT_DEADLINE_S if deadline_s is None else deadline_s
+        self.deadline_ns = now + int(self.deadline_s * 1e9)
+        self.chain: tuple[str, ...] = ()
+        outer = running.get()
+        if outer is None:
+            return
+        self.chain = (*outer.chain, outer.service)
+        if outer.expires_ns is not None and outer.expires_ns < self.deadline_ns:
+            self.deadline_ns = outer.expires_ns
+            self.deadline_s = max(0.0, (outer.expires_ns - now) / 1e9)
+
+
+class LocalTarget:
+    """A service of this container: called directly, with the validation and the copies a wire would make."""
+
+    def __init__(self, service: LocalService, codec: Codec, own: Address, session: str) -> None:
+        self._service = service
+        self._codec = codec
+        self._own = own
+        self._session = session
+
+    def invoke(self, args: tuple[Any, ...], kwargs: dict[str, Any], request: Request) -> Any:
+        service = self._service
+        raw = encode_arguments(self._codec, service.signature.info, service.label, args, kwargs)
+        expires_ns = None if service.effect == "stop" else request.deadline_ns
+        if service.too_late(expires_ns):
+            raise DeadlineExceeded(service=service.label, deadline_s=request.deadline_s)
+        context = CallContext(0, service.label, self._own.identity, self._session, expires_ns, request.chain)
+        return service.signature.copy_result(service.run(raw, context))
+
+
+class RemoteTarget:
+    """A service of another container, with everything about calling it that can be decided beforehand."""
+
+    def __init__(self, record: Record, caller: Caller, codec: Codec) -> None:
+        address, key = record.key.address, record.key
+        self._label = record.label
+        self._info: ServiceInfo = record.info
+        self._codec = codec
+        self._caller = caller
+        self._peer: Peer = caller.peer(address)
+        self._is_stop = record.info.effect == "stop"
+        self._publisher = caller.publisher(address, key.domain, key.provider, stop=self._is_stop)
+        self._clock = caller.publisher(address, DOMAIN, PROVIDER, stop=False)
+        self._decode = codec.decoder(type_from_schema(record.info.result_schema, record.info.types))
+
+    def invoke(self, args: tuple[Any, ...], kwargs: dict[str, Any], request: Request) -> Any:
+        raw = encode_arguments(self._codec, self._info, self._label, args, kwargs)
+        if not (self._peer.clock_known or self._is_stop):
+            reply = self._ask(self._clock, CLOCK, EMPTY_ARGUMENTS, None, request)
+            if reply.status != Status.OK:
+                raise self._failure(reply, request)
+        return self._unpack(self._ask(self._publisher, self._info.name, raw, self._expiry(request), request), request)
+
+    def begin(self, args: tuple[Any, ...], kwargs: dict[str, Any], request: Request, run: Run) -> None:
+        """The same without waiting; the outcome goes into the run."""
+        raw = encode_arguments(self._codec, self._info, self._label, args, kwargs)
+
+        def go() -> None:
+            self._start(self._publisher, self._info.name, raw, self._expiry(request), request, finish)
+
+        def finish(reply: Reply) -> None:
+            run.end(lambda: self._unpack(reply, request))
+
+        def clock_heard(reply: Reply) -> None:
+            go() if reply.status == Status.OK else finish(reply)
+
+        if self._peer.clock_known or self._is_stop:
+            go()
+        else:
+            self._start(self._clock, CLOCK, EMPTY_ARGUMENTS, None, request, clock_heard)
+
+    def _expiry(self, request: Request) -> int | None:
+        return None if self._is_stop else self._peer.expiry_ns(request.deadline_ns)
+
+    def _ask(self, publisher: Any, service: str, raw: Raw, expires_ns: int | None, request: Request) -> Reply:
+        return self._caller.ask(self._peer, publisher, service, raw, request.deadline_ns, expires_ns, request.chain)
+
+    def _start(
+        self,
+        publisher: Any,
+        service: str,
+        raw: Raw,
+        expires_ns: int | None,
+        request: Request,
+        then: Callable[[Reply], None],
+    ) -> None:
+        self._caller.start(self._peer, publisher, service, raw, request.deadline_ns, expires_ns, request.chain, then)
+
+    def _unpack(self, reply: Reply, request: Request) -> Any:
+        if reply.status != Status.OK:
+            raise self._failure(reply, request)
+        try:
+            return self._decode(reply.body)
+        except msgspec.DecodeError as bad:
+            raise InvalidResult(service=self._label, problem=str(bad)) from None
+
+    def _failure(self, reply: Reply, request: Request) -> BaseException:
+        container = self._peer.address.container
+        match reply.status:
+            case Status.ERROR:
+                return unpack_error(_decode_error(reply.body), self._label)
+            case Status.BUSY:
+                return Busy(service=self._label, container=container)
+            case Status.EXPIRED:
+                return DeadlineExceeded(service=self._label, deadline_s=request.deadline_s)
+            case Status.GONE:
+                return ServiceGone(service=self._label)
+            case Status.TIMED_OUT:
+                return OutcomeUnknown(service=self._label, deadline_s=request.deadline_s)
+            case _:
+                return ContainerLost(service=self._label, container=container)

@@ -1,0 +1,88 @@
+"""How the containers of one system find each other on one host: a folder with a file for each one's loopback endpoint.
+
+The loopback interface carries no multicast. Who starts writes its own endpoint first and reads the others' then, so of
+two that start together at least one sees the other; the newcomer dials everybody.
+"""
+
+import contextlib
+import os
+import socket
+import stat
+import tempfile
+import time
+from pathlib import Path
+from typing import Final
+
+from trade.errors import ConfigurationError
+
+__all__ = ["Rendezvous", "free_endpoint"]
+
+_YOUNG_S: Final = 10.0
+"""A file this young may belong to a container that does not listen yet."""
+
+
+def free_endpoint() -> str:
+    """A loopback endpoint nobody listens on now."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+class Rendezvous:
+    """One system's folder on this host; only this user can read or write it."""
+
+    def __init__(self, system: str) -> None:
+        self._folder = _runtime_folder() / system
+        self._folder.mkdir(mode=0o700, exist_ok=True)
+        self._own: Path | None = None
+
+    def enter(self, endpoint: str) -> list[str]:
+        """Say where we listen; returns where the others do."""
+        name = endpoint.replace("/", "_").replace(":", "_")
+        self._own = self._folder / name
+        fresh = self._folder / f".{name}.{os.getpid()}"
+        fresh.write_text(endpoint, encoding="ascii")
+        fresh.replace(self._own)
+        return self._others()
+
+    def _others(self) -> list[str]:
+        found: list[str] = []
+        for path in sorted(self._folder.glob("tcp_*")):
+            with contextlib.suppress(OSError, ValueError):
+                endpoint = path.read_text(encoding="ascii").strip()
+                if path == self._own:
+                    continue
+                if _listens(endpoint) or time.time() - path.stat().st_mtime < _YOUNG_S:
+                    found.append(endpoint)
+                else:
+                    path.unlink()
+        return found
+
+    def leave(self) -> None:
+        """Take our endpoint away. Idempotent."""
+        if self._own is not None:
+            self._own.unlink(missing_ok=True)
+            self._own = None
+
+
+def _listens(endpoint: str) -> bool:
+    host, port = endpoint.partition("/")[2].rsplit(":", 1)
+    try:
+        with socket.create_connection((host, int(port)), timeout=0.5):
+            return True
+    except OSError:
+        return False
+
+
+def _runtime_folder() -> Path:
+    named = os.environ.get("TRADE_RUNTIME_DIR")
+    base = named or os.environ.get("XDG_RUNTIME_DIR")
+    uid = str(os.getuid()) if hasattr(os, "getuid") else "user"
+    folder = Path(base) / "trade" if base else Path(tempfile.gettempdir()) / f"trade-{uid}"
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    if hasattr(os, "getuid"):
+        state = folder.stat()
+        if state.st_uid != os.getuid() or stat.S_IMODE(state.st_mode) & 0o022:
+            problem = "others may write there; remove it, or set TRADE_RUNTIME_DIR to a folder of your own"
+            raise ConfigurationError(where=str(folder), problem=problem)
+    return folder

@@ -1,0 +1,95 @@
+"""``@service``, and reading a class with its interfaces into the services it provides."""
+
+# pyright: reportUnknownArgumentType=false
+
+import inspect
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, TypeVar, overload
+
+from trade.errors import ConfigurationError
+
+__all__ = ["Effect", "ServiceMark", "marked_methods", "service"]
+
+Effect = Literal["read", "actuate", "stop"]
+
+_Function = TypeVar("_Function", bound=Callable[..., Any])
+_MARK = "__trade_service__"
+_EFFECTS = ("read", "actuate", "stop")
+
+
+@dataclass(frozen=True, slots=True)
+class ServiceMark:
+    """What ``@service`` notes on a method."""
+
+    effect: Effect = "actuate"
+    cancel: str | None = None
+    achieves: tuple[str, ...] = ()
+    uses: tuple[str, ...] = ()
+
+
+@overload
+def service(function: _Function, /) -> _Function: ...
+@overload
+def service(
+    *, effect: Effect = "actuate", cancel: str | None = None, achieves: Sequence[str] = (), uses: Sequence[str] = ()
+) -> Callable[[_Function], _Function]: ...
+def service(
+    function: Callable[..., Any] | None = None,
+    /,
+    *,
+    effect: Effect = "actuate",
+    cancel: str | None = None,
+    achieves: Sequence[str] = (),
+    uses: Sequence[str] = (),
+) -> Any:
+    """Mark a method as a service, in a class or in an interface whose implementations then have it.
+
+    Args:
+        effect: ``"read"`` changes nothing, ``"actuate"`` (default) may move something or change state, ``"stop"`` ends
+            motion: it overtakes everything and ignores deadlines.
+        cancel: name of the service of the same provider that ends this one early.
+        achieves: post-conditions, such as ``"open(gripper)"``.
+        uses: physical resources it needs for itself.
+
+    Raises:
+        ConfigurationError: the effect is none of these.
+    """
+    if effect not in _EFFECTS:
+        raise ConfigurationError(problem=f"effect must be one of {', '.join(_EFFECTS)}, not {effect!r}")
+    mark = ServiceMark(effect, cancel, tuple(achieves), tuple(uses))
+
+    def note(target: _Function) -> _Function:
+        if not callable(target) or inspect.isclass(target):
+            raise ConfigurationError(problem=f"@service stands on a method, not on {target!r}; put it below @property")
+        setattr(target, _MARK, mark)
+        return target
+
+    return note if function is None else note(function)
+
+
+def marked_methods(cls: type, interfaces: Sequence[type] = ()) -> dict[str, tuple[ServiceMark, Callable[..., Any]]]:
+    """The services of a class: name -> its mark and the function whose signature counts.
+
+    A mark on any class of the method resolution order, or on an interface named beside it, holds for the
+    implementation.
+    The most derived marked declaration gives the signature.
+    """
+    found: dict[str, tuple[ServiceMark, Callable[..., Any]]] = {}
+    for owner in (*cls.__mro__, *(base for interface in interfaces for base in interface.__mro__)):
+        for name, member in vars(owner).items():
+            function: Any = getattr(member, "__func__", member)
+            mark = getattr(function, _MARK, None)
+            if isinstance(mark, ServiceMark) and name not in found:
+                found[name] = (mark, function)
+    _check(cls, found)
+    return found
+
+
+def _check(cls: type, found: dict[str, tuple[ServiceMark, Callable[..., Any]]]) -> None:
+    for name, (mark, _) in found.items():
+        where = f"{cls.__qualname__}.{name}"
+        if getattr(getattr(cls, name, None), "__isabstractmethod__", False) or not hasattr(cls, name):
+            raise ConfigurationError(where=where, problem="the interface has this service, but the class does not")
+        if mark.cancel is not None and mark.cancel not in found:
+            raise ConfigurationError(where=where, problem=f"cancel={mark.cancel!r} names no service of this class")

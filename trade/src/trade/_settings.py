@@ -1,0 +1,120 @@
+"""Who a container is and where it may be reached; every default stays on this host."""
+
+import getpass
+import ipaddress
+import os
+import socket
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from trade._wire import as_chunk, is_chunk
+from trade.errors import ConfigurationError
+
+__all__ = ["Settings"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Settings:
+    """What a container is started with; ``Settings.read`` fills in the environment and the defaults.
+
+    Raises:
+        ConfigurationError: a name cannot stand in a key, or the settings would reach beyond this host by accident.
+    """
+
+    system: str
+    """Containers of other systems are invisible."""
+    identity: str
+    """Who speaks."""
+    container: str
+    """Name of the container."""
+    listen: tuple[str, ...] = ()
+    """Endpoints such as ``tcp/127.0.0.1:7450``; none: any free port of the loopback interface."""
+    connect: tuple[str, ...] = ()
+    """Endpoints of others; none: the containers of this system on this host."""
+    credentials: tuple[str, str] | None = None
+    """User and password."""
+    explicit_system: bool = False
+
+    def __post_init__(self) -> None:
+        for what, text in (("system", self.system), ("identity", self.identity), ("container", self.container)):
+            if not is_chunk(text):
+                problem = f"{text!r} is no name for a {what}; use letters, digits, . _ - (at most 80)"
+                raise ConfigurationError(where=what, problem=problem)
+        for endpoint in self.listen:
+            if not _is_loopback(endpoint):
+                problem = "listening beyond loopback needs a policy, and none is loaded; listen on tcp/127.0.0.1:PORT"
+                raise ConfigurationError(where=f"listen {endpoint}", problem=problem)
+        for endpoint in self.connect:
+            if not _is_loopback(endpoint) and not (self.explicit_system and self.credentials):
+                problem = (
+                    "reaching a network needs an explicit system id and credentials: set TRADE_SYSTEM and "
+                    "TRADE_CREDENTIALS=user:password"
+                )
+                raise ConfigurationError(where=f"connect {endpoint}", problem=problem)
+
+    @classmethod
+    def read(
+        cls,
+        *,
+        system: str | None = None,
+        identity: str | None = None,
+        container: str | None = None,
+        listen: Sequence[str] | None = None,
+        connect: Sequence[str] | None = None,
+        credentials: tuple[str, str] | None = None,
+        environment: Mapping[str, str] = os.environ,
+    ) -> "Settings":
+        """Settings from arguments, else from the environment, else the defaults.
+
+        The environment has ``TRADE_SYSTEM``, ``TRADE_IDENTITY``, ``TRADE_CONTAINER``, ``TRADE_LISTEN`` and
+        ``TRADE_CONNECT`` (comma-separated), ``TRADE_CREDENTIALS`` (``user:password``).
+        """
+        named = system or environment.get("TRADE_SYSTEM")
+        return cls(
+            system=named or f"{_user()}@{as_chunk(socket.gethostname())}",
+            identity=identity or environment.get("TRADE_IDENTITY") or _user(),
+            container=container or environment.get("TRADE_CONTAINER") or _program(),
+            listen=tuple(_split(environment, "TRADE_LISTEN") if listen is None else listen),
+            connect=tuple(_split(environment, "TRADE_CONNECT") if connect is None else connect),
+            credentials=credentials or _credentials(environment.get("TRADE_CREDENTIALS")),
+            explicit_system=named is not None,
+        )
+
+
+def _split(environment: Mapping[str, str], name: str) -> list[str]:
+    return [part.strip() for part in environment.get(name, "").split(",") if part.strip()]
+
+
+def _credentials(text: str | None) -> tuple[str, str] | None:
+    if not text:
+        return None
+    user, colon, password = text.partition(":")
+    if not (user and colon and password):
+        raise ConfigurationError(where="TRADE_CREDENTIALS", problem="must be user:password")
+    return user, password
+
+
+def _user() -> str:
+    try:
+        return as_chunk(getpass.getuser())
+    except (OSError, KeyError):  # a container image without a user name
+        return "nobody"
+
+
+def _program() -> str:
+    name = Path(sys.argv[0]).stem if sys.argv and sys.argv[0] else ""
+    return as_chunk(f"{name if name not in ('', '-c', '-m', '__main__') else 'python'}-{os.getpid()}")
+
+
+def _is_loopback(endpoint: str) -> bool:
+    """Whether ``protocol/host:port`` stays on this host."""
+    protocol, slash, rest = endpoint.partition("/")
+    host, colon, port = rest.split("#")[0].split("?")[0].rpartition(":")
+    if not (protocol and slash and host and colon and port.isdigit()):
+        raise ConfigurationError(where=f"endpoint {endpoint!r}", problem="must look like tcp/127.0.0.1:7450")
+    try:
+        return ipaddress.ip_address(host.strip("[]")).is_loopback
+    except ValueError:
+        return host == "localhost"

@@ -1,0 +1,86 @@
+"""The threads that listen to the rest of the system: who is there, and what they offer."""
+
+import logging
+import threading
+from collections.abc import Callable
+from typing import Final
+
+from trade._registry import Registry
+from trade._transport import Channel, ChannelClosed, Message, Transport
+from trade._wire import ALIVE, REGISTRY, Address, Malformed, decode_provider
+
+_logger = logging.getLogger("trade")
+
+_FIRST_SYNC_S: Final = 2.0
+
+
+class Watch:
+    """Feeds a registry from the network. Construction ends with the first sync: what stands now is known then."""
+
+    def __init__(self, transport: Transport, registry: Registry, own: Address, lost: Callable[..., None]) -> None:
+        self._registry = registry
+        self._own = own
+        self._lost = lost
+        self.malformed = 0
+        entries, signs = transport.announcements(REGISTRY), transport.presences(ALIVE)
+        for key in transport.present(ALIVE, _FIRST_SYNC_S):
+            self._sign(Message(key, b""))
+        for message in transport.standing(REGISTRY, _FIRST_SYNC_S):
+            self._entry(message)
+        self._channels = (entries, signs)
+        self._threads = [
+            threading.Thread(target=self._read, args=(entries, self._entry), name="trade-registry", daemon=True),
+            threading.Thread(target=self._read, args=(signs, self._sign), name="trade-presence", daemon=True),
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    def _read(self, channel: Channel, take: Callable[[Message], None]) -> None:
+        while True:
+            try:
+                take(channel.receive())
+            except ChannelClosed:
+                return
+            except Exception:
+                _logger.exception("the registry could not take a message")
+
+    def _entry(self, message: Message) -> None:
+        try:
+            _, domain, identity, container, epoch, provider = message.key.split("/")
+            address = Address(identity, container, epoch)
+            if address == self._own:
+                return
+            if message.payload is None:
+                self._registry.remove(address, provider)
+            else:
+                self._registry.put(address, domain, provider, decode_provider(message.payload))
+        except (Malformed, ValueError) as bad:
+            self._drop(message.key, bad)
+
+    def _sign(self, message: Message) -> None:
+        try:
+            address = Address(*message.key.split("/")[1:])
+        except TypeError as bad:
+            self._drop(message.key, bad)
+            return
+        if address == self._own:
+            return
+        if message.payload is None:
+            self._lost(address)
+            self._registry.vanish(address)
+        else:
+            self._lost(address, back=True)
+            self._registry.appear(address)
+
+    def _drop(self, key: str, bad: Exception) -> None:
+        self.malformed += 1
+        if self.malformed == 1:
+            _logger.warning("dropped a registry message on %s: %s (further ones are counted, not logged)", key, bad)
+
+    def close(self) -> None:
+        """End the threads. Idempotent."""
+        for channel in self._channels:
+            channel.close()
+        for thread in self._threads:
+            if thread is not threading.current_thread():
+                thread.join(2)

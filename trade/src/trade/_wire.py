@@ -1,0 +1,227 @@
+"""What goes over the wire: keys, messages, the protocol version. docs/wire-protocol.md says the same in prose."""
+
+# pyright: reportUnknownVariableType=false
+
+import re
+from typing import Any, Final
+
+import msgspec
+from msgspec import Raw, Struct
+
+PROTOCOL: Final = 1
+"""Version of every message. A reader drops, counts and logs once what carries another."""
+
+_CHUNK = re.compile(r"[A-Za-z0-9_.@:-]{1,80}")
+
+
+def is_chunk(text: str) -> bool:
+    """Whether the text can stand as one chunk of a key: no separator, no wildcard, not the reserved first ``@``."""
+    return _CHUNK.fullmatch(text) is not None and not text.startswith("@")
+
+
+def as_chunk(text: str) -> str:
+    """The text with everything replaced that cannot stand in a key."""
+    return re.sub(r"[^A-Za-z0-9_.-]", "-", text)[:80] or "_"
+
+
+class Address(Struct, frozen=True, array_like=True):
+    """Where a container is: who speaks, under which name, in which boot."""
+
+    identity: str
+    container: str
+    epoch: str
+
+    def __str__(self) -> str:
+        return f"{self.identity}/{self.container}/{self.epoch}"
+
+
+class ServiceKey(Struct, frozen=True, array_like=True):
+    """Names one service of one boot epoch; what a handle is over the wire."""
+
+    address: Address
+    domain: str
+    provider: str
+    name: str
+
+
+# --- keys. Identities stand in chunks of their own, so that access control can pin who speaks and who answers.
+
+
+def call_key(caller: str, callee: Address, domain: str, provider: str, *, stop: bool) -> str:
+    return f"{'stop' if stop else 'call'}/{caller}/{callee}/{domain}/{provider}"
+
+
+def calls_to(callee: Address, *, stop: bool) -> str:
+    return f"{'stop' if stop else 'call'}/*/{callee}/**"
+
+
+def reply_key(callee: str, caller: str, container: str, channel: str) -> str:
+    return f"reply/{callee}/{caller}/{container}/{channel}"
+
+
+def registry_key(domain: str, address: Address, provider: str) -> str:
+    return f"registry/{domain}/{address}/{provider}"
+
+
+def alive_key(address: Address) -> str:
+    return f"alive/{address}"
+
+
+REGISTRY: Final = "registry/**"
+ALIVE: Final = "alive/**"
+
+
+def domain_of(groups: tuple[str, ...]) -> str:
+    """The first segment of a provider's first group: the grain of export lists."""
+    return groups[0].split(".")[0] if groups else "_"
+
+
+# --- messages
+
+
+class Call(Struct, array_like=True, gc=False):
+    """A request, put on ``call/...`` or ``stop/...``. Who asks stands in the key."""
+
+    v: int
+    id: int
+    """Unique in the system: a random start per container plus a counter."""
+    service: str
+    reply: str
+    """``container/channel`` of the caller's reply key."""
+    session: str
+    expires_ns: int | None
+    """In the callee's monotonic clock; None only where being late is harmless (reading, stopping)."""
+    chain: tuple[str, ...]
+    """Services whose calls led to this one, outermost first."""
+    args: Raw
+    """Positional arguments as an array, or all arguments by name as a map."""
+
+
+class Status:
+    """How a call ended."""
+
+    OK: Final = 0
+    ERROR: Final = 1
+    BUSY: Final = 2
+    EXPIRED: Final = 3
+    GONE: Final = 4
+    # Put by the caller's own container on its own reply key, to end a wait.
+    TIMED_OUT: Final = 5
+    LOST: Final = 6
+    CLOSED: Final = 7
+
+
+class Reply(Struct, array_like=True, gc=False):
+    """An answer, put on ``reply/...``."""
+
+    v: int
+    id: int
+    status: int
+    clock_ns: int
+    """The callee's monotonic clock when it answered: keeps the caller's estimate of the offset fresh."""
+    body: Raw
+    """OK: the result. ERROR: an ErrorInfo. Otherwise nil."""
+
+
+class ErrorInfo(Struct):
+    """An exception on its way to the caller."""
+
+    type: str
+    """``module:qualified name``."""
+    message: str
+    fields: dict[str, Any] = {}
+    traceback: str = ""
+
+
+class Parameter(Struct, frozen=True, array_like=True):
+    """One parameter of a service."""
+
+    name: str
+    required: bool = True
+    keyword_only: bool = False
+    positional_only: bool = False
+
+
+class ServiceInfo(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """What everybody may know of a service."""
+
+    name: str
+    signature: str
+    doc: str = ""
+    effect: str = "actuate"
+    cancel: str | None = None
+    achieves: tuple[str, ...] = ()
+    uses: tuple[str, ...] = ()
+    parameters: tuple[Parameter, ...] = ()
+    arguments_schema: dict[str, Any] = {}
+    result_schema: dict[str, Any] = {}
+    types: dict[str, str] = {}
+    """Schema definition -> ``module:qualified name``, so that a process that has the type gets the type."""
+
+
+class ProviderInfo(Struct, frozen=True, kw_only=True):
+    """A registry entry. Identity, container, epoch, domain and provider stand in its key."""
+
+    v: int = PROTOCOL
+    revision: int
+    groups: tuple[str, ...]
+    kind: str
+    host: str
+    pid: int
+    services: tuple[ServiceInfo, ...]
+
+
+EMPTY: Final = Raw(msgspec.msgpack.encode(None))
+EMPTY_ARGUMENTS: Final = Raw(msgspec.msgpack.encode(()))
+
+
+class Malformed(Exception):
+    """Bytes that are no message of this protocol version; dropped, never answered."""
+
+
+call_decoder: Final = msgspec.msgpack.Decoder(Call)
+reply_decoder: Final = msgspec.msgpack.Decoder(Reply)
+_provider_decoder: Final = msgspec.msgpack.Decoder(ProviderInfo)
+encode_message: Final = msgspec.msgpack.Encoder().encode
+
+
+def decode_call(payload: bytes) -> Call:
+    try:
+        call = call_decoder.decode(payload)
+    except (msgspec.DecodeError, ValueError) as bad:
+        raise Malformed(why_malformed(payload, bad)) from None
+    if call.v != PROTOCOL:
+        raise Malformed(why_malformed(payload, None))
+    return call
+
+
+def decode_reply(payload: bytes) -> Reply:
+    try:
+        reply = reply_decoder.decode(payload)
+    except (msgspec.DecodeError, ValueError) as bad:
+        raise Malformed(why_malformed(payload, bad)) from None
+    if reply.v != PROTOCOL:
+        raise Malformed(why_malformed(payload, None))
+    return reply
+
+
+def decode_provider(payload: bytes) -> ProviderInfo:
+    try:
+        info = _provider_decoder.decode(payload)
+    except (msgspec.DecodeError, ValueError) as bad:
+        raise Malformed(why_malformed(payload, bad)) from None
+    if info.v != PROTOCOL:
+        raise Malformed(why_malformed(payload, None))
+    return info
+
+
+def why_malformed(payload: bytes, bad: Exception | None) -> str:
+    """A reason for the log: a future version is worth telling from garbage."""
+    try:
+        raw: Any = msgspec.msgpack.decode(payload)
+        version: Any = raw[0] if isinstance(raw, list) else raw.get("v")
+    except Exception:  # noqa: BLE001 - the bytes are anything
+        version = None
+    if isinstance(version, int) and version != PROTOCOL:
+        return f"protocol version {version}, this is {PROTOCOL}; update the older side"
+    return f"not a message of this protocol: {bad}"

@@ -1,0 +1,169 @@
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
+# pyright: reportUnknownLambdaType=false, reportCallIssue=false
+"""The transport on eclipse-zenoh.
+
+No Python runs on zenoh's threads: every subscriber is a channel that our threads read. Puts block for a stalled
+receiver instead of dropping (zenoh's default), and go out at once. All sessions carry the same short lease.
+"""
+
+import json
+from collections.abc import Sequence
+from typing import Any, Final
+
+import zenoh
+from zenoh import ext
+
+from trade._transport import Channel, ChannelClosed, Message, Presence, Publisher, Transport
+from trade.errors import ConfigurationError
+
+LEASE_MS: Final = 2000
+_CHANNEL_CAPACITY: Final = 4096
+_BLOCK: Final = zenoh.CongestionControl.BLOCK
+_PUT: Final = zenoh.SampleKind.PUT
+
+
+def configuration(
+    *, namespace: str, listen: Sequence[str], connect: Sequence[str], credentials: tuple[str, str] | None
+) -> dict[str, Any]:
+    """The settings of one session, as zenoh names them."""
+    settings: dict[str, Any] = {
+        "mode": "peer",
+        "namespace": namespace,
+        "listen/endpoints": list(listen),
+        "connect/endpoints": list(connect),
+        "connect/timeout_ms": 0,
+        "connect/exit_on_failure": False,
+        "connect/retry": {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2},
+        "scouting/multicast/enabled": False,
+        "timestamping/enabled": True,
+        "transport/link/tx/lease": LEASE_MS,
+        "transport/link/tx/keep_alive": 4,
+        "transport/link/tx/queue/congestion_control/block/wait_before_close": 1_000_000,
+    }
+    if credentials is not None:
+        settings["transport/auth/usrpwd/user"], settings["transport/auth/usrpwd/password"] = credentials
+    return settings
+
+
+class ZenohChannel(Channel):
+    def __init__(self, subscriber: Any) -> None:  # three kinds of subscriber, one shape
+        self._subscriber = subscriber
+        self._recv = subscriber.handler.recv if hasattr(subscriber, "handler") else subscriber.recv
+
+    def receive(self) -> Message:
+        try:
+            sample: zenoh.Sample = self._recv()
+        except zenoh.ZError:
+            raise ChannelClosed from None
+        return Message(str(sample.key_expr), sample.payload.to_bytes() if sample.kind == _PUT else None)
+
+    def close(self) -> None:
+        _quietly(self._subscriber.undeclare)
+
+
+class ZenohPublisher(Publisher):
+    def __init__(self, publisher: Any, *, announcement: bool = False) -> None:
+        self._publisher = publisher
+        self._announcement = announcement
+
+    def put(self, payload: bytes) -> None:
+        self._publisher.put(payload)
+
+    def close(self) -> None:
+        if self._announcement:
+            _quietly(self._publisher.delete)
+        _quietly(self._publisher.undeclare)
+
+
+class ZenohPresence(Presence):
+    def __init__(self, token: zenoh.LivelinessToken) -> None:
+        self._token = token
+
+    def close(self) -> None:
+        _quietly(self._token.undeclare)
+
+
+class ZenohTransport(Transport):
+    def __init__(self, settings: dict[str, Any]) -> None:
+        config = zenoh.Config()
+        for key, value in settings.items():
+            config.insert_json5(key, json.dumps(value))
+        try:
+            self._session = zenoh.open(config)
+        except zenoh.ZError as bad:
+            raise ConfigurationError(
+                where=f"listen {', '.join(settings['listen/endpoints'])}",
+                problem=f"cannot listen there: {bad}; is the address taken, or not of this host?",
+            ) from None
+
+    def publish(self, key: str, *, urgent: bool = False) -> Publisher:
+        priority = zenoh.Priority.REAL_TIME if urgent else zenoh.Priority.DATA
+        declared = self._session.declare_publisher(key, congestion_control=_BLOCK, express=True, priority=priority)
+        return ZenohPublisher(declared)
+
+    def subscribe(self, pattern: str) -> Channel:
+        return ZenohChannel(self._session.declare_subscriber(pattern, _fifo()))
+
+    def announce(self, key: str) -> Publisher:
+        declared = ext.declare_advanced_publisher(
+            self._session,
+            key,
+            congestion_control=_BLOCK,
+            express=True,
+            cache=ext.CacheConfig(max_samples=1),
+            publisher_detection=True,
+            sample_miss_detection=ext.MissDetectionConfig(sporadic_heartbeat=0.5),
+        )
+        return ZenohPublisher(declared, announcement=True)
+
+    def announcements(self, pattern: str) -> Channel:
+        declared = ext.declare_advanced_subscriber(
+            self._session,
+            pattern,
+            _fifo(),
+            allowed_origin=zenoh.Locality.REMOTE,
+            history=ext.HistoryConfig(detect_late_publishers=True),
+            recovery=ext.RecoveryConfig(heartbeat=True),
+        )
+        return ZenohChannel(declared)
+
+    def standing(self, pattern: str, timeout_s: float) -> list[Message]:
+        # The caches of announcements answer on keys below @adv, with samples of the plain key.
+        replies = self._session.get(
+            f"{pattern}/@adv/**",
+            _fifo(),
+            target=zenoh.QueryTarget.ALL,
+            accept_replies=zenoh.ReplyKeyExpr.ANY,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            timeout=timeout_s,
+        )
+        samples = [reply.ok for reply in replies if reply.ok is not None]
+        return [Message(str(sample.key_expr), sample.payload.to_bytes()) for sample in samples if sample.kind == _PUT]
+
+    def appear(self, key: str) -> Presence:
+        return ZenohPresence(self._session.liveliness().declare_token(key))
+
+    def presences(self, pattern: str) -> Channel:
+        return ZenohChannel(self._session.liveliness().declare_subscriber(pattern, _fifo(), history=True))
+
+    def present(self, pattern: str, timeout_s: float) -> list[str]:
+        replies = self._session.liveliness().get(pattern, _fifo(), timeout=timeout_s)
+        return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
+
+    def wake(self, key: str, payload: bytes) -> None:
+        _quietly(lambda: self._session.put(key, payload, allowed_destination=zenoh.Locality.SESSION_LOCAL))
+
+    def close(self) -> None:
+        _quietly(self._session.close)
+
+
+def _fifo() -> Any:
+    return zenoh.handlers.FifoChannel(_CHANNEL_CAPACITY)
+
+
+def _quietly(action: Any) -> None:
+    """Do it unless the session is closed already: closing is idempotent and never fails."""
+    try:
+        action()
+    except zenoh.ZError:
+        return

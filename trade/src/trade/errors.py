@@ -1,0 +1,289 @@
+"""The error tree: one root, branches by who must act.
+
+Every error carries its data as attributes, crosses the wire with them, and says what to do next. Each also inherits the
+builtin a Python programmer would catch for it, so ``except TimeoutError`` finds a deadline that passed.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+__all__ = [
+    "Busy",
+    "CallError",
+    "CallerError",
+    "Cancelled",
+    "ConfigurationError",
+    "ContainerLost",
+    "DeadlineExceeded",
+    "DeviceError",
+    "DeviceFault",
+    "DeviceSilent",
+    "InvalidArgument",
+    "InvalidResult",
+    "LimitExceeded",
+    "NoSuchService",
+    "NotSerialisable",
+    "OutcomeUnknown",
+    "RemoteError",
+    "ServiceGone",
+    "SetupError",
+    "TooManyServices",
+    "TradeError",
+]
+
+
+@dataclass(kw_only=True, eq=False)
+class TradeError(Exception):
+    """Root of everything this project raises on purpose."""
+
+    def __str__(self) -> str:
+        return self.describe()
+
+    def describe(self) -> str:
+        """The message: what happened, then what to do."""
+        return type(self).__name__
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return _rebuild, (type(self), {f.name: getattr(self, f.name) for f in fields(self)})
+
+
+def _rebuild(cls: type[TradeError], data: dict[str, object]) -> TradeError:
+    return cls(**data)
+
+
+# --- the caller must act
+
+
+@dataclass(kw_only=True, eq=False)
+class CallerError(TradeError):
+    """The caller asked for something that cannot be given."""
+
+
+@dataclass(kw_only=True, eq=False)
+class NoSuchService(CallerError, LookupError):
+    """Nothing in the system matches the constraint."""
+
+    constraint: str
+    waited_s: float = 0.0
+    near: Sequence[str] = ()
+
+    def describe(self) -> str:
+        hint = f"; did you mean {' or '.join(self.near)}?" if self.near else "; `trade services` lists what there is"
+        return f"no service matches {self.constraint} after {self.waited_s:.3g} s{hint}"
+
+
+@dataclass(kw_only=True, eq=False)
+class TooManyServices(CallerError, LookupError):
+    """More than one service matches where exactly one was wanted."""
+
+    constraint: str
+    matches: Sequence[str]
+
+    def describe(self) -> str:
+        shown = ", ".join(list(self.matches)[:5]) + (", ..." if len(self.matches) > 5 else "")
+        return (
+            f"{len(self.matches)} services match {self.constraint}: {shown}; add a constraint (group, container, "
+            "host, local), or take them all with trade.services(...)"
+        )
+
+
+@dataclass(kw_only=True, eq=False)
+class ServiceGone(CallerError, LookupError):
+    """The service behind this handle was deregistered, or its container has ended or restarted."""
+
+    service: str
+    reason: str = "its provider was deregistered"
+
+    def describe(self) -> str:
+        return f"{self.service} is gone: {self.reason}; look it up again with trade.find(...)"
+
+
+@dataclass(kw_only=True, eq=False)
+class InvalidArgument(CallerError, ValueError, TypeError):
+    """An argument does not fit the service's signature; no code of the provider ran."""
+
+    service: str
+    argument: str
+    problem: str
+    signature: str = ""
+
+    def describe(self) -> str:
+        where = f" argument {self.argument!r}" if self.argument else ""
+        tail = f"; it is called as {self.signature}" if self.signature else ""
+        return f"{self.service}{where}: {self.problem}{tail}"
+
+
+@dataclass(kw_only=True, eq=False)
+class LimitExceeded(CallerError, ValueError):
+    """A commanded value lies outside a configured limit; it was refused, not clipped."""
+
+    what: str
+    value: float
+    lower: float
+    upper: float
+    unit: str = ""
+
+    def describe(self) -> str:
+        unit = f" {self.unit}" if self.unit else ""
+        return (
+            f"{self.what}: {self.value:.6g}{unit} is outside {self.lower:.6g} to {self.upper:.6g}{unit}; nothing moved"
+            ". Command a value inside, or change the limit in the robot file"
+        )
+
+
+@dataclass(kw_only=True, eq=False)
+class NotSerialisable(CallerError, TypeError):
+    """A value cannot be sent: it is no plain data, struct, dataclass, enum or handle."""
+
+    service: str
+    what: str
+    problem: str
+
+    def describe(self) -> str:
+        return f"{self.service}: {self.what} cannot be sent: {self.problem}; use plain data, a struct or a handle"
+
+
+@dataclass(kw_only=True, eq=False)
+class DeadlineExceeded(CallerError, TimeoutError):
+    """The deadline passed before the service began; it did not run and will not."""
+
+    service: str
+    deadline_s: float
+
+    def describe(self) -> str:
+        return f"{self.service} did not run: its deadline of {self.deadline_s:.3g} s had passed before it could begin"
+
+
+@dataclass(kw_only=True, eq=False)
+class OutcomeUnknown(CallerError, TimeoutError):
+    """The deadline passed without an answer; the service may have run, may be running, or may not have."""
+
+    service: str
+    deadline_s: float
+
+    def describe(self) -> str:
+        return (
+            f"no answer from {self.service} within {self.deadline_s:.3g} s; whether it ran is unknown. Look at its "
+            "state before trying again; handle.with_(deadline_s=...) waits longer"
+        )
+
+
+@dataclass(kw_only=True, eq=False)
+class Cancelled(CallerError):
+    """The call was cancelled by its caller before it finished."""
+
+    service: str
+
+    def describe(self) -> str:
+        return f"the call of {self.service} was cancelled"
+
+
+# --- the other side of a call failed
+
+
+@dataclass(kw_only=True, eq=False)
+class CallError(TradeError):
+    """The far side of a call failed."""
+
+
+@dataclass(kw_only=True, eq=False)
+class ContainerLost(CallError, ConnectionError):
+    """The container ended or became unreachable while the call was under way; whether it ran is unknown."""
+
+    service: str
+    container: str
+
+    def describe(self) -> str:
+        return (
+            f"container {self.container} was lost during a call of {self.service}; whether it ran is unknown. "
+            "Find the service again and look at its state"
+        )
+
+
+@dataclass(kw_only=True, eq=False)
+class Busy(CallError, BlockingIOError):
+    """All handler threads of the container are taken; nothing ran."""
+
+    service: str
+    container: str
+
+    def describe(self) -> str:
+        return f"{self.service} did not run: container {self.container} has no free handler thread; try again shortly"
+
+
+@dataclass(kw_only=True, eq=False)
+class InvalidResult(CallError, TypeError):
+    """The provider returned something else than its annotation says; a defect of the provider."""
+
+    service: str
+    problem: str
+
+    def describe(self) -> str:
+        return f"{self.service} ran, but its result breaks its own annotation: {self.problem}; mend the provider"
+
+
+@dataclass(kw_only=True, eq=False)
+class RemoteError(CallError, RuntimeError):
+    """The provider raised an exception of a type this process does not know."""
+
+    service: str
+    type_name: str
+    message: str
+    traceback: str = ""
+
+    def describe(self) -> str:
+        return f"{self.service} raised {self.type_name}: {self.message}"
+
+
+# --- the device
+
+
+@dataclass(kw_only=True, eq=False)
+class DeviceError(TradeError):
+    """A device did not do what it was told."""
+
+    device: str
+    bus: str
+
+
+@dataclass(kw_only=True, eq=False)
+class DeviceSilent(DeviceError, TimeoutError):
+    """A device has not answered within its time; the last values are too old to be trusted."""
+
+    waited_s: float
+
+    def describe(self) -> str:
+        return (
+            f"{self.device} did not answer on {self.bus} within {self.waited_s * 1e3:.0f} ms; is it powered, plugged "
+            "in, and set to the id and baud rate of the robot file?"
+        )
+
+
+@dataclass(kw_only=True, eq=False)
+class DeviceFault(DeviceError, RuntimeError):
+    """A device reports a fault, or refused a command."""
+
+    fault: str
+    remedy: str = "remove the cause, then enable it again"
+
+    def describe(self) -> str:
+        return f"{self.device} on {self.bus}: {self.fault}; {self.remedy}"
+
+
+# --- the set-up
+
+
+@dataclass(kw_only=True, eq=False)
+class SetupError(TradeError):
+    """Something about the installation or configuration must be changed."""
+
+
+@dataclass(kw_only=True, eq=False)
+class ConfigurationError(SetupError, ValueError):
+    """A setting, file or installation is wrong; the message says where and what would be right."""
+
+    problem: str
+    where: str = ""
+
+    def describe(self) -> str:
+        return f"{self.where}: {self.problem}" if self.where else self.problem
