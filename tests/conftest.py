@@ -11,8 +11,9 @@ from pathlib import Path
 
 import psutil
 import pytest
+
 import trade
-from trade import Container, Settings
+from trade import Container, Settings, where
 
 _SETTLE_S = 5.0
 """How long what a test has ended may take to be gone; far above what it takes."""
@@ -22,8 +23,10 @@ _SETTLE_S = 5.0
 def _warm_up(tmp_path_factory: pytest.TempPathFactory) -> None:
     """The transport's runtime and the event loop's selector open files once a process; that is no leak."""
     os.environ["TRADE_RUNTIME_DIR"] = str(tmp_path_factory.mktemp("runtime"))
-    with Container(Settings.read(system="warm-up")):
-        pass
+    for _ in range(2):
+        with Container(Settings.read(system="warm-up", container="a")) as one:
+            with Container(Settings.read(system="warm-up", container="b")) as other:
+                other.handle(one.services(where(name="clock", container="a"))[0].key)()
     asyncio.run(asyncio.sleep(0))
 
 
@@ -55,9 +58,11 @@ def _files() -> set[str]:
     found: set[str] = set()
     for entry in Path("/proc/self/fd").iterdir() if Path("/proc/self/fd").exists() else ():
         try:
-            found.add(f"{entry.name} -> {entry.readlink()}")
+            target = str(entry.readlink())
         except OSError:  # the descriptor of the listing itself
             continue
+        if not target.endswith(".zenoh"):  # shared memory of closed links: zenoh lets go of it in its own time
+            found.add(f"{entry.name} -> {target}")
     return found
 
 

@@ -1,0 +1,89 @@
+"""``trade call GROUP.NAME ARGUMENT...``: call one service and print its result."""
+
+import re
+from typing import Annotated, Any
+
+import msgspec
+import typer
+
+from trade import Container, Handle, where
+from trade.errors import ConfigurationError, TooManyServices, TradeError
+from trade_gateway._list import Json
+from trade_gateway._output import Output, say_error
+from trade_gateway._system_choice import visitor
+
+_NAMED = re.compile(r"([A-Za-z_]\w*)=(.*)", re.DOTALL)
+
+
+def call(
+    context: typer.Context,
+    service: Annotated[str, typer.Argument(help="Group and name: rosie.head.move_to.")],
+    arguments: Annotated[
+        list[str] | None,
+        typer.Argument(help="Each argument as JSON, by place ('[0.3, -0.2]') or by name (speed_rad_s=0.5)."),
+    ] = None,
+    deadline: Annotated[float, typer.Option(min=0.001, help="Seconds until the call is given up.")] = 10.0,
+    wait: Annotated[float, typer.Option(min=0.0, help="Seconds to wait for the service to appear.")] = 2.0,
+    container: Annotated[str | None, typer.Option(help="Only the service of this container.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Call a service and print its result; Ctrl-C cancels a motion under way.
+
+    For example: trade call rosie.head.move_to '[0.3, -0.2]' speed_rad_s=0.5
+    """
+    args, kwargs = parse_arguments(arguments or [])
+    with visitor(context) as visiting:
+        handle = find(visiting, service, container, wait).with_(deadline_s=deadline)
+        run = handle.start(*args, **kwargs)
+        try:
+            result = run.result()
+        except KeyboardInterrupt:
+            _cancel(handle)
+            raise
+    Output(as_json=as_json).data(result)
+
+
+def _cancel(handle: Handle) -> None:
+    """Ctrl-C: end what was begun, and say if that failed."""
+    try:
+        handle.cancel_service()()
+    except TradeError as error:
+        say_error(error)
+
+
+def find(visiting: Container, service: str, container: str | None, wait_s: float) -> Handle:
+    """The service of a group and name; one of exactly this group goes before those beneath it."""
+    group, _, name = service.rpartition(".")
+    constraint = where(name=name or service, group=group or None, container=container)
+    try:
+        return visiting.find(constraint, wait_s=wait_s)
+    except TooManyServices:
+        exact = [handle for handle in visiting.services(constraint) if group in handle.groups]
+        if len(exact) == 1:
+            return exact[0]
+        raise
+
+
+def parse_arguments(texts: list[str]) -> tuple[list[Any], dict[str, Any]]:
+    """Arguments of a call from the words of a command line.
+
+    Raises:
+        ConfigurationError: a word is not JSON.
+    """
+    args: list[Any] = []
+    kwargs: dict[str, Any] = {}
+    for text in texts:
+        named = _NAMED.fullmatch(text)
+        if named is None:
+            args.append(_value(text))
+        else:
+            kwargs[named.group(1)] = _value(named.group(2))
+    return args, kwargs
+
+
+def _value(text: str) -> Any:
+    try:
+        return msgspec.json.decode(text)
+    except msgspec.DecodeError as bad:
+        problem = f"is not JSON ({bad}); write numbers as 0.3, lists as '[0.3, -0.2]', texts as '\"left\"'"
+        raise ConfigurationError(where=f"argument {text!r}", problem=problem) from None

@@ -1,0 +1,73 @@
+"""``trade services`` and ``trade containers``: what there is."""
+
+from typing import Annotated, Any
+
+import typer
+
+from trade import Constraint, Handle, where
+from trade_gateway._output import Output
+from trade_gateway._system_choice import visitor
+
+Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+
+
+def services(
+    context: typer.Context,
+    group: Annotated[str | None, typer.Option(help="Only this group and what is beneath it: rosie.head.")] = None,
+    name: Annotated[str | None, typer.Option(help="Only this name; * and ? stand for anything.")] = None,
+    everything: Annotated[bool, typer.Option("--all", help="Also the middleware's own services.")] = False,
+    doc: Annotated[bool, typer.Option("--doc", help="Show what each service does.")] = False,
+    as_json: Json = False,
+) -> None:
+    """List services: group and name, arguments, where they run."""
+    constraint: Constraint = where(group=group, name=name)
+    if not everything and group is None:
+        constraint = constraint & ~where(group="trade")
+    out = Output(as_json=as_json)
+    with visitor(context) as container:
+        found = container.services(constraint)
+        if as_json:
+            out.data([describe(handle) for handle in found])
+        elif not found:
+            out.say(f"no services match {constraint}; is something up? [bold]trade up examples/rosie.toml --sim[/]")
+        elif doc:
+            for handle in found:
+                out.say(f"[bold]{handle.label}[/]  {handle.signature}\n  {handle.doc or '(undocumented)'}\n")
+        else:
+            out.table(("SERVICE", "CALLED AS", "EFFECT", "CONTAINER", "HOST"), [_row(handle) for handle in found])
+
+
+def describe(handle: Handle) -> dict[str, Any]:
+    """Everything a handle tells, as plain data."""
+    return {
+        "service": handle.label,
+        "name": handle.name,
+        "groups": handle.groups,
+        "signature": handle.signature,
+        "effect": handle.effect,
+        "resources": handle.resources,
+        "doc": handle.doc,
+        "container": handle.container,
+        "host": handle.host,
+        "schema": handle.schema,
+    }
+
+
+def _row(handle: Handle) -> tuple[str, ...]:
+    return handle.label, handle.signature, handle.effect, handle.container, handle.host
+
+
+def containers(context: typer.Context, as_json: Json = False) -> None:
+    """List the containers of the system."""
+    out = Output(as_json=as_json)
+    with visitor(context) as container:
+        found = [info for info in container.containers() if info.epoch != container.address.epoch]
+        if as_json:
+            out.data(found)
+        elif not found:
+            out.say("no other container is up in this system; [bold]trade up examples/rosie.toml --sim[/] starts one")
+        else:
+            rows = [
+                (info.name, info.identity, info.host, str(info.pid), str(info.services), info.epoch) for info in found
+            ]
+            out.table(("CONTAINER", "IDENTITY", "HOST", "PID", "SERVICES", "EPOCH"), rows)

@@ -1,0 +1,99 @@
+"""``trade up ROBOT.toml``: attach a robot's devices and offer them as services until told to leave."""
+
+import signal
+import threading
+from collections.abc import Generator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import Annotated, Any
+
+import typer
+
+from trade import Container
+from trade.errors import ConfigurationError
+from trade_drivers import attach, load
+from trade_drivers.robotfile import Robot
+from trade_gateway._list import Json
+from trade_gateway._output import Output
+from trade_gateway._system_choice import choice_of
+
+
+def up(
+    context: typer.Context,
+    robot_file: Annotated[Path, typer.Argument(metavar="ROBOT.toml", help="The robot file.")],
+    sim: Annotated[bool, typer.Option("--sim", help="Simulate the devices: the same bytes, no hardware.")] = False,
+    sim_log: Annotated[Path | None, typer.Option(help="With --sim: where to write the log of all bytes.")] = None,
+    name: Annotated[str | None, typer.Option(help="Name of the container; by default the robot's.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Bring a robot up and keep it up; Ctrl-C or SIGTERM leaves it as its file says (hold or relax).
+
+    Attaching moves nothing and resets nothing.
+    """
+    out = Output(as_json=as_json)
+    robot = load(robot_file)
+    with ExitStack() as stack:
+        asked_to_leave = stack.enter_context(_leaving())
+        simulation = stack.enter_context(_simulation(robot_file, sim_log)) if sim else None
+        ports: dict[str, str] | None = simulation.ports if simulation else None
+        container = stack.enter_context(Container(choice_of(context).settings(name or robot.name)))
+        _say_attaching(out, robot, ports)
+        stack.enter_context(
+            attach(
+                robot,
+                register=container.register,
+                deregister=container.deregister,
+                ports=ports,
+                healthy=container.healthy,
+            )
+        )
+        _say_ready(out, robot, container, simulation)
+        while not asked_to_leave.wait(0.5):
+            if simulation is not None and not simulation.running:
+                raise ConfigurationError(where="simulation", problem="its process ended; start again")
+        out.say("leaving")
+
+
+@contextmanager
+def _leaving() -> Generator[threading.Event]:
+    """An event that Ctrl-C and SIGTERM set, so that devices are always left in order."""
+    event = threading.Event()
+
+    def leave(_number: int, _frame: FrameType | None) -> None:
+        event.set()
+
+    before = {number: signal.signal(number, leave) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield event
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _simulation(robot_file: Path, log: Path | None) -> Any:
+    try:
+        from trade_hil_sim import SimProcess  # noqa: PLC0415 - only needed without hardware
+    except ImportError:
+        raise ConfigurationError(where="--sim", problem="needs trade-hil-sim; pip install trade-hil-sim") from None
+    return SimProcess(robot_file, log=log)
+
+
+def _say_attaching(out: Output, robot: Robot, ports: dict[str, str] | None) -> None:
+    for bus in robot.buses:
+        joints = ", ".join(f"{joint.name} ({joint.model}, id {joint.id})" for joint in robot.joints_on(bus.name))
+        out.say(f"[bold]{robot.name}[/]: attaching bus {bus.name} on {(ports or {}).get(bus.name, bus.port)}: {joints}")
+
+
+def _say_ready(out: Output, robot: Robot, container: Container, simulation: Any) -> None:
+    mine = [handle for handle in container.services() if handle.local and "trade" not in handle.groups]
+    if out.as_json:
+        ready = {"ready": True, "robot": robot.name, "container": container.name, "system": container.settings.system}
+        extra = {"log": str(simulation.log_path), "control": str(simulation.control_path)} if simulation else {}
+        out.data({**ready, **extra, "services": [handle.label for handle in mine]})
+        return
+    out.say(f"[bold green]{robot.name} is up[/]: {len(mine)} services in container {container.name}")
+    example = next((handle.label for handle in mine if handle.name == "state"), None)
+    if example:
+        out.say(f"in another terminal: [bold]trade services --group {robot.name}[/] or [bold]trade call {example}[/]")
+    out.say("Ctrl-C leaves")

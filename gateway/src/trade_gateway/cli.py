@@ -1,0 +1,64 @@
+"""The command ``trade``: bring a robot up, look at a system, call its services."""
+
+import sys
+from typing import Annotated
+
+import typer
+
+from trade.errors import TradeError
+from trade_gateway import _call, _list, _up
+from trade_gateway._output import say_error
+from trade_gateway._system_choice import SystemChoice
+
+__all__ = ["app", "main"]
+
+app = typer.Typer(
+    name="trade",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode="rich",
+    help="Robots as services: bring one up, see what it offers, call it.",
+    epilog="Without hardware: trade up examples/rosie.toml --sim, then in another terminal: trade services",
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+app.command("up")(_up.up)
+app.command("services")(_list.services)
+app.command("containers")(_list.containers)
+app.command("call", context_settings={"ignore_unknown_options": True})(_call.call)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version  # noqa: PLC0415 - only for this option
+
+        typer.echo(f"trade {version('trade-gateway')}")
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    context: typer.Context,
+    system: Annotated[
+        str | None, typer.Option(help="System id; containers of other systems are invisible. \\[env: TRADE_SYSTEM]")
+    ] = None,
+    connect: Annotated[
+        list[str] | None,
+        typer.Option(help="Endpoint of a container, such as tcp/127.0.0.1:7450; repeatable. \\[env: TRADE_CONNECT]"),
+    ] = None,
+    version: Annotated[  # noqa: ARG001 - answered by its callback
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version.")
+    ] = False,
+) -> None:
+    """Options of every command."""
+    context.obj = SystemChoice(system, connect)
+
+
+def main() -> None:
+    """Run the command line; errors of ours are one line on stderr and exit code 1."""
+    try:
+        app()
+    except TradeError as error:
+        say_error(error)
+        sys.exit(1)
+    except KeyboardInterrupt:
+        sys.exit(130)

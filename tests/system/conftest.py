@@ -1,0 +1,133 @@
+"""Whole systems of processes, as a user starts them."""
+
+import json
+import os
+import queue
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+ROSIE = ROOT / "examples" / "rosie.toml"
+PATIENCE_S = 60.0
+
+
+class Program:
+    """A child process whose output is read line by line, with a deadline on every wait."""
+
+    def __init__(self, *words: str | Path) -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, *map(str, words)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, bufsize=1
+        )
+        self._lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
+        self.errors: list[str] = []
+        self._readers = [threading.Thread(target=self._read), threading.Thread(target=self._complaints)]
+        for reader in self._readers:
+            reader.start()
+
+    def _read(self) -> None:
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            self._lines.put(line)
+        self._lines.put(None)
+
+    def _complaints(self) -> None:
+        assert self.process.stderr is not None
+        self.errors.extend(self.process.stderr)
+
+    def line(self) -> str:
+        """The next line of output; fails if there is none in time."""
+        try:
+            line = self._lines.get(timeout=PATIENCE_S)
+        except queue.Empty:
+            pytest.fail(f"no output of {self.process.args} within {PATIENCE_S} s; stderr: {''.join(self.errors)}")
+        if line is None:
+            pytest.fail(f"{self.process.args} ended; stderr: {''.join(self.errors)}")
+        return line
+
+    def json(self) -> dict[str, Any]:
+        return json.loads(self.line())
+
+    def wait_for(self, wanted: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
+        """The next JSON line that is as wanted."""
+        while not wanted(message := self.json()):
+            pass
+        return message
+
+    def wait(self) -> int:
+        """Wait for its end; the exit code."""
+        code = self.process.wait(PATIENCE_S)
+        for reader in self._readers:
+            reader.join(PATIENCE_S)
+        return code
+
+    def signal(self, number: int) -> None:
+        os.kill(self.process.pid, number)
+
+    def close(self) -> None:
+        if self.process.poll() is None:
+            self.process.terminate()
+            try:
+                self.process.wait(10)
+            except subprocess.TimeoutExpired:
+                self.process.kill()
+        self.wait()
+        for stream in (self.process.stdout, self.process.stderr):
+            assert stream is not None
+            stream.close()
+
+
+@pytest.fixture
+def run(system: str) -> Iterator[Callable[..., Program]]:
+    """Starts Python programs in the test's system; ends them."""
+    programs: list[Program] = []
+
+    def start(*words: str | Path) -> Program:
+        programs.append(Program(*words))
+        return programs[-1]
+
+    yield start
+    for program in reversed(programs):
+        program.close()
+
+
+@pytest.fixture
+def trade_command(system: str) -> Callable[..., subprocess.CompletedProcess[str]]:
+    """Runs ``trade WORDS`` to its end."""
+
+    def command(*words: str | Path) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            [sys.executable, "-m", "trade_gateway", *map(str, words)],
+            capture_output=True,
+            text=True,
+            timeout=PATIENCE_S,
+            check=False,
+        )
+
+    return command
+
+
+class Rosie:
+    """``trade up examples/rosie.toml --sim``, ready."""
+
+    def __init__(self, program: Program) -> None:
+        self.program = program
+        self.ready = program.json()
+        self.log = Path(self.ready["log"])
+
+
+@pytest.fixture
+def rosie_up(run: Callable[..., Program], tmp_path: Path) -> Callable[[], Rosie]:
+    """Brings rosie up, simulated, in a process of its own."""
+    counter = iter(range(100))
+
+    def up() -> Rosie:
+        log = tmp_path / f"bytes-{next(counter)}.jsonl"
+        return Rosie(run("-m", "trade_gateway", "up", ROSIE, "--sim", "--sim-log", log, "--json"))
+
+    return up

@@ -1,0 +1,114 @@
+import json
+import signal
+import subprocess
+import threading
+from collections.abc import Callable
+
+import pytest
+
+from trade_hil_sim import events, motion_writes, read_log
+
+Command = Callable[..., subprocess.CompletedProcess[str]]
+
+
+def test_services_of_a_robot_are_listed_as_json(rosie_up, trade_command: Command) -> None:
+    rosie_up()
+    listed = trade_command("services", "--group", "rosie", "--json")
+    services = {entry["service"]: entry for entry in json.loads(listed.stdout)}
+    assert services["rosie.head.move_to"]["effect"] == "actuate"
+    assert services["rosie.head.move_to"]["resources"] == ["rosie.neck.pan", "rosie.neck.tilt"]
+    assert services["rosie.neck.pan.stop"]["container"] == "rosie"
+
+
+def test_a_call_moves_the_simulated_servos_and_prints_where_they_are(rosie_up, trade_command: Command) -> None:
+    rosie = rosie_up()
+    called = trade_command("call", "rosie.head.move_to", "[0.3, -0.2]", "--json")
+    assert called.returncode == 0, called.stderr
+    assert json.loads(called.stdout) == pytest.approx([0.3, -0.2], abs=0.02)
+    rests = {entry.joint: entry.position_rad for entry in events(read_log(rosie.log), "at_rest")}
+    assert [rests["neck.pan"], rests["neck.tilt"]] == pytest.approx([0.3, -0.2], abs=0.02)
+
+
+def test_a_negative_number_and_a_named_argument_are_no_options(rosie_up, trade_command: Command) -> None:
+    rosie_up()
+    called = trade_command("call", "rosie.neck.pan.move_to", "-0.2", "speed_rad_s=1.5", "--json")
+    assert json.loads(called.stdout) == pytest.approx(-0.2, abs=0.02)
+
+
+def test_containers_are_listed(rosie_up, trade_command: Command) -> None:
+    rosie = rosie_up()
+    [container] = json.loads(trade_command("containers", "--json").stdout)
+    assert (container["name"], container["pid"]) == ("rosie", rosie.program.process.pid)
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        (["call", "rosie.head.move_to", "[3.0, 0.0]"], "LimitExceeded: rosie.neck.pan: 3 rad is outside -1.4 to 1.4"),
+        (["call", "rosie.head.move_to", "[0.1]"], "InvalidArgument"),
+        (["call", "rosie.head.move_to", '["left", 0]'], "InvalidArgument: rosie.head.move_to argument 'positions_rad'"),
+        (["call", "rosie.head.move_to"], "argument 'positions_rad': missing"),
+        (["call", "rosie.head.move_to", "[0.1, NaN]"], "is not JSON"),
+        (["call", "rosie.head.move_to", "[0.1, 0.1]", "haste=3"], "there is no such argument"),
+        (["call", "rosie.head.mvoe_to", "[0.1]", "--wait", "0"], "did you mean rosie.head.move_to"),
+        (["call", "rosie.neck.move_to", "0.1"], "TooManyServices: 2 services match"),
+    ],
+)
+def test_a_bad_call_is_one_line_that_says_what_to_do_and_moves_nothing(
+    words: list[str], complaint: str, rosie_up, trade_command: Command
+) -> None:
+    rosie = rosie_up()
+    called = trade_command(*words)
+    assert called.returncode == 1
+    assert complaint in called.stderr
+    assert len(called.stderr.strip().splitlines()) == 1
+    assert motion_writes(read_log(rosie.log)) == []
+
+
+def test_help_names_every_command(trade_command: Command) -> None:
+    shown = trade_command("--help").stdout
+    assert all(command in shown for command in ("up", "services", "call", "containers"))
+
+
+def test_nothing_up_says_how_to_bring_something_up(trade_command: Command) -> None:
+    assert "trade up examples/rosie.toml --sim" in trade_command("services").stdout
+
+
+def test_a_missing_robot_file_is_named(trade_command: Command) -> None:
+    started = trade_command("up", "nowhere.toml", "--sim")
+    assert started.returncode == 1
+    assert "nowhere.toml" in started.stderr
+
+
+def test_ctrl_c_on_a_call_stops_the_motion(rosie_up, run) -> None:
+    rosie = rosie_up()
+    call = run(
+        "-m", "trade_gateway", "call", "rosie.head.move_to", "[1.2, 0.0]", "speed_rad_s=0.05", "--deadline", "60"
+    )
+    _wait_until(lambda: bool(events(read_log(rosie.log), "motion_started")))
+    call.signal(signal.SIGINT)
+    assert call.wait() == 130
+    [rest] = [entry for entry in events(read_log(rosie.log), "at_rest") if entry.joint == "neck.pan"]
+    assert rest.position_rad is not None
+    assert rest.position_rad < 1.0
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_S19_leaving_holds_the_position_and_moves_nothing(number: int, rosie_up, trade_command: Command) -> None:
+    rosie = rosie_up()
+    assert trade_command("call", "rosie.head.move_to", "[0.3, -0.2]").returncode == 0
+    log = rosie.log
+    before = len(events(read_log(log), "motion_started"))
+    rosie.program.signal(number)
+    assert rosie.program.wait() == 0, rosie.program.errors
+    entries = read_log(log)
+    assert len(events(entries, "motion_started")) == before
+    assert events(entries, "torque_off") == []
+
+
+def _wait_until(condition: Callable[[], bool]) -> None:
+    for _ in range(2000):
+        if condition():
+            return
+        threading.Event().wait(0.03)
+    pytest.fail("it did not happen within a minute")
