@@ -66,9 +66,8 @@ def compare_with_log(path: Path, began_s: float) -> None:
     rests = [entry for entry in events(entries, "at_rest") if entry.joint.endswith("neck.pan")]
     print("the simulator's log, of what the pan servo itself did:")
     for entry in rests:
-        print(
-            f"  {entry.t - began_s:6.2f} s  at rest at {entry.position_rad or 0.0:+.3f} rad ({entry.position_counts} counts)"
-        )
+        angle_rad, counts = entry.position_rad or 0.0, entry.position_counts
+        print(f"  {entry.t - began_s:6.2f} s  at rest at {angle_rad:+.3f} rad ({counts} counts)")
     angles = [entry.position_rad or 0.0 for entry in rests]
     if len(angles) != len(LOOKS_RAD) or any(abs(a - b) > AGREE_RAD for a, b in zip(angles, LOOKS_RAD, strict=True)):
         raise DemoFailed(f"the servo should have come to rest at {LOOKS_RAD}, but was at {angles}")

@@ -24,9 +24,11 @@ def _warm_up(tmp_path_factory: pytest.TempPathFactory) -> None:
     """The transport's runtime and the event loop's selector open files once a process; that is no leak."""
     os.environ["TRADE_RUNTIME_DIR"] = str(tmp_path_factory.mktemp("runtime"))
     for _ in range(2):
-        with Container(Settings.read(system="warm-up", container="a")) as one:
-            with Container(Settings.read(system="warm-up", container="b")) as other:
-                other.handle(one.services(where(name="clock", container="a"))[0].key)()
+        with (
+            Container(Settings.read(system="warm-up", container="a")) as one,
+            Container(Settings.read(system="warm-up", container="b")) as other,
+        ):
+            other.handle(one.services(where(name="clock", container="a"))[0].key)()
     asyncio.run(asyncio.sleep(0))
 
 

@@ -1,4 +1,4 @@
-"""A behaviour that must survive its robot: calls in a loop, finds again when the service is gone, reports each outcome."""
+"""A behaviour that must survive its robot: calls in a loop, finds again when the service is gone, says what happens."""
 
 import json
 import sys

@@ -3,21 +3,26 @@
 import re
 import sys
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal, TypeVar
+from math import isfinite
+from typing import Annotated, Literal, TypeVar, cast
 
 import msgspec
 from msgspec import Meta, Struct
+
 from trade.errors import ConfigurationError
 
 if sys.version_info >= (3, 11):
     import tomllib
 else:
-    import tomli as tomllib
+    import tomli as tomllib  # pyright: ignore[reportMissingImports]
 
 __all__ = ["Bus", "Group", "Joint", "Robot", "parse"]
 
 _SEGMENTS = re.compile(r"[a-z][a-z0-9_]*(\.[a-z][a-z0-9_]*)*")
 _AT = re.compile(r" - at `\$\.?([^`]*)`$")
+_MISSING = re.compile(r"missing required field `([^`]*)`")
+_UNKNOWN = re.compile(r"contains unknown field `([^`]*)`")
+_CHOICES = {"leave": '"hold" or "relax"'}
 
 Positive = Annotated[float, Meta(gt=0)]
 
@@ -96,8 +101,8 @@ def parse(text: str, where: str) -> Robot:
         ConfigurationError: names file, key, value and what would be right.
     """
     try:
-        raw = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as bad:
+        raw = cast("dict[str, object]", tomllib.loads(text))  # pyright: ignore[reportUnknownMemberType]
+    except ValueError as bad:  # tomllib.TOMLDecodeError is one
         raise ConfigurationError(where=where, problem=f"not valid TOML: {bad}") from None
     _only_known(raw, where)
     robot = Robot(
@@ -139,7 +144,7 @@ def _check_name(name: str, where: str) -> None:
         raise ConfigurationError(where=where, problem=problem)
 
 
-def _records(raw: Mapping[str, Any], section: str, record: type[_Record], where: str) -> list[_Record]:
+def _records(raw: Mapping[str, object], section: str, record: type[_Record], where: str) -> list[_Record]:
     tables = raw.get(section, {})
     if not isinstance(tables, dict):
         raise _wrong(where, section, f"must be tables: [{section}.NAME]")
@@ -156,9 +161,11 @@ def _record(table: object, section: str, name: str, record: type[_Record], where
     if any(isinstance(value, dict) for value in table.values()):  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]
         raise _wrong(where, key, f'a dotted name needs quotes: [{section}."{name}.{next(iter(table))}"]')  # pyright: ignore[reportUnknownArgumentType]
     try:
-        return msgspec.convert({**table, "name": name}, record)
+        made = msgspec.convert({**table, "name": name}, record)
     except msgspec.ValidationError as bad:
         raise _explain(bad, table, key, record, where) from None  # pyright: ignore[reportUnknownArgumentType]
+    _check_finite(made, key, where)
+    return made
 
 
 def _explain(
@@ -166,15 +173,30 @@ def _explain(
 ) -> ConfigurationError:
     text = str(bad)
     keys = ", ".join(name for name in record.__struct_fields__ if name != "name")
+    if missing := _MISSING.search(text):
+        return _wrong(where, key, f"missing required key {missing.group(1)!r}; the keys are {keys}")
+    if unknown := _UNKNOWN.search(text):
+        return _wrong(where, f"{key}.{unknown.group(1)}", f"unknown key; the keys are {keys}")
     at = _AT.search(text)
-    if at is None:  # a missing or unknown key
-        return _wrong(where, key, f"{text.replace('Object', 'it').replace('field', 'key')}; the keys are {keys}")
-    field = re.split(r"[.\[]", at.group(1))[0]
-    return _wrong(where, f"{key}.{field}", f"{text[: at.start()]}, but it is {table.get(field)!r}")
+    field = re.split(r"[.\[]", at.group(1))[0] if at else ""
+    value = table.get(field)
+    if (choices := _CHOICES.get(field)) and isinstance(value, str):
+        return _wrong(where, f"{key}.{field}", f"must be {choices}, but it is {value!r}")
+    problem = text[: at.start()] if at else text
+    return _wrong(where, f"{key}.{field}", f"{problem}, but it is {value!r}")
+
+
+def _check_finite(record: Struct, key: str, where: str) -> None:
+    """TOML knows inf and nan; no limit may be one."""
+    for field in record.__struct_fields__:
+        value = getattr(record, field)
+        if isinstance(value, float) and not isfinite(value):
+            raise _wrong(where, f"{key}.{field}", f"must be a finite number, but it is {value}")
 
 
 def _check_links(robot: Robot) -> None:
     where, buses, seen = robot.where, {bus.name for bus in robot.buses}, dict[tuple[str, int], str]()
+    _check_ports(robot)
     for joint in robot.joints:
         key = f'joint."{joint.name}"'
         if joint.bus not in buses:
@@ -186,6 +208,14 @@ def _check_links(robot: Robot) -> None:
             raise _wrong(where, f"{key}.id", f"{joint.id} is taken on bus {joint.bus!r} by joint {other!r}")
         seen[joint.bus, joint.id] = joint.name
     _check_groups(robot)
+
+
+def _check_ports(robot: Robot) -> None:
+    owners = dict[str, str]()
+    for bus in robot.buses:
+        if other := owners.get(bus.port):
+            raise _wrong(robot.where, f"bus.{bus.name}.port", f"{bus.port} is the port of bus {other!r} already")
+        owners[bus.port] = bus.name
 
 
 def _check_groups(robot: Robot) -> None:
