@@ -3,61 +3,44 @@
 import atexit
 import difflib
 import os
-import re
 import secrets
-import socket
 import threading
 import weakref
 from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 import msgspec
-from msgspec import Struct, structs
 
 from trade._calls import Caller
 from trade._constraints import Constraint, where
-from trade._dispatch import Dispatcher, LocalService
+from trade._dispatch import Dispatcher
 from trade._handle import Handle, Run
 from trade._invoke import LocalTarget, RemoteTarget, Request
 from trade._notifications import Callback, Notification, Notifier
+from trade._providers import Providers, checked_groups
 from trade._registry import Change, Record, Registry
 from trade._rendezvous import Rendezvous, free_endpoint
-from trade._service import marked_methods
 from trade._settings import Settings
-from trade._signature import Codec, Signature
+from trade._signature import Codec
 from trade._system import DOMAIN, PROVIDER, ContainerInfo, SystemServices
-from trade._transport import Publisher, Transport
+from trade._transport import Transport
 from trade._watch import Watch
 from trade._wire import (
     Address,
-    ProviderInfo,
     ServiceKey,
     alive_key,
-    domain_of,
     encode_message,
-    registry_key,
 )
 from trade._zenoh import ZenohTransport, configuration
 from trade.errors import ConfigurationError, NoSuchService, ServiceGone, TooManyServices
 
 __all__ = ["Container"]
 
-_GROUP: Final = re.compile(r"[A-Za-z0-9_-]+(\.[A-Za-z0-9_-]+)*")
 _HANDLE_EXT: Final = 1
 _PATIENCE_S: Final = 1.0
 """How long a call waits for the registry to hear of a handle that came by message before its registry entry did."""
 
 _live: "weakref.WeakSet[Container]" = weakref.WeakSet()
-
-
-class _Registered(Struct, frozen=True):
-    """A provider of this container."""
-
-    provider: Any
-    name: str
-    groups: tuple[str, ...]
-    services: dict[str, LocalService]
-    announcement: Publisher
 
 
 class Container:
@@ -75,12 +58,8 @@ class Container:
         self._settings = settings or Settings.read()
         self.address: Final = Address(self._settings.identity, self._settings.container, secrets.token_hex(6))
         self.session: Final = secrets.token_hex(8)
-        self._host = socket.gethostname()
         self._lock = threading.Lock()
         self._closed = False
-        self._providers: dict[str, _Registered] = {}
-        self._names: dict[int, str] = {}
-        self._counter = 0
         self._targets: dict[ServiceKey, LocalTarget | RemoteTarget] = {}
         self._codec = Codec(self._handle_to_data, self._data_to_handle)
         self._rendezvous: Rendezvous | None = None
@@ -90,8 +69,9 @@ class Container:
         self._notifier = Notifier(lambda record: Handle(self, record.key, record))
         self._registry.listen(self._changed)
         self._registry.listen(self._notifier.changed)
-        self._dispatcher = Dispatcher(self._transport, self.address, self._codec, self._lookup)
-        self._add(SystemServices(), (DOMAIN,), (), name=PROVIDER)
+        self._providers = Providers(self._transport, self._registry, self.address, self._codec)
+        self._dispatcher = Dispatcher(self._transport, self.address, self._codec, self._providers.lookup)
+        self._providers.add(SystemServices(), (DOMAIN,), name=PROVIDER)
         self._presence = self._transport.appear(alive_key(self.address))
         self._watch = Watch(self._transport, self._registry, self.address, self._caller.lost)
         _live.add(self)
@@ -133,53 +113,8 @@ class Container:
                 already.
         """
         self._check_open()
-        named = (groups,) if isinstance(groups, str) else tuple(groups)
-        for group in named:
-            if not _GROUP.fullmatch(group) or group.split(".")[0] == DOMAIN:
-                problem = (
-                    f"{group!r} is no group; use words joined by dots, such as rosie.head ({DOMAIN!r} is reserved)"
-                )
-                raise ConfigurationError(where=type(provider).__qualname__, problem=problem)
-        return self._add(provider, named, implements)
-
-    def _add(
-        self, provider: object, groups: tuple[str, ...], implements: Sequence[type], name: str | None = None
-    ) -> tuple[Handle, ...]:
-        kind = type(provider).__qualname__
-        services = self._services_of(provider, groups, implements)
-        with self._lock:
-            if id(provider) in self._names:
-                raise ConfigurationError(where=kind, problem="this object is registered already; deregister it first")
-            self._counter += 1
-            chunk = name or f"{type(provider).__name__}-{self._counter}"
-            self._names[id(provider)] = chunk
-        infos = tuple(service.signature.info for service in services.values())
-        info = ProviderInfo(revision=1, groups=groups, kind=kind, host=self._host, pid=os.getpid(), services=infos)
-        domain = domain_of(groups)
-        announcement = self._transport.announce(registry_key(domain, self.address, chunk))
-        self._providers[chunk] = _Registered(provider, chunk, groups, services, announcement)
-        self._registry.put(self.address, domain, chunk, info)
-        announcement.put(encode_message(info))
-        return tuple(self.handle(ServiceKey(self.address, domain, chunk, info.name)) for info in infos)
-
-    def _services_of(
-        self, provider: object, groups: tuple[str, ...], implements: Sequence[type]
-    ) -> dict[str, LocalService]:
-        kind = type(provider).__qualname__
-        marked = marked_methods(type(provider), implements)
-        if not marked:
-            raise ConfigurationError(
-                where=kind, problem="it has no services; mark methods of its class with @trade.service"
-            )
-        resources = tuple(getattr(provider, "resources", ()))
-        services: dict[str, LocalService] = {}
-        for name, (mark, function) in marked.items():
-            label = f"{groups[0] if groups else kind}.{name}"
-            signature = Signature(label, name, mark, function, self._codec)
-            if mark.effect != "read":
-                signature.info = structs.replace(signature.info, uses=(*mark.uses, *resources))
-            services[name] = LocalService(label, signature, getattr(provider, name), mark.effect)
-        return services
+        keys = self._providers.add(provider, checked_groups(provider, groups), implements)
+        return tuple(self.handle(key) for key in keys)
 
     def deregister(self, provider: object) -> None:
         """Withdraw an object's services from the whole system; handles of them fail from now on.
@@ -188,19 +123,7 @@ class Container:
             ConfigurationError: it is not registered here.
         """
         self._check_open()
-        with self._lock:
-            chunk = self._names.pop(id(provider), None)
-        if chunk is None:
-            raise ConfigurationError(
-                where=type(provider).__qualname__, problem="it is not registered in this container"
-            )
-        registered = self._providers.pop(chunk)
-        self._registry.remove(self.address, chunk)
-        registered.announcement.close()
-
-    def _lookup(self, provider: str, service: str) -> LocalService | None:
-        registered = self._providers.get(provider)
-        return None if registered is None else registered.services.get(service)
+        self._providers.remove(provider)
 
     # --- looking up
 
@@ -341,7 +264,7 @@ class Container:
         record = self._registry.get(key)
         if record is None:
             raise self._gone(handle)
-        local = self._lookup(key.provider, key.name) if record.local else None
+        local = self._providers.lookup(key.provider, key.name) if record.local else None
         target: LocalTarget | RemoteTarget = (
             LocalTarget(local, self._codec, self.address, self.session)
             if local is not None
@@ -403,8 +326,7 @@ class Container:
                 return
             self._closed = True
         self._presence.close()
-        for registered in self._providers.values():
-            registered.announcement.close()
+        self._providers.close()
         self._dispatcher.close()
         self._caller.close()
         self._watch.close()

@@ -3,16 +3,28 @@
 import asyncio
 import concurrent.futures
 from collections.abc import Callable, Generator, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
-from trade._wire import ServiceKey
+from trade._registry import Record
+from trade._wire import Address, ServiceKey
 from trade.errors import ConfigurationError
 
-if TYPE_CHECKING:
-    from trade._container import Container
-    from trade._registry import Record
-
 __all__ = ["Handle", "Run"]
+
+
+class Home(Protocol):
+    """What a handle asks of the container that made it."""
+
+    @property
+    def address(self) -> Address: ...
+    def invoke(
+        self, handle: "Handle", args: tuple[Any, ...], kwargs: dict[str, Any], deadline_s: float | None
+    ) -> Any: ...
+    def begin(
+        self, handle: "Handle", args: tuple[Any, ...], kwargs: dict[str, Any], deadline_s: float | None
+    ) -> "Run": ...
+    def record(self, handle: "Handle") -> Record: ...
+    def has(self, key: ServiceKey) -> bool: ...
 
 
 class Run:
@@ -69,12 +81,10 @@ class Handle:
     A call raises ServiceGone once the service was deregistered or its container ended or restarted.
     """
 
-    __slots__ = ("_container", "_deadline_s", "_record", "key")
+    __slots__ = ("_deadline_s", "_home", "_record", "key")
 
-    def __init__(
-        self, container: "Container", key: ServiceKey, record: "Record | None", deadline_s: float | None = None
-    ) -> None:
-        self._container = container
+    def __init__(self, home: Home, key: ServiceKey, record: Record | None, deadline_s: float | None = None) -> None:
+        self._home = home
         self.key = key
         """What the handle is over the wire."""
         self._record = record
@@ -84,11 +94,11 @@ class Handle:
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         """Call and wait for the result, at most until the deadline."""
-        return self._container.invoke(self, args, kwargs, self._deadline_s)
+        return self._home.invoke(self, args, kwargs, self._deadline_s)
 
     def start(self, *args: Any, **kwargs: Any) -> Run:
         """Call without waiting."""
-        return self._container.begin(self, args, kwargs, self._deadline_s)
+        return self._home.begin(self, args, kwargs, self._deadline_s)
 
     async def acall(self, *args: Any, **kwargs: Any) -> Any:
         """Call from asyncio."""
@@ -102,18 +112,18 @@ class Handle:
         """
         if not deadline_s > 0:
             raise ConfigurationError(problem=f"deadline_s must be greater than 0, not {deadline_s}")
-        return Handle(self._container, self.key, self._record, deadline_s)
+        return Handle(self._home, self.key, self._record, deadline_s)
 
     # --- telling
 
     @property
-    def record(self) -> "Record":
+    def record(self) -> Record:
         """What the registry says of it now, or said last. Raises ServiceGone if it never knew the service."""
-        self._record = self._container.record(self)
+        self._record = self._home.record(self)
         return self._record
 
     @property
-    def last_record(self) -> "Record | None":
+    def last_record(self) -> Record | None:
         """What the registry said of it last, if anything."""
         return self._record
 
@@ -145,12 +155,12 @@ class Handle:
     @property
     def local(self) -> bool:
         """Whether it lives in this very container."""
-        return self.key.address == self._container.address
+        return self.key.address == self._home.address
 
     @property
     def alive(self) -> bool:
         """Whether the registry has it now."""
-        return self._container.has(self.key)
+        return self._home.has(self.key)
 
     @property
     def signature(self) -> str:
@@ -191,7 +201,7 @@ class Handle:
                 where=self.label, problem="it cannot be cancelled: its provider names no service for that"
             )
         key = ServiceKey(self.key.address, self.key.domain, self.key.provider, cancel)
-        return Handle(self._container, key, None)
+        return Handle(self._home, key, None)
 
     # --- being a value
 

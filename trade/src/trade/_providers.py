@@ -1,0 +1,129 @@
+"""The objects a container offers: reading them into services, announcing and withdrawing them."""
+
+import os
+import re
+import socket
+import threading
+from collections.abc import Sequence
+from typing import Any, Final
+
+from msgspec import Struct, structs
+
+from trade._dispatch import LocalService
+from trade._registry import Registry
+from trade._service import marked_methods
+from trade._signature import Codec, Signature
+from trade._system import DOMAIN
+from trade._transport import Publisher, Transport
+from trade._wire import Address, ProviderInfo, ServiceKey, domain_of, encode_message, registry_key
+from trade.errors import ConfigurationError
+
+_GROUP: Final = re.compile(r"[A-Za-z0-9_-]+(\.[A-Za-z0-9_-]+)*")
+
+
+class _Registered(Struct, frozen=True):
+    """A provider of this container."""
+
+    provider: Any
+    services: dict[str, LocalService]
+    announcement: Publisher
+
+
+class Providers:
+    """Owns what this container hosts; the registry and the rest of the system are told from here."""
+
+    def __init__(self, transport: Transport, registry: Registry, own: Address, codec: Codec) -> None:
+        self._transport = transport
+        self._registry = registry
+        self._own = own
+        self._codec = codec
+        self._lock = threading.Lock()
+        self._hosted: dict[str, _Registered] = {}
+        self._names: dict[int, str] = {}
+        self._counter = 0
+
+    def add(
+        self, provider: object, groups: tuple[str, ...], implements: Sequence[type] = (), *, name: str | None = None
+    ) -> list[ServiceKey]:
+        """Host an object: callable first, announced then. Returns the keys of its services.
+
+        Args:
+            provider: the object; kept until it is removed.
+            groups: dotted labels, checked by the caller of this.
+            implements: interfaces beside those it inherits from.
+            name: of the provider in keys; by default its class and a number.
+
+        Raises:
+            ConfigurationError: see `Container.register`.
+        """
+        kind = type(provider).__qualname__
+        services = self._services_of(provider, groups, implements)
+        infos = tuple(service.signature.info for service in services.values())
+        domain = domain_of(groups)
+        with self._lock:
+            if id(provider) in self._names:
+                raise ConfigurationError(where=kind, problem="this object is registered already; deregister it first")
+            self._counter += 1
+            chunk = name or f"{type(provider).__name__}-{self._counter}"
+            announcement = self._transport.announce(registry_key(domain, self._own, chunk))
+            self._names[id(provider)] = chunk
+            self._hosted[chunk] = _Registered(provider, services, announcement)
+        info = ProviderInfo(
+            revision=1, groups=groups, kind=kind, host=socket.gethostname(), pid=os.getpid(), services=infos
+        )
+        self._registry.put(self._own, domain, chunk, info)
+        announcement.put(encode_message(info))
+        return [ServiceKey(self._own, domain, chunk, info.name) for info in infos]
+
+    def remove(self, provider: object) -> None:
+        """Stop hosting an object: gone from the registry first, uncallable then.
+
+        Raises:
+            ConfigurationError: it is not registered here.
+        """
+        with self._lock:
+            chunk = self._names.pop(id(provider), None)
+            if chunk is None:
+                where = type(provider).__qualname__
+                raise ConfigurationError(where=where, problem="it is not registered in this container")
+            registered = self._hosted.pop(chunk)
+        self._registry.remove(self._own, chunk)
+        registered.announcement.close()
+
+    def lookup(self, provider: str, service: str) -> LocalService | None:
+        """A service as calls name it."""
+        registered = self._hosted.get(provider)
+        return None if registered is None else registered.services.get(service)
+
+    def close(self) -> None:
+        """Withdraw everything. Idempotent."""
+        for registered in list(self._hosted.values()):
+            registered.announcement.close()
+
+    def _services_of(
+        self, provider: object, groups: tuple[str, ...], implements: Sequence[type]
+    ) -> dict[str, LocalService]:
+        kind = type(provider).__qualname__
+        marked = marked_methods(type(provider), implements)
+        if not marked:
+            problem = "it has no services; mark methods of its class with @trade.service"
+            raise ConfigurationError(where=kind, problem=problem)
+        resources = tuple(getattr(provider, "resources", ()))
+        services: dict[str, LocalService] = {}
+        for name, (mark, function) in marked.items():
+            label = f"{groups[0] if groups else kind}.{name}"
+            signature = Signature(label, name, mark, function, self._codec)
+            if mark.effect != "read":
+                signature.info = structs.replace(signature.info, uses=(*mark.uses, *resources))
+            services[name] = LocalService(label, signature, getattr(provider, name), mark.effect)
+        return services
+
+
+def checked_groups(provider: object, groups: str | Sequence[str]) -> tuple[str, ...]:
+    """Groups as a tuple; raises ConfigurationError for one that is malformed or the middleware's own."""
+    named = (groups,) if isinstance(groups, str) else tuple(groups)
+    for group in named:
+        if not _GROUP.fullmatch(group) or group.split(".")[0] == DOMAIN:
+            problem = f"{group!r} is no group; use words joined by dots, such as rosie.head ({DOMAIN!r} is reserved)"
+            raise ConfigurationError(where=type(provider).__qualname__, problem=problem)
+    return named
