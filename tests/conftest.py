@@ -34,7 +34,7 @@ def _warm_up(tmp_path_factory: pytest.TempPathFactory) -> None:
 
 @pytest.fixture(autouse=True)
 def _nothing_leaks(_warm_up: None) -> Iterator[None]:
-    threads, files, children = set(threading.enumerate()), _files(), _children()
+    threads, files, children, tasks = set(threading.enumerate()), _files(), _children(), _tasks()
     yield
     trade.close()
     leaked = _wait_until_gone(
@@ -42,6 +42,7 @@ def _nothing_leaks(_warm_up: None) -> Iterator[None]:
             *(f"thread {thread.name}" for thread in set(threading.enumerate()) - threads if thread.is_alive()),
             *(f"file {path}" for path in _files() - files),
             *(f"process {name}" for name in _children() - children),
+            *(f"task {name}" for name in _tasks() - tasks),
         ]
     )
     assert not leaked, f"the test left behind: {', '.join(leaked)}"
@@ -66,6 +67,13 @@ def _files() -> set[str]:
         if not target.endswith(".zenoh"):  # shared memory of closed links: zenoh lets go of it in its own time
             found.add(f"{entry.name} -> {target}")
     return found
+
+
+def _tasks() -> set[str]:
+    """Tasks of any loop that are not done, a stopped loop's included."""
+    known = getattr(asyncio.tasks, "_all_tasks", None)  # until 3.11
+    known = asyncio.tasks._scheduled_tasks if known is None else known
+    return {repr(task) for task in list(known) if not task.done()}
 
 
 def _children() -> set[str]:

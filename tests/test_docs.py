@@ -1,0 +1,36 @@
+"""What the pages say is there, is there; what they show, runs."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+
+
+def test_the_readme_program_does_what_it_says(system: str, tmp_path: Path) -> None:
+    [program] = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
+    *lines, last = program.strip().splitlines()
+    path = tmp_path / "program.py"
+    path.write_text("\n".join([*lines[:-1], f"print({lines[-1].split('#')[0]})", last]), encoding="utf-8")
+    ended = subprocess.run([sys.executable, path], capture_output=True, text=True, timeout=60, check=False)
+    assert ended.stdout.strip() == "True"
+    said = last.split("# ", 1)[1]
+    assert said in ended.stderr.splitlines()[-1].removeprefix("trade.errors.")
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_links_lead_somewhere(page: Path) -> None:
+    for target in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", page.read_text(encoding="utf-8")):
+        assert (page.parent / target).exists(), target
+
+
+def test_tests_named_in_the_pages_exist() -> None:
+    tests = "\n".join(path.read_text(encoding="utf-8") for path in (ROOT / "tests").rglob("test_*.py"))
+    tests += "\n".join(path.read_text(encoding="utf-8") for path in (ROOT / "tests").rglob("*_contract.py"))
+    named = {name for page in PAGES for name in re.findall(r"`(test_\w+)`", page.read_text(encoding="utf-8"))}
+    missing = sorted(name for name in named if f"def {name}" not in tests)
+    assert not missing
