@@ -131,3 +131,12 @@ def rosie_up(run: Callable[..., Program], tmp_path: Path) -> Callable[[], Rosie]
         return Rosie(run("-m", "trade_gateway", "up", ROSIE, "--sim", "--sim-log", log, "--json"))
 
     return up
+
+
+def wait_until(condition: Callable[[], bool]) -> None:
+    """Wait for something other processes do; fails after a minute."""
+    for _ in range(2000):
+        if condition():
+            return
+        threading.Event().wait(0.03)
+    pytest.fail("it did not happen within a minute")

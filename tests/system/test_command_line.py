@@ -1,11 +1,11 @@
 import json
 import signal
 import subprocess
-import threading
 from collections.abc import Callable
 
 import pytest
 
+from system.conftest import wait_until
 from trade_hil_sim import events, motion_writes, read_log
 
 Command = Callable[..., subprocess.CompletedProcess[str]]
@@ -85,7 +85,7 @@ def test_ctrl_c_on_a_call_stops_the_motion(rosie_up, run) -> None:
     call = run(
         "-m", "trade_gateway", "call", "rosie.head.move_to", "[1.2, 0.0]", "speed_rad_s=0.05", "--deadline", "60"
     )
-    _wait_until(lambda: bool(events(read_log(rosie.log), "motion_started")))
+    wait_until(lambda: bool(events(read_log(rosie.log), "motion_started")))
     call.signal(signal.SIGINT)
     assert call.wait() == 130
     [rest] = [entry for entry in events(read_log(rosie.log), "at_rest") if entry.joint == "neck.pan"]
@@ -104,11 +104,3 @@ def test_S19_leaving_holds_the_position_and_moves_nothing(number: int, rosie_up,
     entries = read_log(log)
     assert len(events(entries, "motion_started")) == before
     assert events(entries, "torque_off") == []
-
-
-def _wait_until(condition: Callable[[], bool]) -> None:
-    for _ in range(2000):
-        if condition():
-            return
-        threading.Event().wait(0.03)
-    pytest.fail("it did not happen within a minute")

@@ -1,0 +1,84 @@
+"""Simulated devices that speak the real bytes, on pseudo-terminals, with a byte log and scripted faults.
+
+`SimProcess` simulates a whole robot file in a process of its own; `trade_hil_sim.dynamixel` has the devices for use in
+one's own process. `read_log`, `motion_writes` and their kin say what a bus has seen.
+"""
+
+from ._client import SimControl
+from ._errors import SimulationError
+from ._faults import (
+    Absent,
+    AnswerFault,
+    BadCrc,
+    BrownOut,
+    Command,
+    Dribble,
+    Duplicate,
+    Echo,
+    Freeze,
+    Garbage,
+    HardwareFault,
+    Heal,
+    Jam,
+    Late,
+    Mute,
+    Place,
+    Replug,
+    Supply,
+    Truncate,
+    Unmute,
+    Unplug,
+    WrongModel,
+)
+from ._judge import events, instructions, motion_writes, read_log, received, sent, writes
+from ._line import Peer, SerialLine
+from ._log import ByteLog, Entry
+from ._process import SimProcess
+from ._state import BusState, DeviceState
+from .dynamixel import MODELS, XL430_W250, XM430_W350, DynamixelBus, Servo
+
+__all__ = [
+    "MODELS",
+    "XL430_W250",
+    "XM430_W350",
+    "Absent",
+    "AnswerFault",
+    "BadCrc",
+    "BrownOut",
+    "BusState",
+    "ByteLog",
+    "Command",
+    "DeviceState",
+    "Dribble",
+    "Duplicate",
+    "DynamixelBus",
+    "Echo",
+    "Entry",
+    "Freeze",
+    "Garbage",
+    "HardwareFault",
+    "Heal",
+    "Jam",
+    "Late",
+    "Mute",
+    "Peer",
+    "Place",
+    "Replug",
+    "SerialLine",
+    "Servo",
+    "SimControl",
+    "SimProcess",
+    "SimulationError",
+    "Supply",
+    "Truncate",
+    "Unmute",
+    "Unplug",
+    "WrongModel",
+    "events",
+    "instructions",
+    "motion_writes",
+    "read_log",
+    "received",
+    "sent",
+    "writes",
+]

@@ -1,0 +1,135 @@
+"""``trade-hil-sim ROBOT.toml``: simulate the buses of a robot file until told to stop."""
+
+import argparse
+import os
+import select
+import shutil
+import signal
+import sys
+import tempfile
+from collections.abc import Sequence
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from types import FrameType
+
+import msgspec
+
+from ._control import ControlServer
+from ._errors import SimulationError
+from ._log import ByteLog
+from ._process import Ready
+from ._robot import buses_of, read_robot
+
+EPILOG = """\
+When all ports can be opened, one line of JSON appears on standard output:
+  {"ready": true, "ports": {"neck": "/tmp/trade-sim-x/neck"}, "log": null, "control": "/tmp/trade-sim-x/_control"}
+Give such a port to any client in place of a real one. The control socket takes lines of JSON, for instance
+  {"do": "mute", "ids": [1]}   {"do": "unplug", "bus": "neck"}   {"do": "state"}
+SIGTERM, SIGINT, the end of --parent or (with --stdin) the end of standard input end the simulator.
+"""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the simulator; return its exit status: 0 after a signal, 2 if it could not start."""
+    options = _parser().parse_args(argv)
+    stop = _Stop()
+    try:
+        with ExitStack() as stack:
+            stack.callback(stop.close)
+            _run(options, stack, stop)
+    except (SimulationError, OSError, ValueError) as problem:
+        sys.stderr.write(f"trade-hil-sim: {problem}\n")
+        return 2
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="trade-hil-sim",
+        description="Simulate the devices of a robot file, byte for byte, on pseudo-terminals.",
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("robot", type=Path, metavar="ROBOT.toml", help="the robot file")
+    parser.add_argument("--bus", action="append", default=[], metavar="NAME", help="simulate only this bus; repeatable")
+    parser.add_argument("--log", type=Path, metavar="FILE", help="append every byte and event to FILE, as JSON lines")
+    parser.add_argument("--dir", type=Path, metavar="DIR", help="put the ports here (default: a temporary directory)")
+    parser.add_argument("--control", type=Path, metavar="PATH", help="control socket (default: DIR/_control)")
+    parser.add_argument("--unpaced", action="store_true", help="answer as fast as possible, not at the baud rate")
+    parser.add_argument("--parent", type=int, metavar="PID", help="end when this process ends")
+    parser.add_argument("--stdin", action="store_true", help="end when standard input ends")
+    return parser
+
+
+def _run(options: argparse.Namespace, stack: ExitStack, stop: "_Stop") -> None:
+    robot = read_robot(options.robot)
+    directory = _directory(options.dir, stack)
+    log = stack.enter_context(ByteLog(options.log, keep=False))
+    buses = buses_of(robot, directory, names=options.bus, log=log, paced=not options.unpaced)
+    for bus in buses:
+        stack.callback(bus.close)
+        bus.open()
+    control = stack.enter_context(ControlServer(options.control or directory / "_control", buses))
+    ready = Ready(
+        ready=True,
+        ports={bus.name: str(bus.port) for bus in buses},
+        log=None if options.log is None else str(options.log.absolute()),
+        control=str(control.path),
+    )
+    sys.stdout.write(msgspec.json.encode(ready).decode() + "\n")
+    sys.stdout.flush()
+    stop.wait(options.parent, sys.stdin.fileno() if options.stdin else None)
+
+
+def _directory(wanted: Path | None, stack: ExitStack) -> Path:
+    if wanted is not None:
+        wanted.mkdir(parents=True, exist_ok=True)
+        return wanted.absolute()
+    made = Path(tempfile.mkdtemp(prefix="trade-sim-"))
+    stack.callback(shutil.rmtree, made, ignore_errors=True)
+    return made
+
+
+class _Stop:
+    """Waits for a reason to end: a signal, the parent's end, the end of standard input."""
+
+    def __init__(self) -> None:
+        self._bell, self._rope = os.pipe()
+        os.set_blocking(self._rope, False)
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, self._on_signal)
+
+    def _on_signal(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002
+        with suppress(OSError):
+            os.write(self._rope, b"!")
+
+    def wait(self, parent: int | None, stdin: int | None) -> None:
+        """Return when there is a reason to end."""
+        with ExitStack() as stack:
+            watched = [self._bell]
+            if parent is not None:
+                try:
+                    pidfd = os.pidfd_open(parent)
+                except ProcessLookupError:
+                    return
+                stack.callback(os.close, pidfd)
+                watched.append(pidfd)
+            if stdin is not None:
+                watched.append(stdin)
+            while True:
+                readable, _, _ = select.select(watched, [], [])
+                if stdin in readable and os.read(stdin or 0, 4096):
+                    readable.remove(stdin or 0)
+                if readable:
+                    return
+
+    def close(self) -> None:
+        """Let go of signals and pipe."""
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, signal.SIG_IGN)
+        os.close(self._bell)
+        os.close(self._rope)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,171 @@
+"""Steering a running simulator: a typed client of its control socket."""
+
+import socket
+import threading
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Final
+
+import msgspec
+
+from . import _faults as faults
+from ._control import Answer, State
+from ._errors import SimulationError
+from ._state import BusState, DeviceState
+
+__all__ = ["SimControl"]
+
+ANSWER_S: Final = 10.0
+"""How long a simulator may take over a command."""
+
+
+class SimControl:
+    """Makes things happen in a running simulator. Threads may share one.
+
+    In every method, `ids` are device ids (default: all) and `bus` is the name of a bus (default: every bus); `count` is
+    how many answers a fault strikes (default: all until `heal`), and `instruction` the one whose answers it strikes.
+
+    Args:
+        path: the socket, as the simulator's ready line names it.
+
+    Raises:
+        SimulationError: nobody listens there; later, whatever the simulator refuses, with what would be right.
+    """
+
+    def __init__(self, path: Path | str) -> None:
+        self._lock = threading.Lock()
+        self._held = b""
+        self._socket = socket.socket(socket.AF_UNIX)
+        self._socket.settimeout(ANSWER_S)
+        try:
+            self._socket.connect(str(path))
+        except OSError as problem:
+            self._socket.close()
+            raise SimulationError(f"no simulator listens on {path}: {problem}") from None
+
+    def close(self) -> None:
+        """Hang up. Idempotent; the simulator goes on."""
+        self._socket.close()
+
+    def __enter__(self) -> "SimControl":
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    # the truth
+
+    def state(self) -> list[BusState]:
+        """The truth about every bus and its devices."""
+        return self._ask(State()).buses or []
+
+    def device(self, which: str | int) -> DeviceState:
+        """The truth about one device, by its joint's name or its id.
+
+        Raises:
+            SimulationError: no such device; names those there are. The same if an id is on two buses.
+        """
+        devices = [device for bus in self.state() for device in bus.devices]
+        found = [device for device in devices if which in {device.joint, device.device_id}]
+        if len(found) != 1:
+            known = ", ".join(f"{device.joint} ({device.bus} {device.device_id})" for device in devices)
+            raise SimulationError(f"{len(found)} devices are called {which!r}; there is {known}")
+        return found[0]
+
+    # faults of answers
+
+    def mute(
+        self,
+        ids: Iterable[int] | None = None,
+        *,
+        bus: str | None = None,
+        instruction: str | None = None,
+        count: int | None = None,
+    ) -> None:
+        """Devices obey, but do not answer."""
+        self.do(faults.Mute(ids=_ids(ids), bus=bus, instruction=instruction, count=count))
+
+    def unmute(self, ids: Iterable[int] | None = None, *, bus: str | None = None) -> None:
+        """End every mute of these devices."""
+        self.do(faults.Unmute(ids=_ids(ids), bus=bus))
+
+    def late(
+        self,
+        s: float,
+        ids: Iterable[int] | None = None,
+        *,
+        bus: str | None = None,
+        instruction: str | None = None,
+        count: int | None = None,
+    ) -> None:
+        """Answers come `s` seconds late."""
+        self.do(faults.Late(s=s, ids=_ids(ids), bus=bus, instruction=instruction, count=count))
+
+    def bad_crc(self, ids: Iterable[int] | None = None, *, bus: str | None = None, count: int | None = None) -> None:
+        """The last byte of answers is wrong."""
+        self.do(faults.BadCrc(ids=_ids(ids), bus=bus, count=count))
+
+    def heal(self, *, bus: str | None = None) -> None:
+        """End every fault of answers, echo, frozen sensors, jams, absences and wrong models."""
+        self.do(faults.Heal(bus=bus))
+
+    # the line and the devices
+
+    def unplug(self, bus: str | None = None) -> None:
+        """Pull the serial adapter. The devices stay powered."""
+        self.do(faults.Unplug(bus=bus))
+
+    def replug(self, bus: str | None = None) -> None:
+        """Plug the serial adapter in again; clients must open the port anew."""
+        self.do(faults.Replug(bus=bus))
+
+    def absent(self, ids: Iterable[int], *, on: bool = True, bus: str | None = None) -> None:
+        """Take devices off the bus, or with `on` false put them back."""
+        self.do(faults.Absent(ids=_ids(ids), on=on, bus=bus))
+
+    def brown_out(self, ids: Iterable[int] | None = None, *, bus: str | None = None) -> None:
+        """Let the supply dip: RAM at its defaults, torque off."""
+        self.do(faults.BrownOut(ids=_ids(ids), bus=bus))
+
+    def hardware_fault(self, bits: int, ids: Iterable[int] | None = None, *, bus: str | None = None) -> None:
+        """Latch bits of the hardware error register; 32 is overload."""
+        self.do(faults.HardwareFault(bits=bits, ids=_ids(ids), bus=bus))
+
+    def freeze(
+        self, ids: Iterable[int] | None = None, *, on: bool = True, tick: bool = False, bus: str | None = None
+    ) -> None:
+        """Let the measured position stand still, and with `tick` the device's clock."""
+        self.do(faults.Freeze(ids=_ids(ids), on=on, tick=tick, bus=bus))
+
+    def place(self, counts: int, ids: Iterable[int] | None = None, *, bus: str | None = None) -> None:
+        """Turn shafts by hand, to a position in counts."""
+        self.do(faults.Place(counts=counts, ids=_ids(ids), bus=bus))
+
+    def do(self, command: faults.Command) -> None:
+        """Send any command of the simulator."""
+        self._ask(command)
+
+    def _ask(self, command: faults.Command | State) -> Answer:
+        with self._lock:
+            try:
+                self._socket.sendall(msgspec.json.encode(command) + b"\n")
+                line = self._line()
+            except OSError as problem:
+                raise SimulationError(f"the simulator is gone: {problem}") from None
+        answer = msgspec.json.decode(line, type=Answer)
+        if answer.error is not None:
+            raise SimulationError(answer.error)
+        return answer
+
+    def _line(self) -> bytes:
+        while b"\n" not in self._held:
+            data = self._socket.recv(65536)
+            if not data:
+                raise ConnectionResetError("it hung up")
+            self._held += data
+        line, _, self._held = self._held.partition(b"\n")
+        return line
+
+
+def _ids(ids: Iterable[int] | None) -> tuple[int, ...] | None:
+    return None if ids is None else tuple(ids)

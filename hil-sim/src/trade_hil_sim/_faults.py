@@ -1,0 +1,306 @@
+"""Scripted faults as plain values, so that they can be made in Python or sent over the control socket.
+
+Two kinds: faults of answers, which change the bytes of some answers on their way out, and orders, which do something to
+a device or to the line once.
+"""
+
+from typing import Annotated, NamedTuple
+
+import msgspec
+from msgspec import Meta
+
+__all__ = [
+    "Absent",
+    "AnswerFault",
+    "BadCrc",
+    "BrownOut",
+    "Command",
+    "Dribble",
+    "Duplicate",
+    "Echo",
+    "Freeze",
+    "Garbage",
+    "HardwareFault",
+    "Heal",
+    "Jam",
+    "Late",
+    "Mute",
+    "Piece",
+    "Place",
+    "Replug",
+    "Script",
+    "Supply",
+    "Truncate",
+    "Unmute",
+    "Unplug",
+    "WrongModel",
+    "kinds_of",
+]
+
+
+Seconds = Annotated[float, Meta(ge=0, le=60)]
+Byte = Annotated[int, Meta(ge=0, le=255)]
+
+
+class Piece(NamedTuple):
+    """Part of an answer, and how much later than it should it leaves."""
+
+    data: bytes
+    late_s: float = 0.0
+
+
+class _Order(msgspec.Struct, frozen=True, kw_only=True, tag_field="do", forbid_unknown_fields=True):
+    bus: str | None = None
+    """Name of the bus; default: every bus."""
+
+
+class _Devices(_Order, frozen=True, kw_only=True):
+    ids: tuple[int, ...] | None = None
+    """Devices it concerns; default: all on the bus."""
+
+
+class AnswerFault(_Devices, frozen=True, kw_only=True):
+    """What goes wrong with answers, and with which of them."""
+
+    instruction: str | None = None
+    """Only answers to this one: ``ping``, ``read``, ``sync_read``, ...; default: any."""
+    skip: Annotated[int, Meta(ge=0)] = 0
+    """How many matching answers go out unharmed first."""
+    count: Annotated[int, Meta(ge=1)] | None = None
+    """How many answers it strikes; default: all, until healed."""
+
+    def strikes(self, ids: tuple[int, ...], instruction: str) -> bool:
+        """Whether it concerns an answer of these devices to this instruction."""
+        whom = self.ids is None or any(i in self.ids for i in ids)
+        return whom and self.instruction in {None, instruction}
+
+    def shape(self, pieces: list[Piece]) -> list[Piece]:
+        """The answer as this fault leaves it."""
+        return pieces
+
+
+class Mute(AnswerFault, frozen=True, tag="mute"):
+    """Devices obey but do not answer."""
+
+    def shape(self, pieces: list[Piece]) -> list[Piece]:
+        """Nothing of it."""
+        return pieces[:0]
+
+
+class Late(AnswerFault, frozen=True, kw_only=True, tag="late"):
+    """Answers come `s` seconds late; the bus goes on meanwhile."""
+
+    s: Seconds
+
+    def shape(self, pieces: list[Piece]) -> list[Piece]:
+        """The same, later."""
+        return [Piece(data, late_s + self.s) for data, late_s in pieces]
+
+
+class BadCrc(AnswerFault, frozen=True, tag="bad_crc"):
+    """The last byte of the answer is wrong."""
+
+    def shape(self, pieces: list[Piece]) -> list[Piece]:
+        """The same with its last byte inverted."""
+        *before, (data, late_s) = pieces
+        wrong = bytes(byte ^ 0xFF for byte in data[-1:])
+        return [*before, Piece(data[:-1] + wrong, late_s)]
+
+
+class Truncate(AnswerFault, frozen=True, kw_only=True, tag="truncate"):
+    """The answer breaks off; the last `missing` bytes never come."""
+
+    missing: Annotated[int, Meta(ge=1)] = 3
+
+    def shape(self, pieces: list[Piece]) -> list[Piece]:
+        """The beginning."""
+        *before, (data, late_s) = pieces
+        return [*before, Piece(data[: -self.missing], late_s)]
+
+
+class Garbage(AnswerFault, frozen=True, kw_only=True, tag="garbage"):
+    """Noise comes before the answer."""
+
+    hex: str = "fffffd00ff"
+
+    def __post_init__(self) -> None:
+        """Refuse what is not hex."""
+        bytes.fromhex(self.hex)
+
+    def shape(self, pieces: list[Piece]) -> list[Piece]:
+        """Noise, then the same."""
+        return [Piece(bytes.fromhex(self.hex), pieces[0].late_s), *pieces]
+
+
+class Dribble(AnswerFault, frozen=True, kw_only=True, tag="dribble"):
+    """The answer comes byte by byte, `s` seconds apart."""
+
+    s: Seconds
+
+    def shape(self, pieces: list[Piece]) -> list[Piece]:
+        """Single bytes, each later than the one before."""
+        whole, late_s = b"".join(piece.data for piece in pieces), pieces[0].late_s
+        return [Piece(bytes([byte]), late_s + k * self.s) for k, byte in enumerate(whole)]
+
+
+class Duplicate(AnswerFault, frozen=True, tag="duplicate"):
+    """The answer comes twice."""
+
+    def shape(self, pieces: list[Piece]) -> list[Piece]:
+        """The same, and once more when it is through."""
+        span_s = pieces[-1].late_s - pieces[0].late_s
+        return [*pieces, *(Piece(data, late_s + span_s) for data, late_s in pieces)]
+
+
+class Echo(_Order, frozen=True, kw_only=True, tag="echo"):
+    """The adapter sends back what it hears, as a half-duplex adapter without echo suppression does."""
+
+    on: bool = True
+
+
+class Unmute(_Devices, frozen=True, tag="unmute"):
+    """End every `Mute` of these devices."""
+
+
+class Heal(_Order, frozen=True, tag="heal"):
+    """End every fault of answers, echo, frozen sensors, jams, absences and wrong models."""
+
+
+class Unplug(_Order, frozen=True, tag="unplug"):
+    """Pull the serial adapter."""
+
+
+class Replug(_Order, frozen=True, tag="replug"):
+    """Plug the serial adapter in again."""
+
+
+class Absent(_Devices, frozen=True, kw_only=True, tag="absent"):
+    """Devices are off the bus: they neither hear nor answer. With ``on`` false they are back."""
+
+    on: bool = True
+
+
+class Freeze(_Devices, frozen=True, kw_only=True, tag="freeze"):
+    """The measured position stands still although the shaft moves; with `tick`, the device's clock as well."""
+
+    on: bool = True
+    tick: bool = False
+
+
+class Jam(_Devices, frozen=True, kw_only=True, tag="jam"):
+    """The shaft is held fast; straining against that for a second is an overload."""
+
+    on: bool = True
+
+
+class WrongModel(_Devices, frozen=True, kw_only=True, tag="wrong_model"):
+    """Devices report another model number, as after a swap."""
+
+    number: Annotated[int, Meta(ge=0, le=65_535)]
+
+
+class BrownOut(_Devices, frozen=True, tag="brown_out"):
+    """The supply dips: RAM at its defaults, torque off, EEPROM kept."""
+
+
+class HardwareFault(_Devices, frozen=True, kw_only=True, tag="hardware_fault"):
+    """Latch bits of the hardware error register: 4 overheating, 32 overload, ..."""
+
+    bits: Byte = 0x20
+
+
+class Supply(_Devices, frozen=True, kw_only=True, tag="supply"):
+    """Set what devices measure of their supply and housing; outside their limits they shut down."""
+
+    voltage_v: Annotated[float, Meta(ge=0, le=100)] | None = None
+    temperature_c: Byte | None = None
+
+
+class Place(_Devices, frozen=True, kw_only=True, tag="place"):
+    """Turn shafts by hand, to a position in counts."""
+
+    counts: Annotated[int, Meta(ge=-1_048_575, le=1_048_575)]
+
+
+Command = (
+    Absent
+    | BadCrc
+    | BrownOut
+    | Dribble
+    | Duplicate
+    | Echo
+    | Freeze
+    | Garbage
+    | HardwareFault
+    | Heal
+    | Jam
+    | Late
+    | Mute
+    | Place
+    | Replug
+    | Supply
+    | Truncate
+    | Unmute
+    | Unplug
+    | WrongModel
+)
+
+
+def kinds_of(union: object) -> dict[str, type[msgspec.Struct]]:
+    """The words a command may have under ``do``, and what each makes."""
+    kinds: tuple[type[msgspec.Struct], ...] = getattr(union, "__args__", ())
+    return {str(kind.__struct_config__.tag): kind for kind in kinds}
+
+
+class _Active:
+    """A fault and how often it has matched."""
+
+    def __init__(self, fault: AnswerFault) -> None:
+        self.fault = fault
+        self.seen = 0
+
+    @property
+    def spent(self) -> bool:
+        return self.fault.count is not None and self.seen >= self.fault.skip + self.fault.count
+
+    def hits(self, ids: tuple[int, ...], instruction: str) -> bool:
+        if self.spent or not self.fault.strikes(ids, instruction):
+            return False
+        self.seen += 1
+        return self.seen > self.fault.skip
+
+
+class Script:
+    """The faults of answers in force on one bus."""
+
+    def __init__(self) -> None:
+        self._active: list[_Active] = []
+
+    def add(self, fault: AnswerFault) -> None:
+        """Bring a fault into force; faults act in the order they were added."""
+        self._active.append(_Active(fault))
+
+    def unmute(self, ids: tuple[int, ...] | None) -> None:
+        """End the mutes that name one of these ids; without ids, all."""
+        self._active = [a for a in self._active if not (isinstance(a.fault, Mute) and _overlap(a.fault.ids, ids))]
+
+    def heal(self) -> None:
+        """End all."""
+        self._active.clear()
+
+    def silences(self, device_id: int, instruction: str) -> bool:
+        """Whether this answer is not given at all; counts as one matched."""
+        return any(a.hits((device_id,), instruction) for a in self._active if isinstance(a.fault, Mute))
+
+    def shape(self, answer: bytes, ids: tuple[int, ...], instruction: str) -> list[Piece]:
+        """The answer as the faults in force leave it."""
+        pieces = [Piece(answer)]
+        for active in self._active:
+            if not isinstance(active.fault, Mute) and active.hits(ids, instruction):
+                pieces = active.fault.shape(pieces)
+        self._active = [active for active in self._active if not active.spent]
+        return pieces
+
+
+def _overlap(some: tuple[int, ...] | None, others: tuple[int, ...] | None) -> bool:
+    return some is None or others is None or bool(set(some) & set(others))

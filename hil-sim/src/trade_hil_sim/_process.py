@@ -1,0 +1,170 @@
+"""A simulator in a process of its own, as tests and demos use it."""
+
+import contextlib
+import os
+import select
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+import msgspec
+
+from ._client import SimControl
+from ._errors import SimulationError
+from ._judge import read_log
+from ._log import Entry
+
+__all__ = ["Ready", "SimProcess"]
+
+READY_S: Final = 30.0
+"""How long a simulator may take to start; a busy machine needs seconds to import."""
+END_S: Final = 5.0
+
+
+class Ready(msgspec.Struct, frozen=True):
+    """The one line a simulator prints when all its ports can be opened."""
+
+    ready: bool
+    ports: dict[str, str]
+    log: str | None
+    control: str
+
+
+class SimProcess:
+    """Simulates the buses of a robot file in a process of its own, which ends with this one at the latest.
+
+    Args:
+        robot_file: which robot.
+        buses: only these; default: all.
+        log: file for the byte log; default: one that `close` removes.
+        directory: where ports and control socket go; default: a temporary one that `close` removes.
+        paced: take as long as the real wires.
+        ready_s: how long it may take to start, in seconds.
+
+    Raises:
+        SimulationError: it did not start; with what it said.
+    """
+
+    def __init__(
+        self,
+        robot_file: Path | str,
+        *,
+        buses: Sequence[str] = (),
+        log: Path | None = None,
+        directory: Path | None = None,
+        paced: bool = True,
+        ready_s: float = READY_S,
+    ) -> None:
+        self._own = Path(tempfile.mkdtemp(prefix="trade-sim-"))
+        self._control: SimControl | None = None
+        where = directory or self._own
+        command = [sys.executable, "-m", "trade_hil_sim", str(robot_file), "--dir", str(where)]
+        command += ["--control", str(self._own / "_control"), "--log", str(log or self._own / "_log.jsonl")]
+        command += ["--parent", str(os.getpid()), *(["--unpaced"] if not paced else [])]
+        command += [word for bus in buses for word in ("--bus", bus)]
+        with (self._own / "_stderr").open("wb") as complaints:
+            self._process = subprocess.Popen(  # noqa: S603  # our own module
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=complaints,
+                start_new_session=True,  # Ctrl-C is for the driver: it needs its devices to leave them in order
+            )
+        try:
+            self._ready = self._wait_ready(ready_s)
+            self._control = SimControl(self._ready.control)
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def ports(self) -> dict[str, str]:
+        """What to open for each bus."""
+        return dict(self._ready.ports)
+
+    @property
+    def log_path(self) -> Path:
+        """The byte log, being written."""
+        return Path(self._ready.log or "")
+
+    @property
+    def control(self) -> SimControl:
+        """Makes things happen in the simulator."""
+        if self._control is None:
+            raise SimulationError("the simulator has been closed")
+        return self._control
+
+    @property
+    def control_path(self) -> Path:
+        """The control socket, for a `SimControl` of another process."""
+        return Path(self._ready.control)
+
+    @property
+    def running(self) -> bool:
+        """Whether it has not ended."""
+        return self._process.poll() is None
+
+    @property
+    def pid(self) -> int:
+        """Its process id."""
+        return self._process.pid
+
+    def entries(self) -> list[Entry]:
+        """The byte log so far."""
+        return read_log(self.log_path)
+
+    def kill(self) -> None:
+        """End it at once, as a power cut does to the computer it runs on; links stay behind until `close`."""
+        self._process.kill()
+        self._process.wait(END_S)
+
+    def close(self) -> None:
+        """End it and remove what it left, the log with it unless one was named. Idempotent."""
+        if self._control is not None:
+            self._control.close()
+            self._control = None
+        self._end()
+        if self._process.stdout is not None:
+            self._process.stdout.close()
+        shutil.rmtree(self._own, ignore_errors=True)
+
+    def __enter__(self) -> "SimProcess":
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    def _end(self) -> None:
+        if self._process.poll() is None:
+            self._process.terminate()
+        try:
+            self._process.wait(END_S)
+        except subprocess.TimeoutExpired:
+            self.kill()
+
+    def _wait_ready(self, ready_s: float) -> Ready:
+        line = self._first_line(time.monotonic() + ready_s)
+        if not line.endswith(b"\n"):
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self._process.wait(0.5)
+            said = (self._own / "_stderr").read_text(errors="replace").strip()
+            state = "ended" if self._process.poll() is not None else f"was not ready after {ready_s:g} s"
+            raise SimulationError(f"the simulator {state}: {said or 'it said nothing'}")
+        return msgspec.json.decode(line, type=Ready)
+
+    def _first_line(self, deadline: float) -> bytes:
+        if self._process.stdout is None:
+            return b""
+        fd, line = self._process.stdout.fileno(), b""
+        while b"\n" not in line:
+            readable, _, _ = select.select([fd], [], [], max(0.0, deadline - time.monotonic()))
+            data = os.read(fd, 4096) if readable else b""
+            if not data:
+                return line
+            line += data
+        return line

@@ -1,0 +1,109 @@
+"""From a robot file to simulated buses: which class simulates which driver. The only module that reads robot files."""
+
+from collections.abc import Sequence
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from typing import Final, Protocol, cast
+
+from trade_drivers.robotfile import Bus, Joint, Robot, parse
+
+from ._errors import SimulationError
+from ._faults import Command
+from ._log import ByteLog
+from ._state import BusState
+
+__all__ = ["SimulatedBus", "SimulatedBusClass", "buses_of", "find_simulator", "read_robot"]
+
+GROUP: Final = "trade.sims"
+"""Entry points of this group are `SimulatedBusClass`es; their names are those of the drivers they stand in for."""
+
+
+class SimulatedBus(Protocol):
+    """One bus with its devices, behind one port."""
+
+    @property
+    def name(self) -> str:
+        """Its name in the robot file."""
+        ...
+
+    @property
+    def port(self) -> Path:
+        """What a client opens."""
+        ...
+
+    def open(self) -> object:
+        """From now on the port can be opened."""
+        ...
+
+    def close(self) -> None:
+        """Free everything; idempotent."""
+        ...
+
+    def do(self, command: Command) -> None:
+        """Carry out a fault or an order; raises `SimulationError` for what it has not got."""
+        ...
+
+    def state(self) -> BusState:
+        """The truth about its devices."""
+        ...
+
+
+class SimulatedBusClass(Protocol):
+    """What an entry point of the group ``trade.sims`` names."""
+
+    def from_robot(
+        self, bus: Bus, joints: Sequence[Joint], port: Path, *, log: ByteLog | None = None, paced: bool = True
+    ) -> SimulatedBus:
+        """Make the bus a robot file describes, not yet open; raises `SimulationError` naming what it cannot do."""
+        ...
+
+
+def read_robot(path: Path) -> Robot:
+    """Read a robot file; raises what `trade_drivers.robotfile.parse` raises, and `OSError`."""
+    return parse(path.read_text(encoding="utf-8"), str(path))
+
+
+def buses_of(
+    robot: Robot, directory: Path, *, names: Sequence[str] = (), log: ByteLog | None = None, paced: bool = True
+) -> list[SimulatedBus]:
+    """Simulate the buses of a robot, not yet open; each gets the port ``directory / name``.
+
+    Args:
+        robot: from `read_robot`.
+        directory: where the ports go.
+        names: which buses; default: all.
+        log: where all of them record.
+        paced: take as long as the real wires.
+    """
+    known = {bus.name for bus in robot.buses}
+    for name in names:
+        if name not in known:
+            raise SimulationError(f"{robot.where} has no bus {name!r}; it has {', '.join(sorted(known))}")
+    return [
+        find_simulator(bus.driver).from_robot(
+            bus, robot.joints_on(bus.name), directory / bus.name, log=log, paced=paced
+        )
+        for bus in robot.buses
+        if not names or bus.name in names
+    ]
+
+
+def find_simulator(driver: str, installed: Sequence[EntryPoint] | None = None) -> SimulatedBusClass:
+    """The class that simulates what a driver talks to.
+
+    Args:
+        driver: its name in robot files.
+        installed: where to look; default: the entry points of all installed packages.
+
+    Raises:
+        SimulationError: there is none, or more than one.
+    """
+    offered = list(entry_points(group=GROUP) if installed is None else installed)
+    values = sorted({point.value for point in offered if point.name == driver})
+    if len(values) > 1:
+        raise SimulationError(f"two simulators are named {driver!r}: {' and '.join(values)}; uninstall one")
+    if not values:
+        known = ", ".join(sorted({point.name for point in offered})) or "none"
+        raise SimulationError(f"nothing simulates driver {driver!r}; simulated are: {known}")
+    point = next(point for point in offered if point.name == driver)
+    return cast("SimulatedBusClass", point.load())

@@ -1,0 +1,26 @@
+"""Simulated Dynamixel servos on Protocol 2.0: the bytes of the X series, without the hardware."""
+
+from ._bus import DynamixelBus
+from ._protocol import ErrorCode, Instruction, Packet, PacketReader, crc16, encode, status
+from ._rules import HardwareError
+from ._servo import Servo
+from ._table import MODELS, XL430_W250, XM430_W350, Access, Model, Register
+
+__all__ = [
+    "MODELS",
+    "XL430_W250",
+    "XM430_W350",
+    "Access",
+    "DynamixelBus",
+    "ErrorCode",
+    "HardwareError",
+    "Instruction",
+    "Model",
+    "Packet",
+    "PacketReader",
+    "Register",
+    "Servo",
+    "crc16",
+    "encode",
+    "status",
+]

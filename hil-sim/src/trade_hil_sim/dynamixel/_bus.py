@@ -1,0 +1,268 @@
+"""A simulated Dynamixel bus: servos behind one serial line, with a log and scripted faults."""
+
+import threading
+import time
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import msgspec
+
+from trade_hil_sim import _faults as faults
+from trade_hil_sim._errors import SimulationError
+from trade_hil_sim._line import SerialLine
+from trade_hil_sim._log import ByteLog
+from trade_hil_sim._state import BusState
+
+from ._dispatch import Dispatch
+from ._journal import Journal
+from ._protocol import BROADCAST, Packet, PacketReader
+from ._servo import Servo
+from ._table import BAUDS, CENTRE, MODELS, RAD_PER_COUNT
+
+if TYPE_CHECKING:
+    from trade_drivers.robotfile import Bus, Joint
+
+__all__ = ["DynamixelBus"]
+
+PAUSE_S: Final = 0.1
+"""A packet whose next byte has not come after this long is given up."""
+
+
+class DynamixelBus:
+    """Servos on one serial line; a client opens `port` as it would a real adapter.
+
+    Args:
+        servos: on the bus; two of one id answer on top of each other.
+        port: stable path the client opens; made here, gone after `close`.
+        name: of the bus, in the log.
+        log: where to record; default: a log in memory, at `log`.
+        paced: take as long as the real wire, return delays included; else answer as fast as possible.
+        clock: the servos' clock, in seconds. The line itself keeps real time.
+    """
+
+    def __init__(
+        self,
+        servos: Iterable[Servo],
+        port: Path,
+        *,
+        name: str = "bus",
+        log: ByteLog | None = None,
+        paced: bool = True,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.name, self.port = name, port
+        self.log = ByteLog() if log is None else log
+        self._clock = clock
+        self._servos = list(servos)
+        self._lock = threading.RLock()
+        self._script = faults.Script()
+        self._journal = Journal(self.log, name, self._servos)
+        self._dispatch = Dispatch(self._script.silences, self._journal.refused)
+        self._reader = PacketReader()
+        self._last_byte_at = 0.0
+        self._echo = False
+        self._deaf_to: int | None = None
+        for servo in self._servos:
+            servo.emit = self._journal.event
+        self._line = SerialLine(port, self, name=name, log=self.log, paced=paced)
+
+    @classmethod
+    def from_robot(
+        cls, bus: "Bus", joints: "Sequence[Joint]", port: Path, *, log: ByteLog | None = None, paced: bool = True
+    ) -> "DynamixelBus":
+        """The bus a robot file describes, each joint at its zero (or as near as its limits allow).
+
+        Args:
+            bus: the bus's record.
+            joints: the joints on it.
+            port: path the client will open instead of the record's.
+            log: where to record.
+            paced: take as long as the real wire.
+
+        Raises:
+            SimulationError: a model or baud rate that is not simulated.
+        """
+        clock = time.monotonic
+        servos = [_servo_for(bus, joint, clock()) for joint in joints]
+        return cls(servos, port, name=bus.name, log=log, paced=paced, clock=clock)
+
+    def open(self) -> "DynamixelBus":
+        """Plug in: from now on the port can be opened."""
+        self._line.open()
+        return self
+
+    def close(self) -> None:
+        """Hang up and remove the port. Idempotent; a log passed in stays open."""
+        self._line.close()
+
+    def __enter__(self) -> "DynamixelBus":
+        return self.open()
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    @property
+    def servos(self) -> Sequence[Servo]:
+        """The servos; take care, the bus's own thread uses them, too."""
+        return tuple(self._servos)
+
+    def state(self) -> BusState:
+        """The truth about the bus and its servos, now."""
+        with self._lock:
+            t = self._clock()
+            devices = [msgspec.structs.replace(servo.state(t), bus=self.name) for servo in self._servos]
+        return BusState(name=self.name, port=str(self.port), plugged=self._line.plugged, devices=devices)
+
+    # faults and orders
+
+    def do(self, command: faults.Command) -> None:
+        """Carry out one fault or order; raises `SimulationError` for a device that is not here."""
+        match command:
+            case faults.Unplug():
+                self._line.unplug()
+            case faults.Replug():
+                self._line.replug()
+            case _:
+                with self._lock:
+                    self._do_here(command)
+                self._line.nudge()
+
+    def _do_here(self, command: faults.Command) -> None:
+        match command:
+            case faults.AnswerFault():
+                self._named(command.ids)
+                self._script.add(command)
+            case faults.Unmute():
+                self._named(command.ids)
+                self._script.unmute(command.ids)
+            case faults.Heal():
+                self._heal()
+            case faults.Echo():
+                self._echo = command.on
+            case _:
+                self._do_to_devices(command)
+
+    def _do_to_devices(self, command: faults.Command) -> None:
+        if isinstance(
+            command, (faults.AnswerFault, faults.Unmute, faults.Heal, faults.Echo, faults.Unplug, faults.Replug)
+        ):
+            return
+        t = self._clock()
+        for servo in self._named(command.ids):
+            servo.advance(t)
+            _do_to(servo, command, t)
+
+    def _heal(self) -> None:
+        t = self._clock()
+        self._script.heal()
+        self._echo = False
+        for servo in self._servos:
+            servo.advance(t)
+            servo.absent = False
+            servo.freeze_sensor(False, t)
+            servo.jam(False, t)
+            servo.table.set("model_number", servo.model.number)
+
+    def _named(self, ids: tuple[int, ...] | None) -> list[Servo]:
+        here = {servo.device_id for servo in self._servos}
+        if unknown := set(ids or ()) - here:
+            raise SimulationError(f"bus {self.name} has no device {sorted(unknown)}; it has {sorted(here)}")
+        return [servo for servo in self._servos if ids is None or servo.device_id in ids]
+
+    # the far end of the line; called from its thread
+
+    def wake_in_s(self) -> float | None:
+        """Seconds until a servo does something by itself."""
+        with self._lock:
+            due = min((due for servo in self._servos if (due := servo.next_due()) is not None), default=None)
+            return None if due is None else due - self._clock()
+
+    def wake(self) -> None:
+        """Let the servos do what is due."""
+        with self._lock:
+            t = self._clock()
+            for servo in self._servos:
+                servo.advance(t)
+
+    def received(self, data: bytes, t: float) -> None:
+        """Bytes from the client."""
+        if self._echo:
+            self._line.send(data, name="echo")
+        if t - self._last_byte_at > PAUSE_S:
+            self._reader.reset()
+        self._last_byte_at = t
+        with self._lock:
+            hearing = self._hearing(t)
+            for packet in self._reader.feed(data) if hearing else ():
+                self._carry_out([servo for servo in hearing if servo.hears], packet, t)
+
+    def _hearing(self, t: float) -> list[Servo]:
+        """Servos set to the baud rate the client speaks at; to others it is noise."""
+        baud = self._line.client_baud
+        hearing = [servo for servo in self._servos if baud is None or servo.baud == baud]
+        if hearing:
+            self._deaf_to = None
+        elif baud != self._deaf_to:
+            self._deaf_to = baud
+            self._journal.wrong_baud(t, baud)
+            self._reader.reset()
+        return hearing
+
+    def _carry_out(self, servos: list[Servo], packet: Packet, t: float) -> None:
+        now = self._clock()
+        self._journal.instruction(packet, t)
+        if packet.intact:
+            for servo in servos:
+                servo.heard(now)
+        for answer in self._dispatch.answers(servos, packet, now):
+            delay_s = answer.delay_s
+            for data, late_s in self._script.shape(answer.data, answer.ids, packet.name):
+                device_id = answer.ids[0] if len(answer.ids) == 1 else BROADCAST
+                self._line.send(data, after_s=delay_s, late_s=late_s, name=packet.name, device_id=device_id)
+                delay_s = 0.0
+
+
+def _servo_for(bus: "Bus", joint: "Joint", t: float) -> Servo:
+    model = MODELS.get(joint.model)
+    if model is None:
+        known = ", ".join(sorted(MODELS))
+        raise SimulationError(f'joint."{joint.name}".model: {joint.model!r} is not simulated; there is {known}')
+    if bus.baud not in BAUDS:
+        known = ", ".join(str(baud) for baud in BAUDS)
+        raise SimulationError(f"bus.{bus.name}.baud: {bus.baud} is no rate of a {model.name}; there is {known}")
+    angle_rad = max(joint.min_rad, min(joint.max_rad, 0.0))
+    sign = -1 if joint.reversed else 1
+    counts = CENTRE + round(sign * (angle_rad - joint.offset_rad) / RAD_PER_COUNT)
+    return Servo(
+        joint.id,
+        model,
+        position_counts=counts,
+        baud=bus.baud,
+        joint=joint.name,
+        reversed_=joint.reversed,
+        offset_rad=joint.offset_rad,
+        t=t,
+    )
+
+
+def _do_to(servo: Servo, command: faults.Command, t: float) -> None:
+    match command:
+        case faults.Absent():
+            servo.absent = command.on
+        case faults.Freeze():
+            servo.freeze_sensor(command.on, t, tick=command.tick)
+        case faults.Jam():
+            servo.jam(command.on, t)
+        case faults.WrongModel():
+            servo.table.set("model_number", command.number)
+        case faults.BrownOut():
+            servo.reboot(t, "brown_out")
+        case faults.HardwareFault():
+            servo.fail(command.bits, t)
+        case faults.Supply():
+            servo.set_supply(t, voltage_v=command.voltage_v, temperature_c=command.temperature_c)
+        case faults.Place():
+            servo.place(command.counts, t)
+        case _:
+            raise SimulationError(f"{command} is not for one device")

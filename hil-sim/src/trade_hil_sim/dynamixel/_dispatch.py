@@ -1,0 +1,212 @@
+"""Who carries out an instruction on the bus, and who answers what in which order. No port, no waiting."""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from itertools import zip_longest
+from typing import Final, TypeVar
+
+from ._memory import Refusal
+from ._protocol import BROADCAST, ErrorCode, Instruction, JoinedStatus, Packet, status
+from ._requests import JOINED, Reading, Writing, readings, writings
+from ._servo import Servo
+
+__all__ = ["Answer", "Dispatch"]
+
+READING: Final = frozenset({Instruction.PING, Instruction.READ, Instruction.SYNC_READ, Instruction.BULK_READ}) | JOINED
+GROUP_READS: Final = frozenset({Instruction.SYNC_READ, Instruction.BULK_READ})
+GROUP_WRITES: Final = frozenset({Instruction.SYNC_WRITE, Instruction.BULK_WRITE})
+
+_Wish = TypeVar("_Wish", Reading, Writing)
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """One answer on its way out."""
+
+    ids: tuple[int, ...]
+    data: bytes
+    delay_s: float
+    """The device's return delay."""
+
+
+class Dispatch:
+    """Hands an instruction to the servos on a bus.
+
+    Args:
+        silent: whether a device's answer is suppressed by a fault: device id, instruction name.
+        refused: told of every instruction a servo does not carry out: servo, time, reason.
+    """
+
+    def __init__(self, silent: Callable[[int, str], bool], refused: Callable[[Servo, float, str], None]) -> None:
+        self._silent = silent
+        self._refused = refused
+
+    def answers(self, servos: Sequence[Servo], packet: Packet, t: float) -> list[Answer]:
+        """Carry out one packet on the servos that hear it; return what comes back, in order."""
+        if not packet.intact:
+            return self._to_one(servos, packet, t, _complain_of_crc)
+        if packet.instruction in JOINED:
+            return self._joined(servos, packet, t)
+        if packet.instruction in GROUP_READS:
+            return self._group_read(servos, packet, t)
+        if packet.instruction in GROUP_WRITES:
+            self._group_write(servos, packet, t)
+            return []
+        if packet.device_id == BROADCAST:
+            return self._to_all(servos, packet, t)
+        return self._to_one(servos, packet, t, lambda servo: _carry_out(servo, packet, t))
+
+    # to one device, or to all
+
+    def _to_one(self, servos: Sequence[Servo], packet: Packet, t: float, act: Callable[[Servo], bytes]) -> list[Answer]:
+        for servo in _shadows(servos, packet.device_id):
+            self._obey_shadow(servo, packet, t)
+        answers = [self._answer(servo, packet, t, act) for servo in servos if servo.device_id == packet.device_id]
+        return _collided([answer for answer in answers if answer is not None])
+
+    def _to_all(self, servos: Sequence[Servo], packet: Packet, t: float) -> list[Answer]:
+        found: list[Answer] = []
+        for device_id in sorted({servo.device_id for servo in servos}):
+            twins = [servo for servo in servos if servo.device_id == device_id]
+            answers = [self._answer(servo, packet, t, lambda one: _carry_out(one, packet, t)) for servo in twins]
+            found += _collided([answer for answer in answers if answer is not None])
+        return found
+
+    def _answer(self, servo: Servo, packet: Packet, t: float, act: Callable[[Servo], bytes]) -> Answer | None:
+        device_id, code, params = servo.device_id, ErrorCode.NONE, b""
+        delay_s, level = servo.return_delay_s, servo.status_return_level
+        try:
+            params = act(servo)
+        except Refusal as refusal:
+            code = refusal.code
+            self._refused(servo, t, f"error {code.value}: {refusal}")
+        needed = _level_needed(packet)
+        if level < needed or self._silent(device_id, packet.name):
+            return None
+        return Answer((device_id,), status(device_id, servo.error_field(code), params), delay_s)
+
+    def _obey_shadow(self, servo: Servo, packet: Packet, t: float) -> None:
+        if packet.intact and packet.instruction == Instruction.WRITE:
+            self._write(servo, writings(packet), t, by_shadow_id=True)
+
+    # to some
+
+    def _group_read(self, servos: Sequence[Servo], packet: Packet, t: float) -> list[Answer]:
+        found: list[Answer] = []
+        for wish in readings(packet) or []:
+            alone = Packet(wish.device_id, packet.instruction, b"")
+            twins = [servo for servo in servos if servo.device_id == wish.device_id]
+            answers = [self._answer(servo, alone, t, _reader(wish, t)) for servo in twins]
+            found += _collided([answer for answer in answers if answer is not None])
+        return found
+
+    def _joined(self, servos: Sequence[Servo], packet: Packet, t: float) -> list[Answer]:
+        """One answer made by all; a device that is silent leaves those behind it without their cue."""
+        wishes = readings(packet) or []
+        joined = JoinedStatus(sum(wish.length for wish in wishes), len(wishes))
+        ids: list[int] = []
+        delay_s = 0.0
+        for wish in wishes:
+            servo = next((servo for servo in servos if servo.device_id == wish.device_id), None)
+            if servo is None or servo.status_return_level < 1 or self._silent(wish.device_id, packet.name):
+                break
+            delay_s = delay_s or servo.return_delay_s
+            ids.append(wish.device_id)
+            self._add_block(joined, servo, wish, t)
+        return [Answer(tuple(ids), bytes(joined), delay_s)] if ids else []
+
+    def _add_block(self, joined: JoinedStatus, servo: Servo, wish: Reading, t: float) -> None:
+        try:
+            data = servo.read(wish.address, wish.length, t)
+        except Refusal as refusal:
+            self._refused(servo, t, f"error {refusal.code.value}: {refusal}")
+            joined.add(wish.device_id, servo.error_field(refusal.code), bytes(wish.length))
+        else:
+            joined.add(wish.device_id, servo.error_field(), data)
+
+    def _group_write(self, servos: Sequence[Servo], packet: Packet, t: float) -> None:
+        for wish in writings(packet) or []:
+            for servo in servos:
+                if servo.device_id == wish.device_id:
+                    self._write(servo, [wish], t)
+            for servo in _shadows(servos, wish.device_id):
+                self._write(servo, [wish], t, by_shadow_id=True)
+
+    def _write(self, servo: Servo, wishes: Iterable[Writing] | None, t: float, *, by_shadow_id: bool = False) -> None:
+        for wish in wishes or []:
+            try:
+                servo.write(wish.address, wish.data, t, by_shadow_id=by_shadow_id)
+            except Refusal as refusal:
+                self._refused(servo, t, f"error {refusal.code.value}: {refusal}")
+
+
+def _level_needed(packet: Packet) -> int:
+    """The status return level from which an instruction is answered; 3 if never."""
+    if packet.instruction == Instruction.PING:
+        return 0
+    if packet.device_id == BROADCAST:
+        return 3
+    return 1 if packet.instruction in READING else 2
+
+
+def _shadows(servos: Iterable[Servo], device_id: int) -> list[Servo]:
+    return [servo for servo in servos if servo.shadow_id == device_id]
+
+
+def _collided(answers: list[Answer]) -> list[Answer]:
+    """Devices with one id answer on top of each other: the bytes of all come, none of them where it belongs."""
+    if len(answers) < 2:
+        return answers
+    mixed = bytes(byte for bytes_ in zip_longest(*(a.data for a in answers)) for byte in bytes_ if byte is not None)
+    return [Answer(answers[0].ids, mixed, min(a.delay_s for a in answers))]
+
+
+def _reader(wish: Reading, t: float) -> Callable[[Servo], bytes]:
+    return lambda servo: servo.read(wish.address, wish.length, t)
+
+
+def _complain_of_crc(_: Servo) -> bytes:
+    raise Refusal(ErrorCode.CRC, "CRC of the instruction does not match")
+
+
+def _carry_out(servo: Servo, packet: Packet, t: float) -> bytes:
+    """Carry out a packet for one servo; return the parameters of its answer."""
+    match packet.instruction:
+        case Instruction.PING:
+            identity = servo.read(0, 7, t)
+            return identity[:2] + identity[6:]
+        case Instruction.READ:
+            wish = _sensible(readings(packet))[0]
+            return servo.read(wish.address, wish.length, t) if packet.device_id != BROADCAST else b""
+        case Instruction.WRITE:
+            wish = _sensible(writings(packet))[0]
+            servo.write(wish.address, wish.data, t)
+        case Instruction.REG_WRITE:
+            wish = _sensible(writings(packet))[0]
+            servo.reg_write(wish.address, wish.data)
+        case _:
+            _carry_out_rare(servo, packet, t)
+    return b""
+
+
+def _carry_out_rare(servo: Servo, packet: Packet, t: float) -> None:
+    match packet.instruction:
+        case Instruction.ACTION:
+            servo.action(t)
+        case Instruction.REBOOT:
+            servo.reboot(t)
+        case Instruction.CLEAR:
+            servo.clear(packet.params, t)
+        case Instruction.FACTORY_RESET:
+            option = packet.params[0] if len(packet.params) == 1 else -1
+            if packet.device_id == BROADCAST and option == 0xFF:
+                raise Refusal(ErrorCode.RESULT_FAIL, "factory reset of everything is not open to id 254")
+            servo.factory_reset(option, t)
+        case _:
+            raise Refusal(ErrorCode.INSTRUCTION, f"instruction {packet.name} is not one of mine")
+
+
+def _sensible(wishes: list[_Wish] | None) -> list[_Wish]:
+    if wishes is None:
+        raise Refusal(ErrorCode.DATA_LENGTH, "parameters too short or too long")
+    return wishes

@@ -1,0 +1,138 @@
+"""The simulator as a process of its own: ready line, clean end, and no life after its parent."""
+
+import json
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+import serial
+
+from trade_hil_sim import SimProcess, SimulationError, events, instructions, read_log
+from trade_hil_sim.dynamixel import encode
+
+COMMAND = [sys.executable, "-m", "trade_hil_sim"]
+
+
+def ping(port: str, device_id: int, baud: int = 1_000_000) -> bytes:
+    with serial.Serial(port, baud, timeout=10) as line:
+        line.write(encode(device_id, 1))
+        return line.read(14)
+
+
+def test_it_simulates_all_buses_of_a_robot_file(robot_file: Path) -> None:
+    with SimProcess(robot_file) as sim:
+        assert set(sim.ports) == {"neck", "arm"}
+        assert ping(sim.ports["neck"], 1)[9:11] == (1060).to_bytes(2, "little")
+        assert ping(sim.ports["arm"], 3, 57_600)[9:11] == (1020).to_bytes(2, "little")
+        assert [(e.bus, e.name, e.device_id) for e in instructions(sim.entries())] == [
+            ("neck", "ping", 1),
+            ("arm", "ping", 3),
+        ]
+        sim.control.unplug("neck")
+        assert not Path(sim.ports["neck"]).exists()
+        ports, log = sim.ports, sim.log_path
+    assert not any(Path(p).is_symlink() for p in [*ports.values(), str(log)])
+    sim.close()
+
+
+def test_what_it_logged_outlives_it_if_a_file_was_named(robot_file: Path, tmp_path: Path) -> None:
+    with SimProcess(robot_file, log=tmp_path / "log", directory=tmp_path / "ports", buses=["neck"]) as sim:
+        assert sim.ports == {"neck": str(tmp_path / "ports" / "neck")}
+        ping(sim.ports["neck"], 2)
+        sim.kill()
+        # nothing is lost, not even to SIGKILL
+        assert len(instructions(read_log(tmp_path / "log"), device_id=2)) == 1
+    assert len(read_log(tmp_path / "log")) >= 3
+
+
+def test_its_times_are_this_process_times(robot_file: Path) -> None:
+    import time
+
+    with SimProcess(robot_file, paced=False) as sim:
+        before = time.monotonic()
+        ping(sim.ports["neck"], 1)
+        after = time.monotonic()
+        assert len(instructions(sim.entries(), since=before, until=after)) == 1
+
+
+def test_faults_come_in_while_it_runs(robot_file: Path, wait_until: Any) -> None:
+    with SimProcess(robot_file) as sim:
+        sim.control.brown_out([1])
+        wait_until(lambda: events(sim.entries(), "booted", device_id=1), "the servo's return")
+        assert sim.control.device("neck.pan").torque is False
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_ends_it_cleanly(robot_file: Path, tmp_path: Path, number: signal.Signals) -> None:
+    place = tmp_path / "d"
+    with subprocess.Popen([*COMMAND, str(robot_file), "--dir", str(place)], stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        ready = json.loads(process.stdout.readline())
+        assert ready == {
+            "ready": True,
+            "ports": {"neck": str(place / "neck"), "arm": str(place / "arm")},
+            "log": None,
+            "control": str(place / "_control"),
+        }
+        assert sorted(p.name for p in place.iterdir()) == ["_control", "arm", "neck"]
+        process.send_signal(number)
+        assert process.wait(20) == 0
+    assert list(place.iterdir()) == []
+
+
+def test_it_ends_when_its_parent_is_killed(robot_file: Path, wait_until: Any) -> None:
+    code = """
+import sys
+from trade_hil_sim import SimProcess
+sim = SimProcess(sys.argv[1])
+print(sim.pid, sim.ports["neck"], flush=True)
+sys.stdin.read()
+"""
+    command = [sys.executable, "-c", code, str(robot_file)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as parent:
+        assert parent.stdout is not None
+        pid, name = parent.stdout.readline().decode().split()
+        child, port = psutil.Process(int(pid)), Path(name)
+        assert port.is_symlink()
+        parent.kill()
+        wait_until(lambda: not child.is_running() or child.status() == psutil.STATUS_ZOMBIE, "the child's end")
+        assert not port.is_symlink()
+        shutil.rmtree(port.parent)
+
+
+def test_it_ends_when_standard_input_does(robot_file: Path) -> None:
+    command = [*COMMAND, str(robot_file), "--stdin"]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        assert process.stdin is not None
+        assert json.loads(process.stdout.readline())["ready"]
+        process.stdin.write(b"words are ignored\n")
+        process.stdin.close()
+        assert process.wait(20) == 0
+
+
+def test_a_robot_file_it_cannot_use_is_told_on_standard_error(robot_file: Path, tmp_path: Path) -> None:
+    with pytest.raises(SimulationError, match=r"nothere\.toml"):
+        SimProcess(tmp_path / "nothere.toml")
+    robot_file.write_text(robot_file.read_text().replace("XM430-W350", "AX-12A"))
+    ended = subprocess.run([*COMMAND, str(robot_file)], capture_output=True, text=True, timeout=60, check=False)
+    assert (ended.returncode, ended.stdout) == (2, "")
+    assert ended.stderr.startswith("trade-hil-sim: ")
+    assert ended.stderr.count("\n") == 1
+
+
+def test_help_says_how_to_talk_to_it(robot_file: Path) -> None:
+    said = subprocess.run([*COMMAND, "--help"], capture_output=True, text=True, timeout=60, check=True).stdout
+    for word in ("--bus", "--log", "--control", "--unpaced", "--parent", "--stdin", '{"do": "mute", "ids": [1]}'):
+        assert word in said
+
+
+def test_the_package_alone_imports_nothing_of_ours() -> None:
+    code = "import trade_hil_sim, sys; print(sorted({'trade', 'trade_drivers', 'zenoh'} & set(sys.modules)))"
+    command = [sys.executable, "-W", "error", "-c", code]
+    assert subprocess.run(command, capture_output=True, timeout=60, check=True).stdout == b"[]\n"

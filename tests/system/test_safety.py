@@ -1,0 +1,136 @@
+"""Motion rules through the whole stack: a caller here, the driver in its own process, simulated servos in a third."""
+
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import psutil
+import pytest
+
+import trade
+from system.conftest import ROSIE, Program, wait_until
+from trade import Handle, where
+from trade.errors import ContainerLost, DeadlineExceeded, DeviceSilent, OutcomeUnknown
+from trade_hil_sim import SimProcess, events, motion_writes, received, writes
+
+
+class Bench:
+    """Simulated servos and, apart from them, a driver process."""
+
+    def __init__(self, sim: SimProcess, driver: Program) -> None:
+        self.sim = sim
+        self.driver = driver
+        driver.json()
+
+    def rests(self, joint: str) -> list[float]:
+        entries = events(self.sim.entries(), "at_rest")
+        return [entry.position_rad or 0.0 for entry in entries if entry.joint == joint]
+
+    def moving(self) -> bool:
+        return any(abs(device.velocity_rad_s) > 0 for bus in self.sim.control.state() for device in bus.devices)
+
+
+@pytest.fixture
+def bench(system: str, tmp_path: Path, run: Callable[..., Program]) -> Iterator[Bench]:
+    with SimProcess(ROSIE) as sim:
+        text = "\n".join(
+            f'port = "{sim.ports["neck"]}"' if line.startswith("port =") else line
+            for line in ROSIE.read_text(encoding="utf-8").splitlines()
+        )
+        robot_file = tmp_path / "rosie.toml"
+        robot_file.write_text(text, encoding="utf-8")
+        bench = Bench(sim, run("-m", "trade_gateway", "up", robot_file, "--json"))
+        yield bench
+        bench.driver.close()
+
+
+@pytest.fixture
+def look(bench: Bench) -> Handle:
+    return trade.find(where(name="move_to", group="rosie.head"), wait_s=30)
+
+
+def test_S01_a_frozen_driver_never_writes_what_has_expired(bench: Bench, look: Handle) -> None:
+    look([0.0, 0.0])
+    bench.driver.signal(signal.SIGSTOP)
+    frozen_at = time.monotonic()
+    try:
+        with pytest.raises((OutcomeUnknown, ContainerLost, DeadlineExceeded)):
+            look.with_(deadline_s=0.5)([0.5, 0.0])
+        wait_until(lambda: time.monotonic() > frozen_at + 1.5)
+    finally:
+        bench.driver.signal(signal.SIGCONT)
+    state = trade.find(where(name="state", group="rosie.head"), wait_s=30)
+    wait_until(lambda: _answers(state))  # the bus runs again, so what came before has been seen
+    assert writes(bench.sim.entries(), since=frozen_at, register="goal_position") == []
+    assert bench.rests("neck.pan") == []
+
+
+def _answers(state: Handle) -> bool:
+    try:
+        state()
+    except DeviceSilent:  # its newest measurement is from before
+        return False
+    return True
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+def test_S06_a_driver_that_dies_or_freezes_leaves_no_motion(number: int, bench: Bench, look: Handle) -> None:
+    run = look.with_(deadline_s=120).start([1.3, 0.0], speed_rad_s=0.05)
+    wait_until(bench.moving)
+    bench.driver.signal(number)
+    try:
+        wait_until(lambda: not bench.moving())
+        [rest] = bench.rests("neck.pan")
+        assert 0.0 < rest < 1.0
+        assert [entry.joint for entry in events(bench.sim.entries(), "watchdog_expired")]
+        with pytest.raises(ContainerLost):
+            run.result()
+    finally:
+        if number == signal.SIGSTOP:
+            bench.driver.signal(signal.SIGCONT)
+            os.kill(bench.driver.process.pid, signal.SIGTERM)
+
+
+def test_S20_a_second_robot_on_the_port_is_refused_and_sends_nothing(
+    bench: Bench, look: Handle, run: Callable[..., Program], tmp_path: Path
+) -> None:
+    bench.driver.signal(signal.SIGSTOP)  # what the log shows from now on is not the first driver's
+    try:
+        time_of_stop = time.monotonic()
+        second = run("-m", "trade_gateway", "up", tmp_path / "rosie.toml", "--name", "second", "--json")
+        assert second.wait() == 1
+        assert "neck" in "".join(second.errors)
+        heard = received(bench.sim.entries(), since=time_of_stop + 0.1)
+    finally:
+        bench.driver.signal(signal.SIGCONT)
+    assert heard == b""
+
+
+def test_S21_another_system_on_this_host_sees_nothing_and_moves_nothing(
+    bench: Bench, look: Handle, trade_command: Callable[..., object]
+) -> None:
+    called = trade_command("--system", "another", "call", "rosie.head.move_to", "[0.3, 0.0]", "--wait", "1")
+    assert called.returncode == 1
+    assert "NoSuchService" in called.stderr
+    assert motion_writes(bench.sim.entries()) == []
+
+
+def test_S21_a_driver_listens_on_the_loopback_interface_only(bench: Bench) -> None:
+    listening = [
+        connection.laddr.ip
+        for connection in psutil.Process(bench.driver.process.pid).net_connections(kind="inet")
+        if connection.status in (psutil.CONN_LISTEN, psutil.CONN_NONE)
+    ]
+    assert listening
+    assert set(listening) == {"127.0.0.1"}
+
+
+def test_S22_a_refused_command_is_typed_on_this_side_and_writes_no_byte(bench: Bench, look: Handle) -> None:
+    with pytest.raises(trade.errors.LimitExceeded) as refused:
+        look([0.1, 0.7])
+    assert (refused.value.what, refused.value.upper, refused.value.unit) == ("rosie.neck.tilt", 0.6, "rad")
+    with pytest.raises(trade.errors.InvalidArgument):
+        look([0.1, float("nan")])
+    assert motion_writes(bench.sim.entries()) == []
