@@ -14,6 +14,7 @@ import os
 import secrets
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Generator
 from pathlib import Path
@@ -35,9 +36,9 @@ class DemoFailed(Exception):
 
 
 @contextlib.contextmanager
-def robot_up() -> Generator[dict[str, str]]:
+def robot_up(log: Path) -> Generator[dict[str, str]]:
     """The driver container with simulated servos, in processes of their own; yields what it says when it is ready."""
-    command = [sys.executable, "-m", "trade_gateway", "up", str(ROBOT), "--sim", "--json"]
+    command = [sys.executable, "-m", "trade_gateway", "up", str(ROBOT), "--sim", "--sim-log", str(log), "--json"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as driver:
         try:
             assert driver.stdout is not None
@@ -77,8 +78,8 @@ def compare_with_log(path: Path, began_s: float) -> None:
         raise DemoFailed("the refused command reached the wire")
 
 
-def tell(mute: bool, stay: bool) -> None:
-    with robot_up() as ready:
+def tell(log: Path, *, mute: bool, stay: bool) -> None:
+    with robot_up(log) as ready:
         print(f"rosie is up: simulated servos, driver container {ready['container']!r}, system {ready['system']!r}\n")
         if mute:
             with SimControl(ready["control"]) as control:
@@ -87,24 +88,24 @@ def tell(mute: bool, stay: bool) -> None:
         began_s = time.monotonic()
         behave()
         print()
-        compare_with_log(Path(ready["log"]), began_s)
+        compare_with_log(log, began_s)
         look = trade.find(where(name="move_to", group="rosie.head"))
-        print("\na handle kept by this process, after the driver has left:")
         if stay:
-            wait_for_the_user(ready)
+            wait_for_the_user(log)
+    print("\na handle kept by this process, after the driver has left:")
     expect_gone(look)
-    with robot_up():
+    with robot_up(log.with_suffix(".again")):
         again = trade.find(where(name="move_to", group="rosie.head"), wait_s=PATIENCE_S)
         print(f"  the robot is back; a new look-up finds it and it looks at {again([0.3, -0.2])[0]:+.3f} rad")
 
 
-def wait_for_the_user(ready: dict[str, str]) -> None:
-    print("  (first, the robot stays up; Ctrl-C here ends it)\n")
+def wait_for_the_user(log: Path) -> None:
+    print("\nthe robot stays up; Ctrl-C here ends it\n")
     print("in another terminal:\n  source .venv/bin/activate")
     print(
         "  trade services --group rosie\n  trade call rosie.head.move_to '[0.3, -0.2]'\n  trade call rosie.head.state"
     )
-    print(f"the log of all bytes: {ready['log']}\n")
+    print(f"the log of all bytes: {log}\n")
     with contextlib.suppress(KeyboardInterrupt):
         while True:
             time.sleep(1)
@@ -130,7 +131,8 @@ def main() -> int:
     began_s = time.monotonic()
     try:
         trade.start(Settings.read(container="demo"))
-        tell(options.mute, options.stay)
+        with tempfile.TemporaryDirectory(prefix="trade-demo-") as folder:
+            tell(Path(folder) / "bytes.jsonl", mute=options.mute, stay=options.stay)
     except (DemoFailed, errors.TradeError, subprocess.TimeoutExpired) as failed:
         print(f"\nthe demo failed: {failed}", file=sys.stderr)
         return 1

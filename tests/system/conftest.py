@@ -115,10 +115,10 @@ def trade_command(system: str) -> Callable[..., subprocess.CompletedProcess[str]
 class Rosie:
     """``trade up examples/rosie.toml --sim``, ready."""
 
-    def __init__(self, program: Program) -> None:
+    def __init__(self, program: Program, log: Path) -> None:
         self.program = program
+        self.log = log
         self.ready = program.json()
-        self.log = Path(self.ready["log"])
 
 
 @pytest.fixture
@@ -128,7 +128,7 @@ def rosie_up(run: Callable[..., Program], tmp_path: Path) -> Callable[[], Rosie]
 
     def up() -> Rosie:
         log = tmp_path / f"bytes-{next(counter)}.jsonl"
-        return Rosie(run("-m", "trade_gateway", "up", ROSIE, "--sim", "--sim-log", log, "--json"))
+        return Rosie(run("-m", "trade_gateway", "up", ROSIE, "--sim", "--sim-log", log, "--json"), log)
 
     return up
 

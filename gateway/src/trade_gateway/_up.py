@@ -76,7 +76,7 @@ def _simulation(robot_file: Path, log: Path | None) -> Any:
         from trade_hil_sim import SimProcess  # noqa: PLC0415 - only needed without hardware
     except ImportError:
         raise ConfigurationError(where="--sim", problem="needs trade-hil-sim; pip install trade-hil-sim") from None
-    return SimProcess(robot_file, log=log)
+    return SimProcess(robot_file, log=log, logged=log is not None)
 
 
 def _say_attaching(out: Output, robot: Robot, ports: dict[str, str] | None) -> None:
@@ -89,7 +89,7 @@ def _say_ready(out: Output, robot: Robot, container: Container, simulation: Any)
     mine = [handle for handle in container.services() if handle.local and "trade" not in handle.groups]
     if out.as_json:
         ready = {"ready": True, "robot": robot.name, "container": container.name, "system": container.settings.system}
-        extra = {"log": str(simulation.log_path), "control": str(simulation.control_path)} if simulation else {}
+        extra = {"control": str(simulation.control_path)} if simulation else {}
         out.data({**ready, **extra, "services": [handle.label for handle in mine]})
         return
     out.say(f"[bold green]{robot.name} is up[/]: {len(mine)} services in container {container.name}")

@@ -42,6 +42,7 @@ class SimProcess:
         robot_file: which robot.
         buses: only these; default: all.
         log: file for the byte log; default: one that `close` removes.
+        logged: False writes no log: it grows by about 100 kB a second.
         directory: where ports and control socket go; default: a temporary one that `close` removes.
         paced: take as long as the real wires.
         ready_s: how long it may take to start, in seconds.
@@ -56,6 +57,7 @@ class SimProcess:
         *,
         buses: Sequence[str] = (),
         log: Path | None = None,
+        logged: bool = True,
         directory: Path | None = None,
         paced: bool = True,
         ready_s: float = READY_S,
@@ -64,7 +66,11 @@ class SimProcess:
         self._control: SimControl | None = None
         where = directory or self._own
         command = [sys.executable, "-m", "trade_hil_sim", str(robot_file), "--dir", str(where)]
-        command += ["--control", str(self._own / "_control"), "--log", str(log or self._own / "_log.jsonl")]
+        command += [
+            "--control",
+            str(self._own / "_control"),
+            *(["--log", str(log or self._own / "_log.jsonl")] if logged else []),
+        ]
         command += ["--parent", str(os.getpid()), *(["--unpaced"] if not paced else [])]
         command += [word for bus in buses for word in ("--bus", bus)]
         with (self._own / "_stderr").open("wb") as complaints:
@@ -89,8 +95,10 @@ class SimProcess:
 
     @property
     def log_path(self) -> Path:
-        """The byte log, being written."""
-        return Path(self._ready.log or "")
+        """The byte log, being written. Raises SimulationError if there is none."""
+        if self._ready.log is None:
+            raise SimulationError("this simulator writes no log; start it with logged=True")
+        return Path(self._ready.log)
 
     @property
     def control(self) -> SimControl:
