@@ -1,0 +1,28 @@
+"""Motors, grippers and arms as TRADE services: interfaces in SI units, the robot file, and drivers by vendor."""
+
+from trade_drivers._attach import AttachedRobot, attach
+from trade_drivers._driver import AttachedBus, Driver, drivers
+from trade_drivers._errors import BusGone, MotionStopped
+from trade_drivers._interfaces import JointGroup, JointLimits, Motor, MotorState
+from trade_drivers._load import load
+from trade_drivers.robotfile import Bus, Group, Joint, Robot, parse
+
+__all__ = [
+    "AttachedBus",
+    "AttachedRobot",
+    "Bus",
+    "BusGone",
+    "Driver",
+    "Group",
+    "Joint",
+    "JointGroup",
+    "JointLimits",
+    "MotionStopped",
+    "Motor",
+    "MotorState",
+    "Robot",
+    "attach",
+    "drivers",
+    "load",
+    "parse",
+]

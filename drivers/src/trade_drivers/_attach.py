@@ -1,0 +1,153 @@
+"""From a robot file to services: every bus attached first, every provider announced after, all undone by close."""
+
+import atexit
+import logging
+import threading
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+
+import trade
+from trade._service import marked_methods
+from trade.errors import ConfigurationError, TradeError
+from trade_drivers._driver import AttachedBus, load_driver
+from trade_drivers._interfaces import JointGroup, Motor
+from trade_drivers.robotfile import Group, Robot
+
+__all__ = ["AttachedRobot", "attach"]
+
+_log = logging.getLogger(__name__)
+
+Register = Callable[[object, str], object]
+Deregister = Callable[[object], object]
+
+
+class AttachedRobot:
+    """A robot whose devices are attached and whose services are announced, until it is closed."""
+
+    def __init__(self, robot: Robot, providers: Mapping[str, Motor | JointGroup], undo: ExitStack) -> None:
+        self.robot = robot
+        self.providers = dict(providers)
+        """By group: ``rosie.neck.pan`` -> its Motor, ``rosie.head`` -> its JointGroup."""
+        self._undo = undo
+        self._lock = threading.Lock()
+        atexit.register(self.close)
+
+    def motor(self, joint: str) -> Motor:
+        """The provider of a joint, named as in the robot file; KeyError if there is none."""
+        provider = self.providers[f"{self.robot.name}.{joint}"]
+        if not isinstance(provider, Motor):
+            raise KeyError(joint)
+        return provider
+
+    def group(self, name: str) -> JointGroup:
+        """The provider of a group, named as in the robot file; KeyError if there is none."""
+        provider = self.providers[f"{self.robot.name}.{name}"]
+        if not isinstance(provider, JointGroup):
+            raise KeyError(name)
+        return provider
+
+    def close(self) -> None:
+        """Withdraw the services, stop what moves, leave every device as the robot file asks. More than once is fine.
+
+        Raises:
+            TradeError: a device could not be left as asked; everything is closed all the same.
+        """
+        atexit.unregister(self.close)
+        with self._lock:
+            self._undo.close()
+
+    def __enter__(self) -> "AttachedRobot":
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+
+def _always() -> bool:
+    return True
+
+
+def attach(
+    robot: Robot,
+    *,
+    register: Register | None = None,
+    deregister: Deregister | None = None,
+    ports: Mapping[str, str] | None = None,
+    healthy: Callable[[], bool] = _always,
+) -> AttachedRobot:
+    """Attach all devices of a robot, then announce their services. Nothing is moved or enabled; what moves is stopped.
+
+    Joint ``neck.pan`` of robot ``rosie`` becomes a Motor in group ``rosie.neck.pan``, group ``head`` a JointGroup in
+    ``rosie.head``. If anything is wrong, nothing is announced and every port is let go of.
+
+    Args:
+        robot: what ``load`` read.
+        register: what announces a provider; ``trade.register`` by default.
+        deregister: its opposite; ``trade.deregister`` by default.
+        ports: bus name -> serial device, instead of the file's: for simulated devices.
+        healthy: asked by every bus thread in every cycle; while it says no, devices are told to hold once and the bus
+            falls silent, so that their own watchdogs stop them.
+
+    Raises:
+        ConfigurationError: a driver is missing, a port cannot be had, a device is absent, another, or set wrongly.
+    """
+    with ExitStack() as undo:
+        buses = _attach_buses(robot, ports or {}, healthy, undo)
+        providers = _providers(robot, buses)
+        for provider in providers.values():
+            _require_stop(provider)
+        for group, provider in providers.items():
+            (register or trade.register)(provider, group)
+            undo.callback(_withdraw, deregister or trade.deregister, provider)
+        return AttachedRobot(robot, providers, undo.pop_all())
+
+
+def _attach_buses(
+    robot: Robot, ports: Mapping[str, str], healthy: Callable[[], bool], undo: ExitStack
+) -> dict[str, AttachedBus]:
+    names = [bus.name for bus in robot.buses]
+    if unknown := sorted(set(ports) - set(names)):
+        problem = f"there is no bus {unknown[0]!r} to give a port to; there is {', '.join(names)}"
+        raise ConfigurationError(where=robot.where, problem=problem)
+    used = {joint.bus for joint in robot.joints}
+    buses: dict[str, AttachedBus] = {}
+    for bus in robot.buses:
+        driver = load_driver(bus.driver, f"{robot.where}: bus.{bus.name}.driver")
+        if bus.name in used:
+            buses[bus.name] = driver.attach(robot, bus, ports.get(bus.name, bus.port), healthy)
+            undo.callback(buses[bus.name].close)
+    return buses
+
+
+def _providers(robot: Robot, buses: Mapping[str, AttachedBus]) -> dict[str, Motor | JointGroup]:
+    providers: dict[str, Motor | JointGroup] = {
+        f"{robot.name}.{joint.name}": buses[joint.bus].motor(joint.name) for joint in robot.joints
+    }
+    for group in robot.groups:
+        name = f"{robot.name}.{group.name}"
+        providers[name] = buses[_bus_of(robot, group)].group(name, group.joints)
+    return providers
+
+
+def _bus_of(robot: Robot, group: Group) -> str:
+    buses = sorted({joint.bus for joint in robot.joints if joint.name in group.joints})
+    if len(buses) > 1:
+        problem = f"are on {' and '.join(buses)}; joints that move together have to share a bus"
+        raise ConfigurationError(where=f"{robot.where}: group.{group.name}.joints", problem=problem)
+    return buses[0]
+
+
+def _require_stop(provider: object) -> None:
+    """S17: nothing that can move is offered without a way to stop it."""
+    effects = {name: mark.effect for name, (mark, _) in marked_methods(type(provider)).items()}
+    moving = sorted(name for name, effect in effects.items() if effect == "actuate")
+    if moving and "stop" not in effects.values():
+        problem = f'has actuating services ({", ".join(moving)}) but none with effect="stop"; it is not offered'
+        raise ConfigurationError(where=type(provider).__qualname__, problem=problem)
+
+
+def _withdraw(deregister: Deregister, provider: object) -> None:
+    try:
+        deregister(provider)
+    except TradeError as gone:  # its container has ended before it: then it is withdrawn already
+        _log.debug("withdrawing %r: %s", provider, gone)

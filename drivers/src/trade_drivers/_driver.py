@@ -1,0 +1,95 @@
+"""What a driver is, and finding one by its name: the entry points of the group ``trade.drivers``."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from importlib.metadata import EntryPoint, entry_points
+
+from trade.errors import ConfigurationError
+from trade_drivers._interfaces import JointGroup, Motor
+from trade_drivers.robotfile import Bus, Robot
+
+__all__ = ["AttachedBus", "Driver", "drivers", "load_driver"]
+
+_GROUP = "trade.drivers"
+
+
+class AttachedBus(ABC):
+    """A bus whose devices were found to be those of the robot file. Nothing on it was moved or reset."""
+
+    @abstractmethod
+    def motor(self, joint: str) -> Motor:
+        """The provider of one joint of this bus, named as in the robot file."""
+
+    @abstractmethod
+    def group(self, name: str, joints: Sequence[str]) -> JointGroup:
+        """A provider of several joints of this bus; ``name`` is the group with the robot's name before it."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Stop everything, leave the devices as the robot file asks, let go of the port; more than once is fine.
+
+        Raises:
+            TradeError: something could not be left as asked; the port is let go all the same.
+        """
+
+
+class Driver(ABC):
+    """One vendor's devices; made without arguments, and harmless to make."""
+
+    @abstractmethod
+    def attach(self, robot: Robot, bus: Bus, port: str, healthy: Callable[[], bool]) -> AttachedBus:
+        """Take a bus over and check its devices, moving and resetting nothing; found moving, they are stopped.
+
+        Args:
+            robot: the whole file.
+            bus: the bus to attach.
+            port: where it is; instead of ``bus.port``.
+            healthy: asked in every cycle; while it says no, the driver tells its devices to hold and falls silent, so
+                that their own watchdogs take over.
+
+        Raises:
+            ConfigurationError: the vendor library is missing, the port cannot be had, or a device is absent, another
+                model, or set wrongly.
+        """
+
+
+def drivers() -> dict[str, list[EntryPoint]]:
+    """The installed drivers by name; more than one under a name is a mistake of the installation."""
+    found: dict[str, list[EntryPoint]] = {}
+    for point in entry_points(group=_GROUP):
+        found.setdefault(point.name, []).append(point)
+    return found
+
+
+def load_driver(name: str, where: str) -> Driver:
+    """The driver of that name.
+
+    Args:
+        name: as in the robot file's ``driver``.
+        where: the key that names it, for messages.
+
+    Raises:
+        ConfigurationError: there is none, there are two, or it cannot be imported.
+    """
+    found = drivers()
+    points = found.get(name, [])
+    if not points:
+        problem = f"there is no driver {name!r}; installed: {', '.join(sorted(found)) or 'none'}"
+        raise ConfigurationError(where=where, problem=problem)
+    if len({point.value for point in points}) > 1:
+        both = " and ".join(sorted(_origin(point) for point in points))
+        raise ConfigurationError(where=where, problem=f"two drivers are named {name!r}: {both}; uninstall one")
+    try:
+        kind = points[0].load()
+    except (ImportError, AttributeError) as broken:
+        problem = f"driver {name!r} ({_origin(points[0])}) cannot be imported: {broken}"
+        raise ConfigurationError(where=where, problem=problem) from broken
+    if not (isinstance(kind, type) and issubclass(kind, Driver)):
+        problem = f"driver {name!r} ({_origin(points[0])}) is no subclass of trade_drivers.Driver"
+        raise ConfigurationError(where=where, problem=problem)
+    return kind()
+
+
+def _origin(point: EntryPoint) -> str:
+    dist = f" of {point.dist.name} {point.dist.version}" if point.dist is not None else ""
+    return f"{point.value}{dist}"

@@ -1,0 +1,164 @@
+"""What a motor and a group of joints can do, in SI units, whoever built them."""
+
+from abc import ABC, abstractmethod
+from typing import Annotated
+
+from msgspec import Struct
+
+from trade import Meta, service
+
+__all__ = ["JointGroup", "JointLimits", "Motor", "MotorState"]
+
+
+class MotorState(Struct, frozen=True, kw_only=True):
+    """What was last measured at one joint."""
+
+    name: str
+    """The joint, such as ``rosie.neck.pan``."""
+    position_rad: float
+    velocity_rad_s: float
+    load: float
+    """Effort as a fraction of the most the motor can give, -1 to 1; negative in the negative direction of the joint."""
+    temperature_c: float
+    voltage_v: float
+    enabled: bool
+    """Torque is on: the joint holds or moves; False: it can be turned by hand."""
+    moving: bool
+    fault: str = ""
+    """Why it refuses to move until it is enabled again; empty if it does not."""
+    measured_at: float
+    """When position, velocity and load were read: ``time.monotonic()`` of the driver's process."""
+    age_s: float
+    """How long ago that was."""
+
+
+class JointLimits(Struct, frozen=True, kw_only=True):
+    """What a joint may be told, from the robot file."""
+
+    name: str
+    min_rad: float
+    max_rad: float
+    max_speed_rad_s: float
+    max_accel_rad_s2: float
+
+
+Position = Annotated[float, Meta(description="joint angle in rad, within limits()")]
+Speed = Annotated[float, Meta(gt=0, description="greatest speed in rad/s; by default the joint's limit")]
+
+
+class Motor(ABC):
+    """One joint with a position drive.
+
+    Everything raises ``DeviceSilent`` when the device has not answered for too long: an old value is no value.
+    """
+
+    @property
+    @abstractmethod
+    def resources(self) -> tuple[str, ...]:
+        """The joint, as what locks and fences attach to: ``("rosie.neck.pan",)``."""
+
+    @service(effect="read")
+    @abstractmethod
+    def state(self) -> MotorState:
+        """Position, velocity, load, health and the time of their measurement.
+
+        Raises:
+            DeviceSilent: the newest measurement is older than the bus allows.
+        """
+
+    @service(effect="read")
+    @abstractmethod
+    def limits(self) -> JointLimits:
+        """The range, speed and acceleration this joint may be commanded."""
+
+    @service(effect="actuate", cancel="stop")
+    @abstractmethod
+    def move_to(self, position_rad: Position, speed_rad_s: Speed | None = None) -> float:
+        """Move to an angle and return, once at rest there, the angle measured; a relaxed joint is enabled first.
+
+        Raises:
+            LimitExceeded: outside of limits(); nothing was sent. Moving back inside is allowed from outside.
+            InvalidArgument: not a finite number.
+            MotionStopped: stop(), another move, or the call's deadline came first; the joint was stopped.
+            DeviceFault: the device reports a fault, or it does not move; it was told to hold.
+            DeviceSilent: the device does not answer.
+            DeadlineExceeded: the deadline passed before anything was sent; nothing will be.
+        """
+
+    @service(effect="stop")
+    @abstractmethod
+    def stop(self) -> None:
+        """End any motion and hold; returns once the joint is at rest. Commands admitted earlier are dropped.
+
+        Raises:
+            DeviceSilent: told to stop, but nobody heard whether it did.
+            DeviceFault: told to stop, but it is still moving.
+        """
+
+    @service(effect="actuate", cancel="stop")
+    @abstractmethod
+    def enable(self) -> None:
+        """Switch torque on, holding where the joint is; clears an expired watchdog and the latched fault.
+
+        Raises:
+            DeviceFault: the device has a hardware error or refuses.
+            DeviceSilent: the device does not answer.
+            DeadlineExceeded: the deadline passed before torque was on.
+        """
+
+    @service(effect="actuate", cancel="stop")
+    @abstractmethod
+    def relax(self) -> None:
+        """Switch torque off: the joint can be turned by hand, and falls if something pulls it.
+
+        Raises:
+            DeviceSilent: the device does not answer.
+            DeadlineExceeded: the deadline passed before it was sent.
+        """
+
+
+class JointGroup(ABC):
+    """Joints that are commanded together; values are in the order of ``joints()``. Errors are those of ``Motor``."""
+
+    @property
+    @abstractmethod
+    def resources(self) -> tuple[str, ...]:
+        """The joints, as what locks and fences attach to."""
+
+    @service(effect="read")
+    @abstractmethod
+    def joints(self) -> list[str]:
+        """The names of the joints, in the order of all values."""
+
+    @service(effect="read")
+    @abstractmethod
+    def state(self) -> list[MotorState]:
+        """The state of every joint; one silent joint makes it an error."""
+
+    @service(effect="read")
+    @abstractmethod
+    def limits(self) -> list[JointLimits]:
+        """The limits of every joint."""
+
+    @service(effect="actuate", cancel="stop")
+    @abstractmethod
+    def move_to(self, positions_rad: list[Position], speed_rad_s: Speed | None = None) -> list[float]:
+        """Move all joints so that they start together and arrive together; the angles measured at rest.
+
+        ``speed_rad_s`` bounds every joint. If one is refused, stopped, faulty or silent, all are stopped.
+        """
+
+    @service(effect="stop")
+    @abstractmethod
+    def stop(self) -> None:
+        """End the motion of every joint and hold; returns once all are at rest."""
+
+    @service(effect="actuate", cancel="stop")
+    @abstractmethod
+    def enable(self) -> None:
+        """Switch the torque of every joint on, holding where they are."""
+
+    @service(effect="actuate", cancel="stop")
+    @abstractmethod
+    def relax(self) -> None:
+        """Switch the torque of every joint off."""

@@ -1,0 +1,29 @@
+"""Reading a robot file from disk."""
+
+from os import PathLike
+from pathlib import Path
+
+from trade.errors import ConfigurationError
+from trade_drivers.robotfile import Robot, parse
+
+__all__ = ["load"]
+
+
+def load(path: str | PathLike[str]) -> Robot:
+    """Read and check a robot file.
+
+    Raises:
+        ConfigurationError: it cannot be read, or what it says is wrong; the message names file, key and remedy.
+    """
+    where = str(path)
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise ConfigurationError(where=where, problem="there is no such file") from None
+    except IsADirectoryError:
+        raise ConfigurationError(where=where, problem="is a directory; name the robot file in it") from None
+    except UnicodeDecodeError as bad:
+        raise ConfigurationError(where=where, problem=f"is not UTF-8 text (byte {bad.start}: {bad.reason})") from None
+    except OSError as bad:
+        raise ConfigurationError(where=where, problem=f"cannot be read: {bad.strerror}") from None
+    return parse(text, where)

@@ -1,0 +1,163 @@
+"""The thread that owns a bus: cycles at its rate, falls silent when its process is sick, reopens its port."""
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from typing import TYPE_CHECKING, Final
+
+from trade.errors import TradeError
+from trade_drivers._errors import BusGone
+from trade_drivers.dynamixel._axis import Axis
+from trade_drivers.dynamixel._exchange import Exchange
+from trade_drivers.dynamixel._jobs import Leave
+from trade_drivers.dynamixel._wire import PortLost
+
+if TYPE_CHECKING:
+    from trade_drivers.dynamixel._sdk import Wire
+    from trade_drivers.robotfile import Bus
+
+__all__ = ["BusThread"]
+
+_log = logging.getLogger(__name__)
+_REOPEN_FIRST_S: Final = 0.1
+_REOPEN_MOST_S: Final = 1.0
+_LEAVE_S: Final = 3.0
+
+
+class BusThread:
+    """One owner thread of one bus. Services hand it work and read what it measured; nobody else touches the port."""
+
+    def __init__(self, exchange: Exchange, wire: "Wire", bus: "Bus", healthy: Callable[[], bool], name: str) -> None:
+        self.exchange = exchange
+        self._wire = wire
+        self._bus = bus
+        self._healthy = healthy
+        self._sick = False
+        self._lost_at = 0.0
+        self._reopen_at = 0.0
+        self._reopen_s = _REOPEN_FIRST_S
+        self._leaving = False
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+
+    def start(self) -> None:
+        """Begin to cycle; the port must be open."""
+        self._thread.start()
+
+    def alive(self) -> bool:
+        """Whether the thread still runs."""
+        return self._thread.is_alive()
+
+    def close(self) -> None:
+        """Stop everything, hold or relax as the robot file says, let go of the port. More than once is fine.
+
+        Raises:
+            TradeError: not everything could be left as the robot file says; the port is closed all the same.
+        """
+        if self._leaving:
+            return
+        try:
+            if self.alive():
+                self._leave()
+        finally:
+            self._leaving = True
+            self.exchange.wake.set()
+            self._thread.join()
+
+    def _leave(self) -> None:
+        exchange = self.exchange
+        with suppress(TradeError):  # a joint that cannot be heard keeps its watchdog; the others are left properly
+            exchange.stop(exchange.axes, "its driver is leaving").wait(self.alive)
+        relax = self._bus.leave == "relax"
+        leave = Leave(exchange, exchange.axes, relax=relax, expires_ns=exchange.clock() + int(_LEAVE_S * 1e9))
+        exchange.submit(leave)
+        leave.wait(self.alive)
+
+    # --- the thread
+
+    def _run(self) -> None:
+        problem = "the thread of its bus has ended"
+        try:
+            next_at = time.monotonic()
+            while not self._leaving:
+                self._beat()
+                next_at = self._rest(next_at + 1 / self._bus.rate_hz)
+        except Exception as defect:  # noqa: BLE001 - whatever it is: the bus falls silent, and the watchdogs stop the motors
+            problem = f"the thread of its bus failed: {defect!r}"
+            _log.exception("bus %s: its thread failed; its devices stop by their watchdogs", self._bus.name)
+        finally:
+            self.exchange.refusing = lambda axis: axis.faulty(problem)
+            self._wire.close()
+            self.exchange.fail_all(self.exchange.refusing)
+
+    def _rest(self, next_at: float) -> float:
+        """Wait for the next cycle; stops do not wait."""
+        exchange = self.exchange
+        while (left_s := next_at - time.monotonic()) > 0:
+            if exchange.wake.wait(left_s):
+                exchange.wake.clear()
+                if self._leaving:
+                    break
+                if not self._lost_at:
+                    self._guarded(exchange.serve_stops)
+        return max(next_at, time.monotonic())
+
+    def _beat(self) -> None:
+        if self._lost_at:
+            self._reopen()
+        elif self._is_healthy():
+            self._guarded(self.exchange.cycle)
+
+    def _guarded(self, act: Callable[[], None]) -> None:
+        try:
+            act()
+        except PortLost as lost:
+            _log.warning("bus %s: port %s is gone: %s", self._bus.name, self._wire.path, lost)
+            self._lost_at = time.monotonic()
+            self._reopen_s = _REOPEN_FIRST_S
+            self._reopen_at = self._lost_at + self._reopen_s
+            self._wire.close()
+            self.exchange.refusing = self._gone
+            self.exchange.forget_measurements()
+            self.exchange.fail_all(self._gone)
+
+    def _gone(self, axis: Axis) -> TradeError:
+        return BusGone(device=axis.name, bus=self._wire.path, waited_s=time.monotonic() - self._lost_at)
+
+    def _reopen(self) -> None:
+        self.exchange.fail_all(self._gone)
+        if time.monotonic() < self._reopen_at:
+            return
+        try:
+            self._wire.open()
+        except (PortLost, TradeError):
+            self._reopen_s = min(_REOPEN_MOST_S, 2 * self._reopen_s)
+            self._reopen_at = time.monotonic() + self._reopen_s
+            return
+        _log.info("bus %s: port %s is back", self._bus.name, self._wire.path)
+        self.exchange.fail_all(self._gone)
+        self._lost_at = 0.0
+        self.exchange.refusing = None
+
+    def _is_healthy(self) -> bool:
+        """A sick process moves nothing: everything is told to hold once, then silence lets the watchdogs judge."""
+        try:
+            healthy = self._healthy()
+        except Exception:  # noqa: BLE001 - a check that fails is a check that says no
+            _log.exception("bus %s: the health check failed", self._bus.name)
+            healthy = False
+        if healthy == (not self._sick):
+            return healthy
+        self._sick = not healthy
+        if self._sick:
+            _log.error("bus %s: this process is not healthy; holding, then silent", self._bus.name)
+            self._guarded(lambda: self.exchange.halt(self.exchange.axes, "its driver's process is not healthy"))
+            self.exchange.refusing = self._unhealthy
+            self.exchange.fail_all(self._unhealthy)
+        else:
+            self.exchange.refusing = None
+        return healthy
+
+    def _unhealthy(self, axis: Axis) -> TradeError:
+        return axis.faulty("its driver's process is not healthy")

@@ -1,0 +1,110 @@
+"""Bringing a Dynamixel bus up, and handing out its motors."""
+
+import logging
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from typing import TYPE_CHECKING, Final
+
+from trade.errors import ConfigurationError
+from trade_drivers._driver import AttachedBus, Driver
+from trade_drivers._interfaces import JointGroup, Motor
+from trade_drivers.dynamixel import _table as table
+from trade_drivers.dynamixel._attach import check_bus, look_over
+from trade_drivers.dynamixel._axis import Axis
+from trade_drivers.dynamixel._bus import BusThread
+from trade_drivers.dynamixel._exchange import Exchange
+from trade_drivers.dynamixel._motor import DynamixelGroup, DynamixelMotor
+from trade_drivers.dynamixel._wire import PortLost, WireError
+from trade_drivers.robotfile import Bus, Joint, Robot
+
+if TYPE_CHECKING:
+    from trade_drivers.dynamixel._sdk import Wire
+
+__all__ = ["DynamixelBus", "DynamixelDriver", "open_exchange"]
+
+_log = logging.getLogger(__name__)
+_SLOW_ANSWER_S: Final = 100e-6
+
+
+class DynamixelBus(AttachedBus):
+    """A bus with its servos, and the thread that owns it."""
+
+    def __init__(self, thread: BusThread, axes: Sequence[Axis]) -> None:
+        self._thread = thread
+        self._axes = {axis.joint.name: axis for axis in axes}
+
+    def motor(self, joint: str) -> Motor:
+        axis = self._axes[joint]
+        return DynamixelMotor(axis.name, self._thread, [axis])
+
+    def group(self, name: str, joints: Sequence[str]) -> JointGroup:
+        return DynamixelGroup(name, self._thread, [self._axes[joint] for joint in joints])
+
+    def close(self) -> None:
+        self._thread.close()
+
+
+class DynamixelDriver(Driver):
+    """X-series servos in position control on a serial bus, through dynamixel-sdk."""
+
+    def attach(self, robot: Robot, bus: Bus, port: str, healthy: Callable[[], bool]) -> AttachedBus:
+        with ExitStack() as undo:
+            exchange = open_exchange(robot, bus, port)
+            undo.callback(exchange.wire.close)
+            thread = BusThread(exchange, exchange.wire, bus, healthy, name=f"bus {robot.name}.{bus.name}")
+            thread.start()
+            undo.pop_all()
+        return DynamixelBus(thread, exchange.axes)
+
+
+def open_exchange(robot: Robot, bus: Bus, port: str) -> Exchange:
+    """Open the port and look every joint over, without a thread: ``cycle()`` is the caller's to call.
+
+    Raises:
+        ConfigurationError: the port cannot be had, or a device is absent, another, or set wrongly.
+    """
+    axes = [Axis(f"{robot.name}.{joint.name}", port, joint) for joint in _known(robot, bus)]
+    check_bus(bus, axes, robot.where)
+    wire = _wire(port, bus.baud)
+    where = f"{robot.where}: bus.{bus.name}.port"
+    try:
+        wire.open()
+        exchange = Exchange(wire, bus, axes)
+        for axis in axes:
+            delay_s = look_over(wire, bus, axis, exchange.clock, robot.where)
+            if delay_s > _SLOW_ANSWER_S:
+                _log.info("%s waits %.0f us before it answers (register 9); 0 is faster", axis.name, delay_s * 1e6)
+        for axis in axes:
+            exchange.admit(axis)
+        exchange.cycle()
+    except PortLost as lost:
+        wire.close()
+        problem = f"{port} cannot be used: {lost}; is its adapter plugged in? See `ls -l /dev/serial/by-id`"
+        raise ConfigurationError(where=where, problem=problem) from None
+    except WireError as bad:
+        wire.close()
+        raise ConfigurationError(
+            where=where, problem=f"the bus does not work reliably: {bad}; check cable and power"
+        ) from bad
+    except BaseException:
+        wire.close()
+        raise
+    return exchange
+
+
+def _known(robot: Robot, bus: Bus) -> list[Joint]:
+    joints = robot.joints_on(bus.name)
+    for joint in joints:
+        if joint.model not in table.BY_MODEL_NAME:
+            problem = f"{joint.model!r} is unknown to the driver dynamixel; it knows {', '.join(table.BY_MODEL_NAME)}"
+            raise ConfigurationError(where=f'{robot.where}: joint."{joint.name}".model', problem=problem)
+    return joints
+
+
+def _wire(port: str, baud: int) -> "Wire":
+    try:
+        from trade_drivers.dynamixel._sdk import Wire  # noqa: PLC0415 - the vendor library is optional
+    except ImportError as missing:
+        problem = f'needs dynamixel-sdk ({missing}); pip install "trade-drivers[dynamixel]"'
+        raise ConfigurationError(where="driver dynamixel", problem=problem) from None
+    return Wire(port, baud)

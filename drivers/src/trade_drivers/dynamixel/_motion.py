@@ -1,0 +1,141 @@
+"""A move: checked and released at the wire, watched until at rest, ended by whatever comes first."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Final
+
+from msgspec import Struct
+
+from trade.errors import TradeError
+from trade_drivers._errors import MotionStopped
+from trade_drivers.dynamixel import _table as table
+from trade_drivers.dynamixel._axis import Axis
+from trade_drivers.dynamixel._jobs import Job, Steps, enabling
+from trade_drivers.dynamixel._profile import Leg, together
+
+if TYPE_CHECKING:
+    from trade_drivers.dynamixel._exchange import Exchange
+
+__all__ = ["Move"]
+
+_ARRIVED_COUNTS: Final = 4
+"""Closer than this (0.35 degrees) and at rest: arrived."""
+_NEAR_COUNTS: Final = 20
+"""Closer than this (1.8 degrees) and no longer coming closer: arrived too, as far as the position loop goes."""
+_SETTLING_S: Final = 0.15
+_STUCK_S: Final = 0.5
+_MOST_PER_CYCLE_S: Final = 0.1
+
+
+class _Progress(Struct):
+    """How one joint's move is coming along."""
+
+    goal: int
+    closest: int
+    waiting_s: float = 0.0
+    """How long it has not come closer."""
+
+
+class Move(Job):
+    """A move of one or more joints to goals in counts."""
+
+    def __init__(
+        self,
+        exchange: "Exchange",
+        axes: Sequence[Axis],
+        goals: Sequence[int],
+        speeds: Sequence[int],
+        *,
+        service: str,
+        expires_ns: int,
+        until_ns: int | None,
+    ) -> None:
+        super().__init__(exchange, axes, service, expires_ns)
+        self._goals = dict(zip(axes, goals, strict=True))
+        self._speeds = tuple(speeds)
+        self._until_ns = until_ns
+        self._progress: dict[Axis, _Progress] = {}
+        self._began_ns = self._watched_ns = 0
+        self._patience_s = 0.0
+        self.final_counts: tuple[int, ...] = ()
+
+    def goal_of(self, axis: Axis) -> int:
+        """Where one of its joints is going, in counts."""
+        return self._goals[axis]
+
+    def steps(self) -> Steps:
+        """Enable what is relaxed, then write all goals in one packet."""
+        exchange = self.exchange
+        for axis in self.axes:
+            axis.check_usable(exchange.clock(), exchange.stale_after_ns)
+        for axis in self.axes:
+            if not axis.ready:
+                yield from enabling(self, axis)
+        self._launch()
+
+    def done_stepping(self) -> None:
+        """Launched; now it is watched. (It has ended already if anything was refused.)"""
+
+    def _launch(self) -> None:
+        exchange, now_ns = self.exchange, self.exchange.clock()
+        samples = [axis.check_usable(now_ns, exchange.stale_after_ns) for axis in self.axes]
+        distances = [abs(self._goals[axis] - sample.position) for axis, sample in zip(self.axes, samples, strict=True)]
+        legs = [
+            Leg(distance, speed, axis.accel_counts)
+            for axis, distance, speed in zip(self.axes, distances, self._speeds, strict=True)
+        ]
+        profiles = together(legs)
+        data: dict[int, bytes] = {}
+        for axis, profile in zip(self.axes, profiles, strict=True):
+            axis.check_goal(self._goals[axis])
+            data[axis.id] = axis.goal_block(self._goals[axis], profile.accel_counts, profile.speed_counts)
+        exchange.wire.sync_write(table.PROFILE_ACCELERATION.address, data, self.gate)
+        exchange.take_over(self)
+        self._progress = {
+            axis: _Progress(self._goals[axis], distance) for axis, distance in zip(self.axes, distances, strict=True)
+        }
+        self._began_ns = self._watched_ns = now_ns
+        self._patience_s = 1.0 + 2 * max(profile.duration_s for profile in profiles)
+
+    def watch(self, now_ns: int) -> None:
+        """Look at the newest measurements; end the move if it has arrived or must not go on."""
+        ending = self._trouble(now_ns)
+        if ending is None:
+            elapsed_s = min((now_ns - self._watched_ns) / 1e9, _MOST_PER_CYCLE_S)
+            self._watched_ns = now_ns
+            arrived = [self._arrived(axis, elapsed_s) for axis in self.axes]
+            if all(arrived):
+                self.final_counts = tuple(axis.sample.position for axis in self.axes if axis.sample is not None)
+                self.exchange.release(self, None)
+                return
+            ending = self._stuck(now_ns)
+        if ending is not None:
+            self.exchange.release(self, ending)
+
+    def _trouble(self, now_ns: int) -> TradeError | None:
+        for axis in self.axes:
+            if axis.fault:
+                return axis.faulty()
+            if axis.silent or axis.age_ns(now_ns) > self.exchange.stale_after_ns:
+                return axis.deaf(now_ns)
+        if self._until_ns is not None and now_ns >= self._until_ns:
+            return MotionStopped(device=self.axes[0].name, reason="the deadline of its call passed")
+        return None
+
+    def _arrived(self, axis: Axis, elapsed_s: float) -> bool:
+        progress, sample = self._progress[axis], axis.sample
+        distance = abs(progress.goal - sample.position) if sample is not None else progress.closest
+        if distance < progress.closest:
+            progress.closest, progress.waiting_s = distance, 0.0
+        else:
+            progress.waiting_s += elapsed_s
+        if axis.still < 2:
+            return False
+        return distance <= _ARRIVED_COUNTS or (distance <= _NEAR_COUNTS and progress.waiting_s > _SETTLING_S)
+
+    def _stuck(self, now_ns: int) -> TradeError | None:
+        late = (now_ns - self._began_ns) / 1e9 > self._patience_s
+        for axis, progress in self._progress.items():
+            if late or (progress.closest > _NEAR_COUNTS and progress.waiting_s > _STUCK_S):
+                short_rad = progress.closest * table.RAD_PER_COUNT
+                return axis.faulty(f"it makes no progress, {short_rad:.3g} rad short of its goal; is it blocked?")
+        return None

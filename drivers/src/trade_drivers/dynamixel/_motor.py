@@ -1,0 +1,174 @@
+"""Motor and JointGroup on a Dynamixel bus: they check, hand over to the bus thread, wait, and never touch the port."""
+
+import time
+from collections.abc import Sequence
+from math import isfinite
+from typing import Final
+
+from trade import current_call
+from trade.errors import DeviceError, DeviceSilent, InvalidArgument, LimitExceeded
+from trade_drivers._interfaces import JointGroup, JointLimits, Motor, MotorState
+from trade_drivers.dynamixel import _table as table
+from trade_drivers.dynamixel._axis import Axis, Health, Sample
+from trade_drivers.dynamixel._bus import BusThread
+from trade_drivers.dynamixel._jobs import Enable, Relax
+from trade_drivers.dynamixel._motion import Move
+
+__all__ = ["DynamixelGroup", "DynamixelMotor"]
+
+_DEFAULT_EXPIRY_NS: Final = 1_000_000_000
+"""How long a plain Python call may wait for its turn on the bus."""
+_HEALTH_STALE_NS: Final = 2_000_000_000
+
+
+class _Joints:
+    """What one motor and a group have in common: a bus and some of its joints."""
+
+    def __init__(self, name: str, thread: BusThread, axes: Sequence[Axis]) -> None:
+        self._name = name
+        self._thread = thread
+        self._exchange = thread.exchange
+        self._axes = tuple(axes)
+
+    @property
+    def resources(self) -> tuple[str, ...]:
+        return tuple(axis.name for axis in self._axes)
+
+    def stop(self) -> None:
+        self._exchange.stop(self._axes).wait(self._thread.alive)
+
+    def enable(self) -> None:
+        self._do(Enable)
+
+    def relax(self) -> None:
+        self._do(Relax)
+
+    def _do(self, kind: type[Enable] | type[Relax]) -> None:
+        expires_ns, _ = self._expiry()
+        job = kind(self._exchange, self._axes, f"{self._name}.{kind.__name__.lower()}", expires_ns)
+        self._exchange.submit(job)
+        job.wait(self._thread.alive)
+
+    def _expiry(self) -> tuple[int, int | None]:
+        """When it may begin at the latest, and when it must be over: a plain Python call ends when it ends."""
+        call = current_call()
+        if call is None or call.expires_ns is None:
+            return self._exchange.clock() + _DEFAULT_EXPIRY_NS, None
+        return call.expires_ns, call.expires_ns
+
+    def _move(self, positions_rad: Sequence[float], speed_rad_s: float | None, argument: str) -> list[float]:
+        service = f"{self._name}.move_to"
+        if len(positions_rad) != len(self._axes):
+            names = ", ".join(axis.name for axis in self._axes)
+            problem = f"has {len(positions_rad)} values; it takes {len(self._axes)}, for {names}"
+            raise InvalidArgument(service=service, argument=argument, problem=problem)
+        goals = [
+            _goal_counts(axis, _finite(value, service, argument))
+            for axis, value in zip(self._axes, positions_rad, strict=True)
+        ]
+        speed = None if speed_rad_s is None else _finite(speed_rad_s, service, "speed_rad_s")
+        speeds = [_speed_counts(axis, speed) for axis in self._axes]
+        expires_ns, until_ns = self._expiry()
+        move = Move(
+            self._exchange, self._axes, goals, speeds, service=service, expires_ns=expires_ns, until_ns=until_ns
+        )
+        self._exchange.submit(move)
+        move.wait(self._thread.alive)
+        return [axis.scale.angle_rad(counts) for axis, counts in zip(self._axes, move.final_counts, strict=True)]
+
+    def _states(self) -> list[MotorState]:
+        return [self._state(axis) for axis in self._axes]
+
+    def _state(self, axis: Axis) -> MotorState:
+        now_ns = self._exchange.clock()
+        health = axis.health
+        try:
+            sample = axis.fresh(now_ns, self._exchange.stale_after_ns)
+            if health is None or now_ns - health.at_ns > _HEALTH_STALE_NS:
+                raise axis.deaf(now_ns)
+        except DeviceSilent:
+            reason = self._exchange.refusing(axis) if self._exchange.refusing is not None else None
+            if isinstance(reason, DeviceError):
+                raise reason from None
+            raise
+        return _motor_state(axis, sample, health, now_ns)
+
+    def _limits(self) -> list[JointLimits]:
+        return [
+            JointLimits(
+                name=axis.name,
+                min_rad=axis.joint.min_rad,
+                max_rad=axis.joint.max_rad,
+                max_speed_rad_s=axis.joint.max_speed_rad_s,
+                max_accel_rad_s2=axis.joint.max_accel_rad_s2,
+            )
+            for axis in self._axes
+        ]
+
+
+class DynamixelMotor(_Joints, Motor):
+    """One servo as a motor."""
+
+    def state(self) -> MotorState:
+        return self._states()[0]
+
+    def limits(self) -> JointLimits:
+        return self._limits()[0]
+
+    def move_to(self, position_rad: float, speed_rad_s: float | None = None) -> float:
+        return self._move([position_rad], speed_rad_s, "position_rad")[0]
+
+
+class DynamixelGroup(_Joints, JointGroup):
+    """Servos of one bus as a group."""
+
+    def joints(self) -> list[str]:
+        return [axis.name for axis in self._axes]
+
+    def state(self) -> list[MotorState]:
+        return self._states()
+
+    def limits(self) -> list[JointLimits]:
+        return self._limits()
+
+    def move_to(self, positions_rad: list[float], speed_rad_s: float | None = None) -> list[float]:
+        return self._move(positions_rad, speed_rad_s, "positions_rad")
+
+
+def _finite(value: float, service: str, argument: str) -> float:
+    if not isinstance(value, int | float) or isinstance(value, bool) or not isfinite(value):  # pyright: ignore[reportUnnecessaryIsInstance]
+        raise InvalidArgument(service=service, argument=argument, problem=f"{value!r} is not a finite number")
+    return float(value)
+
+
+def _goal_counts(axis: Axis, position_rad: float) -> int:
+    joint = axis.joint
+    if not joint.min_rad <= position_rad <= joint.max_rad:
+        raise LimitExceeded(what=axis.name, value=position_rad, lower=joint.min_rad, upper=joint.max_rad, unit="rad")
+    return round(axis.scale.counts(position_rad))
+
+
+def _speed_counts(axis: Axis, speed_rad_s: float | None) -> int:
+    if speed_rad_s is None:
+        return axis.speed_counts
+    slowest, fastest = table.RAD_S_PER_COUNT, axis.joint.max_speed_rad_s
+    if not slowest <= speed_rad_s <= fastest:
+        raise LimitExceeded(what=f"{axis.name} speed", value=speed_rad_s, lower=slowest, upper=fastest, unit="rad/s")
+    return max(1, int(speed_rad_s / table.RAD_S_PER_COUNT))
+
+
+def _motor_state(axis: Axis, sample: Sample, health: Health, now_ns: int) -> MotorState:
+    measured_at = time.monotonic() - (now_ns - sample.at_ns) / 1e9
+    return MotorState(
+        name=axis.name,
+        position_rad=axis.scale.angle_rad(sample.position),
+        velocity_rad_s=axis.scale.speed_rad_s(sample.velocity),
+        load=axis.scale.load(sample.effort, axis.model.full_effort_counts),
+        temperature_c=health.temperature * table.TEMPERATURE.si_per_count,
+        voltage_v=health.voltage * table.INPUT_VOLTAGE.si_per_count,
+        enabled=health.torque,
+        moving=axis.motion is not None or axis.still == 0,
+        fault=axis.fault,
+        measured_at=measured_at,
+        age_s=(now_ns - sample.at_ns) / 1e9,
+    )

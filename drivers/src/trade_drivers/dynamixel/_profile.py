@@ -1,0 +1,66 @@
+"""Speeds and accelerations for joints that start together and arrive together: arithmetic in the device's counts."""
+
+from collections.abc import Sequence
+from math import sqrt
+from typing import NamedTuple
+
+from trade_drivers.dynamixel._table import RAD_PER_COUNT, RAD_S2_PER_COUNT, RAD_S_PER_COUNT
+
+__all__ = ["Leg", "Profile", "together"]
+
+
+class Leg(NamedTuple):
+    """What one joint has to do: how far, and how fast at most."""
+
+    distance_counts: int
+    speed_counts: int
+    accel_counts: int
+
+
+class Profile(NamedTuple):
+    """What goes into a device's profile registers, and how long the move takes with it."""
+
+    accel_counts: int
+    speed_counts: int
+    duration_s: float
+
+
+def together(legs: Sequence[Leg]) -> list[Profile]:
+    """Profiles under which all legs end at the same time, that of the slowest; none above its own limits.
+
+    Each is the leg's own fastest trapezoid stretched in time. 0 is never used: a device takes it for "no limit".
+    """
+    duration_s = max(_duration_s(*leg) for leg in legs)
+    return [_stretched(leg, duration_s) for leg in legs]
+
+
+def _duration_s(distance_counts: int, speed_counts: float, accel_counts: float) -> float:
+    distance, speed = abs(distance_counts) * RAD_PER_COUNT, speed_counts * RAD_S_PER_COUNT
+    accel = accel_counts * RAD_S2_PER_COUNT
+    if distance < speed * speed / accel:
+        return 2 * sqrt(distance / accel)
+    return distance / speed + speed / accel
+
+
+def _stretched(leg: Leg, duration_s: float) -> Profile:
+    fastest_s = _duration_s(*leg)
+    ratio = fastest_s / duration_s if duration_s > 0 else 1.0
+    best: Profile | None = None
+    ideal = leg.speed_counts * ratio
+    for speed in {max(1, int(ideal)), min(leg.speed_counts, int(ideal) + 1)}:
+        accel = _accel_for(leg, speed, duration_s, leg.accel_counts * ratio * ratio)
+        profile = Profile(accel, speed, _duration_s(leg.distance_counts, speed, accel))
+        if best is None or abs(profile.duration_s - duration_s) < abs(best.duration_s - duration_s):
+            best = profile
+    assert best is not None  # noqa: S101 - the set above has one or two members
+    return best
+
+
+def _accel_for(leg: Leg, speed: int, duration_s: float, ideal: float) -> int:
+    """The acceleration that makes up for the rounding of the speed, within the limit."""
+    cruise_s = abs(leg.distance_counts) * RAD_PER_COUNT / (speed * RAD_S_PER_COUNT)
+    if 0 < cruise_s < duration_s:
+        exact = speed * RAD_S_PER_COUNT / (duration_s - cruise_s) / RAD_S2_PER_COUNT
+        # a trapezoid only while it reaches its speed; else the triangle's own acceleration is the right one
+        ideal = exact if cruise_s >= duration_s / 2 else ideal
+    return max(1, min(leg.accel_counts, round(ideal)))

@@ -1,0 +1,122 @@
+"""Control tables of the X series: registers as data, with their conversion to SI units.
+
+Sources: ROBOTIS e-Manual, XL430-W250 and XM430-W350, "Control Table of EEPROM Area" and "Control Table of RAM Area".
+Both have the same addresses; they differ in what stands at 126 (load or current) and in the model number.
+"""
+
+from enum import Enum
+from math import tau
+from typing import Final, Literal
+
+from msgspec import Struct
+
+__all__ = ["BY_MODEL_NAME", "BY_MODEL_NUMBER", "HARDWARE_ERRORS", "Access", "Model", "Register"]
+
+RAD_PER_COUNT: Final = tau / 4096
+RAD_S_PER_COUNT: Final = 0.229 * tau / 60
+RAD_S2_PER_COUNT: Final = 214.577 * tau / 3600
+
+
+class Access(Enum):
+    """Who may change a register, and when."""
+
+    READ = "read only"
+    RAM = "read and write; back to its default at power-up"
+    EEPROM = "kept without power; written only while torque is off"
+
+
+Kind = Literal["u1", "u2", "u4", "i2", "i4"]
+
+
+class Register(Struct, frozen=True):
+    """One item of a control table."""
+
+    address: int
+    kind: Kind
+    si_per_count: float = 1.0
+    unit: str = ""
+    access: Access = Access.READ
+
+    @property
+    def size(self) -> int:
+        """Bytes on the wire."""
+        return int(self.kind[1])
+
+    @property
+    def end(self) -> int:
+        """The address behind it."""
+        return self.address + self.size
+
+    def decode(self, data: bytes, start: int = 0) -> int:
+        """Counts, out of a block of bytes read from address ``start``; two's complement where the table says so."""
+        at = self.address - start
+        return int.from_bytes(data[at : at + self.size], "little", signed=self.kind[0] == "i")
+
+    def encode(self, counts: int) -> bytes:
+        """The bytes of a number of counts; OverflowError if they do not fit."""
+        return counts.to_bytes(self.size, "little", signed=self.kind[0] == "i")
+
+
+_EEPROM, _RAM = Access.EEPROM, Access.RAM
+
+MODEL_NUMBER: Final = Register(0, "u2")
+FIRMWARE: Final = Register(6, "u1")
+RETURN_DELAY: Final = Register(9, "u1", si_per_count=2e-6, unit="s", access=_EEPROM)
+DRIVE_MODE: Final = Register(10, "u1", access=_EEPROM)
+OPERATING_MODE: Final = Register(11, "u1", access=_EEPROM)
+SHADOW_ID: Final = Register(12, "u1", access=_EEPROM)
+VELOCITY_LIMIT: Final = Register(44, "u4", si_per_count=RAD_S_PER_COUNT, unit="rad/s", access=_EEPROM)
+MAX_POSITION: Final = Register(48, "u4", si_per_count=RAD_PER_COUNT, unit="rad", access=_EEPROM)
+MIN_POSITION: Final = Register(52, "u4", si_per_count=RAD_PER_COUNT, unit="rad", access=_EEPROM)
+
+TORQUE_ENABLE: Final = Register(64, "u1", access=_RAM)
+STATUS_RETURN_LEVEL: Final = Register(68, "u1", access=_RAM)
+HARDWARE_ERROR: Final = Register(70, "u1")
+BUS_WATCHDOG: Final = Register(98, "u1", si_per_count=0.020, unit="s", access=_RAM)
+PROFILE_ACCELERATION: Final = Register(108, "u4", si_per_count=RAD_S2_PER_COUNT, unit="rad/s2", access=_RAM)
+PROFILE_VELOCITY: Final = Register(112, "u4", si_per_count=RAD_S_PER_COUNT, unit="rad/s", access=_RAM)
+GOAL_POSITION: Final = Register(116, "i4", si_per_count=RAD_PER_COUNT, unit="rad", access=_RAM)
+REALTIME_TICK: Final = Register(120, "u2", si_per_count=0.001, unit="s")
+MOVING: Final = Register(122, "u1")
+PRESENT_LOAD: Final = Register(126, "i2", si_per_count=0.001, unit="of full load")
+PRESENT_CURRENT: Final = Register(126, "i2", si_per_count=0.00269, unit="A")
+PRESENT_VELOCITY: Final = Register(128, "i4", si_per_count=RAD_S_PER_COUNT, unit="rad/s")
+PRESENT_POSITION: Final = Register(132, "i4", si_per_count=RAD_PER_COUNT, unit="rad")
+VELOCITY_TRAJECTORY: Final = Register(136, "i4", si_per_count=RAD_S_PER_COUNT, unit="rad/s")
+POSITION_TRAJECTORY: Final = Register(140, "i4", si_per_count=RAD_PER_COUNT, unit="rad")
+INPUT_VOLTAGE: Final = Register(144, "u2", si_per_count=0.1, unit="V")
+TEMPERATURE: Final = Register(146, "u1", si_per_count=1.0, unit="degC")
+
+POSITION_MODE: Final = 3
+CENTRE_COUNTS: Final = 2048
+TICK_WRAPS_AT: Final = 32768
+WATCHDOG_EXPIRED: Final = 255
+"""What register 98 reads after it has stopped the device; goal registers are read-only until 0 is written to it."""
+
+HARDWARE_ERRORS: Final = {
+    0x01: "input voltage out of range",
+    0x04: "overheating",
+    0x08: "encoder fault",
+    0x10: "electrical shock",
+    0x20: "overload",
+}
+"""Bits of register 70."""
+
+
+class Model(Struct, frozen=True):
+    """What differs between the models this driver knows."""
+
+    name: str
+    number: int
+    effort: Register
+    """What stands at address 126."""
+    full_effort_counts: int
+    """Counts of ``effort`` that mean full load: fractions are relative to it."""
+
+
+MODELS: Final = (
+    Model("XL430-W250", 1060, PRESENT_LOAD, 1000),
+    Model("XM430-W350", 1020, PRESENT_CURRENT, 1193),  # current limit 3.2 A
+)
+BY_MODEL_NAME: Final = {model.name: model for model in MODELS}
+BY_MODEL_NUMBER: Final = {model.number: model for model in MODELS}

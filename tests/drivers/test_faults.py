@@ -1,0 +1,303 @@
+"""What happens on a bad bus: nobody is believed who must not be, and nobody suffers for another."""
+
+import pytest
+
+import trade_hil_sim as sim
+from drivers.conftest import Outcome, Rig, wait_until, written_now
+from trade.errors import DeviceFault, DeviceSilent
+from trade_drivers import AttachedRobot, BusGone, MotorState
+
+COUNT_RAD = 6.283185 / 4096
+
+
+@pytest.fixture
+def robot(head: Rig) -> AttachedRobot:
+    return head.attach()
+
+
+def state(robot: AttachedRobot, joint: str) -> MotorState | None:
+    """The state, or None while it is silent."""
+    try:
+        return robot.motor(joint).state()
+    except DeviceSilent:
+        return None
+
+
+def await_silence(robot: AttachedRobot, joint: str) -> None:
+    wait_until(lambda: state(robot, joint) is None, f"{joint} is silent")
+
+
+def await_answers(robot: AttachedRobot, joint: str) -> None:
+    wait_until(lambda: state(robot, joint) is not None, f"{joint} answers")
+
+
+# --- silence
+
+
+def test_a_silent_joint_is_an_error_with_its_name_and_never_a_zero(head: Rig, robot: AttachedRobot) -> None:
+    robot.motor("neck.pan").move_to(0.5)
+    head.sim.do(sim.Mute(ids=(1,)))
+    seen: set[float] = set()
+
+    def silent() -> bool:
+        now = state(robot, "neck.pan")
+        if now is not None:
+            seen.add(round(now.position_rad, 2))
+        return now is None
+
+    wait_until(silent, "it is silent")
+    assert seen <= {0.5}
+    with pytest.raises(DeviceSilent, match=r"rosie\.neck\.pan did not answer") as deaf:
+        robot.motor("neck.pan").state()
+    assert deaf.value.waited_s > 0.25
+
+
+def test_a_silent_joint_leaves_the_other_usable(head: Rig, robot: AttachedRobot) -> None:
+    head.sim.do(sim.Mute(ids=(1,)))
+    await_silence(robot, "neck.pan")
+    assert robot.motor("neck.tilt").move_to(0.4) == pytest.approx(0.4, abs=0.03)
+    tilt = robot.motor("neck.tilt").state()
+    assert tilt.age_s < 1
+    with pytest.raises(DeviceSilent, match=r"neck\.pan"):
+        robot.motor("neck.pan").move_to(0.1)
+    with pytest.raises(DeviceSilent, match=r"neck\.pan"):
+        robot.group("head").state()
+
+
+def test_a_silent_joint_does_not_let_the_watchdog_of_a_moving_one_expire(head: Rig, robot: AttachedRobot) -> None:
+    moving = Outcome(lambda: robot.motor("neck.tilt").move_to(0.5, 0.5))
+    head.wait_for("motion_started", 2)
+    head.sim.do(sim.Mute(ids=(1,)))
+    assert moving.wait().result == pytest.approx(0.5, abs=0.03)
+    assert not head.events("watchdog_expired", 2)
+
+
+def test_a_joint_that_falls_silent_ends_the_move_of_its_group_and_the_others_hold(
+    head: Rig, robot: AttachedRobot
+) -> None:
+    moving = Outcome(lambda: robot.group("head").move_to([1.3, 0.5], 0.2))
+    head.wait_for("motion_started", 2)
+    head.sim.do(sim.Mute(ids=(1,)))
+    assert isinstance(moving.wait().error, DeviceSilent)
+    assert "neck.pan" in str(moving.error)
+    wait_until(lambda: not head.truth(2).moving, "the tilt joint rests")
+    assert head.truth(2).position_rad < 0.45
+
+
+def test_a_joint_that_answers_again_is_usable_again(head: Rig, robot: AttachedRobot) -> None:
+    head.sim.do(sim.Mute(ids=(1,)))
+    await_silence(robot, "neck.pan")
+    mark = written_now()
+    head.sim.do(sim.Heal())
+    await_answers(robot, "neck.pan")
+    assert not head.moves(since=mark)
+    assert robot.motor("neck.pan").move_to(0.2) == pytest.approx(0.2, abs=0.03)
+
+
+def test_stopping_a_silent_joint_is_tried_and_reported(head: Rig, robot: AttachedRobot) -> None:
+    moving = Outcome(lambda: robot.motor("neck.pan").move_to(1.3, 0.1))
+    wait_until(lambda: head.truth(1).position_rad > 0.03, "it is under way")
+    head.sim.do(sim.Mute(ids=(1,)))
+    with pytest.raises(DeviceSilent):
+        robot.motor("neck.pan").stop()
+    assert moving.wait().error is not None
+    wait_until(lambda: not head.truth(1).moving, "it rests")
+    assert head.truth(1).position_rad < 0.5
+
+
+# --- damaged, late, cut, slow, double
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [
+        sim.BadCrc(ids=(1,), count=1),
+        sim.Truncate(ids=(1,), count=1),
+        sim.Garbage(ids=(1,), count=3),
+        sim.Duplicate(ids=(1,), count=3),
+        sim.Dribble(ids=(1,), count=3, s=0.0005),
+        sim.Dribble(ids=(1,), count=1, s=0.006),
+        sim.Mute(ids=(1,), count=1),
+        sim.Late(ids=(1,), count=1, s=0.04),
+    ],
+    ids=lambda fault: f"{type(fault).__name__}",
+)
+def test_a_single_bad_answer_goes_unnoticed(head: Rig, robot: AttachedRobot, fault: sim.Command) -> None:
+    pan = robot.motor("neck.pan")
+    pan.enable()
+    head.sim.do(fault)
+    assert pan.move_to(0.4) == pytest.approx(0.4, abs=0.03)
+    assert pan.state().fault == ""
+
+
+@pytest.mark.parametrize("fast", [False, True], ids=["sync", "fast sync"])
+@pytest.mark.parametrize("late_s", [0.033, 0.040, 0.060, 0.066, 0.080, 0.1, 0.15])
+def test_a_late_answer_never_becomes_a_wrong_value(rig: Rig, late_s: float, fast: bool) -> None:
+    if fast:
+        rig.configure(('driver = "dynamixel"', 'driver = "dynamixel"\nfast_sync = true'))
+    rig.plug()
+    robot = rig.attach()
+    robot.motor("neck.pan").move_to(0.5)
+    rig.sim.do(sim.Late(ids=(1,), s=late_s, count=2))
+    rig.sim.do(sim.Place(ids=(2,), counts=2148))
+    begun = written_now()
+
+    def plausible() -> bool:
+        pan, tilt = state(robot, "neck.pan"), state(robot, "neck.tilt")
+        assert pan is None or pan.position_rad == pytest.approx(0.5, abs=0.01)
+        assert pan is None or (pan.temperature_c, pan.fault) == (30.0, "")
+        assert tilt is None or tilt.position_rad == pytest.approx(0, abs=0.01) or tilt.position_rad < -0.14
+        return pan is not None and pan.measured_at > begun + 0.5
+
+    wait_until(plausible, "later measurements came in")
+
+
+@pytest.mark.parametrize("late_s", [0.04, 0.07, 0.075, 0.08, 0.085, 0.09, 0.1, 0.12])
+def test_a_late_position_is_not_taken_for_a_new_one(head: Rig, robot: AttachedRobot, late_s: float) -> None:
+    head.sim.do(sim.Late(ids=(1,), s=late_s, count=1, instruction="sync_read"))
+    struck = len(sim.instructions(head.log, "sync_read"))
+    wait_until(lambda: len(sim.instructions(head.log, "sync_read")) > struck, "an answer is on its way, late")
+    head.sim.do(sim.Place(ids=(1,), counts=2500))
+    moved = written_now()
+
+    def measured_anew() -> bool:
+        now = state(robot, "neck.pan")
+        fresh = now is not None and now.measured_at > moved
+        assert now is None or not fresh or now.position_rad == pytest.approx(452 * COUNT_RAD, abs=0.01)
+        return now is not None and now.measured_at > moved + 0.2
+
+    wait_until(measured_anew, "later measurements came in")
+
+
+@pytest.mark.parametrize("kind", [sim.BadCrc, sim.Mute, sim.Truncate], ids=lambda kind: kind.__name__)
+def test_answers_that_stay_bad_are_silence(head: Rig, robot: AttachedRobot, kind: type[sim.AnswerFault]) -> None:
+    head.sim.do(kind(ids=(1,)))
+    await_silence(robot, "neck.pan")
+    assert state(robot, "neck.tilt") is not None
+    head.sim.do(sim.Heal())
+    await_answers(robot, "neck.pan")
+
+
+def test_an_adapter_that_echoes_is_no_trouble(head: Rig, robot: AttachedRobot) -> None:
+    head.sim.do(sim.Echo())
+    assert robot.motor("neck.pan").move_to(0.3) == pytest.approx(0.3, abs=0.03)
+
+
+def test_enabling_copes_with_an_answer_lost(head: Rig, robot: AttachedRobot) -> None:
+    head.sim.do(sim.Mute(ids=(1,), instruction="write", count=2))
+    robot.motor("neck.pan").enable()
+    assert head.truth(1).torque
+
+
+# --- unplugged
+
+
+def test_an_unplugged_bus_is_named_and_comes_back_by_itself(head: Rig, robot: AttachedRobot) -> None:
+    robot.motor("neck.pan").move_to(0.3)
+    head.sim.do(sim.Unplug())
+    await_silence(robot, "neck.pan")
+    with pytest.raises(BusGone, match="plug its adapter in again") as gone:
+        robot.motor("neck.pan").state()
+    assert gone.value.bus == str(head.sim.port)
+    for act in (lambda: robot.motor("neck.pan").move_to(0.1), robot.motor("neck.pan").enable):
+        with pytest.raises(BusGone):
+            act()
+    head.sim.do(sim.Replug())
+    await_answers(robot, "neck.pan")
+    assert state(robot, "neck.tilt") is not None
+
+
+def test_unplugging_while_moving_ends_the_move(head: Rig, robot: AttachedRobot) -> None:
+    moving = Outcome(lambda: robot.motor("neck.pan").move_to(1.3, 0.1))
+    head.wait_for("motion_started", 1)
+    head.sim.do(sim.Unplug())
+    assert isinstance(moving.wait().error, BusGone)
+    expired = head.wait_for("watchdog_expired", 1)
+    head.sim.do(sim.Replug())
+    await_answers(robot, "neck.pan")
+    assert not head.moves(since=expired.t)
+    with pytest.raises(DeviceFault, match="watchdog"):
+        robot.motor("neck.pan").move_to(0.0)
+    robot.motor("neck.pan").enable()
+    assert robot.motor("neck.pan").move_to(0.0) == pytest.approx(0.0, abs=0.03)
+
+
+def test_a_stop_while_unplugged_is_not_written_after_replugging(head: Rig, robot: AttachedRobot) -> None:
+    robot.motor("neck.pan").enable()
+    head.sim.do(sim.Unplug())
+    await_silence(robot, "neck.pan")
+    mark = written_now()
+    with pytest.raises(BusGone):
+        robot.motor("neck.pan").stop()
+    head.sim.do(sim.Replug())
+    await_answers(robot, "neck.pan")
+    assert not head.moves(since=mark)
+
+
+def test_another_device_after_replugging_is_not_used(head: Rig, robot: AttachedRobot) -> None:
+    head.sim.do(sim.Unplug())
+    await_silence(robot, "neck.pan")
+    head.sim.do(sim.WrongModel(ids=(1,), number=1020))
+    head.sim.do(sim.Replug())
+    await_answers(robot, "neck.tilt")
+    mark = written_now()
+    with pytest.raises((DeviceFault, DeviceSilent)):
+        robot.motor("neck.pan").move_to(0.1)
+    assert not head.moves(1, mark)
+
+
+def test_closing_while_unplugged_ends_all_the_same(head: Rig, robot: AttachedRobot) -> None:
+    head.sim.do(sim.Unplug())
+    await_silence(robot, "neck.pan")
+    with pytest.raises(BusGone):
+        robot.close()
+    robot.close()
+
+
+# --- the device itself
+
+
+def test_a_brown_out_while_moving_is_a_fault_and_nothing_is_enabled_again(head: Rig, robot: AttachedRobot) -> None:
+    moving = Outcome(lambda: robot.motor("neck.pan").move_to(1.3, 0.1))
+    head.wait_for("motion_started", 1)
+    head.sim.do(sim.BrownOut(ids=(1,)))
+    assert isinstance(moving.wait().error, DeviceFault | DeviceSilent)
+    wait_until(lambda: (s := state(robot, "neck.pan")) is not None and s.fault, "the fault is latched")
+    mark = written_now()
+    with pytest.raises(DeviceFault, match=r"torque went off|restarted"):
+        robot.motor("neck.pan").move_to(0.1)
+    assert not head.truth(1).torque
+    assert not [entry for entry in head.moves(1, mark) if "torque_enable" in entry.registers]
+    robot.motor("neck.pan").enable()
+    assert robot.motor("neck.pan").move_to(0.1) == pytest.approx(0.1, abs=0.03)
+
+
+def test_a_hardware_error_ends_the_move_and_is_named(head: Rig, robot: AttachedRobot) -> None:
+    moving = Outcome(lambda: robot.motor("neck.pan").move_to(1.3, 0.1))
+    head.wait_for("motion_started", 1)
+    head.sim.do(sim.HardwareFault(ids=(1,), bits=0x20))
+    assert "overload" in str(moving.wait().error)
+    with pytest.raises(DeviceFault, match="overload"):
+        robot.motor("neck.pan").enable()
+
+
+def test_a_jammed_joint_is_a_fault_and_is_told_to_hold(head: Rig, robot: AttachedRobot) -> None:
+    moving = Outcome(lambda: robot.motor("neck.pan").move_to(1.3, 0.5))
+    wait_until(lambda: head.truth(1).position_rad > 0.1, "it is under way")
+    head.sim.do(sim.Jam(ids=(1,)))
+    assert isinstance(moving.wait().error, DeviceFault)
+    wait_until(lambda: abs(head.truth(1).goal_counts - head.truth(1).position_counts) < 5, "it holds where it is")
+
+
+def test_a_position_that_stands_still_while_it_should_not_is_a_fault(head: Rig, robot: AttachedRobot) -> None:
+    pan = robot.motor("neck.pan")
+    pan.enable()
+    head.sim.do(sim.Freeze(ids=(1,)))
+    with pytest.raises(DeviceFault, match="no progress"):
+        pan.move_to(0.5)
+
+
+def test_a_clock_that_stands_still_is_a_fault(head: Rig, robot: AttachedRobot) -> None:
+    robot.motor("neck.pan").enable()
+    head.sim.do(sim.Freeze(ids=(1,), tick=True))
+    wait_until(lambda: (s := state(robot, "neck.pan")) is not None and s.fault, "the fault is latched")

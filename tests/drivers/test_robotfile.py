@@ -1,0 +1,109 @@
+"""Robot files: what is read, and what each mistake is answered with."""
+
+from pathlib import Path
+
+import pytest
+
+from drivers.conftest import HEAD
+from trade.errors import ConfigurationError
+from trade_drivers import Robot, load, parse
+
+
+def test_a_robot_file_becomes_records() -> None:
+    robot = parse(HEAD, "head.toml")
+    assert (robot.name, robot.where) == ("rosie", "head.toml")
+    assert [joint.name for joint in robot.joints_on("neck")] == ["neck.pan", "neck.tilt"]
+    assert robot.joints[1].reversed
+    assert (robot.buses[0].rate_hz, robot.buses[0].leave, robot.buses[0].watchdog_s) == (100.0, "hold", 0.3)
+    assert robot.groups[0].joints == ["neck.pan", "neck.tilt"]
+
+
+MISTAKES = [
+    ("[robot]\nname", "name", "head.toml: [name]: unknown table; a robot file has [robot], [bus], [joint], [group]"),
+    ('name = "rosie"', "", 'head.toml: [robot]: missing; write [robot] and name = "rosie"'),
+    ('name = "rosie"', 'name = "Rosie"', "robot.name: 'Rosie' is no name"),
+    ('name = "rosie"', 'name = "rosie"\nage = 3', "robot.age: unknown key; [robot] has only name"),
+    ("[robot]", "[robots]", "[robots]: unknown table"),
+    ("[bus.neck]", "[bus.", "not valid TOML"),
+    ('driver = "dynamixel"\n', "", "bus.neck: missing required key 'driver'; the keys are driver, port, baud"),
+    ('driver = "dynamixel"', 'driver = "dynamixel"\nbuad = 1', "bus.neck.buad: unknown key; the keys are driver"),
+    (
+        'driver = "dynamixel"',
+        'driver = "dynamixel"\nbaud = 300',
+        "bus.neck.baud: Expected `int` >= 9600, but it is 300",
+    ),
+    ('driver = "dynamixel"', 'driver = "dynamixel"\nbaud = "1M"', "bus.neck.baud: Expected `int`, got `str`"),
+    ('driver = "dynamixel"', 'driver = "dynamixel"\nrate_hz = 0', "bus.neck.rate_hz: Expected `float` > 0"),
+    ('driver = "dynamixel"', 'driver = "dynamixel"\nrate_hz = nan', "bus.neck.rate_hz"),
+    ('driver = "dynamixel"', 'driver = "dynamixel"\nwatchdog_s = 9', "bus.neck.watchdog_s: Expected `float` <= 2"),
+    (
+        'driver = "dynamixel"',
+        'driver = "dynamixel"\nleave = "drop"',
+        'leave: must be "hold" or "relax", but it is \'drop\'',
+    ),
+    ('[joint."neck.pan"]', "[joint.neck.pan]", 'a dotted name needs quotes: [joint."neck.pan"]'),
+    ('[joint."neck.pan"]', '[joint."Neck"]', "'Neck' is no name"),
+    ('[joint."neck.pan"]\nbus = "neck"', '[joint."neck.pan"]\nbus = "foot"', "there is no bus 'foot'; there is neck"),
+    ("id = 1\n", "id = 2\n", "id: 2 is taken on bus 'neck' by joint 'neck.pan'"),
+    ("id = 1\n", "id = 253\n", "id: Expected `int` <= 252, but it is 253"),
+    ("id = 1\n", "id = 1.5\n", "id: Expected `int`"),
+    ("id = 1\n", "", "missing required key 'id'"),
+    ("max_rad = 1.4", "max_rad = inf", "max_rad: must be a finite number, but it is inf"),
+    ("min_rad = -1.4", "min_rad = nan", "min_rad: must be a finite number, but it is nan"),
+    ("max_rad = 1.4", "max_rad = -1.4", "max_rad: must be greater than min_rad, but -1.4 <= -1.4"),
+    ("max_speed_rad_s = 2.5", "max_speed_rad_s = inf", "max_speed_rad_s: must be a finite number"),
+    ("max_speed_rad_s = 2.5", "max_speed_rad_s = 0", "max_speed_rad_s: Expected `float` > 0"),
+    ("max_speed_rad_s = 2.5", "max_speed_rad_s = -1", "max_speed_rad_s: Expected `float` > 0"),
+    ("max_accel_rad_s2 = 20.0", "max_accel_rad_s2 = true", "max_accel_rad_s2: Expected `float`, got `bool`"),
+    ("reversed = true", "offset_rad = inf", "offset_rad: must be a finite number"),
+    ("[group.head]", '[group."neck.pan"]', "a joint has this name already"),
+    (
+        '"neck.pan", "neck.tilt"]',
+        '"neck.pan", "neck.nod"]',
+        "group.head.joints: there is no joint 'neck.nod'; there is neck.pan, neck.tilt",
+    ),
+    ('"neck.pan", "neck.tilt"]', '"neck.pan", "neck.pan"]', "names a joint twice"),
+    ('["neck.pan", "neck.tilt"]', "[]", "group.head.joints: Expected `array` of length >= 1"),
+]
+
+
+@pytest.mark.parametrize(("before", "after", "complaint"), MISTAKES, ids=[m[2][:40] for m in MISTAKES])
+def test_a_mistake_is_answered_with_the_key_and_what_would_be_right(before: str, after: str, complaint: str) -> None:
+    assert before in HEAD
+    with pytest.raises(ConfigurationError) as error:
+        parse(HEAD.replace(before, after, 1), "head.toml")
+    assert str(error.value).startswith("head.toml: ")
+    assert complaint in str(error.value)
+
+
+def test_two_buses_on_one_port_are_refused() -> None:
+    other = '[bus.arm]\ndriver = "dynamixel"\nport = "/dev/ttyNOWHERE"\n'
+    with pytest.raises(ConfigurationError, match="is the port of bus 'neck' already"):
+        parse(HEAD + other, "head.toml")
+
+
+def test_a_file_with_nothing_in_it_says_what_is_missing() -> None:
+    for text, missing in (("", r"\[robot\]"), ('[robot]\nname = "r"', r"\[bus.NAME\]")):
+        with pytest.raises(ConfigurationError, match=missing):
+            parse(text, "empty.toml")
+
+
+def test_load_reads_a_file(tmp_path: Path) -> None:
+    file = tmp_path / "head.toml"
+    file.write_text(HEAD)
+    assert isinstance(load(file), Robot)
+    assert load(str(file)).where == str(file)
+
+
+def test_load_says_what_is_wrong_with_the_file_itself(tmp_path: Path) -> None:
+    latin = tmp_path / "latin.toml"
+    latin.write_bytes("# K\u00f6rper".encode("latin-1"))
+    for path, complaint in (
+        (tmp_path / "missing.toml", "there is no such file"),
+        (tmp_path, "is a directory"),
+        (latin, "is not UTF-8 text"),
+        (latin / "below", "cannot be read"),
+    ):
+        with pytest.raises(ConfigurationError, match=complaint) as error:
+            load(path)
+        assert str(path) in str(error.value)
