@@ -5,8 +5,8 @@ import threading
 
 import pytest
 
-from trade.errors import InvalidArgument, LimitExceeded
-from trade_drivers import MotionStopped, Motor
+from trade.errors import InvalidArgument, LimitExceeded, MotionStopped
+from trade_drivers import Motor
 
 
 class MotorContract:

@@ -4,8 +4,8 @@ import pytest
 
 import trade_hil_sim as sim
 from drivers.conftest import Outcome, Rig, wait_until, written_now
-from trade.errors import DeviceFault, DeviceSilent
-from trade_drivers import AttachedRobot, BusGone, MotorState
+from trade.errors import BusGone, DeviceFault, DeviceSilent
+from trade_drivers import AttachedRobot, MotorState
 
 COUNT_RAD = 6.283185 / 4096
 

@@ -4,8 +4,8 @@ import pytest
 
 from drivers.conftest import Outcome, Rig, goal_counts, wait_until, written_now
 from drivers.motor_contract import MotorContract
-from trade.errors import InvalidArgument
-from trade_drivers import AttachedRobot, MotionStopped, Motor
+from trade.errors import InvalidArgument, MotionStopped
+from trade_drivers import AttachedRobot, Motor
 
 
 class TestDynamixelMotor(MotorContract):

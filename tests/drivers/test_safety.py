@@ -23,6 +23,7 @@ from drivers.conftest import (
     wait_until,
     written_now,
 )
+from trade import service
 from trade.errors import (
     ConfigurationError,
     DeadlineExceeded,
@@ -31,9 +32,10 @@ from trade.errors import (
     DeviceSilent,
     InvalidArgument,
     LimitExceeded,
+    MotionStopped,
     OutcomeUnknown,
 )
-from trade_drivers import AttachedRobot, MotionStopped
+from trade_drivers import AttachedRobot
 from trade_hil_sim import DynamixelBus, Servo, instructions, received
 
 WATCHDOG_S = 0.3
@@ -317,11 +319,10 @@ def test_S08_a_stop_holds_where_the_joint_is(head: Rig) -> None:
 # --- S17
 
 
-def test_S17_a_provider_that_moves_but_cannot_be_stopped_is_refused() -> None:
-    from trade import service
-    from trade_drivers._attach import _require_stop
-
+def test_S17_a_provider_that_moves_but_cannot_be_stopped_is_refused(start_container) -> None:
     class Unstoppable:
+        resources = ("rosie.wheel",)
+
         @service
         def go(self) -> None: ...
 
@@ -329,9 +330,10 @@ def test_S17_a_provider_that_moves_but_cannot_be_stopped_is_refused() -> None:
         @service(effect="stop")
         def stop(self) -> None: ...
 
-    _require_stop(Stoppable())
-    with pytest.raises(ConfigurationError, match="go"):
-        _require_stop(Unstoppable())
+    container = start_container("driver")
+    container.register(Stoppable(), "rosie.wheel")
+    with pytest.raises(ConfigurationError, match="cannot be stopped"):
+        container.register(Unstoppable(), "rosie.wheel")
 
 
 # --- S18 attach moves and resets nothing

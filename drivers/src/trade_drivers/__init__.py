@@ -2,7 +2,6 @@
 
 from trade_drivers._attach import AttachedRobot, attach
 from trade_drivers._driver import AttachedBus, Driver, drivers
-from trade_drivers._errors import BusGone, MotionStopped
 from trade_drivers._interfaces import JointGroup, JointLimits, Motor, MotorState
 from trade_drivers._load import load
 from trade_drivers.robotfile import Bus, Group, Joint, Robot, parse
@@ -11,13 +10,11 @@ __all__ = [
     "AttachedBus",
     "AttachedRobot",
     "Bus",
-    "BusGone",
     "Driver",
     "Group",
     "Joint",
     "JointGroup",
     "JointLimits",
-    "MotionStopped",
     "Motor",
     "MotorState",
     "Robot",

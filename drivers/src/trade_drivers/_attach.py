@@ -7,7 +7,6 @@ from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 
 import trade
-from trade._service import marked_methods
 from trade.errors import ConfigurationError, TradeError
 from trade_drivers._driver import AttachedBus, load_driver
 from trade_drivers._interfaces import JointGroup, Motor
@@ -94,8 +93,6 @@ def attach(
     with ExitStack() as undo:
         buses = _attach_buses(robot, ports or {}, healthy, undo)
         providers = _providers(robot, buses)
-        for provider in providers.values():
-            _require_stop(provider)
         for group, provider in providers.items():
             (register or trade.register)(provider, group)
             undo.callback(_withdraw, deregister or trade.deregister, provider)
@@ -135,15 +132,6 @@ def _bus_of(robot: Robot, group: Group) -> str:
         problem = f"are on {' and '.join(buses)}; joints that move together have to share a bus"
         raise ConfigurationError(where=f"{robot.where}: group.{group.name}.joints", problem=problem)
     return buses[0]
-
-
-def _require_stop(provider: object) -> None:
-    """S17: nothing that can move is offered without a way to stop it."""
-    effects = {name: mark.effect for name, (mark, _) in marked_methods(type(provider)).items()}
-    moving = sorted(name for name, effect in effects.items() if effect == "actuate")
-    if moving and "stop" not in effects.values():
-        problem = f'has actuating services ({", ".join(moving)}) but none with effect="stop"; it is not offered'
-        raise ConfigurationError(where=type(provider).__qualname__, problem=problem)
 
 
 def _withdraw(deregister: Deregister, provider: object) -> None:

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 __all__ = [
+    "BusGone",
     "Busy",
     "CallError",
     "CallerError",
@@ -21,6 +22,7 @@ __all__ = [
     "InvalidArgument",
     "InvalidResult",
     "LimitExceeded",
+    "MotionStopped",
     "NoSuchService",
     "NotSerialisable",
     "OutcomeUnknown",
@@ -169,6 +171,17 @@ class OutcomeUnknown(CallerError, TimeoutError):
 
 
 @dataclass(kw_only=True, eq=False)
+class MotionStopped(CallerError, RuntimeError):
+    """A motion ended before its goal because somebody wanted it to; the joint holds where it stopped."""
+
+    device: str
+    reason: str
+
+    def describe(self) -> str:
+        return f"{self.device} stopped before its goal: {self.reason}. It holds its position until it is moved again"
+
+
+@dataclass(kw_only=True, eq=False)
 class Cancelled(CallerError):
     """The call was cancelled by its caller before it finished."""
 
@@ -268,6 +281,17 @@ class DeviceFault(DeviceError, RuntimeError):
 
     def describe(self) -> str:
         return f"{self.device} on {self.bus}: {self.fault}; {self.remedy}"
+
+
+@dataclass(kw_only=True, eq=False)
+class BusGone(DeviceSilent, ConnectionError):
+    """The port of a bus is gone: its adapter was unplugged. It is opened again by itself when it comes back."""
+
+    def describe(self) -> str:
+        return (
+            f"{self.device} cannot be reached: port {self.bus} is gone (for {self.waited_s:.1f} s); plug its adapter "
+            "in again. The driver reconnects by itself and moves nothing"
+        )
 
 
 # --- the set-up

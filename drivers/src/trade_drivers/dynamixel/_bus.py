@@ -7,8 +7,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import TYPE_CHECKING, Final
 
-from trade.errors import TradeError
-from trade_drivers._errors import BusGone
+from trade.errors import BusGone, TradeError
 from trade_drivers.dynamixel._axis import Axis
 from trade_drivers.dynamixel._exchange import Exchange
 from trade_drivers.dynamixel._jobs import Leave

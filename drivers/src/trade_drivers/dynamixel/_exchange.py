@@ -7,8 +7,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Final
 
-from trade.errors import TradeError
-from trade_drivers._errors import MotionStopped
+from trade.errors import MotionStopped, TradeError
 from trade_drivers.dynamixel import _table as table
 from trade_drivers.dynamixel._axis import CYCLIC, SLOW, Axis, Health
 from trade_drivers.dynamixel._jobs import Job, StopTicket

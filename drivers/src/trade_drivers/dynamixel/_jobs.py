@@ -4,8 +4,7 @@ import threading
 from collections.abc import Callable, Generator, Sequence
 from typing import TYPE_CHECKING, Final, TypeVar
 
-from trade.errors import DeadlineExceeded, DeviceSilent, OutcomeUnknown, TradeError
-from trade_drivers._errors import MotionStopped
+from trade.errors import DeadlineExceeded, DeviceSilent, MotionStopped, OutcomeUnknown, TradeError
 from trade_drivers.dynamixel import _table as table
 from trade_drivers.dynamixel._axis import SLOW, Axis, Health
 from trade_drivers.dynamixel._wire import NoAnswer, Refused

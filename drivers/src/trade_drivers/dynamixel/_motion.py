@@ -5,8 +5,7 @@ from typing import TYPE_CHECKING, Final
 
 from msgspec import Struct
 
-from trade.errors import TradeError
-from trade_drivers._errors import MotionStopped
+from trade.errors import MotionStopped, TradeError
 from trade_drivers.dynamixel import _table as table
 from trade_drivers.dynamixel._axis import Axis
 from trade_drivers.dynamixel._jobs import Job, Steps, enabling
