@@ -43,6 +43,8 @@ class Peer:
 
     def __init__(self, address: Address) -> None:
         self.address = address
+        self.answers_on = f"reply/{address.identity}/"
+        """How the keys of its answers begin."""
         self.lost = False
         self._low_ns = -_NEVER
         self._high_ns = _NEVER
@@ -61,24 +63,32 @@ class Peer:
             low, high = clock_ns - received_ns, clock_ns - sent_ns
         self._low_ns, self._high_ns, self._at_ns = low, high, received_ns
 
-    def expiry_ns(self, deadline_ns: int) -> int:
-        """Our deadline in its clock, never later than it is meant."""
-        slack = (time.monotonic_ns() - self._at_ns) * _DRIFT
-        return int(deadline_ns + self._low_ns - slack)
+    def forget_clock(self) -> None:
+        """While it is out of sight its clock may stand still: a computer that sleeps."""
+        self._low_ns, self._high_ns = -_NEVER, _NEVER
+
+    def expiry_ns(self, deadline_ns: int) -> int | None:
+        """Our deadline in its clock, never later than it is meant; None while the clock is unknown."""
+        low, slack = self._low_ns, (time.monotonic_ns() - self._at_ns) * _DRIFT
+        return int(deadline_ns + low - slack) if low > -_NEVER else None
+
+
+_Waiting = tuple[int, Peer, int]
+"""Call id, who is to answer, deadline: swapped as a whole, so that whoever ends a wait ends the one it looked at."""
 
 
 class _Box:
     """A reply channel lent to one caller at a time."""
 
-    __slots__ = ("call_id", "channel", "deadline_ns", "name", "peer", "wake_key")
+    __slots__ = ("channel", "ended_id", "name", "waiting", "wake_key")
 
     def __init__(self, name: str, wake_key: str, channel: Channel) -> None:
         self.name = name
         self.wake_key = wake_key
         self.channel = channel
-        self.call_id = 0
-        self.deadline_ns: float = _NEVER
-        self.peer: Peer | None = None
+        self.waiting: _Waiting | None = None
+        self.ended_id = 0
+        """The call whose wait was ended from our side last."""
 
 
 class _Pending:
@@ -100,7 +110,8 @@ class Caller:
         self._transport = transport
         self._own = own
         self._session = session
-        self._ids = itertools.count(secrets.randbits(38) << 24 | 1)
+        self._ends_on = f"reply/{own.identity}/"
+        self.new_id: Callable[[], int] = itertools.count(secrets.randbits(38) << 24 | 1).__next__
         self._peers: dict[Address, Peer] = {}
         self._publishers: dict[str, Publisher] = {}
         self._lock = threading.Lock()
@@ -114,6 +125,16 @@ class Caller:
         self._sooner = threading.Event()
         self.malformed = 0
         self._spawn("trade-deadlines", self._watch_deadlines)
+
+    @property
+    def own(self) -> Address:
+        """The container that calls."""
+        return self._own
+
+    @property
+    def closed(self) -> bool:
+        """Whether no more calls are sent."""
+        return self._closed
 
     # --- what a call needs to know
 
@@ -152,45 +173,44 @@ class Caller:
         chain: tuple[str, ...],
     ) -> Reply:
         """Call and wait for the answer; it always comes, if only from ourselves at the deadline."""
-        box = self._borrow()
-        call_id = next(self._ids)
-        box.peer, box.deadline_ns, box.call_id = peer, deadline_ns, call_id
-        if deadline_ns < self._next_deadline_ns:
-            self._sooner.set()
+        call_id = self.new_id()
         try:
+            box = self._borrow()
+        except ChannelClosed:
+            return _ended(call_id, Status.UNSENT)
+        try:
+            box.waiting = (call_id, peer, deadline_ns)
+            if deadline_ns < self._next_deadline_ns:
+                self._sooner.set()
             if peer.lost or self._closed:
-                return _ended(call_id, Status.LOST if peer.lost else Status.CLOSED)
+                return _ended(call_id, Status.UNSENT)
             sent_ns = time.monotonic_ns()
             publisher.put(
                 encode_message(Call(PROTOCOL, call_id, service, box.name, self._session, expires_ns, chain, args))
             )
-            return self._await_reply(box, call_id, sent_ns)
+            return self._await_reply(box, call_id, peer, sent_ns)
+        except ChannelClosed:  # the publisher went with its provider, or everything does
+            return _ended(call_id, Status.UNSENT)
         finally:
-            box.call_id, box.deadline_ns, box.peer = 0, _NEVER, None
+            box.waiting = None
             self._free.append(box)
 
-    def _await_reply(self, box: _Box, call_id: int, sent_ns: int) -> Reply:
+    def _await_reply(self, box: _Box, call_id: int, peer: Peer, sent_ns: int) -> Reply:
         while True:
             try:
                 message = box.channel.receive()
             except ChannelClosed:
                 return _ended(call_id, Status.CLOSED)
             reply = self._decode(message)
-            if (
-                reply is None
-                or reply.id != call_id
-                or box.peer is None
-                or not self._may_answer(message, box.peer, reply)
-            ):
+            if reply is None or reply.id != call_id or not self._may_answer(message, peer, reply):
                 continue
             if reply.status < Status.TIMED_OUT:
-                box.peer.heard(reply.clock_ns, sent_ns, time.monotonic_ns())
+                peer.heard(reply.clock_ns, sent_ns, time.monotonic_ns())
             return reply
 
     def _may_answer(self, message: Message, peer: Peer, reply: Reply) -> bool:
         """Only the callee may answer, and only ourselves may end the wait; who puts stands in the key."""
-        speaker = message.key.split("/", 2)[1]
-        return speaker == (self._own.identity if reply.status >= Status.TIMED_OUT else peer.address.identity)
+        return message.key.startswith(self._ends_on if reply.status >= Status.TIMED_OUT else peer.answers_on)
 
     def start(
         self,
@@ -204,17 +224,24 @@ class Caller:
         on_reply: OnReply,
     ) -> None:
         """Call without waiting; the answer goes to ``on_reply`` on a thread of ours."""
-        shared = self._shared_box()
-        call_id = next(self._ids)
+        try:
+            shared = self._shared_box()
+        except ChannelClosed:
+            on_reply(_ended(0, Status.UNSENT))
+            return
+        call_id = self.new_id()
         self._pending[call_id] = _Pending(peer, deadline_ns, on_reply)
         if deadline_ns < self._next_deadline_ns:
             self._sooner.set()
         if peer.lost or self._closed:
-            self._finish(_ended(call_id, Status.LOST if peer.lost else Status.CLOSED))
+            self._finish(_ended(call_id, Status.UNSENT))
             return
-        publisher.put(
-            encode_message(Call(PROTOCOL, call_id, service, shared.name, self._session, expires_ns, chain, args))
-        )
+        try:
+            publisher.put(
+                encode_message(Call(PROTOCOL, call_id, service, shared.name, self._session, expires_ns, chain, args))
+            )
+        except ChannelClosed:
+            self._finish(_ended(call_id, Status.UNSENT))
 
     def _finish(self, reply: Reply) -> None:
         pending = self._pending.pop(reply.id, None)
@@ -283,6 +310,7 @@ class Caller:
         peer = self.peer(address)
         peer.lost = not back
         if not back:
+            peer.forget_clock()
             self._end(lambda waiting, _: waiting is peer, Status.LOST)
 
     def _watch_deadlines(self) -> None:
@@ -291,20 +319,26 @@ class Caller:
             self._next_deadline_ns = _NEVER  # whoever starts during the scan wakes us
             now = time.monotonic_ns()
             self._end_overdue(now)
-            deadlines = [box.deadline_ns for box in list(self._every)]
-            deadlines += [pending.deadline_ns for pending in list(self._pending.values())]
-            soonest = min(deadlines, default=_NEVER)
+            soonest = min(self._deadlines(), default=_NEVER)
             self._next_deadline_ns = soonest
             self._sooner.wait(None if soonest == _NEVER else max(0.0, (soonest - now) / 1e9))
+
+    def _deadlines(self) -> list[int]:
+        waiting = [(box.waiting, box.ended_id) for box in list(self._every)]
+        blocked = [call[2] for call, ended_id in waiting if call is not None and call[0] != ended_id]
+        return blocked + [pending.deadline_ns for pending in list(self._pending.values())]
 
     def _end_overdue(self, now_ns: int) -> None:
         self._end(lambda _, deadline_ns: deadline_ns <= now_ns, Status.TIMED_OUT)
 
     def _end(self, meant: Callable[[Peer, float], bool], status: int) -> None:
         for box in list(self._every):
-            peer, call_id = box.peer, box.call_id
-            if call_id and peer is not None and meant(peer, box.deadline_ns):
-                box.deadline_ns = _NEVER
+            waiting = box.waiting
+            if waiting is None:
+                continue
+            call_id, peer, deadline_ns = waiting
+            if call_id != box.ended_id and meant(peer, deadline_ns):
+                box.ended_id = call_id
                 self._transport.wake(box.wake_key, encode_message(_ended(call_id, status)))
         for call_id, pending in list(self._pending.items()):
             if meant(pending.peer, pending.deadline_ns):
@@ -320,13 +354,19 @@ class Caller:
         self._closed = True
         self._sooner.set()
         self._end(lambda _peer, _deadline: True, Status.CLOSED)
+        self._wait_until_free(time.monotonic() + 2)
         for box in list(self._every):
             box.channel.close()
         for thread in self._threads:
             if thread is not threading.current_thread():
                 thread.join(2)
-        for publisher in self._publishers.values():
+        for publisher in list(self._publishers.values()):
             publisher.close()
+
+    def _wait_until_free(self, deadline: float) -> None:
+        """Nobody may be left inside the transport when the interpreter ends: that would abort it."""
+        while any(box.waiting is not None for box in list(self._every)) and time.monotonic() < deadline:
+            time.sleep(0.001)
 
 
 def _ended(call_id: int, status: int) -> Reply:

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from fnmatch import fnmatchcase
-from typing import Final, Protocol
+from typing import Final, Literal, Protocol
 
 from msgspec import Struct
 
@@ -11,6 +11,7 @@ from trade.errors import ConfigurationError
 __all__ = ["Candidate", "Constraint", "where"]
 
 _MOST_CLAUSES: Final = 1000
+_Field = Literal["name", "group", "host", "container", "local"]
 
 
 class Candidate(Protocol):
@@ -31,7 +32,7 @@ class Candidate(Protocol):
 class Term(Struct, frozen=True, array_like=True, order=True):
     """One test: a field against a pattern."""
 
-    field: str
+    field: _Field
     pattern: str
     negated: bool = False
 
@@ -122,8 +123,9 @@ class _Where:
             container: the container's name, ``*`` and ``?`` allowed.
             local: whether it lives in this container.
         """
-        given = {"name": name, "group": group, "host": host, "container": container}
-        terms = [Term(field, _pattern(field, pattern)) for field, pattern in given.items() if pattern is not None]
+        given: tuple[tuple[_Field, str | None], ...]
+        given = (("name", name), ("group", group), ("host", host), ("container", container))
+        terms = [Term(field, _pattern(field, pattern)) for field, pattern in given if pattern is not None]
         if local is not None:
             terms.append(Term("local", "", negated=not local))
         return Constraint((frozenset(terms),))

@@ -1,12 +1,13 @@
 """One participant: starts, joins, hosts providers, looks up, leaves. Ties the other modules together."""
 
 import atexit
+import contextlib
 import difflib
 import os
 import secrets
 import threading
 import weakref
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, Final
 
 import msgspec
@@ -15,7 +16,7 @@ from trade._calls import Caller
 from trade._constraints import Constraint, where
 from trade._dispatch import Dispatcher
 from trade._handle import Handle, Run
-from trade._invoke import LocalTarget, RemoteTarget, Request
+from trade._invoke import LocalTarget, RemoteTarget, Request, container_closed
 from trade._notifications import Callback, Notification, Notifier
 from trade._providers import Providers, checked_groups
 from trade._registry import Change, Record, Registry
@@ -23,7 +24,7 @@ from trade._rendezvous import Rendezvous, free_endpoint
 from trade._settings import Settings
 from trade._signature import Codec
 from trade._system import DOMAIN, PROVIDER, ContainerInfo, SystemServices
-from trade._transport import Transport
+from trade._transport import ChannelClosed, Transport
 from trade._watch import Watch
 from trade._wire import (
     Address,
@@ -37,6 +38,7 @@ from trade.errors import ConfigurationError, NoSuchService, ServiceGone, TooMany
 __all__ = ["Container"]
 
 _HANDLE_EXT: Final = 1
+_PORTS_TRIED: Final = 4
 _PATIENCE_S: Final = 1.0
 """How long a call waits for the registry to hear of a handle that came by message before its registry entry did."""
 
@@ -55,43 +57,52 @@ class Container:
 
     def __init__(self, settings: Settings | None = None, *, transport: Transport | None = None) -> None:
         _refuse_after_fork()
+        _note_start()
         self._settings = settings or Settings.read()
         self.address: Final = Address(self._settings.identity, self._settings.container, secrets.token_hex(6))
         self.session: Final = secrets.token_hex(8)
-        self._lock = threading.Lock()
+        self._closing = threading.RLock()
         self._closed = False
         self._targets: dict[ServiceKey, LocalTarget | RemoteTarget] = {}
-        self._codec = Codec(self._handle_to_data, self._data_to_handle)
-        self._rendezvous: Rendezvous | None = None
+        self._codec = Codec(self._handle_to_data, self._data_to_handle, (Handle,))
         self._registry = Registry(self.address)
-        self._transport = transport or self._join()
-        self._caller = Caller(self._transport, self.address, self.session)
-        self._notifier = Notifier(lambda record: Handle(self, record.key, record))
-        self._registry.listen(self._changed)
-        self._registry.listen(self._notifier.changed)
-        self._providers = Providers(self._transport, self._registry, self.address, self._codec)
-        self._dispatcher = Dispatcher(self._transport, self.address, self._codec, self._providers.lookup)
-        self._providers.add(SystemServices(), (DOMAIN,), name=PROVIDER)
-        self._presence = self._transport.appear(alive_key(self.address))
-        self._watch = Watch(self._transport, self._registry, self.address, self._caller.lost)
+        with contextlib.ExitStack() as leaving:  # what has begun ends again if the rest cannot begin
+            self._transport = transport or self._join(leaving)
+            leaving.callback(self._transport.close)
+            self._caller = Caller(self._transport, self.address, self.session)
+            leaving.callback(self._caller.close)
+            self._notifier = Notifier(lambda record: Handle(self, record.key, record))
+            leaving.callback(self._notifier.close)
+            self._registry.listen(self._changed)
+            self._registry.listen(self._notifier.changed)
+            self._providers = Providers(self._transport, self._registry, self.address, self._codec)
+            leaving.callback(self._providers.close)
+            self._dispatcher = Dispatcher(self._transport, self.address, self._providers.lookup)
+            leaving.callback(self._dispatcher.close)
+            self._providers.add(SystemServices(), (DOMAIN,), name=PROVIDER)
+            presence = self._transport.appear(alive_key(self.address))
+            leaving.callback(presence.close)
+            self._watch = Watch(self._transport, self._registry, self.address, self._caller.lost)
+            leaving.callback(self._watch.close)
+            self._leaving = leaving.pop_all()
         _live.add(self)
 
-    def _join(self) -> Transport:
+    def _join(self, leaving: contextlib.ExitStack) -> Transport:
+        for _ in range(_PORTS_TRIED if not self._settings.listen else 0):
+            with contextlib.suppress(ConfigurationError):  # somebody else took the free port first
+                return self._join_at([free_endpoint()], leaving)
+        return self._join_at(list(self._settings.listen) or [free_endpoint()], leaving)
+
+    def _join_at(self, listen: list[str], leaving: contextlib.ExitStack) -> Transport:
         settings = self._settings
-        listen, connect = list(settings.listen) or [free_endpoint()], list(settings.connect)
-        if not settings.connect:
-            self._rendezvous = Rendezvous(settings.system)
-            connect = self._rendezvous.enter(listen[0])
-        try:
-            return ZenohTransport(
-                configuration(
-                    namespace=settings.system, listen=listen, connect=connect, credentials=settings.credentials
-                )
-            )
-        except BaseException:
-            if self._rendezvous is not None:
-                self._rendezvous.leave()
-            raise
+        connect = list(settings.connect)
+        if not connect:
+            rendezvous = Rendezvous(settings.system)
+            leaving.callback(rendezvous.leave)
+            connect = rendezvous.enter(listen[0])
+        return ZenohTransport(
+            configuration(namespace=settings.system, listen=listen, connect=connect, credentials=settings.credentials)
+        )
 
     # --- hosting
 
@@ -113,7 +124,10 @@ class Container:
                 already.
         """
         self._check_open()
-        keys = self._providers.add(provider, checked_groups(provider, groups), implements)
+        try:
+            keys = self._providers.add(provider, checked_groups(provider, groups), implements)
+        except ChannelClosed:  # closed by another thread meanwhile
+            raise container_closed(self.address) from None
         return tuple(self.handle(key) for key in keys)
 
     def deregister(self, provider: object) -> None:
@@ -228,10 +242,12 @@ class Container:
 
     def _changed(self, change: Change) -> None:
         """Told by the registry: calls to what left must fail at once."""
-        for record in change[1]:
+        for record in (*change.left, *change.replaced):
             self._targets.pop(record.key, None)
-            if not record.local and not self._registry.is_alive(record.key.address):
-                self._caller.forget(record.key.address, record.key.domain, record.key.provider)
+        for record in change.left:
+            key = record.key
+            if not record.local and (self._registry.removed(key) or not self._registry.is_alive(key.address)):
+                self._caller.forget(key.address, key.domain, key.provider)
 
     # --- calling
 
@@ -243,12 +259,7 @@ class Container:
     def begin(self, handle: Handle, args: tuple[Any, ...], kwargs: dict[str, Any], deadline_s: float | None) -> Run:
         """Call a service without waiting; what ``handle.start(...)`` does."""
         request, run = Request(deadline_s), Run(handle)
-        target = self._target(handle)
-        if isinstance(target, RemoteTarget):
-            target.begin(args, kwargs, request, run)
-        else:
-            work: Callable[[], None] = lambda: run.end(lambda: target.invoke(args, kwargs, request))  # noqa: E731
-            threading.Thread(target=work, name=f"trade-run-{handle.name}", daemon=True).start()
+        self._target(handle).begin(args, kwargs, request, run)
         return run
 
     def _target(self, handle: Handle) -> LocalTarget | RemoteTarget:
@@ -262,18 +273,21 @@ class Container:
         if not known:
             self._registry.wait_for(lambda: self._registry.get(key) is not None, _PATIENCE_S)
         record = self._registry.get(key)
-        if record is None:
+        target = None if record is None else self._make_target(record)
+        if target is None:
             raise self._gone(handle)
-        local = self._providers.lookup(key.provider, key.name) if record.local else None
-        target: LocalTarget | RemoteTarget = (
-            LocalTarget(local, self._codec, self.address, self.session)
-            if local is not None
-            else RemoteTarget(record, self._caller, self._codec)
-        )
         self._targets[key] = target
-        if self._registry.get(key) is None:  # it left in between
+        if self._closed or self._registry.get(key) is not record:  # it left, or is another one, since we looked
             self._targets.pop(key, None)
         return target
+
+    def _make_target(self, record: Record) -> LocalTarget | RemoteTarget | None:
+        if not record.local:
+            return RemoteTarget(record, self._caller, self._codec)
+        service = self._providers.lookup(f"{record.key.domain}/{record.key.provider}", record.key.name)
+        if service is None:  # deregistered since we looked
+            return None
+        return LocalTarget(service, self._codec, self.address, self.session, self._caller.new_id)
 
     def _gone(self, handle: Handle) -> ServiceGone:
         address = handle.key.address
@@ -290,7 +304,7 @@ class Container:
 
     def _data_to_handle(self, code: int, data: memoryview) -> Any:
         if code != _HANDLE_EXT:
-            raise ValueError(f"unknown extension {code}")
+            raise msgspec.ValidationError(f"Unknown extension {code}")
         return self.handle(msgspec.msgpack.decode(data, type=ServiceKey))
 
     # --- being
@@ -317,23 +331,24 @@ class Container:
     def _check_open(self) -> None:
         _refuse_after_fork()
         if self._closed:
-            raise ConfigurationError(where=self.name, problem="this container is closed; start another one")
+            raise container_closed(self.address)
 
     def close(self) -> None:
         """Leave: services, handles and notifications end; nothing stays behind. Idempotent."""
-        with self._lock:
+        if _forked:
+            return
+        with self._closing:  # who comes second waits until it is done
             if self._closed:
                 return
             self._closed = True
-        self._presence.close()
-        self._providers.close()
-        self._dispatcher.close()
-        self._caller.close()
-        self._watch.close()
-        self._notifier.close()
-        self._transport.close()
-        if self._rendezvous is not None:
-            self._rendezvous.leave()
+            self._targets.clear()
+            self._leaving.close()
+
+    def abandon(self) -> None:
+        """In a forked child: everything belongs to the parent; touch nothing, refuse everything."""
+        self._closed = True
+        self._targets.clear()
+        self._leaving.pop_all()
 
     def __enter__(self) -> "Container":
         return self
@@ -352,12 +367,21 @@ def _close_all() -> None:
         container.close()
 
 
+_started = False
 _forked = False
+
+
+def _note_start() -> None:
+    global _started  # noqa: PLW0603 - a fact about the process: the transport's runtime stays for good
+    _started = True
 
 
 def _after_fork() -> None:
     global _forked  # noqa: PLW0603 - a fact about the process
-    _forked = _forked or bool(_live)
+    _forked = _forked or _started
+    for container in list(_live):
+        container.abandon()
+    _live.clear()
 
 
 if hasattr(os, "register_at_fork"):
@@ -367,6 +391,6 @@ if hasattr(os, "register_at_fork"):
 def _refuse_after_fork() -> None:
     if _forked:
         problem = (
-            "this process was forked from one with a container, which cannot work; start it with spawn instead of fork"
+            "this process was forked from one that had a container, which cannot work; start it with spawn, not fork"
         )
         raise ConfigurationError(problem=problem)

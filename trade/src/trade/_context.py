@@ -2,13 +2,13 @@
 
 import time
 from contextvars import ContextVar
-from dataclasses import dataclass
+
+from msgspec import Struct
 
 __all__ = ["CallContext", "current_call"]
 
 
-@dataclass(frozen=True, slots=True)
-class CallContext:
+class CallContext(Struct, frozen=True, gc=False):
     """One call, seen from inside the service."""
 
     id: int

@@ -1,14 +1,13 @@
 """Exceptions on their way over the wire and back into the type a caller would catch."""
 
-import builtins
-import sys
 import traceback
-from dataclasses import fields, is_dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from typing import Any, Final
 
 import msgspec
 
-from trade import errors
+from trade._records import imported
 from trade._wire import ErrorInfo
 from trade.errors import RemoteError, TradeError
 
@@ -25,21 +24,42 @@ class RemoteTraceback(Exception):
 
 
 def pack_error(error: BaseException) -> ErrorInfo:
-    """An exception as data. Values that cannot be sent are sent as their text."""
+    """An exception as data. Values that cannot be sent are sent as their text; it never fails."""
     kind = type(error)
-    data = {f.name: getattr(error, f.name) for f in fields(error)} if is_dataclass(error) else {"args": error.args}
-    text = "".join(traceback.format_exception(kind, error, error.__traceback__))
     return ErrorInfo(
         type=f"{kind.__module__}:{kind.__qualname__}",
-        message=str(error),
-        fields={name: _sendable(value) for name, value in data.items()},
-        traceback=text[-_MOST_TRACEBACK:],
+        message=_text(error),
+        fields={name: _sendable(value) for name, value in _data(error).items()},
+        traceback=_traceback(error)[-_MOST_TRACEBACK:],
     )
+
+
+def _data(error: BaseException) -> dict[str, Any]:
+    """What makes up an exception: of ours its fields, of others its arguments and attributes."""
+    if isinstance(error, TradeError):
+        return {f.name: getattr(error, f.name, None) for f in fields(error)}
+    args = error.__reduce__()[1] if isinstance(error, OSError) else error.args  # which leaves out the file's name
+    return {**vars(error), "args": [_sendable(argument) for argument in args]}
+
+
+def _text(value: Any) -> str:
+    try:
+        text = str(value)
+    except Exception:  # noqa: BLE001 - a text of the user's making
+        text = f"<{type(value).__qualname__} without a text>"
+    return text.encode(errors="backslashreplace").decode()
+
+
+def _traceback(error: BaseException) -> str:
+    try:
+        return _text("".join(traceback.format_exception(error)))
+    except Exception:  # noqa: BLE001 - it prints values of the user's making
+        return ""
 
 
 def unpack_error(info: ErrorInfo, service: str) -> BaseException:
     """The exception a caller sees: the own type where this process has it, else RemoteError."""
-    error = _own(info) or _builtin(info) or _loaded(info)
+    error = _rebuilt(info)
     if error is None:
         error = RemoteError(service=service, type_name=info.type, message=info.message, traceback=info.traceback)
     if info.traceback:
@@ -49,49 +69,29 @@ def unpack_error(info: ErrorInfo, service: str) -> BaseException:
 
 def _sendable(value: Any) -> Any:
     try:
-        return msgspec.to_builtins(value)
-    except (TypeError, ValueError):
-        return str(value)
+        return msgspec.msgpack.decode(msgspec.msgpack.encode(value))
+    except Exception:  # noqa: BLE001 - the value is anything
+        return _text(value)
 
 
-def _own(info: ErrorInfo) -> BaseException | None:
-    """One of our tree: rebuilt with its attributes."""
-    found = _find(info.type)
-    if not (isinstance(found, type) and issubclass(found, TradeError)):
-        return None
-    try:
-        return found(**info.fields)
-    except TypeError:  # another version of the class
-        return None
-
-
-def _builtin(info: ErrorInfo) -> BaseException | None:
-    module, _, name = info.type.partition(":")
-    found = getattr(builtins, name, None) if module == "builtins" else None
+def _rebuilt(info: ErrorInfo) -> BaseException | None:
+    """The exception in its own type, if this process has that and it can be made from what was sent."""
+    found = imported(info.type)
     if not (isinstance(found, type) and issubclass(found, Exception)):
         return None
     try:
-        return found(*info.fields.get("args", (info.message,)))
-    except TypeError:  # a class that wants more, such as UnicodeDecodeError
+        if issubclass(found, TradeError):
+            checked = msgspec.convert(info.fields, found, strict=False)
+            return found(**{f.name: getattr(checked, f.name) for f in fields(found)})
+        args = info.fields.get("args", (info.message,))
+        return found(*args) if found.__module__ == "builtins" else _users(found, args, info.fields)
+    except Exception:  # noqa: BLE001 - another version of the class, or one that is made differently
         return None
 
 
-def _loaded(info: ErrorInfo) -> BaseException | None:
-    """A class of the user's that is imported here already. Its code does not run: only its arguments are set."""
-    found = _find(info.type)
-    if not (isinstance(found, type) and issubclass(found, Exception)):
-        return None
-    try:
-        error = found.__new__(found)
-    except TypeError:
-        return None
-    error.args = tuple(info.fields.get("args", (info.message,)))
+def _users(found: type[Exception], args: Sequence[Any], attributes: Mapping[str, Any]) -> Exception:
+    """One of a class of the user's, with its arguments and attributes; its own code is not run."""
+    error = found.__new__(found)
+    error.args = tuple(args)
+    error.__dict__.update({name: value for name, value in attributes.items() if name != "args"})
     return error
-
-
-def _find(path: str) -> Any:
-    module_name, _, qualified = path.partition(":")
-    found: Any = errors if module_name == errors.__name__ else sys.modules.get(module_name)
-    for part in qualified.split("."):
-        found = getattr(found, part, None)
-    return found

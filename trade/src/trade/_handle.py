@@ -3,13 +3,15 @@
 import asyncio
 import concurrent.futures
 from collections.abc import Callable, Generator, Mapping
-from typing import Any, Protocol
+from typing import Any, Final, Protocol
 
 from trade._registry import Record
 from trade._wire import Address, ServiceKey
 from trade.errors import ConfigurationError
 
 __all__ = ["Handle", "Run"]
+
+LONGEST_DEADLINE_S: Final = 86_400.0
 
 
 class Home(Protocol):
@@ -64,6 +66,10 @@ class Run:
         """
         self._handle.cancel_service()()
 
+    def fail(self, error: BaseException) -> None:
+        """Told by the container: it could not begin."""
+        self._future.set_exception(error)
+
     def end(self, outcome: Callable[[], Any]) -> None:
         """Told by the container: the outcome is what this returns or raises."""
         try:
@@ -108,10 +114,11 @@ class Handle:
         """The same service, called with other options.
 
         Args:
-            deadline_s: how long a call may take, in seconds; greater than zero.
+            deadline_s: how long a call may take, in seconds; greater than zero, at most a day.
         """
-        if not deadline_s > 0:
-            raise ConfigurationError(problem=f"deadline_s must be greater than 0, not {deadline_s}")
+        if not 0 < deadline_s <= LONGEST_DEADLINE_S:
+            problem = f"deadline_s must be more than 0 and at most {LONGEST_DEADLINE_S:.0f} (a day), not {deadline_s}"
+            raise ConfigurationError(problem=problem)
         return Handle(self._home, self.key, self._record, deadline_s)
 
     # --- telling

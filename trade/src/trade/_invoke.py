@@ -1,5 +1,7 @@
 """From a handle to a result: the same checks whether the service is here or elsewhere."""
 
+import logging
+import threading
 import time
 from collections.abc import Callable
 from typing import Any, Final
@@ -17,7 +19,18 @@ from trade._registry import Record
 from trade._signature import Codec, encode_arguments
 from trade._system import CLOCK, DOMAIN, PROVIDER
 from trade._wire import EMPTY_ARGUMENTS, Address, ErrorInfo, Reply, ServiceInfo, Status
-from trade.errors import Busy, ContainerLost, DeadlineExceeded, InvalidResult, OutcomeUnknown, ServiceGone
+from trade.errors import (
+    Busy,
+    ConfigurationError,
+    ContainerLost,
+    DeadlineExceeded,
+    InvalidResult,
+    OutcomeUnknown,
+    RemoteError,
+    ServiceGone,
+)
+
+_logger = logging.getLogger("trade")
 
 DEFAULT_DEADLINE_S: Final = 10.0
 
@@ -27,11 +40,11 @@ _decode_error: Final = msgspec.msgpack.Decoder(ErrorInfo).decode
 class Request:
     """One call on its way out: deadline and chain, inherited from the call that makes it."""
 
-    __slots__ = ("chain", "deadline_ns", "deadline_s")
+    __slots__ = ("_asked_s", "_begun_ns", "chain", "deadline_ns", "deadline_s")
 
     def __init__(self, deadline_s: float | None) -> None:
-        now = time.monotonic_ns()
-        self.deadline_s = DEFAULT_DEADLINE_S if deadline_s is None else deadline_s
+        self._begun_ns = now = time.monotonic_ns()
+        self._asked_s = self.deadline_s = DEFAULT_DEADLINE_S if deadline_s is None else deadline_s
         self.deadline_ns = now + int(self.deadline_s * 1e9)
         self.chain: tuple[str, ...] = ()
         outer = running.get()
@@ -42,23 +55,44 @@ class Request:
             self.deadline_ns = outer.expires_ns
             self.deadline_s = max(0.0, (outer.expires_ns - now) / 1e9)
 
+    def ignore_outer_deadline(self) -> None:
+        """A stop is sent and waited for however late the call is that makes it."""
+        self.deadline_s = self._asked_s
+        self.deadline_ns = self._begun_ns + int(self._asked_s * 1e9)
+
 
 class LocalTarget:
     """A service of this container: called directly, with the validation and the copies a wire would make."""
 
-    def __init__(self, service: LocalService, codec: Codec, own: Address, session: str) -> None:
+    def __init__(
+        self, service: LocalService, codec: Codec, own: Address, session: str, new_id: Callable[[], int]
+    ) -> None:
         self._service = service
         self._codec = codec
         self._own = own
         self._session = session
+        self._new_id = new_id
 
     def invoke(self, args: tuple[Any, ...], kwargs: dict[str, Any], request: Request) -> Any:
+        return self._run(self._encode(args, kwargs), request)
+
+    def begin(self, args: tuple[Any, ...], kwargs: dict[str, Any], request: Request, run: Run) -> None:
+        """The same on a thread of its own, with the arguments as they are now."""
+        raw = self._encode(args, kwargs)
+        name = f"trade-run-{self._service.label}"
+        threading.Thread(target=run.end, args=(lambda: self._run(raw, request),), name=name, daemon=True).start()
+
+    def _encode(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Raw:
+        return encode_arguments(self._codec, self._service.signature.info, self._service.label, args, kwargs)
+
+    def _run(self, raw: Raw, request: Request) -> Any:
         service = self._service
-        raw = encode_arguments(self._codec, service.signature.info, service.label, args, kwargs)
         expires_ns = None if service.effect == "stop" else request.deadline_ns
         if service.too_late(expires_ns):
             raise DeadlineExceeded(service=service.label, deadline_s=request.deadline_s)
-        context = CallContext(0, service.label, self._own.identity, self._session, expires_ns, request.chain)
+        context = CallContext(
+            self._new_id(), service.label, self._own.identity, self._session, expires_ns, request.chain
+        )
         return service.signature.copy_result(service.run(raw, context))
 
 
@@ -75,19 +109,19 @@ class RemoteTarget:
         self._is_stop = record.info.effect == "stop"
         self._publisher = caller.publisher(address, key.domain, key.provider, stop=self._is_stop)
         self._clock = caller.publisher(address, DOMAIN, PROVIDER, stop=False)
-        self._decode = codec.decoder(type_from_schema(record.info.result_schema, record.info.types))
+        self._decode = _result_decoder(codec, record.info)
 
     def invoke(self, args: tuple[Any, ...], kwargs: dict[str, Any], request: Request) -> Any:
-        raw = encode_arguments(self._codec, self._info, self._label, args, kwargs)
+        raw = self._encode(args, kwargs, request)
         if not (self._peer.clock_known or self._is_stop):
             reply = self._ask(self._clock, CLOCK, EMPTY_ARGUMENTS, None, request)
             if reply.status != Status.OK:
-                raise self._failure(reply, request)
+                raise self._not_begun(reply, request)
         return self._unpack(self._ask(self._publisher, self._info.name, raw, self._expiry(request), request), request)
 
     def begin(self, args: tuple[Any, ...], kwargs: dict[str, Any], request: Request, run: Run) -> None:
         """The same without waiting; the outcome goes into the run."""
-        raw = encode_arguments(self._codec, self._info, self._label, args, kwargs)
+        raw = self._encode(args, kwargs, request)
 
         def go() -> None:
             self._start(self._publisher, self._info.name, raw, self._expiry(request), request, finish)
@@ -96,12 +130,20 @@ class RemoteTarget:
             run.end(lambda: self._unpack(reply, request))
 
         def clock_heard(reply: Reply) -> None:
-            go() if reply.status == Status.OK else finish(reply)
+            go() if reply.status == Status.OK else run.fail(self._not_begun(reply, request))
 
         if self._peer.clock_known or self._is_stop:
             go()
         else:
             self._start(self._clock, CLOCK, EMPTY_ARGUMENTS, None, request, clock_heard)
+
+    def _encode(self, args: tuple[Any, ...], kwargs: dict[str, Any], request: Request) -> Raw:
+        raw = encode_arguments(self._codec, self._info, self._label, args, kwargs)
+        if self._is_stop:
+            request.ignore_outer_deadline()
+        elif request.deadline_s <= 0:
+            raise DeadlineExceeded(service=self._label, deadline_s=request.deadline_s)
+        return raw
 
     def _expiry(self, request: Request) -> int | None:
         return None if self._is_stop else self._peer.expiry_ns(request.deadline_ns)
@@ -128,11 +170,25 @@ class RemoteTarget:
         except msgspec.DecodeError as bad:
             raise InvalidResult(service=self._label, problem=str(bad)) from None
 
+    def _not_begun(self, reply: Reply, request: Request) -> BaseException:
+        """The answer to the question before the call was none: the call itself was never sent."""
+        if reply.status == Status.TIMED_OUT:
+            return DeadlineExceeded(service=self._label, deadline_s=request.deadline_s)
+        if reply.status == Status.LOST:
+            return self._gone()
+        return self._failure(reply, request)
+
+    def _gone(self) -> BaseException:
+        if self._caller.closed:
+            return container_closed(self._caller.own)
+        reason = f"container {self._peer.address.container} has ended, restarted or cannot be reached"
+        return ServiceGone(service=self._label, reason=reason)
+
     def _failure(self, reply: Reply, request: Request) -> BaseException:
         container = self._peer.address.container
         match reply.status:
             case Status.ERROR:
-                return unpack_error(_decode_error(reply.body), self._label)
+                return self._error(reply)
             case Status.BUSY:
                 return Busy(service=self._label, container=container)
             case Status.EXPIRED:
@@ -141,5 +197,29 @@ class RemoteTarget:
                 return ServiceGone(service=self._label)
             case Status.TIMED_OUT:
                 return OutcomeUnknown(service=self._label, deadline_s=request.deadline_s)
-            case _:
+            case Status.UNSENT:
+                return self._gone()
+            case Status.LOST:
                 return ContainerLost(service=self._label, container=container)
+            case _:
+                return ContainerLost(service=self._label, container=self._caller.own.container)
+
+    def _error(self, reply: Reply) -> BaseException:
+        try:
+            return unpack_error(_decode_error(reply.body), self._label)
+        except msgspec.DecodeError as bad:
+            return RemoteError(service=self._label, type_name="an error that cannot be read", message=str(bad))
+
+
+def _result_decoder(codec: Codec, info: ServiceInfo) -> Callable[[Any], Any]:
+    """A decoder for the result, as typed as its description allows."""
+    try:
+        return codec.decoder(type_from_schema(info.result_schema, info.types))
+    except Exception as bad:  # noqa: BLE001 - a schema from elsewhere may be anything
+        _logger.debug("the result of %s stays plain data: %s", info.name, bad)
+        return codec.decoder(Any)
+
+
+def container_closed(own: Address) -> ConfigurationError:
+    """What every use of a closed container raises."""
+    return ConfigurationError(where=own.container, problem="this container is closed; start another one")

@@ -64,7 +64,7 @@ class Notifier:
         """Told by the registry."""
         with self._lock:
             self._standing = [standing for standing in self._standing if standing.active]
-            for occasion, records in zip(("joined", "left"), change, strict=True):
+            for occasion, records in (("joined", change.joined), ("left", change.left)):
                 for notification in self._standing:
                     if notification.occasion == occasion:
                         self._match(notification, records)
@@ -81,7 +81,7 @@ class Notifier:
                 continue
             try:
                 notification.call(handle)
-            except Exception:
+            except BaseException:
                 _logger.exception("the call of %r failed; it stays attached", notification)
 
     def close(self) -> None:

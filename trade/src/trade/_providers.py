@@ -9,16 +9,16 @@ from typing import Any, Final
 
 from msgspec import Struct, structs
 
-from trade._dispatch import LocalService
+from trade._dispatch import AsyncLoop, LocalService
 from trade._registry import Registry
-from trade._service import marked_methods
+from trade._service import ServiceMark, marked_methods
 from trade._signature import Codec, Signature
 from trade._system import DOMAIN
 from trade._transport import Publisher, Transport
-from trade._wire import Address, ProviderInfo, ServiceKey, domain_of, encode_message, registry_key
+from trade._wire import Address, ProviderInfo, ServiceKey, as_chunk, domain_of, encode_message, registry_key
 from trade.errors import ConfigurationError
 
-_GROUP: Final = re.compile(r"[A-Za-z0-9_-]+(\.[A-Za-z0-9_-]+)*")
+_GROUP: Final = re.compile(r"[A-Za-z0-9_-]{1,80}(\.[A-Za-z0-9_-]{1,80})*")
 
 
 class _Registered(Struct, frozen=True):
@@ -37,6 +37,7 @@ class Providers:
         self._registry = registry
         self._own = own
         self._codec = codec
+        self._loop = AsyncLoop()
         self._lock = threading.Lock()
         self._hosted: dict[str, _Registered] = {}
         self._names: dict[int, str] = {}
@@ -64,10 +65,10 @@ class Providers:
             if id(provider) in self._names:
                 raise ConfigurationError(where=kind, problem="this object is registered already; deregister it first")
             self._counter += 1
-            chunk = name or f"{type(provider).__name__}-{self._counter}"
+            chunk = name or f"{as_chunk(type(provider).__name__)[:60]}-{self._counter}"
             announcement = self._transport.announce(registry_key(domain, self._own, chunk))
-            self._names[id(provider)] = chunk
-            self._hosted[chunk] = _Registered(provider, services, announcement)
+            self._names[id(provider)] = f"{domain}/{chunk}"
+            self._hosted[f"{domain}/{chunk}"] = _Registered(provider, services, announcement)
         info = ProviderInfo(
             revision=1, groups=groups, kind=kind, host=socket.gethostname(), pid=os.getpid(), services=infos
         )
@@ -82,23 +83,29 @@ class Providers:
             ConfigurationError: it is not registered here.
         """
         with self._lock:
-            chunk = self._names.pop(id(provider), None)
-            if chunk is None:
+            place = self._names.pop(id(provider), None)
+            if place is None:
                 where = type(provider).__qualname__
                 raise ConfigurationError(where=where, problem="it is not registered in this container")
-            registered = self._hosted.pop(chunk)
-        self._registry.remove(self._own, chunk)
+            registered = self._hosted.pop(place)
+        self._registry.remove(self._own, place.partition("/")[2])
         registered.announcement.close()
 
-    def lookup(self, provider: str, service: str) -> LocalService | None:
-        """A service as calls name it."""
-        registered = self._hosted.get(provider)
+    def lookup(self, place: str, service: str) -> LocalService | None:
+        """A service as calls name it.
+
+        Args:
+            place: ``domain/provider``. The domain must be the provider's own: access rules go by it.
+            service: its name.
+        """
+        registered = self._hosted.get(place)
         return None if registered is None else registered.services.get(service)
 
     def close(self) -> None:
         """Withdraw everything. Idempotent."""
         for registered in list(self._hosted.values()):
             registered.announcement.close()
+        self._loop.close()
 
     def _services_of(
         self, provider: object, groups: tuple[str, ...], implements: Sequence[type]
@@ -109,21 +116,32 @@ class Providers:
             problem = "it has no services; mark methods of its class with @trade.service"
             raise ConfigurationError(where=kind, problem=problem)
         resources = tuple(getattr(provider, "resources", ()))
+        _require_stop(kind, resources, [mark for mark, _ in marked.values()])
         services: dict[str, LocalService] = {}
         for name, (mark, function) in marked.items():
             label = f"{groups[0] if groups else kind}.{name}"
             signature = Signature(label, name, mark, function, self._codec)
             if mark.effect != "read":
                 signature.info = structs.replace(signature.info, uses=(*mark.uses, *resources))
-            services[name] = LocalService(label, signature, getattr(provider, name), mark.effect)
+            services[name] = LocalService(label, signature, getattr(provider, name), mark.effect, self._loop)
         return services
+
+
+def _require_stop(kind: str, resources: tuple[str, ...], marks: Sequence[ServiceMark]) -> None:
+    """S17: what moves something physical is not offered without a way to stop it."""
+    physical = resources or any(mark.uses for mark in marks)
+    effects = {mark.effect for mark in marks}
+    if physical and "actuate" in effects and "stop" not in effects:
+        problem = 'it moves something but cannot be stopped; give it a method marked @service(effect="stop")'
+        raise ConfigurationError(where=kind, problem=problem)
 
 
 def checked_groups(provider: object, groups: str | Sequence[str]) -> tuple[str, ...]:
     """Groups as a tuple; raises ConfigurationError for one that is malformed or the middleware's own."""
     named = (groups,) if isinstance(groups, str) else tuple(groups)
     for group in named:
-        if not _GROUP.fullmatch(group) or group.split(".")[0] == DOMAIN:
+        is_text = isinstance(group, str)  # pyright: ignore[reportUnnecessaryIsInstance] - callers may not check types
+        if not is_text or not _GROUP.fullmatch(group) or group.split(".")[0] == DOMAIN:
             problem = f"{group!r} is no group; use words joined by dots, such as rosie.head ({DOMAIN!r} is reserved)"
             raise ConfigurationError(where=type(provider).__qualname__, problem=problem)
     return named

@@ -4,6 +4,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from typing import Final, NamedTuple
 
 from trade._constraints import Constraint
 from trade._wire import Address, ProviderInfo, ServiceInfo, ServiceKey
@@ -47,8 +48,17 @@ class ContainerState:
     removed: set[str]
 
 
-Change = tuple[list[Record], list[Record]]
-"""Records that joined, records that left."""
+class Change(NamedTuple):
+    """What a message did to the registry."""
+
+    joined: list[Record]
+    left: list[Record]
+    replaced: list[Record]
+    """The same services, told anew."""
+
+
+_MOST_ENDED: Final = 256
+"""So many ended containers are remembered, for the one that comes back."""
 
 
 class Registry:
@@ -115,6 +125,7 @@ class Registry:
                 state = self._state(address)
                 was, state.alive = state.alive, False
                 change = self._swap(_all(state) if was else [], [], alive=True)
+                self._forget_ended()
             self._tell(change)
 
     def _state(self, address: Address) -> ContainerState:
@@ -122,6 +133,11 @@ class Registry:
         if state is None:
             state = self._containers[address] = ContainerState(address, alive=False, providers={}, removed=set())
         return state
+
+    def _forget_ended(self) -> None:
+        ended = [address for address, state in self._containers.items() if not state.alive]
+        for address in ended[:-_MOST_ENDED]:
+            del self._containers[address]
 
     def _make(self, address: Address, domain: str, provider: str, info: ProviderInfo) -> list[Record]:
         return [
@@ -140,17 +156,22 @@ class Registry:
     def _swap(self, before: Iterable[Record], after: Iterable[Record], alive: bool) -> Change:
         """Replace records in the index, under the lock. What stays under its key neither joins nor leaves."""
         if not alive:
-            return [], []
+            return Change([], [], [])
         old = {record.key: record for record in before}
         new = {record.key: record for record in after}
-        for key in old:
-            self._records.pop(key, None)
         self._records.update(new)
+        for key in old:
+            if key not in new:
+                self._records.pop(key, None)
         self._changed.notify_all()
-        return [new[key] for key in new if key not in old], [old[key] for key in old if key not in new]
+        return Change(
+            joined=[new[key] for key in new if key not in old],
+            left=[old[key] for key in old if key not in new],
+            replaced=[new[key] for key in new if key in old],
+        )
 
     def _tell(self, change: Change) -> None:
-        if change[0] or change[1]:
+        if any(change):
             for listener in list(self._listeners):
                 listener(change)
 

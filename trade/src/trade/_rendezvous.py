@@ -47,7 +47,7 @@ class Rendezvous:
 
     def _others(self) -> list[str]:
         found: list[str] = []
-        for path in sorted(self._folder.glob("tcp_*")):
+        for path in sorted(path for path in self._folder.iterdir() if not path.name.startswith(".")):
             with contextlib.suppress(OSError, ValueError):
                 endpoint = path.read_text(encoding="ascii").strip()
                 if path == self._own:
@@ -68,7 +68,7 @@ class Rendezvous:
 def _listens(endpoint: str) -> bool:
     host, port = endpoint.partition("/")[2].rsplit(":", 1)
     try:
-        with socket.create_connection((host, int(port)), timeout=0.5):
+        with socket.create_connection((host.strip("[]"), int(port)), timeout=0.5):
             return True
     except OSError:
         return False
@@ -81,7 +81,7 @@ def _runtime_folder() -> Path:
     folder = Path(base) / "trade" if base else Path(tempfile.gettempdir()) / f"trade-{uid}"
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     if hasattr(os, "getuid"):
-        state = folder.stat()
+        state = folder.lstat()  # a link may lead anywhere
         if state.st_uid != os.getuid() or stat.S_IMODE(state.st_mode) & 0o022:
             problem = "others may write there; remove it, or set TRADE_RUNTIME_DIR to a folder of your own"
             raise ConfigurationError(where=str(folder), problem=problem)

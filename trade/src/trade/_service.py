@@ -57,15 +57,20 @@ def service(
     """
     if effect not in _EFFECTS:
         raise ConfigurationError(problem=f"effect must be one of {', '.join(_EFFECTS)}, not {effect!r}")
-    mark = ServiceMark(effect, cancel, tuple(achieves), tuple(uses))
+    mark = ServiceMark(effect, cancel, _several(achieves), _several(uses))
 
     def note(target: _Function) -> _Function:
-        if not callable(target) or inspect.isclass(target):
-            raise ConfigurationError(problem=f"@service stands on a method, not on {target!r}; put it below @property")
-        setattr(target, _MARK, mark)
+        function: Any = getattr(target, "__func__", target)  # a class or static method: its function carries the mark
+        if not inspect.isroutine(function):
+            raise ConfigurationError(problem=f"@service stands on a method, not on {target!r}")
+        setattr(function, _MARK, mark)
         return target
 
     return note if function is None else note(function)
+
+
+def _several(texts: str | Sequence[str]) -> tuple[str, ...]:
+    return (texts,) if isinstance(texts, str) else tuple(texts)
 
 
 def marked_methods(cls: type, interfaces: Sequence[type] = ()) -> dict[str, tuple[ServiceMark, Callable[..., Any]]]:
@@ -89,7 +94,20 @@ def marked_methods(cls: type, interfaces: Sequence[type] = ()) -> dict[str, tupl
 def _check(cls: type, found: dict[str, tuple[ServiceMark, Callable[..., Any]]]) -> None:
     for name, (mark, _) in found.items():
         where = f"{cls.__qualname__}.{name}"
-        if getattr(getattr(cls, name, None), "__isabstractmethod__", False) or not hasattr(cls, name):
-            raise ConfigurationError(where=where, problem="the interface has this service, but the class does not")
+        if not _implements(cls, name):
+            problem = "the interface has this service, but the class does not implement it"
+            raise ConfigurationError(where=where, problem=problem)
         if mark.cancel is not None and mark.cancel not in found:
             raise ConfigurationError(where=where, problem=f"cancel={mark.cancel!r} names no service of this class")
+
+
+def _implements(cls: type, name: str) -> bool:
+    """Whether the class has a method of its own: neither an abstract one nor the empty body in a protocol."""
+    owner = next((base for base in cls.__mro__ if name in vars(base)), None)
+    method = getattr(cls, name, None)
+    return (
+        owner is not None
+        and not getattr(owner, "_is_protocol", False)
+        and not getattr(method, "__isabstractmethod__", False)
+        and callable(method)
+    )

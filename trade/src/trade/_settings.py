@@ -1,6 +1,5 @@
 """Who a container is and where it may be reached; every default stays on this host."""
 
-import getpass
 import ipaddress
 import os
 import socket
@@ -39,7 +38,7 @@ class Settings:
 
     def __post_init__(self) -> None:
         for what, text in (("system", self.system), ("identity", self.identity), ("container", self.container)):
-            if not is_chunk(text):
+            if not is_chunk(text) or text.strip(".") == "":  # the system names a folder, too
                 problem = f"{text!r} is no name for a {what}; use letters, digits, . _ - (at most 80)"
                 raise ConfigurationError(where=what, problem=problem)
         for endpoint in self.listen:
@@ -71,7 +70,7 @@ class Settings:
         The environment has ``TRADE_SYSTEM``, ``TRADE_IDENTITY``, ``TRADE_CONTAINER``, ``TRADE_LISTEN`` and
         ``TRADE_CONNECT`` (comma-separated), ``TRADE_CREDENTIALS`` (``user:password``).
         """
-        named = system or environment.get("TRADE_SYSTEM")
+        named = system or environment.get("TRADE_SYSTEM") or None
         return cls(
             system=named or f"{_user()}@{as_chunk(socket.gethostname())}",
             identity=identity or environment.get("TRADE_IDENTITY") or _user(),
@@ -97,6 +96,8 @@ def _credentials(text: str | None) -> tuple[str, str] | None:
 
 
 def _user() -> str:
+    import getpass  # noqa: PLC0415 - it loads modules that not every operating system has
+
     try:
         return as_chunk(getpass.getuser())
     except (OSError, KeyError):  # a container image without a user name
@@ -112,7 +113,7 @@ def _is_loopback(endpoint: str) -> bool:
     """Whether ``protocol/host:port`` stays on this host."""
     protocol, slash, rest = endpoint.partition("/")
     host, colon, port = rest.split("#")[0].split("?")[0].rpartition(":")
-    if not (protocol and slash and host and colon and port.isdigit()):
+    if not (protocol and slash and host and colon and port.isascii() and port.isdigit()):
         raise ConfigurationError(where=f"endpoint {endpoint!r}", problem="must look like tcp/127.0.0.1:7450")
     try:
         return ipaddress.ip_address(host.strip("[]")).is_loopback

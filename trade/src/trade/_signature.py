@@ -7,11 +7,14 @@ import math
 import re
 import types
 from collections.abc import Callable, Mapping, Sequence
+from decimal import Decimal
 from typing import Any, Final, Literal, Union, get_origin, get_type_hints
 
 import msgspec
 from msgspec import UNSET, Raw, UnsetType
+from msgspec.structs import astuple
 
+from trade._records import noted
 from trade._service import ServiceMark
 from trade._wire import Parameter, ServiceInfo
 from trade.errors import ConfigurationError, InvalidArgument, InvalidResult, NotSerialisable
@@ -25,14 +28,27 @@ _PLAIN: Final = frozenset([bool, int, float, str, bytes, type(None)])
 class Codec:
     """Encoding and decoding of values, with the container's way to turn handles into data and back."""
 
-    def __init__(self, enc_hook: Callable[[Any], Any], ext_hook: Callable[[int, memoryview], Any]) -> None:
-        self._enc_hook = enc_hook
+    def __init__(
+        self, enc_hook: Callable[[Any], Any], ext_hook: Callable[[int, memoryview], Any], own: Sequence[type] = ()
+    ) -> None:
         self._ext_hook = ext_hook
+        self._own = tuple(own)
+        """Types that only the hooks know how to send."""
         self.encode: Callable[[Any], bytes] = msgspec.msgpack.Encoder(enc_hook=enc_hook).encode
 
     def decoder(self, kind: Any) -> Callable[[Any], Any]:
         """A decoder for one type; raises msgspec.ValidationError."""
         return msgspec.msgpack.Decoder(kind, dec_hook=_as_it_is, ext_hook=self._ext_hook).decode
+
+    def schema(self, kind: Any) -> tuple[dict[str, Any], dict[str, Any]]:
+        """JSON Schema of a type and of the types it refers to; raises TypeError for one that cannot be sent."""
+        [schema], definitions = msgspec.json.schema_components([kind], schema_hook=self._own_schema)
+        return schema, dict(definitions)
+
+    def _own_schema(self, kind: Any) -> dict[str, Any]:
+        if kind not in self._own:
+            raise TypeError(f"{_type_text(kind)} is no plain data")
+        return {"type": "object", "title": kind.__name__, "x-trade-type": kind.__name__}
 
 
 def _as_it_is(kind: type, value: Any) -> Any:
@@ -57,13 +73,17 @@ def encode_arguments(
 def _by_name(info: ServiceInfo, service: str, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> dict[str, Any]:
     places = [parameter.name for parameter in info.parameters if not parameter.keyword_only]
     if len(args) > len(places):
-        problem = f"takes at most {len(places)} positional arguments, got {len(args)}"
+        problem = _too_many(len(places), len(args))
         raise InvalidArgument(service=service, argument="", problem=problem, signature=info.signature)
     named = dict(zip(places, args, strict=False))
     for name in kwargs:
         if name in named:
             raise InvalidArgument(service=service, argument=name, problem="given twice", signature=info.signature)
     return {**named, **kwargs}
+
+
+def _too_many(places: int, given: int) -> str:
+    return f"takes at most {places} positional argument{'' if places == 1 else 's'}, got {given}"
 
 
 def _unsendable(
@@ -100,9 +120,9 @@ class Signature:
         self._keyword_only = [p.name for p in parameters if p.kind not in _POSITIONAL]
         self._has_defaults = any(p.default is not p.empty for p in parameters)
         self._must_be_finite = mark.effect != "read" and any(_mentions_float(kind) for kind in kinds.values())
-        self._result_is_plain = returns if returns in _PLAIN or returns is Any else None
+        self._result_is_plain = returns if returns is Any or (isinstance(returns, type) and returns in _PLAIN) else None
         self._decode_result = _described(where, "its result", lambda: codec.decoder(returns))
-        self.info = _describe(where, name, mark, function, parameters, kinds, returns)
+        self.info = _describe(where, name, mark, function, parameters, kinds, returns, codec)
 
     @staticmethod
     def _decoders(
@@ -118,27 +138,25 @@ class Signature:
 
         return _described(where, "an argument", build)
 
-    def decode(self, raw: Raw) -> tuple[list[Any], dict[str, Any]]:
+    def decode(self, raw: Raw) -> tuple[Sequence[Any], dict[str, Any]]:
         """Validate arguments from the wire. Raises InvalidArgument; no code of the provider has run then."""
-        data = memoryview(raw)
         try:
-            args, kwargs = self._by_name(raw) if data[0] in _MAP_HEADS else self._by_place(raw)
+            args, kwargs = self._by_name(raw) if memoryview(raw)[0] in _MAP_HEADS else self._by_place(raw)
         except (msgspec.ValidationError, msgspec.DecodeError) as bad:
             raise self._explain(str(bad), raw) from None
         if self._must_be_finite and not (_finite(args) and _finite(kwargs)):
             raise self._not_finite(args, kwargs)
         return args, kwargs
 
-    def _by_place(self, raw: Raw) -> tuple[list[Any], dict[str, Any]]:
-        struct = self._decode_array(raw)
-        args = [getattr(struct, name) for name in self._positional]
+    def _by_place(self, raw: Raw) -> tuple[Sequence[Any], dict[str, Any]]:
+        args = astuple(self._decode_array(raw))
         while args and args[-1] is UNSET:
-            args.pop()
+            args = args[:-1]
         if self._keyword_only:
             self._decode_map(self._codec.encode(dict(zip(self._positional, args, strict=False))))
         return args, {}
 
-    def _by_name(self, raw: Raw) -> tuple[list[Any], dict[str, Any]]:
+    def _by_name(self, raw: Raw) -> tuple[Sequence[Any], dict[str, Any]]:
         struct = self._decode_map(raw)
         args: list[Any] = []
         kwargs: dict[str, Any] = {}
@@ -189,7 +207,7 @@ class Signature:
             count = len(given)  # pyright: ignore[reportUnknownArgumentType]
             missing = [name for name in required if name not in self._positional[:count]]
             if not missing:
-                return "", f"takes at most {len(self._positional)} arguments, got {count}"
+                return "", _too_many(len(self._positional), count)
         elif isinstance(given, dict):
             missing = [name for name in required if name not in given]
             unknown = [str(name) for name in given if name not in self._names]  # pyright: ignore[reportUnknownArgumentType, reportUnknownVariableType]
@@ -199,7 +217,7 @@ class Signature:
             return "", text
         return (missing[0], "missing") if missing else ("", text)
 
-    def _not_finite(self, args: list[Any], kwargs: Mapping[str, Any]) -> InvalidArgument:
+    def _not_finite(self, args: Sequence[Any], kwargs: Mapping[str, Any]) -> InvalidArgument:
         named = [*zip(self._positional, args, strict=False), *kwargs.items()]
         name = next(name for name, value in named if not _finite(value))
         problem = "must be finite: no NaN, no infinity"
@@ -247,21 +265,16 @@ def _describe(
     parameters: Sequence[inspect.Parameter],
     kinds: Mapping[str, Any],
     returns: Any,
+    codec: Codec,
 ) -> ServiceInfo:
-    arguments = msgspec.defstruct(
-        "Arguments", [_field(parameter, kinds[parameter.name]) for parameter in parameters], kw_only=True
-    )
-    known: dict[str, str] = {}
-    hook = _opaque_schema
-    (arguments_schema, result_schema), definitions = _described(
-        where,
-        "an argument or the result",
-        lambda: msgspec.json.schema_components([arguments, returns], schema_hook=hook),
-    )
-    definitions = dict(definitions)
-    arguments_schema = definitions.pop("Arguments", arguments_schema)
-    for kind in _types_in(returns, set()):
-        known[kind.__name__] = f"{kind.__module__}:{kind.__qualname__}"
+    for parameter in parameters:
+        _described(where, f"argument {parameter.name!r}", lambda kind=kinds[parameter.name]: codec.schema(kind))
+    fields = [_field(parameter, kinds[parameter.name]) for parameter in parameters]
+    _, inside = codec.schema(msgspec.defstruct("Arguments", fields, kw_only=True))
+    arguments_schema = inside.pop("Arguments")
+    result_schema, definitions = _described(where, "its result", lambda: codec.schema(noted(returns)))
+    known = {kind.__name__: kind for kind in _types_in(returns, set())}
+    definitions = {name: _noted_fields(schema, known.get(name), codec) for name, schema in definitions.items()}
     return ServiceInfo(
         name=name,
         signature=_signature_text(name, parameters, kinds, returns),
@@ -271,10 +284,25 @@ def _describe(
         achieves=mark.achieves,
         uses=mark.uses,
         parameters=tuple(_parameter(parameter) for parameter in parameters),
-        arguments_schema={**arguments_schema, "$defs": definitions} if definitions else arguments_schema,
+        arguments_schema={**arguments_schema, "$defs": inside} if inside else arguments_schema,
         result_schema={**result_schema, "$defs": definitions} if definitions else result_schema,
-        types=known,
+        types={name: f"{kind.__module__}:{kind.__qualname__}" for name, kind in known.items()},
     )
+
+
+def _noted_fields(schema: dict[str, Any], kind: type | None, codec: Codec) -> dict[str, Any]:
+    """The schema of a struct with what JSON Schema loses of its fields' types."""
+    fields: Sequence[str] = getattr(kind, "__struct_fields__", ())
+    if not fields or "properties" not in schema:
+        return schema
+    sent = dict(zip(fields, kind.__struct_encode_fields__, strict=True))  # pyright: ignore[reportOptionalMemberAccess, reportAttributeAccessIssue]
+    hints = get_type_hints(kind, include_extras=True)
+    properties = {
+        sent[name]: {**schema["properties"][sent[name]], **codec.schema(noted(hints[name]))[0]}
+        for name in fields
+        if sent[name] in schema["properties"]
+    }
+    return {**schema, "properties": {**schema["properties"], **properties}}
 
 
 def _parameter(parameter: inspect.Parameter) -> Parameter:
@@ -286,17 +314,19 @@ def _parameter(parameter: inspect.Parameter) -> Parameter:
     )
 
 
-def _opaque_schema(kind: type) -> dict[str, Any]:
-    return {"type": "object", "title": kind.__name__, "x-trade-type": kind.__name__}
-
-
 def _signature_text(name: str, parameters: Sequence[inspect.Parameter], kinds: Mapping[str, Any], returns: Any) -> str:
     parts: list[str] = []
+    before = None
     for parameter in parameters:
-        if parameter.kind is parameter.KEYWORD_ONLY and "*" not in parts:
+        if before is parameter.POSITIONAL_ONLY and parameter.kind is not before:
+            parts.append("/")
+        if parameter.kind is parameter.KEYWORD_ONLY and before is not parameter.kind:
             parts.append("*")
+        before = parameter.kind
         hint = "" if kinds[parameter.name] is Any else f": {_type_text(kinds[parameter.name])}"
         parts.append(parameter.name + hint + _default_text(parameter, hint))
+    if before is inspect.Parameter.POSITIONAL_ONLY:
+        parts.append("/")
     return f"{name}({', '.join(parts)})" + ("" if returns is Any else f" -> {_type_text(returns)}")
 
 
@@ -312,6 +342,8 @@ def _type_text(kind: Any) -> str:
         return _type_text(kind.__origin__)
     if kind is None or kind is type(None):
         return "None"
+    if kind is Ellipsis:
+        return "..."
     inner = [_type_text(arg) for arg in getattr(kind, "__args__", ())]
     origin = get_origin(kind)
     if origin in (Union, types.UnionType):
@@ -358,4 +390,6 @@ def _finite(value: Any) -> bool:
         return all(map(_finite, value.values()))  # pyright: ignore[reportUnknownArgumentType]
     if isinstance(value, msgspec.Struct):
         return all(_finite(getattr(value, name)) for name in value.__struct_fields__)
-    return all(map(_finite, vars(value).values())) if hasattr(value, "__dataclass_fields__") else True
+    if isinstance(value, Decimal):
+        return value.is_finite()
+    return all(_finite(getattr(value, name)) for name in getattr(value, "__dataclass_fields__", ()))

@@ -5,14 +5,15 @@ implementation; ``_zenoh`` is the real one.
 """
 
 from abc import ABC, abstractmethod
-from typing import NamedTuple
+
+from msgspec import Struct
 
 
 class ChannelClosed(Exception):
-    """The channel or its transport was closed; the reader's thread should end."""
+    """The channel, the publisher or the whole transport was closed; a reader's thread should end."""
 
 
-class Message(NamedTuple):
+class Message(Struct, frozen=True, gc=False):
     """Bytes and the key they were put on; no payload says that what stood there is gone."""
 
     key: str
@@ -36,7 +37,10 @@ class Publisher(ABC):
 
     @abstractmethod
     def put(self, payload: bytes) -> None:
-        """Send; may wait for a stalled receiver up to a second, never drops for one that is alive."""
+        """Send; may wait for a stalled receiver up to a second, never drops for one that is alive.
+
+        Raises ChannelClosed once closed.
+        """
 
     @abstractmethod
     def close(self) -> None:

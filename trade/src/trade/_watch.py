@@ -7,7 +7,7 @@ from typing import Final
 
 from trade._registry import Registry
 from trade._transport import Channel, ChannelClosed, Message, Transport
-from trade._wire import ALIVE, REGISTRY, Address, Malformed, decode_provider
+from trade._wire import ALIVE, REGISTRY, Address, Malformed, decode_provider, is_chunk
 
 _logger = logging.getLogger("trade")
 
@@ -46,7 +46,7 @@ class Watch:
 
     def _entry(self, message: Message) -> None:
         try:
-            _, domain, identity, container, epoch, provider = message.key.split("/")
+            domain, identity, container, epoch, provider = _chunks(message.key, 5)
             address = Address(identity, container, epoch)
             if address == self._own:
                 return
@@ -54,13 +54,13 @@ class Watch:
                 self._registry.remove(address, provider)
             else:
                 self._registry.put(address, domain, provider, decode_provider(message.payload))
-        except (Malformed, ValueError) as bad:
+        except Malformed as bad:
             self._drop(message.key, bad)
 
     def _sign(self, message: Message) -> None:
         try:
-            address = Address(*message.key.split("/")[1:])
-        except TypeError as bad:
+            address = Address(*_chunks(message.key, 3))
+        except Malformed as bad:
             self._drop(message.key, bad)
             return
         if address == self._own:
@@ -84,3 +84,11 @@ class Watch:
         for thread in self._threads:
             if thread is not threading.current_thread():
                 thread.join(2)
+
+
+def _chunks(key: str, count: int) -> list[str]:
+    """The chunks of a key after its first; one may put on a pattern, too, and that is nobody's key."""
+    chunks = key.split("/")[1:]
+    if len(chunks) != count or not all(map(is_chunk, chunks)):
+        raise Malformed(f"{key!r} is a pattern or of another shape")
+    return chunks

@@ -3,10 +3,10 @@
 # pyright: reportUnknownVariableType=false
 
 import re
-from typing import Any, Final
+from typing import Annotated, Any, Final, TypeVar
 
 import msgspec
-from msgspec import Raw, Struct
+from msgspec import Meta, Raw, Struct
 
 PROTOCOL: Final = 1
 """Version of every message. A reader drops, counts and logs once what carries another."""
@@ -109,6 +109,8 @@ class Status:
     TIMED_OUT: Final = 5
     LOST: Final = 6
     CLOSED: Final = 7
+    # Never put at all: what a call ends with that could not be sent.
+    UNSENT: Final = 8
 
 
 class Reply(Struct, array_like=True, gc=False):
@@ -116,7 +118,7 @@ class Reply(Struct, array_like=True, gc=False):
 
     v: int
     id: int
-    status: int
+    status: Annotated[int, Meta(ge=0, le=7)]
     clock_ns: int
     """The callee's monotonic clock when it answered: keeps the caller's estimate of the offset fresh."""
     body: Raw
@@ -175,6 +177,9 @@ EMPTY: Final = Raw(msgspec.msgpack.encode(None))
 EMPTY_ARGUMENTS: Final = Raw(msgspec.msgpack.encode(()))
 
 
+_Message = TypeVar("_Message", Call, Reply, ProviderInfo)
+
+
 class Malformed(Exception):
     """Bytes that are no message of this protocol version; dropped, never answered."""
 
@@ -186,33 +191,25 @@ encode_message: Final = msgspec.msgpack.Encoder().encode
 
 
 def decode_call(payload: bytes) -> Call:
-    try:
-        call = call_decoder.decode(payload)
-    except (msgspec.DecodeError, ValueError) as bad:
-        raise Malformed(why_malformed(payload, bad)) from None
-    if call.v != PROTOCOL:
-        raise Malformed(why_malformed(payload, None))
-    return call
+    return _decoded(call_decoder, payload)
 
 
 def decode_reply(payload: bytes) -> Reply:
-    try:
-        reply = reply_decoder.decode(payload)
-    except (msgspec.DecodeError, ValueError) as bad:
-        raise Malformed(why_malformed(payload, bad)) from None
-    if reply.v != PROTOCOL:
-        raise Malformed(why_malformed(payload, None))
-    return reply
+    return _decoded(reply_decoder, payload)
 
 
 def decode_provider(payload: bytes) -> ProviderInfo:
+    return _decoded(_provider_decoder, payload)
+
+
+def _decoded(decoder: msgspec.msgpack.Decoder[_Message], payload: bytes) -> _Message:
     try:
-        info = _provider_decoder.decode(payload)
-    except (msgspec.DecodeError, ValueError) as bad:
+        message = decoder.decode(payload)
+    except (msgspec.DecodeError, ValueError, RecursionError, MemoryError) as bad:
         raise Malformed(why_malformed(payload, bad)) from None
-    if info.v != PROTOCOL:
+    if message.v != PROTOCOL:
         raise Malformed(why_malformed(payload, None))
-    return info
+    return message
 
 
 def why_malformed(payload: bytes, bad: Exception | None) -> str:

@@ -7,7 +7,7 @@ receiver instead of dropping (zenoh's default), and go out at once. All sessions
 """
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 import zenoh
@@ -18,7 +18,10 @@ from trade.errors import ConfigurationError
 
 LEASE_MS: Final = 2000
 _CHANNEL_CAPACITY: Final = 4096
+_MOST_KNOWN_KEYS: Final = 1024
 _BLOCK: Final = zenoh.CongestionControl.BLOCK
+_CLOSED: Final = (zenoh.ZError, RuntimeError)
+"""What zenoh raises for something closed already, and for something that another thread closes or uses right now."""
 _PUT: Final = zenoh.SampleKind.PUT
 
 
@@ -31,7 +34,7 @@ def configuration(
         "namespace": namespace,
         "listen/endpoints": list(listen),
         "connect/endpoints": list(connect),
-        "connect/timeout_ms": 0,
+        "connect/timeout_ms": -1,  # 0 would be no retry; opening itself waits half a second at most
         "connect/exit_on_failure": False,
         "connect/retry": {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2},
         "scouting/multicast/enabled": False,
@@ -46,8 +49,16 @@ def configuration(
 
 
 class ZenohChannel(Channel):
-    def __init__(self, subscriber: Any) -> None:  # three kinds of subscriber, one shape
+    """A subscriber of any of zenoh's three kinds.
+
+    Where the same few keys are heard over and over, they are declared on the session: zenoh keeps the route of a key it
+    knows, and works it out for every message of one it does not.
+    """
+
+    def __init__(self, subscriber: Any, declare_on: zenoh.Session | None = None) -> None:
         self._subscriber = subscriber
+        self._session = declare_on
+        self._known: dict[str, zenoh.KeyExpr] = {}
         self._recv = subscriber.handler.recv if hasattr(subscriber, "handler") else subscriber.recv
 
     def receive(self) -> Message:
@@ -55,24 +66,48 @@ class ZenohChannel(Channel):
             sample: zenoh.Sample = self._recv()
         except zenoh.ZError:
             raise ChannelClosed from None
-        return Message(str(sample.key_expr), sample.payload.to_bytes() if sample.kind == _PUT else None)
+        key, payload = str(sample.key_expr), sample.payload.to_bytes()
+        if self._session is not None and key not in self._known:
+            self._learn(self._session, key)
+        return Message(key, payload if payload or sample.kind == _PUT else None)
+
+    def _learn(self, session: zenoh.Session, key: str) -> None:
+        if len(self._known) >= _MOST_KNOWN_KEYS:
+            self._forget(session)
+        _quietly(lambda: self._known.setdefault(key, session.declare_keyexpr(key)))
+
+    def _forget(self, session: zenoh.Session) -> None:
+        known, self._known = self._known, {}
+        for declared in known.values():
+            _quietly(lambda declared=declared: session.undeclare(declared))
 
     def close(self) -> None:
         _quietly(self._subscriber.undeclare)
+        if self._session is not None:
+            self._forget(self._session)
 
 
 class ZenohPublisher(Publisher):
-    def __init__(self, publisher: Any, *, announcement: bool = False) -> None:
+    def __init__(self, publisher: Any, forget_key: Callable[[], Any] | None = None) -> None:
         self._publisher = publisher
-        self._announcement = announcement
+        self._forget_key = forget_key
 
     def put(self, payload: bytes) -> None:
-        self._publisher.put(payload)
+        try:
+            self._publisher.put(payload)
+        except _CLOSED:
+            raise ChannelClosed from None
 
     def close(self) -> None:
-        if self._announcement:
-            _quietly(self._publisher.delete)
         _quietly(self._publisher.undeclare)
+        if self._forget_key is not None:
+            _quietly(self._forget_key)
+
+
+class ZenohAnnouncement(ZenohPublisher):
+    def close(self) -> None:
+        _quietly(self._publisher.delete)
+        super().close()
 
 
 class ZenohPresence(Presence):
@@ -98,23 +133,35 @@ class ZenohTransport(Transport):
 
     def publish(self, key: str, *, urgent: bool = False) -> Publisher:
         priority = zenoh.Priority.REAL_TIME if urgent else zenoh.Priority.DATA
-        declared = self._session.declare_publisher(key, congestion_control=_BLOCK, express=True, priority=priority)
-        return ZenohPublisher(declared)
+        try:
+            known = self._session.declare_keyexpr(key)
+            declared = self._session.declare_publisher(
+                known, congestion_control=_BLOCK, express=True, priority=priority
+            )
+        except zenoh.ZError:
+            raise ChannelClosed from None
+        return ZenohPublisher(declared, lambda: self._session.undeclare(known))
 
     def subscribe(self, pattern: str) -> Channel:
-        return ZenohChannel(self._session.declare_subscriber(pattern, _fifo()))
+        try:
+            return ZenohChannel(self._session.declare_subscriber(pattern, _fifo()), declare_on=self._session)
+        except zenoh.ZError:
+            raise ChannelClosed from None
 
     def announce(self, key: str) -> Publisher:
-        declared = ext.declare_advanced_publisher(
-            self._session,
-            key,
-            congestion_control=_BLOCK,
-            express=True,
-            cache=ext.CacheConfig(max_samples=1),
-            publisher_detection=True,
-            sample_miss_detection=ext.MissDetectionConfig(sporadic_heartbeat=0.5),
-        )
-        return ZenohPublisher(declared, announcement=True)
+        try:
+            declared = ext.declare_advanced_publisher(
+                self._session,
+                key,
+                congestion_control=_BLOCK,
+                express=True,
+                cache=ext.CacheConfig(max_samples=1),
+                publisher_detection=True,
+                sample_miss_detection=ext.MissDetectionConfig(sporadic_heartbeat=0.5),
+            )
+        except zenoh.ZError:
+            raise ChannelClosed from None
+        return ZenohAnnouncement(declared)
 
     def announcements(self, pattern: str) -> Channel:
         declared = ext.declare_advanced_subscriber(
@@ -162,8 +209,11 @@ def _fifo() -> Any:
 
 
 def _quietly(action: Any) -> None:
-    """Do it unless the session is closed already: closing is idempotent and never fails."""
+    """Do it unless the session is closed already: closing is idempotent and never fails.
+
+    What another thread uses at this moment zenoh lets go of when that is done.
+    """
     try:
         action()
-    except zenoh.ZError:
+    except _CLOSED:
         return

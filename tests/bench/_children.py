@@ -1,0 +1,114 @@
+"""A peer in two processes, its server and its caller, told over pipes what to do; both end with the block."""
+
+import multiprocessing
+import statistics
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+
+from tests.bench._peers import PAYLOAD, Call, Peer
+
+_SPAWN = multiprocessing.get_context("spawn")
+_PATIENCE_S = 60.0
+
+
+@dataclass(frozen=True, slots=True)
+class Round:
+    """What one peer took for a round of calls."""
+
+    p50_us: float
+    p99_us: float
+    cpu_us: float
+    """Per call, of both processes together."""
+
+
+class Running:
+    """A peer whose processes are up."""
+
+    def __init__(self, name: str, server: Connection, caller: Connection) -> None:
+        self.name = name
+        self._server = server
+        self._caller = caller
+
+    def run(self, n: int) -> Round:
+        before_ns = _ask(self._server, "cpu")
+        took_ns, caller_ns = _ask(self._caller, n)
+        server_ns = _ask(self._server, "cpu") - before_ns
+        took_us = [ns / 1e3 for ns in took_ns]
+        p99_us = statistics.quantiles(took_us, n=100)[98] if n > 1 else took_us[0]
+        return Round(statistics.median(took_us), p99_us, (caller_ns + server_ns) / 1e3 / n)
+
+
+@contextmanager
+def running(peer: Peer) -> Iterator[Running]:
+    """Start both processes of a peer. Raises RuntimeError if one of them does not come up."""
+    with _child(_serve, peer) as server, _child(_call, peer, _hear(server)) as caller:
+        _hear(caller)
+        yield Running(peer.name, server, caller)
+
+
+@contextmanager
+def _child(main, *args: object) -> Iterator[Connection]:
+    ours, theirs = _SPAWN.Pipe()
+    process = _SPAWN.Process(target=main, args=(theirs, *args), daemon=True)
+    process.start()
+    theirs.close()
+    try:
+        yield ours
+    finally:
+        ours.close()  # which ends it
+        process.join(5)
+        if process.is_alive():
+            process.kill()
+            process.join()
+
+
+def _serve(pipe: Connection, peer: Peer) -> None:
+    with peer.serve() as address:
+        pipe.send(address)
+        for _ in _requests(pipe):
+            pipe.send(time.process_time_ns())
+
+
+def _call(pipe: Connection, peer: Peer, address: str) -> None:
+    with peer.connect(address) as call:
+        pipe.send("ready")
+        for n in _requests(pipe):
+            pipe.send(_round(call, n))
+
+
+def _round(call: Call, n: int) -> tuple[list[int], int]:
+    """How long each of n calls took, and the CPU time of this process for all of them; in nanoseconds."""
+    took_ns: list[int] = []
+    clock, spent_ns = time.perf_counter_ns, time.process_time_ns()
+    for _ in range(n):
+        began = clock()
+        answer = call(PAYLOAD)
+        took_ns.append(clock() - began)
+        if answer != PAYLOAD:
+            raise RuntimeError(f"a wrong answer: {answer!r}")
+    return took_ns, time.process_time_ns() - spent_ns
+
+
+def _requests(pipe: Connection) -> Iterator:
+    while True:
+        try:
+            yield pipe.recv()
+        except (EOFError, OSError):  # the parent is done with us
+            return
+
+
+def _ask(pipe: Connection, request: object):
+    pipe.send(request)
+    return _hear(pipe)
+
+
+def _hear(pipe: Connection):
+    if not pipe.poll(_PATIENCE_S):
+        raise RuntimeError(f"a child process said nothing for {_PATIENCE_S} s")
+    try:
+        return pipe.recv()
+    except EOFError:
+        raise RuntimeError("a child process ended early; its error stands above") from None

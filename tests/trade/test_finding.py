@@ -1,0 +1,93 @@
+"""Looking services up: one that matches, all that match, none."""
+
+import threading
+
+import pytest
+
+from trade import Container, service, where
+from trade.errors import NoSuchService, TooManyServices
+
+
+class Arm:
+    @service
+    def move_to(self, angle_rad: float) -> None: ...
+
+    @service(effect="read")
+    def angle(self) -> float:
+        return 0.5
+
+
+def test_services_without_a_constraint_lists_everything_in_order(here: Container) -> None:
+    here.register(Arm(), "rosie.arm")
+    assert [handle.label for handle in here.services()] == ["rosie.arm.angle", "rosie.arm.move_to", "trade.clock"]
+
+
+def test_services_lists_what_matches(here: Container) -> None:
+    here.register(Arm(), "rosie.left")
+    here.register(Arm(), "rosie.right")
+    here.register(Arm(), "bob")
+    assert [handle.label for handle in here.services(where(name="angle", group="rosie"))] == [
+        "rosie.left.angle",
+        "rosie.right.angle",
+    ]
+
+
+def test_what_stands_when_a_container_starts_is_known_from_the_start(start_container) -> None:  # type: ignore[no-untyped-def]
+    start_container("there").register(Arm(), "rosie")
+    assert [handle.name for handle in start_container("here").services(where(group="rosie"))] == ["angle", "move_to"]
+
+
+def test_no_match_is_an_error_that_says_what_was_asked(here: Container) -> None:
+    with pytest.raises(NoSuchService, match="no service matches name='fly' after 0 s; `trade services` lists") as none:
+        here.find(where(name="fly"), wait_s=0)
+    assert isinstance(none.value, LookupError)
+
+
+def test_no_match_hints_at_what_looks_alike(here: Container) -> None:
+    here.register(Arm(), "rosie.arm")
+    with pytest.raises(NoSuchService) as none:
+        here.find(where(name="move_two", group="rosie.arm"), wait_s=0)
+    assert none.value.near == ("rosie.arm.move_to",)
+    assert str(none.value).endswith("; did you mean rosie.arm.move_to?")
+
+
+def test_two_matches_are_an_error_that_names_them(here: Container, there: Container) -> None:
+    here.register(Arm(), "rosie")
+    there.register(Arm(), "rosie")
+    here.find(where(name="angle", container="there"), wait_s=20)
+    with pytest.raises(TooManyServices) as many:
+        here.find(where(name="angle"))
+    assert list(many.value.matches) == ["rosie.angle in here", "rosie.angle in there"]
+    assert "add a constraint" in str(many.value)
+
+
+def test_find_waits_for_a_service_that_comes_late(here: Container, there: Container) -> None:
+    coming = threading.Timer(0.05, lambda: there.register(Arm(), "late"))
+    coming.start()
+    assert here.find(where(name="angle", group="late"), wait_s=20)() == 0.5
+    coming.join()
+
+
+def test_the_containers_of_the_system_are_listed(here: Container, there: Container) -> None:
+    there.register(Arm(), "rosie")
+    here.find(where(name="angle"), wait_s=20)
+    infos = {info.name: info for info in here.containers()}
+    assert set(infos) == {"here", "there"}
+    assert (infos["there"].providers, infos["there"].services) == (2, 3)
+    assert infos["there"].epoch == there.address.epoch
+
+
+def test_a_closed_container_is_no_longer_listed(here: Container, there: Container) -> None:
+    assert {info.name for info in here.containers()} >= {"here"}
+    there.close()
+    assert here._registry.wait_for(lambda: [info.name for info in here.containers()] == ["here"], 20)
+
+
+def test_systems_on_one_host_do_not_see_each_other(here: Container) -> None:
+    from trade import Settings
+
+    here.register(Arm(), "rosie")
+    with Container(Settings.read(system="another-system", container="stranger")) as stranger:
+        assert [info.name for info in stranger.containers()] == ["stranger"]
+        assert stranger.services(where(group="rosie")) == []
+        assert [info.name for info in here.containers()] == ["here"]

@@ -1,0 +1,159 @@
+"""S21: nothing reaches beyond this host by accident."""
+
+import ipaddress
+import os
+from typing import Any
+
+import psutil
+import pytest
+
+from trade import Container, Settings, service, where
+from trade.errors import ConfigurationError
+
+
+def read(**settings: Any) -> Settings:
+    return Settings.read(environment={}, **settings)
+
+
+def test_S21_with_default_settings_a_container_listens_on_loopback_only(here: Container) -> None:
+    listening = {
+        connection.laddr.ip
+        for connection in psutil.Process().net_connections("inet")
+        if connection.status == psutil.CONN_LISTEN or not connection.raddr
+    }
+    assert listening
+    assert all(ipaddress.ip_address(address).is_loopback for address in listening)
+
+
+def test_S21_the_default_system_is_the_users_on_this_host() -> None:
+    user, at, host = read().system.partition("@")
+    assert user and at and host
+    assert not read().explicit_system
+
+
+@pytest.mark.parametrize(
+    "endpoint", ["tcp/0.0.0.0:7450", "tcp/[::]:7450", "tcp/192.168.1.5:0", "tls/robot.example:7447", "udp/10.0.0.1:1"]
+)
+def test_S21_listening_beyond_loopback_is_refused(endpoint: str) -> None:
+    with pytest.raises(ConfigurationError, match="listening beyond loopback needs a policy, and none is loaded"):
+        read(system="lab", credentials=("me", "secret"), listen=[endpoint])
+
+
+@pytest.mark.parametrize("missing", [{"system": "lab"}, {"credentials": ("me", "secret")}, {}], ids=str)
+def test_S21_reaching_a_network_needs_a_system_and_credentials(missing: dict[str, Any]) -> None:
+    with pytest.raises(ConfigurationError, match="reaching a network needs an explicit system id and credentials"):
+        read(connect=["tcp/192.168.1.5:7450"], **missing)
+
+
+def test_S21_a_network_may_be_reached_on_purpose() -> None:
+    settings = read(system="lab", credentials=("me", "secret"), connect=["tls/robot.example:7447"])
+    assert settings.connect == ("tls/robot.example:7447",)
+
+
+def test_an_empty_system_in_the_environment_is_no_explicit_one() -> None:
+    assert not Settings.read(environment={"TRADE_SYSTEM": ""}).explicit_system
+
+
+LOOPBACK = ["tcp/127.0.0.1:0", "tcp/127.8.9.1:7450", "tcp/[::1]:7450", "tcp/localhost:7450", "tls/127.0.0.1:1#a=b"]
+
+
+@pytest.mark.parametrize("endpoint", LOOPBACK)
+def test_loopback_endpoints_are_allowed(endpoint: str) -> None:
+    assert read(listen=[endpoint], connect=[endpoint]).listen == (endpoint,)
+
+
+BROKEN = ["", "tcp", "127.0.0.1:7450", "tcp/127.0.0.1", "tcp/:7450", "tcp/127.0.0.1:", "tcp/127.0.0.1:x", "tcp//:1x"]
+
+
+@pytest.mark.parametrize("endpoint", [*BROKEN, "tcp/127.0.0.1:\uff17\uff14"])
+@pytest.mark.parametrize("what", ["listen", "connect"])
+def test_a_malformed_endpoint_is_refused_with_an_example(what: str, endpoint: str) -> None:
+    with pytest.raises(ConfigurationError, match=r"must look like tcp/127.0.0.1:7450"):
+        read(**{what: [endpoint]})
+
+
+@pytest.mark.parametrize("name", ["a/b", "*", "a b", "@me", "x" * 81, ".", "..", "ä"])
+@pytest.mark.parametrize("what", ["system", "identity", "container"])
+def test_a_name_that_cannot_stand_in_a_key_is_refused(what: str, name: str) -> None:
+    with pytest.raises(ConfigurationError, match=f"is no name for a {what}; use letters, digits"):
+        read(**{what: name})
+
+
+@pytest.mark.parametrize("text", ["me", "me:", ":secret"])
+def test_malformed_credentials_are_refused_without_repeating_them(text: str) -> None:
+    with pytest.raises(ConfigurationError, match="TRADE_CREDENTIALS: must be user:password"):
+        Settings.read(environment={"TRADE_CREDENTIALS": text})
+
+
+def test_settings_come_from_arguments_then_the_environment_then_defaults() -> None:
+    environment = {
+        "TRADE_SYSTEM": "lab",
+        "TRADE_IDENTITY": "arm",
+        "TRADE_CONTAINER": "driver",
+        "TRADE_LISTEN": "tcp/127.0.0.1:7450, tcp/127.0.0.1:7451",
+        "TRADE_CONNECT": "",
+        "TRADE_CREDENTIALS": "me:sec:ret",
+    }
+    settings = Settings.read(environment=environment, container="mine")
+    assert (settings.system, settings.identity, settings.container) == ("lab", "arm", "mine")
+    assert settings.listen == ("tcp/127.0.0.1:7450", "tcp/127.0.0.1:7451")
+    assert (settings.connect, settings.credentials, settings.explicit_system) == ((), ("me", "sec:ret"), True)
+    assert str(os.getpid()) in read().container
+
+
+def test_a_container_may_be_reached_at_a_chosen_endpoint(system: str) -> None:
+    from trade._rendezvous import free_endpoint
+
+    class Echo:
+        @service(effect="read")
+        def echo(self, value: int) -> int:
+            return value
+
+    endpoint = free_endpoint()
+    with (
+        Container(Settings.read(container="server", listen=[endpoint])) as server,
+        Container(Settings.read(container="client", connect=[endpoint])) as client,
+    ):
+        server.register(Echo(), "robot")
+        assert client.find(where(name="echo"), wait_s=20)(3) == 3
+
+
+def test_an_endpoint_that_is_taken_is_refused_and_leaves_nothing(here: Container, system: str) -> None:
+    taken = next(
+        connection.laddr.port
+        for connection in psutil.Process().net_connections("tcp")
+        if connection.status == psutil.CONN_LISTEN
+    )
+    with pytest.raises(
+        ConfigurationError, match=rf"listen tcp/127.0.0.1:{taken}: cannot listen there: .*; is the addr"
+    ):
+        Container(Settings.read(container="second", listen=[f"tcp/127.0.0.1:{taken}"]))
+
+
+def test_when_a_free_port_is_taken_in_between_another_one_is_tried(
+    here: Container, system: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from trade import _container
+
+    taken = next(
+        connection.laddr.port
+        for connection in psutil.Process().net_connections("tcp")
+        if connection.status == psutil.CONN_LISTEN
+    )
+    endpoints = iter([f"tcp/127.0.0.1:{taken}", f"tcp/127.0.0.1:{taken}", _container.free_endpoint()])
+    monkeypatch.setattr(_container, "free_endpoint", lambda: next(endpoints))
+    with Container(Settings.read(container="second")) as second:
+        assert {info.name for info in second.containers()} == {"here", "second"}
+
+
+def test_a_container_reached_at_its_endpoint_is_reached_again_after_its_restart(system: str) -> None:
+    from trade._rendezvous import free_endpoint
+
+    endpoint = free_endpoint()
+    with Container(Settings.read(container="client", connect=[endpoint])) as client:
+        for _ in range(2):
+            with Container(Settings.read(container="server", listen=[endpoint])) as server:
+                clock = client.find(where(name="clock", container="server", local=False), wait_s=30)
+                assert clock.key.address == server.address
+                assert clock() > 0
+            assert client._registry.wait_for(lambda clock=clock: not clock.alive, 20)

@@ -1,0 +1,131 @@
+"""How containers of one host find each other: a folder with a file for each one's endpoint."""
+
+import os
+import socket
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from trade import Container, where
+from trade._rendezvous import Rendezvous, free_endpoint
+from trade.errors import ConfigurationError
+
+
+@pytest.fixture
+def folder(system: str, tmp_path: Path) -> Path:
+    Rendezvous(system)
+    return tmp_path / "runtime" / "trade" / system
+
+
+def old(path: Path) -> None:
+    os.utime(path, (1, 1))
+
+
+def test_who_enters_leaves_its_endpoint_and_takes_it_away(system: str, folder: Path) -> None:
+    rendezvous = Rendezvous(system)
+    assert rendezvous.enter("tcp/127.0.0.1:7450") == []
+    assert [path.read_text() for path in folder.iterdir()] == ["tcp/127.0.0.1:7450"]
+    rendezvous.leave()
+    rendezvous.leave()
+    assert list(folder.iterdir()) == []
+
+
+def test_who_enters_hears_of_those_that_listen(system: str, folder: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        endpoint = f"tcp/127.0.0.1:{listening.getsockname()[1]}"
+        Rendezvous(system).enter(endpoint)
+        old(next(folder.iterdir()))
+        assert Rendezvous(system).enter("tcp/127.0.0.1:1") == [endpoint]
+
+
+def test_endpoints_nobody_listens_on_are_pruned(system: str, folder: Path) -> None:
+    stale = Rendezvous(system)
+    stale.enter(free_endpoint())
+    old(next(folder.iterdir()))
+    assert Rendezvous(system).enter("tcp/127.0.0.1:1") == []
+    assert [path.read_text() for path in folder.iterdir()] == ["tcp/127.0.0.1:1"]
+
+
+def test_endpoints_of_those_that_are_just_starting_are_kept(system: str, folder: Path) -> None:
+    starting = free_endpoint()
+    Rendezvous(system).enter(starting)
+    assert Rendezvous(system).enter("tcp/127.0.0.1:1") == [starting]
+
+
+def test_endpoints_on_the_newer_loopback_address_are_not_pruned(system: str, folder: Path) -> None:
+    if not socket.has_ipv6:
+        pytest.skip("this host has no IPv6")
+    try:
+        listening = socket.create_server(("::1", 0), family=socket.AF_INET6)
+    except OSError:
+        pytest.skip("this host has no IPv6 loopback")
+    with listening:
+        endpoint = f"tcp/[::1]:{listening.getsockname()[1]}"
+        Rendezvous(system).enter(endpoint)
+        old(next(folder.iterdir()))
+        assert Rendezvous(system).enter("tcp/127.0.0.1:1") == [endpoint]
+
+
+def test_rubbish_in_the_folder_disturbs_nobody(system: str, folder: Path) -> None:
+    (folder / "tcp_rubbish").write_bytes(b"\xff\x00")
+    (folder / "tcp_more").write_text("not an endpoint")
+    (folder / "tcp_folder").mkdir()
+    old(folder / "tcp_rubbish")
+    old(folder / "tcp_more")
+    assert Rendezvous(system).enter("tcp/127.0.0.1:1") == []
+
+
+def test_a_container_takes_its_file_away(here: Container, folder: Path) -> None:
+    assert len(list(folder.iterdir())) == 1
+    here.close()
+    assert list(folder.iterdir()) == []
+
+
+def test_the_folder_is_the_users_own(folder: Path) -> None:
+    assert folder.stat().st_mode & 0o077 == 0
+
+
+def test_a_folder_that_others_may_write_is_refused(system: str, tmp_path: Path) -> None:
+    shared = tmp_path / "runtime" / "trade"
+    shared.mkdir(parents=True)
+    shared.chmod(0o777)
+    with pytest.raises(ConfigurationError, match="others may write there; remove it, or set TRADE_RUNTIME_DIR"):
+        Container()
+
+
+def test_a_folder_that_is_a_link_is_refused(system: str, tmp_path: Path) -> None:
+    (tmp_path / "runtime").mkdir()
+    (tmp_path / "elsewhere").mkdir(mode=0o700)
+    (tmp_path / "runtime" / "trade").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(ConfigurationError, match="others may write there"):
+        Rendezvous(system)
+
+
+def test_containers_that_start_at_the_same_moment_see_each_other(start_program: Any, system: str) -> None:
+    source = """
+        for round in range(10):
+            hear()
+            with Container(Settings.read(system=f"{sys.argv[1]}-{round}", container=sys.argv[2])) as container:
+                other = container.find(where(name="clock", container=sys.argv[3]), wait_s=30)
+                say(other() > 0)
+                hear()
+    """
+    pair = [start_program(source, system, "one", "other"), start_program(source, system, "other", "one")]
+    for _ in range(10):
+        for program in pair:
+            program.tell()
+        assert [program.heard() for program in pair] == ["True", "True"]
+        for program in pair:
+            program.tell()
+    assert [program.ends() for program in pair] == [0, 0]
+
+
+def test_who_is_known_but_does_not_listen_yet_is_dialled_until_it_does(here: Container, start_container: Any) -> None:
+    """Its file was there first; it read the folder before ours was."""
+    endpoint = free_endpoint()
+    Rendezvous(here.settings.system).enter(endpoint)
+    early = start_container("early")
+    late = start_container("late", listen=[endpoint], connect=[free_endpoint()])
+    assert early.find(where(name="clock", container="late"), wait_s=30)() > 0
+    assert late.find(where(name="clock", container="early"), wait_s=30)() > 0

@@ -1,0 +1,64 @@
+"""The public surface: what ``trade`` exports is there, documented, and asks nothing special of the system."""
+
+import inspect
+from typing import Any
+
+import pytest
+
+import trade
+
+
+@pytest.mark.parametrize("name", trade.__all__)
+def test_every_public_name_exists_and_is_documented(name: str) -> None:
+    assert inspect.getdoc(getattr(trade, name))
+
+
+def _public_methods() -> list[Any]:
+    kinds = [getattr(trade, name) for name in trade.__all__ if inspect.isclass(getattr(trade, name))]
+    return [
+        pytest.param(member, id=f"{kind.__name__}.{name}")
+        for kind in kinds
+        if kind.__module__.startswith("trade")
+        for name, member in vars(kind).items()
+        if not name.startswith("_") and (inspect.isfunction(member) or isinstance(member, property))
+    ]
+
+
+@pytest.mark.parametrize("member", _public_methods())
+def test_every_public_method_is_documented(member: Any) -> None:
+    assert inspect.getdoc(member)
+
+
+def test_public_names_are_sorted_and_complete() -> None:
+    assert list(trade.__all__) == sorted(trade.__all__)
+    public = {
+        name
+        for name, value in vars(trade).items()
+        if not name.startswith("_") and (inspect.isclass(value) or inspect.isfunction(value))
+    }
+    assert public - {"Sequence", "Callback"} <= set(trade.__all__)
+
+
+def test_importing_trade_needs_nothing_of_one_operating_system_and_no_hardware(start_program: Any) -> None:
+    program = start_program(
+        """
+        print(sorted(trade.services()[0].name), flush=True)
+        """,
+        prelude="""
+import sys
+for name in ("termios", "fcntl", "tty", "pty", "pwd", "grp", "resource", "msvcrt", "winreg", "serial", "can"):
+    sys.modules[name] = None  # importing it fails, as where there is none
+import os
+os.environ["USER"] = "somebody"
+import trade
+""",
+    )
+    assert program.heard() == str(sorted("clock"))
+    assert program.ends() == 0
+    assert program.errors() == ""
+
+
+def test_the_package_is_typed() -> None:
+    from importlib.resources import files
+
+    assert (files("trade") / "py.typed").is_file()

@@ -1,0 +1,465 @@
+"""What goes over the wire: garbage is dropped, counted, logged once; forgeries are ignored; nothing else stops."""
+
+import logging
+from typing import Any
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from trade import Container, Handle, service, where
+from trade._wire import (
+    EMPTY,
+    EMPTY_ARGUMENTS,
+    PROTOCOL,
+    Address,
+    Call,
+    Malformed,
+    ProviderInfo,
+    Reply,
+    ServiceInfo,
+    Status,
+    alive_key,
+    as_chunk,
+    call_key,
+    calls_to,
+    decode_call,
+    decode_provider,
+    decode_reply,
+    encode_message,
+    is_chunk,
+    registry_key,
+    reply_key,
+)
+from trade.errors import InvalidResult, RemoteError
+
+CALL = Call(PROTOCOL, 7, "echo", "raw/0", "session", 2**62, (), EMPTY_ARGUMENTS)
+REPLY = Reply(PROTOCOL, 7, Status.OK, 1, EMPTY)
+PROVIDER = ProviderInfo(
+    revision=1, groups=("forged",), kind="Forged", host="h", pid=1, services=(ServiceInfo(name="go", signature="go()"),)
+)
+FUTURE = 99
+
+
+class Echo:
+    def __init__(self) -> None:
+        self.runs = 0
+
+    @service(effect="read")
+    def echo(self, value: int = 0) -> int:
+        self.runs += 1
+        return value
+
+    @service(effect="stop")
+    def stop(self) -> None:
+        self.runs += 1
+
+
+# --- decoding
+
+_plain = st.recursive(
+    st.none() | st.booleans() | st.integers(-(2**63), 2**64 - 1) | st.floats() | st.text(max_size=5) | st.binary(),
+    lambda inner: st.lists(inner, max_size=9) | st.dictionaries(st.text(max_size=8), inner, max_size=5),
+    max_leaves=20,
+)
+_bytes = (
+    st.binary(max_size=200)
+    | _plain.map(msgspec.msgpack.encode)
+    | st.lists(_plain, min_size=5, max_size=9).map(lambda rest: msgspec.msgpack.encode([PROTOCOL, *rest]))
+)
+_DECODERS = [decode_call, decode_reply, decode_provider]
+
+
+@pytest.mark.parametrize("decode", _DECODERS, ids=lambda decode: decode.__name__)
+@given(data=_bytes)
+def test_any_bytes_are_a_message_or_malformed(decode: Any, data: bytes) -> None:
+    try:
+        decode(data)
+    except Malformed as bad:
+        assert str(bad)
+
+
+@pytest.mark.parametrize("decode", _DECODERS, ids=lambda decode: decode.__name__)
+@pytest.mark.parametrize("message", [CALL, REPLY, PROVIDER], ids=["call", "reply", "provider"])
+@given(st.data())
+def test_a_message_with_damaged_bytes_is_a_message_or_malformed(decode: Any, message: Any, data: st.DataObject) -> None:
+    good = bytearray(encode_message(message))
+    for _ in range(data.draw(st.integers(1, 4))):
+        good[data.draw(st.integers(0, len(good) - 1))] = data.draw(st.integers(0, 255))
+    try:
+        decode(bytes(good[: data.draw(st.integers(0, len(good)))]))
+    except Malformed:
+        return
+
+
+DEEP = [b"\x91" * 100_000, b"\x81\xa1a" * 100_000, b"\xdd\xff\xff\xff\xff", b"\xdf\xff\xff\xff\xff", b"", b"\xc1"]
+
+
+@pytest.mark.parametrize("decode", _DECODERS, ids=lambda decode: decode.__name__)
+@pytest.mark.parametrize("data", DEEP, ids=lambda data: data[:6].hex() or "empty")
+def test_hostile_nesting_and_lengths_are_malformed(decode: Any, data: bytes) -> None:
+    inside = encode_message(CALL)[:-1] + data  # also where anything may stand
+    for hostile in (data, inside, b"\x98\x01\x07" + data, b"\x86\xa1v\x01\xa8services" + data):
+        with pytest.raises(Malformed):
+            decode(hostile)
+
+
+@pytest.mark.parametrize("message", [CALL, REPLY, PROVIDER], ids=["call", "reply", "provider"])
+def test_another_version_of_the_protocol_is_malformed_and_says_so(message: Any) -> None:
+    decode = {Call: decode_call, Reply: decode_reply, ProviderInfo: decode_provider}[type(message)]
+    future = msgspec.structs.replace(message, v=FUTURE)
+    with pytest.raises(Malformed, match=f"protocol version {FUTURE}, this is {PROTOCOL}; update the older side"):
+        decode(encode_message(future))
+
+
+@pytest.mark.parametrize("message", [CALL, REPLY, PROVIDER], ids=["call", "reply", "provider"])
+def test_messages_survive_the_wire(message: Any) -> None:
+    decode = {Call: decode_call, Reply: decode_reply, ProviderInfo: decode_provider}[type(message)]
+    assert encode_message(decode(encode_message(message))) == encode_message(message)
+
+
+@pytest.mark.parametrize("status", [-1, 8, 99])
+def test_a_reply_of_an_unknown_status_is_malformed(status: int) -> None:
+    with pytest.raises(Malformed):
+        decode_reply(encode_message(Reply(PROTOCOL, 7, status, 1, EMPTY)))
+
+
+# --- keys
+
+
+@given(st.text(max_size=100))
+def test_any_text_can_be_made_a_chunk_of_a_key(text: str) -> None:
+    assert is_chunk(as_chunk(text))
+
+
+@pytest.mark.parametrize("text", ["", "*", "a*", "a/b", "a$", "@a", "a b", "a" * 81, "ä", "a?", "a#"])
+def test_what_could_be_a_pattern_is_no_chunk(text: str) -> None:
+    assert not is_chunk(text)
+
+
+def test_identities_stand_in_chunks_of_their_own() -> None:
+    callee = Address("arm", "driver", "e1")
+    assert call_key("me", callee, "rosie", "Arm-1", stop=False) == "call/me/arm/driver/e1/rosie/Arm-1"
+    assert call_key("me", callee, "rosie", "Arm-1", stop=True) == "stop/me/arm/driver/e1/rosie/Arm-1"
+    assert calls_to(callee, stop=False) == "call/*/arm/driver/e1/**"
+    assert reply_key("arm", "me", "laptop", "0") == "reply/arm/me/laptop/0"
+    assert registry_key("rosie", callee, "Arm-1") == "registry/rosie/arm/driver/e1/Arm-1"
+    assert alive_key(callee) == "alive/arm/driver/e1"
+
+
+# --- calls from somewhere strange
+
+
+@pytest.fixture
+def echo(here: Container) -> Echo:
+    echo = Echo()
+    here.register(echo, "robot")
+    return echo
+
+
+def key_of(container: Container, name: str) -> Any:
+    return container.find(where(name=name, container=container.name)).key
+
+
+def still_works(container: Container, raw: Any) -> bool:
+    """A proper call from elsewhere is answered properly."""
+    key = key_of(container, "echo")
+    replies = raw.subscribe(reply_key(container.address.identity, "tester", "raw", "0"))
+    raw.publish(call_key("tester", key.address, key.domain, key.provider, stop=False)).put(encode_message(CALL))
+    return decode_reply(replies.receive().payload or b"").status == Status.OK
+
+
+BAD_CALLS = {
+    "garbage": b"garbage",
+    "empty": b"",
+    "future": encode_message(msgspec.structs.replace(CALL, v=FUTURE)),
+    "short": encode_message([PROTOCOL, 7]),
+    "pattern as reply container": encode_message(msgspec.structs.replace(CALL, reply="*/0")),
+    "pattern as reply channel": encode_message(msgspec.structs.replace(CALL, reply="raw/**")),
+    "no reply": encode_message(msgspec.structs.replace(CALL, reply="")),
+    "reply elsewhere": encode_message(msgspec.structs.replace(CALL, reply="raw/0/more")),
+}
+
+
+@pytest.mark.parametrize("payload", BAD_CALLS.values(), ids=list(BAD_CALLS))
+@pytest.mark.parametrize("kind", ["call", "stop"])
+def test_a_malformed_call_is_dropped_counted_and_never_run(
+    here: Container, echo: Echo, open_raw: Any, eventually: Any, payload: bytes, kind: str
+) -> None:
+    raw = open_raw(here)
+    key = key_of(here, "echo" if kind == "call" else "stop")
+    raw.publish(call_key("tester", key.address, key.domain, key.provider, stop=kind == "stop")).put(payload)
+    assert eventually(lambda: here.dropped_messages == 1)
+    assert echo.runs == 0
+    assert still_works(here, raw)
+
+
+BAD_KEYS = {
+    "everybody": "call/tester/*/*/*/robot/{provider}",
+    "every boot": "call/tester/{identity}/{container}/*/robot/{provider}",
+    "every kind": "*/tester/{address}/robot/{provider}",
+    "any caller": "call/*/{address}/robot/{provider}",
+    "everything": "**",
+    "everything of its kind": "call/**",
+}
+
+
+@pytest.mark.parametrize("pattern", BAD_KEYS.values(), ids=list(BAD_KEYS))
+def test_a_call_to_a_pattern_is_dropped_and_never_run(
+    here: Container, echo: Echo, open_raw: Any, eventually: Any, pattern: str
+) -> None:
+    raw = open_raw(here)
+    key = key_of(here, "echo")
+    parts = {"identity": key.address.identity, "container": key.address.container, "provider": key.provider}
+    raw.publish(pattern.format(address=key.address, **parts)).put(encode_message(CALL))
+    assert eventually(lambda: here.dropped_messages >= 1)
+    assert echo.runs == 0
+    assert still_works(here, raw)
+
+
+GONE = {
+    "no such provider": ("robot", "Echo-99", "echo", False),
+    "no such service": ("robot", None, "fly", False),
+    "under a domain of others": ("public", None, "echo", False),
+    "a pattern for a provider": ("robot", "**", "echo", False),
+    "a reading service as a stop": ("robot", None, "echo", True),
+    "a stop as a call": ("robot", None, "stop", False),
+}
+
+
+@pytest.mark.parametrize(("domain", "provider", "name", "as_stop"), GONE.values(), ids=list(GONE))
+def test_a_call_of_what_is_not_there_is_answered_so(
+    here: Container, echo: Echo, open_raw: Any, domain: str, provider: str | None, name: str, as_stop: bool
+) -> None:
+    raw = open_raw(here)
+    key = key_of(here, "echo")
+    replies = raw.subscribe(reply_key(here.address.identity, "tester", "raw", "0"))
+    raw.publish(call_key("tester", key.address, domain, provider or key.provider, stop=as_stop)).put(
+        encode_message(msgspec.structs.replace(CALL, service=name))
+    )
+    assert decode_reply(replies.receive().payload or b"").status == Status.GONE
+    assert echo.runs == 0
+
+
+def test_arguments_that_are_no_arguments_are_invalid(here: Container, echo: Echo, open_raw: Any) -> None:
+    raw = open_raw(here)
+    key = key_of(here, "echo")
+    replies = raw.subscribe(reply_key(here.address.identity, "tester", "raw", "0"))
+    publisher = raw.publish(call_key("tester", key.address, key.domain, key.provider, stop=False))
+    strange = [5, "text", None, b"", {1: 2}, [msgspec.msgpack.Ext(99, b"x")], [msgspec.msgpack.Ext(1, b"x")]]
+    for args in strange:
+        publisher.put(encode_message(msgspec.structs.replace(CALL, args=msgspec.Raw(encode_message(args)))))
+        reply = decode_reply(replies.receive().payload or b"")
+        assert reply.status == Status.ERROR
+        assert msgspec.msgpack.decode(reply.body)["type"] == "trade.errors:InvalidArgument"
+    assert echo.runs == 0
+
+
+def test_malformed_messages_are_logged_once_and_counted(
+    here: Container, echo: Echo, open_raw: Any, eventually: Any, caplog: pytest.LogCaptureFixture
+) -> None:
+    raw = open_raw(here)
+    key = key_of(here, "echo")
+    publisher = raw.publish(call_key("tester", key.address, key.domain, key.provider, stop=False))
+    with caplog.at_level(logging.DEBUG, "trade"):
+        for _ in range(20):
+            publisher.put(encode_message(msgspec.structs.replace(CALL, v=FUTURE)))
+        assert eventually(lambda: here.dropped_messages == 20)
+    [record] = [record for record in caplog.records if "dropped" in record.message]
+    assert f"protocol version {FUTURE}" in record.message
+    assert "further ones are counted, not logged" in record.message
+
+
+# --- registry entries from somewhere strange
+
+FORGED = Address("mallory", "ghost", "e1")
+BAD_ENTRIES = {
+    "garbage": (registry_key("robot", FORGED, "P-1"), b"garbage"),
+    "future": (registry_key("robot", FORGED, "P-1"), encode_message(msgspec.structs.replace(PROVIDER, v=FUTURE))),
+    "short key": ("registry/robot/mallory", encode_message(PROVIDER)),
+    "long key": (registry_key("robot", FORGED, "P-1/more"), encode_message(PROVIDER)),
+}
+
+
+@pytest.mark.parametrize(("key", "payload"), BAD_ENTRIES.values(), ids=list(BAD_ENTRIES))
+def test_a_malformed_registry_entry_is_dropped_and_counted(
+    here: Container, echo: Echo, open_raw: Any, eventually: Any, key: str, payload: bytes
+) -> None:
+    raw = open_raw(here)
+    ghost = raw.appear(alive_key(FORGED))
+    entry = raw.announce(key)
+    entry.put(payload)
+    assert eventually(lambda: here.dropped_messages >= 1)
+    assert here.services(where(group="forged")) == []
+    assert still_works(here, raw)
+    entry.close()
+    ghost.close()
+
+
+def test_an_entry_under_a_pattern_never_makes_a_service(
+    here: Container, echo: Echo, open_raw: Any, eventually: Any
+) -> None:
+    """Calling it would put the call to everybody."""
+    raw = open_raw(here)
+    raw.publish("registry/robot/*/*/*/P-1").put(encode_message(PROVIDER))
+    assert eventually(lambda: here.dropped_messages == 1)
+    assert here.services(where(group="forged")) == []
+    assert still_works(here, raw)
+
+
+def test_a_late_joiner_survives_malformed_entries_that_stand(
+    here: Container, start_container: Any, open_raw: Any, echo: Echo
+) -> None:
+    raw = open_raw(here)
+    raw.announce(registry_key("robot", FORGED, "P-1")).put(b"garbage")
+    raw.announce(registry_key("robot", FORGED, "P-2")).put(encode_message(msgspec.structs.replace(PROVIDER, v=FUTURE)))
+    late = start_container("late")
+    assert late.find(where(name="echo"), wait_s=20)(3) == 3
+
+
+def test_entries_count_only_while_their_container_shows_itself(here: Container, open_raw: Any, eventually: Any) -> None:
+    raw = open_raw(here)
+    raw.announce(registry_key("robot", FORGED, "P-1")).put(encode_message(PROVIDER))
+    assert here.services(where(group="forged")) == []
+    sign = raw.appear(alive_key(FORGED))
+    assert here.find(where(group="forged"), wait_s=20).container == "ghost"
+    sign.close()
+    assert eventually(lambda: here.services(where(group="forged")) == [])
+
+
+def test_a_newer_revision_of_an_entry_replaces_it_and_an_older_one_does_not(
+    here: Container, open_raw: Any, eventually: Any
+) -> None:
+    raw = open_raw(here)
+    sign = raw.appear(alive_key(FORGED))
+    entry = raw.announce(registry_key("robot", FORGED, "P-1"))
+    entry.put(encode_message(PROVIDER))
+    handle = here.find(where(group="forged"), wait_s=20)
+    entry.put(encode_message(msgspec.structs.replace(PROVIDER, revision=3, groups=("newer",))))
+    assert here.find(where(group="newer"), wait_s=20) == handle
+    entry.put(encode_message(msgspec.structs.replace(PROVIDER, revision=2, groups=("older",))))
+    entry.put(encode_message(msgspec.structs.replace(PROVIDER, revision=4, groups=("newest",))))
+    assert here.find(where(group="newest"), wait_s=20).groups == ("newest",)
+    assert here.services(where(group="older")) == here.services(where(group="forged")) == []
+    sign.close()
+
+
+# --- replies from somewhere strange
+
+
+class FakeCallee:
+    """Shows itself like a container, and answers as the test says."""
+
+    def __init__(self, raw: Any, caller: Container) -> None:
+        self.raw, self.caller = raw, caller
+        self.calls = raw.subscribe(calls_to(FORGED, stop=False))
+        info = ServiceInfo(name="go", signature="go() -> int", effect="read", result_schema={"type": "integer"})
+        self.sign = raw.appear(alive_key(FORGED))
+        self.entry = raw.announce(registry_key("robot", FORGED, "P-1"))
+        self.entry.put(encode_message(msgspec.structs.replace(PROVIDER, services=(info,))))
+        self.handle: Handle = caller.find(where(group="forged"), wait_s=20)
+
+    def answer_clock(self) -> None:
+        self.answer(self.next(), Status.OK)
+
+    def next(self) -> Call:
+        return decode_call(self.calls.receive().payload)
+
+    def answer(self, call: Call, status: int, body: Any = None, *, speaker: str = "mallory", **more: Any) -> None:
+        raw_body = msgspec.Raw(encode_message(body))
+        self.put(
+            call, encode_message(Reply(more.get("v", PROTOCOL), more.get("id", call.id), status, 1, raw_body)), speaker
+        )
+
+    def put(self, call: Call, payload: bytes, speaker: str = "mallory") -> None:
+        container, channel = call.reply.split("/")
+        self.raw.publish(reply_key(speaker, self.caller.address.identity, container, channel)).put(payload)
+
+
+@pytest.fixture
+def callee(here: Container, open_raw: Any) -> FakeCallee:
+    return FakeCallee(open_raw(here), here)
+
+
+@pytest.fixture(params=["call", "start"])
+def asked(request: pytest.FixtureRequest, callee: FakeCallee) -> Any:
+    """A call under way at the fake callee: the call as it arrived, and how to wait for its end."""
+    import concurrent.futures
+
+    with concurrent.futures.ThreadPoolExecutor(1) as pool:
+        if request.param == "call":
+            future: Any = pool.submit(callee.handle)
+        else:
+            future = callee.handle.start()
+        callee.answer_clock()
+        yield callee.next(), lambda: future.result(30)
+
+
+def test_a_reply_from_another_identity_is_ignored(callee: FakeCallee, asked: Any) -> None:
+    call, result = asked
+    for status in (Status.OK, Status.GONE, Status.BUSY, Status.TIMED_OUT, Status.LOST, Status.CLOSED):
+        callee.answer(call, status, 666, speaker="eve")
+    callee.answer(call, Status.OK, 5)
+    assert result() == 5
+
+
+def test_a_callee_cannot_end_a_call_in_the_callers_name(callee: FakeCallee, asked: Any) -> None:
+    call, result = asked
+    for status in (Status.TIMED_OUT, Status.LOST, Status.CLOSED):
+        callee.answer(call, status)
+    callee.answer(call, Status.OK, 5)
+    assert result() == 5
+
+
+def test_a_reply_to_a_pattern_is_ignored(here: Container, callee: FakeCallee, asked: Any) -> None:
+    call, result = asked
+    forged = encode_message(Reply(PROTOCOL, call.id, Status.OK, 1, msgspec.Raw(encode_message(666))))
+    callee.raw.publish("reply/**").put(forged)
+    callee.raw.publish(f"*/mallory/{here.address.identity}/{call.reply}").put(forged)
+    callee.answer(call, Status.OK, 5)
+    assert result() == 5
+
+
+def test_a_reply_to_another_call_is_ignored(callee: FakeCallee, asked: Any) -> None:
+    call, result = asked
+    callee.answer(call, Status.OK, 666, id=call.id + 1)
+    callee.answer(call, Status.OK, 666, id=0)
+    callee.answer(call, Status.OK, 5)
+    assert result() == 5
+
+
+def test_malformed_replies_are_dropped_and_counted(here: Container, callee: FakeCallee, asked: Any) -> None:
+    call, result = asked
+    callee.put(call, b"garbage")
+    callee.put(call, b"")
+    callee.answer(call, Status.OK, 666, v=FUTURE)
+    callee.answer(call, 99, 666)
+    callee.answer(call, Status.OK, 5)
+    assert result() == 5
+    assert here.dropped_messages == 4
+
+
+def test_a_second_reply_changes_nothing(callee: FakeCallee, asked: Any) -> None:
+    call, result = asked
+    callee.answer(call, Status.OK, 5)
+    callee.answer(call, Status.OK, 6)
+    assert result() == 5
+    again = callee.handle.start()
+    callee.answer(callee.next(), Status.OK, 7)
+    assert again.result(20) == 7
+
+
+def test_a_result_of_another_type_than_described_is_an_invalid_result(callee: FakeCallee, asked: Any) -> None:
+    call, result = asked
+    callee.answer(call, Status.OK, "text")
+    with pytest.raises(InvalidResult, match=r"forged.go ran, but .* Expected `int`, got `str`"):
+        result()
+
+
+@pytest.mark.parametrize("body", [None, 5, {"type": 5}, []], ids=str)
+def test_an_error_that_cannot_be_read_is_still_an_error(callee: FakeCallee, asked: Any, body: Any) -> None:
+    call, result = asked
+    callee.answer(call, Status.ERROR, body)
+    with pytest.raises(RemoteError, match=r"forged.go raised an error that cannot be read"):
+        result()
