@@ -3,6 +3,8 @@ PYTHON ?= $(firstword $(foreach v,python3 python3.13 python3.12 python3.11 pytho
 UV := .uv/bin/uv
 export UV_PYTHON ?= $(PYTHON)
 export UV_PYTHON_DOWNLOADS ?= never
+# Networks with certificates of their own work as they do for every other program of the machine.
+export UV_SYSTEM_CERTS ?= true
 RUN := $(UV) run --locked
 ARGS ?=
 

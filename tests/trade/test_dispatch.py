@@ -172,7 +172,7 @@ def test_an_async_service_is_cancelled_at_its_deadline(offer: Any) -> None:
 
     slow = Slow()
     with pytest.raises(OutcomeUnknown, match=r"no answer from robot.wait within"):
-        offer(slow)("wait").with_(deadline_s=0.2)()
+        offer(slow)("wait").with_(deadline_s=1)()
     assert slow.cancelled.wait(20)
 
 

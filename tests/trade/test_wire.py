@@ -345,6 +345,21 @@ def test_a_newer_revision_of_an_entry_replaces_it_and_an_older_one_does_not(
     sign.close()
 
 
+def test_a_call_goes_by_the_newest_description_of_its_service(here: Container, open_raw: Any) -> None:
+    callee = FakeCallee(open_raw(here), here)
+    first = callee.handle.start()
+    callee.answer_clock()
+    callee.answer(callee.next(), Status.OK, 5)
+    assert first.result(20) == 5
+    info = ServiceInfo(name="go", signature="go() -> str", effect="read", result_schema={"type": "string"})
+    callee.entry.put(encode_message(msgspec.structs.replace(PROVIDER, revision=2, services=(info,), groups=("newer",))))
+    assert here.find(where(group="newer"), wait_s=20) == callee.handle
+    second = callee.handle.start()
+    callee.answer(callee.next(), Status.OK, "text")
+    assert second.result(20) == "text"
+    assert callee.handle.signature == "go() -> str"
+
+
 # --- replies from somewhere strange
 
 
