@@ -431,14 +431,16 @@ INVALID: dict[str, tuple[Case, str, str]] = {
 }
 
 
+@pytest.mark.parametrize("where_it_runs", ["local", "remote"])
 @pytest.mark.parametrize(("case", "argument", "problem"), INVALID.values(), ids=list(INVALID))
 def test_an_invalid_argument_is_named_and_no_provider_code_runs(
-    offer: Any, case: Case, argument: str, problem: str
+    both: Any, case: Case, argument: str, problem: str, where_it_runs: str
 ) -> None:
-    provider = Provider()
-    found = offer(provider)
+    index = ["local", "remote"].index(where_it_runs)
+    provider = both[2][index]
+    provider.runs = 0
     with pytest.raises(InvalidArgument) as refused:
-        case(found)
+        case(both[index])
     assert refused.value.argument == argument
     assert problem in refused.value.problem
     assert refused.value.signature in str(refused.value)
