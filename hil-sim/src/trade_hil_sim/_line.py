@@ -205,16 +205,17 @@ class SerialLine:
         return min(waits)
 
     def _write_due(self) -> None:
-        while self._out and self._out[0].due - time.monotonic() < SPIN_S + 0.001:
+        while self._terminal is not None and self._out and self._out[0].due - time.monotonic() < SPIN_S + 0.001:
             chunk = heapq.heappop(self._out)
-            _sleep_until(chunk.due)
+            # logged first: whoever has an answer finds it in the log, and the wire does not wait for the log
+            due = max(chunk.due, time.monotonic())
+            self._note("sent", chunk.data, t=due, name=chunk.name, device_id=chunk.device_id)
+            _sleep_until(due)
             self._write(chunk)
 
     def _write(self, chunk: _Chunk) -> None:
         if self._terminal is None:
             return
-        # logged first, so that whoever has an answer finds it in the log
-        self._note("sent", chunk.data, name=chunk.name, device_id=chunk.device_id)
         try:
             taken = os.write(self._terminal.master, chunk.data)
         except BlockingIOError:
