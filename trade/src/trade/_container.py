@@ -15,15 +15,17 @@ import msgspec
 from trade._calls import Caller
 from trade._constraints import Constraint, where
 from trade._dispatch import Dispatcher
+from trade._endpoints import Endpoint, dialled_from_here, free_endpoint, with_free_port
 from trade._handle import Handle, Run
 from trade._invoke import LocalTarget, RemoteTarget, Request, container_closed
 from trade._notifications import Callback, Notification, Notifier
 from trade._providers import Providers, checked_groups
+from trade._reach import Reach
 from trade._registry import Change, Record, Registry
-from trade._rendezvous import Rendezvous, free_endpoint
+from trade._rendezvous import Rendezvous
 from trade._settings import Settings
 from trade._signature import Codec
-from trade._system import DOMAIN, PROVIDER, ContainerInfo, SystemServices
+from trade._system import DOMAIN, PROVIDER, ContainerInfo, System, SystemServices
 from trade._transport import ChannelClosed, Transport
 from trade._watch import Watch
 from trade._wire import (
@@ -63,12 +65,19 @@ class Container:
         self.session: Final = secrets.token_hex(8)
         self._closing = threading.RLock()
         self._closed = False
+        self.system: Final = System(lambda: self)
+        """Its own switches: who it is linked to, and whether it lets itself be found."""
         self._targets: dict[ServiceKey, LocalTarget | RemoteTarget] = {}
         self._codec = Codec(self._handle_to_data, self._data_to_handle, (Handle,))
         self._registry = Registry(self.address)
         with contextlib.ExitStack() as leaving:  # what has begun ends again if the rest cannot begin
+            self._reach: Reach | None = None
             self._transport = transport or self._join(leaving)
             leaving.callback(self._transport.close)
+            if isinstance(self._transport, ZenohTransport):
+                links, configured = self._transport.links, self._settings.connect
+                self._reach = Reach(links, self._settings.check_may_dial, configured)
+                leaving.callback(self._reach.close)
             self._caller = Caller(self._transport, self.address, self.session)
             leaving.callback(self._caller.close)
             self._notifier = Notifier(lambda record: Handle(self, record.key, record))
@@ -79,7 +88,7 @@ class Container:
             leaving.callback(self._providers.close)
             self._dispatcher = Dispatcher(self._transport, self.address, self._providers.lookup)
             leaving.callback(self._dispatcher.close)
-            self._providers.add(SystemServices(), (DOMAIN,), name=PROVIDER)
+            self._providers.add(SystemServices(self.system), (DOMAIN,), name=PROVIDER)
             presence = self._transport.appear(alive_key(self.address))
             leaving.callback(presence.close)
             self._watch = Watch(self._transport, self._registry, self.address, self._caller.lost)
@@ -91,7 +100,8 @@ class Container:
         for _ in range(_PORTS_TRIED if not self._settings.listen else 0):
             with contextlib.suppress(ConfigurationError):  # somebody else took the free port first
                 return self._join_at([free_endpoint()], leaving)
-        return self._join_at(list(self._settings.listen) or [free_endpoint()], leaving)
+        chosen = [str(with_free_port(Endpoint.read(endpoint))) for endpoint in self._settings.listen]
+        return self._join_at(chosen or [free_endpoint()], leaving)
 
     def _join_at(self, listen: list[str], leaving: contextlib.ExitStack) -> Transport:
         settings = self._settings
@@ -99,7 +109,7 @@ class Container:
         if not connect:
             rendezvous = Rendezvous(settings.system)
             leaving.callback(rendezvous.leave)
-            connect = rendezvous.enter(listen[0])
+            connect = rendezvous.enter(dialled_from_here(Endpoint.read(listen[0])))
         return ZenohTransport(
             configuration(namespace=settings.system, listen=listen, connect=connect, credentials=settings.credentials)
         )
@@ -196,6 +206,14 @@ class Container:
                 )
             )
         return infos
+
+    @property
+    def reach(self) -> Reach:
+        """Whom it is linked to; raises ConfigurationError on a transport that has no such switches."""
+        self._check_open()
+        if self._reach is None:
+            raise ConfigurationError(problem="this container's transport cannot be linked to others while it runs")
+        return self._reach
 
     def handle(self, key: ServiceKey) -> Handle:
         """A handle of a service whose key is known."""

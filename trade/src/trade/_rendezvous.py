@@ -6,26 +6,19 @@ two that start together at least one sees the other; the newcomer dials everybod
 
 import contextlib
 import os
-import socket
 import stat
 import tempfile
 import time
 from pathlib import Path
 from typing import Final
 
+from trade._endpoints import accepts, free_endpoint
 from trade.errors import ConfigurationError
 
 __all__ = ["Rendezvous", "free_endpoint"]
 
 _YOUNG_S: Final = 10.0
 """A file this young may belong to a container that does not listen yet."""
-
-
-def free_endpoint() -> str:
-    """A loopback endpoint nobody listens on now."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
 class Rendezvous:
@@ -52,7 +45,7 @@ class Rendezvous:
                 endpoint = path.read_text(encoding="ascii").strip()
                 if path == self._own:
                     continue
-                if _listens(endpoint) or time.time() - path.stat().st_mtime < _YOUNG_S:
+                if accepts(endpoint) or time.time() - path.stat().st_mtime < _YOUNG_S:
                     found.append(endpoint)
                 else:
                     path.unlink()
@@ -63,15 +56,6 @@ class Rendezvous:
         if self._own is not None:
             self._own.unlink(missing_ok=True)
             self._own = None
-
-
-def _listens(endpoint: str) -> bool:
-    host, port = endpoint.partition("/")[2].rsplit(":", 1)
-    try:
-        with socket.create_connection((host.strip("[]"), int(port)), timeout=0.5):
-            return True
-    except OSError:
-        return False
 
 
 def _runtime_folder() -> Path:

@@ -1,6 +1,5 @@
 """Who a container is and where it may be reached; every default stays on this host."""
 
-import ipaddress
 import os
 import socket
 import sys
@@ -8,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from trade._endpoints import Endpoint
 from trade._wire import as_chunk, is_chunk
 from trade.errors import ConfigurationError
 
@@ -42,16 +42,20 @@ class Settings:
                 problem = f"{text!r} is no name for a {what}; use letters, digits, . _ - (at most 80)"
                 raise ConfigurationError(where=what, problem=problem)
         for endpoint in self.listen:
-            if not _is_loopback(endpoint):
+            if not Endpoint.read(endpoint).loopback:
                 problem = "listening beyond loopback needs a policy, and none is loaded; listen on tcp/127.0.0.1:PORT"
                 raise ConfigurationError(where=f"listen {endpoint}", problem=problem)
         for endpoint in self.connect:
-            if not _is_loopback(endpoint) and not (self.explicit_system and self.credentials):
-                problem = (
-                    "reaching a network needs an explicit system id and credentials: set TRADE_SYSTEM and "
-                    "TRADE_CREDENTIALS=user:password"
-                )
-                raise ConfigurationError(where=f"connect {endpoint}", problem=problem)
+            self.check_may_dial(endpoint)
+
+    def check_may_dial(self, endpoint: str) -> None:
+        """S21: raises ConfigurationError if that would reach a network by accident."""
+        if not Endpoint.read(endpoint).loopback and not (self.explicit_system and self.credentials):
+            problem = (
+                "reaching a network needs an explicit system id and credentials: set TRADE_SYSTEM and "
+                "TRADE_CREDENTIALS=user:password"
+            )
+            raise ConfigurationError(where=f"connect {endpoint}", problem=problem)
 
     @classmethod
     def read(
@@ -107,15 +111,3 @@ def _user() -> str:
 def _program() -> str:
     name = Path(sys.argv[0]).stem if sys.argv and sys.argv[0] else ""
     return as_chunk(f"{name if name not in ('', '-c', '-m', '__main__') else 'python'}-{os.getpid()}")
-
-
-def _is_loopback(endpoint: str) -> bool:
-    """Whether ``protocol/host:port`` stays on this host."""
-    protocol, slash, rest = endpoint.partition("/")
-    host, colon, port = rest.split("#")[0].split("?")[0].rpartition(":")
-    if not (protocol and slash and host and colon and port.isascii() and port.isdigit()):
-        raise ConfigurationError(where=f"endpoint {endpoint!r}", problem="must look like tcp/127.0.0.1:7450")
-    try:
-        return ipaddress.ip_address(host.strip("[]")).is_loopback
-    except ValueError:
-        return host == "localhost"

@@ -6,13 +6,13 @@ No Python runs on zenoh's threads: every subscriber is a channel that our thread
 receiver instead of dropping (zenoh's default), and go out at once. All sessions carry the same short lease.
 """
 
-import json
 from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 import zenoh
 from zenoh import ext
 
+from trade._links import Links, new_session_id, open_session
 from trade._transport import Channel, ChannelClosed, Message, Presence, Publisher, Transport
 from trade.errors import ConfigurationError
 
@@ -30,6 +30,7 @@ def configuration(
 ) -> dict[str, Any]:
     """The settings of one session, as zenoh names them."""
     settings: dict[str, Any] = {
+        "id": new_session_id(),
         "mode": "peer",
         "namespace": namespace,
         "listen/endpoints": list(listen),
@@ -120,16 +121,14 @@ class ZenohPresence(Presence):
 
 class ZenohTransport(Transport):
     def __init__(self, settings: dict[str, Any]) -> None:
-        config = zenoh.Config()
-        for key, value in settings.items():
-            config.insert_json5(key, json.dumps(value))
         try:
-            self._session = zenoh.open(config)
+            self._session = open_session(settings)
         except zenoh.ZError as bad:
             raise ConfigurationError(
                 where=f"listen {', '.join(settings['listen/endpoints'])}",
                 problem=f"cannot listen there: {bad}; is the address taken, or not of this host?",
             ) from None
+        self.links: Final = Links(self._session, settings)
 
     def publish(self, key: str, *, urgent: bool = False) -> Publisher:
         priority = zenoh.Priority.REAL_TIME if urgent else zenoh.Priority.DATA
