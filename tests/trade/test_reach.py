@@ -133,15 +133,15 @@ def test_an_endpoint_that_is_taken_is_refused_and_leaves_nothing(here: Container
 def test_when_a_free_port_is_taken_in_between_another_one_is_tried(
     here: Container, system: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from trade import _container
+    from trade import _joining
 
     taken = next(
         connection.laddr.port
         for connection in psutil.Process().net_connections("tcp")
         if connection.status == psutil.CONN_LISTEN
     )
-    endpoints = iter([f"tcp/127.0.0.1:{taken}", f"tcp/127.0.0.1:{taken}", _container.free_endpoint()])
-    monkeypatch.setattr(_container, "free_endpoint", lambda: next(endpoints))
+    endpoints = iter([f"tcp/127.0.0.1:{taken}", f"tcp/127.0.0.1:{taken}", _joining.free_endpoint()])
+    monkeypatch.setattr(_joining, "free_endpoint", lambda: next(endpoints))
     with Container(Settings.read(container="second")) as second:
         assert {info.name for info in second.containers()} == {"here", "second"}
 

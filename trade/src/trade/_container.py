@@ -15,14 +15,13 @@ import msgspec
 from trade._calls import Caller
 from trade._constraints import Constraint, where
 from trade._dispatch import Dispatcher
-from trade._endpoints import Endpoint, dialled_from_here, free_endpoint, with_free_port
 from trade._handle import Handle, Run
 from trade._invoke import LocalTarget, RemoteTarget, Request, container_closed
+from trade._joining import join
 from trade._notifications import Callback, Notification, Notifier
 from trade._providers import Providers, checked_groups
 from trade._reach import Reach
 from trade._registry import Change, Record, Registry
-from trade._rendezvous import Rendezvous
 from trade._settings import Settings
 from trade._signature import Codec
 from trade._system import DOMAIN, PROVIDER, ContainerInfo, System, SystemServices
@@ -34,13 +33,12 @@ from trade._wire import (
     alive_key,
     encode_message,
 )
-from trade._zenoh import ZenohTransport, configuration
+from trade._zenoh import ZenohTransport
 from trade.errors import ConfigurationError, NoSuchService, ServiceGone, TooManyServices
 
 __all__ = ["Container"]
 
 _HANDLE_EXT: Final = 1
-_PORTS_TRIED: Final = 4
 _PATIENCE_S: Final = 1.0
 """How long a call waits for the registry to hear of a handle that came by message before its registry entry did."""
 
@@ -72,7 +70,7 @@ class Container:
         self._registry = Registry(self.address)
         with contextlib.ExitStack() as leaving:  # what has begun ends again if the rest cannot begin
             self._reach: Reach | None = None
-            self._transport = transport or self._join(leaving)
+            self._transport = transport or join(self._settings, leaving)
             leaving.callback(self._transport.close)
             if isinstance(self._transport, ZenohTransport):
                 links, configured = self._transport.links, self._settings.connect
@@ -95,24 +93,6 @@ class Container:
             leaving.callback(self._watch.close)
             self._leaving = leaving.pop_all()
         _live.add(self)
-
-    def _join(self, leaving: contextlib.ExitStack) -> Transport:
-        for _ in range(_PORTS_TRIED if not self._settings.listen else 0):
-            with contextlib.suppress(ConfigurationError):  # somebody else took the free port first
-                return self._join_at([free_endpoint()], leaving)
-        chosen = [str(with_free_port(Endpoint.read(endpoint))) for endpoint in self._settings.listen]
-        return self._join_at(chosen or [free_endpoint()], leaving)
-
-    def _join_at(self, listen: list[str], leaving: contextlib.ExitStack) -> Transport:
-        settings = self._settings
-        connect = list(settings.connect)
-        if not connect:
-            rendezvous = Rendezvous(settings.system)
-            leaving.callback(rendezvous.leave)
-            connect = rendezvous.enter(dialled_from_here(Endpoint.read(listen[0])))
-        return ZenohTransport(
-            configuration(namespace=settings.system, listen=listen, connect=connect, credentials=settings.credentials)
-        )
 
     # --- hosting
 

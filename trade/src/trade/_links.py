@@ -17,6 +17,7 @@ from typing import Any, Final, NamedTuple
 
 import zenoh
 
+from trade._credentials import dictionary_file
 from trade._endpoints import Endpoint, dialled_from_here
 from trade.errors import ConfigurationError
 
@@ -25,7 +26,8 @@ _HALF: Final = 16
 """Hexadecimal digits: the first half of a session's id names it, the first half of a beacon's its system."""
 _LOOK_S: Final = 0.01
 
-Session = zenoh.Session
+_USER: Final = "transport/auth/usrpwd/user"
+_PASSWORD: Final = "transport/auth/usrpwd/password"  # noqa: S105 - the name of a setting
 
 
 def new_session_id() -> str:
@@ -33,12 +35,27 @@ def new_session_id() -> str:
     return secrets.choice("123456789abcdef") + secrets.token_hex(_HALF)[1:]
 
 
-def open_session(settings: dict[str, Any]) -> Session:
-    """Open what the settings say, as zenoh names them. Raises zenoh.ZError."""
+def open_session(settings: dict[str, Any]) -> zenoh.Session:
+    """Open what the settings say, as zenoh names them; it lets in who has its own credentials. Raises zenoh.ZError."""
+    with dictionary_file((settings[_USER], settings[_PASSWORD])) as allowed:
+        return zenoh.open(_config({**settings, "transport/auth/usrpwd/dictionary_file": str(allowed)}))
+
+
+def _config(settings: dict[str, Any]) -> zenoh.Config:
     config = zenoh.Config()
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))
-    return zenoh.open(config)
+    return config
+
+
+class Beacon:
+    """Answers scouts until it is closed."""
+
+    def __init__(self, session: zenoh.Session) -> None:
+        self._session = session
+
+    def close(self) -> None:
+        self._session.close()
 
 
 class Found(NamedTuple):
@@ -52,7 +69,7 @@ class Found(NamedTuple):
 class Links:
     """Who the main session is linked to, and how to link it to more."""
 
-    def __init__(self, session: Session, settings: dict[str, Any]) -> None:
+    def __init__(self, session: zenoh.Session, settings: dict[str, Any]) -> None:
         self._session = session
         self._settings = settings
         self._own = str(session.zid())
@@ -71,18 +88,16 @@ class Links:
         wanted = set(Endpoint.read(endpoint).resolved())
         return any(_plain(str(link.dst)) in wanted for link in self._session.info.links())
 
-    def beacon(self) -> Session:
+    def beacon(self) -> Beacon:
         """A session linked to the main one that answers scouts and dials nobody, until it is closed."""
         listen = [f"{own.protocol}/{own.host}:0" for own in self._listen]
-        return self._beside(listen, [self._door()], {**self._scouting(), "id": self._tag + self._own[:_HALF]})
+        more = {**self._scouting(), "id": self._tag + self._own[:_HALF]}
+        return Beacon(self._beside(listen, [self._door()], more))
 
     def scouted(self, for_s: float, ended: Callable[[], bool]) -> Iterator[Found]:
         """Ask who is there; each container of this system that lets itself be found, once."""
-        config = zenoh.Config()
-        for key, value in self._scouting().items():
-            config.insert_json5(key, json.dumps(value))
         seen = {self._tag + self._own[:_HALF]}
-        asking = zenoh.scout(zenoh.handlers.FifoChannel(256), what="peer", config=config)
+        asking = zenoh.scout(zenoh.handlers.FifoChannel(256), what="peer", config=_config(self._scouting()))
         try:
             until = time.monotonic() + for_s
             while time.monotonic() < until and not ended():
@@ -119,7 +134,7 @@ class Links:
         """Where a session of this process reaches the main one."""
         return dialled_from_here(self._listen[0])
 
-    def _beside(self, listen: Sequence[str], connect: Sequence[str], more: dict[str, Any]) -> Session:
+    def _beside(self, listen: Sequence[str], connect: Sequence[str], more: dict[str, Any]) -> zenoh.Session:
         settings = {
             **self._settings,
             "id": new_session_id(),
@@ -154,8 +169,7 @@ class Links:
 
 def _tag(settings: dict[str, Any]) -> str:
     """What the ids of one system's beacons begin with; without its password nobody can tell which system it is."""
-    password = settings.get("transport/auth/usrpwd/password", "")
-    digest = hmac.digest(str(password).encode(), str(settings["namespace"]).encode(), hashlib.sha256).hex()
+    digest = hmac.digest(str(settings[_PASSWORD]).encode(), str(settings["namespace"]).encode(), hashlib.sha256).hex()
     return "b" + digest[: _HALF - 1]
 
 

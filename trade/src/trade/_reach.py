@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from typing import Final
 
 from trade._endpoints import Endpoint, accepts
-from trade._links import Links, Session
+from trade._links import Beacon, Links
 from trade.errors import CannotConnect, ConfigurationError, LinkStays
 
 _logger = logging.getLogger("trade")
@@ -32,7 +32,7 @@ class Reach:
         self._links = links
         self._may_dial = may_dial
         self._lock = threading.RLock()
-        self._beacon: Session | None = None
+        self._beacon: Beacon | None = None
         self._discovering = False
         self._kept: dict[str, str] = {}
         """Endpoint -> id of the session found there."""

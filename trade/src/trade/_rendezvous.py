@@ -15,7 +15,7 @@ from typing import Final
 from trade._endpoints import accepts, free_endpoint
 from trade.errors import ConfigurationError
 
-__all__ = ["Rendezvous", "free_endpoint"]
+__all__ = ["Rendezvous", "free_endpoint", "runtime_folder"]
 
 _YOUNG_S: Final = 10.0
 """A file this young may belong to a container that does not listen yet."""
@@ -25,7 +25,7 @@ class Rendezvous:
     """One system's folder on this host; only this user can read or write it."""
 
     def __init__(self, system: str) -> None:
-        self._folder = _runtime_folder() / system
+        self._folder = runtime_folder() / system
         self._folder.mkdir(mode=0o700, exist_ok=True)
         self._own: Path | None = None
 
@@ -58,7 +58,7 @@ class Rendezvous:
             self._own = None
 
 
-def _runtime_folder() -> Path:
+def runtime_folder() -> Path:
     named = os.environ.get("TRADE_RUNTIME_DIR")
     base = named or os.environ.get("XDG_RUNTIME_DIR")
     uid = str(os.getuid()) if hasattr(os, "getuid") else "user"

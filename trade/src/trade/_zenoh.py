@@ -26,10 +26,10 @@ _PUT: Final = zenoh.SampleKind.PUT
 
 
 def configuration(
-    *, namespace: str, listen: Sequence[str], connect: Sequence[str], credentials: tuple[str, str] | None
+    *, namespace: str, listen: Sequence[str], connect: Sequence[str], credentials: tuple[str, str]
 ) -> dict[str, Any]:
     """The settings of one session, as zenoh names them."""
-    settings: dict[str, Any] = {
+    return {
         "id": new_session_id(),
         "mode": "peer",
         "namespace": namespace,
@@ -40,13 +40,12 @@ def configuration(
         "connect/retry": {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2},
         "scouting/multicast/enabled": False,
         "timestamping/enabled": True,
+        "transport/auth/usrpwd/user": credentials[0],
+        "transport/auth/usrpwd/password": credentials[1],
         "transport/link/tx/lease": LEASE_MS,
         "transport/link/tx/keep_alive": 4,
         "transport/link/tx/queue/congestion_control/block/wait_before_close": 1_000_000,
     }
-    if credentials is not None:
-        settings["transport/auth/usrpwd/user"], settings["transport/auth/usrpwd/password"] = credentials
-    return settings
 
 
 class ZenohChannel(Channel):
