@@ -102,7 +102,7 @@ def test_settings_come_from_arguments_then_the_environment_then_defaults() -> No
 
 
 def test_a_container_may_be_reached_at_a_chosen_endpoint(system: str) -> None:
-    from trade._rendezvous import free_endpoint
+    from trade._endpoints import free_endpoint
 
     class Echo:
         @service(effect="read")
@@ -147,7 +147,7 @@ def test_when_a_free_port_is_taken_in_between_another_one_is_tried(
 
 
 def test_a_container_reached_at_its_endpoint_is_reached_again_after_its_restart(system: str) -> None:
-    from trade._rendezvous import free_endpoint
+    from trade._endpoints import free_endpoint
 
     endpoint = free_endpoint()
     with Container(Settings.read(container="client", connect=[endpoint])) as client:

@@ -18,7 +18,7 @@ from trade.errors import ConfigurationError
 __all__ = ["Rendezvous", "free_endpoint", "runtime_folder"]
 
 _YOUNG_S: Final = 10.0
-"""A file this young may belong to a container that does not listen yet."""
+"""A file this young may belong to a container that does not listen yet, if its process lives."""
 
 
 class Rendezvous:
@@ -34,7 +34,7 @@ class Rendezvous:
         name = endpoint.replace("/", "_").replace(":", "_")
         self._own = self._folder / name
         fresh = self._folder / f".{name}.{os.getpid()}"
-        fresh.write_text(endpoint, encoding="ascii")
+        fresh.write_text(f"{endpoint}\n{os.getpid()}\n", encoding="ascii")
         fresh.replace(self._own)
         return self._others()
 
@@ -42,10 +42,11 @@ class Rendezvous:
         found: list[str] = []
         for path in sorted(path for path in self._folder.iterdir() if not path.name.startswith(".")):
             with contextlib.suppress(OSError, ValueError):
-                endpoint = path.read_text(encoding="ascii").strip()
                 if path == self._own:
                     continue
-                if accepts(endpoint) or time.time() - path.stat().st_mtime < _YOUNG_S:
+                endpoint, _, writer = path.read_text(encoding="ascii").strip().partition("\n")
+                young = time.time() - path.stat().st_mtime < _YOUNG_S
+                if accepts(endpoint) or (young and _may_live(writer)):
                     found.append(endpoint)
                 else:
                     path.unlink()
@@ -56,6 +57,19 @@ class Rendezvous:
         if self._own is not None:
             self._own.unlink(missing_ok=True)
             self._own = None
+
+
+def _may_live(writer: str) -> bool:
+    """Whether the process that wrote a file may be about to listen; not known on every operating system."""
+    if os.name != "posix" or not writer.isdigit():  # elsewhere signal 0 is no question
+        return True
+    try:
+        os.kill(int(writer), 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except PermissionError:
+        return True
+    return True
 
 
 def runtime_folder() -> Path:
