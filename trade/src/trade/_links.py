@@ -12,7 +12,7 @@ import json
 import secrets
 import socket
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, Final, NamedTuple
 
 import zenoh
@@ -22,8 +22,11 @@ from trade._endpoints import Endpoint, dialled_from_here
 from trade.errors import ConfigurationError
 
 _NOBODY: Final[dict[str, Any]] = {"router": [], "peer": []}
-_HALF: Final = 16
-"""Hexadecimal digits: the first half of a session's id names it, the first half of a beacon's its system."""
+_DIGITS: Final = 32
+_TAG: Final = 16
+_NAME: Final = 12
+"""Hexadecimal digits: the id of a beacon is made of its system's tag, of so much of the id of the main session as names
+it, and of the port that the main session listens on. So a scout knows whom it found, and dials the main session."""
 _LOOK_S: Final = 0.01
 
 _USER: Final = "transport/auth/usrpwd/user"
@@ -32,7 +35,7 @@ _PASSWORD: Final = "transport/auth/usrpwd/password"  # noqa: S105 - the name of 
 
 def new_session_id() -> str:
     """An id that zenoh keeps as it is written: its first digit is not zero."""
-    return secrets.choice("123456789abcdef") + secrets.token_hex(_HALF)[1:]
+    return secrets.choice("123456789abcdef") + secrets.token_hex(_DIGITS // 2)[1:]
 
 
 def open_session(settings: dict[str, Any]) -> zenoh.Session:
@@ -62,7 +65,7 @@ class Found(NamedTuple):
     """A container of this system that lets itself be found."""
 
     session: str
-    """The first half of its main session's id."""
+    """How the id of its main session begins."""
     endpoints: tuple[str, ...]
 
 
@@ -75,6 +78,8 @@ class Links:
         self._own = str(session.zid())
         self._listen = [Endpoint.read(text) for text in settings["listen/endpoints"]]
         self._tag = _tag(settings)
+        self._shown = next((own for own in self._listen if not own.loopback), self._listen[0])
+        self._beacon_id = f"{self._tag}{self._own[:_NAME]}{self._shown.port:04x}"
 
     def linked(self, session: str) -> bool:
         """Whether the main session is linked to one whose id begins so."""
@@ -90,13 +95,12 @@ class Links:
 
     def beacon(self) -> Beacon:
         """A session linked to the main one that answers scouts and dials nobody, until it is closed."""
-        listen = [f"{own.protocol}/{own.host}:0" for own in self._listen]
-        more = {**self._scouting(), "id": self._tag + self._own[:_HALF]}
-        return Beacon(self._beside(listen, [self._door()], more))
+        listen = str(self._shown._replace(port=0))
+        return Beacon(self._beside([listen], [self._door()], {**self._scouting(), "id": self._beacon_id}))
 
     def scouted(self, for_s: float, ended: Callable[[], bool]) -> Iterator[Found]:
         """Ask who is there; each container of this system that lets itself be found, once."""
-        seen = {self._tag + self._own[:_HALF]}
+        seen = {self._beacon_id}
         asking = zenoh.scout(zenoh.handlers.FifoChannel(256), what="peer", config=_config(self._scouting()))
         try:
             until = time.monotonic() + for_s
@@ -108,7 +112,7 @@ class Links:
                 found = str(hello.zid)
                 if found not in seen and found.startswith(self._tag):
                     seen.add(found)
-                    yield Found(found[_HALF:], tuple(map(str, hello.locators)))
+                    yield _found(found, map(str, hello.locators))
         finally:
             asking.stop()
 
@@ -167,10 +171,16 @@ class Links:
         return loopback
 
 
+def _found(beacon: str, locators: Iterable[str]) -> Found:
+    port = int(beacon[_TAG + _NAME :], 16)
+    endpoints = (Endpoint.read(locator)._replace(port=port) for locator in locators)
+    return Found(beacon[_TAG:][:_NAME], tuple(map(str, endpoints)))
+
+
 def _tag(settings: dict[str, Any]) -> str:
     """What the ids of one system's beacons begin with; without its password nobody can tell which system it is."""
     digest = hmac.digest(str(settings[_PASSWORD]).encode(), str(settings["namespace"]).encode(), hashlib.sha256).hex()
-    return "b" + digest[: _HALF - 1]
+    return "b" + digest[: _TAG - 1]
 
 
 def _plain(locator: str) -> str:

@@ -39,6 +39,8 @@ def configuration(
         "connect/exit_on_failure": False,
         "connect/retry": {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2},
         "scouting/multicast/enabled": False,
+        # Two that hear of each other at once must not both dial: each would refuse the other as a second link.
+        "scouting/gossip/autoconnect_strategy": {"peer": {"to_router": "always", "to_peer": "greater-zid"}},
         "timestamping/enabled": True,
         "transport/auth/usrpwd/user": credentials[0],
         "transport/auth/usrpwd/password": credentials[1],
