@@ -153,6 +153,8 @@ def test_disconnecting_says_that_a_standing_link_stays(apart: tuple[Container, C
     clock = clock_of(one, "b")
     with pytest.raises(LinkStays, match="stays while both containers run; it is dialled no more"):
         one.system.disconnect(endpoint)
+    with pytest.raises(LinkStays, match="the link to b stays"):
+        one.system.disconnect("b")
     assert clock() > 0
 
 

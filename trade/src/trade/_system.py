@@ -8,6 +8,7 @@ from msgspec import Struct
 
 from trade._reach import Reach
 from trade._service import service
+from trade.errors import LinkStays
 
 DOMAIN: Final = "trade"
 PROVIDER: Final = "system"
@@ -69,9 +70,14 @@ class System:
     def disconnect(self, endpoint: str) -> None:
         """Dial an endpoint no more.
 
+        Args:
+            endpoint: what was given to `connect`; the name of a container is understood, too.
+
         Raises:
             LinkStays: the link is there, and stays until one of its containers closes; it is dialled no more.
         """
+        if any(info.name == endpoint for info in self.containers()):
+            raise LinkStays(to=endpoint)
         self._member().reach.disconnect(endpoint)
 
     def containers(self) -> list[ContainerInfo]:
