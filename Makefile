@@ -8,11 +8,11 @@ export UV_SYSTEM_CERTS ?= true
 RUN := $(UV) run --locked
 ARGS ?=
 
-.PHONY: demo test check bench clean
+.PHONY: demo test soak-registry check bench clean
 .DEFAULT_GOAL := help
 
 help: ## show the targets
-	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' Makefile | expand -t 12
+	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' Makefile | expand -t 16
 
 $(UV):
 	@$(or $(PYTHON),$(error no python3 found; install Python 3.10-3.13 (Debian: apt-get install python3 python3-venv))) -c 'import sys; sys.exit(not (3, 10) <= sys.version_info < (3, 14))' \
@@ -27,6 +27,9 @@ demo: $(UV) ## a simulated pan-tilt head moves through remote service calls (ARG
 
 test: $(UV) ## the whole test suite
 	@$(RUN) pytest $(ARGS)
+
+soak-registry: $(UV) ## three containers on two hosts register at the same moment, 200 times (root, iproute2)
+	@TRADE_SOAK_ROUNDS=200 $(RUN) pytest tests/system/test_namespaces.py -k same_moment $(ARGS)
 
 check: $(UV) ## lint, formatting, types, import rules, isolated install of the core
 	@$(RUN) ruff check

@@ -15,7 +15,9 @@ import hypothesis
 import pytest
 
 from trade import Container, Handle, service, where
-from trade._rendezvous import Rendezvous, free_endpoint
+from trade._credentials import user_secret
+from trade._endpoints import free_endpoint
+from trade._rendezvous import Rendezvous
 from trade._wire import ALIVE, alive_key
 from trade._zenoh import ZenohTransport, configuration
 
@@ -181,7 +183,7 @@ def open_raw(system: str) -> Iterator[OpenRaw]:
             stack.callback(rendezvous.leave)
             others = rendezvous.enter(endpoint)
             transport = ZenohTransport(
-                configuration(namespace=system, listen=[endpoint], connect=others, credentials=None)
+                configuration(namespace=system, listen=[endpoint], connect=others, credentials=user_secret())
             )
             stack.callback(transport.close)
             signs = transport.presences(ALIVE)

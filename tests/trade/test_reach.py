@@ -102,7 +102,7 @@ def test_settings_come_from_arguments_then_the_environment_then_defaults() -> No
 
 
 def test_a_container_may_be_reached_at_a_chosen_endpoint(system: str) -> None:
-    from trade._rendezvous import free_endpoint
+    from trade._endpoints import free_endpoint
 
     class Echo:
         @service(effect="read")
@@ -133,21 +133,21 @@ def test_an_endpoint_that_is_taken_is_refused_and_leaves_nothing(here: Container
 def test_when_a_free_port_is_taken_in_between_another_one_is_tried(
     here: Container, system: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from trade import _container
+    from trade import _joining
 
     taken = next(
         connection.laddr.port
         for connection in psutil.Process().net_connections("tcp")
         if connection.status == psutil.CONN_LISTEN
     )
-    endpoints = iter([f"tcp/127.0.0.1:{taken}", f"tcp/127.0.0.1:{taken}", _container.free_endpoint()])
-    monkeypatch.setattr(_container, "free_endpoint", lambda: next(endpoints))
+    endpoints = iter([f"tcp/127.0.0.1:{taken}", f"tcp/127.0.0.1:{taken}", _joining.free_endpoint()])
+    monkeypatch.setattr(_joining, "free_endpoint", lambda: next(endpoints))
     with Container(Settings.read(container="second")) as second:
         assert {info.name for info in second.containers()} == {"here", "second"}
 
 
 def test_a_container_reached_at_its_endpoint_is_reached_again_after_its_restart(system: str) -> None:
-    from trade._rendezvous import free_endpoint
+    from trade._endpoints import free_endpoint
 
     endpoint = free_endpoint()
     with Container(Settings.read(container="client", connect=[endpoint])) as client:

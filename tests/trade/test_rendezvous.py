@@ -8,7 +8,8 @@ from typing import Any
 import pytest
 
 from trade import Container, where
-from trade._rendezvous import Rendezvous, free_endpoint
+from trade._endpoints import free_endpoint
+from trade._rendezvous import Rendezvous
 from trade.errors import ConfigurationError
 
 
@@ -25,7 +26,7 @@ def old(path: Path) -> None:
 def test_who_enters_leaves_its_endpoint_and_takes_it_away(system: str, folder: Path) -> None:
     rendezvous = Rendezvous(system)
     assert rendezvous.enter("tcp/127.0.0.1:7450") == []
-    assert [path.read_text() for path in folder.iterdir()] == ["tcp/127.0.0.1:7450"]
+    assert [path.read_text().split()[0] for path in folder.iterdir()] == ["tcp/127.0.0.1:7450"]
     rendezvous.leave()
     rendezvous.leave()
     assert list(folder.iterdir()) == []
@@ -44,13 +45,44 @@ def test_endpoints_nobody_listens_on_are_pruned(system: str, folder: Path) -> No
     stale.enter(free_endpoint())
     old(next(folder.iterdir()))
     assert Rendezvous(system).enter("tcp/127.0.0.1:1") == []
-    assert [path.read_text() for path in folder.iterdir()] == ["tcp/127.0.0.1:1"]
+    assert [path.read_text().split()[0] for path in folder.iterdir()] == ["tcp/127.0.0.1:1"]
 
 
 def test_endpoints_of_those_that_are_just_starting_are_kept(system: str, folder: Path) -> None:
     starting = free_endpoint()
     Rendezvous(system).enter(starting)
     assert Rendezvous(system).enter("tcp/127.0.0.1:1") == [starting]
+
+
+def test_endpoints_of_processes_that_were_killed_are_pruned_at_once(
+    system: str, folder: Path, start_program: Any
+) -> None:
+    program = start_program(
+        """
+        container = Container(Settings.read(container="there"))
+        say("up")
+        hear()
+        """
+    )
+    assert program.heard() == "up"
+    [path] = folder.iterdir()
+    program.kill()
+    assert path.exists()
+    assert Rendezvous(system).enter("tcp/127.0.0.1:1") == []
+    assert not path.exists()
+
+
+@pytest.mark.parametrize("writer", ["", "\nrubbish", "\n1"])
+def test_where_it_is_not_known_whether_the_writer_lives_the_file_counts_as_young(
+    system: str, folder: Path, writer: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(pid: int, signal: int) -> None:
+        raise PermissionError
+
+    monkeypatch.setattr(os, "kill", refuse)  # another user's process
+    endpoint = free_endpoint()
+    (folder / "tcp_early").write_text(endpoint + writer)
+    assert Rendezvous(system).enter("tcp/127.0.0.1:1") == [endpoint]
 
 
 def test_endpoints_on_the_newer_loopback_address_are_not_pruned(system: str, folder: Path) -> None:

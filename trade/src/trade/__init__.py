@@ -17,7 +17,7 @@ from trade._handle import Handle, Run
 from trade._notifications import Callback, Notification
 from trade._service import service
 from trade._settings import Settings
-from trade._system import ContainerInfo
+from trade._system import ContainerInfo, System
 
 __all__ = [
     "CallContext",
@@ -29,6 +29,7 @@ __all__ = [
     "Notification",
     "Run",
     "Settings",
+    "System",
     "close",
     "container",
     "containers",
@@ -42,6 +43,7 @@ __all__ = [
     "service",
     "services",
     "start",
+    "system",
     "where",
 ]
 
@@ -82,6 +84,10 @@ def close() -> None:
         running, _default = _default, None
     if running is not None:
         running.close()
+
+
+system = System(container)
+"""The switches of the default container."""
 
 
 def register(

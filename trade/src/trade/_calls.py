@@ -264,7 +264,7 @@ class Caller:
 
     def _new_box(self) -> _Box:
         with self._lock:
-            index = str(len(self._every))
+            index = f"{self._own.epoch}-{len(self._every)}"  # another container may have our name: answers never cross
             key = reply_key("*", self._own.identity, self._own.container, index)
             own = reply_key(self._own.identity, self._own.identity, self._own.container, index)
             box = _Box(f"{self._own.container}/{index}", own, self._transport.subscribe(key))

@@ -17,13 +17,14 @@ from trade._constraints import Constraint, where
 from trade._dispatch import Dispatcher
 from trade._handle import Handle, Run
 from trade._invoke import LocalTarget, RemoteTarget, Request, container_closed
+from trade._joining import join
 from trade._notifications import Callback, Notification, Notifier
 from trade._providers import Providers, checked_groups
+from trade._reach import Reach
 from trade._registry import Change, Record, Registry
-from trade._rendezvous import Rendezvous, free_endpoint
 from trade._settings import Settings
 from trade._signature import Codec
-from trade._system import DOMAIN, PROVIDER, ContainerInfo, SystemServices
+from trade._system import DOMAIN, PROVIDER, ContainerInfo, System, SystemServices
 from trade._transport import ChannelClosed, Transport
 from trade._watch import Watch
 from trade._wire import (
@@ -32,13 +33,12 @@ from trade._wire import (
     alive_key,
     encode_message,
 )
-from trade._zenoh import ZenohTransport, configuration
+from trade._zenoh import ZenohTransport
 from trade.errors import ConfigurationError, NoSuchService, ServiceGone, TooManyServices
 
 __all__ = ["Container"]
 
 _HANDLE_EXT: Final = 1
-_PORTS_TRIED: Final = 4
 _PATIENCE_S: Final = 1.0
 """How long a call waits for the registry to hear of a handle that came by message before its registry entry did."""
 
@@ -63,12 +63,19 @@ class Container:
         self.session: Final = secrets.token_hex(8)
         self._closing = threading.RLock()
         self._closed = False
+        self.system: Final = System(lambda: self)
+        """Its own switches: who it is linked to, and whether it lets itself be found."""
         self._targets: dict[ServiceKey, LocalTarget | RemoteTarget] = {}
         self._codec = Codec(self._handle_to_data, self._data_to_handle, (Handle,))
         self._registry = Registry(self.address)
         with contextlib.ExitStack() as leaving:  # what has begun ends again if the rest cannot begin
-            self._transport = transport or self._join(leaving)
+            self._reach: Reach | None = None
+            self._transport = transport or join(self._settings, leaving)
             leaving.callback(self._transport.close)
+            if isinstance(self._transport, ZenohTransport):
+                links, configured = self._transport.links, self._settings.connect
+                self._reach = Reach(links, self._settings.check_may_dial, configured)
+                leaving.callback(self._reach.close)
             self._caller = Caller(self._transport, self.address, self.session)
             leaving.callback(self._caller.close)
             self._notifier = Notifier(lambda record: Handle(self, record.key, record))
@@ -79,30 +86,13 @@ class Container:
             leaving.callback(self._providers.close)
             self._dispatcher = Dispatcher(self._transport, self.address, self._providers.lookup)
             leaving.callback(self._dispatcher.close)
-            self._providers.add(SystemServices(), (DOMAIN,), name=PROVIDER)
+            self._providers.add(SystemServices(self.system), (DOMAIN,), name=PROVIDER)
             presence = self._transport.appear(alive_key(self.address))
             leaving.callback(presence.close)
             self._watch = Watch(self._transport, self._registry, self.address, self._caller.lost)
             leaving.callback(self._watch.close)
             self._leaving = leaving.pop_all()
         _live.add(self)
-
-    def _join(self, leaving: contextlib.ExitStack) -> Transport:
-        for _ in range(_PORTS_TRIED if not self._settings.listen else 0):
-            with contextlib.suppress(ConfigurationError):  # somebody else took the free port first
-                return self._join_at([free_endpoint()], leaving)
-        return self._join_at(list(self._settings.listen) or [free_endpoint()], leaving)
-
-    def _join_at(self, listen: list[str], leaving: contextlib.ExitStack) -> Transport:
-        settings = self._settings
-        connect = list(settings.connect)
-        if not connect:
-            rendezvous = Rendezvous(settings.system)
-            leaving.callback(rendezvous.leave)
-            connect = rendezvous.enter(listen[0])
-        return ZenohTransport(
-            configuration(namespace=settings.system, listen=listen, connect=connect, credentials=settings.credentials)
-        )
 
     # --- hosting
 
@@ -196,6 +186,14 @@ class Container:
                 )
             )
         return infos
+
+    @property
+    def reach(self) -> Reach:
+        """Whom it is linked to; raises ConfigurationError on a transport that has no such switches."""
+        self._check_open()
+        if self._reach is None:
+            raise ConfigurationError(problem="this container's transport cannot be linked to others while it runs")
+        return self._reach
 
     def handle(self, key: ServiceKey) -> Handle:
         """A handle of a service whose key is known."""

@@ -6,33 +6,26 @@ two that start together at least one sees the other; the newcomer dials everybod
 
 import contextlib
 import os
-import socket
 import stat
 import tempfile
 import time
 from pathlib import Path
 from typing import Final
 
+from trade._endpoints import accepts, free_endpoint
 from trade.errors import ConfigurationError
 
-__all__ = ["Rendezvous", "free_endpoint"]
+__all__ = ["Rendezvous", "free_endpoint", "runtime_folder"]
 
 _YOUNG_S: Final = 10.0
-"""A file this young may belong to a container that does not listen yet."""
-
-
-def free_endpoint() -> str:
-    """A loopback endpoint nobody listens on now."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+"""A file this young may belong to a container that does not listen yet, if its process lives."""
 
 
 class Rendezvous:
     """One system's folder on this host; only this user can read or write it."""
 
     def __init__(self, system: str) -> None:
-        self._folder = _runtime_folder() / system
+        self._folder = runtime_folder() / system
         self._folder.mkdir(mode=0o700, exist_ok=True)
         self._own: Path | None = None
 
@@ -41,7 +34,7 @@ class Rendezvous:
         name = endpoint.replace("/", "_").replace(":", "_")
         self._own = self._folder / name
         fresh = self._folder / f".{name}.{os.getpid()}"
-        fresh.write_text(endpoint, encoding="ascii")
+        fresh.write_text(f"{endpoint}\n{os.getpid()}\n", encoding="ascii")
         fresh.replace(self._own)
         return self._others()
 
@@ -49,10 +42,11 @@ class Rendezvous:
         found: list[str] = []
         for path in sorted(path for path in self._folder.iterdir() if not path.name.startswith(".")):
             with contextlib.suppress(OSError, ValueError):
-                endpoint = path.read_text(encoding="ascii").strip()
                 if path == self._own:
                     continue
-                if _listens(endpoint) or time.time() - path.stat().st_mtime < _YOUNG_S:
+                endpoint, _, writer = path.read_text(encoding="ascii").strip().partition("\n")
+                young = time.time() - path.stat().st_mtime < _YOUNG_S
+                if accepts(endpoint) or (young and _may_live(writer)):
                     found.append(endpoint)
                 else:
                     path.unlink()
@@ -65,16 +59,20 @@ class Rendezvous:
             self._own = None
 
 
-def _listens(endpoint: str) -> bool:
-    host, port = endpoint.partition("/")[2].rsplit(":", 1)
+def _may_live(writer: str) -> bool:
+    """Whether the process that wrote a file may be about to listen; not known on every operating system."""
+    if os.name != "posix" or not writer.isdigit():  # elsewhere signal 0 is no question
+        return True
     try:
-        with socket.create_connection((host.strip("[]"), int(port)), timeout=0.5):
-            return True
-    except OSError:
+        os.kill(int(writer), 0)
+    except (ProcessLookupError, OverflowError):
         return False
+    except PermissionError:
+        return True
+    return True
 
 
-def _runtime_folder() -> Path:
+def runtime_folder() -> Path:
     named = os.environ.get("TRADE_RUNTIME_DIR")
     base = named or os.environ.get("XDG_RUNTIME_DIR")
     uid = str(os.getuid()) if hasattr(os, "getuid") else "user"

@@ -1,6 +1,5 @@
 """Who a container is and where it may be reached; every default stays on this host."""
 
-import ipaddress
 import os
 import socket
 import sys
@@ -8,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from trade._endpoints import Endpoint
 from trade._wire import as_chunk, is_chunk
 from trade.errors import ConfigurationError
 
@@ -33,7 +33,9 @@ class Settings:
     connect: tuple[str, ...] = ()
     """Endpoints of others; none: the containers of this system on this host."""
     credentials: tuple[str, str] | None = None
-    """User and password."""
+    """User and password of the whole system; none: a secret that this user's containers on this host share."""
+    insecure_lan: bool = False
+    """Laboratories only: listen on a network without a policy and without encryption."""
     explicit_system: bool = False
 
     def __post_init__(self) -> None:
@@ -42,16 +44,29 @@ class Settings:
                 problem = f"{text!r} is no name for a {what}; use letters, digits, . _ - (at most 80)"
                 raise ConfigurationError(where=what, problem=problem)
         for endpoint in self.listen:
-            if not _is_loopback(endpoint):
+            if not Endpoint.read(endpoint).loopback and not self._open_on_purpose():
                 problem = "listening beyond loopback needs a policy, and none is loaded; listen on tcp/127.0.0.1:PORT"
                 raise ConfigurationError(where=f"listen {endpoint}", problem=problem)
+        if self.credentials is not None and not _can_be_told(*self.credentials):
+            problem = "user and password must be printable, without spaces around them, and the user without a colon"
+            raise ConfigurationError(where="credentials", problem=problem)
         for endpoint in self.connect:
-            if not _is_loopback(endpoint) and not (self.explicit_system and self.credentials):
-                problem = (
-                    "reaching a network needs an explicit system id and credentials: set TRADE_SYSTEM and "
-                    "TRADE_CREDENTIALS=user:password"
-                )
-                raise ConfigurationError(where=f"connect {endpoint}", problem=problem)
+            self.check_may_dial(endpoint)
+
+    def check_may_dial(self, endpoint: str) -> None:
+        """S21: raises ConfigurationError if that would reach a network by accident."""
+        if not Endpoint.read(endpoint).loopback and not (self.explicit_system and self.credentials):
+            problem = (
+                "reaching a network needs an explicit system id and credentials: set TRADE_SYSTEM and "
+                "TRADE_CREDENTIALS=user:password"
+            )
+            raise ConfigurationError(where=f"connect {endpoint}", problem=problem)
+
+    def _open_on_purpose(self) -> bool:
+        if self.insecure_lan and not (self.explicit_system and self.credentials):
+            problem = "needs an explicit system id and credentials, too: set TRADE_SYSTEM and TRADE_CREDENTIALS"
+            raise ConfigurationError(where="TRADE_INSECURE_LAN", problem=problem)
+        return self.insecure_lan
 
     @classmethod
     def read(
@@ -63,12 +78,13 @@ class Settings:
         listen: Sequence[str] | None = None,
         connect: Sequence[str] | None = None,
         credentials: tuple[str, str] | None = None,
+        insecure_lan: bool | None = None,
         environment: Mapping[str, str] = os.environ,
     ) -> "Settings":
         """Settings from arguments, else from the environment, else the defaults.
 
         The environment has ``TRADE_SYSTEM``, ``TRADE_IDENTITY``, ``TRADE_CONTAINER``, ``TRADE_LISTEN`` and
-        ``TRADE_CONNECT`` (comma-separated), ``TRADE_CREDENTIALS`` (``user:password``).
+        ``TRADE_CONNECT`` (comma-separated), ``TRADE_CREDENTIALS`` (``user:password``), ``TRADE_INSECURE_LAN`` (``1``).
         """
         named = system or environment.get("TRADE_SYSTEM") or None
         return cls(
@@ -78,6 +94,7 @@ class Settings:
             listen=tuple(_split(environment, "TRADE_LISTEN") if listen is None else listen),
             connect=tuple(_split(environment, "TRADE_CONNECT") if connect is None else connect),
             credentials=credentials or _credentials(environment.get("TRADE_CREDENTIALS")),
+            insecure_lan=environment.get("TRADE_INSECURE_LAN") == "1" if insecure_lan is None else insecure_lan,
             explicit_system=named is not None,
         )
 
@@ -95,6 +112,12 @@ def _credentials(text: str | None) -> tuple[str, str] | None:
     return user, password
 
 
+def _can_be_told(user: str, password: str) -> bool:
+    """Whether the transport's file of users can hold them."""
+    fit = all(text and text.isprintable() and text == text.strip() for text in (user, password))
+    return fit and ":" not in user
+
+
 def _user() -> str:
     import getpass  # noqa: PLC0415 - it loads modules that not every operating system has
 
@@ -107,15 +130,3 @@ def _user() -> str:
 def _program() -> str:
     name = Path(sys.argv[0]).stem if sys.argv and sys.argv[0] else ""
     return as_chunk(f"{name if name not in ('', '-c', '-m', '__main__') else 'python'}-{os.getpid()}")
-
-
-def _is_loopback(endpoint: str) -> bool:
-    """Whether ``protocol/host:port`` stays on this host."""
-    protocol, slash, rest = endpoint.partition("/")
-    host, colon, port = rest.split("#")[0].split("?")[0].rpartition(":")
-    if not (protocol and slash and host and colon and port.isascii() and port.isdigit()):
-        raise ConfigurationError(where=f"endpoint {endpoint!r}", problem="must look like tcp/127.0.0.1:7450")
-    try:
-        return ipaddress.ip_address(host.strip("[]")).is_loopback
-    except ValueError:
-        return host == "localhost"

@@ -1,11 +1,14 @@
 """The middleware's own functions as services, in group ``trade`` of every container."""
 
 import time
-from typing import Final
+from collections.abc import Callable
+from typing import Final, Protocol
 
 from msgspec import Struct
 
+from trade._reach import Reach
 from trade._service import service
+from trade.errors import LinkStays
 
 DOMAIN: Final = "trade"
 PROVIDER: Final = "system"
@@ -24,10 +27,96 @@ class ContainerInfo(Struct, frozen=True):
     services: int
 
 
+class _Member(Protocol):
+    """The container the switches belong to."""
+
+    @property
+    def reach(self) -> Reach: ...
+    def containers(self) -> list[ContainerInfo]: ...
+
+
+class System:
+    """Switches of a running container: whom it is linked to, and whether it finds and is found.
+
+    None of them disturbs calls under way, and each is a service in group ``trade`` of every container as well.
+    """
+
+    def __init__(self, member: Callable[[], _Member]) -> None:
+        self._member = member
+
+    def set_discovery(self, on: bool) -> None:
+        """Look for containers of this system that broadcast, and link to each; off: what is linked stays linked.
+
+        It looks as far as the container listens: on this host, or on its networks.
+        """
+        self._member().reach.set_discovery(on)
+
+    def set_broadcast(self, on: bool) -> None:
+        """Answer those who look for containers of this system."""
+        self._member().reach.set_broadcast(on)
+
+    def connect(self, endpoint: str) -> None:
+        """Link to the container that listens there, and again whenever the link is lost.
+
+        Args:
+            endpoint: such as ``tcp/127.0.0.1:7450`` or ``tcp/robot.example:7450``; names are looked up at every try.
+
+        Raises:
+            CannotConnect: nobody there lets us in.
+            ConfigurationError: no endpoint, or a network, with neither system id nor credentials (S21).
+        """
+        self._member().reach.connect(endpoint)
+
+    def disconnect(self, endpoint: str) -> None:
+        """Dial an endpoint no more.
+
+        Args:
+            endpoint: what was given to `connect`; the name of a container is understood, too.
+
+        Raises:
+            LinkStays: the link is there, and stays until one of its containers closes; it is dialled no more.
+        """
+        if any(info.name == endpoint for info in self.containers()):
+            raise LinkStays(to=endpoint)
+        self._member().reach.disconnect(endpoint)
+
+    def containers(self) -> list[ContainerInfo]:
+        """The containers of the system, this one included."""
+        return self._member().containers()
+
+
 class SystemServices:
     """What every container offers about itself."""
+
+    def __init__(self, system: System) -> None:
+        self._system = system
 
     @service(effect="read")
     def clock(self) -> int:
         """Monotonic clock of this container, in nanoseconds; the basis of every expiry."""
         return time.monotonic_ns()
+
+    @service(effect="read")
+    def containers(self) -> list[ContainerInfo]:
+        """The containers that this one knows of, itself included."""
+        return self._system.containers()
+
+    @service
+    def set_discovery(self, on: bool) -> None:
+        """Look for containers of the system that broadcast, and link to each."""
+        self._system.set_discovery(on)
+
+    @service
+    def set_broadcast(self, on: bool) -> None:
+        """Answer those who look for containers of the system."""
+        self._system.set_broadcast(on)
+
+    @service
+    def connect(self, endpoint: str) -> None:
+        """Link to the container that listens there; CannotConnect if nobody there lets this one in."""
+        self._system.connect(endpoint)
+
+    @service
+    def disconnect(self, endpoint: str) -> None:
+        """Dial an endpoint no more; LinkStays if a link is there, which only the end of a container ends."""
+        self._system.disconnect(endpoint)

@@ -6,13 +6,13 @@ No Python runs on zenoh's threads: every subscriber is a channel that our thread
 receiver instead of dropping (zenoh's default), and go out at once. All sessions carry the same short lease.
 """
 
-import json
 from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 import zenoh
 from zenoh import ext
 
+from trade._links import Links, new_session_id, open_session
 from trade._transport import Channel, ChannelClosed, Message, Presence, Publisher, Transport
 from trade.errors import ConfigurationError
 
@@ -26,10 +26,11 @@ _PUT: Final = zenoh.SampleKind.PUT
 
 
 def configuration(
-    *, namespace: str, listen: Sequence[str], connect: Sequence[str], credentials: tuple[str, str] | None
+    *, namespace: str, listen: Sequence[str], connect: Sequence[str], credentials: tuple[str, str]
 ) -> dict[str, Any]:
     """The settings of one session, as zenoh names them."""
-    settings: dict[str, Any] = {
+    return {
+        "id": new_session_id(),
         "mode": "peer",
         "namespace": namespace,
         "listen/endpoints": list(listen),
@@ -38,14 +39,15 @@ def configuration(
         "connect/exit_on_failure": False,
         "connect/retry": {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2},
         "scouting/multicast/enabled": False,
+        # Two that hear of each other at once must not both dial: each would refuse the other as a second link.
+        "scouting/gossip/autoconnect_strategy": {"peer": {"to_router": "always", "to_peer": "greater-zid"}},
         "timestamping/enabled": True,
+        "transport/auth/usrpwd/user": credentials[0],
+        "transport/auth/usrpwd/password": credentials[1],
         "transport/link/tx/lease": LEASE_MS,
         "transport/link/tx/keep_alive": 4,
         "transport/link/tx/queue/congestion_control/block/wait_before_close": 1_000_000,
     }
-    if credentials is not None:
-        settings["transport/auth/usrpwd/user"], settings["transport/auth/usrpwd/password"] = credentials
-    return settings
 
 
 class ZenohChannel(Channel):
@@ -120,16 +122,14 @@ class ZenohPresence(Presence):
 
 class ZenohTransport(Transport):
     def __init__(self, settings: dict[str, Any]) -> None:
-        config = zenoh.Config()
-        for key, value in settings.items():
-            config.insert_json5(key, json.dumps(value))
         try:
-            self._session = zenoh.open(config)
+            self._session = open_session(settings)
         except zenoh.ZError as bad:
             raise ConfigurationError(
                 where=f"listen {', '.join(settings['listen/endpoints'])}",
                 problem=f"cannot listen there: {bad}; is the address taken, or not of this host?",
             ) from None
+        self.links: Final = Links(self._session, settings)
 
     def publish(self, key: str, *, urgent: bool = False) -> Publisher:
         priority = zenoh.Priority.REAL_TIME if urgent else zenoh.Priority.DATA

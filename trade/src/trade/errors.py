@@ -13,6 +13,7 @@ __all__ = [
     "CallError",
     "CallerError",
     "Cancelled",
+    "CannotConnect",
     "ConfigurationError",
     "ContainerLost",
     "DeadlineExceeded",
@@ -22,6 +23,7 @@ __all__ = [
     "InvalidArgument",
     "InvalidResult",
     "LimitExceeded",
+    "LinkStays",
     "MotionStopped",
     "NoSuchService",
     "NotSerialisable",
@@ -311,3 +313,27 @@ class ConfigurationError(SetupError, ValueError):
 
     def describe(self) -> str:
         return f"{self.where}: {self.problem}" if self.where else self.problem
+
+
+@dataclass(kw_only=True, eq=False)
+class CannotConnect(SetupError, ConnectionError):
+    """Nobody at the endpoint lets this container in."""
+
+    endpoint: str
+    reason: str
+
+    def describe(self) -> str:
+        return f"no link to {self.endpoint}: {self.reason}"
+
+
+@dataclass(kw_only=True, eq=False)
+class LinkStays(SetupError, RuntimeError):
+    """A link cannot be cut while both of its containers run; the transport has no way to."""
+
+    to: str
+
+    def describe(self) -> str:
+        return (
+            f"the link to {self.to} stays while both containers run; it is dialled no more. To cut it, close one of "
+            "them, or give them different credentials and restart it"
+        )

@@ -1,0 +1,148 @@
+"""Who is not of the system is not linked, and sees nothing."""
+
+import logging
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from trade import Container, Settings, service, where
+from trade._credentials import user_secret
+from trade._endpoints import free_endpoint
+from trade._zenoh import ZenohTransport
+from trade.errors import CannotConnect, ConfigurationError, NoSuchService
+
+ALICE = ("alice", "pass:word")
+OTHERS = [("alice", "wrong"), ("bob", "pass:word"), None]
+
+
+class Echo:
+    @service(effect="read")
+    def echo(self, value: int) -> int:
+        return value
+
+
+def peers(container: Container) -> int:
+    assert isinstance(container._transport, ZenohTransport)
+    return len(container._transport._session.info.peers_zid())
+
+
+@pytest.mark.parametrize("first", [0, 1], ids=["dialling", "dialled"])
+@pytest.mark.parametrize("credentials", OTHERS, ids=str)
+def test_who_has_other_credentials_is_not_linked_and_sees_nothing(
+    start_container: Any, credentials: tuple[str, str] | None, first: int
+) -> None:
+    settings = [{"credentials": ALICE}, {"credentials": credentials}]
+    containers = [start_container(f"c{number}", **settings[number]) for number in (first, 1 - first)]
+    for container in containers:
+        container.register(Echo(), "robot")
+    for container in containers:
+        with pytest.raises(NoSuchService):
+            container.find(where(name="echo", local=False), wait_s=1.2)
+        assert len(container.containers()) == 1
+        assert peers(container) == 0
+
+
+def test_who_has_the_same_credentials_is_linked(start_container: Any) -> None:
+    one, other = (start_container(name, credentials=ALICE) for name in ("one", "other"))
+    one.register(Echo(), "robot")
+    assert other.find(where(name="echo"), wait_s=20)(3) == 3
+
+
+def test_an_endpoint_that_refuses_us_is_warned_of(start_container: Any, caplog: pytest.LogCaptureFixture) -> None:
+    endpoint = free_endpoint()
+    start_container("there", credentials=ALICE, listen=[endpoint])
+    outsider = start_container("outsider", credentials=("alice", "wrong"), connect=[endpoint])
+    with caplog.at_level(logging.WARNING, "trade"):
+        assert outsider.reach._thread is not None
+        outsider.reach._thread.join(20)  # it has nothing to do once this is settled
+    assert f"no link to {endpoint}: something listens there but does not let us in" in caplog.text
+    with pytest.raises(CannotConnect, match="do both have the same user and password"):
+        outsider.system.connect(endpoint)
+
+
+def test_an_endpoint_that_lets_us_in_is_not_warned_of(start_container: Any, caplog: pytest.LogCaptureFixture) -> None:
+    endpoint = free_endpoint()
+    start_container("there", listen=[endpoint])
+    visitor = start_container("visitor", connect=[endpoint])
+    with caplog.at_level(logging.WARNING, "trade"):
+        if visitor.reach._thread is not None:
+            visitor.reach._thread.join(20)
+    assert caplog.text == ""
+
+
+def test_discovery_links_nobody_with_other_credentials(start_container: Any) -> None:
+    one = start_container("one", credentials=ALICE)
+    other = start_container("other", credentials=("alice", "wrong"))
+    one.system.set_broadcast(True)
+    other.system.set_discovery(True)
+    with pytest.raises(NoSuchService):
+        other.find(where(name="clock", container="one"), wait_s=1.5)
+
+
+def test_containers_of_one_user_share_a_secret_that_nobody_else_can_read(here: Container, tmp_path: Path) -> None:
+    secret = tmp_path / "runtime" / "trade" / "@secret"
+    assert secret.stat().st_mode & 0o077 == 0
+    assert user_secret() == user_secret()
+    assert len(user_secret()[1]) > 40
+
+
+def test_another_user_cannot_join_through_the_loopback_port(
+    here: Container, system: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another user has another runtime folder, and so another secret."""
+    [entry] = (tmp_path / "runtime" / "trade" / system).iterdir()
+    endpoint = entry.read_text().split()[0]
+    monkeypatch.setenv("TRADE_RUNTIME_DIR", str(tmp_path / "elsewhere"))
+    with Container(Settings.read(container="intruder", connect=[endpoint])) as intruder:
+        with pytest.raises(NoSuchService):
+            intruder.find(where(name="clock", container="here"), wait_s=1.2)
+        assert peers(intruder) == peers(here) == 0
+
+
+def test_a_secret_that_others_can_read_is_refused(here: Container, tmp_path: Path) -> None:
+    (tmp_path / "runtime" / "trade" / "@secret").chmod(0o644)
+    with pytest.raises(ConfigurationError, match="must be this user's alone; remove it"):
+        Container(Settings.read(container="second"))
+
+
+def test_no_file_with_a_password_stays_behind(start_container: Any, tmp_path: Path) -> None:
+    start_container("one", credentials=ALICE).system.set_broadcast(True)
+    texts = [path.read_text() for path in (tmp_path / "runtime").rglob("*") if path.is_file()]
+    assert not any("pass:word" in text for text in texts)
+
+
+@pytest.mark.parametrize("credentials", [("a:b", "c"), ("a", "b\nc"), ("a", " b"), ("", "b"), ("a", "")], ids=repr)
+def test_credentials_that_cannot_be_told_the_transport_are_refused(credentials: tuple[str, str]) -> None:
+    with pytest.raises(ConfigurationError, match="user and password must be printable"):
+        Settings.read(environment={}, credentials=credentials)
+
+
+LAN = ["tcp/192.168.1.5:7450"]
+
+
+@pytest.mark.parametrize("missing", [{"system": "lab"}, {"credentials": ALICE}, {}], ids=str)
+def test_S21_a_laboratory_network_needs_a_system_and_credentials_as_well(missing: dict[str, Any]) -> None:
+    with pytest.raises(ConfigurationError, match="TRADE_INSECURE_LAN: needs an explicit system id and credentials"):
+        Settings.read(environment={"TRADE_INSECURE_LAN": "1"}, listen=LAN, **missing)
+
+
+def test_S21_a_laboratory_network_is_listened_on_only_on_purpose() -> None:
+    settings = Settings.read(environment={"TRADE_INSECURE_LAN": "1"}, listen=LAN, system="lab", credentials=ALICE)
+    assert settings.listen == tuple(LAN)
+    for environment in ({}, {"TRADE_INSECURE_LAN": "0"}, {"TRADE_INSECURE_LAN": ""}):
+        with pytest.raises(ConfigurationError, match="needs a policy, and none is loaded"):
+            Settings.read(environment=environment, listen=LAN, system="lab", credentials=ALICE)
+
+
+@pytest.mark.parametrize(("credentials", "seen"), [("alice:pass:word", True), ("alice:wrong", False), ("", False)])
+def test_the_command_line_lists_nobody_without_the_credentials(
+    start_container: Any, monkeypatch: pytest.MonkeyPatch, credentials: str, seen: bool
+) -> None:
+    start_container("there", credentials=ALICE)
+    monkeypatch.setenv("TRADE_CREDENTIALS", credentials)
+    command = [sys.executable, "-m", "trade_gateway", "containers", "--json"]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+    assert ("there" in ended.stdout) == seen

@@ -1,0 +1,84 @@
+"""Endpoints: ``protocol/host:port``, where a container listens or dials."""
+
+import ipaddress
+import socket
+from typing import NamedTuple
+
+from trade.errors import ConfigurationError
+
+__all__ = ["Endpoint", "accepts", "dialled_from_here", "free_endpoint", "with_free_port"]
+
+
+class Endpoint(NamedTuple):
+    """One endpoint in its parts."""
+
+    protocol: str
+    host: str
+    """As in the text: an IPv6 address has its brackets."""
+    port: int
+    rest: str = ""
+    """What zenoh takes after ``?`` or ``#``."""
+
+    @classmethod
+    def read(cls, text: str) -> "Endpoint":
+        """Raises ConfigurationError: it is none."""
+        protocol, slash, where = text.partition("/")
+        plain = where.split("#")[0].split("?")[0]
+        host, colon, port = plain.rpartition(":")
+        if not (protocol and slash and host and colon and port.isascii() and port.isdigit()):
+            raise ConfigurationError(where=f"endpoint {text!r}", problem="must look like tcp/127.0.0.1:7450")
+        return cls(protocol, host, int(port), where[len(plain) :])
+
+    @property
+    def loopback(self) -> bool:
+        """Whether it stays on this host."""
+        try:
+            return ipaddress.ip_address(self.host.strip("[]")).is_loopback
+        except ValueError:
+            return self.host == "localhost"
+
+    def resolved(self) -> list[str]:
+        """The same with each address its host has now; none if its name means nothing."""
+        try:
+            found = socket.getaddrinfo(self.host.strip("[]"), self.port, type=socket.SOCK_STREAM)
+        except (OSError, UnicodeError, OverflowError):
+            return []
+        addresses = dict.fromkeys(str(address[4][0]) for address in found)
+        return [f"{self.protocol}/{f'[{ip}]' if ':' in ip else ip}:{self.port}" for ip in addresses]
+
+    def __str__(self) -> str:
+        return f"{self.protocol}/{self.host}:{self.port}{self.rest}"
+
+
+def with_free_port(endpoint: Endpoint) -> Endpoint:
+    """A port nobody listens on now in place of port 0."""
+    if endpoint.port:
+        return endpoint
+    host = endpoint.host.strip("[]")
+    try:
+        with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
+            probe.bind((host, 0))
+            return endpoint._replace(port=probe.getsockname()[1])
+    except OSError:  # the transport will say what is wrong with it
+        return endpoint
+
+
+def free_endpoint() -> str:
+    """A loopback endpoint nobody listens on now."""
+    return str(with_free_port(Endpoint("tcp", "127.0.0.1", 0)))
+
+
+def dialled_from_here(endpoint: Endpoint) -> str:
+    """How this host dials what listens there."""
+    everywhere = {"0.0.0.0": "127.0.0.1", "[::]": "[::1]"}  # noqa: S104 - what somebody else listens on
+    return str(endpoint._replace(host=everywhere.get(endpoint.host, endpoint.host)))
+
+
+def accepts(endpoint: str) -> bool:
+    """Whether anything accepts connections there; a name or text that means nothing is no such thing."""
+    try:
+        where = Endpoint.read(endpoint)
+        with socket.create_connection((where.host.strip("[]"), where.port), timeout=0.5):
+            return True
+    except (OSError, ValueError, OverflowError):
+        return False
