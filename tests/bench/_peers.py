@@ -1,34 +1,113 @@
-"""What our calls are measured against, and our calls themselves: each echoes 64 bytes between two processes."""
+"""Ways to call another process, each echoing bytes: the floor, the yardstick, and our own calls."""
 
 import itertools
 import json
 import socket
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
-
-PAYLOAD = bytes(range(64))
+from importlib.util import find_spec
+from typing import Any
 
 Call = Callable[[bytes], bytes]
+
+_SIZE_BYTES = 4
+_MOST_UNREAD = 256 * 1024
+"""Bytes that raw TCP may have under way: with more, both ends could wait to send and nobody would read."""
+
+
+class Link(ABC):
+    """A connection of a caller."""
+
+    @abstractmethod
+    def call(self, payload: bytes) -> bytes:
+        """Send, and wait for the echo."""
+
+    @abstractmethod
+    def burst(self, payload: bytes, n: int, in_flight: int) -> None:
+        """n calls, so many of them under way at a time, in the way that fits the peer best."""
 
 
 class Peer(ABC):
     """One way to call another process."""
 
     name: str
+    needs = ""
+    """The module without which it cannot run."""
+
+    @property
+    def missing(self) -> bool:
+        return bool(self.needs) and find_spec(self.needs) is None
 
     @abstractmethod
     def serve(self) -> AbstractContextManager[str]:
         """Answer calls; gives what ``connect`` needs to find us."""
 
     @abstractmethod
-    def connect(self, address: str) -> AbstractContextManager[Call]:
-        """Gives the function that calls."""
+    def connect(self, address: str) -> AbstractContextManager[Link]:
+        """Be ready to call."""
+
+
+class Pipeline(Link):
+    """A link whose calls can begin before others have ended."""
+
+    def burst(self, payload: bytes, n: int, in_flight: int) -> None:
+        waiting: deque[Any] = deque()
+        for _ in range(n):
+            if len(waiting) == in_flight:
+                check(payload, self.end(waiting.popleft()))
+            waiting.append(self.begin(payload))
+        while waiting:
+            check(payload, self.end(waiting.popleft()))
+
+    def call(self, payload: bytes) -> bytes:
+        return self.end(self.begin(payload))
+
+    @abstractmethod
+    def begin(self, payload: bytes) -> Any: ...
+    @abstractmethod
+    def end(self, begun: Any) -> bytes: ...
+
+
+class Threads(Link):
+    """A link whose callers wait, each in a thread of its own."""
+
+    def burst(self, payload: bytes, n: int, in_flight: int) -> None:
+        left = itertools.count(1).__next__
+        wrong: list[BaseException] = []
+
+        def work(call: Call) -> None:
+            try:
+                while left() <= n:
+                    check(payload, call(payload))
+            except Exception as bad:  # noqa: BLE001 - told by the thread that waits for all
+                wrong.append(bad)
+
+        threads = [threading.Thread(target=work, args=(call,)) for call in self.several(in_flight)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        if wrong:
+            raise wrong[0]
+
+    @abstractmethod
+    def several(self, count: int) -> Sequence[Call]:
+        """Calls of which each may be made by another thread."""
+
+
+def check(payload: bytes, answer: bytes) -> None:
+    if answer != payload:
+        raise RuntimeError(f"a wrong answer of {len(answer)} bytes: {answer[:80]!r}")
+
+
+# --- the floor
 
 
 class Tcp(Peer):
-    """The floor: a blocking socket on each side, messages of fixed length."""
+    """A blocking socket on each side, a length before each message."""
 
     name = "raw TCP"
 
@@ -39,27 +118,45 @@ class Tcp(Peer):
             yield json.dumps(listener.getsockname())
 
     @contextmanager
-    def connect(self, address: str) -> Iterator[Call]:
+    def connect(self, address: str) -> Iterator[Link]:
         with socket.create_connection(tuple(json.loads(address))) as link:
             link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            yield _TcpLink(link)
 
-            def call(payload: bytes) -> bytes:
-                link.sendall(payload)
-                return link.recv(len(payload), socket.MSG_WAITALL)
 
-            yield call
+class _TcpLink(Pipeline):
+    def __init__(self, link: socket.socket) -> None:
+        self._link = link
+
+    def begin(self, payload: bytes) -> None:
+        self._link.sendall(len(payload).to_bytes(_SIZE_BYTES, "little") + payload)
+
+    def end(self, begun: None) -> bytes:
+        return _framed(self._link)[_SIZE_BYTES:]
+
+    def burst(self, payload: bytes, n: int, in_flight: int) -> None:
+        super().burst(payload, n, min(in_flight, max(1, _MOST_UNREAD // len(payload))))
 
 
 def _echo_all(listener: socket.socket) -> None:
     link, _ = listener.accept()
     link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     with link:
-        while data := link.recv(len(PAYLOAD), socket.MSG_WAITALL):
-            link.sendall(data)
+        while message := _framed(link):
+            link.sendall(message)
+
+
+def _framed(link: socket.socket) -> bytes:
+    """A message with its length before it; nothing at the end."""
+    size = link.recv(_SIZE_BYTES, socket.MSG_WAITALL)
+    return size + link.recv(int.from_bytes(size, "little"), socket.MSG_WAITALL) if size else b""
+
+
+# --- the yardstick
 
 
 class BarePair(Peer):
-    """The yardstick: what our calls stand on, with nothing of ours around it.
+    """What our calls stand on, with nothing of ours around it.
 
     A channel and a declared publisher on each side, the lease every session of ours has, an id before the payload.
     """
@@ -76,24 +173,31 @@ class BarePair(Peer):
             yield endpoint
 
     @contextmanager
-    def connect(self, address: str) -> Iterator[Call]:
-        ids = itertools.count(1)
+    def connect(self, address: str) -> Iterator[Link]:
         with _bare_session(connect=address) as session:
             replies = session.declare_subscriber("reply/bench", _fifo())
             calls = _declare(session, "call/bench")
             while not calls.matching_status.matching:
                 threading.Event().wait(0.01)
-            receive = replies.handler.recv
+            yield _BareLink(calls.put, replies.handler.recv)
 
-            def call(payload: bytes) -> bytes:
-                call_id = next(ids).to_bytes(8, "little")
-                calls.put(call_id + payload)
-                while True:
-                    answer = receive().payload.to_bytes()
-                    if answer[:8] == call_id:
-                        return answer[8:]
 
-            yield call
+class _BareLink(Pipeline):
+    def __init__(self, put: Callable[[bytes], Any], receive: Callable[[], Any]) -> None:
+        self._put = put
+        self._receive = receive
+        self._ids = itertools.count(1)
+
+    def begin(self, payload: bytes) -> bytes:
+        call_id = next(self._ids).to_bytes(8, "little")
+        self._put(call_id + payload)
+        return call_id
+
+    def end(self, begun: bytes) -> bytes:
+        while True:
+            answer = self._receive().payload.to_bytes()
+            if answer[:8] == begun:
+                return answer[8:]
 
 
 def _answer_all(calls, replies) -> None:
@@ -143,52 +247,67 @@ def _free_endpoint() -> str:
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
-class Rpyc(Peer):
-    """The other library of its kind: plain values, no types, no checks."""
-
-    name = "rpyc"
-
-    @contextmanager
-    def serve(self) -> Iterator[str]:
-        import rpyc
-        from rpyc.utils.server import ThreadedServer
-
-        class Echo(rpyc.Service):
-            def exposed_echo(self, payload):
-                return payload
-
-        server = ThreadedServer(Echo, hostname="127.0.0.1")
-        threading.Thread(target=server.start, daemon=True).start()
-        try:
-            yield str(server.port)
-        finally:
-            server.close()
-
-    @contextmanager
-    def connect(self, address: str) -> Iterator[Call]:
-        import rpyc
-
-        with rpyc.connect("127.0.0.1", int(address)) as link:
-            yield link.root.echo
+# --- ours
 
 
 class Trade(Peer):
     """A remote call of ours: typed, with deadline, identity and checks; of the kind that may move something."""
 
     name = "TRADE"
+    system = "two"
 
     @contextmanager
     def serve(self) -> Iterator[str]:
-        with _container("server", "two") as container:
+        with _container("server", self.system) as container:
             container.register(_provider(), "bench")
             yield ""
 
     @contextmanager
-    def connect(self, address: str) -> Iterator[Call]:
+    def connect(self, address: str) -> Iterator[Link]:
         from trade import where
 
-        with _container("client", "two") as container:
-            yield container.find(where(name="echo", group="bench"), wait_s=10)
+        with _container("client", self.system) as container:
+            yield self.link(container.find(where(name="echo", group="bench"), wait_s=10))
+
+    def link(self, handle) -> Link:
+        return _Started(handle)
+
+
+class _Started(Pipeline):
+    def __init__(self, handle) -> None:
+        self._handle = handle
+
+    def call(self, payload: bytes) -> bytes:
+        return self._handle(payload)
+
+    def begin(self, payload: bytes) -> Any:
+        return self._handle.start(payload)
+
+    def end(self, begun) -> bytes:
+        return begun.result()
+
+
+class TradeThreads(Trade):
+    """The same with callers that wait, each in a thread."""
+
+    name = "TRADE, threads"
+    system = "threads"
+
+    def link(self, handle) -> Link:
+        return _Shared(handle)
+
+
+class _Shared(Threads):
+    """One handle, called by every thread."""
+
+    def __init__(self, handle) -> None:
+        self._handle = handle
+
+    def call(self, payload: bytes) -> bytes:
+        return self._handle(payload)
+
+    def several(self, count: int) -> Sequence[Call]:
+        return [self._handle] * count
 
 
 class LocalTrade(Peer):
@@ -201,9 +320,9 @@ class LocalTrade(Peer):
         yield ""
 
     @contextmanager
-    def connect(self, address: str) -> Iterator[Call]:
+    def connect(self, address: str) -> Iterator[Link]:
         with _container("alone", "one") as container:
-            yield container.register(_provider(), "bench")[0]
+            yield _Shared(container.register(_provider(), "bench")[0])
 
 
 def _container(name: str, system: str):
