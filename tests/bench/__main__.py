@@ -3,6 +3,7 @@
 parts:
   calls      one remote call at a time, of 64 B to 2 MiB: raw TCP, the bare transport, ours, rpyc, Pyro5, gRPC
   in-flight  the same with 32 calls under way: calls/s as a share of the bare transport's
+  local      a call in the same container, of three numbers
   servo      the Dynamixel driver against what a bus of 1 Mbaud can carry
 
 Progress goes to stderr, tables and targets (met or missed) to stdout. Peers that are not installed are skipped.
@@ -11,11 +12,12 @@ Progress goes to stderr, tables and targets (met or missed) to stdout. Peers tha
 import argparse
 from collections.abc import Callable, Mapping
 
-from tests.bench import _calls, _servo
+from tests.bench import _calls, _local, _servo
 
 _PARTS: Mapping[str, Callable[[argparse.Namespace], None]] = {
     "calls": lambda options: _calls.run(options.n, options.rounds),
     "in-flight": lambda options: _calls.run_in_flight(options.n, options.rounds),
+    "local": lambda options: _local.run(50 * options.n, options.rounds),
     "servo": lambda options: _servo.run(options.n, options.rounds, options.seconds),
 }
 _QUICK = {"n": 200, "rounds": 8, "seconds": 1.5}

@@ -3,18 +3,16 @@
 One call at a time for the latency, then 32 under way for the rate.
 """
 
-import os
 import sys
-import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from statistics import median
 from typing import Final
-from unittest import mock
 
 from tests.bench._children import Job, Round, Running, running
 from tests.bench._others import Grpc, Pyro5, Rpyc
 from tests.bench._peers import BarePair, LocalTrade, Peer, Tcp, Trade, TradeThreads
+from tests.bench._places import own_folder
 from tests.bench._report import print_target
 
 _PEERS: Final[Sequence[Peer]] = (Tcp(), BarePair(), Trade(), Rpyc(), Pyro5(), Grpc(), LocalTrade())
@@ -65,8 +63,7 @@ def up(wanted: Sequence[Peer]) -> Iterator[list[Running]]:
     for peer in wanted:
         if peer.missing:
             print(f"{peer.name}: skipped, the module {peer.needs} is not installed")
-    with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
-        stack.enter_context(mock.patch.dict(os.environ, TRADE_RUNTIME_DIR=folder))  # children inherit it
+    with own_folder(), ExitStack() as stack:
         yield [stack.enter_context(running(peer)) for peer in wanted if not peer.missing]
 
 

@@ -58,13 +58,14 @@ class Running:
 @contextmanager
 def running(peer: Peer) -> Iterator[Running]:
     """Start both processes of a peer. Raises RuntimeError if one of them does not come up."""
-    with _child(_serve, peer) as server, _child(_call, peer, _hear(server)) as caller:
-        _hear(caller)
+    with child(_serve, peer) as server, child(_call, peer, hear(server)) as caller:
+        hear(caller)
         yield Running(peer.name, server, caller)
 
 
 @contextmanager
-def _child(main, *args: object) -> Iterator[Connection]:
+def child(main, *args: object) -> Iterator[Connection]:
+    """A process that runs ``main(pipe, *args)``, and our end of the pipe."""
     ours, theirs = _SPAWN.Pipe()
     process = _SPAWN.Process(target=main, args=(theirs, *args), daemon=True)
     process.start()
@@ -124,12 +125,13 @@ def _requests(pipe: Connection) -> Iterator:
 
 def _ask(pipe: Connection, request: object):
     pipe.send(request)
-    return _hear(pipe)
+    return hear(pipe)
 
 
-def _hear(pipe: Connection):
-    if not pipe.poll(_PATIENCE_S):
-        raise RuntimeError(f"a child process said nothing for {_PATIENCE_S} s")
+def hear(pipe: Connection, patience_s: float = _PATIENCE_S):
+    """What a child says next. Raises RuntimeError if it says nothing, or has ended."""
+    if not pipe.poll(patience_s):
+        raise RuntimeError(f"a child process said nothing for {patience_s} s")
     try:
         return pipe.recv()
     except EOFError:

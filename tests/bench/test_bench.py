@@ -52,6 +52,12 @@ def test_a_peer_that_is_not_installed_is_named_and_skipped(
     assert capsys.readouterr().out == "rpyc: skipped, the module no_such_module is not installed\n"
 
 
+def test_the_bench_of_local_calls_prints_its_target_and_says_what_is_not_there() -> None:
+    printed = bench("local", "-n", "3", "--rounds", "1")
+    assert targets(printed) == ["local, strict: us a call"]
+    assert "\nstrict=False" in printed
+
+
 def test_the_bench_of_the_servo_bus_prints_its_targets() -> None:
     printed = bench("servo", "-n", "3", "--rounds", "1", "--seconds", "0.05")
     assert "156 bytes a cycle" in printed
