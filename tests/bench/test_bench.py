@@ -58,6 +58,12 @@ def test_the_bench_of_local_calls_prints_its_target_and_says_what_is_not_there()
     assert "\nstrict=False" in printed
 
 
+def test_the_bench_of_the_registry_prints_its_targets() -> None:
+    printed = bench("registry", "--services", "30", "--rounds", "1")
+    assert targets(printed) == ["late joiner: s", "remote service: KiB", "find: us"]
+    assert "missed up to" not in printed
+
+
 def test_the_bench_of_the_servo_bus_prints_its_targets() -> None:
     printed = bench("servo", "-n", "3", "--rounds", "1", "--seconds", "0.05")
     assert "156 bytes a cycle" in printed
