@@ -10,8 +10,10 @@ from statistics import median
 from typing import Final
 
 from tests.bench._children import Job, Round, Running, running
+from tests.bench._links import Peer
 from tests.bench._others import Grpc, Pyro5, Rpyc
-from tests.bench._peers import BarePair, LocalTrade, Peer, Tcp, Trade, TradeThreads
+from tests.bench._ours import LocalTrade, Trade, TradeThreads
+from tests.bench._peers import BarePair, Tcp
 from tests.bench._places import own_folder
 from tests.bench._report import print_target
 

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 
-from tests.bench._peers import Link, Peer, check
+from tests.bench._links import Link, Peer, check
 
 _SPAWN = multiprocessing.get_context("spawn")
 _PATIENCE_S = 60.0

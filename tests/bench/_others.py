@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 
-from tests.bench._peers import Call, Link, Peer, Pipeline, Threads
+from tests.bench._links import Call, Link, Peer, Pipeline, Threads
 
 _WORKERS = 32
 

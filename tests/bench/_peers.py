@@ -1,109 +1,18 @@
-"""Ways to call another process, each echoing bytes: the floor, the yardstick, and our own calls."""
+"""What others are measured against: raw TCP, the floor, and a bare zenoh pair, the yardstick."""
 
 import itertools
 import json
 import socket
 import threading
-from abc import ABC, abstractmethod
-from collections import deque
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
-from importlib.util import find_spec
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
-Call = Callable[[bytes], bytes]
+from tests.bench._links import Link, Peer, Pipeline
 
 _SIZE_BYTES = 4
 _MOST_UNREAD = 256 * 1024
 """Bytes that raw TCP may have under way: with more, both ends could wait to send and nobody would read."""
-
-
-class Link(ABC):
-    """A connection of a caller."""
-
-    @abstractmethod
-    def call(self, payload: bytes) -> bytes:
-        """Send, and wait for the echo."""
-
-    @abstractmethod
-    def burst(self, payload: bytes, n: int, in_flight: int) -> None:
-        """n calls, so many of them under way at a time, in the way that fits the peer best."""
-
-
-class Peer(ABC):
-    """One way to call another process."""
-
-    name: str
-    needs = ""
-    """The module without which it cannot run."""
-
-    @property
-    def missing(self) -> bool:
-        return bool(self.needs) and find_spec(self.needs) is None
-
-    @abstractmethod
-    def serve(self) -> AbstractContextManager[str]:
-        """Answer calls; gives what ``connect`` needs to find us."""
-
-    @abstractmethod
-    def connect(self, address: str) -> AbstractContextManager[Link]:
-        """Be ready to call."""
-
-
-class Pipeline(Link):
-    """A link whose calls can begin before others have ended."""
-
-    def burst(self, payload: bytes, n: int, in_flight: int) -> None:
-        waiting: deque[Any] = deque()
-        for _ in range(n):
-            if len(waiting) == in_flight:
-                check(payload, self.end(waiting.popleft()))
-            waiting.append(self.begin(payload))
-        while waiting:
-            check(payload, self.end(waiting.popleft()))
-
-    def call(self, payload: bytes) -> bytes:
-        return self.end(self.begin(payload))
-
-    @abstractmethod
-    def begin(self, payload: bytes) -> Any: ...
-    @abstractmethod
-    def end(self, begun: Any) -> bytes: ...
-
-
-class Threads(Link):
-    """A link whose callers wait, each in a thread of its own."""
-
-    def burst(self, payload: bytes, n: int, in_flight: int) -> None:
-        left = itertools.count(1).__next__
-        wrong: list[BaseException] = []
-
-        def work(call: Call) -> None:
-            try:
-                while left() <= n:
-                    check(payload, call(payload))
-            except Exception as bad:  # noqa: BLE001 - told by the thread that waits for all
-                wrong.append(bad)
-
-        threads = [threading.Thread(target=work, args=(call,)) for call in self.several(in_flight)]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
-        if wrong:
-            raise wrong[0]
-
-    @abstractmethod
-    def several(self, count: int) -> Sequence[Call]:
-        """Calls of which each may be made by another thread."""
-
-
-def check(payload: bytes, answer: bytes) -> None:
-    if answer != payload:
-        raise RuntimeError(f"a wrong answer of {len(answer)} bytes: {answer[:80]!r}")
-
-
-# --- the floor
 
 
 class Tcp(Peer):
@@ -150,9 +59,6 @@ def _framed(link: socket.socket) -> bytes:
     """A message with its length before it; nothing at the end."""
     size = link.recv(_SIZE_BYTES, socket.MSG_WAITALL)
     return size + link.recv(int.from_bytes(size, "little"), socket.MSG_WAITALL) if size else b""
-
-
-# --- the yardstick
 
 
 class BarePair(Peer):
@@ -245,98 +151,3 @@ def _free_endpoint() -> str:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
-
-
-# --- ours
-
-
-class Trade(Peer):
-    """A remote call of ours: typed, with deadline, identity and checks; of the kind that may move something."""
-
-    name = "TRADE"
-    system = "two"
-
-    @contextmanager
-    def serve(self) -> Iterator[str]:
-        with _container("server", self.system) as container:
-            container.register(_provider(), "bench")
-            yield ""
-
-    @contextmanager
-    def connect(self, address: str) -> Iterator[Link]:
-        from trade import where
-
-        with _container("client", self.system) as container:
-            yield self.link(container.find(where(name="echo", group="bench"), wait_s=10))
-
-    def link(self, handle) -> Link:
-        return _Started(handle)
-
-
-class _Started(Pipeline):
-    def __init__(self, handle) -> None:
-        self._handle = handle
-
-    def call(self, payload: bytes) -> bytes:
-        return self._handle(payload)
-
-    def begin(self, payload: bytes) -> Any:
-        return self._handle.start(payload)
-
-    def end(self, begun) -> bytes:
-        return begun.result()
-
-
-class TradeThreads(Trade):
-    """The same with callers that wait, each in a thread."""
-
-    name = "TRADE, threads"
-    system = "threads"
-
-    def link(self, handle) -> Link:
-        return _Shared(handle)
-
-
-class _Shared(Threads):
-    """One handle, called by every thread."""
-
-    def __init__(self, handle) -> None:
-        self._handle = handle
-
-    def call(self, payload: bytes) -> bytes:
-        return self._handle(payload)
-
-    def several(self, count: int) -> Sequence[Call]:
-        return [self._handle] * count
-
-
-class LocalTrade(Peer):
-    """A call of a service in the same container: the same checks and copies, no wire. For information."""
-
-    name = "TRADE, local"
-
-    @contextmanager
-    def serve(self) -> Iterator[str]:
-        yield ""
-
-    @contextmanager
-    def connect(self, address: str) -> Iterator[Link]:
-        with _container("alone", "one") as container:
-            yield _Shared(container.register(_provider(), "bench")[0])
-
-
-def _container(name: str, system: str):
-    from trade import Container, Settings
-
-    return Container(Settings.read(container=name, system=f"bench-{system}"))
-
-
-def _provider() -> object:
-    from trade import service
-
-    class Echo:
-        @service
-        def echo(self, payload: bytes) -> bytes:
-            return payload
-
-    return Echo()
