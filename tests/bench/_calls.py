@@ -52,10 +52,10 @@ def run(n: int, rounds: int) -> None:
 
 
 def run_in_flight(n: int, rounds: int) -> None:
-    """Measure and print the rate of calls of which 32 are under way; arguments as above, but at least 32 calls."""
+    """Measure and print the rate of calls of which 32 are under way; as above, but of large ones, too, at least 32."""
     with up(_IN_FLIGHT_PEERS) as peers:
         for size, share in _SIZES.items():
-            job = Job(size, max(_IN_FLIGHT, int(n * share)), _IN_FLIGHT)
+            job = Job(size, max(min(n, _IN_FLIGHT), int(n * share)), _IN_FLIGHT)
             _print_rate(_measure(f"{_IN_FLIGHT} in flight of {_NAMES[size]}", peers, job, rounds), job)
 
 
