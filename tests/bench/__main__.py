@@ -1,23 +1,59 @@
-"""Speed as ratios against peers in the same run. Numbers are printed, never asserted."""
+"""Speed as ratios against peers in the same run. Numbers are printed, never asserted.
+
+parts:
+  calls      one remote call at a time, of 64 B to 2 MiB: raw TCP, the bare transport, ours, rpyc, Pyro5, gRPC
+  in-flight  the same with 32 calls under way: calls/s as a share of the bare transport's
+  local      a call in the same container, of three numbers
+  registry   10,000 services as a late joiner sees them: time, memory, finding one (--full: of 10,000 providers, too)
+  servo      the Dynamixel driver against what a bus of 1 Mbaud can carry
+
+Progress goes to stderr, tables and targets (met or missed) to stdout. Peers that are not installed are skipped.
+"""
 
 import argparse
+from collections.abc import Callable, Mapping
 
-from tests.bench import _calls, _servo
+from tests.bench import _calls, _local, _registry, _servo
+
+_SERVICES_EACH = 10
+
+
+def _run_registry(options: argparse.Namespace) -> None:
+    _registry.run(options.services // _SERVICES_EACH, _SERVICES_EACH, max(1, options.rounds // 2))
+    if options.full:
+        _registry.run(options.services, 1, 1)
+
+
+_PARTS: Mapping[str, Callable[[argparse.Namespace], None]] = {
+    "calls": lambda options: _calls.run(options.n, options.rounds),
+    "in-flight": lambda options: _calls.run_in_flight(options.n, options.rounds),
+    "local": lambda options: _local.run(50 * options.n, options.rounds),
+    "registry": _run_registry,
+    "servo": lambda options: _servo.run(options.n, options.rounds, options.seconds),
+}
+_QUICK = {"n": 200, "rounds": 8, "seconds": 1.5}
+_FULL = {"n": 500, "rounds": 20, "seconds": 3.0}
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(prog="python -m tests.bench", description=__doc__)
-    parser.add_argument("parts", nargs="*", help="calls, servo; both by default")
-    parser.add_argument("-n", type=int, default=300, help="calls or cycles in a round (default: %(default)s)")
-    parser.add_argument("--rounds", type=int, default=20, help="turns of each peer (default: %(default)s)")
-    parser.add_argument("--seconds", type=float, default=3.0, help="length of a 100 Hz round (default: %(default)s)")
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.bench", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("parts", nargs="*", metavar="part", help=f"{', '.join(_PARTS)}; all of them by default")
+    parser.add_argument("--full", action="store_true", help="longer rounds and more of them: some fifteen minutes")
+    parser.add_argument("-n", type=int, help=f"calls or cycles in a round ({_QUICK['n']}, full {_FULL['n']})")
+    parser.add_argument("--rounds", type=int, help=f"turns of each peer ({_QUICK['rounds']}, full {_FULL['rounds']})")
+    parser.add_argument("--seconds", type=float, help="length of a 100 Hz round of the servo bus")
+    parser.add_argument("--services", type=int, default=10_000, help="of the registry part (default: %(default)s)")
     options = parser.parse_args()
-    if unknown := set(options.parts) - {"calls", "servo"}:
-        parser.error(f"there is no part {', '.join(unknown)}; there are calls and servo")
-    if not options.parts or "calls" in options.parts:
-        _calls.run(options.n, options.rounds)
-    if not options.parts or "servo" in options.parts:
-        _servo.run(options.n, options.rounds, options.seconds)
+    if unknown := set(options.parts) - set(_PARTS):
+        parser.error(f"there is no part {', '.join(unknown)}; there are {', '.join(_PARTS)}")
+    for name, default in (_FULL if options.full else _QUICK).items():
+        if getattr(options, name) is None:
+            setattr(options, name, default)
+    for part, run in _PARTS.items():
+        if not options.parts or part in options.parts:
+            run(options)
 
 
 if __name__ == "__main__":

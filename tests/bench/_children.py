@@ -1,6 +1,7 @@
 """A peer in two processes, its server and its caller, told over pipes what to do; both end with the block."""
 
 import multiprocessing
+import random
 import statistics
 import time
 from collections.abc import Iterator
@@ -8,10 +9,19 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 
-from tests.bench._peers import PAYLOAD, Call, Peer
+from tests.bench._links import Link, Peer, check
 
 _SPAWN = multiprocessing.get_context("spawn")
 _PATIENCE_S = 60.0
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """What a caller is told to do in a round."""
+
+    size: int
+    n: int
+    in_flight: int = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,6 +30,7 @@ class Round:
 
     p50_us: float
     p99_us: float
+    calls_per_s: float
     cpu_us: float
     """Per call, of both processes together."""
 
@@ -32,25 +43,29 @@ class Running:
         self._server = server
         self._caller = caller
 
-    def run(self, n: int) -> Round:
+    def run(self, job: Job) -> Round:
+        """A round. Of calls that overlap only their rate is known: p50 and p99 are those of a mean call."""
         before_ns = _ask(self._server, "cpu")
-        took_ns, caller_ns = _ask(self._caller, n)
+        took_ns, caller_ns = _ask(self._caller, job)
         server_ns = _ask(self._server, "cpu") - before_ns
         took_us = [ns / 1e3 for ns in took_ns]
-        p99_us = statistics.quantiles(took_us, n=100)[98] if n > 1 else took_us[0]
-        return Round(statistics.median(took_us), p99_us, (caller_ns + server_ns) / 1e3 / n)
+        p99_us = statistics.quantiles(took_us, n=100)[98] if len(took_us) > 1 else took_us[0]
+        return Round(
+            statistics.median(took_us), p99_us, 1e6 / statistics.fmean(took_us), (caller_ns + server_ns) / 1e3 / job.n
+        )
 
 
 @contextmanager
 def running(peer: Peer) -> Iterator[Running]:
     """Start both processes of a peer. Raises RuntimeError if one of them does not come up."""
-    with _child(_serve, peer) as server, _child(_call, peer, _hear(server)) as caller:
-        _hear(caller)
+    with child(_serve, peer) as server, child(_call, peer, hear(server)) as caller:
+        hear(caller)
         yield Running(peer.name, server, caller)
 
 
 @contextmanager
-def _child(main, *args: object) -> Iterator[Connection]:
+def child(main, *args: object) -> Iterator[Connection]:
+    """A process that runs ``main(pipe, *args)``, and our end of the pipe."""
     ours, theirs = _SPAWN.Pipe()
     process = _SPAWN.Process(target=main, args=(theirs, *args), daemon=True)
     process.start()
@@ -73,23 +88,31 @@ def _serve(pipe: Connection, peer: Peer) -> None:
 
 
 def _call(pipe: Connection, peer: Peer, address: str) -> None:
-    with peer.connect(address) as call:
+    with peer.connect(address) as link:
         pipe.send("ready")
-        for n in _requests(pipe):
-            pipe.send(_round(call, n))
+        for job in _requests(pipe):
+            pipe.send(_round(link, job))
 
 
-def _round(call: Call, n: int) -> tuple[list[int], int]:
-    """How long each of n calls took, and the CPU time of this process for all of them; in nanoseconds."""
-    took_ns: list[int] = []
-    clock, spent_ns = time.perf_counter_ns, time.process_time_ns()
-    for _ in range(n):
-        began = clock()
-        answer = call(PAYLOAD)
-        took_ns.append(clock() - began)
-        if answer != PAYLOAD:
-            raise RuntimeError(f"a wrong answer: {answer!r}")
+def _round(link: Link, job: Job) -> tuple[list[float], int]:
+    """How long each call took (or the mean one, if they overlap), and this process's CPU time for all; in ns."""
+    payload = random.Random(0).randbytes(job.size)  # nothing that a library could compress
+    spent_ns = time.process_time_ns()
+    if job.in_flight == 1:
+        took_ns = [_timed(link, payload) for _ in range(job.n)]
+    else:
+        began = time.perf_counter_ns()
+        link.burst(payload, job.n, job.in_flight)
+        took_ns = [(time.perf_counter_ns() - began) / job.n]
     return took_ns, time.process_time_ns() - spent_ns
+
+
+def _timed(link: Link, payload: bytes) -> float:
+    began = time.perf_counter_ns()
+    answer = link.call(payload)
+    took_ns = time.perf_counter_ns() - began
+    check(payload, answer)
+    return took_ns
 
 
 def _requests(pipe: Connection) -> Iterator:
@@ -102,12 +125,13 @@ def _requests(pipe: Connection) -> Iterator:
 
 def _ask(pipe: Connection, request: object):
     pipe.send(request)
-    return _hear(pipe)
+    return hear(pipe)
 
 
-def _hear(pipe: Connection):
-    if not pipe.poll(_PATIENCE_S):
-        raise RuntimeError(f"a child process said nothing for {_PATIENCE_S} s")
+def hear(pipe: Connection, patience_s: float = _PATIENCE_S):
+    """What a child says next. Raises RuntimeError if it says nothing, or has ended."""
+    if not pipe.poll(patience_s):
+        raise RuntimeError(f"a child process said nothing for {patience_s} s")
     try:
         return pipe.recv()
     except EOFError:

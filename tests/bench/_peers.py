@@ -1,34 +1,22 @@
-"""What our calls are measured against, and our calls themselves: each echoes 64 bytes between two processes."""
+"""What others are measured against: raw TCP, the floor, and a bare zenoh pair, the yardstick."""
 
 import itertools
 import json
 import socket
 import threading
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
+from typing import Any
 
-PAYLOAD = bytes(range(64))
+from tests.bench._links import Link, Peer, Pipeline
 
-Call = Callable[[bytes], bytes]
-
-
-class Peer(ABC):
-    """One way to call another process."""
-
-    name: str
-
-    @abstractmethod
-    def serve(self) -> AbstractContextManager[str]:
-        """Answer calls; gives what ``connect`` needs to find us."""
-
-    @abstractmethod
-    def connect(self, address: str) -> AbstractContextManager[Call]:
-        """Gives the function that calls."""
+_SIZE_BYTES = 4
+_MOST_UNREAD = 256 * 1024
+"""Bytes that raw TCP may have under way: with more, both ends could wait to send and nobody would read."""
 
 
 class Tcp(Peer):
-    """The floor: a blocking socket on each side, messages of fixed length."""
+    """A blocking socket on each side, a length before each message."""
 
     name = "raw TCP"
 
@@ -39,27 +27,42 @@ class Tcp(Peer):
             yield json.dumps(listener.getsockname())
 
     @contextmanager
-    def connect(self, address: str) -> Iterator[Call]:
+    def connect(self, address: str) -> Iterator[Link]:
         with socket.create_connection(tuple(json.loads(address))) as link:
             link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            yield _TcpLink(link)
 
-            def call(payload: bytes) -> bytes:
-                link.sendall(payload)
-                return link.recv(len(payload), socket.MSG_WAITALL)
 
-            yield call
+class _TcpLink(Pipeline):
+    def __init__(self, link: socket.socket) -> None:
+        self._link = link
+
+    def begin(self, payload: bytes) -> None:
+        self._link.sendall(len(payload).to_bytes(_SIZE_BYTES, "little") + payload)
+
+    def end(self, begun: None) -> bytes:
+        return _framed(self._link)[_SIZE_BYTES:]
+
+    def burst(self, payload: bytes, n: int, in_flight: int) -> None:
+        super().burst(payload, n, min(in_flight, max(1, _MOST_UNREAD // len(payload))))
 
 
 def _echo_all(listener: socket.socket) -> None:
     link, _ = listener.accept()
     link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     with link:
-        while data := link.recv(len(PAYLOAD), socket.MSG_WAITALL):
-            link.sendall(data)
+        while message := _framed(link):
+            link.sendall(message)
+
+
+def _framed(link: socket.socket) -> bytes:
+    """A message with its length before it; nothing at the end."""
+    size = link.recv(_SIZE_BYTES, socket.MSG_WAITALL)
+    return size + link.recv(int.from_bytes(size, "little"), socket.MSG_WAITALL) if size else b""
 
 
 class BarePair(Peer):
-    """The yardstick: what our calls stand on, with nothing of ours around it.
+    """What our calls stand on, with nothing of ours around it.
 
     A channel and a declared publisher on each side, the lease every session of ours has, an id before the payload.
     """
@@ -76,24 +79,31 @@ class BarePair(Peer):
             yield endpoint
 
     @contextmanager
-    def connect(self, address: str) -> Iterator[Call]:
-        ids = itertools.count(1)
+    def connect(self, address: str) -> Iterator[Link]:
         with _bare_session(connect=address) as session:
             replies = session.declare_subscriber("reply/bench", _fifo())
             calls = _declare(session, "call/bench")
             while not calls.matching_status.matching:
                 threading.Event().wait(0.01)
-            receive = replies.handler.recv
+            yield _BareLink(calls.put, replies.handler.recv)
 
-            def call(payload: bytes) -> bytes:
-                call_id = next(ids).to_bytes(8, "little")
-                calls.put(call_id + payload)
-                while True:
-                    answer = receive().payload.to_bytes()
-                    if answer[:8] == call_id:
-                        return answer[8:]
 
-            yield call
+class _BareLink(Pipeline):
+    def __init__(self, put: Callable[[bytes], Any], receive: Callable[[], Any]) -> None:
+        self._put = put
+        self._receive = receive
+        self._ids = itertools.count(1)
+
+    def begin(self, payload: bytes) -> bytes:
+        call_id = next(self._ids).to_bytes(8, "little")
+        self._put(call_id + payload)
+        return call_id
+
+    def end(self, begun: bytes) -> bytes:
+        while True:
+            answer = self._receive().payload.to_bytes()
+            if answer[:8] == begun:
+                return answer[8:]
 
 
 def _answer_all(calls, replies) -> None:
@@ -141,83 +151,3 @@ def _free_endpoint() -> str:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
-
-
-class Rpyc(Peer):
-    """The other library of its kind: plain values, no types, no checks."""
-
-    name = "rpyc"
-
-    @contextmanager
-    def serve(self) -> Iterator[str]:
-        import rpyc
-        from rpyc.utils.server import ThreadedServer
-
-        class Echo(rpyc.Service):
-            def exposed_echo(self, payload):
-                return payload
-
-        server = ThreadedServer(Echo, hostname="127.0.0.1")
-        threading.Thread(target=server.start, daemon=True).start()
-        try:
-            yield str(server.port)
-        finally:
-            server.close()
-
-    @contextmanager
-    def connect(self, address: str) -> Iterator[Call]:
-        import rpyc
-
-        with rpyc.connect("127.0.0.1", int(address)) as link:
-            yield link.root.echo
-
-
-class Trade(Peer):
-    """A remote call of ours: typed, with deadline, identity and checks; of the kind that may move something."""
-
-    name = "TRADE"
-
-    @contextmanager
-    def serve(self) -> Iterator[str]:
-        with _container("server", "two") as container:
-            container.register(_provider(), "bench")
-            yield ""
-
-    @contextmanager
-    def connect(self, address: str) -> Iterator[Call]:
-        from trade import where
-
-        with _container("client", "two") as container:
-            yield container.find(where(name="echo", group="bench"), wait_s=10)
-
-
-class LocalTrade(Peer):
-    """A call of a service in the same container: the same checks and copies, no wire. For information."""
-
-    name = "TRADE, local"
-
-    @contextmanager
-    def serve(self) -> Iterator[str]:
-        yield ""
-
-    @contextmanager
-    def connect(self, address: str) -> Iterator[Call]:
-        with _container("alone", "one") as container:
-            yield container.register(_provider(), "bench")[0]
-
-
-def _container(name: str, system: str):
-    from trade import Container, Settings
-
-    return Container(Settings.read(container=name, system=f"bench-{system}"))
-
-
-def _provider() -> object:
-    from trade import service
-
-    class Echo:
-        @service
-        def echo(self, payload: bytes) -> bytes:
-            return payload
-
-    return Echo()

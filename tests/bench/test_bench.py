@@ -1,10 +1,19 @@
 """The bench runs and prints its lines; how fast anything is, is not this test's business."""
 
+import re
 import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+from tests.bench._calls import up
+from tests.bench._others import Rpyc
+
 ROOT = Path(__file__).parents[2]
+
+
+def targets(printed: str) -> list[str]:
+    return [re.split("  | [0-9]+[.]", line)[0] for line in printed.splitlines() if "  target " in line]
 
 
 def bench(*arguments: str) -> str:
@@ -14,15 +23,45 @@ def bench(*arguments: str) -> str:
     return done.stdout
 
 
+PEERS = ("raw TCP", "bare zenoh pair", "TRADE ", "rpyc", "Pyro5", "gRPC")
+SIZES = ("64 B", "4 KiB", "64 KiB", "2 MiB")
+
+
 def test_the_bench_of_calls_prints_every_peer_and_every_target() -> None:
-    printed = bench("calls", "-n", "3", "--rounds", "2")
-    for peer in ("raw TCP", "bare zenoh pair", "TRADE ", "rpyc", "TRADE, local"):
-        assert f"\n{peer}" in printed
-    assert [line.split("  ")[0] for line in printed.splitlines() if "target" in line] == [
-        "p50 / bare pair",
-        "CPU / bare pair",
-        "p50 / rpyc",
+    printed = bench("calls", "-n", "3", "--rounds", "1")
+    for peer in (*PEERS, "TRADE, local"):
+        assert printed.count(f"\n{peer}") == len(SIZES)
+    assert targets(printed) == [
+        f"{size}: {what}" for size in SIZES for what in ("p50 / bare pair", "CPU / bare pair", "p50 / rpyc")
     ]
+
+
+def test_the_bench_of_calls_in_flight_prints_every_peer_and_every_target() -> None:
+    printed = bench("in-flight", "-n", "3", "--rounds", "1")
+    for peer in (*PEERS, "TRADE, threads"):
+        assert len(re.findall(rf"^{peer}[^:]*$", printed, re.MULTILINE)) == len(SIZES)
+    assert targets(printed) == ["TRADE: rate / bare pair", "TRADE, threads: rate / bare pair"] * len(SIZES)
+
+
+def test_a_peer_that_is_not_installed_is_named_and_skipped(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(Rpyc, "needs", "no_such_module")
+    with up([Rpyc()]) as peers:
+        assert peers == []
+    assert capsys.readouterr().out == "rpyc: skipped, the module no_such_module is not installed\n"
+
+
+def test_the_bench_of_local_calls_prints_its_target_and_says_what_is_not_there() -> None:
+    printed = bench("local", "-n", "3", "--rounds", "1")
+    assert targets(printed) == ["local, strict: us a call"]
+    assert "\nstrict=False" in printed
+
+
+def test_the_bench_of_the_registry_prints_its_targets() -> None:
+    printed = bench("registry", "--services", "30", "--rounds", "1")
+    assert targets(printed) == ["late joiner: s", "remote service: KiB", "find: us"]
+    assert "missed up to" not in printed
 
 
 def test_the_bench_of_the_servo_bus_prints_its_targets() -> None:

@@ -1,0 +1,75 @@
+"""A call of a service in the same container, of three numbers: with the copies a wire would make, and without."""
+
+import inspect
+import sys
+import time
+from collections.abc import Callable
+from statistics import median
+from typing import Final
+
+from tests.bench._alone import alone
+from tests.bench._places import own_folder
+from tests.bench._report import print_target
+
+_MOST_US: Final = 5.0
+_PLAIN, _STRICT, _LENIENT = "plain method", "strict", "strict=False"
+
+Results = dict[str, list[float]]
+
+
+def run(n: int, rounds: int) -> None:
+    """Measure and print.
+
+    Args:
+        n: calls of each kind in a round.
+        rounds: how often each kind has its turn.
+    """
+    with own_folder():
+        results = alone(_measure, n, rounds)
+    print(f"\nlocal call of three numbers: medians over {rounds} rounds of {n} calls")
+    for name, us in results.items():
+        print(f"{name:16}{median(us):8.2f} us")
+    if _LENIENT not in results:
+        print(f"{_LENIENT:16}not there yet")
+    print_target("local, strict: us a call", results[_STRICT], f"at most {_MOST_US:.0f}", lambda us: us <= _MOST_US)
+
+
+def _measure(n: int, rounds: int) -> Results:
+    from trade import Container, Settings
+
+    with Container(Settings.read(container="alone", system="bench-local")) as container:
+        plain = _arm({})
+        calls = {_PLAIN: plain.move, _STRICT: container.register(plain, "bench")[0]}
+        if "strict" in _options():
+            calls[_LENIENT] = container.register(_arm({"strict": False}), "bench")[0]
+        results: Results = {name: [] for name in calls}
+        for i in range(rounds):
+            for name, call in calls.items():
+                results[name].append(_us_per_call(call, n))
+            print(f"local: round {i + 1} of {rounds}", file=sys.stderr, flush=True)
+        return results
+
+
+def _options() -> set[str]:
+    from trade import service
+
+    return set(inspect.signature(service).parameters)
+
+
+def _arm(options: dict[str, bool]):
+    from trade import service
+
+    class Arm:
+        @service(**options)
+        def move(self, shoulder_rad: float, elbow_rad: float, speed_rad_s: float) -> float:
+            return shoulder_rad
+
+    return Arm()
+
+
+def _us_per_call(call: Callable[[float, float, float], float], n: int) -> float:
+    call(0.1, 0.2, 0.3)
+    began = time.perf_counter_ns()
+    for _ in range(n):
+        call(0.1, 0.2, 0.3)
+    return (time.perf_counter_ns() - began) / 1e3 / n
