@@ -6,7 +6,7 @@ from collections.abc import Callable, Generator, Mapping
 from typing import Any, Final, Protocol
 
 from trade._registry import Record
-from trade._wire import Address, ServiceKey
+from trade._wire import Address, Scalar, ServiceKey
 from trade.errors import ConfigurationError
 
 __all__ = ["Handle", "Run"]
@@ -88,6 +88,8 @@ class Handle:
     """
 
     __slots__ = ("_deadline_s", "_home", "_record", "key")
+    __trade_type__: Final = "Handle"
+    """Its name in JSON Schema."""
 
     def __init__(self, home: Home, key: ServiceKey, record: Record | None, deadline_s: float | None = None) -> None:
         self._home = home
@@ -188,6 +190,26 @@ class Handle:
     def resources(self) -> tuple[str, ...]:
         """Physical things it needs for itself."""
         return self.record.info.uses
+
+    @property
+    def achieves(self) -> tuple[str, ...]:
+        """Its post-conditions."""
+        return self.record.info.achieves
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """Names of its provider's class and of the bases and interfaces that have services."""
+        return self.record.kinds
+
+    @property
+    def meta(self) -> Mapping[str, Scalar]:
+        """What it is declared with, and its provider over it."""
+        return self.record.meta
+
+    @property
+    def health(self) -> str:
+        """``healthy``, or what its provider says is wrong."""
+        return self.record.health
 
     @property
     def roles(self) -> tuple[str, ...]:

@@ -11,7 +11,7 @@ from msgspec import Struct, structs
 
 from trade._dispatch import AsyncLoop, LocalService
 from trade._registry import Registry
-from trade._service import ServiceMark, marked_methods
+from trade._service import ServiceMark, kinds_of, marked_methods
 from trade._signature import Codec, Signature
 from trade._system import DOMAIN
 from trade._transport import Publisher, Transport
@@ -70,7 +70,13 @@ class Providers:
             self._names[id(provider)] = f"{domain}/{chunk}"
             self._hosted[f"{domain}/{chunk}"] = _Registered(provider, services, announcement)
         info = ProviderInfo(
-            revision=1, groups=groups, kind=kind, host=socket.gethostname(), pid=os.getpid(), services=infos
+            revision=1,
+            groups=groups,
+            kind=kind,
+            host=socket.gethostname(),
+            pid=os.getpid(),
+            services=infos,
+            kinds=kinds_of(type(provider), implements),
         )
         self._registry.put(self._own, domain, chunk, info)
         announcement.put(encode_message(info))
