@@ -5,7 +5,8 @@ functions here use the process's default container, which starts itself on first
 """
 
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from typing import Any
 
 from msgspec import Meta
 
@@ -13,13 +14,15 @@ from trade import errors
 from trade._constraints import Constraint, where
 from trade._container import Container
 from trade._context import CallContext, current_call
-from trade._handle import Handle, Run
+from trade._handle import Bound, Handle, Run
+from trade._many import Outcome
 from trade._notifications import Callback, Notification
 from trade._service import service
 from trade._settings import Settings
 from trade._system import ContainerInfo
 
 __all__ = [
+    "Bound",
     "CallContext",
     "Constraint",
     "Container",
@@ -27,8 +30,15 @@ __all__ = [
     "Handle",
     "Meta",
     "Notification",
+    "Outcome",
     "Run",
     "Settings",
+    "acall",
+    "acall_all",
+    "acall_sequence",
+    "call",
+    "call_all",
+    "call_sequence",
     "close",
     "container",
     "containers",
@@ -104,6 +114,36 @@ def services(constraint: Constraint | None = None) -> list[Handle]:
 def find(constraint: Constraint, *, wait_s: float = 2.0) -> Handle:
     """The only service that matches; see `Container.find`."""
     return container().find(constraint, wait_s=wait_s)
+
+
+def call(constraint: Constraint, /, *args: Any, **kwargs: Any) -> Any:
+    """Call the only service that matches; see `Container.call`."""
+    return container().call(constraint, *args, **kwargs)
+
+
+def call_all(which: Constraint | Iterable[Handle | Bound], /, *args: Any, **kwargs: Any) -> list[Outcome]:
+    """Call several services at once; see `Container.call_all`."""
+    return container().call_all(which, *args, **kwargs)
+
+
+def call_sequence(calls: Iterable[Handle | Bound], /, *, go_on: bool = False) -> list[Outcome]:
+    """Make calls one after the other; see `Container.call_sequence`."""
+    return container().call_sequence(calls, go_on=go_on)
+
+
+async def acall(constraint: Constraint, /, *args: Any, **kwargs: Any) -> Any:
+    """`call` from asyncio."""
+    return await container().acall(constraint, *args, **kwargs)
+
+
+async def acall_all(which: Constraint | Iterable[Handle | Bound], /, *args: Any, **kwargs: Any) -> list[Outcome]:
+    """`call_all` from asyncio."""
+    return await container().acall_all(which, *args, **kwargs)
+
+
+async def acall_sequence(calls: Iterable[Handle | Bound], /, *, go_on: bool = False) -> list[Outcome]:
+    """`call_sequence` from asyncio."""
+    return await container().acall_sequence(calls, go_on=go_on)
 
 
 def containers() -> list[ContainerInfo]:

@@ -1,5 +1,6 @@
 """One participant: starts, joins, hosts providers, looks up, leaves. Ties the other modules together."""
 
+import asyncio
 import atexit
 import contextlib
 import difflib
@@ -7,15 +8,16 @@ import os
 import secrets
 import threading
 import weakref
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, Final
 
 import msgspec
 
+from trade import _many
 from trade._calls import Caller
 from trade._constraints import Constraint, where
 from trade._dispatch import Dispatcher
-from trade._handle import Handle, Run
+from trade._handle import Bound, Handle, Run
 from trade._invoke import LocalTarget, RemoteTarget, Request, container_closed
 from trade._notifications import Callback, Notification, Notifier
 from trade._providers import Providers, checked_groups
@@ -261,6 +263,58 @@ class Container:
         request, run = Request(deadline_s), Run(handle)
         self._target(handle).begin(args, kwargs, request, run)
         return run
+
+    def call(self, constraint: Constraint, /, *args: Any, **kwargs: Any) -> Any:
+        """Call the only service that matches. Raises what `find` raises, and what the call does."""
+        return self.find(constraint)(*args, **kwargs)
+
+    def call_all(
+        self, which: Constraint | Iterable[Handle | Bound], /, *args: Any, **kwargs: Any
+    ) -> list[_many.Outcome]:
+        """Call several services at once and wait for all of them.
+
+        Args:
+            which: a constraint (all that match now), or handles; bound calls bring arguments of their own.
+            args: for each.
+            kwargs: for each.
+
+        Returns:
+            An outcome for each, in order; what one raises is its own outcome and stops no other.
+        """
+        return _many.all_outcomes(self._bound(which, args, kwargs))
+
+    def call_sequence(self, calls: Iterable[Handle | Bound], /, *, go_on: bool = False) -> list[_many.Outcome]:
+        """Make calls one after the other.
+
+        Args:
+            calls: bound calls, or handles of services without arguments.
+            go_on: also after an error, at which it stops otherwise.
+
+        Returns:
+            Outcomes of those that ran.
+        """
+        return _many.sequence(self._bound(calls, (), {}), go_on=go_on)
+
+    async def acall(self, constraint: Constraint, /, *args: Any, **kwargs: Any) -> Any:
+        """`call` from asyncio."""
+        handle = await asyncio.to_thread(self.find, constraint)
+        return await handle.acall(*args, **kwargs)
+
+    async def acall_all(
+        self, which: Constraint | Iterable[Handle | Bound], /, *args: Any, **kwargs: Any
+    ) -> list[_many.Outcome]:
+        """`call_all` from asyncio."""
+        return await _many.all_outcomes_async(self._bound(which, args, kwargs))
+
+    async def acall_sequence(self, calls: Iterable[Handle | Bound], /, *, go_on: bool = False) -> list[_many.Outcome]:
+        """`call_sequence` from asyncio."""
+        return await _many.sequence_async(self._bound(calls, (), {}), go_on=go_on)
+
+    def _bound(
+        self, which: Constraint | Iterable[Handle | Bound], args: tuple[Any, ...], kwargs: dict[str, Any]
+    ) -> list[Bound]:
+        self._check_open()
+        return _many.bound(self.services(which) if isinstance(which, Constraint) else which, args, kwargs)
 
     def _target(self, handle: Handle) -> LocalTarget | RemoteTarget:
         target = self._targets.get(handle.key)
