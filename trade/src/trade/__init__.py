@@ -5,7 +5,7 @@ functions here use the process's default container, which starts itself on first
 """
 
 import threading
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from msgspec import Meta
@@ -20,6 +20,7 @@ from trade._notifications import Callback, Notification
 from trade._service import service
 from trade._settings import Settings
 from trade._system import ContainerInfo
+from trade._wire import HEALTHY, Scalar
 
 __all__ = [
     "Bound",
@@ -36,9 +37,12 @@ __all__ = [
     "acall",
     "acall_all",
     "acall_sequence",
+    "add_group",
+    "alter",
     "call",
     "call_all",
     "call_sequence",
+    "changed",
     "close",
     "container",
     "containers",
@@ -49,8 +53,11 @@ __all__ = [
     "joined",
     "left",
     "register",
+    "remove_group",
     "service",
     "services",
+    "set_groups",
+    "set_health",
     "start",
     "where",
 ]
@@ -95,15 +102,44 @@ def close() -> None:
 
 
 def register(
-    provider: object, groups: str | Sequence[str] = (), *, implements: Sequence[type] = ()
+    provider: object,
+    groups: str | Sequence[str] = (),
+    *,
+    implements: Sequence[type] = (),
+    meta: Mapping[str, Scalar] | None = None,
 ) -> tuple[Handle, ...]:
     """Offer an object's services to the whole system; see `Container.register`."""
-    return container().register(provider, groups, implements=implements)
+    return container().register(provider, groups, implements=implements, meta=meta)
 
 
 def deregister(provider: object) -> None:
     """Withdraw an object's services from the whole system; see `Container.deregister`."""
     container().deregister(provider)
+
+
+def set_groups(provider: object, groups: str | Sequence[str]) -> None:
+    """Put a live provider into other groups; see `Container.set_groups`."""
+    container().set_groups(provider, groups)
+
+
+def add_group(provider: object, group: str) -> None:
+    """Put a live provider into one more group; see `Container.add_group`."""
+    container().add_group(provider, group)
+
+
+def remove_group(provider: object, group: str) -> None:
+    """Take a live provider out of a group; see `Container.remove_group`."""
+    container().remove_group(provider, group)
+
+
+def set_health(provider: object, health: str = HEALTHY) -> None:
+    """Say what is wrong with a provider, or that nothing is any more; see `Container.set_health`."""
+    container().set_health(provider, health)
+
+
+def alter(provider: object, *, meta: Mapping[str, Scalar] | None = None) -> None:
+    """Read a live provider again, as if registered anew; see `Container.alter`."""
+    container().alter(provider, meta=meta)
 
 
 def services(constraint: Constraint | None = None) -> list[Handle]:
@@ -159,3 +195,8 @@ def joined(constraint: Constraint, call: Callback, *, existing: bool = False) ->
 def left(constraint: Constraint, call: Callback) -> Notification:
     """Call with the handle of every service that goes and matched; see `Container.left`."""
     return container().left(constraint, call)
+
+
+def changed(constraint: Constraint, call: Callback) -> Notification:
+    """Call with the handle of every service that matches and is altered; see `Container.changed`."""
+    return container().changed(constraint, call)

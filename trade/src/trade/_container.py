@@ -8,19 +8,20 @@ import os
 import secrets
 import threading
 import weakref
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Final
 
 import msgspec
+from msgspec import structs
 
 from trade import _many
 from trade._calls import Caller
-from trade._constraints import Constraint, where
+from trade._constraints import Constraint, checked_meta, where
 from trade._dispatch import Dispatcher
 from trade._handle import Bound, Handle, Run
 from trade._invoke import LocalTarget, RemoteTarget, Request, container_closed
 from trade._notifications import Callback, Notification, Notifier
-from trade._providers import Providers, checked_groups
+from trade._providers import Providers, checked_groups, checked_health
 from trade._registry import Change, Record, Registry
 from trade._rendezvous import Rendezvous, free_endpoint
 from trade._settings import Settings
@@ -29,7 +30,10 @@ from trade._system import DOMAIN, PROVIDER, ContainerInfo, SystemServices
 from trade._transport import ChannelClosed, Transport
 from trade._watch import Watch
 from trade._wire import (
+    HEALTHY,
     Address,
+    ProviderInfo,
+    Scalar,
     ServiceKey,
     alive_key,
     encode_message,
@@ -109,7 +113,12 @@ class Container:
     # --- hosting
 
     def register(
-        self, provider: object, groups: str | Sequence[str] = (), *, implements: Sequence[type] = ()
+        self,
+        provider: object,
+        groups: str | Sequence[str] = (),
+        *,
+        implements: Sequence[type] = (),
+        meta: Mapping[str, Scalar] | None = None,
     ) -> tuple[Handle, ...]:
         """Offer an object's services to the whole system.
 
@@ -117,6 +126,7 @@ class Container:
             provider: an object whose class, bases or interfaces have ``@service`` methods.
             groups: dotted labels such as ``"rosie.head"``.
             implements: interfaces (protocols) the object fits without inheriting from them.
+            meta: numbers, texts, booleans by name; holds for all its services, over what they say themselves.
 
         Returns:
             Handles of its services.
@@ -127,7 +137,7 @@ class Container:
         """
         self._check_open()
         try:
-            keys = self._providers.add(provider, checked_groups(provider, groups), implements)
+            keys = self._providers.add(provider, checked_groups(provider, groups), implements, meta=meta)
         except ChannelClosed:  # closed by another thread meanwhile
             raise container_closed(self.address) from None
         return tuple(self.handle(key) for key in keys)
@@ -140,6 +150,56 @@ class Container:
         """
         self._check_open()
         self._providers.remove(provider)
+
+    def set_groups(self, provider: object, groups: str | Sequence[str]) -> None:
+        """Put a live provider into other groups. Handles stay valid: its place was settled when it was registered.
+
+        Raises:
+            ConfigurationError: a malformed group, or it is not registered here.
+        """
+        named = checked_groups(provider, groups)
+        self._alter(provider, lambda info: structs.replace(info, groups=named))
+
+    def add_group(self, provider: object, group: str) -> None:
+        """Put a live provider into one more group. Raises like `set_groups`."""
+        [named] = checked_groups(provider, (group,))
+        self._alter(provider, lambda info: structs.replace(info, groups=tuple(dict.fromkeys((*info.groups, named)))))
+
+    def remove_group(self, provider: object, group: str) -> None:
+        """Take a live provider out of a group; one it is not in is fine. Raises like `set_groups`."""
+        self._alter(
+            provider,
+            lambda info: structs.replace(info, groups=tuple(known for known in info.groups if known != group)),
+        )
+
+    def set_health(self, provider: object, health: str = HEALTHY) -> None:
+        """Say what is wrong with a provider, such as ``"degraded: overheating"``, or that nothing is any more.
+
+        Raises:
+            ConfigurationError: no text, or it is not registered here.
+        """
+        said = checked_health(provider, health)
+        self._alter(provider, lambda info: structs.replace(info, health=said))
+
+    def alter(self, provider: object, *, meta: Mapping[str, Scalar] | None = None) -> None:
+        """Read a live provider again, as if it were registered anew: its class's marks, its resources. Handles hold.
+
+        Args:
+            provider: the object.
+            meta: instead of the metadata it was registered with; by default that stays.
+
+        Raises:
+            ConfigurationError: like `register`, or it is not registered here.
+        """
+        new = None if meta is None else checked_meta(meta)
+        self._alter(provider, lambda info: info if new is None else structs.replace(info, meta=new), reread=True)
+
+    def _alter(self, provider: object, change: Callable[[ProviderInfo], ProviderInfo], *, reread: bool = False) -> None:
+        self._check_open()
+        try:
+            self._providers.alter(provider, change, reread=reread)
+        except ChannelClosed:  # closed by another thread meanwhile
+            raise container_closed(self.address) from None
 
     # --- looking up
 
@@ -229,6 +289,14 @@ class Container:
     def left(self, constraint: Constraint, call: Callback) -> Notification:
         """Call with the (dead) handle of every service that goes and matched."""
         return self._notify("left", constraint, call, existing=False)
+
+    def changed(self, constraint: Constraint, call: Callback) -> Notification:
+        """Call with the handle of every service whose groups, metadata, health or description become others.
+
+        It fires for what matches, and once more for what has just ceased to. Who is quick may find several changes in
+        one.
+        """
+        return self._notify("changed", constraint, call, existing=False)
 
     def _notify(self, occasion: str, constraint: Constraint, call: Callback, *, existing: bool) -> Notification:
         self._check_open()

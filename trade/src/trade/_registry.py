@@ -63,6 +63,8 @@ class Change(NamedTuple):
     left: list[Record]
     replaced: list[Record]
     """The same services, told anew."""
+    before: list[Record]
+    """What was known of those, in the same order."""
 
 
 _MOST_ENDED: Final = 256
@@ -167,7 +169,7 @@ class Registry:
     def _swap(self, before: Iterable[Record], after: Iterable[Record], alive: bool) -> Change:
         """Replace records in the index, under the lock. What stays under its key neither joins nor leaves."""
         if not alive:
-            return Change([], [], [])
+            return Change([], [], [], [])
         old = {record.key: record for record in before}
         new = {record.key: record for record in after}
         for record in new.values():
@@ -180,6 +182,7 @@ class Registry:
             joined=[new[key] for key in new if key not in old],
             left=[old[key] for key in old if key not in new],
             replaced=[new[key] for key in new if key in old],
+            before=[old[key] for key in new if key in old],
         )
 
     def _tell(self, change: Change) -> None:
