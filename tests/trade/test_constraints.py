@@ -1,6 +1,8 @@
 """``where``: what a service must be."""
 
-from dataclasses import dataclass
+import inspect
+import threading
+from dataclasses import dataclass, field
 from typing import Any
 
 import msgspec
@@ -8,9 +10,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trade import Constraint, Container, service, where
+from trade import Constraint, Container, Handle, service, where
 from trade._constraints import Term
+from trade._service import ServiceMark
+from trade._signature import Codec, Signature
+from trade._wire import ServiceInfo
 from trade.errors import ConfigurationError
+
+_PLAIN = ServiceInfo(name="move", signature="move()")
+_CODEC = Codec(lambda value: value, lambda code, data: data)
 
 
 @dataclass(frozen=True)
@@ -20,6 +28,14 @@ class Candidate:
     host: str = "edge"
     container: str = "driver"
     local: bool = False
+    info: ServiceInfo = _PLAIN
+    kinds: tuple[str, ...] = ()
+    meta: dict[str, Any] = field(default_factory=dict)
+    healthy: bool = True
+
+
+def using(*resources: str) -> Candidate:
+    return Candidate(info=ServiceInfo(name="move", signature="move()", uses=resources))
 
 
 MATCHES: list[tuple[Constraint, Candidate, bool]] = [
@@ -56,6 +72,22 @@ MATCHES: list[tuple[Constraint, Candidate, bool]] = [
     (~where(), Candidate(), False),
     (where(name="a") & ~where(name="a"), Candidate(name="a"), False),
     (where(name="a") | ~where(name="a"), Candidate(name="b"), True),
+    (where(uses="rosie.left"), using("rosie.left.wrist"), True),
+    (where(uses="rosie.left"), using("rosie.lefty"), False),
+    (where(uses="rosie.left"), using("gripper", "rosie.left"), True),
+    (where(kind="Motor"), Candidate(kinds=("DynamixelMotor", "Motor")), True),
+    (where(kind="*Motor"), Candidate(kinds=("DynamixelMotor",)), True),
+    (where(kind="Motor"), Candidate(kinds=("Gripper",)), False),
+    (where(meta={"payload_kg": 2}), Candidate(meta={"payload_kg": 2.0, "a": None}), True),
+    (where(meta={"payload_kg": 2}), Candidate(meta={"payload_kg": 3}), False),
+    (where(meta={"left": True}), Candidate(meta={"left": 1}), False),
+    (where(meta={"a": 1, "b": "x"}), Candidate(meta={"a": 1, "b": "y"}), False),
+    (where(meta={"a": None}), Candidate(), False),
+    (where(meta={}), Candidate(), True),
+    (where(healthy=True), Candidate(), True),
+    (where(healthy=False), Candidate(), False),
+    (where.healthy, Candidate(healthy=False), False),
+    (~where.healthy, Candidate(healthy=False), True),
 ]
 
 
@@ -67,9 +99,23 @@ def test_a_constraint_matches_what_it_says(constraint: Constraint, candidate: Ca
 # --- any combination means the same as evaluating it term by term
 
 _texts = st.sampled_from(["a", "b", "a.b", "a.b.c", "ab", "*", "a*", "?"])
+_TYPES: list[Any] = [int, float, str, bool, None, list[int], list[float], int | None, dict[str, int]]
+_FACTS = ["see(cup)", "on(cup, table)", "on(cup, cup)", "at(?place)"]
+_PATTERNS = ["see(?x)", "on(?x, ?x)", "on(?x, table)", "at(dock)", "?x", "see(?x), on(?x, ?y)"]
+
+
+def _term(**asked: Any) -> Term:
+    [[term]] = where(**asked).clauses
+    return term
+
+
 _terms = st.one_of(
-    st.builds(Term, st.sampled_from(["name", "group", "host", "container"]), _texts),
-    st.just(Term("local", "")),
+    st.builds(Term, st.sampled_from(["name", "group", "host", "container", "uses", "kind"]), _texts),
+    st.sampled_from([Term("local", ""), Term("healthy", "")]),
+    st.builds(lambda types: _term(args=types), st.lists(st.sampled_from(_TYPES), max_size=2)),
+    st.builds(lambda kind: _term(returns=kind), st.sampled_from(_TYPES)),
+    st.builds(lambda pattern: _term(achieves=pattern), st.sampled_from(_PATTERNS)),
+    st.builds(lambda value: _term(meta={"a": value}), st.sampled_from([1, 2, True, "x", None])),
 )
 _expressions = st.recursive(
     _terms,
@@ -80,8 +126,40 @@ _expressions = st.recursive(
     ),
     max_leaves=6,
 )
+
+
+def _info(kinds: list[Any], required: int, returns: Any, achieves: list[str], uses: list[str]) -> ServiceInfo:
+    def function(*_: Any) -> Any: ...
+
+    places = [
+        inspect.Parameter(
+            f"p{index}",
+            inspect.Parameter.POSITIONAL_OR_KEYWORD,
+            annotation=kind,
+            default=inspect.Parameter.empty if index < required else None,
+        )
+        for index, kind in enumerate(kinds)
+    ]
+    function.__signature__ = inspect.Signature(places)  # type: ignore[attr-defined]
+    function.__annotations__ = {**{place.name: place.annotation for place in places}, "return": returns}
+    mark = ServiceMark(achieves=tuple(achieves), uses=tuple(uses))
+    return Signature("robot.go", "go", mark, function, _CODEC).info
+
+
+_infos = st.builds(
+    _info,
+    st.lists(st.sampled_from(_TYPES), max_size=2),
+    st.integers(0, 2),
+    st.sampled_from(_TYPES),
+    st.lists(st.sampled_from(_FACTS), max_size=2),
+    st.lists(st.sampled_from(["a", "a.b", "ab"]), max_size=2),
+)
 _candidates = st.builds(
     Candidate,
+    info=_infos,
+    kinds=st.lists(st.sampled_from(["a", "b", "ab"]), max_size=2).map(tuple),
+    meta=st.dictionaries(st.just("a"), st.sampled_from([1, 2, True, "x", None])),
+    healthy=st.booleans(),
     name=st.sampled_from(["a", "b", "ab"]),
     groups=st.lists(st.sampled_from(["a", "b", "a.b", "a.b.c", "ab"]), max_size=2).map(tuple),
     host=st.sampled_from(["a", "b"]),
@@ -139,6 +217,29 @@ def test_a_term_about_an_unknown_field_is_refused_on_arrival() -> None:
 
 
 @pytest.mark.parametrize(
+    "term",
+    [
+        ["args", "no types", False],
+        ["args", "[1, 2]", False],
+        ["returns", "[[{}, {}], {}]", False],
+        ["achieves", "see(", False],
+        ["meta", "[]", False],
+        ["meta", '["a", [1]]', False],
+    ],
+)
+def test_a_term_whose_pattern_makes_no_sense_is_refused_on_arrival(term: list[Any]) -> None:
+    with pytest.raises(msgspec.ValidationError):
+        msgspec.msgpack.decode(msgspec.msgpack.encode({"clauses": [[term]]}), type=Constraint)
+
+
+@given(_expressions)
+def test_a_constraint_can_be_kept_in_a_set_and_read(expression: Any) -> None:
+    constraint = _built(expression)
+    assert {constraint, _built(expression)} == {constraint}
+    assert str(constraint)
+
+
+@pytest.mark.parametrize(
     "misuse",
     [
         lambda: where(name="a") and where(name="b"),
@@ -158,6 +259,27 @@ def test_a_pattern_must_be_a_text(wrong: dict[str, Any]) -> None:
         where(**wrong)
 
 
+@pytest.mark.parametrize(
+    ("wrong", "problem"),
+    [
+        ({"args": float}, "args must be a list of types"),
+        ({"args": [object]}, "this type cannot be sent"),
+        ({"returns": threading.Lock}, "this type cannot be sent"),
+        ({"achieves": "see(?x"}, "a closing parenthesis is missing"),
+        ({"achieves": ""}, "must be a non-empty text"),
+        ({"meta": {"a": [1]}}, "meta maps names to numbers"),
+        ({"meta": {"a": float("nan")}}, "must be finite"),
+        ({"meta": {1: 2}}, "meta maps names to numbers"),
+        ({"meta": {"a": 2**70}}, "meta maps names to numbers"),
+        ({"uses": ""}, "must be a non-empty text"),
+        ({"kind": int}, "must be a non-empty text"),
+    ],
+)
+def test_what_cannot_be_asked_for_is_refused_where_it_is_written(wrong: dict[str, Any], problem: str) -> None:
+    with pytest.raises(ConfigurationError, match=problem):
+        where(**wrong)
+
+
 def test_a_constraint_that_explodes_is_refused() -> None:
     wide = where(name="a0") & where(group="b0")
     with pytest.raises(ConfigurationError, match="more than 1000 alternatives; make it simpler"):
@@ -172,6 +294,12 @@ TEXTS = [
     (~where(), "nothing"),
     (where(name="a", group="b"), "group='b' and name='a'"),
     (where(name="a") | ~where.local, "(not local) or (name='a')"),
+    (where(args=[float, list[int], Any]), "args=[float, list[int], Any]"),
+    (where(args=[], returns=None), "args=[] and returns=None"),
+    (where(returns=int | None, healthy=False), "not healthy and returns=int | None"),
+    (where(returns=Handle), "returns=Handle"),
+    (where(achieves=["see( ?x )", "on(?x,table)"]), "achieves='see(?x), on(?x, table)'"),
+    (where(meta={"side": "left"}), "meta side='left'"),
 ]
 
 

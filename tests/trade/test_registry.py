@@ -25,7 +25,7 @@ class Told:
         registry.listen(self.hear)
 
     def hear(self, change: Change) -> None:
-        joined, left, replaced = ([record.name for record in records] for records in change)
+        joined, left, replaced = ([record.name for record in records] for records in change[:3])
         self.changes.append((joined, left, replaced))
 
 

@@ -5,7 +5,8 @@ functions here use the process's default container, which starts itself on first
 """
 
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 from msgspec import Meta
 
@@ -13,13 +14,16 @@ from trade import errors
 from trade._constraints import Constraint, where
 from trade._container import Container
 from trade._context import CallContext, current_call
-from trade._handle import Handle, Run
+from trade._handle import Bound, Handle, Run
+from trade._many import Outcome
 from trade._notifications import Callback, Notification
 from trade._service import service
 from trade._settings import Settings
 from trade._system import ContainerInfo, System
+from trade._wire import HEALTHY, Scalar
 
 __all__ = [
+    "Bound",
     "CallContext",
     "Constraint",
     "Container",
@@ -27,9 +31,19 @@ __all__ = [
     "Handle",
     "Meta",
     "Notification",
+    "Outcome",
     "Run",
     "Settings",
     "System",
+    "acall",
+    "acall_all",
+    "acall_sequence",
+    "add_group",
+    "alter",
+    "call",
+    "call_all",
+    "call_sequence",
+    "changed",
     "close",
     "container",
     "containers",
@@ -40,8 +54,11 @@ __all__ = [
     "joined",
     "left",
     "register",
+    "remove_group",
     "service",
     "services",
+    "set_groups",
+    "set_health",
     "start",
     "system",
     "where",
@@ -91,15 +108,44 @@ system = System(container)
 
 
 def register(
-    provider: object, groups: str | Sequence[str] = (), *, implements: Sequence[type] = ()
+    provider: object,
+    groups: str | Sequence[str] = (),
+    *,
+    implements: Sequence[type] = (),
+    meta: Mapping[str, Scalar] | None = None,
 ) -> tuple[Handle, ...]:
     """Offer an object's services to the whole system; see `Container.register`."""
-    return container().register(provider, groups, implements=implements)
+    return container().register(provider, groups, implements=implements, meta=meta)
 
 
 def deregister(provider: object) -> None:
     """Withdraw an object's services from the whole system; see `Container.deregister`."""
     container().deregister(provider)
+
+
+def set_groups(provider: object, groups: str | Sequence[str]) -> None:
+    """Put a live provider into other groups; see `Container.set_groups`."""
+    container().set_groups(provider, groups)
+
+
+def add_group(provider: object, group: str) -> None:
+    """Put a live provider into one more group; see `Container.add_group`."""
+    container().add_group(provider, group)
+
+
+def remove_group(provider: object, group: str) -> None:
+    """Take a live provider out of a group; see `Container.remove_group`."""
+    container().remove_group(provider, group)
+
+
+def set_health(provider: object, health: str = HEALTHY) -> None:
+    """Say what is wrong with a provider, or that nothing is any more; see `Container.set_health`."""
+    container().set_health(provider, health)
+
+
+def alter(provider: object, *, meta: Mapping[str, Scalar] | None = None) -> None:
+    """Read a live provider again, as if registered anew; see `Container.alter`."""
+    container().alter(provider, meta=meta)
 
 
 def services(constraint: Constraint | None = None) -> list[Handle]:
@@ -110,6 +156,36 @@ def services(constraint: Constraint | None = None) -> list[Handle]:
 def find(constraint: Constraint, *, wait_s: float = 2.0) -> Handle:
     """The only service that matches; see `Container.find`."""
     return container().find(constraint, wait_s=wait_s)
+
+
+def call(constraint: Constraint, /, *args: Any, **kwargs: Any) -> Any:
+    """Call the only service that matches; see `Container.call`."""
+    return container().call(constraint, *args, **kwargs)
+
+
+def call_all(which: Constraint | Iterable[Handle | Bound], /, *args: Any, **kwargs: Any) -> list[Outcome]:
+    """Call several services at once; see `Container.call_all`."""
+    return container().call_all(which, *args, **kwargs)
+
+
+def call_sequence(calls: Iterable[Handle | Bound], /, *, go_on: bool = False) -> list[Outcome]:
+    """Make calls one after the other; see `Container.call_sequence`."""
+    return container().call_sequence(calls, go_on=go_on)
+
+
+async def acall(constraint: Constraint, /, *args: Any, **kwargs: Any) -> Any:
+    """`call` from asyncio."""
+    return await container().acall(constraint, *args, **kwargs)
+
+
+async def acall_all(which: Constraint | Iterable[Handle | Bound], /, *args: Any, **kwargs: Any) -> list[Outcome]:
+    """`call_all` from asyncio."""
+    return await container().acall_all(which, *args, **kwargs)
+
+
+async def acall_sequence(calls: Iterable[Handle | Bound], /, *, go_on: bool = False) -> list[Outcome]:
+    """`call_sequence` from asyncio."""
+    return await container().acall_sequence(calls, go_on=go_on)
 
 
 def containers() -> list[ContainerInfo]:
@@ -125,3 +201,8 @@ def joined(constraint: Constraint, call: Callback, *, existing: bool = False) ->
 def left(constraint: Constraint, call: Callback) -> Notification:
     """Call with the handle of every service that goes and matched; see `Container.left`."""
     return container().left(constraint, call)
+
+
+def changed(constraint: Constraint, call: Callback) -> Notification:
+    """Call with the handle of every service that matches and is altered; see `Container.changed`."""
+    return container().changed(constraint, call)

@@ -1,17 +1,25 @@
 """``where``: what a service must be. And, or, not, kept as disjunctive normal form; plain data that can be sent."""
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from fnmatch import fnmatchcase
-from typing import Final, Literal, Protocol
+from functools import lru_cache
+from typing import Any, Final, Literal, Protocol
 
+import msgspec
 from msgspec import Struct
 
+from trade._predicates import achieves_all, parse_predicates
+from trade._schemas import fits, read_json, read_types, readable, types_text
+from trade._wire import Scalar, ServiceInfo
 from trade.errors import ConfigurationError
 
 __all__ = ["Candidate", "Constraint", "where"]
 
 _MOST_CLAUSES: Final = 1000
-_Field = Literal["name", "group", "host", "container", "local"]
+_Field = Literal[
+    "name", "group", "host", "container", "local", "args", "returns", "achieves", "uses", "kind", "meta", "healthy"
+]
 
 
 class Candidate(Protocol):
@@ -27,14 +35,39 @@ class Candidate(Protocol):
     def container(self) -> str: ...
     @property
     def local(self) -> bool: ...
+    @property
+    def info(self) -> ServiceInfo: ...
+    @property
+    def kinds(self) -> Sequence[str]: ...
+    @property
+    def meta(self) -> Mapping[str, Scalar]: ...
+    @property
+    def healthy(self) -> bool: ...
 
 
 class Term(Struct, frozen=True, array_like=True, order=True):
-    """One test: a field against a pattern."""
+    """One test: a field against a pattern.
+
+    Patterns are texts: names and groups as they are, types as JSON Schema, predicates, a key and its value as JSON.
+    """
 
     field: _Field
     pattern: str
     negated: bool = False
+
+    def __post_init__(self) -> None:
+        """What comes by message is checked like what is written."""
+        match self.field:
+            case "args" | "returns":
+                schemas, _ = read_types(self.pattern)
+                if self.field == "returns" and len(schemas) != 1:
+                    raise ValueError("a service returns one thing")
+            case "achieves":
+                parse_predicates(self.pattern)
+            case "meta":
+                _key_and_value(self.pattern)
+            case _:
+                pass
 
     def __invert__(self) -> "Term":
         return Term(self.field, self.pattern, not self.negated)
@@ -43,21 +76,86 @@ class Term(Struct, frozen=True, array_like=True, order=True):
         return self._holds(candidate) is not self.negated
 
     def _holds(self, candidate: Candidate) -> bool:
-        if self.field == "local":
-            return candidate.local
-        if self.field == "group":
-            return any(under(group, self.pattern) for group in candidate.groups)
-        value: str = getattr(candidate, self.field)
-        return value == self.pattern or fnmatchcase(value, self.pattern)
+        match self.field:
+            case "local" | "healthy":
+                return bool(getattr(candidate, self.field))
+            case "group":
+                return any(under(group, self.pattern) for group in candidate.groups)
+            case "uses":
+                return any(under(resource, self.pattern) for resource in candidate.info.uses)
+            case "kind":
+                return any(_like(kind, self.pattern) for kind in candidate.kinds)
+            case "args":
+                return _takes(candidate.info, self.pattern)
+            case "returns":
+                return _returns(candidate.info, self.pattern)
+            case "achieves":
+                return achieves_all(candidate.info.achieves, parse_predicates(self.pattern))
+            case "meta":
+                key, value = _key_and_value(self.pattern)
+                return key in candidate.meta and _same(candidate.meta[key], value)
+            case "name" | "host" | "container":
+                return _like(getattr(candidate, self.field), self.pattern)
 
     def __str__(self) -> str:
-        text = "local" if self.field == "local" else f"{self.field}={self.pattern!r}"
-        return f"not {text}" if self.negated else text
+        return f"not {self._text()}" if self.negated else self._text()
+
+    def _text(self) -> str:
+        match self.field:
+            case "local" | "healthy":
+                return self.field
+            case "args":
+                return f"args={readable(self.pattern)}"
+            case "returns":
+                return f"returns={readable(self.pattern)[1:-1]}"
+            case "meta":
+                key, value = _key_and_value(self.pattern)
+                return f"meta {key}={value!r}"
+            case _:
+                return f"{self.field}={self.pattern!r}"
 
 
 def under(group: str, selected: str) -> bool:
     """Whether a dotted group is the selected one or beneath it; whole segments only."""
     return group == selected or group.startswith(selected + ".")
+
+
+def is_exact(pattern: str) -> bool:
+    """Whether a name's pattern stands for one name only."""
+    return not any(sign in pattern for sign in "*?[")
+
+
+def _like(name: str, pattern: str) -> bool:
+    return name == pattern or fnmatchcase(name, pattern)
+
+
+def _takes(info: ServiceInfo, pattern: str) -> bool:
+    """Whether the service can be called with so many positional arguments of these types."""
+    given, definitions = read_types(pattern)
+    places = [parameter for parameter in info.parameters if not parameter.keyword_only]
+    left_out = [parameter for parameter in info.parameters if parameter not in places[: len(given)]]
+    if len(given) > len(places) or any(parameter.required for parameter in left_out):
+        return False
+    properties, own = info.arguments_schema.get("properties", {}), info.arguments_schema.get("$defs", {})
+    return all(
+        not schema or fits(schema, definitions, properties.get(place.name, {}), own)  # {} is Any: of whatever type
+        for schema, place in zip(given, places, strict=False)
+    )
+
+
+def _returns(info: ServiceInfo, pattern: str) -> bool:
+    [wanted], definitions = read_types(pattern)
+    return fits(info.result_schema, info.result_schema.get("$defs", {}), wanted, definitions)
+
+
+@lru_cache(1024)
+def _key_and_value(pattern: str) -> tuple[str, Scalar]:
+    return read_json(pattern, tuple[str, Scalar])
+
+
+def _same(one: Scalar, other: Scalar) -> bool:
+    """Equal, and true is not 1."""
+    return one == other and isinstance(one, bool) is isinstance(other, bool)
 
 
 class Constraint(Struct, frozen=True):
@@ -104,6 +202,8 @@ class _Where:
 
     local: Final = Constraint((frozenset((Term("local", ""),)),))
     """Services of this very container."""
+    healthy: Final = Constraint((frozenset((Term("healthy", ""),)),))
+    """Services whose provider says that nothing is wrong."""
 
     def __call__(
         self,
@@ -113,6 +213,13 @@ class _Where:
         host: str | None = None,
         container: str | None = None,
         local: bool | None = None,
+        args: Sequence[Any] | None = None,
+        returns: Any = msgspec.UNSET,
+        achieves: str | Sequence[str] | None = None,
+        uses: str | None = None,
+        kind: str | None = None,
+        meta: Mapping[str, Scalar] | None = None,
+        healthy: bool | None = None,
     ) -> Constraint:
         """Services that fit everything said; nothing said: all.
 
@@ -122,13 +229,65 @@ class _Where:
             host: the computer's name, ``*`` and ``?`` allowed.
             container: the container's name, ``*`` and ``?`` allowed.
             local: whether it lives in this container.
+            args: types of positional arguments it can be called with; ``[]`` is a call without any. ``int`` fits
+                ``float``, a struct one that asks for no more fields; ``Any`` is an argument of whatever type.
+            returns: the type of its result, or one that fits it; ``None`` is a service without one.
+            achieves: a predicate that one of its post-conditions must fit; ``?x`` is a variable. Of several, each must
+                fit one, and a variable means the same in all.
+            uses: a physical resource; selects everything beneath it, too.
+            kind: name of its provider's class, or of a base or interface of that; ``*`` and ``?`` allowed.
+            meta: keys and values it is declared with.
+            healthy: whether its provider says that nothing is wrong.
+
+        Raises:
+            ConfigurationError: a pattern is empty, a type cannot be sent, a predicate is malformed.
         """
         given: tuple[tuple[_Field, str | None], ...]
         given = (("name", name), ("group", group), ("host", host), ("container", container))
+        given = (*given, ("uses", uses), ("kind", kind))
         terms = [Term(field, _pattern(field, pattern)) for field, pattern in given if pattern is not None]
-        if local is not None:
-            terms.append(Term("local", "", negated=not local))
+        flags: tuple[tuple[_Field, bool | None], ...] = (("local", local), ("healthy", healthy))
+        terms += [Term(field, "", negated=not flag) for field, flag in flags if flag is not None]
+        if args is not None:
+            terms.append(Term("args", types_text(_checked_types(args))))
+        if returns is not msgspec.UNSET:
+            terms.append(Term("returns", types_text([returns])))
+        if achieves is not None:
+            terms.append(Term("achieves", _predicates(achieves)))
+        for key, value in (meta or {}).items():
+            terms.append(Term("meta", _meta_text(key, value)))
         return Constraint((frozenset(terms),))
+
+
+def _checked_types(args: Any) -> Sequence[Any]:
+    if not isinstance(args, list | tuple):
+        raise ConfigurationError(problem=f"args must be a list of types, such as [float, str], not {args!r}")
+    return args  # pyright: ignore[reportUnknownVariableType]
+
+
+def _predicates(achieves: str | Sequence[str]) -> str:
+    several = [achieves] if isinstance(achieves, str) else achieves
+    text = ", ".join(_pattern("achieves", pattern) for pattern in several)
+    return ", ".join(map(str, parse_predicates(text)))
+
+
+def _meta_text(key: str, value: Scalar) -> str:
+    checked_meta({key: value})
+    return msgspec.json.encode([key, value]).decode()
+
+
+def checked_meta(meta: Mapping[str, Any]) -> dict[str, Scalar]:
+    """Plain key/values; raises ConfigurationError for anything else."""
+    for key, value in meta.items():
+        plain = value is None or isinstance(value, bool | int | float | str)
+        whole = not isinstance(value, int) or -(2**63) <= value < 2**63
+        if not isinstance(key, str) or not key or not plain or not whole:  # pyright: ignore[reportUnnecessaryIsInstance]
+            raise ConfigurationError(
+                problem=f"meta maps names to numbers, texts, booleans or None, not {key!r}: {value!r}"
+            )
+        if isinstance(value, float) and not math.isfinite(value):
+            raise ConfigurationError(problem=f"meta {key!r} must be finite, not {value}")
+    return dict(meta)
 
 
 def _pattern(field: str, pattern: str) -> str:

@@ -1,5 +1,6 @@
 """One participant: starts, joins, hosts providers, looks up, leaves. Ties the other modules together."""
 
+import asyncio
 import atexit
 import contextlib
 import difflib
@@ -7,19 +8,21 @@ import os
 import secrets
 import threading
 import weakref
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Final
 
 import msgspec
+from msgspec import structs
 
+from trade import _many
 from trade._calls import Caller
-from trade._constraints import Constraint, where
+from trade._constraints import Constraint, checked_meta, where
 from trade._dispatch import Dispatcher
-from trade._handle import Handle, Run
+from trade._handle import Bound, Handle, Run
 from trade._invoke import LocalTarget, RemoteTarget, Request, container_closed
 from trade._joining import join
 from trade._notifications import Callback, Notification, Notifier
-from trade._providers import Providers, checked_groups
+from trade._providers import Providers, checked_groups, checked_health
 from trade._reach import Reach
 from trade._registry import Change, Record, Registry
 from trade._settings import Settings
@@ -28,7 +31,10 @@ from trade._system import DOMAIN, PROVIDER, ContainerInfo, System, SystemService
 from trade._transport import ChannelClosed, Transport
 from trade._watch import Watch
 from trade._wire import (
+    HEALTHY,
     Address,
+    ProviderInfo,
+    Scalar,
     ServiceKey,
     alive_key,
     encode_message,
@@ -97,7 +103,12 @@ class Container:
     # --- hosting
 
     def register(
-        self, provider: object, groups: str | Sequence[str] = (), *, implements: Sequence[type] = ()
+        self,
+        provider: object,
+        groups: str | Sequence[str] = (),
+        *,
+        implements: Sequence[type] = (),
+        meta: Mapping[str, Scalar] | None = None,
     ) -> tuple[Handle, ...]:
         """Offer an object's services to the whole system.
 
@@ -105,6 +116,7 @@ class Container:
             provider: an object whose class, bases or interfaces have ``@service`` methods.
             groups: dotted labels such as ``"rosie.head"``.
             implements: interfaces (protocols) the object fits without inheriting from them.
+            meta: numbers, texts, booleans by name; holds for all its services, over what they say themselves.
 
         Returns:
             Handles of its services.
@@ -115,7 +127,7 @@ class Container:
         """
         self._check_open()
         try:
-            keys = self._providers.add(provider, checked_groups(provider, groups), implements)
+            keys = self._providers.add(provider, checked_groups(provider, groups), implements, meta=meta)
         except ChannelClosed:  # closed by another thread meanwhile
             raise container_closed(self.address) from None
         return tuple(self.handle(key) for key in keys)
@@ -128,6 +140,56 @@ class Container:
         """
         self._check_open()
         self._providers.remove(provider)
+
+    def set_groups(self, provider: object, groups: str | Sequence[str]) -> None:
+        """Put a live provider into other groups. Handles stay valid: its place was settled when it was registered.
+
+        Raises:
+            ConfigurationError: a malformed group, or it is not registered here.
+        """
+        named = checked_groups(provider, groups)
+        self._alter(provider, lambda info: structs.replace(info, groups=named))
+
+    def add_group(self, provider: object, group: str) -> None:
+        """Put a live provider into one more group. Raises like `set_groups`."""
+        [named] = checked_groups(provider, (group,))
+        self._alter(provider, lambda info: structs.replace(info, groups=tuple(dict.fromkeys((*info.groups, named)))))
+
+    def remove_group(self, provider: object, group: str) -> None:
+        """Take a live provider out of a group; one it is not in is fine. Raises like `set_groups`."""
+        self._alter(
+            provider,
+            lambda info: structs.replace(info, groups=tuple(known for known in info.groups if known != group)),
+        )
+
+    def set_health(self, provider: object, health: str = HEALTHY) -> None:
+        """Say what is wrong with a provider, such as ``"degraded: overheating"``, or that nothing is any more.
+
+        Raises:
+            ConfigurationError: no text, or it is not registered here.
+        """
+        said = checked_health(provider, health)
+        self._alter(provider, lambda info: structs.replace(info, health=said))
+
+    def alter(self, provider: object, *, meta: Mapping[str, Scalar] | None = None) -> None:
+        """Read a live provider again, as if it were registered anew: its class's marks, its resources. Handles hold.
+
+        Args:
+            provider: the object.
+            meta: instead of the metadata it was registered with; by default that stays.
+
+        Raises:
+            ConfigurationError: like `register`, or it is not registered here.
+        """
+        new = None if meta is None else checked_meta(meta)
+        self._alter(provider, lambda info: info if new is None else structs.replace(info, meta=new), reread=True)
+
+    def _alter(self, provider: object, change: Callable[[ProviderInfo], ProviderInfo], *, reread: bool = False) -> None:
+        self._check_open()
+        try:
+            self._providers.alter(provider, change, reread=reread)
+        except ChannelClosed:  # closed by another thread meanwhile
+            raise container_closed(self.address) from None
 
     # --- looking up
 
@@ -226,6 +288,14 @@ class Container:
         """Call with the (dead) handle of every service that goes and matched."""
         return self._notify("left", constraint, call, existing=False)
 
+    def changed(self, constraint: Constraint, call: Callback) -> Notification:
+        """Call with the handle of every service whose groups, metadata, health or description become others.
+
+        It fires for what matches, and once more for what has just ceased to. Who is quick may find several changes in
+        one.
+        """
+        return self._notify("changed", constraint, call, existing=False)
+
     def _notify(self, occasion: str, constraint: Constraint, call: Callback, *, existing: bool) -> Notification:
         self._check_open()
         if not callable(call):
@@ -259,6 +329,58 @@ class Container:
         request, run = Request(deadline_s), Run(handle)
         self._target(handle).begin(args, kwargs, request, run)
         return run
+
+    def call(self, constraint: Constraint, /, *args: Any, **kwargs: Any) -> Any:
+        """Call the only service that matches. Raises what `find` raises, and what the call does."""
+        return self.find(constraint)(*args, **kwargs)
+
+    def call_all(
+        self, which: Constraint | Iterable[Handle | Bound], /, *args: Any, **kwargs: Any
+    ) -> list[_many.Outcome]:
+        """Call several services at once and wait for all of them.
+
+        Args:
+            which: a constraint (all that match now), or handles; bound calls bring arguments of their own.
+            args: for each.
+            kwargs: for each.
+
+        Returns:
+            An outcome for each, in order; what one raises is its own outcome and stops no other.
+        """
+        return _many.all_outcomes(self._bound(which, args, kwargs))
+
+    def call_sequence(self, calls: Iterable[Handle | Bound], /, *, go_on: bool = False) -> list[_many.Outcome]:
+        """Make calls one after the other.
+
+        Args:
+            calls: bound calls, or handles of services without arguments.
+            go_on: also after an error, at which it stops otherwise.
+
+        Returns:
+            Outcomes of those that ran.
+        """
+        return _many.sequence(self._bound(calls, (), {}), go_on=go_on)
+
+    async def acall(self, constraint: Constraint, /, *args: Any, **kwargs: Any) -> Any:
+        """`call` from asyncio."""
+        handle = await asyncio.to_thread(self.find, constraint)
+        return await handle.acall(*args, **kwargs)
+
+    async def acall_all(
+        self, which: Constraint | Iterable[Handle | Bound], /, *args: Any, **kwargs: Any
+    ) -> list[_many.Outcome]:
+        """`call_all` from asyncio."""
+        return await _many.all_outcomes_async(self._bound(which, args, kwargs))
+
+    async def acall_sequence(self, calls: Iterable[Handle | Bound], /, *, go_on: bool = False) -> list[_many.Outcome]:
+        """`call_sequence` from asyncio."""
+        return await _many.sequence_async(self._bound(calls, (), {}), go_on=go_on)
+
+    def _bound(
+        self, which: Constraint | Iterable[Handle | Bound], args: tuple[Any, ...], kwargs: dict[str, Any]
+    ) -> list[Bound]:
+        self._check_open()
+        return _many.bound(self.services(which) if isinstance(which, Constraint) else which, args, kwargs)
 
     def _target(self, handle: Handle) -> LocalTarget | RemoteTarget:
         target = self._targets.get(handle.key)

@@ -2,14 +2,16 @@
 
 import asyncio
 import concurrent.futures
+import contextlib
 from collections.abc import Callable, Generator, Mapping
+from types import MappingProxyType
 from typing import Any, Final, Protocol
 
 from trade._registry import Record
-from trade._wire import Address, ServiceKey
+from trade._wire import Address, Scalar, ServiceKey
 from trade.errors import ConfigurationError
 
-__all__ = ["Handle", "Run"]
+__all__ = ["Bound", "Handle", "Run"]
 
 LONGEST_DEADLINE_S: Final = 86_400.0
 
@@ -77,6 +79,17 @@ class Run:
         except BaseException as error:  # noqa: BLE001 - whatever the service raised belongs to who asks for the result
             self._future.set_exception(error)
 
+    async def settled(self) -> None:
+        """Wait for its end from asyncio, well or not; the service goes on if this waiting is cancelled."""
+        loop, ended = asyncio.get_running_loop(), asyncio.Event()
+
+        def tell(_: object) -> None:
+            with contextlib.suppress(RuntimeError):  # nobody waits any more: that loop has ended
+                loop.call_soon_threadsafe(ended.set)
+
+        self._future.add_done_callback(tell)
+        await ended.wait()
+
     def __await__(self) -> Generator[Any, None, Any]:
         return asyncio.wrap_future(self._future).__await__()
 
@@ -88,6 +101,8 @@ class Handle:
     """
 
     __slots__ = ("_deadline_s", "_home", "_record", "key")
+    __trade_type__: Final = "Handle"
+    """Its name in JSON Schema."""
 
     def __init__(self, home: Home, key: ServiceKey, record: Record | None, deadline_s: float | None = None) -> None:
         self._home = home
@@ -120,6 +135,10 @@ class Handle:
             problem = f"deadline_s must be more than 0 and at most {LONGEST_DEADLINE_S:.0f} (a day), not {deadline_s}"
             raise ConfigurationError(problem=problem)
         return Handle(self._home, self.key, self._record, deadline_s)
+
+    def bind(self, *args: Any, **kwargs: Any) -> "Bound":
+        """The call as a value, to be made later; arguments are checked then."""
+        return Bound(self, args, kwargs)
 
     # --- telling
 
@@ -190,6 +209,26 @@ class Handle:
         return self.record.info.uses
 
     @property
+    def achieves(self) -> tuple[str, ...]:
+        """Its post-conditions."""
+        return self.record.info.achieves
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """Names of its provider's class and of the bases and interfaces that have services."""
+        return self.record.kinds
+
+    @property
+    def meta(self) -> Mapping[str, Scalar]:
+        """What it is declared with, and its provider over it."""
+        return self.record.meta
+
+    @property
+    def health(self) -> str:
+        """``healthy``, or what its provider says is wrong."""
+        return self.record.health
+
+    @property
     def roles(self) -> tuple[str, ...]:
         """Roles a caller needs; none are asked for until a policy is loaded."""
         return ()
@@ -220,3 +259,44 @@ class Handle:
 
     def __repr__(self) -> str:
         return f"<Handle {self.label} in {self.container}>"
+
+
+class Bound:
+    """A call that can be made: a handle with arguments. Call it, compare it, put it into a sequence."""
+
+    __slots__ = ("args", "handle", "kwargs")
+
+    def __init__(self, handle: Handle, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> None:
+        self.handle = handle
+        """Which service."""
+        self.args = args
+        """Positional arguments."""
+        self.kwargs = MappingProxyType(dict(kwargs))
+        """Arguments by name."""
+
+    def __call__(self) -> Any:
+        """Make the call and wait for the result."""
+        return self.handle(*self.args, **self.kwargs)
+
+    def start(self) -> Run:
+        """Make the call without waiting."""
+        return self.handle.start(*self.args, **self.kwargs)
+
+    async def acall(self) -> Any:
+        """Make the call from asyncio."""
+        return await self.start()
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Bound) and (self.handle, self.args, self.kwargs) == (
+            other.handle,
+            other.args,
+            other.kwargs,
+        )
+
+    def __hash__(self) -> int:
+        """Raises TypeError if an argument has no hash."""
+        return hash((self.handle, self.args, frozenset(self.kwargs.items())))
+
+    def __repr__(self) -> str:
+        given = [*map(repr, self.args), *(f"{name}={value!r}" for name, value in self.kwargs.items())]
+        return f"<Bound {self.handle.label}({', '.join(given)}) in {self.handle.container}>"

@@ -1,4 +1,4 @@
-"""Standing requests: on this occasion, make that call. Here: ``joined`` and ``left``."""
+"""Standing requests: on this occasion, make that call. Here: ``joined``, ``left`` and ``changed``."""
 
 import logging
 import queue
@@ -13,7 +13,7 @@ from trade._registry import Change, Record
 _logger = logging.getLogger("trade")
 
 Callback = Callable[[Handle], Any]
-"""A handle of a service, or a function of this process; it is given the handle of the service that came or went."""
+"""A handle of a service, or a function of this process; it is given the handle of what came, went or changed."""
 
 
 class Notification:
@@ -64,15 +64,9 @@ class Notifier:
         """Told by the registry."""
         with self._lock:
             self._standing = [standing for standing in self._standing if standing.active]
-            for occasion, records in (("joined", change.joined), ("left", change.left)):
-                for notification in self._standing:
-                    if notification.occasion == occasion:
-                        self._match(notification, records)
-
-    def _match(self, notification: Notification, records: list[Record]) -> None:
-        for record in records:
-            if notification.constraint.matches(record):
-                self._queue.put((notification, self._handle(record)))
+            for notification in self._standing:
+                for record in _concerned(notification, change):
+                    self._queue.put((notification, self._handle(record)))
 
     def _fire(self) -> None:
         while (item := self._queue.get()) is not None:
@@ -91,3 +85,13 @@ class Notifier:
         self._queue.put(None)
         if self._thread is not None and self._thread is not threading.current_thread():
             self._thread.join(2)
+
+
+def _concerned(notification: Notification, change: Change) -> list[Record]:
+    matches = notification.constraint.matches
+    if notification.occasion == "joined":
+        return [record for record in change.joined if matches(record)]
+    if notification.occasion == "left":
+        return [record for record in change.left if matches(record)]
+    altered = [(old, new) for old, new in zip(change.before, change.replaced, strict=True) if old != new]
+    return [new for old, new in altered if matches(old) or matches(new)]

@@ -4,21 +4,34 @@ import os
 import re
 import socket
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
 from msgspec import Struct, structs
 
+from trade._constraints import checked_meta
 from trade._dispatch import AsyncLoop, LocalService
 from trade._registry import Registry
-from trade._service import ServiceMark, marked_methods
+from trade._service import ServiceMark, kinds_of, marked_methods
 from trade._signature import Codec, Signature
 from trade._system import DOMAIN
 from trade._transport import Publisher, Transport
-from trade._wire import Address, ProviderInfo, ServiceKey, as_chunk, domain_of, encode_message, registry_key
+from trade._wire import (
+    Address,
+    ProviderInfo,
+    Scalar,
+    ServiceInfo,
+    ServiceKey,
+    as_chunk,
+    domain_of,
+    encode_message,
+    registry_key,
+)
 from trade.errors import ConfigurationError
 
 _GROUP: Final = re.compile(r"[A-Za-z0-9_-]{1,80}(\.[A-Za-z0-9_-]{1,80})*")
+
+_LONGEST_HEALTH: Final = 500
 
 
 class _Registered(Struct, frozen=True):
@@ -27,6 +40,9 @@ class _Registered(Struct, frozen=True):
     provider: Any
     services: dict[str, LocalService]
     announcement: Publisher
+    implements: tuple[type, ...]
+    info: ProviderInfo
+    """As it was announced last."""
 
 
 class Providers:
@@ -39,12 +55,20 @@ class Providers:
         self._codec = codec
         self._loop = AsyncLoop()
         self._lock = threading.Lock()
+        self._announcing = threading.RLock()
+        """Revisions go out in order, one at a time."""
         self._hosted: dict[str, _Registered] = {}
         self._names: dict[int, str] = {}
         self._counter = 0
 
     def add(
-        self, provider: object, groups: tuple[str, ...], implements: Sequence[type] = (), *, name: str | None = None
+        self,
+        provider: object,
+        groups: tuple[str, ...],
+        implements: Sequence[type] = (),
+        *,
+        meta: Mapping[str, Scalar] | None = None,
+        name: str | None = None,
     ) -> list[ServiceKey]:
         """Host an object: callable first, announced then. Returns the keys of its services.
 
@@ -52,6 +76,7 @@ class Providers:
             provider: the object; kept until it is removed.
             groups: dotted labels, checked by the caller of this.
             implements: interfaces beside those it inherits from.
+            meta: holds for all its services, over what they say themselves.
             name: of the provider in keys; by default its class and a number.
 
         Raises:
@@ -59,22 +84,68 @@ class Providers:
         """
         kind = type(provider).__qualname__
         services = self._services_of(provider, groups, implements)
-        infos = tuple(service.signature.info for service in services.values())
         domain = domain_of(groups)
-        with self._lock:
-            if id(provider) in self._names:
-                raise ConfigurationError(where=kind, problem="this object is registered already; deregister it first")
-            self._counter += 1
-            chunk = name or f"{as_chunk(type(provider).__name__)[:60]}-{self._counter}"
-            announcement = self._transport.announce(registry_key(domain, self._own, chunk))
-            self._names[id(provider)] = f"{domain}/{chunk}"
-            self._hosted[f"{domain}/{chunk}"] = _Registered(provider, services, announcement)
         info = ProviderInfo(
-            revision=1, groups=groups, kind=kind, host=socket.gethostname(), pid=os.getpid(), services=infos
+            revision=1,
+            groups=groups,
+            kind=kind,
+            host=socket.gethostname(),
+            pid=os.getpid(),
+            services=_infos(services),
+            kinds=kinds_of(type(provider), implements),
+            meta=checked_meta(meta or {}),
         )
+        with self._announcing:
+            with self._lock:
+                if id(provider) in self._names:
+                    problem = "this object is registered already; deregister it first"
+                    raise ConfigurationError(where=kind, problem=problem)
+                self._counter += 1
+                chunk = name or f"{as_chunk(type(provider).__name__)[:60]}-{self._counter}"
+                place = f"{domain}/{chunk}"
+                announcement = self._transport.announce(registry_key(domain, self._own, chunk))
+                self._names[id(provider)] = place
+                self._hosted[place] = _Registered(provider, services, announcement, tuple(implements), info)
+            self._announce(place, info)
+        return [ServiceKey(self._own, domain, chunk, service) for service in services]
+
+    def alter(self, provider: object, change: Callable[[ProviderInfo], ProviderInfo], *, reread: bool = False) -> None:
+        """Tell everybody something else about a provider, in a new revision. Its place stays: handles hold.
+
+        Args:
+            provider: the object.
+            change: from what was announced to what is to be.
+            reread: read its class and resources again, too; calls under way end as they began.
+
+        Raises:
+            ConfigurationError: it is not registered here, or the class has become wrong.
+        """
+        with self._announcing:
+            place, known = self._known(provider)
+            info = change(known.info)
+            services = known.services
+            if reread:
+                services = self._services_of(provider, info.groups, known.implements)
+                kinds = kinds_of(type(provider), known.implements)
+                info = structs.replace(info, services=_infos(services), kinds=kinds)
+            if not reread and info == known.info:
+                return
+            info = structs.replace(info, revision=known.info.revision + 1)
+            with self._lock:
+                self._hosted[place] = structs.replace(known, services=services, info=info)
+            self._announce(place, info)
+
+    def _known(self, provider: object) -> tuple[str, _Registered]:
+        with self._lock:
+            place = self._names.get(id(provider))
+            if place is None:
+                raise _not_registered(provider)
+            return place, self._hosted[place]
+
+    def _announce(self, place: str, info: ProviderInfo) -> None:
+        domain, _, chunk = place.partition("/")
         self._registry.put(self._own, domain, chunk, info)
-        announcement.put(encode_message(info))
-        return [ServiceKey(self._own, domain, chunk, info.name) for info in infos]
+        self._hosted[place].announcement.put(encode_message(info))
 
     def remove(self, provider: object) -> None:
         """Stop hosting an object: gone from the registry first, uncallable then.
@@ -82,14 +153,14 @@ class Providers:
         Raises:
             ConfigurationError: it is not registered here.
         """
-        with self._lock:
-            place = self._names.pop(id(provider), None)
-            if place is None:
-                where = type(provider).__qualname__
-                raise ConfigurationError(where=where, problem="it is not registered in this container")
-            registered = self._hosted.pop(place)
-        self._registry.remove(self._own, place.partition("/")[2])
-        registered.announcement.close()
+        with self._announcing:
+            with self._lock:
+                place = self._names.pop(id(provider), None)
+                if place is None:
+                    raise _not_registered(provider)
+                registered = self._hosted.pop(place)
+            self._registry.remove(self._own, place.partition("/")[2])
+            registered.announcement.close()
 
     def lookup(self, place: str, service: str) -> LocalService | None:
         """A service as calls name it.
@@ -127,6 +198,14 @@ class Providers:
         return services
 
 
+def _infos(services: Mapping[str, LocalService]) -> tuple[ServiceInfo, ...]:
+    return tuple(service.signature.info for service in services.values())
+
+
+def _not_registered(provider: object) -> ConfigurationError:
+    return ConfigurationError(where=type(provider).__qualname__, problem="it is not registered in this container")
+
+
 def _require_stop(kind: str, resources: tuple[str, ...], marks: Sequence[ServiceMark]) -> None:
     """S17: what moves something physical is not offered without a way to stop it."""
     physical = resources or any(mark.uses for mark in marks)
@@ -145,3 +224,11 @@ def checked_groups(provider: object, groups: str | Sequence[str]) -> tuple[str, 
             problem = f"{group!r} is no group; use words joined by dots, such as rosie.head ({DOMAIN!r} is reserved)"
             raise ConfigurationError(where=type(provider).__qualname__, problem=problem)
     return named
+
+
+def checked_health(provider: object, health: str) -> str:
+    """A health text; raises ConfigurationError for what is none."""
+    if not isinstance(health, str) or not 0 < len(health) <= _LONGEST_HEALTH:  # pyright: ignore[reportUnnecessaryIsInstance]
+        problem = f"health must be a text of 1 to {_LONGEST_HEALTH} characters that says what is wrong, or 'healthy'"
+        raise ConfigurationError(where=type(provider).__qualname__, problem=problem)
+    return health

@@ -2,12 +2,13 @@
 
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 from trade._constraints import Constraint
-from trade._wire import Address, ProviderInfo, ServiceInfo, ServiceKey
+from trade._index import Index
+from trade._wire import HEALTHY, Address, ProviderInfo, Scalar, ServiceInfo, ServiceKey
 
 __all__ = ["ContainerState", "Record", "Registry"]
 
@@ -23,6 +24,13 @@ class Record:
     host: str
     pid: int
     local: bool
+    kinds: tuple[str, ...]
+    meta: Mapping[str, Scalar]
+    health: str
+
+    @property
+    def healthy(self) -> bool:
+        return self.health == HEALTHY
 
     @property
     def name(self) -> str:
@@ -55,6 +63,8 @@ class Change(NamedTuple):
     left: list[Record]
     replaced: list[Record]
     """The same services, told anew."""
+    before: list[Record]
+    """What was known of those, in the same order."""
 
 
 _MOST_ENDED: Final = 256
@@ -71,7 +81,7 @@ class Registry:
     def __init__(self, own: Address) -> None:
         self._own = own
         self._containers: dict[Address, ContainerState] = {}
-        self._records: dict[ServiceKey, Record] = {}
+        self._records: Index[Record] = Index()
         self._changed = threading.Condition()
         self._telling = threading.RLock()
         self._listeners: list[Callable[[Change], None]] = []
@@ -149,6 +159,9 @@ class Registry:
                 host=info.host,
                 pid=info.pid,
                 local=address == self._own,
+                kinds=info.kinds,
+                meta={**service.meta, **info.meta},
+                health=info.health,
             )
             for service in info.services
         ]
@@ -156,18 +169,20 @@ class Registry:
     def _swap(self, before: Iterable[Record], after: Iterable[Record], alive: bool) -> Change:
         """Replace records in the index, under the lock. What stays under its key neither joins nor leaves."""
         if not alive:
-            return Change([], [], [])
+            return Change([], [], [], [])
         old = {record.key: record for record in before}
         new = {record.key: record for record in after}
-        self._records.update(new)
+        for record in new.values():
+            self._records.put(record)
         for key in old:
             if key not in new:
-                self._records.pop(key, None)
+                self._records.remove(key)
         self._changed.notify_all()
         return Change(
             joined=[new[key] for key in new if key not in old],
             left=[old[key] for key in old if key not in new],
             replaced=[new[key] for key in new if key in old],
+            before=[old[key] for key in new if key in old],
         )
 
     def _tell(self, change: Change) -> None:
@@ -182,7 +197,7 @@ class Registry:
 
     def select(self, constraint: Constraint) -> list[Record]:
         """Records that match, ordered by label and place."""
-        records = [record for record in list(self._records.values()) if constraint.matches(record)]
+        records = [record for record in self._records.candidates(constraint) if constraint.matches(record)]
         return sorted(records, key=lambda record: (record.label, str(record.key.address), record.key.provider))
 
     def wait_for(self, ready: Callable[[], bool], timeout_s: float) -> bool:

@@ -3,10 +3,13 @@
 # pyright: reportUnknownArgumentType=false
 
 import inspect
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any, Literal, TypeVar, overload
 
+from trade._constraints import checked_meta
+from trade._predicates import parse_achieved
+from trade._wire import Scalar
 from trade.errors import ConfigurationError
 
 __all__ = ["Effect", "ServiceMark", "marked_methods", "service"]
@@ -26,13 +29,19 @@ class ServiceMark:
     cancel: str | None = None
     achieves: tuple[str, ...] = ()
     uses: tuple[str, ...] = ()
+    meta: Mapping[str, Scalar] = field(default_factory=dict[str, Scalar])
 
 
 @overload
 def service(function: _Function, /) -> _Function: ...
 @overload
 def service(
-    *, effect: Effect = "actuate", cancel: str | None = None, achieves: Sequence[str] = (), uses: Sequence[str] = ()
+    *,
+    effect: Effect = "actuate",
+    cancel: str | None = None,
+    achieves: Sequence[str] = (),
+    uses: Sequence[str] = (),
+    meta: Mapping[str, Scalar] | None = None,
 ) -> Callable[[_Function], _Function]: ...
 def service(
     function: Callable[..., Any] | None = None,
@@ -42,6 +51,7 @@ def service(
     cancel: str | None = None,
     achieves: Sequence[str] = (),
     uses: Sequence[str] = (),
+    meta: Mapping[str, Scalar] | None = None,
 ) -> Any:
     """Mark a method as a service, in a class or in an interface whose implementations then have it.
 
@@ -49,15 +59,18 @@ def service(
         effect: ``"read"`` changes nothing, ``"actuate"`` (default) may move something or change state, ``"stop"`` ends
             motion: it overtakes everything and ignores deadlines.
         cancel: name of the service of the same provider that ends this one early.
-        achieves: post-conditions, such as ``"open(gripper)"``.
+        achieves: post-conditions, predicates such as ``"open(gripper)"`` or ``"at(?place)"``.
         uses: physical resources it needs for itself.
+        meta: numbers, texts, booleans by name, for others to select by: ``{"payload_kg": 2}``.
 
     Raises:
-        ConfigurationError: the effect is none of these.
+        ConfigurationError: the effect is none of these, a post-condition is malformed, metadata is no plain value.
     """
     if effect not in _EFFECTS:
         raise ConfigurationError(problem=f"effect must be one of {', '.join(_EFFECTS)}, not {effect!r}")
-    mark = ServiceMark(effect, cancel, _several(achieves), _several(uses))
+    for condition in _several(achieves):
+        parse_achieved(condition)
+    mark = ServiceMark(effect, cancel, _several(achieves), _several(uses), checked_meta(meta or {}))
 
     def note(target: _Function) -> _Function:
         function: Any = getattr(target, "__func__", target)  # a class or static method: its function carries the mark
@@ -89,6 +102,20 @@ def marked_methods(cls: type, interfaces: Sequence[type] = ()) -> dict[str, tupl
                 found[name] = (mark, function)
     _check(cls, found)
     return found
+
+
+def kinds_of(cls: type, interfaces: Sequence[type] = ()) -> tuple[str, ...]:
+    """Names of a class and of its bases and interfaces that have services."""
+    every = (*cls.__mro__, *(base for interface in interfaces for base in interface.__mro__))
+    serving = [base.__name__ for base in every if base is cls or any(map(_has_marks, base.__mro__))]
+    return tuple(dict.fromkeys(serving))
+
+
+def _has_marks(cls: type) -> bool:
+    return any(
+        isinstance(getattr(getattr(member, "__func__", member), _MARK, None), ServiceMark)
+        for member in vars(cls).values()
+    )
 
 
 def _check(cls: type, found: dict[str, tuple[ServiceMark, Callable[..., Any]]]) -> None:

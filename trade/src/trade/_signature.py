@@ -269,7 +269,7 @@ def _describe(
 ) -> ServiceInfo:
     for parameter in parameters:
         _described(where, f"argument {parameter.name!r}", lambda kind=kinds[parameter.name]: codec.schema(kind))
-    fields = [_field(parameter, kinds[parameter.name]) for parameter in parameters]
+    fields = [_field(parameter, noted(kinds[parameter.name])) for parameter in parameters]
     _, inside = codec.schema(msgspec.defstruct("Arguments", fields, kw_only=True))
     arguments_schema = inside.pop("Arguments")
     result_schema, definitions = _described(where, "its result", lambda: codec.schema(noted(returns)))
@@ -283,6 +283,7 @@ def _describe(
         cancel=mark.cancel,
         achieves=mark.achieves,
         uses=mark.uses,
+        meta=dict(mark.meta),
         parameters=tuple(_parameter(parameter) for parameter in parameters),
         arguments_schema={**arguments_schema, "$defs": inside} if inside else arguments_schema,
         result_schema={**result_schema, "$defs": definitions} if definitions else result_schema,

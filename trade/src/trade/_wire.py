@@ -135,6 +135,13 @@ class ErrorInfo(Struct):
     traceback: str = ""
 
 
+Scalar = bool | int | float | str | None
+"""What metadata may be."""
+
+HEALTHY: Final = "healthy"
+"""The health of a provider with which nothing is wrong; any other text says what is."""
+
+
 class Parameter(Struct, frozen=True, array_like=True):
     """One parameter of a service."""
 
@@ -159,6 +166,7 @@ class ServiceInfo(Struct, frozen=True, kw_only=True, omit_defaults=True):
     result_schema: dict[str, Any] = {}
     types: dict[str, str] = {}
     """Schema definition -> ``module:qualified name``, so that a process that has the type gets the type."""
+    meta: dict[str, Scalar] = {}
 
 
 class ProviderInfo(Struct, frozen=True, kw_only=True):
@@ -171,6 +179,11 @@ class ProviderInfo(Struct, frozen=True, kw_only=True):
     host: str
     pid: int
     services: tuple[ServiceInfo, ...]
+    kinds: tuple[str, ...] = ()
+    """Names of its class and of the bases and interfaces that have services."""
+    meta: dict[str, Scalar] = {}
+    """Holds for all its services, over what they say themselves."""
+    health: str = HEALTHY
 
 
 EMPTY: Final = Raw(msgspec.msgpack.encode(None))

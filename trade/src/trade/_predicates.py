@@ -1,0 +1,163 @@
+"""Predicates such as ``on(cup, table)``: what services achieve, and patterns with variables that ask for it."""
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from functools import lru_cache
+from typing import Final
+
+from msgspec import Struct
+
+from trade.errors import ConfigurationError
+
+_TOKEN: Final = re.compile(r"\s*([?]?[\w.+-]+|[(),])\s*")
+_LONGEST: Final = 1000
+_DEEPEST: Final = 20
+_Bindings = Mapping[str, "Predicate"]
+
+
+class Predicate(Struct, frozen=True):
+    """A name with arguments, or a variable: a name that begins with ``?``."""
+
+    functor: str
+    arguments: tuple["Predicate", ...] = ()
+
+    @property
+    def is_variable(self) -> bool:
+        return self.functor.startswith("?")
+
+    def __str__(self) -> str:
+        inner = ", ".join(map(str, self.arguments))
+        return f"{self.functor}({inner})" if inner else self.functor
+
+
+@lru_cache(4096)
+def parse_predicates(text: str) -> tuple[Predicate, ...]:
+    """One predicate or several between commas; raises ConfigurationError saying where it goes wrong."""
+    return _Parser(text).read()
+
+
+def parse_achieved(text: str) -> Predicate:
+    """What a service achieves: one predicate, and not just a variable. Raises ConfigurationError."""
+    several = parse_predicates(text)
+    if len(several) != 1 or several[0].is_variable:
+        raise ConfigurationError(problem=f"{text!r} is no post-condition; write one predicate, such as open(gripper)")
+    return several[0]
+
+
+@lru_cache(4096)
+def read_achieved(text: str) -> Predicate | None:
+    """What another container says its service achieves; None for what is no post-condition."""
+    try:
+        return _renamed(parse_achieved(text))
+    except ConfigurationError:
+        return None
+
+
+class _Parser:
+    def __init__(self, text: str) -> None:
+        self._text = text
+        self._tokens: list[str] = []
+        self._at = 0
+
+    def read(self) -> tuple[Predicate, ...]:
+        self._split()
+        found = self._several(0)
+        if self._at < len(self._tokens):
+            raise self._wrong(f"{self._tokens[self._at]!r} is one too many")
+        return found
+
+    def _split(self) -> None:
+        end = 0
+        while end < len(self._text) <= _LONGEST:
+            token = _TOKEN.match(self._text, end)
+            if token is None:
+                raise self._wrong(f"{self._text[end]!r} cannot stand there")
+            self._tokens.append(token[1])
+            end = token.end()
+        if len(self._text) > _LONGEST:
+            raise ConfigurationError(problem=f"a predicate has at most {_LONGEST} characters, not {len(self._text)}")
+
+    def _several(self, depth: int) -> tuple[Predicate, ...]:
+        found = [self._one(depth)]
+        while self._take(","):
+            found.append(self._one(depth))
+        return tuple(found)
+
+    def _one(self, depth: int) -> Predicate:
+        if depth > _DEEPEST:
+            raise self._wrong(f"it is nested deeper than {_DEEPEST}")
+        name = self._tokens[self._at] if self._at < len(self._tokens) else ""
+        if name in ("", "(", ")", ","):
+            raise self._wrong("a name is missing")
+        self._at += 1
+        if not self._take("("):
+            return Predicate(name)
+        if name.startswith("?"):
+            raise self._wrong("a variable has no arguments")
+        if self._take(")"):
+            return Predicate(name)
+        arguments = self._several(depth + 1)
+        if not self._take(")"):
+            raise self._wrong("a closing parenthesis is missing")
+        return Predicate(name, arguments)
+
+    def _take(self, token: str) -> bool:
+        there = self._at < len(self._tokens) and self._tokens[self._at] == token
+        self._at += there
+        return there
+
+    def _wrong(self, problem: str) -> ConfigurationError:
+        return ConfigurationError(
+            problem=f"{self._text!r} is no predicate: {problem}; write it like see(?x) or on(cup, table)"
+        )
+
+
+def _renamed(predicate: Predicate) -> Predicate:
+    """With variables no pattern can have: one side's ``?x`` is not the other's."""
+    if predicate.is_variable:
+        return Predicate("?:" + predicate.functor[1:])
+    return Predicate(predicate.functor, tuple(map(_renamed, predicate.arguments)))
+
+
+def achieves_all(achieved: Sequence[str], patterns: Sequence[Predicate]) -> bool:
+    """Whether every pattern fits one of the post-conditions, a variable meaning the same throughout."""
+    facts = [fact for fact in map(read_achieved, achieved) if fact is not None]
+    return any(True for _ in _solutions(facts, patterns, {}))
+
+
+def _solutions(facts: Sequence[Predicate], patterns: Sequence[Predicate], bindings: _Bindings) -> Iterator[_Bindings]:
+    if not patterns:
+        yield bindings
+        return
+    for fact in facts:
+        agreed = _unified(patterns[0], fact, bindings)
+        if agreed is not None:
+            yield from _solutions(facts, patterns[1:], agreed)
+
+
+def _unified(left: Predicate, right: Predicate, bindings: _Bindings) -> _Bindings | None:
+    left, right = _walked(left, bindings), _walked(right, bindings)
+    if left == right:
+        return bindings
+    if left.is_variable:
+        return None if _occurs(left, right, bindings) else {**bindings, left.functor: right}
+    if right.is_variable:
+        return _unified(right, left, bindings)
+    if left.functor != right.functor or len(left.arguments) != len(right.arguments):
+        return None
+    agreed: _Bindings | None = bindings
+    for one, other in zip(left.arguments, right.arguments, strict=True):
+        if agreed is not None:
+            agreed = _unified(one, other, agreed)
+    return agreed
+
+
+def _walked(term: Predicate, bindings: _Bindings) -> Predicate:
+    while term.is_variable and term.functor in bindings:
+        term = bindings[term.functor]
+    return term
+
+
+def _occurs(variable: Predicate, term: Predicate, bindings: _Bindings) -> bool:
+    term = _walked(term, bindings)
+    return term == variable or any(_occurs(variable, inner, bindings) for inner in term.arguments)
