@@ -12,9 +12,10 @@ from msgspec import Meta
 from trade import errors
 from trade._constraints import Constraint, where
 from trade._container import Container
-from trade._context import CallContext, current_call
+from trade._context import CallContext, current_call, progress
 from trade._handle import Handle, Run
 from trade._notifications import Callback, Notification
+from trade._secret import Secret
 from trade._service import service
 from trade._settings import Settings
 from trade._system import ContainerInfo
@@ -28,6 +29,7 @@ __all__ = [
     "Meta",
     "Notification",
     "Run",
+    "Secret",
     "Settings",
     "close",
     "container",
@@ -38,6 +40,7 @@ __all__ = [
     "find",
     "joined",
     "left",
+    "progress",
     "register",
     "service",
     "services",

@@ -26,13 +26,21 @@ class ServiceMark:
     cancel: str | None = None
     achieves: tuple[str, ...] = ()
     uses: tuple[str, ...] = ()
+    serial: bool = False
+    strict: bool = True
 
 
 @overload
 def service(function: _Function, /) -> _Function: ...
 @overload
 def service(
-    *, effect: Effect = "actuate", cancel: str | None = None, achieves: Sequence[str] = (), uses: Sequence[str] = ()
+    *,
+    effect: Effect = "actuate",
+    cancel: str | None = None,
+    achieves: Sequence[str] = (),
+    uses: Sequence[str] = (),
+    serial: bool = False,
+    strict: bool = True,
 ) -> Callable[[_Function], _Function]: ...
 def service(
     function: Callable[..., Any] | None = None,
@@ -42,6 +50,8 @@ def service(
     cancel: str | None = None,
     achieves: Sequence[str] = (),
     uses: Sequence[str] = (),
+    serial: bool = False,
+    strict: bool = True,
 ) -> Any:
     """Mark a method as a service, in a class or in an interface whose implementations then have it.
 
@@ -51,13 +61,18 @@ def service(
         cancel: name of the service of the same provider that ends this one early.
         achieves: post-conditions, such as ``"open(gripper)"``.
         uses: physical resources it needs for itself.
+        serial: it never runs beside another serial service of the same object; calls wait in order of arrival.
+        strict: a local call sees what a remote one would, validated arguments and copies. False: it goes straight
+            through by reference, checked and copied by nobody; what needs physical resources is always strict.
 
     Raises:
-        ConfigurationError: the effect is none of these.
+        ConfigurationError: the effect is none of these, or the options contradict each other.
     """
     if effect not in _EFFECTS:
         raise ConfigurationError(problem=f"effect must be one of {', '.join(_EFFECTS)}, not {effect!r}")
-    mark = ServiceMark(effect, cancel, _several(achieves), _several(uses))
+    if serial and effect == "stop":
+        raise ConfigurationError(problem="a stop waits for nobody: it cannot be serial")
+    mark = ServiceMark(effect, cancel, _several(achieves), _several(uses), serial, strict)
 
     def note(target: _Function) -> _Function:
         function: Any = getattr(target, "__func__", target)  # a class or static method: its function carries the mark
