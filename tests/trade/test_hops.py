@@ -69,7 +69,7 @@ def hops(here: Container, there: Container, start_container: Callable[..., Conta
 
 def test_deadline_and_chain_go_over_two_hops(hops: Any) -> None:
     first, second = hops["there"][1]("chain"), hops["beyond"][1]("chain")
-    chain, remaining_s = first.with_(deadline_s=5)([second])
+    chain, remaining_s = first.with_(deadline_s=5)([second, first])
     assert chain == ("robot.there.chain", "robot.beyond.chain")
     assert 0 < remaining_s <= 5
 

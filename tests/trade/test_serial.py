@@ -169,3 +169,22 @@ def test_only_so_many_wait(
 def test_a_stop_cannot_be_serial() -> None:
     with pytest.raises(ConfigurationError, match="a stop waits for nobody"):
         service(effect="stop", serial=True)
+
+
+def test_what_waits_when_its_container_closes_never_runs(
+    here: Container, there: Container, bench: Bench, eventually: Any
+) -> None:
+    there.register(bench, "robot")
+    work = here.find(where(name="work"), wait_s=20)
+    runs = [work.start(0)]
+    assert bench.entered.wait(20)
+    runs.append(work.start(1))
+    assert eventually(lambda: len(work_serial(work)._queue) == 1)
+    serial = work_serial(work)
+    closing = threading.Thread(target=there.close)
+    closing.start()
+    assert all(isinstance(run.exception(20), ConnectionError) for run in runs)
+    bench.open.set()
+    closing.join(20)
+    assert eventually(lambda: not serial._taken)
+    assert bench.order == [0]

@@ -253,7 +253,8 @@ class Dispatcher:
 
     def _queue(self, serial: Serial, ongoing: Ongoing, service: LocalService, replier: Publisher, call: Call) -> None:
         def begin() -> None:
-            self._perform(ongoing, service, replier, call)
+            if not self._closed:
+                self._perform(ongoing, service, replier, call)
 
         def drop() -> None:
             if serial.withdraw(begin):

@@ -20,6 +20,7 @@ GRACE_NS: Final = 5_000_000_000
 MOST_BYTES: Final = 64 << 20
 MOST_CALLS: Final = 65_536
 _SWEEP_FROM: Final = 1024
+_MOST_CALLERS: Final = 1024
 
 Answer = tuple[int, Raw]
 Key = tuple[str, int]
@@ -144,6 +145,8 @@ class Once:
                 never.answer = cancelled(service)
                 never.until_ns = time.monotonic_ns() + int(keep_s * 1e9) + GRACE_NS
                 self._calls[caller, call_id] = never
+                if len(self._calls) >= self._sweep_at:
+                    self._sweep()
         if found is not None and found.answer is None:
             found.cancel()
 
@@ -165,7 +168,9 @@ class Once:
             early = [key for key, one in ended if one.until_ns >= now][:too_many]
             for caller, call_id in early:
                 place = (caller, call_id >> 24)
-                self._evicted[place] = max(call_id, self._evicted.get(place, -1))
+                self._evicted[place] = max(call_id, self._evicted.pop(place, -1))
+            while len(self._evicted) > _MOST_CALLERS:
+                del self._evicted[next(iter(self._evicted))]
             late += early
         for key in late:
             del self._calls[key]
