@@ -2,8 +2,8 @@
 
 import threading
 import time
-from collections import deque
 from collections.abc import Callable
+from heapq import heappop, heappush
 from typing import TYPE_CHECKING, Any, Final
 
 from msgspec import Raw
@@ -19,7 +19,6 @@ GRACE_NS: Final = 5_000_000_000
 """How long after its deadline a call's answer is kept."""
 MOST_BYTES: Final = 64 << 20
 MOST_CALLS: Final = 65_536
-_SWEEP_FROM: Final = 1024
 _MOST_CALLERS: Final = 1024
 
 Answer = tuple[int, Raw]
@@ -35,7 +34,7 @@ class Ongoing:
 
     __slots__ = (
         *("_event", "_on_cancel", "also", "answer", "call", "caller"),
-        *("cancelled", "report", "service", "size", "until_ns"),
+        *("cancelled", "report", "service", "size"),
     )
 
     def __init__(
@@ -55,7 +54,6 @@ class Ongoing:
         self.also: list[Call] | None = None
         """The same call, come again while it ran."""
         self.size = 0
-        self.until_ns = 0
         self._event: threading.Event | None = None
         self._on_cancel: list[Callable[[], object]] | None = None
 
@@ -98,9 +96,10 @@ class Once:
 
     def __init__(self) -> None:
         self._calls: dict[Key, Ongoing] = {}
-        self._bodies: deque[Ongoing] = deque()
+        self._until: list[tuple[int, Key]] = []
+        """A heap of when which kept call may go."""
+        self._bodies: dict[Key, Ongoing] = {}
         self._bytes = 0
-        self._sweep_at = _SWEEP_FROM
         self._evicted: dict[Key, int] = {}
         """Caller and the upper bits of its ids -> the highest id let go before its time; they count upwards."""
         self._lock = threading.Lock()
@@ -110,6 +109,7 @@ class Once:
         found = self._calls.setdefault((ongoing.caller, call.id), ongoing)
         if self._evicted and found is ongoing and call.id <= self._evicted.get((ongoing.caller, call.id >> 24), -1):
             ongoing.answer = _unknown(call.service)
+            self._calls.pop((ongoing.caller, call.id), None)
         return found
 
     def find(self, caller: str, call: Call) -> Ongoing | None:
@@ -127,13 +127,14 @@ class Once:
         with self._lock:
             ongoing.answer = answer
             ongoing.call = ongoing.report = None  # the arguments may be large
+            key = (ongoing.caller, call.id)
             if keep:
-                ongoing.until_ns = (call.expires_ns or time.monotonic_ns()) + GRACE_NS
-                self._keep_body(ongoing, len(memoryview(answer[1])), call.service)
+                now = time.monotonic_ns()
+                self._keep_body(key, ongoing, len(memoryview(answer[1])), call.service)
+                heappush(self._until, ((call.expires_ns or now) + GRACE_NS, key))
+                self._let_go(now)
             else:
-                self._calls.pop((ongoing.caller, call.id), None)
-            if len(self._calls) >= self._sweep_at:
-                self._sweep()
+                self._calls.pop(key, None)
             return ongoing.also
 
     def cancel(self, caller: str, call_id: int, service: str, keep_s: float) -> None:
@@ -143,42 +144,37 @@ class Once:
             if found is None:
                 never = Ongoing(None, caller, None, None)
                 never.answer = cancelled(service)
-                never.until_ns = time.monotonic_ns() + int(keep_s * 1e9) + GRACE_NS
+                now = time.monotonic_ns()
                 self._calls[caller, call_id] = never
-                if len(self._calls) >= self._sweep_at:
-                    self._sweep()
+                heappush(self._until, (now + int(keep_s * 1e9) + GRACE_NS, (caller, call_id)))
+                self._let_go(now)
         if found is not None and found.answer is None:
             found.cancel()
 
-    def _keep_body(self, ongoing: Ongoing, size: int, service: str) -> None:
+    def _keep_body(self, key: Key, ongoing: Ongoing, size: int, service: str) -> None:
         ongoing.size = size
         self._bytes += size
-        self._bodies.append(ongoing)
+        self._bodies[key] = ongoing
         while self._bytes > MOST_BYTES:
-            oldest = self._bodies.popleft()
+            oldest = self._bodies.pop(next(iter(self._bodies)))
             self._bytes -= oldest.size
-            oldest.size, oldest.answer = 0, _unknown(service)
+            oldest.answer = _unknown(service)
 
-    def _sweep(self) -> None:
-        now = time.monotonic_ns()
-        ended = [(key, one) for key, one in list(self._calls.items()) if one.answer is not None]
-        late = [key for key, one in ended if one.until_ns < now]
-        too_many = len(self._calls) - len(late) - MOST_CALLS // 2
-        if len(self._calls) - len(late) >= MOST_CALLS:
-            early = [key for key, one in ended if one.until_ns >= now][:too_many]
-            for caller, call_id in early:
-                place = (caller, call_id >> 24)
-                self._evicted[place] = max(call_id, self._evicted.pop(place, -1))
-            while len(self._evicted) > _MOST_CALLERS:
-                del self._evicted[next(iter(self._evicted))]
-            late += early
-        for key in late:
-            del self._calls[key]
-        self._bodies = deque(one for one in self._calls.values() if one.size)
-        self._bytes = sum(one.size for one in self._bodies)
-        self._sweep_at = min(MOST_CALLS, max(_SWEEP_FROM, 2 * len(self._calls)))
-        if len(self._calls) >= self._sweep_at:  # all of them run
-            self._sweep_at = 2 * len(self._calls)
+    def _let_go(self, now_ns: int) -> None:
+        """Forget what can come no more, and what is nearest to that where there is too much."""
+        while self._until and (self._until[0][0] < now_ns or len(self._calls) > MOST_CALLS):
+            until_ns, key = heappop(self._until)
+            self._calls.pop(key, None)
+            if key in self._bodies:
+                self._bytes -= self._bodies.pop(key).size
+            if until_ns >= now_ns:
+                self._note_evicted(*key)
+
+    def _note_evicted(self, caller: str, call_id: int) -> None:
+        place = (caller, call_id >> 24)
+        self._evicted[place] = max(call_id, self._evicted.pop(place, -1))
+        if len(self._evicted) > _MOST_CALLERS:
+            del self._evicted[next(iter(self._evicted))]
 
 
 def _unknown(service: str) -> Answer:
