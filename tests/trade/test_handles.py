@@ -85,10 +85,11 @@ def test_a_started_call_is_cancelled_by_the_service_named_for_that(offer: Any) -
 
     class Walker:
         def __init__(self) -> None:
-            self.stopped = threading.Event()
+            self.begun, self.stopped = threading.Event(), threading.Event()
 
         @service(cancel="halt")
         def walk(self) -> str:
+            self.begun.set()
             self.stopped.wait(20)
             return "stopped early"
 
@@ -96,16 +97,20 @@ def test_a_started_call_is_cancelled_by_the_service_named_for_that(offer: Any) -
         def halt(self) -> None:
             self.stopped.set()
 
-    run = offer(Walker())("walk").start()
+    walker = Walker()
+    run = offer(walker)("walk").start()
+    assert walker.begun.wait(20)
     run.cancel()
     assert run.result(20) == "stopped early"
 
 
-def test_a_call_without_a_cancel_service_cannot_be_cancelled(offer: Any) -> None:
-    run = offer(Counter())("add").start()
+def test_a_call_that_has_ended_is_not_cancelled_any_more(offer: Any) -> None:
+    add = offer(Counter())("add")
+    run = add.start()
     run.result(20)
+    run.cancel()
     with pytest.raises(ConfigurationError, match=r"robot.add: it cannot be cancelled"):
-        run.cancel()
+        add.cancel_service()
 
 
 def test_many_calls_run_at_once_from_asyncio(offer: Any) -> None:

@@ -13,10 +13,11 @@ from msgspec import Meta
 from trade import errors
 from trade._constraints import Constraint, where
 from trade._container import Container
-from trade._context import CallContext, current_call
+from trade._context import CallContext, current_call, progress
 from trade._handle import Bound, Handle, Run
 from trade._many import Outcome
 from trade._notifications import Callback, Notification
+from trade._secret import Secret
 from trade._service import service
 from trade._settings import Settings
 from trade._system import ContainerInfo, System
@@ -33,6 +34,7 @@ __all__ = [
     "Notification",
     "Outcome",
     "Run",
+    "Secret",
     "Settings",
     "System",
     "acall",
@@ -53,6 +55,7 @@ __all__ = [
     "find",
     "joined",
     "left",
+    "progress",
     "register",
     "remove_group",
     "service",

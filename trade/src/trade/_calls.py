@@ -13,14 +13,18 @@ import time
 from collections.abc import Callable
 from typing import Final
 
-from msgspec import Raw
+from msgspec import Raw, structs
 
+from trade._system import CLOCK, DOMAIN, PROVIDER
 from trade._transport import Channel, ChannelClosed, Message, Publisher, Transport
 from trade._wire import (
+    CANCEL,
     EMPTY,
+    EMPTY_ARGUMENTS,
     PROTOCOL,
     Address,
     Call,
+    CancelArguments,
     Malformed,
     Reply,
     Status,
@@ -34,6 +38,8 @@ _logger = logging.getLogger("trade")
 _NEVER: Final = math.inf
 _DRIFT: Final = 200e-6
 """Two monotonic clocks run apart at most this fast (quartz is specified to 100 ppm)."""
+
+_CANCEL_S: Final = 2.0
 
 OnReply = Callable[[Reply], None]
 
@@ -77,16 +83,21 @@ _Waiting = tuple[int, Peer, int]
 """Call id, who is to answer, deadline: swapped as a whole, so that whoever ends a wait ends the one it looked at."""
 
 
+_Sent = tuple[Publisher, Call]
+"""What was put where, to be put once more if the link had gone."""
+
+
 class _Box:
     """A reply channel lent to one caller at a time."""
 
-    __slots__ = ("channel", "ended_id", "name", "waiting", "wake_key")
+    __slots__ = ("channel", "ended_id", "name", "sent", "waiting", "wake_key")
 
     def __init__(self, name: str, wake_key: str, channel: Channel) -> None:
         self.name = name
         self.wake_key = wake_key
         self.channel = channel
         self.waiting: _Waiting | None = None
+        self.sent: _Sent | None = None
         self.ended_id = 0
         """The call whose wait was ended from our side last."""
 
@@ -94,12 +105,16 @@ class _Box:
 class _Pending:
     """A started call that waits for its answer without a thread."""
 
-    __slots__ = ("deadline_ns", "on_reply", "peer", "sent_ns")
+    __slots__ = ("deadline_ns", "on_progress", "on_reply", "peer", "sent", "sent_ns")
 
-    def __init__(self, peer: Peer, deadline_ns: int, on_reply: OnReply) -> None:
+    def __init__(
+        self, peer: Peer, deadline_ns: int, on_reply: OnReply, on_progress: OnReply | None, sent: _Sent
+    ) -> None:
         self.peer = peer
         self.deadline_ns = deadline_ns
         self.on_reply = on_reply
+        self.on_progress = on_progress
+        self.sent = sent
         self.sent_ns = time.monotonic_ns()
 
 
@@ -179,20 +194,20 @@ class Caller:
         except ChannelClosed:
             return _ended(call_id, Status.UNSENT)
         try:
+            call = Call(PROTOCOL, call_id, service, box.name, self._session, expires_ns, chain, args)
+            box.sent = (publisher, call)
             box.waiting = (call_id, peer, deadline_ns)
             if deadline_ns < self._next_deadline_ns:
                 self._sooner.set()
             if peer.lost or self._closed:
                 return _ended(call_id, Status.UNSENT)
             sent_ns = time.monotonic_ns()
-            publisher.put(
-                encode_message(Call(PROTOCOL, call_id, service, box.name, self._session, expires_ns, chain, args))
-            )
+            publisher.put(encode_message(call))
             return self._await_reply(box, call_id, peer, sent_ns)
         except ChannelClosed:  # the publisher went with its provider, or everything does
             return _ended(call_id, Status.UNSENT)
         finally:
-            box.waiting = None
+            box.waiting = box.sent = None
             self._free.append(box)
 
     def _await_reply(self, box: _Box, call_id: int, peer: Peer, sent_ns: int) -> Reply:
@@ -203,6 +218,8 @@ class Caller:
                 return _ended(call_id, Status.CLOSED)
             reply = self._decode(message)
             if reply is None or reply.id != call_id or not self._may_answer(message, peer, reply):
+                continue
+            if reply.status == Status.PROGRESS:  # nobody asks a call that is waited for
                 continue
             if reply.status < Status.TIMED_OUT:
                 peer.heard(reply.clock_ns, sent_ns, time.monotonic_ns())
@@ -222,26 +239,76 @@ class Caller:
         expires_ns: int | None,
         chain: tuple[str, ...],
         on_reply: OnReply,
-    ) -> None:
-        """Call without waiting; the answer goes to ``on_reply`` on a thread of ours."""
+        on_progress: OnReply | None = None,
+    ) -> int:
+        """Call without waiting; answer and progress go there on a thread of ours. Returns the call's id."""
         try:
             shared = self._shared_box()
         except ChannelClosed:
             on_reply(_ended(0, Status.UNSENT))
-            return
+            return 0
         call_id = self.new_id()
-        self._pending[call_id] = _Pending(peer, deadline_ns, on_reply)
+        call = Call(PROTOCOL, call_id, service, shared.name, self._session, expires_ns, chain, args)
+        self._pending[call_id] = _Pending(peer, deadline_ns, on_reply, on_progress, (publisher, call))
         if deadline_ns < self._next_deadline_ns:
             self._sooner.set()
         if peer.lost or self._closed:
             self._finish(_ended(call_id, Status.UNSENT))
-            return
+            return call_id
         try:
-            publisher.put(
-                encode_message(Call(PROTOCOL, call_id, service, shared.name, self._session, expires_ns, chain, args))
-            )
+            publisher.put(encode_message(call))
         except ChannelClosed:
             self._finish(_ended(call_id, Status.UNSENT))
+        return call_id
+
+    def cancel(self, peer: Peer, call_id: int, service: str, deadline_ns: int) -> None:
+        """Ask the callee to end a call, or never to begin it; does not wait."""
+        now = time.monotonic_ns()
+        if call_id not in self._pending or now >= deadline_ns:
+            return
+        asked = Raw(encode_message(CancelArguments(call_id, service, min(86_400.0, (deadline_ns - now) / 1e9))))
+        publisher = self.publisher(peer.address, DOMAIN, PROVIDER, stop=True)
+        self.start(peer, publisher, CANCEL, asked, now + int(_CANCEL_S * 1e9), None, (), lambda _: None)
+
+    # --- sending again
+
+    def resend(self, peer: Peer) -> None:
+        """The link to the same epoch was gone and is back: put once more what still waits, same id, never later.
+
+        The callee runs no id twice. Its clock is asked for first, as it may have stood still meanwhile.
+        """
+        sent = [box.sent for box in list(self._every) if box.waiting is not None and box.waiting[1] is peer]
+        sent += [pending.sent for pending in list(self._pending.values()) if pending.peer is peer]
+        due = [one for one in sent if one is not None]
+        if due:
+            clock = self.publisher(peer.address, DOMAIN, PROVIDER, stop=False)
+            soon = time.monotonic_ns() + int(_CANCEL_S * 1e9)
+
+            def clock_heard(reply: Reply) -> None:
+                if reply.status == Status.OK:
+                    for publisher, call in due:
+                        self._put_again(peer, publisher, call)
+
+            self.start(peer, clock, CLOCK, EMPTY_ARGUMENTS, soon, None, (), clock_heard)
+
+    def _put_again(self, peer: Peer, publisher: Publisher, call: Call) -> None:
+        deadline_ns = self._deadline_of(call.id)
+        if deadline_ns is None:  # answered meanwhile
+            return
+        expires_ns = call.expires_ns
+        if expires_ns is not None:
+            expires_ns = min(expires_ns, peer.expiry_ns(deadline_ns) or 0)
+        try:
+            publisher.put(encode_message(structs.replace(call, expires_ns=expires_ns)))
+        except ChannelClosed:
+            _logger.debug("%s is not sent again: its provider is gone", call.service)
+
+    def _deadline_of(self, call_id: int) -> int | None:
+        pending = self._pending.get(call_id)
+        if pending is not None:
+            return pending.deadline_ns
+        waiting = [box.waiting for box in list(self._every)]
+        return next((one[2] for one in waiting if one is not None and one[0] == call_id), None)
 
     def _finish(self, reply: Reply) -> None:
         pending = self._pending.pop(reply.id, None)
@@ -291,8 +358,12 @@ class Caller:
                 return
             reply = self._decode(message)
             pending = self._pending.get(reply.id) if reply is not None else None
-            if reply is not None and pending is not None and self._may_answer(message, pending.peer, reply):
+            if reply is None or pending is None or not self._may_answer(message, pending.peer, reply):
+                continue
+            if reply.status != Status.PROGRESS:
                 self._finish(reply)
+            elif pending.on_progress is not None:
+                pending.on_progress(reply)
 
     def _decode(self, message: Message) -> Reply | None:
         try:
@@ -309,7 +380,9 @@ class Caller:
         """The callee's container is gone (or back): end what waits for it."""
         peer = self.peer(address)
         peer.lost = not back
-        if not back:
+        if back:
+            self.resend(peer)
+        else:
             peer.forget_clock()
             self._end(lambda waiting, _: waiting is peer, Status.LOST)
 

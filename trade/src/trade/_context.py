@@ -1,11 +1,16 @@
-"""What a provider may know of the call it serves: who asks, until when, on whose behalf."""
+"""What a provider may know of the call it serves: who asks, until when, on whose behalf; and what it may say of it."""
 
 import time
+from collections.abc import Callable
 from contextvars import ContextVar
+from typing import Any
 
 from msgspec import Struct
 
-__all__ = ["CallContext", "current_call"]
+from trade._ongoing import Ongoing
+from trade.errors import Cancelled
+
+__all__ = ["CallContext", "current_call", "progress"]
 
 
 class CallContext(Struct, frozen=True, gc=False):
@@ -23,6 +28,48 @@ class CallContext(Struct, frozen=True, gc=False):
     chain: tuple[str, ...] = ()
     """Services whose calls led to this one, outermost first."""
 
+    ongoing: Ongoing | None = None
+    """The middleware's own notes on it."""
+
+    @property
+    def cancelled(self) -> bool:
+        """Whether its caller wants it to end; to heed it is up to the provider."""
+        return self.ongoing is not None and self.ongoing.cancelled
+
+    def wait_cancelled(self, timeout_s: float | None = None) -> bool:
+        """Wait until its caller wants it to end, at most this long, and never beyond its deadline.
+
+        Returns:
+            Whether it was cancelled.
+        """
+        left_s = self.remaining_s
+        allowed_s = left_s if timeout_s is None else timeout_s if left_s is None else min(timeout_s, left_s)
+        if self.ongoing is not None:
+            return self.ongoing.wait_cancelled(allowed_s)
+        time.sleep(allowed_s or 0.0)  # nobody can cancel it
+        return False
+
+    def on_cancel(self, tell: Callable[[], object]) -> None:
+        """Have this called, on another thread, once its caller wants it to end; at once if it does already."""
+        if self.ongoing is not None:
+            self.ongoing.on_cancel(tell)
+
+    def raise_if_cancelled(self) -> None:
+        """Raise Cancelled, the way to end a cancelled call, if its caller wants it to end."""
+        if self.cancelled:
+            raise Cancelled(service=self.service)
+
+    def progress(self, value: Any) -> None:
+        """Tell the caller how far it is: the latest value counts. Never waits.
+
+        Args:
+            value: plain data, a struct, a handle: what ``run.progress()`` then gives.
+        """
+        ongoing = self.ongoing
+        report = None if ongoing is None else ongoing.report
+        if ongoing is not None and report is not None:
+            report(ongoing, value)
+
     @property
     def remaining_s(self) -> float | None:
         """Seconds until it expires, never below zero; None if it does not."""
@@ -35,3 +82,10 @@ running: ContextVar[CallContext | None] = ContextVar("trade_call", default=None)
 def current_call() -> CallContext | None:
     """The call the running code serves, or None outside of one (also in a plain call of the method)."""
     return running.get()
+
+
+def progress(value: Any) -> None:
+    """Inside a service: tell the caller how far it is; see `CallContext.progress`. Elsewhere it does nothing."""
+    call = running.get()
+    if call is not None:
+        call.progress(value)

@@ -6,24 +6,33 @@ The last idle one that takes a call starts another; at the cap it answers Busy, 
 
 import asyncio
 import concurrent.futures
+import contextlib
 import inspect
 import logging
 import threading
 import time
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Sequence
 from typing import Any, Final
 
+import msgspec
 from msgspec import Raw
 
 from trade._context import CallContext, running
 from trade._failures import pack_error, unpack_error
+from trade._ongoing import Answer, Herald, Once, Ongoing, cancelled
+from trade._serial import Serial
+from trade._service import ServiceMark
 from trade._signature import Signature
+from trade._system import DOMAIN, PROVIDER
 from trade._transport import Channel, ChannelClosed, Message, Publisher, Transport
 from trade._wire import (
+    CANCEL,
     EMPTY,
     PROTOCOL,
     Address,
     Call,
+    CancelArguments,
+    ErrorInfo,
     Malformed,
     Reply,
     Status,
@@ -40,25 +49,45 @@ _logger = logging.getLogger("trade")
 MOST_THREADS: Final = 64
 _KINDS: Final = frozenset(("call", "stop"))
 _MOST_REPLY_KEYS: Final = 1024
+_SYSTEM: Final = f"{DOMAIN}/{PROVIDER}"
+_decode_cancel: Final = msgspec.msgpack.Decoder(CancelArguments).decode
 
 
 class LocalService:
     """A method of a registered provider, ready to be called."""
 
-    __slots__ = ("_loop", "effect", "label", "method", "signature")
+    __slots__ = ("_loop", "effect", "label", "method", "serial", "signature", "strict")
 
     def __init__(
-        self, label: str, signature: Signature, method: Callable[..., Any], effect: str, loop: "AsyncLoop"
+        self,
+        label: str,
+        signature: Signature,
+        method: Callable[..., Any],
+        mark: ServiceMark,
+        loop: "AsyncLoop",
+        serial: Serial | None,
     ) -> None:
         self.label = label
         self.signature = signature
         self.method = method
-        self.effect = effect
+        self.effect = mark.effect
+        self.strict = mark.strict
+        self.serial = serial
         self._loop = loop
 
     def run(self, raw: Raw, context: CallContext) -> Any:
         """Validate, then call. Raises what the provider raises."""
         args, kwargs = self.signature.decode(raw)
+        return self.run_straight(args, kwargs, context)
+
+    def run_straight(self, args: Sequence[Any], kwargs: dict[str, Any], context: CallContext) -> Any:
+        """Call with the arguments as they are."""
+        if self.serial is not None:
+            with self.serial.held():
+                return self._run(args, kwargs, context)
+        return self._run(args, kwargs, context)
+
+    def _run(self, args: Sequence[Any], kwargs: dict[str, Any], context: CallContext) -> Any:
         token = running.set(context)
         try:
             result = self.method(*args, **kwargs)
@@ -67,6 +96,11 @@ class LocalService:
             raise unpack_error(pack_error(error), self.label) from error
         finally:
             running.reset(token)
+
+    def failure(self, error: BaseException, raw: Raw) -> ErrorInfo:
+        """What the caller is told of an error of a call with these arguments."""
+        info = pack_error(error)
+        return self.signature.without_secrets(info, raw) if self.signature.has_secrets else info
 
     def too_late(self, expires_ns: int | None) -> bool:
         """Whether running it now would be running it late; a stop is never late, a command of unknown expiry always."""
@@ -88,7 +122,7 @@ class AsyncLoop:
     def complete(self, coroutine: Coroutine[Any, Any, Any], context: CallContext) -> Any:
         """Run an ``async def`` service from a handler thread; its deadline cancels it."""
         allowed_s = context.remaining_s
-        future = asyncio.run_coroutine_threadsafe(_contained(coroutine, context.service), self._get())
+        future = asyncio.run_coroutine_threadsafe(_contained(coroutine, context), self._get())
         done, _ = concurrent.futures.wait([future], allowed_s)
         if allowed_s is not None and not done:
             future.cancel()
@@ -117,12 +151,20 @@ class AsyncLoop:
                 thread.join(2)
 
 
-async def _contained(coroutine: Coroutine[Any, Any, Any], service: str) -> Any:
-    """What would end the loop for everybody becomes an error for the caller."""
+async def _contained(coroutine: Coroutine[Any, Any, Any], context: CallContext) -> Any:
+    """What would end the loop for everybody becomes an error for the caller, who may also cancel it."""
+    loop, task = asyncio.get_running_loop(), asyncio.current_task()
+
+    def cancel() -> None:
+        if task is not None:
+            with contextlib.suppress(RuntimeError):  # the loop is closed: everything on it was cancelled
+                loop.call_soon_threadsafe(task.cancel)
+
+    context.on_cancel(cancel)
     try:
         return await coroutine
     except (SystemExit, KeyboardInterrupt) as error:
-        raise unpack_error(pack_error(error), service) from error
+        raise unpack_error(pack_error(error), context.service) from error
 
 
 def _run_loop(loop: asyncio.AbstractEventLoop) -> None:
@@ -156,6 +198,8 @@ class Dispatcher:
         self._repliers: dict[str, Publisher] = {}
         self._lock = threading.Lock()
         self._closed = False
+        self._once = Once()
+        self._herald = Herald(self._send_progress)
         self.malformed = 0
         self._crews = [
             _Crew("trade-call", transport.subscribe(calls_to(own, stop=False)), self._serve, self._busy),
@@ -173,19 +217,95 @@ class Dispatcher:
             return
         call, caller, provider, replier = taken
         service = self._lookup(provider, call.service)
-        if service is None or (service.effect == "stop") is not message.key.startswith("stop/"):
-            status, body = Status.GONE, EMPTY
-        elif service.too_late(call.expires_ns):
-            status, body = Status.EXPIRED, EMPTY
+        urgent = message.key.startswith("stop/")
+        if service is None or (service.effect == "stop") is not urgent:
+            if urgent and call.service == CANCEL and provider == _SYSTEM:
+                self._answer(replier, caller, call, *self._cancel(caller, call))
+            else:
+                self._refuse(replier, caller, call, Status.GONE)
+            return
+        if urgent:
+            self._answer(replier, caller, call, *_run(caller, call, service, None))
+            return
+        ongoing = Ongoing(service, caller, call, self._report)
+        first = self._once.begin(call, ongoing)
+        if first is not ongoing or ongoing.answer is not None:
+            self._again(first, replier, caller, call)
+        elif service.serial is None:
+            self._perform(ongoing, service, replier, call)
         else:
-            status, body = _run(caller, call, service)
-        self._answer(replier, caller, call, status, body)
+            self._queue(service.serial, ongoing, service, replier, call)
+
+    def _perform(self, ongoing: Ongoing, service: LocalService, replier: Publisher, call: Call) -> None:
+        if service.too_late(call.expires_ns):
+            answer: Answer = (Status.EXPIRED, EMPTY)
+        elif ongoing.cancelled:
+            answer = cancelled(service.label)
+        else:
+            answer = _run(ongoing.caller, call, service, ongoing)
+        self._end(ongoing, service, replier, call, answer)
+
+    def _end(self, ongoing: Ongoing, service: LocalService, replier: Publisher, call: Call, answer: Answer) -> None:
+        also = self._once.end(ongoing, call, answer, keep=service.effect != "read")
+        self._answer(replier, ongoing.caller, call, *answer)
+        for again in also or ():
+            self._answer(self._replier(ongoing.caller, again.reply), ongoing.caller, again, *answer)
+
+    def _queue(self, serial: Serial, ongoing: Ongoing, service: LocalService, replier: Publisher, call: Call) -> None:
+        def begin() -> None:
+            if not self._closed:
+                self._perform(ongoing, service, replier, call)
+
+        def drop() -> None:
+            if serial.withdraw(begin):
+                self._end(ongoing, service, replier, call, cancelled(service.label))
+
+        ongoing.on_cancel(drop)
+        if not serial.submit(begin):
+            self._end(ongoing, service, replier, call, (Status.BUSY, EMPTY))
+
+    # --- calls that came before, and calls about calls
+
+    def _again(self, first: Ongoing, replier: Publisher, caller: str, call: Call) -> None:
+        """It runs or has run: it gets that answer, and never runs again."""
+        answer = self._once.attach(first, call)
+        if answer is not None:
+            self._answer(replier, caller, call, *answer)
+
+    def _refuse(self, replier: Publisher, caller: str, call: Call, status: int) -> None:
+        """It does not run now; but it may have before."""
+        first = self._once.find(caller, call)
+        if first is not None:
+            self._again(first, replier, caller, call)
+        else:
+            self._answer(replier, caller, call, status, EMPTY)
+
+    def _cancel(self, caller: str, call: Call) -> Answer:
+        try:
+            asked = _decode_cancel(call.args)
+        except msgspec.DecodeError as bad:
+            return Status.ERROR, Raw(encode_message(pack_error(bad)))
+        self._once.cancel(caller, asked.id, asked.service, asked.keep_s)
+        return Status.OK, EMPTY
+
+    def _report(self, ongoing: Ongoing, value: Any) -> None:
+        if ongoing.service is not None:
+            self._herald.tell(ongoing, ongoing.service.signature.encode_progress(value))
+
+    def _send_progress(self, ongoing: Ongoing, body: Raw) -> None:
+        call = ongoing.call
+        if call is None:  # it has ended
+            return
+        try:
+            self._answer(self._replier(ongoing.caller, call.reply), ongoing.caller, call, Status.PROGRESS, body)
+        except ChannelClosed:
+            _logger.debug("no word of the progress of %s: the container is closing", call.service)
 
     def _busy(self, message: Message) -> None:
         taken = self._take(message)
         if taken is not None:
             call, caller, _, replier = taken
-            self._answer(replier, caller, call, Status.BUSY, EMPTY)
+            self._refuse(replier, caller, call, Status.BUSY)
 
     def _take(self, message: Message) -> tuple[Call, str, str, Publisher] | None:
         """The call, who makes it, the ``domain/provider`` it is for, where to answer: else it is not run."""
@@ -233,17 +353,18 @@ class Dispatcher:
         self._closed = True
         for crew in self._crews:
             crew.close()
+        self._herald.close()
         for replier in list(self._repliers.values()):
             replier.close()
 
 
-def _run(caller: str, call: Call, service: LocalService) -> tuple[int, Raw]:
+def _run(caller: str, call: Call, service: LocalService, ongoing: Ongoing | None) -> Answer:
     expires = None if service.effect == "stop" else call.expires_ns
-    context = CallContext(call.id, service.label, caller, call.session, expires, call.chain)
+    context = CallContext(call.id, service.label, caller, call.session, expires, call.chain, ongoing)
     try:
         return Status.OK, service.signature.encode_result(service.run(call.args, context))
     except BaseException as error:  # noqa: BLE001 - whatever a provider raises belongs to the caller
-        return Status.ERROR, Raw(encode_message(pack_error(error)))
+        return Status.ERROR, Raw(encode_message(service.failure(error, call.args)))
 
 
 class _Crew:

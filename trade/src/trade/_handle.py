@@ -3,6 +3,8 @@
 import asyncio
 import concurrent.futures
 import contextlib
+import logging
+import threading
 from collections.abc import Callable, Generator, Mapping
 from types import MappingProxyType
 from typing import Any, Final, Protocol
@@ -14,6 +16,9 @@ from trade.errors import ConfigurationError
 __all__ = ["Bound", "Handle", "Run"]
 
 LONGEST_DEADLINE_S: Final = 86_400.0
+
+
+_logger = logging.getLogger("trade")
 
 
 class Home(Protocol):
@@ -38,6 +43,9 @@ class Run:
         self._handle = handle
         self._future: concurrent.futures.Future[Any] = concurrent.futures.Future()
         self._future.set_running_or_notify_cancel()  # only its end ends it
+        self._progress: Any = None
+        self._cancelling = False
+        self._cancel_call: Callable[[], None] | None = None
 
     def result(self, timeout_s: float | None = None) -> Any:
         """The service's result, or its error raised.
@@ -61,12 +69,38 @@ class Run:
         return self._future.exception(timeout_s)
 
     def cancel(self) -> None:
-        """End it early by the service that its provider names for that; the result then tells how it ended.
+        """End it early; the result then tells how it ended.
 
-        Raises:
-            ConfigurationError: the provider names none.
+        A call that has not begun never will, and raises Cancelled. One that runs is asked to end, and goes on if
+        it does not heed that. If its provider names a service that ends it, that is called, and waited for.
         """
-        self._handle.cancel_service()()
+        if self._future.done():
+            return
+        self._cancelling = True
+        tell = self._cancel_call
+        if tell is not None:
+            tell()
+        if self._handle.record.info.cancel is not None:
+            self._handle.cancel_service()()
+
+    def progress(self) -> Any:
+        """What the service said last of how far it is, or None."""
+        return self._progress
+
+    @property
+    def cancelling(self) -> bool:
+        """Whether ``cancel()`` was called."""
+        return self._cancelling
+
+    def on_cancel(self, tell: Callable[[], None]) -> None:
+        """Told by the container: how to ask the call to end. Idempotent itself, as it may be used twice."""
+        self._cancel_call = tell
+        if self._cancelling:
+            tell()
+
+    def note_progress(self, value: Any) -> None:
+        """Told by the container: the service said this of how far it is."""
+        self._progress = value
 
     def fail(self, error: BaseException) -> None:
         """Told by the container: it could not begin."""
@@ -92,6 +126,13 @@ class Run:
 
     def __await__(self) -> Generator[Any, None, Any]:
         return asyncio.wrap_future(self._future).__await__()
+
+
+def _cancel(run: Run) -> None:
+    try:
+        run.cancel()
+    except Exception:  # a container that is gone, say: the call is, too
+        _logger.exception("a call whose task was cancelled could not be cancelled")
 
 
 class Handle:
@@ -122,8 +163,14 @@ class Handle:
         return self._home.begin(self, args, kwargs, self._deadline_s)
 
     async def acall(self, *args: Any, **kwargs: Any) -> Any:
-        """Call from asyncio."""
-        return await self.start(*args, **kwargs)
+        """Call from asyncio. Cancelling the task that waits here cancels the call, see `Run.cancel`."""
+        run = self.start(*args, **kwargs)
+        try:
+            return await run
+        except asyncio.CancelledError:
+            if not run.done():
+                threading.Thread(target=_cancel, args=(run,), name="trade-cancel", daemon=True).start()
+            raise
 
     def with_(self, *, deadline_s: float) -> "Handle":
         """The same service, called with other options.

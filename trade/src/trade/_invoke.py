@@ -4,6 +4,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any, Final
 
 import msgspec
@@ -14,13 +15,16 @@ from trade._context import CallContext, running
 from trade._dispatch import LocalService
 from trade._failures import unpack_error
 from trade._handle import Run
+from trade._ongoing import Ongoing
 from trade._records import type_from_schema
 from trade._registry import Record
+from trade._serial import Turn
 from trade._signature import Codec, encode_arguments
 from trade._system import CLOCK, DOMAIN, PROVIDER
 from trade._wire import EMPTY_ARGUMENTS, Address, ErrorInfo, Reply, ServiceInfo, Status
 from trade.errors import (
     Busy,
+    Cancelled,
     ConfigurationError,
     ContainerLost,
     DeadlineExceeded,
@@ -74,26 +78,69 @@ class LocalTarget:
         self._new_id = new_id
 
     def invoke(self, args: tuple[Any, ...], kwargs: dict[str, Any], request: Request) -> Any:
-        return self._run(self._encode(args, kwargs), request)
+        return self._take_turn(self._prepared(args, kwargs), request, None)
 
     def begin(self, args: tuple[Any, ...], kwargs: dict[str, Any], request: Request, run: Run) -> None:
         """The same on a thread of its own, with the arguments as they are now."""
-        raw = self._encode(args, kwargs)
-        name = f"trade-run-{self._service.label}"
-        threading.Thread(target=run.end, args=(lambda: self._run(raw, request),), name=name, daemon=True).start()
-
-    def _encode(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Raw:
-        return encode_arguments(self._codec, self._service.signature.info, self._service.label, args, kwargs)
-
-    def _run(self, raw: Raw, request: Request) -> Any:
         service = self._service
+        do = self._prepared(args, kwargs)
+
+        def report(_: Ongoing, value: Any) -> None:
+            run.note_progress(service.signature.copy_progress(value) if service.strict else value)
+
+        ongoing = Ongoing(service, self._own.identity, None, report)
+        run.on_cancel(ongoing.cancel)
+        name = f"trade-run-{service.label}"
+        outcome = partial(self._take_turn, do, request, ongoing)
+        threading.Thread(target=run.end, args=(outcome,), name=name, daemon=True).start()
+
+    def _prepared(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Callable[[CallContext], Any]:
+        """What to do when its time has come, with the arguments as they are now."""
+        service = self._service
+        if not service.strict:
+            return lambda context: service.run_straight(args, kwargs, context)
+        raw = encode_arguments(self._codec, service.signature.info, service.label, args, kwargs)
+
+        def copied(context: CallContext) -> Any:
+            return service.signature.copy_result(service.run(raw, context))
+
+        return copied if not service.signature.has_secrets else lambda context: self._discreet(copied, context, raw)
+
+    def _discreet(self, do: Callable[[CallContext], Any], context: CallContext, raw: Raw) -> Any:
+        """An error as it would come over the wire: without what is secret."""
+        try:
+            return do(context)
+        except Exception as error:  # noqa: BLE001 - whatever a provider raises
+            masked = unpack_error(self._service.failure(error, raw), self._service.label)
+        raise masked
+
+    def _take_turn(self, do: Callable[[CallContext], Any], request: Request, ongoing: Ongoing | None) -> Any:
+        serial = self._service.serial
+        if serial is None or serial.mine:
+            return self._run(do, request, ongoing)
+        turn = Turn()
+        if ongoing is not None:
+            ongoing.on_cancel(lambda: serial.drop(turn))
+        if not serial.enter(turn, (request.deadline_ns - time.monotonic_ns()) / 1e9):
+            if ongoing is not None and ongoing.cancelled:
+                raise Cancelled(service=self._service.label)
+            raise DeadlineExceeded(service=self._service.label, deadline_s=request.deadline_s)
+        try:
+            return self._run(do, request, ongoing)
+        finally:
+            serial.leave()
+
+    def _run(self, do: Callable[[CallContext], Any], request: Request, ongoing: Ongoing | None) -> Any:
+        service = self._service
+        if ongoing is not None and ongoing.cancelled:
+            raise Cancelled(service=service.label)
         expires_ns = None if service.effect == "stop" else request.deadline_ns
         if service.too_late(expires_ns):
             raise DeadlineExceeded(service=service.label, deadline_s=request.deadline_s)
         context = CallContext(
-            self._new_id(), service.label, self._own.identity, self._session, expires_ns, request.chain
+            self._new_id(), service.label, self._own.identity, self._session, expires_ns, request.chain, ongoing
         )
-        return service.signature.copy_result(service.run(raw, context))
+        return do(context)
 
 
 class RemoteTarget:
@@ -110,6 +157,7 @@ class RemoteTarget:
         self._publisher = caller.publisher(address, key.domain, key.provider, stop=self._is_stop)
         self._clock = caller.publisher(address, DOMAIN, PROVIDER, stop=False)
         self._decode = _result_decoder(codec, record.info)
+        self._decode_any = codec.decoder(Any)
 
     def invoke(self, args: tuple[Any, ...], kwargs: dict[str, Any], request: Request) -> Any:
         raw = self._encode(args, kwargs, request)
@@ -124,7 +172,17 @@ class RemoteTarget:
         raw = self._encode(args, kwargs, request)
 
         def go() -> None:
-            self._start(self._publisher, self._info.name, raw, self._expiry(request), request, finish)
+            if run.cancelling:
+                run.fail(Cancelled(service=self._label))
+                return
+            call_id = self._start(self._publisher, self._info.name, raw, self._expiry(request), request, finish, note)
+            run.on_cancel(lambda: self._caller.cancel(self._peer, call_id, self._label, request.deadline_ns))
+
+        def note(reply: Reply) -> None:
+            try:
+                run.note_progress(self._decode_any(reply.body))
+            except Exception as bad:  # noqa: BLE001 - the bytes are anything
+                _logger.debug("%s said something of its progress that cannot be read: %s", self._label, bad)
 
         def finish(reply: Reply) -> None:
             run.end(lambda: self._unpack(reply, request))
@@ -159,8 +217,11 @@ class RemoteTarget:
         expires_ns: int | None,
         request: Request,
         then: Callable[[Reply], None],
-    ) -> None:
-        self._caller.start(self._peer, publisher, service, raw, request.deadline_ns, expires_ns, request.chain, then)
+        on_progress: Callable[[Reply], None] | None = None,
+    ) -> int:
+        return self._caller.start(
+            self._peer, publisher, service, raw, request.deadline_ns, expires_ns, request.chain, then, on_progress
+        )
 
     def _unpack(self, reply: Reply, request: Request) -> Any:
         if reply.status != Status.OK:

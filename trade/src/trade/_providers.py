@@ -12,6 +12,7 @@ from msgspec import Struct, structs
 from trade._constraints import checked_meta
 from trade._dispatch import AsyncLoop, LocalService
 from trade._registry import Registry
+from trade._serial import Serial
 from trade._service import ServiceMark, kinds_of, marked_methods
 from trade._signature import Codec, Signature
 from trade._system import DOMAIN
@@ -188,13 +189,19 @@ class Providers:
             raise ConfigurationError(where=kind, problem=problem)
         resources = tuple(getattr(provider, "resources", ()))
         _require_stop(kind, resources, [mark for mark, _ in marked.values()])
+        serial = Serial()
         services: dict[str, LocalService] = {}
         for name, (mark, function) in marked.items():
             label = f"{groups[0] if groups else kind}.{name}"
+            if not mark.strict and mark.effect != "read" and (mark.uses or resources):
+                problem = "it needs physical resources, so its arguments are always checked; leave out strict=False"
+                raise ConfigurationError(where=label, problem=problem)
             signature = Signature(label, name, mark, function, self._codec)
             if mark.effect != "read":
                 signature.info = structs.replace(signature.info, uses=(*mark.uses, *resources))
-            services[name] = LocalService(label, signature, getattr(provider, name), mark.effect, self._loop)
+            services[name] = LocalService(
+                label, signature, getattr(provider, name), mark, self._loop, serial if mark.serial else None
+            )
         return services
 
 

@@ -30,6 +30,8 @@ class ServiceMark:
     achieves: tuple[str, ...] = ()
     uses: tuple[str, ...] = ()
     meta: Mapping[str, Scalar] = field(default_factory=dict[str, Scalar])
+    serial: bool = False
+    strict: bool = True
 
 
 @overload
@@ -42,6 +44,8 @@ def service(
     achieves: Sequence[str] = (),
     uses: Sequence[str] = (),
     meta: Mapping[str, Scalar] | None = None,
+    serial: bool = False,
+    strict: bool = True,
 ) -> Callable[[_Function], _Function]: ...
 def service(
     function: Callable[..., Any] | None = None,
@@ -52,6 +56,8 @@ def service(
     achieves: Sequence[str] = (),
     uses: Sequence[str] = (),
     meta: Mapping[str, Scalar] | None = None,
+    serial: bool = False,
+    strict: bool = True,
 ) -> Any:
     """Mark a method as a service, in a class or in an interface whose implementations then have it.
 
@@ -62,15 +68,23 @@ def service(
         achieves: post-conditions, predicates such as ``"open(gripper)"`` or ``"at(?place)"``.
         uses: physical resources it needs for itself.
         meta: numbers, texts, booleans by name, for others to select by: ``{"payload_kg": 2}``.
+        serial: it never runs beside another serial service of the same object; calls wait in order of arrival.
+        strict: a local call sees what a remote one would, validated arguments and copies. False: it goes straight
+            through by reference, checked and copied by nobody; what needs physical resources is always strict.
 
     Raises:
-        ConfigurationError: the effect is none of these, a post-condition is malformed, metadata is no plain value.
+        ConfigurationError: the effect is none of these, the options contradict each other, a post-condition is
+            malformed, metadata is no plain value.
     """
     if effect not in _EFFECTS:
         raise ConfigurationError(problem=f"effect must be one of {', '.join(_EFFECTS)}, not {effect!r}")
+    if serial and effect == "stop":
+        raise ConfigurationError(problem="a stop waits for nobody: it cannot be serial")
     for condition in _several(achieves):
         parse_achieved(condition)
-    mark = ServiceMark(effect, cancel, _several(achieves), _several(uses), checked_meta(meta or {}))
+    mark = ServiceMark(
+        effect, cancel, _several(achieves), _several(uses), checked_meta(meta or {}), serial=serial, strict=strict
+    )
 
     def note(target: _Function) -> _Function:
         function: Any = getattr(target, "__func__", target)  # a class or static method: its function carries the mark

@@ -15,9 +15,10 @@ from msgspec import UNSET, Raw, UnsetType
 from msgspec.structs import astuple
 
 from trade._records import noted
+from trade._secret import MASK, is_secret, mask
 from trade._service import ServiceMark
-from trade._wire import Parameter, ServiceInfo
-from trade.errors import ConfigurationError, InvalidArgument, InvalidResult, NotSerialisable
+from trade._wire import MOST_BYTES, ErrorInfo, Parameter, ServiceInfo
+from trade.errors import ConfigurationError, InvalidArgument, InvalidResult, NotSerialisable, TooLarge
 
 _AT: Final = re.compile(r" - at `\$(?:\[(\d+)\]|\.(\w+))(.*)`$")
 _MAP_HEADS: Final = frozenset([*range(0x80, 0x90), 0xDE, 0xDF])
@@ -63,11 +64,14 @@ def encode_arguments(
 ) -> Raw:
     """The caller's half: positional as an array, with keywords as a map of all by name."""
     try:
-        return Raw(codec.encode(args if not kwargs else _by_name(info, service, args, kwargs)))
+        data = codec.encode(args if not kwargs else _by_name(info, service, args, kwargs))
     except (TypeError, ValueError, OverflowError, RecursionError) as bad:
         if isinstance(bad, InvalidArgument):
             raise
         raise _unsendable(codec, info, service, args, kwargs, bad) from None
+    if len(data) > MOST_BYTES:
+        raise TooLarge(service=service, what="arguments", size_bytes=len(data), limit_bytes=MOST_BYTES)
+    return Raw(data)
 
 
 def _by_name(info: ServiceInfo, service: str, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> dict[str, Any]:
@@ -114,7 +118,9 @@ class Signature:
         self._names = [parameter.name for parameter in parameters]
         kinds = {parameter.name: hints.get(parameter.name, Any) for parameter in parameters}
         returns = hints.get("return", Any)
+        self._secrets = frozenset(name for name, kind in kinds.items() if is_secret(kind))
         self._codec = codec
+        self._decode_any = codec.decoder(Any)
         self._decode_array, self._decode_map = self._decoders(where, parameters, kinds, codec)
         self._positional = [p.name for p in parameters if p.kind in _POSITIONAL]
         self._keyword_only = [p.name for p in parameters if p.kind not in _POSITIONAL]
@@ -184,7 +190,32 @@ class Signature:
             raise InvalidResult(service=self._service, problem=str(bad)) from None
         except (TypeError, ValueError, OverflowError, RecursionError) as bad:
             raise NotSerialisable(service=self._service, what="its result", problem=str(bad)) from None
+        if len(data) > MOST_BYTES:
+            raise TooLarge(service=self._service, what="a result", size_bytes=len(data), limit_bytes=MOST_BYTES)
         return Raw(data)
+
+    def encode_progress(self, value: Any) -> Raw:
+        """What the provider says of its progress. Raises NotSerialisable, TooLarge: the provider's fault."""
+        try:
+            data = self._codec.encode(value)
+        except (TypeError, ValueError, OverflowError, RecursionError) as bad:
+            raise NotSerialisable(service=self._service, what="its progress", problem=str(bad)) from None
+        if len(data) > MOST_BYTES:
+            raise TooLarge(service=self._service, what="progress", size_bytes=len(data), limit_bytes=MOST_BYTES)
+        return Raw(data)
+
+    def copy_progress(self, value: Any) -> Any:
+        """The same as a caller on the other side of the wire would get it."""
+        return self._decode_any(self.encode_progress(value))
+
+    @property
+    def has_secrets(self) -> bool:
+        """Whether an argument is secret."""
+        return bool(self._secrets)
+
+    def without_secrets(self, error: ErrorInfo, raw: Raw) -> ErrorInfo:
+        """An error of a call with these arguments, fit for everybody's eyes."""
+        return mask(error, raw, self._positional, self._secrets)
 
     def copy_result(self, value: Any) -> Any:
         """What a caller on the other side of the wire would get."""
@@ -324,8 +355,10 @@ def _signature_text(name: str, parameters: Sequence[inspect.Parameter], kinds: M
         if parameter.kind is parameter.KEYWORD_ONLY and before is not parameter.kind:
             parts.append("*")
         before = parameter.kind
-        hint = "" if kinds[parameter.name] is Any else f": {_type_text(kinds[parameter.name])}"
-        parts.append(parameter.name + hint + _default_text(parameter, hint))
+        kind = kinds[parameter.name]
+        hint = "" if kind is Any else f": {_type_text(kind)}"
+        default = _default_text(parameter, hint)
+        parts.append(parameter.name + hint + (f" = {MASK}" if default and is_secret(kind) else default))
     if before is inspect.Parameter.POSITIONAL_ONLY:
         parts.append("/")
     return f"{name}({', '.join(parts)})" + ("" if returns is Any else f" -> {_type_text(returns)}")

@@ -105,12 +105,14 @@ class Status:
     BUSY: Final = 2
     EXPIRED: Final = 3
     GONE: Final = 4
+    # No end: how far it is.
+    PROGRESS: Final = 5
     # Put by the caller's own container on its own reply key, to end a wait.
-    TIMED_OUT: Final = 5
-    LOST: Final = 6
-    CLOSED: Final = 7
+    TIMED_OUT: Final = 6
+    LOST: Final = 7
+    CLOSED: Final = 8
     # Never put at all: what a call ends with that could not be sent.
-    UNSENT: Final = 8
+    UNSENT: Final = 9
 
 
 class Reply(Struct, array_like=True, gc=False):
@@ -118,11 +120,11 @@ class Reply(Struct, array_like=True, gc=False):
 
     v: int
     id: int
-    status: Annotated[int, Meta(ge=0, le=7)]
+    status: Annotated[int, Meta(ge=0, le=8)]
     clock_ns: int
     """The callee's monotonic clock when it answered: keeps the caller's estimate of the offset fresh."""
     body: Raw
-    """OK: the result. ERROR: an ErrorInfo. Otherwise nil."""
+    """OK: the result. ERROR: an ErrorInfo. PROGRESS: whatever the provider says. Otherwise nil."""
 
 
 class ErrorInfo(Struct):
@@ -185,6 +187,22 @@ class ProviderInfo(Struct, frozen=True, kw_only=True):
     """Holds for all its services, over what they say themselves."""
     health: str = HEALTHY
 
+
+CANCEL: Final = "cancel"
+"""Asks to end a call: a stop call of this name to the middleware's own provider. It stands in no registry."""
+
+
+class CancelArguments(Struct, array_like=True, gc=False):
+    """Which call to end."""
+
+    id: int
+    service: str
+    keep_s: Annotated[float, Meta(ge=0, le=86_400)]
+    """How long the call may still be under way."""
+
+
+MOST_BYTES: Final = 64 << 20
+"""The largest arguments and the largest result, encoded."""
 
 EMPTY: Final = Raw(msgspec.msgpack.encode(None))
 EMPTY_ARGUMENTS: Final = Raw(msgspec.msgpack.encode(()))

@@ -31,6 +31,7 @@ __all__ = [
     "RemoteError",
     "ServiceGone",
     "SetupError",
+    "TooLarge",
     "TooManyServices",
     "TradeError",
 ]
@@ -145,6 +146,23 @@ class NotSerialisable(CallerError, TypeError):
 
     def describe(self) -> str:
         return f"{self.service}: {self.what} cannot be sent: {self.problem}; use plain data, a struct or a handle"
+
+
+@dataclass(kw_only=True, eq=False)
+class TooLarge(CallerError, ValueError):
+    """Arguments or a result are larger than a message may be; not a byte of them was sent."""
+
+    service: str
+    what: str
+    size_bytes: int
+    limit_bytes: int
+
+    def describe(self) -> str:
+        size, limit = self.size_bytes / (1 << 20), self.limit_bytes / (1 << 20)
+        return (
+            f"{self.service}: {self.what} of {size:.1f} MiB ({self.size_bytes} bytes) cannot be sent, the limit is "
+            f"{limit:.0f} MiB; send it in parts"
+        )
 
 
 @dataclass(kw_only=True, eq=False)

@@ -1,0 +1,121 @@
+"""Services that run one at a time: a queue per provider object, without a thread for each that waits."""
+
+import contextlib
+import logging
+import threading
+from collections import deque
+from collections.abc import Callable, Generator
+from contextvars import ContextVar
+from typing import Final
+
+_logger = logging.getLogger("trade")
+
+MOST_WAITING: Final = 1024
+
+Job = Callable[[], None]
+
+
+class Turn:
+    """A thread of this process that waits for its turn."""
+
+    __slots__ = ("come", "dropped")
+
+    def __init__(self) -> None:
+        self.come = threading.Event()
+        self.dropped = False
+
+
+_held: "ContextVar[tuple[Serial, ...]]" = ContextVar("trade_serial", default=())
+
+
+class Serial:
+    """The serial services of one provider, in order of arrival.
+
+    Whoever finds it free runs its own call and then what has queued up meanwhile. Calls from this process run on their
+    callers' threads.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._queue: deque[Job | Turn] = deque()
+        self._taken = False
+
+    @property
+    def mine(self) -> bool:
+        """Whether the running code is a serial service of this provider: its own nested calls do not queue."""
+        return self in _held.get()
+
+    @contextlib.contextmanager
+    def held(self) -> Generator[None]:
+        """While a serial service runs."""
+        token = _held.set((*_held.get(), self))
+        try:
+            yield
+        finally:
+            _held.reset(token)
+
+    def submit(self, job: Job) -> bool:
+        """Run it now if nothing runs, else when its turn comes, on another thread. False: too many wait already."""
+        with self._lock:
+            if self._taken:
+                if len(self._queue) >= MOST_WAITING:
+                    return False
+                self._queue.append(job)
+                return True
+            self._taken = True
+        self._drain(job)
+        return True
+
+    def withdraw(self, waiting: Job | Turn) -> bool:
+        """Take it out of the queue; False if its turn has come."""
+        with self._lock:
+            if waiting not in self._queue:
+                return False
+            self._queue.remove(waiting)
+            return True
+
+    def drop(self, turn: Turn) -> None:
+        """End a thread's waiting: its turn will not come."""
+        if self.withdraw(turn):
+            turn.dropped = True
+            turn.come.set()
+
+    def enter(self, turn: Turn, timeout_s: float | None) -> bool:
+        """Wait for the turn of this thread; False if it did not come in time. Followed by `leave`."""
+        with self._lock:
+            if not self._taken:
+                self._taken = True
+                return True
+            self._queue.append(turn)
+        try:
+            return (turn.come.wait(timeout_s) or not self.withdraw(turn)) and not turn.dropped
+        except BaseException:
+            if not self.withdraw(turn):
+                self.leave()
+            raise
+
+    def leave(self) -> None:
+        """Give the turn to who is next."""
+        job = self._next()
+        if job is not None:
+            threading.Thread(target=self._drain, args=(job,), name="trade-serial", daemon=True).start()
+
+    def _drain(self, job: Job | None) -> None:
+        while job is not None:
+            try:
+                job()
+            except Exception:
+                _logger.exception("a call that had waited for its turn could not be answered")
+            job = self._next()
+
+    def _next(self) -> Job | None:
+        """The next job; None if nothing waits, or a thread does, which has the turn then."""
+        with self._lock:
+            if not self._queue:
+                self._taken = False
+                return None
+            following = self._queue.popleft()
+        if not isinstance(following, Turn):
+            return following
+        following.come.set()
+        return None
