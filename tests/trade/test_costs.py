@@ -89,7 +89,9 @@ def pair(system: str, sent: Counter[str]) -> Iterator[tuple[Container, Container
             rendezvous, endpoint = Rendezvous(system), free_endpoint()
             stack.callback(rendezvous.leave)
             others = rendezvous.enter(endpoint)
-            settings = configuration(namespace=system, listen=[endpoint], connect=others, credentials=("costs", "secret"))
+            settings = configuration(
+                namespace=system, listen=[endpoint], connect=others, credentials=("costs", "secret")
+            )
             return stack.enter_context(
                 Container(Settings.read(container=name), transport=CountingTransport(settings, sent))
             )

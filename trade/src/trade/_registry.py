@@ -54,6 +54,8 @@ class ContainerState:
     alive: bool
     providers: dict[str, tuple[int, list[Record]]]
     removed: set[str]
+    lost: bool = False
+    """Whether it was alive before."""
 
 
 class Change(NamedTuple):
@@ -109,12 +111,13 @@ class Registry:
                 change = self._swap(known[1] if known else [], state.providers[provider][1], state.alive)
             self._tell(change)
 
-    def remove(self, address: Address, provider: str) -> None:
-        """A provider was deregistered; in this boot it never comes back."""
+    def remove(self, address: Address, provider: str, *, for_good: bool = True) -> None:
+        """A provider was deregistered; in this boot it never comes back, if that is sure."""
         with self._telling:
             with self._changed:
                 state = self._state(address)
-                state.removed.add(provider)
+                if for_good:
+                    state.removed.add(provider)
                 _, records = state.providers.pop(provider, (0, []))
                 change = self._swap(records, [], state.alive)
             self._tell(change)
@@ -124,7 +127,7 @@ class Registry:
         with self._telling:
             with self._changed:
                 state = self._state(address)
-                was, state.alive = state.alive, True
+                was, state.alive, state.lost = state.alive, True, False
                 change = self._swap([], [] if was else _all(state), alive=True)
             self._tell(change)
 
@@ -133,7 +136,7 @@ class Registry:
         with self._telling:
             with self._changed:
                 state = self._state(address)
-                was, state.alive = state.alive, False
+                was, state.alive, state.lost = state.alive, False, True
                 change = self._swap(_all(state) if was else [], [], alive=True)
                 self._forget_ended()
             self._tell(change)
@@ -210,6 +213,11 @@ class Registry:
                     return False
                 self._changed.wait(left)
             return True
+
+    def known_before(self, address: Address) -> set[str]:
+        """The providers of a container whose sign of life fell: what it offered when it was heard last."""
+        state = self._containers.get(address)
+        return set(state.providers) if state is not None and state.lost else set()
 
     def is_alive(self, address: Address) -> bool:
         state = self._containers.get(address)

@@ -20,6 +20,13 @@ class Message(Struct, frozen=True, gc=False):
     payload: bytes | None
 
 
+def some(value: bytes) -> bytes:
+    """The value of an announcement; raises ValueError for an empty one."""
+    if not value:
+        raise ValueError("an announcement has a value of at least one byte; close it to withdraw it")
+    return value
+
+
 class Channel(ABC):
     """A queue filled by the transport and read by our own threads; several may read one."""
 
@@ -60,6 +67,8 @@ class Transport(ABC):
 
     Guarantees: messages on one key from one publisher arrive in order; what is subscribed before something is announced
     hears all that follows the announcement; announcements reach those who come later; presence falls within the lease.
+    Channels, publishers and signs of life last while they are kept. Once closed, every verb but ``wake`` and ``close``
+    raises ChannelClosed.
     """
 
     @abstractmethod
@@ -72,7 +81,10 @@ class Transport(ABC):
 
     @abstractmethod
     def announce(self, key: str) -> Publisher:
-        """Like publish, but the last value is kept for those who come later."""
+        """Like publish, but the last value is kept for those who come later.
+
+        A value is never empty: putting none raises ValueError.
+        """
 
     @abstractmethod
     def announcements(self, pattern: str) -> Channel:
@@ -80,7 +92,7 @@ class Transport(ABC):
 
     @abstractmethod
     def standing(self, pattern: str, timeout_s: float) -> list[Message]:
-        """The announcements of others that stand now, asked for and waited for."""
+        """The announcements that stand now, one's own included, asked for and waited for."""
 
     @abstractmethod
     def appear(self, key: str) -> Presence:
@@ -88,11 +100,11 @@ class Transport(ABC):
 
     @abstractmethod
     def presences(self, pattern: str) -> Channel:
-        """Hear signs of life of others rise (empty payload) and fall (no payload), those standing now first."""
+        """Hear signs of life rise (empty payload) and fall (no payload), those standing now first; one's own, too."""
 
     @abstractmethod
     def present(self, pattern: str, timeout_s: float) -> list[str]:
-        """The signs of life of others that stand now."""
+        """The signs of life that stand now, one's own included."""
 
     @abstractmethod
     def wake(self, key: str, payload: bytes) -> None:

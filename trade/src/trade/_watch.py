@@ -6,26 +6,28 @@ from collections.abc import Callable
 from typing import Final
 
 from trade._registry import Registry
+from trade._system import PROVIDER
 from trade._transport import Channel, ChannelClosed, Message, Transport
-from trade._wire import ALIVE, REGISTRY, Address, Malformed, decode_provider, is_chunk
+from trade._wire import ALIVE, REGISTRY, Address, Malformed, decode_provider, is_chunk, registry_key
 
 _logger = logging.getLogger("trade")
 
-_FIRST_SYNC_S: Final = 2.0
+_SYNC_S: Final = 2.0
 
 
 class Watch:
     """Feeds a registry from the network. Construction ends with the first sync: what stands now is known then."""
 
     def __init__(self, transport: Transport, registry: Registry, own: Address, lost: Callable[..., None]) -> None:
+        self._transport = transport
         self._registry = registry
         self._own = own
         self._lost = lost
         self.malformed = 0
         entries, signs = transport.announcements(REGISTRY), transport.presences(ALIVE)
-        for key in transport.present(ALIVE, _FIRST_SYNC_S):
+        for key in transport.present(ALIVE, _SYNC_S):
             self._sign(Message(key, b""))
-        for message in transport.standing(REGISTRY, _FIRST_SYNC_S):
+        for message in transport.standing(REGISTRY, _SYNC_S):
             self._entry(message)
         self._channels = (entries, signs)
         self._threads = [
@@ -70,7 +72,19 @@ class Watch:
             self._registry.vanish(address)
         else:
             self._lost(address, back=True)
+            self._catch_up(address)
             self._registry.appear(address)
+
+    def _catch_up(self, address: Address) -> None:
+        """Nobody tells what a container withdrew while it was out of sight; so ask what still stands."""
+        known = self._registry.known_before(address)
+        if not known:
+            return
+        standing = self._transport.standing(registry_key("*", address, "*"), _SYNC_S)
+        offered = {message.key.rpartition("/")[2] for message in standing}
+        if PROVIDER in offered:  # every container offers that; without it, nobody answered
+            for provider in known - offered:
+                self._registry.remove(address, provider, for_good=False)
 
     def _drop(self, key: str, bad: Exception) -> None:
         self.malformed += 1

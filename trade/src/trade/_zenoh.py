@@ -6,14 +6,15 @@ No Python runs on zenoh's threads: every subscriber is a channel that our thread
 receiver instead of dropping (zenoh's default), and go out at once. All sessions carry the same short lease.
 """
 
-from collections.abc import Callable, Sequence
+import contextlib
+from collections.abc import Callable, Generator, Sequence
 from typing import Any, Final
 
 import zenoh
 from zenoh import ext
 
 from trade._links import Links, new_session_id, open_session
-from trade._transport import Channel, ChannelClosed, Message, Presence, Publisher, Transport
+from trade._transport import Channel, ChannelClosed, Message, Presence, Publisher, Transport, some
 from trade.errors import ConfigurationError
 
 LEASE_MS: Final = 2000
@@ -89,6 +90,14 @@ class ZenohChannel(Channel):
             self._forget(self._session)
 
 
+class ZenohAnnouncements(ZenohChannel):
+    """What a cache repeats of a withdrawal comes as an empty put; no announcement is empty, so we can tell."""
+
+    def receive(self) -> Message:
+        message = super().receive()
+        return message if message.payload else Message(message.key, None)
+
+
 class ZenohPublisher(Publisher):
     def __init__(self, publisher: Any, forget_key: Callable[[], Any] | None = None) -> None:
         self._publisher = publisher
@@ -107,6 +116,9 @@ class ZenohPublisher(Publisher):
 
 
 class ZenohAnnouncement(ZenohPublisher):
+    def put(self, payload: bytes) -> None:
+        super().put(some(payload))
+
     def close(self) -> None:
         _quietly(self._publisher.delete)
         super().close()
@@ -133,23 +145,19 @@ class ZenohTransport(Transport):
 
     def publish(self, key: str, *, urgent: bool = False) -> Publisher:
         priority = zenoh.Priority.REAL_TIME if urgent else zenoh.Priority.DATA
-        try:
+        with _refusing():
             known = self._session.declare_keyexpr(key)
             declared = self._session.declare_publisher(
                 known, congestion_control=_BLOCK, express=True, priority=priority
             )
-        except zenoh.ZError:
-            raise ChannelClosed from None
         return ZenohPublisher(declared, lambda: self._session.undeclare(known))
 
     def subscribe(self, pattern: str) -> Channel:
-        try:
+        with _refusing():
             return ZenohChannel(self._session.declare_subscriber(pattern, _fifo()), declare_on=self._session)
-        except zenoh.ZError:
-            raise ChannelClosed from None
 
     def announce(self, key: str) -> Publisher:
-        try:
+        with _refusing():
             declared = ext.declare_advanced_publisher(
                 self._session,
                 key,
@@ -159,42 +167,46 @@ class ZenohTransport(Transport):
                 publisher_detection=True,
                 sample_miss_detection=ext.MissDetectionConfig(sporadic_heartbeat=0.5),
             )
-        except zenoh.ZError:
-            raise ChannelClosed from None
         return ZenohAnnouncement(declared)
 
     def announcements(self, pattern: str) -> Channel:
-        declared = ext.declare_advanced_subscriber(
-            self._session,
-            pattern,
-            _fifo(),
-            allowed_origin=zenoh.Locality.REMOTE,
-            history=ext.HistoryConfig(detect_late_publishers=True),
-            recovery=ext.RecoveryConfig(heartbeat=True),
-        )
-        return ZenohChannel(declared)
+        with _refusing():
+            declared = ext.declare_advanced_subscriber(
+                self._session,
+                pattern,
+                _fifo(),
+                allowed_origin=zenoh.Locality.REMOTE,
+                history=ext.HistoryConfig(detect_late_publishers=True),
+                recovery=ext.RecoveryConfig(heartbeat=True),
+            )
+        return ZenohAnnouncements(declared)
 
     def standing(self, pattern: str, timeout_s: float) -> list[Message]:
         # The caches of announcements answer on keys below @adv, with samples of the plain key.
-        replies = self._session.get(
-            f"{pattern}/@adv/**",
-            _fifo(),
-            target=zenoh.QueryTarget.ALL,
-            accept_replies=zenoh.ReplyKeyExpr.ANY,
-            consolidation=zenoh.ConsolidationMode.NONE,
-            timeout=timeout_s,
-        )
+        with _refusing():
+            replies = self._session.get(
+                f"{pattern}/@adv/**",
+                _fifo(),
+                target=zenoh.QueryTarget.ALL,
+                accept_replies=zenoh.ReplyKeyExpr.ANY,
+                consolidation=zenoh.ConsolidationMode.NONE,
+                timeout=timeout_s,
+            )
         samples = [reply.ok for reply in replies if reply.ok is not None]
-        return [Message(str(sample.key_expr), sample.payload.to_bytes()) for sample in samples if sample.kind == _PUT]
+        found = [Message(str(sample.key_expr), sample.payload.to_bytes()) for sample in samples]
+        return [message for message in found if message.payload]  # those withdrawn just now are empty
 
     def appear(self, key: str) -> Presence:
-        return ZenohPresence(self._session.liveliness().declare_token(key))
+        with _refusing():
+            return ZenohPresence(self._session.liveliness().declare_token(key))
 
     def presences(self, pattern: str) -> Channel:
-        return ZenohChannel(self._session.liveliness().declare_subscriber(pattern, _fifo(), history=True))
+        with _refusing():
+            return ZenohChannel(self._session.liveliness().declare_subscriber(pattern, _fifo(), history=True))
 
     def present(self, pattern: str, timeout_s: float) -> list[str]:
-        replies = self._session.liveliness().get(pattern, _fifo(), timeout=timeout_s)
+        with _refusing():
+            replies = self._session.liveliness().get(pattern, _fifo(), timeout=timeout_s)
         return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
 
     def wake(self, key: str, payload: bytes) -> None:
@@ -206,6 +218,15 @@ class ZenohTransport(Transport):
 
 def _fifo() -> Any:
     return zenoh.handlers.FifoChannel(_CHANNEL_CAPACITY)
+
+
+@contextlib.contextmanager
+def _refusing() -> Generator[None, None, None]:
+    """What a closed session refuses is refused in our words."""
+    try:
+        yield
+    except zenoh.ZError:
+        raise ChannelClosed from None
 
 
 def _quietly(action: Any) -> None:

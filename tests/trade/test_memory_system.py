@@ -1,0 +1,459 @@
+"""A whole system in one process: it converges whatever the network does, and nobody hangs whoever dies."""
+
+import concurrent.futures
+import random
+import re
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from trade import Container, Handle, errors, service, where
+from trade._memory import Passage
+from trade._transport import ChannelClosed
+from trade.errors import ContainerLost, NoSuchService, ServiceGone, TradeError
+from trade.testing import Kind, MemorySystem, memory_system
+
+Eventually = Callable[[Callable[[], bool]], bool]
+
+
+class Lamp:
+    def __init__(self) -> None:
+        self.values: list[float] = []
+
+    @service
+    def dim(self, value: float) -> float:
+        self.values.append(value)
+        return value
+
+
+def labels(container: Container) -> list[str]:
+    """What it knows of, the middleware's own left out."""
+    return [f"{handle.container}/{handle.label}" for handle in container.services() if handle.key.domain != "trade"]
+
+
+def found(container: Container, group: str = "robot") -> Handle:
+    return container.find(where(name="dim", group=group), wait_s=20).with_(deadline_s=20)
+
+
+# --- what it is
+
+
+def test_containers_find_and_call_each_other() -> None:
+    with memory_system() as system:
+        system.container("b").register(Lamp(), "robot")
+        assert found(system.container("a"))(0.5) == 0.5
+
+
+def test_a_name_stands_for_one_running_container() -> None:
+    with memory_system() as system:
+        first = system.container("a")
+        assert system.container("a") is first
+        system.kill("a")
+        second = system.container("a")
+        assert second is not first
+        second.close()
+        assert system.container("a") is not second
+
+
+def test_at_the_end_every_container_is_closed() -> None:
+    with memory_system() as system:
+        containers = [system.container(name) for name in "ab"]
+        system.kill("b")
+    assert not any(container.healthy() for container in containers)
+
+
+def test_two_systems_know_nothing_of_each_other() -> None:
+    with memory_system() as one, memory_system() as other:
+        one.container("a").register(Lamp(), "robot")
+        assert labels(other.container("b")) == []
+
+
+def test_over_slow_links_blocking_calls_return_while_time_flows() -> None:
+    with memory_system(seed=3) as system:
+        a, b = system.container("a"), system.container("b")
+        system.delay(0.05, jitter_s=0.05)
+        b.register(Lamp(), "robot")
+        system.settle()
+        with system.flowing():
+            assert found(a)(0.5) == 0.5
+        assert system.clock.monotonic_ns() >= 5 * 50_000_000  # the entry, the clock and back, the call and back
+
+
+def test_over_slow_links_started_calls_can_be_driven_to_their_end() -> None:
+    with memory_system() as system:
+        a, b = system.container("a"), system.container("b")
+        b.register(Lamp(), "robot")
+        handle = found(a)
+        system.delay(3600, between=(a, b))
+        run = handle.start(0.5)
+        system.drive(run.done)
+        assert run.result() == 0.5
+        assert system.clock.monotonic_ns() == 4 * 3600 * 10**9
+
+
+def test_the_page_on_testing_does_what_it_says() -> None:
+    page = Path(__file__).parents[2] / "docs" / "testing.md"
+    known: dict[str, Any] = {"pytest": pytest, "errors": errors}
+    for program in re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL):
+        exec(program, known)
+    tests = [value for name, value in known.items() if name.startswith("test_")]
+    assert len(tests) == 3
+    for test in tests:
+        test()
+
+
+# --- how many messages things take
+
+
+def test_a_call_takes_two_messages_after_the_first() -> None:
+    with memory_system() as system:
+        a, b = system.container("a"), system.container("b")
+        system.container("c")
+        b.register(Lamp(), "robot")
+        handle = found(a)
+        before = system.sent()
+        handle(0.1)
+        assert system.sent() - before == 4  # it asks for the clock first
+        before = system.network.sent.copy()
+        for _ in range(10):
+            handle(0.1)
+        assert system.network.sent - before == Counter({Kind.PUT: 20})
+
+
+def test_joining_takes_as_many_messages_as_there_are_containers_and_providers() -> None:
+    with memory_system() as system:
+        for size in range(5):
+            before = system.sent()
+            container = system.container(f"c{size}")
+            hosts, providers = size, size * 2  # others, and what they offer beyond the middleware's own
+            each = 2 + 1 + 2 + 2  # two signs of life, one entry, asked and answered twice
+            assert system.sent() - before <= hosts * each + providers * 2
+            for group in ("one", "two"):
+                container.register(Lamp(), group)
+
+
+def test_registering_takes_one_message_for_each_other_container() -> None:
+    with memory_system() as system:
+        a, *_ = [system.container(name) for name in "abcd"]
+        lamp, before = Lamp(), system.network.sent.copy()
+        a.register(lamp, "robot")
+        a.deregister(lamp)
+        assert system.network.sent - before == Counter({Kind.ANNOUNCE: 3, Kind.WITHDRAW: 3})
+
+
+# --- partitions
+
+
+@pytest.fixture
+def lamp() -> Lamp:
+    return Lamp()
+
+
+@pytest.fixture
+def pair(lamp: Lamp) -> "Callable[[MemorySystem], tuple[Container, Container, Handle]]":
+    """A caller, a callee, and the caller's handle of the callee's lamp, called once."""
+
+    def start(system: MemorySystem) -> tuple[Container, Container, Handle]:
+        caller, callee = system.container("caller"), system.container("callee")
+        callee.register(lamp, "robot")
+        handle = found(caller)
+        handle(0.0)
+        return caller, callee, handle
+
+    return start
+
+
+Pair = Callable[[MemorySystem], tuple[Container, Container, Handle]]
+
+
+def test_after_a_partition_each_side_knows_only_itself_and_then_everything_again(
+    pair: Pair,
+) -> None:
+    with memory_system() as system:
+        caller, callee, handle = pair(system)
+        caller.register(Lamp(), "hall")
+        system.partition(caller, callee)
+        system.advance(2)
+        assert (labels(caller), labels(callee)) == (["caller/hall.dim"], ["callee/robot.dim"])
+        with pytest.raises(ServiceGone, match="container callee has ended, restarted or cannot be reached"):
+            handle(0.1)
+        system.heal()
+        system.settle()
+        assert labels(caller) == labels(callee) == ["caller/hall.dim", "callee/robot.dim"]
+        assert handle(0.2) == 0.2
+
+
+def test_a_partition_within_the_lease_changes_nothing_but_the_time(pair: Pair) -> None:
+    with memory_system() as system:
+        caller, callee, handle = pair(system)
+        system.partition(caller, callee)
+        run = handle.start(0.1)
+        system.advance(1.9)
+        assert not run.done()
+        system.heal(caller, callee)
+        assert run.result(20) == 0.1
+        system.advance(5)
+        assert labels(caller) == ["callee/robot.dim"]
+
+
+def test_what_comes_and_goes_during_a_partition_is_known_after_it(
+    pair: Pair, lamp: Lamp, eventually: Eventually
+) -> None:
+    with memory_system() as system:
+        caller, callee, _ = pair(system)
+        kept = Lamp()
+        callee.register(kept, "kept")
+        system.partition(caller, callee)
+        system.advance(2)
+        callee.deregister(lamp)
+        callee.register(Lamp(), "new")
+        assert labels(caller) == []
+        joined: list[str] = []
+        caller.joined(where(name="dim"), lambda handle: joined.append(handle.label))
+        system.heal()
+        system.settle()
+        assert labels(caller) == ["callee/kept.dim", "callee/new.dim"]
+        assert eventually(lambda: sorted(joined) == ["kept.dim", "new.dim"])
+
+
+@pytest.mark.parametrize("deaf", ["caller", "callee"])
+def test_a_call_over_a_link_that_lets_one_way_pass_ends_with_the_lease(
+    pair: Pair, lamp: Lamp, deaf: str, eventually: Eventually
+) -> None:
+    with memory_system() as system:
+        caller, callee, handle = pair(system)
+        speaker = callee if deaf == "caller" else caller
+        system.partition(speaker, deaf, one_way=True)
+        run = handle.start(0.1)
+        if deaf == "caller":
+            assert eventually(lambda: lamp.values == [0.0, 0.1])  # it was done; nobody will know
+        system.advance(2)
+        assert isinstance(run.exception(20), ContainerLost)
+        assert labels(caller) == []
+        assert [info.name for info in callee.containers()] == ["callee"]
+        system.heal()
+        system.settle()
+        assert labels(caller) == labels(callee) == ["callee/robot.dim"]
+        assert handle(0.2) == 0.2
+        assert lamp.values == ([0.0, 0.1, 0.2] if deaf == "caller" else [0.0, 0.2])
+
+
+def test_a_partition_of_two_leaves_calls_of_a_third_alone(pair: Pair) -> None:
+    with memory_system() as system:
+        caller, callee, _ = pair(system)
+        third = system.container("third")
+        system.partition(caller, callee)
+        system.advance(2)
+        assert found(third)(0.3) == 0.3
+
+
+# --- deaths, at every message
+
+
+class Death:
+    """Kills a container at one message of many: before it is sent, or when it has just arrived."""
+
+    def __init__(self, system: MemorySystem, victim: str, step: int | None) -> None:
+        self.count = 0
+        self.at: Passage | None = None
+        self._system = system
+        self._victim = victim
+        self._step = step
+        system.tap(self._hear)
+
+    def _hear(self, passage: Passage) -> None:
+        if self.count == self._step:
+            self.at = passage
+            self._system.kill(self._victim)
+        self.count += 1
+
+    @property
+    def happened(self) -> bool:
+        return self.at is not None
+
+
+def meet_offer_and_call(system: MemorySystem, death: Death) -> list[BaseException]:
+    """A callee joins, offers, is called twice, withdraws, leaves. Returns the caller's errors."""
+    caller, errors, offered = system.container("caller"), list[BaseException](), Lamp()
+    callee: Container | None = None
+
+    def of_callee(action: Callable[[], object]) -> None:
+        try:
+            action()
+        except (ChannelClosed, TradeError):
+            assert death.happened
+
+    def join() -> None:
+        nonlocal callee
+        callee = system.container("callee")
+
+    of_callee(join)
+    if callee is not None:
+        joined: Container = callee
+        of_callee(lambda: joined.register(offered, "robot"))
+    try:
+        handle = caller.find(where(name="dim", group="robot"), wait_s=0 if death.happened else 20)
+        for value in (0.1, 0.2):
+            assert handle.with_(deadline_s=60)(value) == value
+    except TradeError as error:
+        errors.append(error)
+    if callee is not None:
+        of_callee(lambda: joined.deregister(offered))
+        joined.close()
+    return errors
+
+
+def steps() -> int:
+    with memory_system() as system:
+        system.container("caller")
+        death = Death(system, "", None)
+        assert meet_offer_and_call(system, death) == []
+        return death.count
+
+
+@pytest.mark.parametrize("victim", ["caller", "callee"])
+def test_whoever_dies_at_whatever_message_nobody_hangs_and_the_rest_goes_on(
+    victim: str,
+) -> None:
+    total = steps()
+    assert total > 30
+    for step in range(total):
+        with memory_system() as system:
+            system.container("caller")
+            death = Death(system, victim, step)
+            errors = meet_offer_and_call(system, death)
+            assert death.at is not None
+            for error in errors:
+                assert isinstance(error, NoSuchService | ServiceGone | ContainerLost), (step, death.at, error)
+            survivor = system.container("caller")
+            system.settle()
+            assert labels(survivor) == [], (step, death.at)
+            system.container("callee").register(Lamp(), "again")
+            assert found(survivor, "again")(0.9) == 0.9
+            everybody = ["caller", "callee"]
+            assert sorted(info.name for info in survivor.containers()) == sorted(everybody), (step, death.at)
+
+
+@pytest.mark.parametrize("arrived", [False, True])
+@pytest.mark.parametrize("answering", [False, True])
+def test_a_callee_that_dies_around_a_call_or_its_answer_is_told_as_lost(
+    pair: Pair, arrived: bool, answering: bool
+) -> None:
+    with memory_system() as system:
+        _, _, handle = pair(system)
+        kind = "reply/" if answering else "call/"
+
+        def kill(passage: Passage) -> None:
+            if passage.key.startswith(kind) and passage.arrived is arrived:
+                system.kill("callee")
+
+        system.tap(kill)
+        if answering and arrived:
+            assert handle(0.1) == 0.1
+        else:
+            with pytest.raises(ContainerLost):
+                handle(0.1)
+
+
+def test_callers_that_wait_are_all_freed_when_their_callee_dies(gate: Any) -> None:
+    with memory_system() as system:
+        callee, callers = system.container("callee"), [system.container(f"caller-{number}") for number in range(3)]
+        callee.register(gate, "gate")
+        handles = [caller.find(where(name="pass_through"), wait_s=20).with_(deadline_s=3600) for caller in callers]
+        with concurrent.futures.ThreadPoolExecutor() as pool:
+            blocked = [pool.submit(handle) for handle in handles]
+            runs = [handle.start() for handle in handles]
+            assert gate.entered.wait(20)
+            system.kill(callee)
+            errors = [waiting.exception(20) for waiting in (*blocked, *runs)]
+        assert all(isinstance(error, ContainerLost | ServiceGone) for error in errors)
+        gate.open.set()
+
+
+def test_a_fault_of_a_container_that_was_never_started_is_an_error() -> None:
+    with memory_system() as system, pytest.raises(LookupError, match="no container 'ghost' was started"):
+        system.kill("ghost")
+
+
+# --- storms
+
+
+class Storm:
+    """Containers that register, deregister, die and return while links break and mend, all drawn from one seed."""
+
+    def __init__(self, system: MemorySystem, seed: int, *, faults: bool) -> None:
+        self._system = system
+        self._random = random.Random(seed)
+        self._names = ["a", "b", "c", "d"]
+        self._offered: dict[str, list[Lamp]] = {name: [] for name in self._names}
+        for name in self._names:
+            system.container(name)
+        self._acts = [self._offer] * 5 + [self._withdraw] * 3 + [self._wait] * 3
+        self._acts += [self._cut, self._cut, self._mend, self._die] if faults else []
+        system.delay(0.001, jitter_s=0.05)
+
+    def rage(self, turns: int) -> None:
+        for _ in range(turns):
+            self._random.choice(self._acts)()
+        self._system.heal()
+        self._system.settle()
+
+    def _any(self) -> str:
+        return self._random.choice(self._names)
+
+    def _offer(self) -> None:
+        name, lamp = self._any(), Lamp()
+        self._system.container(name).register(lamp, f"robot-{self._random.randrange(5)}")
+        self._offered[name].append(lamp)
+
+    def _withdraw(self) -> None:
+        name = self._any()
+        if self._offered[name]:
+            lamp = self._offered[name].pop(self._random.randrange(len(self._offered[name])))
+            self._system.container(name).deregister(lamp)
+
+    def _wait(self) -> None:
+        self._system.advance(self._random.choice([0.01, 0.1, 1, 2.5]))
+
+    def _cut(self) -> None:
+        one, other = self._random.sample(self._names, 2)
+        self._system.partition(one, other, one_way=self._random.random() < 0.3)
+
+    def _mend(self) -> None:
+        self._system.heal(self._any())
+
+    def _die(self) -> None:
+        name = self._any()
+        self._system.kill(name)
+        self._offered[name].clear()
+        self._system.container(name)
+
+    def over(self) -> bool:
+        """Whether all know exactly what each one offers now."""
+        containers = [self._system.container(name) for name in self._names]
+        truth = {handle.key for container in containers for handle in container.services(where.local)}
+        return all({handle.key for handle in container.services()} == truth for container in containers)
+
+    def count(self) -> int:
+        return sum(len(lamps) for lamps in self._offered.values())
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_all_registries_are_the_same_after_a_storm_of_registrations(seed: int) -> None:
+    with memory_system(seed=seed) as system:
+        storm = Storm(system, seed, faults=False)
+        storm.rage(60)
+        assert storm.over()
+        assert len(labels(system.container("a"))) == storm.count()
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_all_registries_are_the_same_after_a_storm_with_partitions_and_deaths(seed: int) -> None:
+    with memory_system(seed=seed) as system:
+        storm = Storm(system, seed, faults=True)
+        storm.rage(80)
+        assert storm.over()
+        assert len(labels(system.container("a"))) == storm.count()

@@ -1,0 +1,116 @@
+"""The transport on zenoh keeps the guarantees of every transport."""
+
+import contextlib
+import secrets
+import socket
+import threading
+from collections.abc import Callable, Iterator
+
+from trade._rendezvous import free_endpoint
+from trade._transport import Presence
+from trade._zenoh import ZenohTransport, configuration
+from trade.testing import LossConformance, Severable, TransportConformance
+
+
+class TestZenoh(TransportConformance):
+    @contextlib.contextmanager
+    def network(self) -> Iterator[Callable[[], ZenohTransport]]:
+        namespace, endpoints = f"test-{secrets.token_hex(4)}", list[str]()
+        with contextlib.ExitStack() as stack:
+            kept: list[Presence] = []
+
+            def open_transport() -> ZenohTransport:
+                endpoint = free_endpoint()
+                transport = ZenohTransport(
+                    configuration(namespace=namespace, listen=[endpoint], connect=endpoints, credentials=None)
+                )
+                stack.callback(transport.close)
+                kept.append(transport.appear(f"linked/{len(endpoints)}"))
+                endpoints.append(endpoint)
+                _wait_for_links(transport, len(endpoints))
+                return transport
+
+            yield open_transport
+
+
+def _wait_for_links(transport: ZenohTransport, count: int) -> None:
+    signs = transport.presences("linked/*")
+    seen: set[str] = set()
+    while len(seen) < count:
+        seen.add(signs.receive().key)
+    signs.close()
+
+
+class Cable:
+    """A TCP relay on loopback that can be pulled out and put back."""
+
+    def __init__(self, endpoint: str) -> None:
+        self._far = ("127.0.0.1", int(endpoint.rpartition(":")[2]))
+        self._server = socket.create_server(("127.0.0.1", 0))
+        self.endpoint = f"tcp/127.0.0.1:{self._server.getsockname()[1]}"
+        self._lock = threading.Lock()
+        self._plugged = True
+        self._sockets: list[socket.socket] = []
+        self._threads: list[threading.Thread] = []
+        self._start(self._accept)
+
+    def _start(self, target: Callable[..., None], *arguments: socket.socket) -> None:
+        thread = threading.Thread(target=target, args=arguments, name="cable", daemon=True)
+        self._threads.append(thread)
+        thread.start()
+
+    def _accept(self) -> None:
+        with contextlib.suppress(OSError):
+            while True:
+                near, _ = self._server.accept()
+                with self._lock:
+                    if not self._plugged:
+                        near.close()
+                        continue
+                    far = socket.create_connection(self._far)
+                    self._sockets += [near, far]
+                    self._start(self._relay, near, far)
+                    self._start(self._relay, far, near)
+
+    def _relay(self, source: socket.socket, target: socket.socket) -> None:
+        with contextlib.suppress(OSError):
+            while data := source.recv(65536):
+                target.sendall(data)
+            target.shutdown(socket.SHUT_RDWR)
+
+    def unplug(self) -> None:
+        with self._lock:
+            self._plugged = False
+            for end in self._sockets:
+                with contextlib.suppress(OSError):
+                    end.shutdown(socket.SHUT_RDWR)
+                end.close()
+            self._sockets.clear()
+
+    def plug(self) -> None:
+        self._plugged = True
+
+    def close(self) -> None:
+        self.unplug()
+        with contextlib.suppress(OSError):
+            self._server.shutdown(socket.SHUT_RDWR)
+        self._server.close()
+        for thread in self._threads:
+            thread.join(10)
+
+
+class TestZenohLosses(LossConformance):
+    @contextlib.contextmanager
+    def severable(self) -> Iterator[Severable]:
+        namespace, endpoint = f"test-{secrets.token_hex(4)}", free_endpoint()
+        with contextlib.ExitStack() as stack:
+            settings = {"namespace": namespace, "credentials": None}
+            one = ZenohTransport(configuration(listen=[endpoint], connect=[], **settings))
+            stack.callback(one.close)
+            cable = Cable(endpoint)
+            stack.callback(cable.close)
+            other = ZenohTransport(configuration(listen=[free_endpoint()], connect=[cable.endpoint], **settings))
+            stack.callback(other.close)
+            signs = one.appear("linked/0"), other.appear("linked/1")
+            _wait_for_links(other, len(signs))
+            yield Severable(one, other, cable.unplug, cable.plug)

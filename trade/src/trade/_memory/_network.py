@@ -1,0 +1,307 @@
+"""A network in memory: which nodes can reach each other, what passes between them, and what goes wrong on the way."""
+
+import functools
+import itertools
+import random
+import threading
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+from trade._memory._clock import Clock
+from trade._memory._keys import meet
+from trade._memory._links import Delay, Kind, Link, Way
+from trade._memory._node import Node, Sample
+from trade._memory._traffic import Arrive, Traffic
+from trade._transport import ChannelClosed, Message
+
+
+@dataclass(frozen=True, slots=True)
+class Passage:
+    """A message between two transports, as a tap sees it: once when it is sent, once when it has arrived."""
+
+    kind: Kind
+    source: str
+    """Name of the sender."""
+    target: str
+    key: str
+    payload: bytes | None
+    arrived: bool
+
+
+Tap = Callable[[Passage], None]
+
+
+class Network:
+    """Where the memory transports of one system meet.
+
+    Messages arrive at once, before ``put`` returns, unless their link has a delay or is cut. Nothing else takes time:
+    questions (``standing``, ``present``) are answered at once by all whose link has not been given up, and who joins is
+    linked with all others. Time is the network's own and stands still until it is moved: see ``clock`` and ``traffic``.
+    Containers keep their deadlines by the real clock.
+
+    A link that is cut (``partition``) keeps what is put on it, as a TCP connection would. Healed within the lease, it
+    delivers all of that. Else the link is given up: signs of life fall on both sides and what it kept is lost; when it
+    heals, they rise again, and the last values of announcements that were missed are told anew. A withdrawal that was
+    missed is not: nothing is left that could tell it.
+
+    Args:
+        seed: of the generator that draws jitter.
+        lease_s: how long a cut is borne.
+        clock: another one than a new one at zero.
+    """
+
+    def __init__(self, *, seed: int = 0, lease_s: float = 2.0, clock: Clock | None = None) -> None:
+        self.clock: Final = clock or Clock()
+        self.sent: Final[Counter[Kind]] = Counter()
+        """How many messages of each kind were sent from one transport to another."""
+        self.lock: Final = threading.RLock()
+        self._lease_s = lease_s
+        self.traffic: Final = Traffic(self.clock, self._under_lock)
+        self._random = random.Random(seed)  # noqa: S311 - no secret
+        self._delay = Delay()
+        self._nodes: list[Node] = []
+        self._named: dict[str, Node] = {}
+        self._links: dict[frozenset[Node], Link] = {}
+        self._taps: list[Tap] = []
+        self._numbers = itertools.count(1)
+
+    def _under_lock(self, arrive: Arrive) -> None:
+        with self.lock:
+            arrive()
+
+    # --- who is there
+
+    def join(self, name: str) -> Node:
+        """A new node, linked with all others; it knows their signs of life when this returns."""
+        with self.lock:
+            node = self._named[name] = Node(name)
+            others, self._nodes = self._nodes, [*self._nodes, node]
+            for other in others:
+                self._links[frozenset((node, other))] = Link(node, other, self.traffic, self._random, self._delay)
+            for other in others:
+                for token, key in list(other.tokens.items()):
+                    self._pass(
+                        Kind.RISE, other, node, Message(key, b""), _seeing(node, other, token, key), at_once=True
+                    )
+            return node
+
+    def node(self, name: str) -> Node | None:
+        """The one that joined last under a name, even if it has ended."""
+        return self._named.get(name)
+
+    def leave(self, node: Node) -> None:
+        """An orderly end: what was sent before arrives, then all signs of life fall. Idempotent."""
+        with self.lock:
+            if node.closed:
+                return
+            self._nodes.remove(node)
+            node.end()
+            for link in self._links_of(node):
+                other = link.far_end(node)
+                self._pass(Kind.LEAVE, node, other, Message("", None), lambda link=link: self._forget(link))
+
+    def kill(self, node: Node) -> None:
+        """The end of a process without a goodbye: what it sent and has not arrived is lost. Idempotent."""
+        with self.lock:
+            if node.closed:
+                return
+            self._nodes.remove(node)
+            node.end()
+            for link in self._links_of(node):
+                self._forget(link)
+
+    def _links_of(self, node: Node) -> list[Link]:
+        return [link for ends, link in self._links.items() if node in ends]
+
+    def _forget(self, link: Link) -> None:
+        self._links.pop(frozenset(link.ends), None)
+        self._give_up(link)
+
+    # --- what passes
+
+    def next_number(self) -> int:
+        """A number nobody else in this network has."""
+        return next(self._numbers)
+
+    def spread(self, source: Node, sample: Sample, kind: Kind) -> None:
+        """To all who would read it; to readers of the source itself at once."""
+        with self.lock:
+            _check_open(source)
+            if kind is Kind.ANNOUNCE:
+                source.announced[sample.publisher] = sample
+            elif kind is Kind.WITHDRAW:
+                source.announced.pop(sample.publisher, None)
+            source.take(sample, own=True)
+            for target in self._others(source):
+                if target.hears(sample.message.key):
+                    self._pass(kind, source, target, sample.message, _taking(target, sample))
+
+    def show(self, source: Node, token: int, key: str) -> None:
+        """A sign of life for everybody."""
+        with self.lock:
+            _check_open(source)
+            source.tokens[token] = key
+            source.see(source, token, key)
+            for target in self._others(source):
+                self._pass(Kind.RISE, source, target, Message(key, b""), _seeing(target, source, token, key))
+
+    def hide(self, source: Node, token: int) -> None:
+        """Take a sign of life down. Idempotent."""
+        with self.lock:
+            key = source.tokens.pop(token, None)
+            if key is None:
+                return
+            source.lose_sight(token)
+            for target in self._others(source):
+                self._pass(Kind.FALL, source, target, Message(key, None), _losing(target, token))
+
+    def ask_all(self, asking: Node, pattern: str) -> None:
+        """Let everybody tell what they announce and the asking node has not heard."""
+        with self.lock:
+            for target in self._others(asking):
+                self._ask(asking, target, pattern)
+
+    def _ask(self, asking: Node, target: Node, pattern: str) -> None:
+        self._pass(Kind.ASK, asking, target, Message(pattern, None), lambda: self._answer(target, asking, pattern))
+
+    def _answer(self, source: Node, asking: Node, pattern: str) -> None:
+        for sample in list(source.announced.values()):
+            if meet(pattern, sample.message.key):
+                self._pass(Kind.ANSWER, source, asking, sample.message, _taking(asking, sample, history=True))
+
+    def announced(self, asking: Node, pattern: str) -> list[Message]:
+        """What stands at everybody it is linked with, asked and answered at once."""
+        with self.lock:
+            _check_open(asking)
+            found = [sample.message for sample in asking.announced.values() if meet(pattern, sample.message.key)]
+            for target in self._others(asking):
+                self._ask_at_once(asking, target, pattern, found.append)
+            return found
+
+    def _ask_at_once(self, asking: Node, target: Node, pattern: str, take: Callable[[Message], None]) -> None:
+        self._pass(Kind.ASK, asking, target, Message(pattern, None), _nothing, at_once=True)
+        for message in [sample.message for sample in target.announced.values() if meet(pattern, sample.message.key)]:
+            self._pass(Kind.ANSWER, target, asking, message, functools.partial(take, message), at_once=True)
+
+    def _others(self, node: Node) -> list[Node]:
+        """Those it has a link to that is up."""
+        others = [link.far_end(node) for link in self._links_of(node) if link.up]
+        return [other for other in others if not other.closed]
+
+    def _pass(
+        self, kind: Kind, source: Node, target: Node, message: Message, arrive: Arrive, *, at_once: bool = False
+    ) -> None:
+        """One message over one link; the link may be gone by the time a tap has seen it."""
+        self.sent[kind] += 1
+        self._tell_taps(Passage(kind, source.name, target.name, message.key, message.payload, arrived=False))
+        link = self._links.get(frozenset((source, target)))
+        if link is None or not link.up:
+            return
+
+        def arrived() -> None:
+            arrive()
+            self._tell_taps(Passage(kind, source.name, target.name, message.key, message.payload, arrived=True))
+
+        arrived() if at_once else link.ways[source].send(kind, arrived)
+
+    def tap(self, hear: Tap) -> Callable[[], None]:
+        """Show somebody every message between two transports, before it is sent and after it arrived.
+
+        It is told under the network's lock, on the thread that sends or moves the time: it may kill, partition and
+        heal, but neither wait, nor move the time, nor use a container.
+
+        Returns:
+            A function that ends it.
+        """
+        self._taps.append(hear)
+        return lambda: self._taps.remove(hear)
+
+    def _tell_taps(self, passage: Passage) -> None:
+        for tap in list(self._taps):
+            tap(passage)
+
+    # --- what goes wrong
+
+    def delay(self, least_s: float, *, jitter_s: float = 0.0, between: tuple[Node, Node] | None = None) -> None:
+        """Let messages travel for ``least_s`` and up to ``jitter_s`` more, on one link or on all, later ones, too."""
+        delay = Delay(least_s, jitter_s)
+        with self.lock:
+            if between is None:
+                self._delay = delay
+            for link in self._links.values() if between is None else [self._links[frozenset(between)]]:
+                for way in link.ways.values():
+                    way.delay = delay
+
+    def partition(self, one: Node, other: Node, *, one_way: bool = False) -> None:
+        """Cut a link; ``one_way``: only from the first to the second. A cut that outlasts the lease ends the link."""
+        with self.lock:
+            link = self._links.get(frozenset((one, other)))
+            if link is None:
+                return
+            for source in (one,) if one_way else (one, other):
+                way = link.ways[source]
+                if not way.cut:
+                    way.cut, way.cuts = True, way.cuts + 1
+                    self._expire_later(link, way)
+
+    def _expire_later(self, link: Link, way: Way) -> None:
+        cut = way.cuts
+
+        def expire() -> None:
+            if way.cut and way.cuts == cut:
+                self._give_up(link)
+
+        due_ns = self.clock.monotonic_ns() + round(self._lease_s * 1e9)
+        self.clock.at(due_ns, lambda: self._under_lock(expire))
+
+    def _give_up(self, link: Link) -> None:
+        if link.up:
+            link.drop()
+            one, other = link.ends
+            one.lose_all_of(other)
+            other.lose_all_of(one)
+            if one.closed or other.closed:
+                self._links.pop(frozenset(link.ends), None)
+
+    def heal(self, one: Node | None = None, other: Node | None = None) -> None:
+        """Mend the link of two nodes, or all links of one, or all."""
+        with self.lock:
+            named = {node for node in (one, other) if node is not None}
+            for link in [link for ends, link in self._links.items() if named <= ends]:
+                for way in link.ways.values():
+                    way.cut = False
+                    way.resume()
+                if not link.up and self._links.get(frozenset(link.ends)) is link:
+                    self._link_again(link)
+
+    def _link_again(self, link: Link) -> None:
+        """Both tell what they show and ask what they missed."""
+        link.up = True
+        for source in link.ends:
+            target = link.far_end(source)
+            for token, key in list(source.tokens.items()):
+                self._pass(Kind.RISE, source, target, Message(key, b""), _seeing(target, source, token, key))
+            for pattern in [ear.pattern for ear in source.ears if ear.of_others]:
+                self._ask(source, target, pattern)
+
+
+def _check_open(node: Node) -> None:
+    if node.closed:
+        raise ChannelClosed
+
+
+def _nothing() -> None: ...
+
+
+def _taking(target: Node, sample: Sample, *, history: bool = False) -> Arrive:
+    return lambda: target.take_history(sample) if history else target.take(sample, own=False)
+
+
+def _seeing(target: Node, owner: Node, token: int, key: str) -> Arrive:
+    return lambda: target.see(owner, token, key)
+
+
+def _losing(target: Node, token: int) -> Arrive:
+    return lambda: target.lose_sight(token)

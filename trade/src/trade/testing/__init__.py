@@ -1,0 +1,21 @@
+"""For tests of what is built on TRADE: a whole system in one process, and suites that implementations must pass.
+
+Nothing here needs a test framework; the suites are plain classes with ``test_`` methods, run in a subclass by pytest.
+"""
+
+from trade._memory import Clock, Kind, Network, Passage
+from trade.testing._losses import LossConformance, Severable
+from trade.testing._system import MemorySystem, memory_system
+from trade.testing._transports import TransportConformance
+
+__all__ = [
+    "Clock",
+    "Kind",
+    "LossConformance",
+    "MemorySystem",
+    "Network",
+    "Passage",
+    "Severable",
+    "TransportConformance",
+    "memory_system",
+]
