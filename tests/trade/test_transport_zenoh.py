@@ -22,7 +22,9 @@ class TestZenoh(TransportConformance):
             def open_transport() -> ZenohTransport:
                 endpoint = free_endpoint()
                 transport = ZenohTransport(
-                    configuration(namespace=namespace, listen=[endpoint], connect=endpoints, credentials=None)
+                    configuration(
+                        namespace=namespace, listen=[endpoint], connect=endpoints, credentials=("conformance", "secret")
+                    )
                 )
                 stack.callback(transport.close)
                 kept.append(transport.appear(f"linked/{len(endpoints)}"))
@@ -104,7 +106,7 @@ class TestZenohLosses(LossConformance):
     def severable(self) -> Iterator[Severable]:
         namespace, endpoint = f"test-{secrets.token_hex(4)}", free_endpoint()
         with contextlib.ExitStack() as stack:
-            settings = {"namespace": namespace, "credentials": None}
+            settings = {"namespace": namespace, "credentials": ("conformance", "secret")}
             one = ZenohTransport(configuration(listen=[endpoint], connect=[], **settings))
             stack.callback(one.close)
             cable = Cable(endpoint)
