@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import pytest
 
-from system.conftest import wait_until
+from system.conftest import ROSIE, wait_until
 from trade_hil_sim import events, motion_writes, read_log
 
 Command = Callable[..., subprocess.CompletedProcess[str]]
@@ -104,3 +104,38 @@ def test_S19_leaving_holds_the_position_and_moves_nothing(number: int, rosie_up,
     entries = read_log(log)
     assert len(events(entries, "motion_started")) == before
     assert events(entries, "torque_off") == []
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_call_that_is_killed_or_loses_its_terminal_stops_the_motion(number: int, rosie_up, run) -> None:
+    rosie = rosie_up()
+    words = ("call", "rosie.head.move_to", "[1.2, 0.0]", "speed_rad_s=0.05", "--deadline", "60")
+    call = run("-m", "trade_gateway", *words)
+    wait_until(lambda: bool(events(read_log(rosie.log), "motion_started")))
+    call.signal(number)
+    assert call.wait() == 130
+    [rest] = [entry for entry in events(read_log(rosie.log), "at_rest") if entry.joint == "neck.pan"]
+    assert rest.position_rad is not None
+    assert rest.position_rad < 1.0
+
+
+def test_a_robot_of_a_name_that_is_up_is_refused(rosie_up, trade_command: Command) -> None:
+    rosie = rosie_up()
+    second = trade_command("up", ROSIE, "--sim")
+    assert second.returncode == 1
+    assert f"'rosie' is up already (process {rosie.program.process.pid}" in second.stderr
+
+
+def test_a_mistake_only_the_simulator_sees_is_one_line(trade_command: Command, tmp_path) -> None:
+    broken = tmp_path / "broken.toml"
+    broken.write_text(ROSIE.read_text(encoding="utf-8").replace("XL430-W250", "XL430-W25"), encoding="utf-8")
+    started = trade_command("up", broken, "--sim")
+    assert started.returncode == 1
+    assert "ConfigurationError" in started.stderr
+    assert "Traceback" not in started.stderr
+    assert "'XL430-W25'" in started.stderr
+
+
+def test_documented_services_keep_their_types(rosie_up, trade_command: Command) -> None:
+    rosie_up()
+    assert "positions_rad: list[float]" in trade_command("services", "--group", "rosie.head", "--doc").stdout

@@ -1,6 +1,10 @@
 """``trade call GROUP.NAME ARGUMENT...``: call one service and print its result."""
 
 import re
+import signal
+from collections.abc import Generator
+from contextlib import contextmanager
+from types import FrameType
 from typing import Annotated, Any
 
 import msgspec
@@ -34,13 +38,30 @@ def call(
     args, kwargs = parse_arguments(arguments or [])
     with visitor(context) as visiting:
         handle = find(visiting, service, container, wait).with_(deadline_s=deadline)
-        run = handle.start(*args, **kwargs)
-        try:
-            result = run.result()
-        except KeyboardInterrupt:
-            _cancel(handle)
-            raise
+        with _interruptible():
+            run = handle.start(*args, **kwargs)
+            try:
+                result = run.result()
+            except KeyboardInterrupt:
+                _cancel(handle)
+                raise
     Output(as_json=as_json).data(result)
+
+
+@contextmanager
+def _interruptible() -> Generator[None]:
+    """A terminal that closes, ``kill`` and ``timeout`` end a call as Ctrl-C does: what it moves is stopped."""
+
+    def interrupt(_number: int, _frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    numbers = [signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else [])]
+    before = {number: signal.signal(number, interrupt) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _cancel(handle: Handle) -> None:

@@ -1,8 +1,10 @@
 """``trade services`` and ``trade containers``: what there is."""
 
+from textwrap import indent
 from typing import Annotated, Any
 
 import typer
+from rich.markup import escape
 
 from trade import Constraint, Handle, where
 from trade_gateway._output import Output
@@ -32,7 +34,8 @@ def services(
             out.say(f"no services match {constraint}; is something up? [bold]trade up examples/rosie.toml --sim[/]")
         elif doc:
             for handle in found:
-                out.say(f"[bold]{handle.label}[/]  {handle.signature}\n  {handle.doc or '(undocumented)'}\n")
+                doc_text = indent(handle.doc or "(undocumented)", "  ")
+                out.say(f"[bold]{escape(handle.label)}[/]  {escape(handle.signature)}\n{escape(doc_text)}\n")
         else:
             out.table(("SERVICE", "CALLED AS", "EFFECT", "CONTAINER", "HOST"), [_row(handle) for handle in found])
 

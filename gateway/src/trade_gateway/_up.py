@@ -38,6 +38,7 @@ def up(
         simulation = stack.enter_context(_simulation(robot_file, sim_log)) if sim else None
         ports: dict[str, str] | None = simulation.ports if simulation else None
         container = stack.enter_context(Container(choice_of(context).settings(name or robot.name)))
+        _refuse_twice(container)
         _say_attaching(out, robot, ports)
         stack.enter_context(
             attach(
@@ -73,10 +74,21 @@ def _leaving() -> Generator[threading.Event]:
 
 def _simulation(robot_file: Path, log: Path | None) -> Any:
     try:
-        from trade_hil_sim import SimProcess  # noqa: PLC0415 - only needed without hardware
+        from trade_hil_sim import SimProcess, SimulationError  # noqa: PLC0415 - only needed without hardware
     except ImportError:
         raise ConfigurationError(where="--sim", problem="needs trade-hil-sim; pip install trade-hil-sim") from None
-    return SimProcess(robot_file, log=log, logged=log is not None)
+    try:
+        return SimProcess(robot_file, log=log, logged=log is not None)
+    except SimulationError as problem:
+        raise ConfigurationError(where=str(robot_file), problem=str(problem)) from None
+
+
+def _refuse_twice(container: Container) -> None:
+    """Two robots of one name would make every look-up ambiguous."""
+    for other in container.containers():
+        if other.name == container.name and other.epoch != container.address.epoch:
+            problem = f"{other.name!r} is up already (process {other.pid} on {other.host}); stop it, or choose a --name"
+            raise ConfigurationError(where="trade up", problem=problem)
 
 
 def _say_attaching(out: Output, robot: Robot, ports: dict[str, str] | None) -> None:
