@@ -289,6 +289,20 @@ def test_a_jammed_joint_is_a_fault_and_is_told_to_hold(head: Rig, robot: Attache
     wait_until(lambda: abs(head.truth(1).goal_counts - head.truth(1).position_counts) < 5, "it holds where it is")
 
 
+def test_a_jammed_joint_moves_again_only_after_somebody_enabled_it(head: Rig, robot: AttachedRobot) -> None:
+    pan = robot.motor("neck.pan")
+    moving = Outcome(lambda: pan.move_to(1.3, 0.5))
+    wait_until(lambda: head.truth(1).position_rad > 0.1, "it is under way")
+    head.sim.do(sim.Jam(ids=(1,)))
+    assert isinstance(moving.wait().error, DeviceFault)
+    head.sim.do(sim.Jam(ids=(1,), on=False))
+    assert "no progress" in pan.state().fault
+    with pytest.raises(DeviceFault, match="no progress"):
+        pan.move_to(0.0)
+    pan.enable()
+    assert pan.move_to(0.0) == pytest.approx(0.0, abs=0.02)
+
+
 def test_a_position_that_stands_still_while_it_should_not_is_a_fault(head: Rig, robot: AttachedRobot) -> None:
     pan = robot.motor("neck.pan")
     pan.enable()

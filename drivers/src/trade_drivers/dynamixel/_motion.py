@@ -134,7 +134,11 @@ class Move(Job):
     def _stuck(self, now_ns: int) -> TradeError | None:
         late = (now_ns - self._began_ns) / 1e9 > self._patience_s
         for axis, progress in self._progress.items():
-            if late or (progress.closest > _NEAR_COUNTS and progress.waiting_s > _STUCK_S):
+            blocked = progress.closest > _NEAR_COUNTS and progress.waiting_s > _STUCK_S
+            if late or blocked:
                 short_rad = progress.closest * table.RAD_PER_COUNT
-                return axis.faulty(f"it makes no progress, {short_rad:.3g} rad short of its goal; is it blocked?")
+                fault = f"it makes no progress, {short_rad:.3g} rad short of its goal; is it blocked?"
+                if blocked:  # it stands: nothing moves it until somebody has looked
+                    axis.fault, axis.ready = fault, False
+                return axis.faulty(fault)
         return None
