@@ -23,7 +23,7 @@ $(UV):
 	@$(PYTHON) -m venv .uv && .uv/bin/python -m pip install --quiet --disable-pip-version-check 'uv==0.13.8'
 
 demo: $(UV) ## a simulated pan-tilt head moves through remote service calls (ARGS=--stay keeps it up)
-	@$(RUN) --no-dev python examples/demo.py $(ARGS)  # the tools of `make test` are fetched by `make test`
+	@$(RUN) python examples/demo.py $(ARGS)
 
 test: $(UV) ## the whole test suite
 	@$(RUN) pytest $(ARGS)
