@@ -7,8 +7,11 @@ from typing import Any
 import pytest
 
 from trade import Container, Handle, _dispatch, current_call, service, where
+from trade._memory import MemoryTransport
+from trade._transport import Channel, Message
 from trade._wire import reply_key
 from trade.errors import Busy, Cancelled, OutcomeUnknown, RemoteError
+from trade.testing import memory_system
 
 
 def found(here: Container, name: str) -> Handle:
@@ -288,3 +291,47 @@ def test_a_reply_key_let_go_while_answering_is_declared_again(here: Container, t
     answer = found(here, "answer")
     assert answer() == "still here"
     assert reply_key("a", "b", "c", "0") == "reply/a/b/c/0"
+
+
+class Endless:
+    """Its service ends when the container does."""
+
+    def __init__(self) -> None:
+        self.entered = threading.Event()
+
+    @service
+    async def wait(self) -> None:
+        self.entered.set()
+        await asyncio.Event().wait()
+
+
+def test_no_thread_goes_back_into_a_transport_that_is_being_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An interpreter that ends while a thread is on its way out of the transport is aborted."""
+    read_again: list[str] = []
+
+    class Watched(Channel):
+        def __init__(self, inner: Channel) -> None:
+            self.inner, self.closed = inner, False
+
+        def receive(self) -> Message:
+            if self.closed:
+                read_again.append(threading.current_thread().name)
+            return self.inner.receive()
+
+        def close(self) -> None:
+            self.closed = True
+            self.inner.close()
+
+    subscribe = MemoryTransport.subscribe
+    monkeypatch.setattr(MemoryTransport, "subscribe", lambda self, pattern: Watched(subscribe(self, pattern)))
+    with memory_system() as system:
+        there, endless = system.container("there"), Endless()
+        there.register(endless, "robot")
+        run = system.container("here").find(where(name="wait")).start()
+        assert endless.entered.wait(20)
+        callers = [thread for thread in threading.enumerate() if thread.name.startswith("trade-call")]
+        there.close()
+        assert read_again == []
+        assert sum(thread.is_alive() for thread in callers) == 1  # the caller's own, which waits for calls
+        with pytest.raises(ConnectionError):
+            run.result(20)

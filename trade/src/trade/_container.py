@@ -17,6 +17,7 @@ from msgspec import structs
 from trade import _many
 from trade._calls import Caller
 from trade._constraints import Constraint, checked_meta, where
+from trade._coroutines import AsyncLoop
 from trade._dispatch import Dispatcher
 from trade._handle import Bound, Handle, Run
 from trade._invoke import LocalTarget, RemoteTarget, Request, container_closed
@@ -88,9 +89,11 @@ class Container:
             leaving.callback(self._notifier.close)
             self._registry.listen(self._changed)
             self._registry.listen(self._notifier.changed)
-            self._providers = Providers(self._transport, self._registry, self.address, self._codec)
+            coroutines = AsyncLoop()
+            leaving.callback(coroutines.close)
+            self._providers = Providers(self._transport, self._registry, self.address, self._codec, coroutines)
             leaving.callback(self._providers.close)
-            self._dispatcher = Dispatcher(self._transport, self.address, self._providers.lookup)
+            self._dispatcher = Dispatcher(self._transport, self.address, self._providers.lookup, coroutines)
             leaving.callback(self._dispatcher.close)
             self._providers.add(SystemServices(self.system), (DOMAIN,), name=PROVIDER)
             presence = self._transport.appear(alive_key(self.address))

@@ -5,19 +5,18 @@ The last idle one that takes a call starts another; at the cap it answers Busy, 
 """
 
 import asyncio
-import concurrent.futures
-import contextlib
 import inspect
 import logging
 import threading
 import time
-from collections.abc import Callable, Coroutine, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 import msgspec
 from msgspec import Raw
 
 from trade._context import CallContext, running
+from trade._coroutines import AsyncLoop
 from trade._failures import pack_error, unpack_error
 from trade._ongoing import Answer, Herald, Once, Ongoing, cancelled
 from trade._serial import Serial
@@ -42,11 +41,11 @@ from trade._wire import (
     is_chunk,
     reply_key,
 )
-from trade.errors import Cancelled, OutcomeUnknown
 
 _logger = logging.getLogger("trade")
 
 MOST_THREADS: Final = 64
+_PARTING_S: Final = 2.0
 _KINDS: Final = frozenset(("call", "stop"))
 _MOST_REPLY_KEYS: Final = 1024
 _SYSTEM: Final = f"{DOMAIN}/{PROVIDER}"
@@ -64,7 +63,7 @@ class LocalService:
         signature: Signature,
         method: Callable[..., Any],
         mark: ServiceMark,
-        loop: "AsyncLoop",
+        loop: AsyncLoop,
         serial: Serial | None,
     ) -> None:
         self.label = label
@@ -111,78 +110,6 @@ class LocalService:
         return time.monotonic_ns() >= expires_ns
 
 
-class AsyncLoop:
-    """The event loop on which a container's ``async def`` services run, started by the first of them."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._loop: asyncio.AbstractEventLoop | None = None
-        self._thread: threading.Thread | None = None
-
-    def complete(self, coroutine: Coroutine[Any, Any, Any], context: CallContext) -> Any:
-        """Run an ``async def`` service from a handler thread; its deadline cancels it."""
-        allowed_s = context.remaining_s
-        future = asyncio.run_coroutine_threadsafe(_contained(coroutine, context), self._get())
-        done, _ = concurrent.futures.wait([future], allowed_s)
-        if allowed_s is not None and not done:
-            future.cancel()
-            raise OutcomeUnknown(service=context.service, deadline_s=allowed_s)
-        try:
-            return future.result()
-        except concurrent.futures.CancelledError:
-            raise Cancelled(service=context.service) from None
-
-    def _get(self) -> asyncio.AbstractEventLoop:
-        with self._lock:
-            if self._loop is None:
-                self._loop = asyncio.new_event_loop()
-                self._thread = threading.Thread(target=_run_loop, args=(self._loop,), name="trade-async", daemon=True)
-                self._thread.start()
-            return self._loop
-
-    def close(self) -> None:
-        """Cancel what still runs and end the thread. Idempotent."""
-        with self._lock:
-            loop, thread = self._loop, self._thread
-            self._loop = self._thread = None
-        if loop is not None and thread is not None:
-            loop.call_soon_threadsafe(loop.stop)
-            if thread is not threading.current_thread():
-                thread.join(2)
-
-
-async def _contained(coroutine: Coroutine[Any, Any, Any], context: CallContext) -> Any:
-    """What would end the loop for everybody becomes an error for the caller, who may also cancel it."""
-    loop, task = asyncio.get_running_loop(), asyncio.current_task()
-
-    def cancel() -> None:
-        if task is not None:
-            with contextlib.suppress(RuntimeError):  # the loop is closed: everything on it was cancelled
-                loop.call_soon_threadsafe(task.cancel)
-
-    context.on_cancel(cancel)
-    try:
-        return await coroutine
-    except (SystemExit, KeyboardInterrupt) as error:
-        raise unpack_error(pack_error(error), context.service) from error
-
-
-def _run_loop(loop: asyncio.AbstractEventLoop) -> None:
-    try:
-        loop.run_forever()
-        loop.run_until_complete(_cancel_all())
-        loop.run_until_complete(loop.shutdown_asyncgens())
-    finally:
-        loop.close()
-
-
-async def _cancel_all() -> None:
-    tasks = asyncio.all_tasks() - {asyncio.current_task()}
-    for task in tasks:
-        task.cancel()
-    await asyncio.gather(*tasks, return_exceptions=True)
-
-
 Lookup = Callable[[str, str], LocalService | None]
 """From ``domain/provider`` and the service's name to the service."""
 
@@ -190,8 +117,9 @@ Lookup = Callable[[str, str], LocalService | None]
 class Dispatcher:
     """Every incoming call of one container."""
 
-    def __init__(self, transport: Transport, own: Address, lookup: Lookup) -> None:
+    def __init__(self, transport: Transport, own: Address, lookup: Lookup, loop: AsyncLoop) -> None:
         self._transport = transport
+        self._loop = loop
         self._own = own
         self._here = f"{own}/"
         self._lookup = lookup
@@ -352,7 +280,12 @@ class Dispatcher:
         """Take no more calls; those running may finish within two seconds. Idempotent."""
         self._closed = True
         for crew in self._crews:
-            crew.close()
+            crew.dismiss()
+        for crew in self._crews:
+            crew.wait(_PARTING_S)
+        self._loop.close()  # whoever still waits for a coroutine ends with it
+        for crew in self._crews:
+            crew.wait(_PARTING_S)
         self._herald.close()
         for replier in list(self._repliers.values()):
             replier.close()
@@ -380,6 +313,7 @@ class _Crew:
         self._lock = threading.Lock()
         self._threads: list[threading.Thread] = []
         self._idle = 0
+        self._dismissed = False
         with self._lock:
             self._hire()
 
@@ -394,7 +328,7 @@ class _Crew:
         self._idle += 1
 
     def _main(self) -> None:
-        while True:
+        while not self._dismissed:
             try:
                 message = self._channel.receive()
             except ChannelClosed:
@@ -415,7 +349,7 @@ class _Crew:
         """Whether this thread may run the call: somebody else must be left to take the next one."""
         with self._lock:
             try:
-                if self._idle == 1 and len(self._threads) < MOST_THREADS:
+                if self._idle == 1 and len(self._threads) < MOST_THREADS and not self._dismissed:
                     self._hire()
             except RuntimeError:  # the process may have no more threads
                 _logger.exception("%s cannot have another thread", self._name)
@@ -424,9 +358,15 @@ class _Crew:
             self._idle -= 1
             return True
 
-    def close(self) -> None:
+    def dismiss(self) -> None:
+        """Take no more calls. No thread goes back into the transport, where the end of the process would abort it."""
+        with self._lock:
+            self._dismissed = True
         self._channel.close()
-        deadline = time.monotonic() + 2
-        for thread in list(self._threads):
+
+    def wait(self, most_s: float) -> None:
+        """Wait until every thread has ended, or for so long."""
+        deadline = time.monotonic() + most_s
+        for thread in self._threads:
             if thread is not threading.current_thread():
                 thread.join(max(0.0, deadline - time.monotonic()))

@@ -10,7 +10,8 @@ from typing import Any, Final
 from msgspec import Struct, structs
 
 from trade._constraints import checked_meta
-from trade._dispatch import AsyncLoop, LocalService
+from trade._coroutines import AsyncLoop
+from trade._dispatch import LocalService
 from trade._registry import Registry
 from trade._serial import Serial
 from trade._service import ServiceMark, kinds_of, marked_methods
@@ -49,12 +50,12 @@ class _Registered(Struct, frozen=True):
 class Providers:
     """Owns what this container hosts; the registry and the rest of the system are told from here."""
 
-    def __init__(self, transport: Transport, registry: Registry, own: Address, codec: Codec) -> None:
+    def __init__(self, transport: Transport, registry: Registry, own: Address, codec: Codec, loop: AsyncLoop) -> None:
         self._transport = transport
         self._registry = registry
         self._own = own
         self._codec = codec
-        self._loop = AsyncLoop()
+        self._loop = loop
         self._lock = threading.Lock()
         self._announcing = threading.RLock()
         """Revisions go out in order, one at a time."""
@@ -177,7 +178,6 @@ class Providers:
         """Withdraw everything. Idempotent."""
         for registered in list(self._hosted.values()):
             registered.announcement.close()
-        self._loop.close()
 
     def _services_of(
         self, provider: object, groups: tuple[str, ...], implements: Sequence[type]
