@@ -40,6 +40,7 @@ from trade._wire import (
     alive_key,
     encode_message,
 )
+from trade._withdrawn import Withdrawn
 from trade._zenoh import ZenohTransport
 from trade.errors import ConfigurationError, NoSuchService, ServiceGone, TooManyServices
 
@@ -93,6 +94,8 @@ class Container:
             leaving.callback(coroutines.close)
             self._providers = Providers(self._transport, self._registry, self.address, self._codec, coroutines)
             leaving.callback(self._providers.close)
+            self.withdrawn: Final = Withdrawn(self._providers)
+            """What was taken off from elsewhere and can be offered again."""
             self._dispatcher = Dispatcher(self._transport, self.address, self._providers.lookup, coroutines)
             leaving.callback(self._dispatcher.close)
             self._providers.add(SystemServices(self.system), (DOMAIN,), name=PROVIDER)
@@ -133,6 +136,7 @@ class Container:
             keys = self._providers.add(provider, checked_groups(provider, groups), implements, meta=meta)
         except ChannelClosed:  # closed by another thread meanwhile
             raise container_closed(self.address) from None
+        self.withdrawn.forget(provider)
         return tuple(self.handle(key) for key in keys)
 
     def deregister(self, provider: object) -> None:
@@ -142,7 +146,8 @@ class Container:
             ConfigurationError: it is not registered here.
         """
         self._check_open()
-        self._providers.remove(provider)
+        if not self.withdrawn.forget(provider):
+            self._providers.remove(provider)
 
     def set_groups(self, provider: object, groups: str | Sequence[str]) -> None:
         """Put a live provider into other groups. Handles stay valid: its place was settled when it was registered.

@@ -5,7 +5,7 @@ import re
 import socket
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from msgspec import Struct, structs
 
@@ -45,6 +45,15 @@ class _Registered(Struct, frozen=True):
     implements: tuple[type, ...]
     info: ProviderInfo
     """As it was announced last."""
+
+
+class Offer(NamedTuple):
+    """An object, and how it is registered."""
+
+    provider: Any
+    groups: tuple[str, ...]
+    implements: tuple[type, ...]
+    meta: Mapping[str, Scalar]
 
 
 class Providers:
@@ -163,6 +172,11 @@ class Providers:
                 registered = self._hosted.pop(place)
             self._registry.remove(self._own, place.partition("/")[2])
             registered.announcement.close()
+
+    def offer(self, place: str) -> Offer | None:
+        """What is registered at a place (``domain/provider``)."""
+        known = self._hosted.get(place)
+        return None if known is None else Offer(known.provider, known.info.groups, known.implements, known.info.meta)
 
     def lookup(self, place: str, service: str) -> LocalService | None:
         """A service as calls name it.

@@ -1,14 +1,16 @@
 """The middleware's own functions as services, in group ``trade`` of every container."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Final, Protocol
 
 from msgspec import Struct
 
+from trade._handle import Handle
 from trade._reach import Reach
 from trade._service import service
-from trade.errors import LinkStays
+from trade._wire import Address, ServiceKey
+from trade.errors import ConfigurationError, LinkStays
 
 DOMAIN: Final = "trade"
 PROVIDER: Final = "system"
@@ -27,11 +29,30 @@ class ContainerInfo(Struct, frozen=True):
     services: int
 
 
+class WithdrawnInfo(Struct, frozen=True):
+    """A provider that was deregistered through its container and can be registered again by its name."""
+
+    provider: str
+    kind: str
+    groups: tuple[str, ...]
+
+
+class _Withdrawn(Protocol):
+    def take_off(self, key: ServiceKey) -> str: ...
+    def put_back(self, provider: str, groups: str | Sequence[str] | None) -> list[ServiceKey]: ...
+    def infos(self) -> list[WithdrawnInfo]: ...
+
+
 class _Member(Protocol):
     """The container the switches belong to."""
 
+    address: Final[Address]
+
     @property
     def reach(self) -> Reach: ...
+    @property
+    def withdrawn(self) -> _Withdrawn: ...
+    def handle(self, key: ServiceKey) -> Handle: ...
     def containers(self) -> list[ContainerInfo]: ...
 
 
@@ -84,6 +105,42 @@ class System:
         """The containers of the system, this one included."""
         return self._member().containers()
 
+    def deregister(self, service: Handle) -> str:
+        """Withdraw the provider of a service of this container, which keeps the object to register it again.
+
+        Returns:
+            The name to `register` it by. Handles of its services fail from now on.
+
+        Raises:
+            ConfigurationError: it is not registered here, or is the middleware's own.
+        """
+        member = self._member()
+        home = service.key.address
+        if home != member.address:
+            problem = f"it belongs to another container, or to an earlier boot; call deregister of {home.container}"
+            raise ConfigurationError(where=service.label, problem=problem)
+        return member.withdrawn.take_off(service.key)
+
+    def register(self, provider: str, groups: tuple[str, ...] | None = None) -> tuple[Handle, ...]:
+        """Offer an object again that was deregistered through this container.
+
+        Args:
+            provider: the name that `deregister` returned.
+            groups: other groups than before.
+
+        Returns:
+            Handles of its services; those from before stay dead.
+
+        Raises:
+            ConfigurationError: no such provider was deregistered, or a malformed group.
+        """
+        member = self._member()
+        return tuple(member.handle(key) for key in member.withdrawn.put_back(provider, groups))
+
+    def withdrawn(self) -> list[WithdrawnInfo]:
+        """What `register` can offer again, by name."""
+        return self._member().withdrawn.infos()
+
 
 class SystemServices:
     """What every container offers about itself."""
@@ -100,6 +157,21 @@ class SystemServices:
     def containers(self) -> list[ContainerInfo]:
         """The containers that this one knows of, itself included."""
         return self._system.containers()
+
+    @service
+    def deregister(self, service: Handle) -> str:
+        """Withdraw the provider of a service of this container; returns the name to register it by again."""
+        return self._system.deregister(service)
+
+    @service
+    def register(self, provider: str, groups: tuple[str, ...] | None = None) -> tuple[Handle, ...]:
+        """Offer an object again that was deregistered through this container, in other groups if some are given."""
+        return self._system.register(provider, groups)
+
+    @service(effect="read")
+    def withdrawn(self) -> list[WithdrawnInfo]:
+        """What can be registered again, by name."""
+        return self._system.withdrawn()
 
     @service
     def set_discovery(self, on: bool) -> None:
