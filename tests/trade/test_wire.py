@@ -1,6 +1,7 @@
 """What goes over the wire: garbage is dropped, counted, logged once; forgeries are ignored; nothing else stops."""
 
 import logging
+import threading
 from typing import Any
 
 import msgspec
@@ -8,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trade import Container, Handle, service, where
+from trade import Container, Handle, _wire, service, where
 from trade._wire import (
     EMPTY,
     EMPTY_ARGUMENTS,
@@ -103,6 +104,13 @@ def test_hostile_nesting_and_lengths_are_malformed(decode: Any, data: bytes) -> 
     for hostile in (data, inside, b"\x98\x01\x07" + data, b"\x86\xa1v\x01\xa8services" + data):
         with pytest.raises(Malformed):
             decode(hostile)
+
+
+@pytest.mark.parametrize("decode", _DECODERS, ids=lambda decode: decode.__name__)
+def test_what_is_larger_than_any_message_is_not_decoded(decode: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_wire, "_MOST_MESSAGE_BYTES", 1000)
+    with pytest.raises(Malformed, match="1001 bytes are more than any message may have"):
+        decode(bytes(1001))
 
 
 @pytest.mark.parametrize("message", [CALL, REPLY, PROVIDER], ids=["call", "reply", "provider"])
@@ -226,6 +234,34 @@ GONE = {
     "a reading service as a stop": ("robot", None, "echo", True),
     "a stop as a call": ("robot", None, "stop", False),
 }
+
+
+def test_a_flood_of_nonsense_is_counted_while_calls_go_on(
+    here: Container, there: Container, open_raw: Any, eventually: Any
+) -> None:
+    there.register(Echo(), "robot")
+    echo = here.find(where(name="echo", container="there"), wait_s=20)
+    raw = open_raw(here, there)
+    calls = raw.publish(call_key("tester", echo.key.address, "robot", echo.key.provider, stop=False))
+    entries = raw.publish(registry_key("robot", Address("tester", "flood", "e1"), "Arm-1"))
+    done = threading.Event()
+
+    def flood() -> None:
+        for _ in range(5000):
+            calls.put(b"garbage")
+            entries.put(b"garbage")
+        done.set()
+
+    flooding = threading.Thread(target=flood)
+    flooding.start()
+    answered = 0
+    while not done.is_set():
+        assert echo(7) == 7
+        answered += 1
+    flooding.join(60)
+    assert answered > 0
+    assert eventually(lambda: there.dropped_messages == 10_000)
+    assert echo(7) == 7
 
 
 @pytest.mark.parametrize(("domain", "provider", "name", "as_stop"), GONE.values(), ids=list(GONE))

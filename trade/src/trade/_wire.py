@@ -204,6 +204,9 @@ class CancelArguments(Struct, array_like=True, gc=False):
 MOST_BYTES: Final = 64 << 20
 """The largest arguments and the largest result, encoded."""
 
+_MOST_MESSAGE_BYTES: Final = MOST_BYTES + (1 << 20)
+"""What more is not even decoded."""
+
 EMPTY: Final = Raw(msgspec.msgpack.encode(None))
 EMPTY_ARGUMENTS: Final = Raw(msgspec.msgpack.encode(()))
 
@@ -234,6 +237,8 @@ def decode_provider(payload: bytes) -> ProviderInfo:
 
 
 def _decoded(decoder: msgspec.msgpack.Decoder[_Message], payload: bytes) -> _Message:
+    if len(payload) > _MOST_MESSAGE_BYTES:
+        raise Malformed(f"{len(payload)} bytes are more than any message may have ({_MOST_MESSAGE_BYTES})")
     try:
         message = decoder.decode(payload)
     except (msgspec.DecodeError, ValueError, RecursionError, MemoryError) as bad:
