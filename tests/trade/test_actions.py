@@ -185,11 +185,11 @@ def test_a_cancellation_that_overtakes_its_call_still_counts_and_only_the_caller
     raw = open_raw(here)
     replies = {who: raw.subscribe(reply_key(here.address.identity, who, "raw", "0")) for who in {"tester", caller}}
     cancel = encode_message(CancelArguments(7, "robot.walk", 5.0))
-    stop = Call(PROTOCOL, 1, "cancel", "raw/0", "session", None, (), Raw(cancel))
+    stop = Call(PROTOCOL, 1, "cancel", "raw/0", f"{caller}/raw/0", None, (), Raw(cancel))
     raw.publish(call_key(caller, key.address, "trade", "system", stop=True)).put(encode_message(stop))
     assert decode_reply(replies[caller].receive().payload).status == Status.OK
     walk.open.set()
-    call = Call(PROTOCOL, 7, "walk", "raw/0", "session", 2**62, (), EMPTY_ARGUMENTS)
+    call = Call(PROTOCOL, 7, "walk", "raw/0", "tester/raw/0", 2**62, (), EMPTY_ARGUMENTS)
     raw.publish(call_key("tester", key.address, key.domain, key.provider, stop=False)).put(encode_message(call))
     reply = decode_reply(replies["tester"].receive().payload)
     assert (reply.status, walk.begun) == ((Status.ERROR, 0) if caller == "tester" else (Status.OK, 1))
@@ -199,6 +199,6 @@ def test_a_cancellation_that_overtakes_its_call_still_counts_and_only_the_caller
 def test_a_malformed_cancellation_is_an_error(here: Container, open_raw: Any, cancel: bytes) -> None:
     raw = open_raw(here)
     replies = raw.subscribe(reply_key(here.address.identity, "tester", "raw", "0"))
-    stop = Call(PROTOCOL, 1, "cancel", "raw/0", "session", None, (), Raw(cancel))
+    stop = Call(PROTOCOL, 1, "cancel", "raw/0", "tester/raw/0", None, (), Raw(cancel))
     raw.publish(call_key("tester", here.address, "trade", "system", stop=True)).put(encode_message(stop))
     assert decode_reply(replies.receive().payload or b"").status == Status.ERROR

@@ -225,7 +225,7 @@ def test_what_arrives_runs_only_if_it_is_known_to_be_in_time(
     key = here.find(where(name="clock")).key if name == "clock" else handle.key
     raw = open_raw(here)
     replies = raw.subscribe(reply_key(here.address.identity, "tester", "raw", "0"))
-    call = Call(PROTOCOL, 7, name, "raw/0", "session", expires_ns, (), EMPTY_ARGUMENTS)
+    call = Call(PROTOCOL, 7, name, "raw/0", "tester/raw/0", expires_ns, (), EMPTY_ARGUMENTS)
     raw.publish(call_key("tester", key.address, key.domain, key.provider, stop=name == "stop")).put(
         encode_message(call)
     )

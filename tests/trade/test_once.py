@@ -6,6 +6,7 @@ from typing import Any
 
 import msgspec
 import pytest
+from msgspec import structs
 
 from trade import Container, Handle, _ongoing, service, where
 from trade._ongoing import Once, Ongoing
@@ -28,7 +29,7 @@ LATER = 2**62
 
 
 def call(call_id: int = 7, name: str = "move", expires_ns: int | None = LATER, reply: str = "raw/0") -> Call:
-    return Call(PROTOCOL, call_id, name, reply, "session", expires_ns, (), EMPTY_ARGUMENTS)
+    return Call(PROTOCOL, call_id, name, reply, "tester/raw/0", expires_ns, (), EMPTY_ARGUMENTS)
 
 
 class Motor:
@@ -63,12 +64,13 @@ class Line:
     """Bare calls to one provider, and their answers."""
 
     def __init__(self, raw: Any, here: Container, key: Any, caller: str = "tester") -> None:
+        self._caller = caller
         self._replies = raw.subscribe(reply_key(here.address.identity, caller, "raw", "*"))
         self._publisher = raw.publish(call_key(caller, key.address, key.domain, key.provider, stop=False))
 
     def put(self, *calls: Call) -> None:
         for one in calls:
-            self._publisher.put(encode_message(one))
+            self._publisher.put(encode_message(structs.replace(one, session=f"{self._caller}/raw/0")))
 
     def answer(self) -> Reply:
         return decode_reply(self._replies.receive().payload or b"")

@@ -35,7 +35,7 @@ from trade._wire import (
 )
 from trade.errors import InvalidResult, RemoteError
 
-CALL = Call(PROTOCOL, 7, "echo", "raw/0", "session", 2**62, (), EMPTY_ARGUMENTS)
+CALL = Call(PROTOCOL, 7, "echo", "raw/0", "tester/raw/0", 2**62, (), EMPTY_ARGUMENTS)
 REPLY = Reply(PROTOCOL, 7, Status.OK, 1, EMPTY)
 PROVIDER = ProviderInfo(
     revision=1, groups=("forged",), kind="Forged", host="h", pid=1, services=(ServiceInfo(name="go", signature="go()"),)

@@ -23,6 +23,7 @@ from trade._wire import (
     EMPTY_ARGUMENTS,
     PROTOCOL,
     Address,
+    Behalf,
     Call,
     CancelArguments,
     Malformed,
@@ -186,6 +187,7 @@ class Caller:
         deadline_ns: int,
         expires_ns: int | None,
         chain: tuple[str, ...],
+        behalf: Behalf | None = None,
     ) -> Reply:
         """Call and wait for the answer; it always comes, if only from ourselves at the deadline."""
         call_id = self.new_id()
@@ -194,7 +196,7 @@ class Caller:
         except ChannelClosed:
             return _ended(call_id, Status.UNSENT)
         try:
-            call = Call(PROTOCOL, call_id, service, box.name, self._session, expires_ns, chain, args)
+            call = Call(PROTOCOL, call_id, service, box.name, self._session, expires_ns, chain, args, behalf)
             box.sent = (publisher, call)
             box.waiting = (call_id, peer, deadline_ns)
             if deadline_ns < self._next_deadline_ns:
@@ -240,6 +242,7 @@ class Caller:
         chain: tuple[str, ...],
         on_reply: OnReply,
         on_progress: OnReply | None = None,
+        behalf: Behalf | None = None,
     ) -> int:
         """Call without waiting; answer and progress go there on a thread of ours. Returns the call's id."""
         try:
@@ -248,7 +251,7 @@ class Caller:
             on_reply(_ended(0, Status.UNSENT))
             return 0
         call_id = self.new_id()
-        call = Call(PROTOCOL, call_id, service, shared.name, self._session, expires_ns, chain, args)
+        call = Call(PROTOCOL, call_id, service, shared.name, self._session, expires_ns, chain, args, behalf)
         self._pending[call_id] = _Pending(peer, deadline_ns, on_reply, on_progress, (publisher, call))
         if deadline_ns < self._next_deadline_ns:
             self._sooner.set()

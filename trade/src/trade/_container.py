@@ -18,14 +18,21 @@ from trade import _many
 from trade._calls import Caller
 from trade._constraints import Constraint, checked_meta, where
 from trade._coroutines import AsyncLoop
+from trade._deadman import Deadman
 from trade._dispatch import Dispatcher
 from trade._handle import Bound, Handle, Run
 from trade._invoke import LocalTarget, RemoteTarget, Request, container_closed
 from trade._joining import join
+from trade._lock import Lock, OnLost, OnRequest
+from trade._lock_services import PROVIDER as LOCKS
+from trade._lock_services import LockServices
+from trade._locking import LEASE_S, Locking
+from trade._locks import LockTable
 from trade._notifications import Callback, Notification, Notifier
 from trade._providers import Providers, checked_groups, checked_health
 from trade._reach import Reach
 from trade._registry import Change, Record, Registry
+from trade._resources import Holder
 from trade._settings import Settings
 from trade._signature import Codec
 from trade._system import DOMAIN, PROVIDER, ContainerInfo, System, SystemServices
@@ -37,6 +44,7 @@ from trade._wire import (
     ProviderInfo,
     Scalar,
     ServiceKey,
+    Token,
     alive_key,
     encode_message,
 )
@@ -68,7 +76,7 @@ class Container:
         _note_start()
         self._settings = settings or Settings.read()
         self.address: Final = Address(self._settings.identity, self._settings.container, secrets.token_hex(6))
-        self.session: Final = secrets.token_hex(8)
+        self.session: Final = str(self.address)
         self._closing = threading.RLock()
         self._closed = False
         self.system: Final = System(lambda: self)
@@ -92,16 +100,27 @@ class Container:
             self._registry.listen(self._notifier.changed)
             coroutines = AsyncLoop()
             leaving.callback(coroutines.close)
-            self._providers = Providers(self._transport, self._registry, self.address, self._codec, coroutines)
+            self.locking: Final = Locking(self)
+            """Its locks on what others offer, and on what it offers itself."""
+            leaving.callback(self.locking.keeper.close)
+            self._table = LockTable(self.address.epoch, self.name)
+            leaving.callback(self._table.close)
+            self._providers = Providers(
+                self._transport, self._registry, self.address, self._codec, coroutines, self._table
+            )
             leaving.callback(self._providers.close)
+            self._deadman = Deadman(self._providers.stop_of, self._table.resources)
+            self._table.stop_with(self._deadman.stop)
             self.withdrawn: Final = Withdrawn(self._providers)
             """What was taken off from elsewhere and can be offered again."""
             self._dispatcher = Dispatcher(self._transport, self.address, self._providers.lookup, coroutines)
             leaving.callback(self._dispatcher.close)
             self._providers.add(SystemServices(self.system), (DOMAIN,), name=PROVIDER)
+            locks = LockServices(self._table, self.address, self._ask_for_release, self.locking.keeper.asked)
+            self._providers.add(locks, (DOMAIN,), name=LOCKS)
             presence = self._transport.appear(alive_key(self.address))
             leaving.callback(presence.close)
-            self._watch = Watch(self._transport, self._registry, self.address, self._caller.lost)
+            self._watch = Watch(self._transport, self._registry, self.address, self._lost)
             leaving.callback(self._watch.close)
             self._leaving = leaving.pop_all()
         _live.add(self)
@@ -237,6 +256,10 @@ class Container:
         labels = {record.label for record in self._registry.select(where())}
         return tuple(difflib.get_close_matches(".".join(filter(None, (group, name))), sorted(labels), n=2, cutoff=0.7))
 
+    def addresses(self) -> list[Address]:
+        """Where the containers of the system are, this one included."""
+        return [state.address for state in self._registry.containers()]
+
     def containers(self) -> list[ContainerInfo]:
         """The containers of the system, this one included."""
         self._check_open()
@@ -315,6 +338,19 @@ class Container:
             lambda: self._notifier.add(notification, self._registry.select(constraint) if existing else [])
         )
         return notification
+
+    def _lost(self, address: Address, *, back: bool = False) -> None:
+        """Told by the watch: a container is out of sight, or there again."""
+        self._caller.lost(address, back=back)
+        if not back:
+            self.locking.keeper.lost(address)
+            self._table.session_ended(str(address), f"its owner {address.container} has ended or cannot be reached")
+            self._deadman.session_ended(str(address))
+
+    def _ask_for_release(self, holder: Holder, token: Token, who: str, reason: str) -> None:
+        """Told by the lock services: somebody would like to have what another one holds."""
+        owner = Address(*holder.session.split("/")[:3])
+        self.handle(ServiceKey(owner, DOMAIN, LOCKS, "release_requested")).start(token, who, reason)
 
     def _changed(self, change: Change) -> None:
         """Told by the registry: calls to what left must fail at once."""
@@ -434,6 +470,53 @@ class Container:
         if code != _HANDLE_EXT:
             raise msgspec.ValidationError(f"Unknown extension {code}")
         return self.handle(msgspec.msgpack.decode(data, type=ServiceKey))
+
+    # --- locks
+
+    def lock(
+        self,
+        which: Constraint | Iterable[Handle],
+        *,
+        purpose: str = "",
+        wait_s: float = 10.0,
+        lease_s: float = LEASE_S,
+        priority: int = 0,
+        delegates: Sequence[str] = (),
+        partial: bool = False,
+        on_lost: OnLost | None = None,
+        on_request: OnRequest | None = None,
+    ) -> Lock:
+        """Take services for oneself alone, on all their containers or on none.
+
+        Args:
+            which: the actuating services that match, as they are now, or handles.
+            purpose: what for, as others are told who would like to have them.
+            wait_s: how long to wait for others, in seconds; 0 tries.
+            lease_s: how long it outlives its owner, in seconds.
+            priority: who waits with a higher one comes first.
+            delegates: identities that may use it, too.
+            partial: take a robot's group even if members of it are not there.
+            on_lost: called with the error, on a thread of its own, when it is lost.
+            on_request: called with who and why, on a thread of its own, when somebody asks for it.
+
+        Raises:
+            LockedByOther: somebody has one of them, or something still moves, after ``wait_s``.
+            IncompleteGroup: the robot file says that more belongs to the group.
+            ConfigurationError: nothing to lock.
+            DeviceSilent: one of them could not be stopped when it had to be.
+        """
+        self._check_open()
+        return self.locking.lock(
+            which,
+            purpose=purpose,
+            wait_s=wait_s,
+            lease_s=lease_s,
+            priority=priority,
+            delegates=delegates,
+            partial=partial,
+            on_lost=on_lost,
+            on_request=on_request,
+        )
 
     # --- being
 

@@ -1,14 +1,18 @@
 """What a provider may know of the call it serves: who asks, until when, on whose behalf; and what it may say of it."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextvars import ContextVar
-from typing import Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 from msgspec import Struct
 
 from trade._ongoing import Ongoing
+from trade._wire import Address, Behalf, Token
 from trade.errors import Cancelled
+
+if TYPE_CHECKING:
+    from trade._resources import Permit
 
 __all__ = ["CallContext", "current_call", "progress"]
 
@@ -30,6 +34,20 @@ class CallContext(Struct, frozen=True, gc=False):
 
     ongoing: Ongoing | None = None
     """The middleware's own notes on it."""
+    behalf: Behalf | None = None
+    """What it inherited; its own calls inherit it, too, while it runs."""
+    permit: "Permit | None" = None
+    """What it may do to the resources of its service."""
+
+    @property
+    def sessions(self) -> tuple[str, ...]:
+        """For whom it runs, nearest first: what it moves stops when one of them ends."""
+        return (self.session,) if self.behalf is None else (self.session, *self.behalf.sessions)
+
+    @property
+    def tokens(self) -> tuple[Token, ...]:
+        """The locks under which it runs."""
+        return () if self.behalf is None else self.behalf.tokens
 
     @property
     def cancelled(self) -> bool:
@@ -75,6 +93,27 @@ class CallContext(Struct, frozen=True, gc=False):
         """Seconds until it expires, never below zero; None if it does not."""
         return None if self.expires_ns is None else max(0.0, (self.expires_ns - time.monotonic_ns()) / 1e9)
 
+
+class Held(Protocol):
+    """A lock that the running code holds or uses."""
+
+    @property
+    def owner(self) -> Address:
+        """The container whose lock it is; calls of others in this process do not carry it."""
+        ...
+
+    @property
+    def held(self) -> bool:
+        """Whether it holds now."""
+        ...
+
+    def tokens(self) -> Iterable[Token]:
+        """What shows it to those it was granted by; raises LockLost if it holds no more."""
+        ...
+
+
+holding: ContextVar[tuple[Held, ...]] = ContextVar("trade_locks", default=())
+"""The locks around the running code, outermost first."""
 
 running: ContextVar[CallContext | None] = ContextVar("trade_call", default=None)
 

@@ -13,12 +13,13 @@ from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 import msgspec
-from msgspec import Raw
+from msgspec import Raw, structs
 
 from trade._context import CallContext, running
 from trade._coroutines import AsyncLoop
 from trade._failures import pack_error, unpack_error
 from trade._ongoing import Answer, Herald, Once, Ongoing, cancelled
+from trade._resources import Resource, admitted
 from trade._serial import Serial
 from trade._service import ServiceMark
 from trade._signature import Signature
@@ -55,7 +56,7 @@ _decode_cancel: Final = msgspec.msgpack.Decoder(CancelArguments).decode
 class LocalService:
     """A method of a registered provider, ready to be called."""
 
-    __slots__ = ("_loop", "effect", "label", "method", "serial", "signature", "strict")
+    __slots__ = ("_loop", "effect", "label", "method", "resources", "serial", "signature", "strict")
 
     def __init__(
         self,
@@ -65,6 +66,7 @@ class LocalService:
         mark: ServiceMark,
         loop: AsyncLoop,
         serial: Serial | None,
+        resources: tuple[Resource, ...] = (),
     ) -> None:
         self.label = label
         self.signature = signature
@@ -72,6 +74,8 @@ class LocalService:
         self.effect = mark.effect
         self.strict = mark.strict
         self.serial = serial
+        self.resources = resources
+        """What it needs for itself, or stops."""
         self._loop = loop
 
     def run(self, raw: Raw, context: CallContext) -> Any:
@@ -83,10 +87,30 @@ class LocalService:
         """Call with the arguments as they are."""
         if self.serial is not None:
             with self.serial.held():
-                return self._run(args, kwargs, context)
-        return self._run(args, kwargs, context)
+                return self._admitted(args, kwargs, context)
+        return self._admitted(args, kwargs, context)
 
-    def _run(self, args: Sequence[Any], kwargs: dict[str, Any], context: CallContext) -> Any:
+    def _admitted(self, args: Sequence[Any], kwargs: dict[str, Any], context: CallContext) -> Any:
+        """Call once its resources are its own to use; a stop needs no leave, and comes before whatever was given it."""
+        if not self.resources:
+            return self.run_admitted(args, kwargs, context)
+        if self.effect == "read":  # open to all, unless it was locked by its own handle
+            for resource in self.resources:
+                resource.check(context.tokens, context.caller, context.session)
+            return self.run_admitted(args, kwargs, context)
+        if self.effect == "stop":
+            for resource in self.resources:
+                resource.stop(context.caller, context.sessions)
+            return self.run_admitted(args, kwargs, context)
+        permit = admitted(self.resources, context)
+        structs.force_setattr(context, "permit", permit)
+        try:
+            return self.run_admitted(args, kwargs, context)
+        finally:
+            permit.close()
+
+    def run_admitted(self, args: Sequence[Any], kwargs: dict[str, Any], context: CallContext) -> Any:
+        """Call with the arguments as they are and nothing more asked: its resources are its own, or it stops them."""
         token = running.set(context)
         try:
             result = self.method(*args, **kwargs)
@@ -95,6 +119,8 @@ class LocalService:
             raise unpack_error(pack_error(error), self.label) from error
         finally:
             running.reset(token)
+            if context.behalf is not None:  # what it began and left running inherits nothing any more
+                structs.force_setattr(context, "behalf", None)
 
     def failure(self, error: BaseException, raw: Raw) -> ErrorInfo:
         """What the caller is told of an error of a call with these arguments."""
@@ -242,6 +268,8 @@ class Dispatcher:
             kind, caller, place = message.key.split("/", 2)
             if kind not in _KINDS or not place.startswith(self._here):
                 raise Malformed("a call goes to one provider, not to a pattern")
+            if not call.session.startswith(f"{caller}/"):
+                raise Malformed(f"session {call.session!r} is not one of {caller}")
             replier = self._replier(caller, call.reply)
         except (Malformed, ValueError) as bad:
             self.malformed += 1
@@ -293,7 +321,7 @@ class Dispatcher:
 
 def _run(caller: str, call: Call, service: LocalService, ongoing: Ongoing | None) -> Answer:
     expires = None if service.effect == "stop" else call.expires_ns
-    context = CallContext(call.id, service.label, caller, call.session, expires, call.chain, ongoing)
+    context = CallContext(call.id, service.label, caller, call.session, expires, call.chain, ongoing, call.behalf)
     try:
         return Status.OK, service.signature.encode_result(service.run(call.args, context))
     except BaseException as error:  # noqa: BLE001 - whatever a provider raises belongs to the caller

@@ -68,6 +68,10 @@ class Run:
         """The error it ended with, or None."""
         return self._future.exception(timeout_s)
 
+    def when_done(self, tell: "Callable[[Run], object]") -> None:
+        """Have this called once it has ended, on the thread that learns of it; at once if it has."""
+        self._future.add_done_callback(lambda _: tell(self))
+
     def cancel(self) -> None:
         """End it early; the result then tells how it ended.
 

@@ -11,7 +11,7 @@ import msgspec
 from msgspec import Raw
 
 from trade._calls import Caller, Peer
-from trade._context import CallContext, running
+from trade._context import CallContext, holding, running
 from trade._dispatch import LocalService
 from trade._failures import unpack_error
 from trade._handle import Run
@@ -21,7 +21,7 @@ from trade._registry import Record
 from trade._serial import Turn
 from trade._signature import Codec, encode_arguments
 from trade._system import CLOCK, DOMAIN, PROVIDER
-from trade._wire import EMPTY_ARGUMENTS, Address, ErrorInfo, Reply, ServiceInfo, Status
+from trade._wire import EMPTY_ARGUMENTS, Address, Behalf, ErrorInfo, Reply, ServiceInfo, Status, Token
 from trade.errors import (
     Busy,
     Cancelled,
@@ -38,26 +38,47 @@ _logger = logging.getLogger("trade")
 
 DEFAULT_DEADLINE_S: Final = 10.0
 
+_NOBODY: Final = Behalf()
 _decode_error: Final = msgspec.msgpack.Decoder(ErrorInfo).decode
 
 
 class Request:
     """One call on its way out: deadline and chain, inherited from the call that makes it."""
 
-    __slots__ = ("_asked_s", "_begun_ns", "chain", "deadline_ns", "deadline_s")
+    __slots__ = ("_asked_s", "_begun_ns", "_outer", "chain", "deadline_ns", "deadline_s")
 
     def __init__(self, deadline_s: float | None) -> None:
         self._begun_ns = now = time.monotonic_ns()
         self._asked_s = self.deadline_s = DEFAULT_DEADLINE_S if deadline_s is None else deadline_s
         self.deadline_ns = now + int(self.deadline_s * 1e9)
         self.chain: tuple[str, ...] = ()
-        outer = running.get()
+        self._outer = outer = running.get()
         if outer is None:
             return
         self.chain = (*outer.chain, outer.service)
         if outer.expires_ns is not None and outer.expires_ns < self.deadline_ns:
             self.deadline_ns = outer.expires_ns
             self.deadline_s = max(0.0, (outer.expires_ns - now) / 1e9)
+
+    def behalf(self, effect: str, own: Address) -> Behalf | None:
+        """What the call inherits; the locks around it unless it stops, which needs none.
+
+        Raises:
+            LockLost: it actuates, and would do so under a lock that holds no more.
+        """
+        outer, around = self._outer, holding.get()
+        if outer is None and not around:
+            return None
+        locks = [lock for lock in around if lock.owner == own]
+        tokens: tuple[Token, ...] = ()
+        if effect != "stop":
+            tokens = tuple(token for lock in locks if effect == "actuate" or lock.held for token in lock.tokens())
+        if outer is None:
+            return Behalf((), (), tokens) if tokens else None
+        inherited = outer.behalf or _NOBODY
+        if effect != "stop":
+            tokens += inherited.tokens
+        return Behalf(outer.sessions, (outer.id, *inherited.calls), tokens)
 
     def ignore_outer_deadline(self) -> None:
         """A stop is sent and waited for however late the call is that makes it."""
@@ -137,10 +158,11 @@ class LocalTarget:
         expires_ns = None if service.effect == "stop" else request.deadline_ns
         if service.too_late(expires_ns):
             raise DeadlineExceeded(service=service.label, deadline_s=request.deadline_s)
-        context = CallContext(
-            self._new_id(), service.label, self._own.identity, self._session, expires_ns, request.chain, ongoing
+        behalf = request.behalf(service.effect, self._own)
+        identity, session = self._own.identity, self._session
+        return do(
+            CallContext(self._new_id(), service.label, identity, session, expires_ns, request.chain, ongoing, behalf)
         )
-        return do(context)
 
 
 class RemoteTarget:
@@ -207,7 +229,10 @@ class RemoteTarget:
         return None if self._is_stop else self._peer.expiry_ns(request.deadline_ns)
 
     def _ask(self, publisher: Any, service: str, raw: Raw, expires_ns: int | None, request: Request) -> Reply:
-        return self._caller.ask(self._peer, publisher, service, raw, request.deadline_ns, expires_ns, request.chain)
+        behalf = request.behalf(self._info.effect, self._caller.own)
+        return self._caller.ask(
+            self._peer, publisher, service, raw, request.deadline_ns, expires_ns, request.chain, behalf
+        )
 
     def _start(
         self,
@@ -219,8 +244,9 @@ class RemoteTarget:
         then: Callable[[Reply], None],
         on_progress: Callable[[Reply], None] | None = None,
     ) -> int:
+        behalf, chain = request.behalf(self._info.effect, self._caller.own), request.chain
         return self._caller.start(
-            self._peer, publisher, service, raw, request.deadline_ns, expires_ns, request.chain, then, on_progress
+            self._peer, publisher, service, raw, request.deadline_ns, expires_ns, chain, then, on_progress, behalf
         )
 
     def _unpack(self, reply: Reply, request: Request) -> Any:

@@ -5,14 +5,16 @@ import re
 import socket
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, cast
 
 from msgspec import Struct, structs
 
 from trade._constraints import checked_meta
 from trade._coroutines import AsyncLoop
 from trade._dispatch import LocalService
+from trade._locks import LockTable
 from trade._registry import Registry
+from trade._resources import Resource
 from trade._serial import Serial
 from trade._service import ServiceMark, kinds_of, marked_methods
 from trade._signature import Codec, Signature
@@ -59,12 +61,15 @@ class Offer(NamedTuple):
 class Providers:
     """Owns what this container hosts; the registry and the rest of the system are told from here."""
 
-    def __init__(self, transport: Transport, registry: Registry, own: Address, codec: Codec, loop: AsyncLoop) -> None:
+    def __init__(
+        self, transport: Transport, registry: Registry, own: Address, codec: Codec, loop: AsyncLoop, table: LockTable
+    ) -> None:
         self._transport = transport
         self._registry = registry
         self._own = own
         self._codec = codec
         self._loop = loop
+        self._table = table
         self._lock = threading.Lock()
         self._announcing = threading.RLock()
         """Revisions go out in order, one at a time."""
@@ -94,8 +99,13 @@ class Providers:
             ConfigurationError: see `Container.register`.
         """
         kind = type(provider).__qualname__
-        services = self._services_of(provider, groups, implements)
         domain = domain_of(groups)
+        with self._lock:
+            self._require_new(provider)
+            self._counter += 1
+            chunk = name or f"{as_chunk(type(provider).__name__)[:60]}-{self._counter}"
+        place = f"{domain}/{chunk}"
+        services = self._services_of(provider, groups, implements, place)
         info = ProviderInfo(
             revision=1,
             groups=groups,
@@ -105,20 +115,21 @@ class Providers:
             services=_infos(services),
             kinds=kinds_of(type(provider), implements),
             meta=checked_meta(meta or {}),
+            members={group: tuple(names) for group, names in getattr(provider, "members", {}).items()},
         )
         with self._announcing:
             with self._lock:
-                if id(provider) in self._names:
-                    problem = "this object is registered already; deregister it first"
-                    raise ConfigurationError(where=kind, problem=problem)
-                self._counter += 1
-                chunk = name or f"{as_chunk(type(provider).__name__)[:60]}-{self._counter}"
-                place = f"{domain}/{chunk}"
+                self._require_new(provider)
                 announcement = self._transport.announce(registry_key(domain, self._own, chunk))
                 self._names[id(provider)] = place
                 self._hosted[place] = _Registered(provider, services, announcement, tuple(implements), info)
             self._announce(place, info)
         return [ServiceKey(self._own, domain, chunk, service) for service in services]
+
+    def _require_new(self, provider: object) -> None:
+        if id(provider) in self._names:
+            problem = "this object is registered already; deregister it first"
+            raise ConfigurationError(where=type(provider).__qualname__, problem=problem)
 
     def alter(self, provider: object, change: Callable[[ProviderInfo], ProviderInfo], *, reread: bool = False) -> None:
         """Tell everybody something else about a provider, in a new revision. Its place stays: handles hold.
@@ -136,7 +147,7 @@ class Providers:
             info = change(known.info)
             services = known.services
             if reread:
-                services = self._services_of(provider, info.groups, known.implements)
+                services = self._services_of(provider, info.groups, known.implements, place)
                 kinds = kinds_of(type(provider), known.implements)
                 info = structs.replace(info, services=_infos(services), kinds=kinds)
             if not reread and info == known.info:
@@ -144,6 +155,8 @@ class Providers:
             info = structs.replace(info, revision=known.info.revision + 1)
             with self._lock:
                 self._hosted[place] = structs.replace(known, services=services, info=info)
+            if reread:
+                self._drop(known.services)
             self._announce(place, info)
 
     def _known(self, provider: object) -> tuple[str, _Registered]:
@@ -172,6 +185,22 @@ class Providers:
                 registered = self._hosted.pop(place)
             self._registry.remove(self._own, place.partition("/")[2])
             registered.announcement.close()
+            self._drop(registered.services)
+
+    def _drop(self, services: Mapping[str, LocalService]) -> None:
+        for service in services.values():
+            for resource in service.resources:
+                self._table.drop(resource)
+
+    def stop_of(self, resource: Resource) -> LocalService | None:
+        """The service that stops a resource, and as few others as there are."""
+        found = [
+            service
+            for registered in list(self._hosted.values())
+            for service in registered.services.values()
+            if service.effect == "stop" and resource in service.resources
+        ]
+        return min(found, key=lambda service: len(service.resources), default=None)
 
     def offer(self, place: str) -> Offer | None:
         """What is registered at a place (``domain/provider``)."""
@@ -194,14 +223,14 @@ class Providers:
             registered.announcement.close()
 
     def _services_of(
-        self, provider: object, groups: tuple[str, ...], implements: Sequence[type]
+        self, provider: object, groups: tuple[str, ...], implements: Sequence[type], place: str
     ) -> dict[str, LocalService]:
         kind = type(provider).__qualname__
         marked = marked_methods(type(provider), implements)
         if not marked:
             problem = "it has no services; mark methods of its class with @trade.service"
             raise ConfigurationError(where=kind, problem=problem)
-        resources = tuple(getattr(provider, "resources", ()))
+        resources = cast("tuple[Resource | str, ...]", tuple(getattr(provider, "resources", ())))
         _require_stop(kind, resources, [mark for mark, _ in marked.values()])
         serial = Serial()
         services: dict[str, LocalService] = {}
@@ -212,11 +241,29 @@ class Providers:
                 raise ConfigurationError(where=label, problem=problem)
             signature = Signature(label, name, mark, function, self._codec)
             if mark.effect != "read":
-                signature.info = structs.replace(signature.info, uses=(*mark.uses, *resources))
+                names = tuple(one if isinstance(one, str) else one.name for one in resources)
+                signature.info = structs.replace(signature.info, uses=(*mark.uses, *names))
             services[name] = LocalService(
-                label, signature, getattr(provider, name), mark, self._loop, serial if mark.serial else None
+                label,
+                signature,
+                getattr(provider, name),
+                mark,
+                self._loop,
+                serial if mark.serial else None,
+                self._adopt(mark, (*mark.uses, *resources), f"{place}/{name}"),
             )
         return services
+
+    def _adopt(self, mark: ServiceMark, needed: Sequence[Resource | str], itself: str) -> tuple[Resource, ...]:
+        """What a service needs for itself; what names nothing, or only reads, can be locked as itself."""
+        if itself.startswith(f"{DOMAIN}/"):
+            return ()
+        if mark.effect == "read" or (not needed and mark.effect == "actuate"):
+            needed = (itself,)
+        try:
+            return tuple(self._table.adopt(one) for one in dict.fromkeys(needed))
+        except ValueError as twice:
+            raise ConfigurationError(where=itself, problem=str(twice)) from None
 
 
 def _infos(services: Mapping[str, LocalService]) -> tuple[ServiceInfo, ...]:
@@ -227,7 +274,7 @@ def _not_registered(provider: object) -> ConfigurationError:
     return ConfigurationError(where=type(provider).__qualname__, problem="it is not registered in this container")
 
 
-def _require_stop(kind: str, resources: tuple[str, ...], marks: Sequence[ServiceMark]) -> None:
+def _require_stop(kind: str, resources: Sequence[object], marks: Sequence[ServiceMark]) -> None:
     """S17: what moves something physical is not offered without a way to stop it."""
     physical = resources or any(mark.uses for mark in marks)
     effects = {mark.effect for mark in marks}

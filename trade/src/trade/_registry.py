@@ -27,6 +27,7 @@ class Record:
     kinds: tuple[str, ...]
     meta: Mapping[str, Scalar]
     health: str
+    members: Mapping[str, tuple[str, ...]]
 
     @property
     def healthy(self) -> bool:
@@ -165,6 +166,7 @@ class Registry:
                 kinds=info.kinds,
                 meta={**service.meta, **info.meta},
                 health=info.health,
+                members=info.members,
             )
             for service in info.services
         ]

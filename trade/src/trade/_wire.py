@@ -79,6 +79,24 @@ def domain_of(groups: tuple[str, ...]) -> str:
 # --- messages
 
 
+class Token(Struct, frozen=True, array_like=True, gc=False):
+    """Names a lock's grant by one container; travels with the calls made under the lock."""
+
+    epoch: str
+    """Of the container that granted."""
+    number: int
+
+
+class Behalf(Struct, frozen=True, array_like=True, gc=False):
+    """What a call inherits from those that led to it, and from the locks around it."""
+
+    sessions: tuple[str, ...] = ()
+    """For whom else it is made, nearest first: what it moves stops when one of them ends."""
+    calls: tuple[int, ...] = ()
+    """The calls that led to it, nearest first."""
+    tokens: tuple[Token, ...] = ()
+
+
 class Call(Struct, array_like=True, gc=False):
     """A request, put on ``call/...`` or ``stop/...``. Who asks stands in the key."""
 
@@ -89,12 +107,14 @@ class Call(Struct, array_like=True, gc=False):
     reply: str
     """``container/channel`` of the caller's reply key."""
     session: str
+    """Of who asks: its address, and more chunks if it has several."""
     expires_ns: int | None
     """In the callee's monotonic clock; None only where being late is harmless (reading, stopping)."""
     chain: tuple[str, ...]
     """Services whose calls led to this one, outermost first."""
     args: Raw
     """Positional arguments as an array, or all arguments by name as a map."""
+    behalf: Behalf | None = None
 
 
 class Status:
@@ -186,6 +206,8 @@ class ProviderInfo(Struct, frozen=True, kw_only=True):
     meta: dict[str, Scalar] = {}
     """Holds for all its services, over what they say themselves."""
     health: str = HEALTHY
+    members: dict[str, tuple[str, ...]] = {}
+    """What the robot's groups consist of: group -> resources, whether or not they are there."""
 
 
 CANCEL: Final = "cancel"

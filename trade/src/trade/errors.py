@@ -4,6 +4,7 @@ Every error carries its data as attributes, crosses the wire with them, and says
 builtin a Python programmer would catch for it, so ``except TimeoutError`` finds a deadline that passed.
 """
 
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
@@ -20,10 +21,13 @@ __all__ = [
     "DeviceError",
     "DeviceFault",
     "DeviceSilent",
+    "IncompleteGroup",
     "InvalidArgument",
     "InvalidResult",
     "LimitExceeded",
     "LinkStays",
+    "LockLost",
+    "LockedByOther",
     "MotionStopped",
     "NoSuchService",
     "NotSerialisable",
@@ -31,6 +35,7 @@ __all__ = [
     "RemoteError",
     "ServiceGone",
     "SetupError",
+    "Stopped",
     "TooLarge",
     "TooManyServices",
     "TradeError",
@@ -199,6 +204,68 @@ class MotionStopped(CallerError, RuntimeError):
 
     def describe(self) -> str:
         return f"{self.device} stopped before its goal: {self.reason}. It holds its position until it is moved again"
+
+
+@dataclass(kw_only=True, eq=False)
+class Stopped(CallerError, RuntimeError):
+    """A stop by somebody else holds until it is resumed; nothing moves before that."""
+
+    resource: str
+    by: str
+    reason: str
+    estop: bool = False
+
+    def describe(self) -> str:
+        remedy = "`trade estop --clear`" if self.estop else "trade.resume(...) or `trade resume`"
+        return f"{self.resource} was stopped by {self.by}: {self.reason}. When it is safe to move, call {remedy}"
+
+
+@dataclass(kw_only=True, eq=False)
+class LockedByOther(CallerError, PermissionError):
+    """Somebody else has it for themselves."""
+
+    resources: Sequence[str]
+    owner: str
+    purpose: str = ""
+    since: float = 0.0
+    """Seconds since the epoch, by the clock of the container that granted it."""
+    own: bool = False
+    """The owner is this very container, in another thread or task."""
+
+    def describe(self) -> str:
+        what = ", ".join(self.resources)
+        aim = f" for {self.purpose!r}" if self.purpose else ""
+        when = f" since {time.strftime('%H:%M:%S', time.localtime(self.since))}" if self.since else ""
+        if self.own:
+            hint = "that is this container itself: in another thread use `with lock.use():`"
+        else:
+            hint = "wait with trade.lock(..., wait_s=...) or ask with trade.request_release(...)"
+        return f"{what} is locked by {self.owner}{aim}{when}; {hint}"
+
+
+@dataclass(kw_only=True, eq=False)
+class LockLost(CallerError, ConnectionError):
+    """A lock one had holds no more; nothing was done under it, and what moved under it was told to stop."""
+
+    resources: Sequence[str]
+    reason: str
+
+    def describe(self) -> str:
+        return f"the lock of {', '.join(self.resources)} is lost: {self.reason}; take it anew with trade.lock(...)"
+
+
+@dataclass(kw_only=True, eq=False)
+class IncompleteGroup(CallerError, LookupError):
+    """Members of a robot's group are not there, so the whole group cannot be locked."""
+
+    group: str
+    missing: Sequence[str]
+
+    def describe(self) -> str:
+        return (
+            f"{self.group} is not complete: {', '.join(self.missing)} missing; start what drives it, or lock what is "
+            "there with partial=True"
+        )
 
 
 @dataclass(kw_only=True, eq=False)

@@ -1,0 +1,126 @@
+"""What every container offers about the locks of its resources, in group ``trade``."""
+
+import threading
+import time
+from collections.abc import Callable
+from typing import Final
+
+from trade._context import CallContext, current_call
+from trade._locks import Granted, LockInfo, LockTable, Terms
+from trade._resources import Holder, Resource
+from trade._service import service
+from trade._wire import Address, Token
+from trade.errors import Busy, LockedByOther
+
+PROVIDER: Final = "locks"
+_MOST_WAITING: Final = 24
+"""So many may stand in the queues of a container at once; who comes then asks again."""
+
+Ask = Callable[[Holder, Token, str, str], None]
+"""Passes a wish on to the holder of a grant: whose, which, who asks and why."""
+Asked = Callable[[Token, str, str], bool]
+"""Told of such a wish for a lock of this container; whether anybody heeds it."""
+
+
+class LockServices:
+    """The wire's side of a `LockTable`."""
+
+    def __init__(self, table: LockTable, own: Address, ask: Ask, asked: Asked) -> None:
+        self._table = table
+        self._own = own
+        self._ask = ask
+        self._asked = asked
+        self._places = threading.BoundedSemaphore(_MOST_WAITING)
+
+    @service
+    def acquire(self, resources: list[str], terms: Terms) -> Granted:
+        """Take all of these and what is coupled to them for the calling session."""
+        call = _call()
+        calls = () if call.behalf is None else call.behalf.calls
+        holder = Holder(
+            identity=call.caller,
+            container=_container_of(call.session),
+            session=call.session,
+            purpose=terms.purpose,
+            since=time.time(),
+            delegates=terms.delegates,
+        )
+        if not self._places.acquire(blocking=False):
+            raise Busy(service="trade.acquire", container=self._own.container)
+        try:
+            return self._table.acquire(resources, holder, terms, call.tokens, (call.id, *calls))
+        finally:
+            self._places.release()
+
+    @service(effect="stop")
+    def renew(self, grants: list[int]) -> list[int]:
+        """Begin the leases of these grants anew; those that still hold."""
+        return self._table.renew(grants, _call().caller)
+
+    @service(effect="stop")
+    def release(self, grant: int, lost: str = "") -> bool:
+        """Give a grant back; ``lost`` says why the rest of its lock is, and then what it moves stops."""
+        identity = _call().caller
+        if lost and self._table.renew([grant], identity):
+            return self._table.lose(grant, lost)
+        return self._table.release(grant, identity)
+
+    @service(effect="read")
+    def locks(self) -> list[LockInfo]:
+        """What is locked here, by whom, and who waits for it."""
+        return self._table.infos()
+
+    @service(effect="stop")
+    def break_lock(self, grant: int, reason: str) -> bool:
+        """Take a lock away from its owner; what it moves stops. Whether it was held."""
+        return self._table.lose(grant, f"broken by {_call().caller}: {reason}")
+
+    @service
+    def request_release(self, resources: list[str], reason: str) -> list[str]:
+        """Ask the owners of these to give them back; who was asked."""
+        call = _call()
+        who = f"{call.caller}/{_container_of(call.session)}"
+        holders: dict[Token, Holder] = {}
+        for resource in self._table.named(resources):
+            if (holder := resource.holder) is not None:
+                holders[Token(self._own.epoch, resource.live)] = holder
+        for token, holder in holders.items():
+            self._ask(holder, token, who, reason)
+        return [f"{holder.identity}/{holder.container}" for holder in holders.values()]
+
+    @service
+    def release_requested(self, token: Token, who: str, reason: str) -> bool:
+        """Somebody would like to have what a lock of this container holds; whether its owner has an ear for that."""
+        return self._asked(token, who, reason)
+
+    @service
+    def resume(self, resources: list[str]) -> list[str]:
+        """Let these move again after a stop; for the owner of their lock, or anybody if they are not locked."""
+        call = _call()
+        found = self._table.named(resources)
+        for resource in found:
+            if resource.holder is not None and resource.holder.session not in call.sessions:
+                owner = f"{resource.holder.identity}/{resource.holder.container}"
+                raise LockedByOther(
+                    resources=(resource.name,),
+                    owner=owner,
+                    purpose=resource.holder.purpose,
+                    since=resource.holder.since,
+                )
+        return [resource.name for resource in found if _resumed(resource)]
+
+
+def _resumed(resource: Resource) -> bool:
+    was = resource.latch is not None or bool(resource.unsafe)
+    resource.resume()
+    return was
+
+
+def _call() -> CallContext:
+    call = current_call()
+    assert call is not None  # noqa: S101 - these are only called as services
+    return call
+
+
+def _container_of(session: str) -> str:
+    return session.split("/")[1] if session.count("/") >= 2 else session

@@ -1,0 +1,171 @@
+"""What one does with locks: take them over many services, look at them, ask for them, take them away; and resume."""
+
+import asyncio
+import functools
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, Final, Protocol
+
+from trade._constraints import Constraint
+from trade._handle import Handle
+from trade._lock import Keeper, Lock, OnLost, OnRequest
+from trade._lock_services import PROVIDER
+from trade._locks import LockInfo, Terms
+from trade._system import DOMAIN
+from trade._wire import Address, ServiceKey
+from trade.errors import ConfigurationError, IncompleteGroup, TradeError
+
+LONGEST_WAIT_S: Final = 3600.0
+LEASE_S: Final = 2.0
+"""The lease of a lock is the deadman's budget, too (S12)."""
+
+
+class Home(Protocol):
+    """What locking asks of its container."""
+
+    @property
+    def address(self) -> Address: ...
+    def handle(self, key: ServiceKey) -> Handle: ...
+    def services(self, constraint: Constraint | None = None) -> list[Handle]: ...
+    def addresses(self) -> list[Address]: ...
+
+
+class Locking:
+    """The locks of one container; ``container.locking``."""
+
+    def __init__(self, home: Home) -> None:
+        self._home = home
+        self.keeper: Final = Keeper(home)
+
+    def lock(
+        self,
+        which: Constraint | Iterable[Handle],
+        *,
+        purpose: str = "",
+        wait_s: float = 10.0,
+        lease_s: float = LEASE_S,
+        priority: int = 0,
+        delegates: Sequence[str] = (),
+        partial: bool = False,
+        on_lost: OnLost | None = None,
+        on_request: OnRequest | None = None,
+    ) -> Lock:
+        """See `Container.lock`."""
+        handles = selected(which, self._home.services)
+        if not partial:
+            require_whole(which, handles)
+        if not 0 <= wait_s <= LONGEST_WAIT_S:
+            raise ConfigurationError(where="lock", problem=f"wait_s must be 0 to {LONGEST_WAIT_S:g}, not {wait_s!r}")
+        if not 0.1 <= lease_s <= 60:
+            raise ConfigurationError(where="lock", problem=f"lease_s must be 0.1 to 60, not {lease_s!r}")
+        terms = Terms(purpose=purpose, lease_s=lease_s, wait_s=wait_s, priority=priority, delegates=tuple(delegates))
+        lock = Lock(self.keeper, terms, on_lost, on_request)
+        return self.keeper.acquire(lock, resources_of(handles), terms)
+
+    async def alock(self, which: Constraint | Iterable[Handle], **options: Any) -> Lock:
+        """`lock` from asyncio; given up, nothing stays held."""
+        taking = asyncio.ensure_future(asyncio.to_thread(functools.partial(self.lock, which, **options)))
+        try:
+            return await asyncio.shield(taking)
+        except asyncio.CancelledError:
+            taking.add_done_callback(_release_unwanted)
+            raise
+
+    def locks(self) -> list[LockInfo]:
+        """See `Container.locks`."""
+        runs = [self._service(address, "locks").start() for address in self._home.addresses()]
+        found: list[LockInfo] = []
+        for run in runs:
+            try:
+                found.extend(run.result())
+            except TradeError:  # it left meanwhile
+                continue
+        return sorted(found, key=lambda info: (info.resources, info.container))
+
+    def request_release(self, which: Constraint | Iterable[Handle], reason: str) -> list[str]:
+        """See `Container.request_release`."""
+        return self._everywhere("request_release", which, reason)
+
+    def resume(self, which: Constraint | Iterable[Handle]) -> list[str]:
+        """See `Container.resume`."""
+        return self._everywhere("resume", which)
+
+    def break_lock(self, which: Constraint | Iterable[Handle], reason: str) -> list[LockInfo]:
+        """See `Container.break_lock`."""
+        handles = selected(which, self._home.services)
+        wanted = resources_of(handles)
+        broken: list[LockInfo] = []
+        for address, names in wanted.items():
+            hit = [info for info in self._service(address, "locks")() if not set(names).isdisjoint(info.resources)]
+            broken += [info for info in hit if self._service(address, "break_lock")(info.token.number, reason)]
+        return broken
+
+    def _everywhere(self, name: str, which: Constraint | Iterable[Handle], *rest: str) -> list[str]:
+        wanted = resources_of(selected(which, self._home.services))
+        runs = [self._service(address, name).start(names, *rest) for address, names in wanted.items()]
+        return [text for run in runs for text in run.result()]
+
+    def _service(self, address: Address, name: str) -> Handle:
+        return self._home.handle(ServiceKey(address, DOMAIN, PROVIDER, name))
+
+
+def _release_unwanted(taking: "asyncio.Future[Lock]") -> None:
+    if not taking.cancelled() and taking.exception() is None:
+        taking.result().release()
+
+
+def resources_of(handles: Sequence[Handle]) -> dict[Address, list[str]]:
+    """What to lock for the use of services, by the container that judges it."""
+    wanted: dict[Address, dict[str, None]] = {}
+    for handle in handles:
+        uses = () if handle.effect == "read" else handle.record.info.uses
+        names = uses or (own_resource(handle.key),)
+        wanted.setdefault(handle.key.address, {}).update(dict.fromkeys(names))
+    return {address: list(names) for address, names in wanted.items()}
+
+
+def own_resource(key: ServiceKey) -> str:
+    """What stands for a service that names no resources: itself."""
+    return f"{key.domain}/{key.provider}/{key.name}"
+
+
+def selected(which: Constraint | Iterable[Handle], select: Callable[[Constraint], Sequence[Handle]]) -> list[Handle]:
+    """The services a lock is for: those given, or the actuating ones that match.
+
+    Raises:
+        ConfigurationError: there are none, or a stop is among them.
+    """
+    if isinstance(which, Constraint):
+        found = [handle for handle in select(which) if handle.effect == "actuate"]
+        if not found:
+            problem = "nothing that matches actuates, so there is nothing to lock; what reads is locked by its handle"
+            raise ConfigurationError(where=f"lock of {which}", problem=problem)
+        return found
+    found = list(which)
+    if not found:
+        raise ConfigurationError(where="lock", problem="an empty selection locks nothing; name some services")
+    for handle in found:
+        if handle.effect == "stop":
+            raise ConfigurationError(where=handle.label, problem="a stop is everybody's; it cannot be locked")
+    return found
+
+
+def require_whole(which: Constraint | Iterable[Handle], handles: Sequence[Handle]) -> None:
+    """A group of a robot is locked as a whole (S16).
+
+    Raises:
+        IncompleteGroup: some of what the robot file says belongs to it is not there.
+    """
+    if not isinstance(which, Constraint):
+        return
+    groups = [term.pattern for clause in which.clauses for term in clause if term.field == "group" and not term.negated]
+    there = {name for handle in handles for name in handle.record.info.uses}
+    for group in groups:
+        expected = {
+            member
+            for handle in handles
+            for whole, members in handle.record.members.items()
+            if whole == group or whole.startswith(f"{group}.")
+            for member in members
+        }
+        if missing := sorted(expected - there):
+            raise IncompleteGroup(group=group, missing=missing)

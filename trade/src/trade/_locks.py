@@ -1,0 +1,381 @@
+"""The lock table of a container: who has which of its resources, for how long, and who comes next.
+
+All of it is this container's own: grants are made here, leases run on this clock, fences fall here. The other side of a
+lock, who asks and renews, is `_locking`.
+"""
+
+import threading
+import time
+from collections.abc import Callable, Iterable, Sequence
+from typing import Final
+
+from msgspec import Struct
+
+from trade._resources import Holder, Resource, locked
+from trade._wire import Token
+from trade.errors import DeviceSilent, LockedByOther, ServiceGone, TradeError
+
+_STOPPING: Final = Holder("trade", "", "", "stopping what moved under a lock that was lost", 0.0)
+
+Stop = Callable[[Sequence[Resource], str, Callable[[Resource, str], None]], None]
+"""Stops resources for a reason, without waiting; tells of each when it is over, and why if it could not be done."""
+
+
+class Terms(Struct, frozen=True):
+    """How somebody wants a lock."""
+
+    purpose: str = ""
+    lease_s: float = 2.0
+    wait_s: float = 0.0
+    """How long to stand in the queue."""
+    drain_s: float = 0.0
+    """How long to wait, once it is one's turn, for what still runs and moves."""
+    priority: int = 0
+    """Higher ones come first; whoever has it keeps it."""
+    delegates: tuple[str, ...] = ()
+    """Identities that may use it, too."""
+
+
+class Granted(Struct, frozen=True):
+    """A lock's part in one container."""
+
+    token: Token | None
+    """None: everything asked for was locked by the asking call already."""
+    resources: tuple[str, ...]
+    waited_s: float = 0.0
+    """How long after it was asked for; the lease began then."""
+
+
+class LockInfo(Struct, frozen=True):
+    """One grant, as `trade.locks` tells it."""
+
+    token: Token
+    container: str
+    resources: tuple[str, ...]
+    holder: Holder
+    left_s: float
+    """What is left of the lease."""
+    uses: int
+    """Calls made under it."""
+    last_use: float
+    """``time.time()`` of the last one; 0 for none."""
+    waiting: tuple[str, ...]
+    """Who waits for any of it, next first."""
+
+
+class _Grant(Struct, eq=False):
+    number: int
+    resources: tuple[Resource, ...]
+    holder: Holder
+    lease_s: float
+    until: float
+
+
+class _Waiter(Struct, eq=False):
+    order: tuple[int, int]
+    resources: tuple[Resource, ...]
+    holder: Holder
+    tokens: frozenset[Token]
+    calls: frozenset[int]
+    """Of the asking chain: they are not waited for."""
+    gone: bool = False
+    """Its session has ended."""
+
+
+class LockTable:
+    """The resources of one container."""
+
+    def __init__(self, epoch: str, container: str, clock: Callable[[], float] = time.monotonic) -> None:
+        self._epoch = epoch
+        self._container = container
+        self._stop: Stop = _leave_it
+        self._clock = clock
+        self._resources: dict[str, tuple[Resource, int]] = {}
+        """By name, with the number of services that use it."""
+        self._grants: dict[int, _Grant] = {}
+        self._waiting: list[_Waiter] = []
+        self._count = 0
+        self._changed = threading.Condition(threading.RLock())
+        self._sooner = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._closed = False
+
+    def stop_with(self, stop: Stop) -> None:
+        """How to stop what moves under a lock that is lost."""
+        self._stop = stop
+
+    # --- resources
+
+    def adopt(self, named: Resource | str) -> Resource:
+        """The resource of that name, made if it is new; given back by `drop`.
+
+        Raises:
+            ValueError: another object stands for that name already.
+        """
+        name = named if isinstance(named, str) else named.name
+        with self._changed:
+            known, uses = self._resources.get(name, (None, 0))
+            resource = known or (named if isinstance(named, Resource) else Resource(name))
+            if isinstance(named, Resource) and resource is not named:
+                raise ValueError(f"resource {name} is another object already; share one trade.Resource")
+            resource.epoch, resource.grants = self._epoch, self._grants
+            resource.on_rest(self._rested)
+            self._resources[name] = (resource, uses + 1)
+            return resource
+
+    def drop(self, resource: Resource) -> None:
+        """One service less uses it."""
+        with self._changed:
+            known, uses = self._resources[resource.name]
+            if uses > 1:
+                self._resources[resource.name] = (known, uses - 1)
+            else:
+                del self._resources[resource.name]
+
+    def resources(self) -> list[Resource]:
+        """All of them, by name."""
+        with self._changed:
+            return [self._resources[name][0] for name in sorted(self._resources)]
+
+    def named(self, names: Iterable[str]) -> tuple[Resource, ...]:
+        """Those of these names and what is coupled to them, in the order all lock in.
+
+        Raises:
+            ServiceGone: one is not here (any more).
+        """
+        wanted, found = list(names), dict[str, Resource]()
+        with self._changed:
+            while wanted:
+                name = wanted.pop()
+                if name in found:
+                    continue
+                if name not in self._resources:
+                    raise ServiceGone(service=name, reason=f"container {self._container} has no such resource")
+                found[name] = self._resources[name][0]
+                wanted.extend(other for other in found[name].coupled if other in self._resources)
+        return tuple(found[name] for name in sorted(found))
+
+    # --- locking
+
+    def acquire(
+        self,
+        names: Sequence[str],
+        holder: Holder,
+        terms: Terms,
+        tokens: Iterable[Token] = (),
+        calls: Iterable[int] = (),
+    ) -> Granted:
+        """Wait for one's turn, then for what still runs, then have them all.
+
+        Args:
+            names: of resources; what is coupled to them comes with them.
+            holder: who asks.
+            terms: how.
+            tokens: locks the asking call is made under; what they hold is not asked for again.
+            calls: the asking chain, which is not waited for.
+
+        Raises:
+            LockedByOther: not within the times given; nothing is held then.
+            DeviceSilent: one could not be stopped when it had to be, and is given to nobody.
+            ServiceGone: one is not here.
+        """
+        mine = frozenset(tokens)
+        resources = tuple(one for one in self.named(names) if Token(self._epoch, one.live) not in mine)
+        if not resources:
+            return Granted(None, ())
+        asked = self._clock()
+        with self._changed:
+            self._count += 1
+            waiter = _Waiter((-terms.priority, self._count), resources, holder, mine, frozenset(calls))
+            self._waiting.append(waiter)
+            self._waiting.sort(key=lambda one: one.order)
+            try:
+                self._take_turn(waiter, self._clock() + terms.wait_s)
+            finally:
+                self._waiting.remove(waiter)
+            try:
+                self._drain(waiter, self._clock() + terms.drain_s)
+                return self._grant(waiter, terms, asked)
+            finally:
+                for resource in resources:
+                    resource.pending = None
+                self._changed.notify_all()
+
+    def _take_turn(self, waiter: _Waiter, until: float) -> None:
+        """Wait until nobody has any of them and nobody waits before us for any; they are ours to empty then."""
+        while (obstacle := self._obstacle(waiter)) is not None:
+            left = until - self._clock()
+            if left <= 0 or waiter.gone or self._closed:
+                raise obstacle
+            self._changed.wait(left)
+        for resource in waiter.resources:
+            resource.pending = waiter.holder
+
+    def _obstacle(self, waiter: _Waiter) -> TradeError | None:
+        for resource in waiter.resources:
+            if resource.unsafe:
+                return DeviceSilent(device=resource.name, bus=self._container, waited_s=0.0)
+            if resource.live:
+                return locked(resource, resource.holder, waiter.holder.session)
+            if resource.pending is not None:
+                return locked(resource, resource.pending, waiter.holder.session)
+        for earlier in self._waiting:
+            if earlier is waiter:
+                return None
+            shared = next((one for one in waiter.resources if one in earlier.resources), None)
+            if shared is not None:  # in strict order, so that every wait is bounded by those before it
+                return locked(shared, earlier.holder, waiter.holder.session)
+        return None
+
+    def _drain(self, waiter: _Waiter, until: float) -> None:
+        while (running := self._running(waiter)) is not None:
+            left = until - self._clock()
+            if left <= 0 or waiter.gone or self._closed:
+                raise LockedByOther(
+                    resources=(running.name,),
+                    owner=", ".join(running.movers) or "somebody",
+                    purpose="a call or a motion that has not ended",
+                )
+            self._changed.wait(left)
+
+    def _running(self, waiter: _Waiter) -> Resource | None:
+        """One of them that is still in use by others than the asking chain."""
+        for resource in waiter.resources:
+            others = [call for call in list(resource.calls) if call not in waiter.calls]
+            if others or (resource.moving and not resource.calls):
+                return resource
+        return None
+
+    def _grant(self, waiter: _Waiter, terms: Terms, asked: float) -> Granted:
+        self._count += 1
+        number = self._count
+        for resource in waiter.resources:
+            resource.holder, resource.live = waiter.holder, number
+            resource.uses, resource.used_at = 0, 0.0
+        now = self._clock()
+        grant = _Grant(number, waiter.resources, waiter.holder, terms.lease_s, now + terms.lease_s)
+        self._grants[number] = grant
+        self._watch_leases()
+        return Granted(Token(self._epoch, number), tuple(one.name for one in grant.resources), now - asked)
+
+    # --- while it is held
+
+    def renew(self, numbers: Iterable[int], identity: str) -> list[int]:
+        """Let leases begin anew; returns those that still hold."""
+        with self._changed:
+            now = self._clock()
+            held = [self._grants[number] for number in numbers if number in self._grants]
+            own = [grant for grant in held if grant.holder.identity == identity]
+            for grant in own:
+                grant.until = now + grant.lease_s
+            return [grant.number for grant in own]
+
+    def release(self, number: int, identity: str) -> bool:
+        """Give it back; what its owner left moving goes on, and the next one waits for it. Returns whether it held."""
+        with self._changed:
+            grant = self._grants.get(number)
+            if grant is None or grant.holder.identity != identity:
+                return False
+            self._end(grant)
+            return True
+
+    def lose(self, number: int, reason: str) -> bool:
+        """Take it away: what moves under it stops, and only then it is given on. Returns whether it held."""
+        with self._changed:
+            grant = self._grants.get(number)
+            if grant is None:
+                return False
+            busy = [resource for resource in grant.resources if resource.busy]
+            self._end(grant)
+            for resource in busy:
+                resource.pending = _STOPPING
+        if busy:
+            self._stop(busy, reason, self._stopped)
+        return True
+
+    def session_ended(self, session: str, reason: str) -> None:
+        """Nobody of that session (or of one within it) is there any more: its locks fall, its waiting ends."""
+        with self._changed:
+            for waiter in self._waiting:
+                waiter.gone = waiter.gone or within(waiter.holder.session, session)
+            fallen = [grant.number for grant in self._grants.values() if within(grant.holder.session, session)]
+            self._changed.notify_all()
+        for number in fallen:
+            self.lose(number, reason)
+
+    def infos(self) -> list[LockInfo]:
+        """What is held, and who waits."""
+        with self._changed:
+            now = self._clock()
+            return [self._info(grant, now) for grant in self._grants.values()]
+
+    def _info(self, grant: _Grant, now: float) -> LockInfo:
+        waiting = [one.holder for one in self._waiting if not set(one.resources).isdisjoint(grant.resources)]
+        return LockInfo(
+            token=Token(self._epoch, grant.number),
+            container=self._container,
+            resources=tuple(resource.name for resource in grant.resources),
+            holder=grant.holder,
+            left_s=max(0.0, grant.until - now),
+            uses=sum(resource.uses for resource in grant.resources),
+            last_use=max(resource.used_at for resource in grant.resources),
+            waiting=tuple(f"{one.identity}/{one.container}" for one in waiting),
+        )
+
+    # --- its end
+
+    def _end(self, grant: _Grant) -> None:
+        del self._grants[grant.number]
+        for resource in grant.resources:
+            if resource.live == grant.number:
+                resource.live, resource.holder = 0, None
+        self._changed.notify_all()
+
+    def _stopped(self, resource: Resource, problem: str) -> None:
+        with self._changed:
+            resource.unsafe = problem
+            if resource.pending is _STOPPING:
+                resource.pending = None
+            self._changed.notify_all()
+
+    def _rested(self) -> None:
+        if self._waiting or any(resource.pending is not None for resource, _ in list(self._resources.values())):
+            with self._changed:
+                self._changed.notify_all()
+
+    def _watch_leases(self) -> None:
+        if self._thread is None:
+            self._thread = threading.Thread(target=self._run, name="trade-leases", daemon=True)
+            self._thread.start()
+        self._sooner.set()
+
+    def _run(self) -> None:
+        while not self._closed:
+            self._sooner.clear()
+            with self._changed:
+                now = self._clock()
+                over = [grant.number for grant in self._grants.values() if grant.until <= now]
+                soonest = min((grant.until for grant in self._grants.values() if grant.until > now), default=None)
+            for number in over:
+                self.lose(number, "its lease ended")
+            self._sooner.wait(None if soonest is None else max(0.0, soonest - now))
+
+    def close(self) -> None:
+        """End every wait. Idempotent."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+        self._sooner.set()
+        if self._thread is not None and self._thread is not threading.current_thread():
+            self._thread.join(2)
+
+
+def _leave_it(resources: Sequence[Resource], _: str, done: Callable[[Resource, str], None]) -> None:
+    """Where nothing is known that stops."""
+    for resource in resources:
+        done(resource, "")
+
+
+def within(session: str, whole: str) -> bool:
+    """Whether a session is that one or one of its parts."""
+    return session == whole or session.startswith(f"{whole}/")

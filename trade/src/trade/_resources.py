@@ -1,0 +1,274 @@
+"""Resources: what one at a time may use, and the fences that hold to the last place before the wire.
+
+A call is admitted under what holds for its resources at that moment, its permit. Whoever drives the hardware looks at
+the permit once more right before bytes go out: any lock, unlock or stop in between makes it void.
+"""
+
+import contextlib
+import itertools
+import time
+from collections.abc import Callable, Container, Generator, Iterable, Sequence
+from typing import Any, Final, NamedTuple
+
+from msgspec import Struct
+
+from trade._context import CallContext, running
+from trade._wire import Token
+from trade.errors import LockedByOther, LockLost, MotionStopped, Stopped
+
+__all__ = ["Permit", "Resource", "permit"]
+
+_permit_ids: Final = itertools.count(-1, -1).__next__
+"""Plain Python calls have no id of the system's; theirs are below zero."""
+
+
+class Holder(Struct, frozen=True):
+    """Whose grant it is, as errors and `trade.locks` tell it."""
+
+    identity: str
+    container: str
+    session: str
+    purpose: str
+    since: float
+    """``time.time()`` when it was granted."""
+    delegates: tuple[str, ...] = ()
+
+
+class Latch(NamedTuple):
+    """A stop that holds until somebody resumes."""
+
+    by: str
+    reason: str
+
+
+class Resource:
+    """Something physical, such as a joint: used by one at a time, stopped by anybody.
+
+    Whoever drives it makes it, names it in ``resources`` of every provider that moves it, reports ``moving``, and
+    passes each command through ``permit``. The container those providers are registered in judges who may use it.
+    """
+
+    __slots__ = (
+        *("_moving", "_rested", "calls", "coupled", "epoch", "estop", "grants", "holder", "latch"),
+        *("live", "movers", "name", "pending", "stops", "unsafe", "used_at", "uses"),
+    )
+
+    def __init__(self, name: str, *, coupled: Sequence[str] = ()) -> None:
+        self.name: Final = name
+        self.coupled: Final = tuple(coupled)
+        """Names of resources of the same container that are only locked together with it."""
+        self.epoch = ""
+        """Of the container that judges."""
+        self.grants: Container[int] = ()
+        """Every grant that holds there, of whatever."""
+        self.live = 0
+        """The grant that holds now; 0 is none."""
+        self.holder: Holder | None = None
+        self.pending: Holder | None = None
+        """For whom it is being emptied: no new call is admitted."""
+        self.stops = 0
+        self.latch: Latch | None = None
+        self.estop: Latch | None = None
+        self.unsafe = ""
+        """Why it is not granted on: it could not be stopped when it had to be."""
+        self.movers: tuple[str, ...] = ()
+        """The sessions for which it was moved last."""
+        self.calls: dict[int, Permit] = {}
+        """What is admitted and has not ended, by call id."""
+        self.uses = 0
+        """Calls under the lock that holds."""
+        self.used_at = 0.0
+        self._moving = False
+        self._rested: Callable[[], None] | None = None
+
+    @property
+    def moving(self) -> bool:
+        """Whether it moves now, as far as whoever drives it knows."""
+        return self._moving
+
+    @moving.setter
+    def moving(self, value: bool) -> None:
+        was, self._moving = self._moving, value
+        if was and not value and self._rested is not None:
+            self._rested()
+
+    def on_rest(self, tell: Callable[[], None]) -> None:
+        """Have this called whenever it comes to rest or a call on it ends."""
+        self._rested = tell
+
+    def stop(self, by: str, sessions: Iterable[str] = (), reason: str = "stop was called") -> None:
+        """Void everything admitted so far; by a session other than the motion's own or the lock owner's, latch (S08).
+
+        Args:
+            by: who stops, for messages.
+            sessions: of who stops; none: whoever drives the resource, which never latches.
+            reason: why.
+        """
+        self.stops += 1
+        asking = set(sessions)
+        own = {*self.movers, *((self.holder.session,) if self.holder else ())}
+        if asking and not asking & own and (own or self.busy):
+            self.latch = Latch(by, reason)
+
+    @property
+    def busy(self) -> bool:
+        """Whether something moves it or is about to."""
+        return self._moving or bool(self.calls)
+
+    def resume(self) -> None:
+        """Let it move again after a stop that latched, and be granted again after one that failed."""
+        self.latch = None
+        self.unsafe = ""
+
+    def check(self, tokens: Iterable[Token], caller: str, session: str = "") -> None:
+        """Whether a call with these tokens may begin.
+
+        Raises:
+            Stopped: a stop latched.
+            LockedByOther: somebody else has it, or it is being emptied for somebody else.
+            LockLost: the caller had it.
+        """
+        latch = self.estop or self.latch
+        if latch is not None:
+            raise Stopped(resource=self.name, by=latch.by, reason=latch.reason, estop=self.estop is not None)
+        holder = self.holder
+        if self.live:
+            if holder is not None and (caller == holder.identity or caller in holder.delegates):
+                for token in tokens:
+                    if token.number == self.live and token.epoch == self.epoch:
+                        self.uses, self.used_at = self.uses + 1, time.time()
+                        return
+            raise locked(self, holder, session)
+        if self.pending is not None:
+            raise locked(self, self.pending, session)
+        for token in tokens:
+            if token.epoch == self.epoch and token.number not in self.grants:
+                raise LockLost(resources=(self.name,), reason="its lease ended or it was taken away")
+
+    def __repr__(self) -> str:
+        return f"<Resource {self.name}>"
+
+
+def locked(resource: Resource, holder: Holder | None, session: str = "") -> LockedByOther:
+    """The error of who comes to a resource that another one has."""
+    if holder is None:
+        return LockedByOther(resources=(resource.name,), owner="somebody")
+    return LockedByOther(
+        resources=(resource.name,),
+        owner=f"{holder.identity}/{holder.container}",
+        purpose=holder.purpose,
+        since=holder.since,
+        own=holder.session == session,
+    )
+
+
+class Permit:
+    """What a call was admitted under, for each of its resources: the grant and the number of stops."""
+
+    __slots__ = ("call_id", "cancel", "fences", "sessions")
+
+    def __init__(
+        self, resources: Sequence[Resource], call_id: int, sessions: tuple[str, ...], cancel: Callable[[], None] | None
+    ) -> None:
+        self.call_id: Final = call_id
+        self.sessions: Final = sessions
+        self.cancel: Final = cancel
+        """Asks what runs under it to end."""
+        self.fences: Final = [(resource, resource.live, resource.stops) for resource in resources]
+
+    def gate(self) -> None:
+        """The last look before bytes go out.
+
+        Raises:
+            MotionStopped: a stop came after it was admitted.
+            LockLost: it was admitted under a lock that does not hold any more.
+            LockedByOther: it was admitted without a lock, and now somebody has it.
+        """
+        for resource, live, stops in self.fences:
+            if resource.stops != stops:
+                latch = resource.estop or resource.latch
+                reason = "it was stopped" if latch is None else f"{latch.by}: {latch.reason}"
+                raise MotionStopped(device=resource.name, reason=reason)
+            if resource.live != live:
+                if live:
+                    raise LockLost(resources=(resource.name,), reason="its lease ended or it was taken away")
+                raise locked(resource, resource.holder)
+
+    def covers(self, resources: Iterable[Resource]) -> bool:
+        """Whether all of these are among what it was admitted for."""
+        own = {id(resource) for resource, _, _ in self.fences}
+        return all(id(resource) in own for resource in resources)
+
+    def close(self) -> None:
+        """The call has ended."""
+        for resource, _, _ in self.fences:
+            resource.calls.pop(self.call_id, None)
+            if resource._rested is not None:  # pyright: ignore[reportPrivateUsage] - two halves of one thing
+                resource._rested()  # pyright: ignore[reportPrivateUsage]
+
+
+def admit(
+    resources: Sequence[Resource],
+    *,
+    call_id: int,
+    caller: str,
+    tokens: Sequence[Token],
+    sessions: tuple[str, ...],
+    cancel: Callable[[], None] | None,
+) -> Permit:
+    """Let a call begin on its resources; it is counted until the permit is closed.
+
+    It is counted first and checked then, so that whoever empties a resource either sees it or has refused it.
+
+    Raises:
+        Stopped, LockedByOther, LockLost: see `Resource.check`; nothing is counted then.
+    """
+    permitted = Permit(resources, call_id, sessions, cancel)
+    for resource in resources:
+        resource.calls[call_id] = permitted
+    try:
+        for resource in resources:
+            resource.check(tokens, caller, sessions[0] if sessions else "")
+        permitted.gate()
+    except BaseException:
+        permitted.close()
+        raise
+    for resource in resources:
+        resource.movers = sessions
+    return permitted
+
+
+def admitted(resources: Sequence[Resource], context: CallContext) -> Permit:
+    """Admit a call that came through the middleware."""
+    ongoing = context.ongoing
+    return admit(
+        resources,
+        call_id=context.id,
+        caller=context.caller,
+        tokens=context.tokens,
+        sessions=context.sessions,
+        cancel=None if ongoing is None else ongoing.cancel,
+    )
+
+
+@contextlib.contextmanager
+def permit(resources: Sequence[Resource]) -> Generator[Permit, None, None]:
+    """For who drives hardware: what the running code may do to these, to be looked at right before bytes go out.
+
+    Within a service that needs them it is that call's permit. Anywhere else it is a plain Python call, which counts as
+    one without a lock (S15).
+
+    Raises:
+        Stopped, LockedByOther: see `Resource.check`.
+    """
+    call = running.get()
+    own: Any = None if call is None else call.permit
+    if own is not None and own.covers(resources):
+        yield own
+        return
+    sessions = () if call is None else call.sessions
+    fresh = admit(resources, call_id=_permit_ids(), caller="", tokens=(), sessions=sessions, cancel=None)
+    try:
+        yield fresh
+    finally:
+        fresh.close()
