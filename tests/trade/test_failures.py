@@ -24,7 +24,7 @@ CONCRETE = [
 
 def sample(kind: type[TradeError]) -> TradeError:
     """One of that kind with a value in every field."""
-    values: dict[type, Any] = {str: "text", float: 1.5, int: 7}
+    values: dict[type, Any] = {str: "text", float: 1.5, int: 7, bool: True}
     hints = get_type_hints(kind)
     return kind(**{f.name: values.get(hints[f.name], ("one", "two")) for f in dataclasses.fields(kind)})
 

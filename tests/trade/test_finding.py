@@ -21,7 +21,7 @@ def test_services_without_a_constraint_lists_everything_in_order(here: Container
     here.register(Arm(), "rosie.arm")
     labels = [handle.label for handle in here.services()]
     assert labels == sorted(labels)
-    assert labels[:3] == ["rosie.arm.angle", "rosie.arm.move_to", "trade.clock"]
+    assert labels[:3] == ["rosie.arm.angle", "rosie.arm.move_to", "trade.acquire"]
 
 
 def test_services_lists_what_matches(here: Container) -> None:

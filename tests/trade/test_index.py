@@ -27,6 +27,7 @@ def record(number: int, **told: Any) -> Record:
         kinds=tuple(told.get("kinds", ("Arm",))),
         meta={},
         health=told.get("health", HEALTHY),
+        members={},
     )
 
 

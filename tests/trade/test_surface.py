@@ -42,7 +42,7 @@ def test_public_names_are_sorted_and_complete() -> None:
 def test_importing_trade_needs_nothing_of_one_operating_system_and_no_hardware(start_program: Any) -> None:
     program = start_program(
         """
-        print(sorted(trade.services()[0].name), flush=True)
+        print("clock" in [handle.name for handle in trade.services()], flush=True)
         """,
         prelude="""
 import sys
@@ -53,7 +53,7 @@ os.environ["USER"] = "somebody"
 import trade
 """,
     )
-    assert program.heard() == str(sorted("clock"))
+    assert program.heard() == "True"
     assert program.ends() == 0
     assert program.errors() == ""
 

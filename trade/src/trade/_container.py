@@ -24,18 +24,17 @@ from trade._handle import Bound, Handle, Run
 from trade._invoke import LocalTarget, RemoteTarget, Request, container_closed
 from trade._joining import join
 from trade._lock import Lock, OnLost, OnRequest
-from trade._lock_services import PROVIDER as LOCKS
-from trade._lock_services import LockServices
 from trade._locking import LEASE_S, Locking
 from trade._locks import LockTable
 from trade._notifications import Callback, Notification, Notifier
+from trade._own_services import OwnServices
 from trade._providers import Providers, checked_groups, checked_health
 from trade._reach import Reach
 from trade._registry import Change, Record, Registry
 from trade._resources import Holder
 from trade._settings import Settings
 from trade._signature import Codec
-from trade._system import DOMAIN, PROVIDER, ContainerInfo, System, SystemServices
+from trade._system import DOMAIN, PROVIDER, ContainerInfo, System
 from trade._transport import ChannelClosed, Transport
 from trade._watch import Watch
 from trade._wire import (
@@ -115,9 +114,8 @@ class Container:
             """What was taken off from elsewhere and can be offered again."""
             self._dispatcher = Dispatcher(self._transport, self.address, self._providers.lookup, coroutines)
             leaving.callback(self._dispatcher.close)
-            self._providers.add(SystemServices(self.system), (DOMAIN,), name=PROVIDER)
-            locks = LockServices(self._table, self.address, self._ask_for_release, self.locking.keeper.asked)
-            self._providers.add(locks, (DOMAIN,), name=LOCKS)
+            own = OwnServices(self.system, self._table, self.address, self._ask_for_release, self.locking.keeper.asked)
+            self._providers.add(own, (DOMAIN,), name=PROVIDER)
             presence = self._transport.appear(alive_key(self.address))
             leaving.callback(presence.close)
             self._watch = Watch(self._transport, self._registry, self.address, self._lost)
@@ -350,7 +348,7 @@ class Container:
     def _ask_for_release(self, holder: Holder, token: Token, who: str, reason: str) -> None:
         """Told by the lock services: somebody would like to have what another one holds."""
         owner = Address(*holder.session.split("/")[:3])
-        self.handle(ServiceKey(owner, DOMAIN, LOCKS, "release_requested")).start(token, who, reason)
+        self.handle(ServiceKey(owner, DOMAIN, PROVIDER, "release_requested")).start(token, who, reason)
 
     def _changed(self, change: Change) -> None:
         """Told by the registry: calls to what left must fail at once."""

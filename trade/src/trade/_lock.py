@@ -15,9 +15,8 @@ from msgspec import structs
 
 from trade._context import Held, holding
 from trade._handle import Bound, Handle, Run
-from trade._lock_services import PROVIDER
 from trade._locks import Granted, Terms
-from trade._system import DOMAIN
+from trade._system import DOMAIN, PROVIDER
 from trade._wire import Address, ServiceKey, Token
 from trade.errors import (
     Busy,

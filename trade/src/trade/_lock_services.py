@@ -12,7 +12,6 @@ from trade._service import service
 from trade._wire import Address, Token
 from trade.errors import Busy, LockedByOther
 
-PROVIDER: Final = "locks"
 _MOST_WAITING: Final = 24
 """So many may stand in the queues of a container at once; who comes then asks again."""
 

@@ -8,9 +8,8 @@ from typing import Any, Final, Protocol
 from trade._constraints import Constraint
 from trade._handle import Handle
 from trade._lock import Keeper, Lock, OnLost, OnRequest
-from trade._lock_services import PROVIDER
 from trade._locks import LockInfo, Terms
-from trade._system import DOMAIN
+from trade._system import DOMAIN, PROVIDER
 from trade._wire import Address, ServiceKey
 from trade.errors import ConfigurationError, IncompleteGroup, TradeError
 

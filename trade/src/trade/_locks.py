@@ -94,6 +94,8 @@ class LockTable:
         """By name, with the number of services that use it."""
         self._grants: dict[int, _Grant] = {}
         self._waiting: list[_Waiter] = []
+        self._acquiring = 0
+        """How many wait for their turn or for what still runs."""
         self._count = 0
         self._changed = threading.Condition(threading.RLock())
         self._sooner = threading.Event()
@@ -187,27 +189,34 @@ class LockTable:
         with self._changed:
             self._count += 1
             waiter = _Waiter((-terms.priority, self._count), resources, holder, mine, frozenset(calls))
-            self._waiting.append(waiter)
-            self._waiting.sort(key=lambda one: one.order)
+            self._acquiring += 1
             try:
-                self._take_turn(waiter, self._clock() + terms.wait_s)
+                self._take_turn(waiter, asked + terms.wait_s)
+                return self._empty_and_grant(waiter, terms, asked)
             finally:
-                self._waiting.remove(waiter)
-            try:
-                self._drain(waiter, self._clock() + terms.drain_s)
-                return self._grant(waiter, terms, asked)
-            finally:
-                for resource in resources:
-                    resource.pending = None
-                self._changed.notify_all()
+                self._acquiring -= 1
+
+    def _empty_and_grant(self, waiter: _Waiter, terms: Terms, asked: float) -> Granted:
+        try:
+            self._drain(waiter, self._clock() + terms.drain_s)
+            return self._grant(waiter, terms, asked)
+        finally:
+            for resource in waiter.resources:
+                resource.pending = None
+            self._changed.notify_all()
 
     def _take_turn(self, waiter: _Waiter, until: float) -> None:
         """Wait until nobody has any of them and nobody waits before us for any; they are ours to empty then."""
-        while (obstacle := self._obstacle(waiter)) is not None:
-            left = until - self._clock()
-            if left <= 0 or waiter.gone or self._closed:
-                raise obstacle
-            self._changed.wait(left)
+        self._waiting.append(waiter)
+        self._waiting.sort(key=lambda one: one.order)
+        try:
+            while (obstacle := self._obstacle(waiter)) is not None:
+                left = until - self._clock()
+                if left <= 0 or waiter.gone or self._closed:
+                    raise obstacle
+                self._changed.wait(left)
+        finally:
+            self._waiting.remove(waiter)
         for resource in waiter.resources:
             resource.pending = waiter.holder
 
@@ -339,7 +348,7 @@ class LockTable:
             self._changed.notify_all()
 
     def _rested(self) -> None:
-        if self._waiting or any(resource.pending is not None for resource, _ in list(self._resources.values())):
+        if self._acquiring:
             with self._changed:
                 self._changed.notify_all()
 

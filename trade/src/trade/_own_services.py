@@ -1,0 +1,14 @@
+"""The one provider of the middleware's own functions: what is in group ``trade`` of every container."""
+
+from trade._lock_services import Ask, Asked, LockServices
+from trade._locks import LockTable
+from trade._system import System, SystemServices
+from trade._wire import Address
+
+
+class OwnServices(SystemServices, LockServices):
+    """One provider, so that one registry entry tells of all its container's own functions."""
+
+    def __init__(self, system: System, locks: LockTable, own: Address, ask: Ask, asked: Asked) -> None:
+        SystemServices.__init__(self, system)
+        LockServices.__init__(self, locks, own, ask, asked)
