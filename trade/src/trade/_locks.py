@@ -217,6 +217,7 @@ class LockTable:
                 self._changed.wait(left)
         finally:
             self._waiting.remove(waiter)
+            self._changed.notify_all()
         for resource in waiter.resources:
             resource.pending = waiter.holder
 
