@@ -5,6 +5,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import psutil
 import pytest
 import serial
 
-from trade_hil_sim import SimProcess, SimulationError, events, instructions, read_log
+from trade_hil_sim import SimProcess, SimulationError, events, instructions, read_log, remove_leftovers
 from trade_hil_sim.dynamixel import encode
 
 COMMAND = [sys.executable, "-m", "trade_hil_sim"]
@@ -136,3 +137,18 @@ def test_the_package_alone_imports_nothing_of_ours() -> None:
     code = "import trade_hil_sim, sys; print(sorted({'trade', 'trade_drivers', 'zenoh'} & set(sys.modules)))"
     command = [sys.executable, "-W", "error", "-c", code]
     assert subprocess.run(command, capture_output=True, timeout=60, check=True).stdout == b"[]\n"
+
+
+def test_only_folders_of_its_kind_whose_owner_is_gone_are_removed(
+    robot_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "tmp"))
+    for name in ("trade-sim-dead", "trade-sim-stranger", "trade-demo-dead"):
+        (tmp_path / "tmp" / name).mkdir(parents=True)
+    for name in ("trade-sim-dead", "trade-demo-dead"):
+        (tmp_path / "tmp" / name / "_owner.pid").write_text("4711")
+    with SimProcess(robot_file) as alive:
+        assert remove_leftovers() == [tmp_path / "tmp" / "trade-sim-dead"]
+        left = sorted(path.name for path in (tmp_path / "tmp").iterdir())
+        assert left == sorted(["trade-demo-dead", "trade-sim-stranger", alive.control_path.parent.name])
+        assert ping(alive.ports["neck"], 1)

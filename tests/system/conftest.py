@@ -50,6 +50,11 @@ class Program:
             pytest.fail(f"{self.process.args} ended; stderr: {''.join(self.errors)}")
         return line
 
+    def lines(self) -> list[str]:
+        """All further output, once it has ended."""
+        self.wait()
+        return list(iter(self._lines.get_nowait, None))
+
     def json(self) -> dict[str, Any]:
         return json.loads(self.line())
 

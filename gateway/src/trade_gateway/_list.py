@@ -6,7 +6,7 @@ from typing import Annotated, Any
 import typer
 from rich.markup import escape
 
-from trade import Constraint, Handle, where
+from trade import Constraint, Container, Handle, where
 from trade_gateway._output import Output
 from trade_gateway._system_choice import visitor
 
@@ -31,13 +31,24 @@ def services(
         if as_json:
             out.data([describe(handle) for handle in found])
         elif not found:
-            out.say(f"no services match {constraint}; is something up? [bold]trade up examples/rosie.toml --sim[/]")
+            out.say(_nothing(container, constraint))
         elif doc:
             for handle in found:
                 doc_text = indent(handle.doc or "(undocumented)", "  ")
                 out.say(f"[bold]{escape(handle.label)}[/]  {escape(handle.signature)}\n{escape(doc_text)}\n")
         else:
             out.table(("SERVICE", "CALLED AS", "EFFECT", "CONTAINER", "HOST"), [_row(handle) for handle in found])
+
+
+def _nothing(container: Container, constraint: Constraint) -> str:
+    """What there is instead of what was asked for."""
+    others = container.services(~where(group="trade"))
+    groups = sorted({group for handle in others for group in handle.groups})
+    if groups:
+        return f"no services match {escape(str(constraint))}; there is {', '.join(groups)}"
+    return (
+        f"nothing is up in system {container.settings.system}; [bold]trade up examples/rosie.toml --sim[/] starts one"
+    )
 
 
 def describe(handle: Handle) -> dict[str, Any]:

@@ -1,0 +1,62 @@
+"""What ``trade up`` tells of its joints: a line when something is wrong with one, and when it is well again."""
+
+from collections.abc import Iterator, Mapping
+from datetime import datetime
+from typing import Any
+
+from msgspec import Struct
+from rich.markup import escape
+
+from trade.errors import DeviceError
+from trade_drivers import Motor
+from trade_gateway._output import Output
+
+__all__ = ["FaultWatch"]
+
+
+class FaultWatch:
+    """Compares what joints say of themselves with what they said before. Looking asks no device anything."""
+
+    def __init__(self, providers: Mapping[str, Any]) -> None:
+        self._motors = {name: motor for name, motor in providers.items() if isinstance(motor, Motor)}
+        self._known: dict[str, _Trouble] = dict.fromkeys(self._motors, _WELL)
+
+    def tell(self, out: Output) -> None:
+        """Say what has changed since the last time; the first time, what is wrong."""
+        for joint, trouble in self._changes():
+            now = datetime.now().astimezone()
+            if out.as_json:
+                out.data({"at": now.isoformat(timespec="milliseconds"), "joint": joint, "fault": trouble.text})
+            elif trouble == _WELL:
+                out.say(f"{now:%H:%M:%S} [green]{joint}: well again[/]")
+            else:
+                out.say(f"{now:%H:%M:%S} [bold red]{escape(trouble.text)}[/]")
+
+    def _changes(self) -> Iterator[tuple[str, "_Trouble"]]:
+        for joint, motor in self._motors.items():
+            trouble = _trouble(joint, motor)
+            if trouble.kind != self._known[joint].kind:
+                self._known[joint] = trouble
+                yield joint, trouble
+
+
+class _Trouble(Struct, frozen=True):
+    """What is wrong with a joint; nothing if the kind is empty."""
+
+    kind: str
+    text: str = ""
+    """The joint, what is wrong with it, and what to do."""
+
+
+_WELL = _Trouble("")
+
+
+def _trouble(joint: str, motor: Motor) -> _Trouble:
+    try:
+        fault = motor.state().fault
+    except DeviceError as silent:
+        return _Trouble(type(silent).__name__, str(silent))
+    if not fault:
+        return _WELL
+    sentence = fault if fault.endswith("?") else f"{fault}."
+    return _Trouble(fault, f"{joint}: {sentence} When you have looked: trade call {joint}.enable")
