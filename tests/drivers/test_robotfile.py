@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from drivers.conftest import HEAD
+from robots import HEAD
 from trade.errors import ConfigurationError
 from trade_drivers import Robot, load, parse
 

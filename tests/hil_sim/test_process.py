@@ -7,7 +7,6 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
-from typing import Any
 
 import psutil
 import pytest
@@ -15,6 +14,7 @@ import serial
 
 from trade_hil_sim import SimProcess, SimulationError, events, instructions, read_log, remove_leftovers
 from trade_hil_sim.dynamixel import encode
+from waiting import wait_until
 
 COMMAND = [sys.executable, "-m", "trade_hil_sim"]
 
@@ -61,7 +61,7 @@ def test_its_times_are_this_process_times(robot_file: Path) -> None:
         assert len(instructions(sim.entries(), since=before, until=after)) == 1
 
 
-def test_faults_come_in_while_it_runs(robot_file: Path, wait_until: Any) -> None:
+def test_faults_come_in_while_it_runs(robot_file: Path) -> None:
     with SimProcess(robot_file) as sim:
         sim.control.brown_out([1])
         wait_until(lambda: events(sim.entries(), "booted", device_id=1), "the servo's return")
@@ -86,7 +86,7 @@ def test_a_signal_ends_it_cleanly(robot_file: Path, tmp_path: Path, number: sign
     assert list(place.iterdir()) == []
 
 
-def test_it_ends_when_its_parent_is_killed(robot_file: Path, wait_until: Any) -> None:
+def test_it_ends_when_its_parent_is_killed(robot_file: Path) -> None:
     code = """
 import sys
 from trade_hil_sim import SimProcess

@@ -8,9 +8,10 @@ from pathlib import Path
 import pytest
 
 import trade
-from system.conftest import ROSIE, wait_until
+from system.conftest import ROSIE
 from trade import where
 from trade_hil_sim import SimControl, SimProcess, events, motion_writes, read_log
+from waiting import wait_until
 
 Command = Callable[..., subprocess.CompletedProcess[str]]
 

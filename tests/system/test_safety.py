@@ -10,10 +10,11 @@ import psutil
 import pytest
 
 import trade
-from system.conftest import ROSIE, Program, wait_until
+from system.conftest import ROSIE, Program
 from trade import Handle, where
 from trade.errors import ContainerLost, DeadlineExceeded, DeviceSilent, MotionStopped, OutcomeUnknown
 from trade_hil_sim import SimProcess, events, motion_writes, received, writes
+from waiting import wait_until
 
 
 class Bench:

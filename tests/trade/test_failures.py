@@ -229,6 +229,10 @@ class Clumsy:
         return "text"  # type: ignore[return-value]
 
     @service
+    def leave(self) -> None:
+        sys.exit(3)
+
+    @service
     def refuse(self) -> None:
         raise LimitExceeded(what="speed", value=2.0, lower=0.0, upper=1.0)
 
@@ -237,16 +241,20 @@ def test_what_a_provider_raises_unmeant_is_logged_once_where_it_runs(
     here: Container, there: Container, caplog: pytest.LogCaptureFixture
 ) -> None:
     there.register(Clumsy(), "robot")
-    drop, lie, refuse = (here.find(where(name=name, group="robot"), wait_s=20) for name in ("drop", "lie", "refuse"))
+    names = ("drop", "lie", "leave", "refuse")
+    drop, lie, leave, refuse = (here.find(where(name=name, group="robot"), wait_s=20) for name in names)
     with pytest.raises(OSError, match="dropped the cup"):
         drop("cup", "hunter2")
     with pytest.raises(InvalidResult):
         lie()
+    with pytest.raises(RemoteError):
+        leave()
     with pytest.raises(LimitExceeded):
         refuse()
-    first, second = (record.getMessage() for record in caplog.records if record.levelname == "WARNING")
+    first, second, third = (record.getMessage() for record in caplog.records if record.levelname == "WARNING")
     assert "robot.drop failed in a call of" in first
     assert "Traceback" in first
     assert "OSError: dropped the cup ***" in first
     assert "hunter2" not in first
     assert "robot.lie failed" in second
+    assert "robot.leave failed" in third

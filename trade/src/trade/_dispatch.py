@@ -41,7 +41,7 @@ from trade._wire import (
     is_chunk,
     reply_key,
 )
-from trade.errors import InvalidResult, NotSerialisable, TradeError
+from trade.errors import InvalidResult, NotSerialisable, RemoteError, TradeError
 
 _logger = logging.getLogger("trade")
 
@@ -50,8 +50,8 @@ _PARTING_S: Final = 2.0
 _KINDS: Final = frozenset(("call", "stop"))
 _MOST_REPLY_KEYS: Final = 1024
 _SYSTEM: Final = f"{DOMAIN}/{PROVIDER}"
-_DEFECTS: Final = (InvalidResult, NotSerialisable)
-"""Errors of ours that are the provider's mistakes; the others are answers it gives on purpose."""
+_DEFECTS: Final = (InvalidResult, NotSerialisable, RemoteError)
+"""Errors of ours that are mistakes of a provider; the others are answers it gives on purpose."""
 _decode_cancel: Final = msgspec.msgpack.Decoder(CancelArguments).decode
 
 

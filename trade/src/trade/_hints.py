@@ -33,7 +33,8 @@ def _near(group: str, name: str, groups: Sequence[str], records: Sequence[Record
     """What looks like what was asked for. A stop is never proposed beside anything else that is near."""
     if not name:
         return tuple(difflib.get_close_matches(group, groups, n=_MOST, cutoff=_LIKE))
-    alike = [record for record in records if difflib.SequenceMatcher(None, record.name, name).ratio() >= _NAME_LIKE]
+    names = set(difflib.get_close_matches(name, sorted({record.name for record in records}), n=20, cutoff=_NAME_LIKE))
+    alike = [record for record in records if record.name in names]
     asked = f"{group}.{name}" if group else name
     for stops in (False, True):
         labels = {
