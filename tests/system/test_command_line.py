@@ -75,6 +75,7 @@ def test_a_bad_call_is_one_line_that_says_what_to_do_and_moves_nothing(
         (["call", "rosie.head.move_to", "[0.1, NaN]"], "UsageError: argument '[0.1, NaN]': is not JSON"),
         (["call", "rosie.head.move_to", "[0.1,", "-0.2]"], "forgot quotes? The shell splits at spaces: '[0.1, -0.2]'"),
         (["call", "rosie.*.stop"], "UsageError: service 'rosie.*.stop': group='rosie.*' would match nothing"),
+        (["services", "--group", "rosie*"], "UsageError: --group rosie*: group='rosie*' would match nothing"),
         (["up", ROSIE, "--sim-log", "log"], "UsageError: --sim-log: is the log of the simulator; it needs --sim"),
     ],
 )

@@ -11,9 +11,9 @@ from typing import Annotated, Any
 import msgspec
 import typer
 
-from trade import Container, Handle, where
-from trade.errors import ConfigurationError, TooManyServices, TradeError
-from trade_gateway._list import Json
+from trade import Container, Handle
+from trade.errors import TooManyServices, TradeError
+from trade_gateway._list import Json, asked_for
 from trade_gateway._output import Output, UsageError, say_error
 from trade_gateway._system_choice import visitor
 
@@ -82,10 +82,7 @@ def find(visiting: Container, service: str, container: str | None, wait_s: float
         UsageError: the text names no service.
     """
     group, _, name = service.rpartition(".")
-    try:
-        constraint = where(name=name or service, group=group or None, container=container)
-    except ConfigurationError as bad:
-        raise UsageError(where=f"service {service!r}", problem=bad.problem) from None
+    constraint = asked_for(f"service {service!r}", name=name or service, group=group or None, container=container)
     try:
         return visiting.find(constraint, wait_s=wait_s)
     except TooManyServices:

@@ -7,7 +7,8 @@ import typer
 from rich.markup import escape
 
 from trade import Constraint, Container, Handle, where
-from trade_gateway._output import Output
+from trade.errors import ConfigurationError
+from trade_gateway._output import Output, UsageError
 from trade_gateway._system_choice import visitor
 
 Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
@@ -22,7 +23,7 @@ def services(
     as_json: Json = False,
 ) -> None:
     """List services: group and name, arguments, where they run."""
-    constraint: Constraint = where(group=group, name=name)
+    constraint = asked_for(f"--group {group}" if group else "services", group=group, name=name)
     if not everything and group is None:
         constraint = constraint & ~where(group="trade")
     out = Output(as_json=as_json)
@@ -38,6 +39,18 @@ def services(
                 out.say(f"[bold]{escape(handle.label)}[/]  {escape(handle.signature)}\n{escape(doc_text)}\n")
         else:
             out.table(("SERVICE", "CALLED AS", "EFFECT", "CONTAINER", "HOST"), [_row(handle) for handle in found])
+
+
+def asked_for(what: str, *, name: str | None, group: str | None, container: str | None = None) -> Constraint:
+    """The constraint that words of the command line ask for.
+
+    Raises:
+        UsageError: they make none.
+    """
+    try:
+        return where(name=name, group=group, container=container)
+    except ConfigurationError as bad:
+        raise UsageError(where=what, problem=bad.problem) from None
 
 
 def _nothing(container: Container, constraint: Constraint) -> str:
