@@ -101,13 +101,11 @@ def tell(log: Path, *, mute: bool, stay: bool) -> None:
 
 
 def wait_for_the_user(log: Path) -> None:
-    print("\nthe robot stays up; Ctrl-C here ends it\n")
-    print("in another terminal:\n  source .venv/bin/activate")
-    print(
-        "  trade services --group rosie\n  trade call rosie.head.move_to '[0.3, -0.2]'\n  trade call rosie.head.state"
-    )
-    print(f"the log of all bytes: {log}\n")
     with contextlib.suppress(KeyboardInterrupt):
+        print("\nthe robot stays up; Ctrl-C here ends it\n")
+        print("in another terminal:\n  source .venv/bin/activate\n  trade services --group rosie")
+        print("  trade call rosie.head.move_to '[0.3, -0.2]'\n  trade call rosie.head.state")
+        print(f"the log of all bytes: {log}\n")
         while True:
             time.sleep(1)
 
