@@ -143,12 +143,14 @@ def test_what_a_killed_simulation_left_is_removed_by_the_next(run, system: str) 
     assert not folder.exists()
 
 
-def test_the_path_of_the_simulators_socket_is_said(run, system: str) -> None:
+def test_the_path_of_the_simulators_socket_and_that_nothing_is_wrong_are_said(run, system: str) -> None:
     up = run("-m", "trade_gateway", "up", ROSIE, "--sim")
     while "to strike the simulator with faults" not in (line := up.line()):
         pass
     with SimControl(line.split(": ")[1].strip()) as control:
         assert [device.joint for bus in control.state() for device in bus.devices] == ["neck.pan", "neck.tilt"]
+    assert up.line() == "Ctrl-C leaves\n"
+    assert re.fullmatch(r"\d\d:\d\d:\d\d no joint has a fault\n", up.line())
 
 
 def test_help_names_every_command(trade_command: Command) -> None:

@@ -21,16 +21,22 @@ class FaultWatch:
         self._motors = {name: motor for name, motor in providers.items() if isinstance(motor, Motor)}
         self._known: dict[str, _Trouble] = dict.fromkeys(self._motors, _WELL)
 
-    def tell(self, out: Output) -> None:
-        """Say what has changed since the last time; the first time, what is wrong."""
-        for joint, trouble in self._changes():
-            now = datetime.now().astimezone()
+    def begin(self, out: Output) -> None:
+        """Say what is wrong, or that nothing is."""
+        if not self.tell(out):
+            out.say(f"{_now():%H:%M:%S} no joint has a fault")
+
+    def tell(self, out: Output) -> bool:
+        """Say what has changed since the last time; returns whether anything has."""
+        changes = list(self._changes())
+        for joint, trouble in changes:
             if out.as_json:
-                out.data({"at": now.isoformat(timespec="milliseconds"), "joint": joint, "fault": trouble.text})
+                out.data({"at": _now().isoformat(timespec="milliseconds"), "joint": joint, "fault": trouble.text})
             elif trouble == _WELL:
-                out.say(f"{now:%H:%M:%S} [green]{joint}: well again[/]")
+                out.say(f"{_now():%H:%M:%S} [green]{joint}: well again[/]")
             else:
-                out.say(f"{now:%H:%M:%S} [bold red]{escape(trouble.text)}[/]")
+                out.say(f"{_now():%H:%M:%S} [bold red]{escape(trouble.text)}[/]")
+        return bool(changes)
 
     def _changes(self) -> Iterator[tuple[str, "_Trouble"]]:
         for joint, motor in self._motors.items():
@@ -51,11 +57,17 @@ class _Trouble(Struct, frozen=True):
 _WELL = _Trouble("")
 
 
+def _now() -> datetime:
+    return datetime.now().astimezone()
+
+
 def _trouble(joint: str, motor: Motor) -> _Trouble:
     try:
         fault = motor.state().fault
     except DeviceError as silent:
         return _Trouble(type(silent).__name__, str(silent))
+    except Exception as defect:  # noqa: BLE001 - a mistake of the driver's is told, and ends nothing
+        return _Trouble(type(defect).__name__, f"{joint}: its state cannot be read: {defect!r}")
     if not fault:
         return _WELL
     sentence = fault if fault.endswith("?") else f"{fault}."

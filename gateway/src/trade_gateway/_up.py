@@ -56,7 +56,7 @@ def up(
         )
         _say_ready(out, robot, container, simulation)
         faults = FaultWatch(attached.providers)
-        faults.tell(out)
+        faults.begin(out)
         while not asked_to_leave.wait(_LOOK_EVERY_S):
             faults.tell(out)
             if simulation is not None and not simulation.running:

@@ -14,6 +14,7 @@ __all__ = ["no_such_service", "too_many_services"]
 _LIKE: Final = 0.7
 _NAME_LIKE: Final = 0.6
 _MOST: Final = 2
+_MOST_GROUPS: Final = 20
 
 
 def no_such_service(constraint: Constraint, records: Iterable[Record], waited_s: float) -> NoSuchService:
@@ -21,7 +22,7 @@ def no_such_service(constraint: Constraint, records: Iterable[Record], waited_s:
     known = list(records)
     groups = sorted({group for record in known for group in record.groups} - {DOMAIN})
     near = _near(_asked(constraint, "group"), _asked(constraint, "name"), groups, known)
-    return NoSuchService(constraint=str(constraint), waited_s=waited_s, near=near, groups=groups)
+    return NoSuchService(constraint=str(constraint), waited_s=waited_s, near=near, groups=groups[:_MOST_GROUPS])
 
 
 def _asked(constraint: Constraint, field: str) -> str:

@@ -77,7 +77,7 @@ class NoSuchService(CallerError, LookupError):
     waited_s: float = 0.0
     near: Sequence[str] = ()
     groups: Sequence[str] = ()
-    """Those there are in the system."""
+    """Some of those there are in the system."""
 
     def describe(self) -> str:
         return f"no service matches {self.constraint} after {self.waited_s:.3g} s; {self._hint()}"
