@@ -29,7 +29,7 @@ test: $(UV) ## the whole test suite
 	@$(RUN) pytest $(ARGS)
 
 soak-registry: $(UV) ## three containers on two hosts register at the same moment, 200 times (root, iproute2)
-	@TRADE_SOAK_ROUNDS=200 $(RUN) pytest tests/system/test_namespaces.py -k same_moment $(ARGS)
+	@SOAK_ROUNDS=200 $(RUN) pytest tests/system/test_namespaces.py -k same_moment $(ARGS)
 
 check: $(UV) ## lint, formatting, types, import rules, isolated install of the core
 	@$(RUN) ruff check

@@ -92,6 +92,7 @@ def tell(log: Path, *, mute: bool, stay: bool) -> None:
         look = trade.find(where(name="move_to", group="rosie.head"))
         if stay:
             wait_for_the_user(log)
+            return
     print("\na handle kept by this process, after the driver has left:")
     expect_gone(look)
     with robot_up(log.with_suffix(".again")):
@@ -100,13 +101,11 @@ def tell(log: Path, *, mute: bool, stay: bool) -> None:
 
 
 def wait_for_the_user(log: Path) -> None:
-    print("\nthe robot stays up; Ctrl-C here ends it\n")
-    print("in another terminal:\n  source .venv/bin/activate")
-    print(
-        "  trade services --group rosie\n  trade call rosie.head.move_to '[0.3, -0.2]'\n  trade call rosie.head.state"
-    )
-    print(f"the log of all bytes: {log}\n")
     with contextlib.suppress(KeyboardInterrupt):
+        print("\nthe robot stays up; Ctrl-C here ends it\n")
+        print("in another terminal:\n  source .venv/bin/activate\n  trade services --group rosie")
+        print("  trade call rosie.head.move_to '[0.3, -0.2]'\n  trade call rosie.head.state")
+        print(f"the log of all bytes: {log}\n")
         while True:
             time.sleep(1)
 
@@ -136,6 +135,8 @@ def main() -> int:
     except (DemoFailed, errors.TradeError, subprocess.TimeoutExpired) as failed:
         print(f"\nthe demo failed: {failed}", file=sys.stderr)
         return 1
+    except KeyboardInterrupt:
+        return 130
     finally:
         trade.close()
     print(f"\ndone in {time.monotonic() - began_s:.0f} s. Next: make demo ARGS=--stay, README.md, docs/guide.md")

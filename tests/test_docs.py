@@ -1,11 +1,15 @@
 """What the pages say is there, is there; what they show, runs."""
 
 import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+
+from trade import errors
+from trade_hil_sim import SimProcess, events
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -34,3 +38,19 @@ def test_tests_named_in_the_pages_exist() -> None:
     named = {name for page in PAGES for name in re.findall(r"`(test_\w+)`", page.read_text(encoding="utf-8"))}
     missing = sorted(name for name in named if f"def {name}" not in tests)
     assert not missing
+
+
+def test_every_error_is_in_the_guides_table() -> None:
+    rows = re.findall(r"^\| (`\w+`.*?) \|", (ROOT / "docs" / "guide.md").read_text(encoding="utf-8"), re.MULTILINE)
+    named = {name for row in rows for name in re.findall(r"`(\w+)`", row)}
+    branches = {"TradeError", "CallerError", "CallError", "DeviceError", "SetupError"}
+    assert set(errors.__all__) - branches - named == set()
+
+
+def test_the_command_for_the_simulator_strikes_it() -> None:
+    page = (ROOT / "docs" / "simulators.md").read_text(encoding="utf-8")
+    [command] = re.findall(r"```sh\n(python .*?)\n```", page)
+    with SimProcess(ROOT / "examples" / "rosie.toml") as sim:
+        words = [sys.executable, *shlex.split(command)[1:-1], str(sim.control_path)]
+        subprocess.run(words, timeout=60, check=True)
+        assert events(sim.entries(), "brown_out", device_id=1)

@@ -9,51 +9,13 @@ from typing import Any
 
 import pytest
 
+from robots import HEAD
 from trade._context import CallContext, running
 from trade_drivers import AttachedRobot, Robot, attach, parse
 from trade_hil_sim import DynamixelBus, Entry, Servo, events, motion_writes, writes
+from waiting import PATIENCE_S, wait_until
 
-PATIENCE_S = 20.0
 GOAL, TORQUE, WATCHDOG = 116, 64, 98
-
-HEAD = """
-[robot]
-name = "rosie"
-
-[bus.neck]
-driver = "dynamixel"
-port = "/dev/ttyNOWHERE"
-
-[joint."neck.pan"]
-bus = "neck"
-id = 1
-model = "XL430-W250"
-min_rad = -1.4
-max_rad = 1.4
-max_speed_rad_s = 2.5
-max_accel_rad_s2 = 20.0
-
-[joint."neck.tilt"]
-bus = "neck"
-id = 2
-model = "XL430-W250"
-reversed = true
-min_rad = -0.6
-max_rad = 0.6
-max_speed_rad_s = 2.5
-max_accel_rad_s2 = 20.0
-
-[group.head]
-joints = ["neck.pan", "neck.tilt"]
-"""
-
-
-def wait_until(true: Callable[[], object], what: str) -> None:
-    """Poll a condition; the only deadline is one no healthy run comes near."""
-    deadline = time.monotonic() + PATIENCE_S
-    while not true():
-        assert time.monotonic() < deadline, f"waited {PATIENCE_S} s in vain until {what}"
-        threading.Event().wait(0.002)
 
 
 def sleep_past(moment_ns: int) -> None:

@@ -5,6 +5,7 @@ import sys
 import time
 from collections.abc import Callable
 from importlib.metadata import EntryPoint
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -81,6 +82,16 @@ def test_a_port_that_is_not_there_is_named(head: Rig) -> None:
     assert "/dev/ttyNOWHERE" in text
 
 
+@pytest.mark.parametrize("kind", ["file", "folder", "device"])
+def test_what_is_no_serial_port_is_named_with_its_key(head: Rig, tmp_path: Path, kind: str) -> None:
+    (tmp_path / "file").touch()
+    port = {"file": tmp_path / "file", "folder": tmp_path, "device": Path("/dev/null")}[kind]
+    text = refused(head, ports={"neck": str(port)})
+    assert (
+        text == f"head.toml: bus.neck.port: {port}: is no serial port; `ls -l /dev/serial/by-id` shows those there are"
+    )
+
+
 def test_the_port_of_the_file_is_used_unless_another_is_given(head: Rig) -> None:
     assert "/dev/ttyNOWHERE" in refused(head, ports={})
 
@@ -135,7 +146,10 @@ def test_a_hardware_error_does_not_keep_the_others_from_being_attached(rig: Rig)
         (("XL430-W250", "AX-12A"), "'AX-12A' is unknown to the driver dynamixel; it knows XL430-W250, XM430-W350"),
         (('driver = "dynamixel"', 'driver = "dynamixel"\nrate_hz = 5'), "rate_hz: 5 is too slow"),
         (('driver = "dynamixel"', 'driver = "dynamixel"\nbaud = 57600\nrate_hz = 200'), "at most"),
-        (('driver = "dynamixel"', 'driver = "dynamixel"\nbaud = 1234567'), "baud 1234567"),
+        (
+            ('driver = "dynamixel"', 'driver = "dynamixel"\nbaud = 1234567'),
+            "head.toml: bus.neck.baud: 1234567 cannot be set; the servos know 9600, 57600, ",
+        ),
         (("max_accel_rad_s2 = 20.0", "max_accel_rad_s2 = 1.0"), "a stop from max_speed_rad_s takes 2.5 s"),
         (("max_speed_rad_s = 2.5", "max_speed_rad_s = 0.01"), "is below 0.024, the least"),
         (("max_accel_rad_s2 = 20.0", "max_accel_rad_s2 = 0.1"), "is below 0.375, the least"),

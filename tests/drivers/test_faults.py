@@ -3,9 +3,10 @@
 import pytest
 
 import trade_hil_sim as sim
-from drivers.conftest import Outcome, Rig, wait_until, written_now
+from drivers.conftest import Outcome, Rig, written_now
 from trade.errors import BusGone, DeviceFault, DeviceSilent
 from trade_drivers import AttachedRobot, MotorState
+from waiting import wait_until
 
 COUNT_RAD = 6.283185 / 4096
 

@@ -2,10 +2,11 @@
 
 import pytest
 
-from drivers.conftest import Outcome, Rig, goal_counts, wait_until, written_now
+from drivers.conftest import Outcome, Rig, goal_counts, written_now
 from drivers.motor_contract import MotorContract
 from trade.errors import InvalidArgument, MotionStopped
 from trade_drivers import AttachedRobot, Motor
+from waiting import wait_until
 
 
 class TestDynamixelMotor(MotorContract):

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from drivers.conftest import HEAD
+from robots import HEAD
 from trade.errors import ConfigurationError
 from trade_drivers import Robot, load, parse
 
@@ -25,7 +25,9 @@ MISTAKES = [
     ('name = "rosie"', 'name = "rosie"\nage = 3', "robot.age: unknown key; [robot] has only name"),
     ("[robot]", "[robots]", "[robots]: unknown table"),
     ("[bus.neck]", "[bus.", "not valid TOML"),
-    ('driver = "dynamixel"\n', "", "bus.neck: missing required key 'driver'; the keys are driver, port, baud"),
+    ('driver = "dynamixel"\n', "", "bus.neck: missing required key 'driver'; write driver = \"dynamixel\""),
+    ('port = "/dev/ttyNOWHERE"\n', "", "bus.neck: missing required key 'port'; write port = \"/dev/serial/by-id/"),
+    ('port = "/dev/ttyNOWHERE"', 'port = ""', "bus.neck.port: Expected `str` of length >= 1, but it is ''"),
     ('driver = "dynamixel"', 'driver = "dynamixel"\nbuad = 1', "bus.neck.buad: unknown key; the keys are driver"),
     (
         'driver = "dynamixel"',

@@ -13,16 +13,8 @@ from pathlib import Path
 import pytest
 
 import trade_hil_sim
-from drivers.conftest import (
-    HEAD,
-    Outcome,
-    Rig,
-    call,
-    goal_counts,
-    sleep_past,
-    wait_until,
-    written_now,
-)
+from drivers.conftest import Outcome, Rig, call, goal_counts, sleep_past, written_now
+from robots import HEAD
 from trade import service
 from trade.errors import (
     ConfigurationError,
@@ -37,6 +29,7 @@ from trade.errors import (
 )
 from trade_drivers import AttachedRobot
 from trade_hil_sim import DynamixelBus, Servo, instructions, received
+from waiting import wait_until
 
 WATCHDOG_S = 0.3
 

@@ -4,55 +4,13 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, Protocol
+from typing import Any
 
 import dynamixel_sdk
 import pytest
 
+from robots import HEAD_AND_ARM
 from trade_hil_sim import DynamixelBus, Servo
-
-ROBOT = """
-[robot]
-name = "rosie"
-
-[bus.neck]
-driver = "dynamixel"
-port = "/dev/ttyUSB0"
-
-[bus.arm]
-driver = "dynamixel"
-port = "/dev/ttyUSB1"
-baud = 57600
-
-[joint."neck.pan"]
-bus = "neck"
-id = 1
-model = "XL430-W250"
-min_rad = -1.4
-max_rad = 1.4
-max_speed_rad_s = 2.5
-max_accel_rad_s2 = 20.0
-
-[joint."neck.tilt"]
-bus = "neck"
-id = 2
-model = "XL430-W250"
-reversed = true
-offset_rad = 0.5
-min_rad = -0.6
-max_rad = 0.6
-max_speed_rad_s = 2.5
-max_accel_rad_s2 = 20.0
-
-[joint.elbow]
-bus = "arm"
-id = 3
-model = "XM430-W350"
-min_rad = 0.25
-max_rad = 1.0
-max_speed_rad_s = 2.5
-max_accel_rad_s2 = 20.0
-"""
 
 
 class FakeClock:
@@ -72,21 +30,6 @@ class FakeClock:
 @pytest.fixture
 def clock() -> FakeClock:
     return FakeClock()
-
-
-class WaitUntil(Protocol):
-    def __call__(self, condition: Callable[[], Any], what: str = "") -> None: ...
-
-
-@pytest.fixture
-def wait_until() -> WaitUntil:
-    def wait(condition: Callable[[], Any], what: str = "the condition") -> None:
-        deadline = time.monotonic() + 20.0
-        while not condition():
-            assert time.monotonic() < deadline, f"{what} did not come"
-            time.sleep(0.001)
-
-    return wait
 
 
 @pytest.fixture
@@ -140,5 +83,5 @@ def sdk(bus: DynamixelBus, open_sdk: Callable[..., SimpleNamespace]) -> SimpleNa
 @pytest.fixture
 def robot_file(tmp_path: Path) -> Path:
     path = tmp_path / "rosie.toml"
-    path.write_text(ROBOT)
+    path.write_text(HEAD_AND_ARM)
     return path

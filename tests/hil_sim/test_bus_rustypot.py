@@ -1,12 +1,13 @@
 """A client that shares no code with the vendor's drives the simulated bus, and stuffs what it sends."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
 import rustypot
 
 from trade_hil_sim import DynamixelBus, writes
+from waiting import wait_until
 
 
 @pytest.fixture
@@ -44,7 +45,7 @@ def test_what_looks_like_a_header_passes_in_both_directions(client: Any) -> None
     assert list(client.read_raw_data(1, 224, 8)) == [0xFF, 0xFF, 0xFD, 0x00] * 2
 
 
-def test_reboot(client: Any, wait_until: Callable[..., None]) -> None:
+def test_reboot(client: Any) -> None:
     client.write_led(1, 1)
     client.reboot(1)
     client.set_timeout(0.1)

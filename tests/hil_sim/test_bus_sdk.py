@@ -8,6 +8,7 @@ import dynamixel_sdk
 import pytest
 
 from trade_hil_sim import DynamixelBus, Servo, instructions, motion_writes, writes
+from waiting import wait_until
 
 OK = (0, 0)
 TORQUE, GOAL, POSITION = 64, 116, 132
@@ -41,7 +42,7 @@ def test_read_and_write(sdk: SimpleNamespace, bus: DynamixelBus) -> None:
     assert motion_writes(bus.log.entries) == []
 
 
-def test_a_move_is_seen_by_client_and_log(sdk: SimpleNamespace, bus: DynamixelBus, wait_until: Any) -> None:
+def test_a_move_is_seen_by_client_and_log(sdk: SimpleNamespace, bus: DynamixelBus) -> None:
     assert sdk.ph.write1ByteTxRx(sdk.port, 1, TORQUE, 1) == OK
     assert sdk.ph.write4ByteTxRx(sdk.port, 1, GOAL, 2200) == OK
     wait_until(lambda: sdk.ph.read1ByteTxRx(sdk.port, 1, 122)[0] == 0, "the end of the motion")
@@ -124,7 +125,7 @@ def test_bulk_write_writes_different_registers_of_each(sdk: SimpleNamespace, gro
     assert [(e.device_id, e.moves) for e in writes(bus.log.entries)] == [(1, True), (2, False)]
 
 
-def test_reboot_answers_first_then_forgets_ram(sdk: SimpleNamespace, wait_until: Any) -> None:
+def test_reboot_answers_first_then_forgets_ram(sdk: SimpleNamespace) -> None:
     assert sdk.ph.write1ByteTxRx(sdk.port, 1, 65, 1) == OK
     assert sdk.ph.reboot(sdk.port, 1) == OK
     assert sdk.ph.ping(sdk.port, 2) == (1060, *OK)
@@ -132,7 +133,7 @@ def test_reboot_answers_first_then_forgets_ram(sdk: SimpleNamespace, wait_until:
     assert sdk.ph.read1ByteTxRx(sdk.port, 1, 65) == (0, *OK)
 
 
-def test_factory_reset_spares_id_and_baud_if_told_to(sdk: SimpleNamespace, wait_until: Any) -> None:
+def test_factory_reset_spares_id_and_baud_if_told_to(sdk: SimpleNamespace) -> None:
     assert sdk.ph.write4ByteTxRx(sdk.port, 2, 24, 99) == OK
     assert sdk.ph.factoryReset(sdk.port, 2, 0x02) == OK
     wait_until(lambda: sdk.ph.read4ByteTxRx(sdk.port, 2, 24) == (10, *OK), "the servo after its reset")
@@ -144,7 +145,7 @@ def test_a_factory_reset_of_everything_is_not_open_to_broadcast(sdk: SimpleNames
     assert sdk.ph.read4ByteTxRx(sdk.port, 2, 24) == (99, *OK)
 
 
-def test_clear_forgets_whole_turns(sdk: SimpleNamespace, wait_until: Any) -> None:
+def test_clear_forgets_whole_turns(sdk: SimpleNamespace) -> None:
     assert sdk.ph.write1ByteTxRx(sdk.port, 1, 11, 4) == OK
     assert sdk.ph.write1ByteTxRx(sdk.port, 1, TORQUE, 1) == OK
     assert sdk.ph.write4ByteTxRx(sdk.port, 1, GOAL, 4200) == OK
@@ -164,7 +165,7 @@ def test_indirect_addresses_gather_scattered_registers(sdk: SimpleNamespace, bus
     assert [e.registers for e in motion_writes(bus.log.entries)] == [("goal_position",)]
 
 
-def test_s06_a_silent_client_stops_the_servo(sdk: SimpleNamespace, bus: DynamixelBus, wait_until: Any) -> None:
+def test_s06_a_silent_client_stops_the_servo(sdk: SimpleNamespace, bus: DynamixelBus) -> None:
     assert sdk.ph.write1ByteTxRx(sdk.port, 1, TORQUE, 1) == OK
     assert sdk.ph.write4ByteTxRx(sdk.port, 1, 112, 10) == OK
     assert sdk.ph.write1ByteTxRx(sdk.port, 1, 98, 25) == OK

@@ -30,6 +30,7 @@ from trade_hil_sim import (
     WrongModel,
     instructions,
 )
+from waiting import wait_until
 
 TIMEOUT, CORRUPT = dynamixel_sdk.COMM_RX_TIMEOUT, dynamixel_sdk.COMM_RX_CORRUPT
 POSITION = 132
@@ -92,7 +93,7 @@ def test_a_late_answer_is_taken_for_the_next_one(sdk: SimpleNamespace, bus: Dyna
     assert (result, profile_velocity) == (0, 2048)
 
 
-def test_a_late_answer_leaves_while_the_bus_goes_on(make_bus: Any, wait_until: Any) -> None:
+def test_a_late_answer_leaves_while_the_bus_goes_on(make_bus: Any) -> None:
     import serial
 
     from trade_hil_sim.dynamixel import encode
@@ -129,7 +130,7 @@ def test_a_dribbled_answer_is_put_together(bus: DynamixelBus, read: Any) -> None
     assert [len(e.data) for e in bus.log.entries if e.kind == "sent"] == [1] * 15
 
 
-def test_an_answer_twice_is_read_once(bus: DynamixelBus, read: Any, wait_until: Any) -> None:
+def test_an_answer_twice_is_read_once(bus: DynamixelBus, read: Any) -> None:
     bus.do(Duplicate(count=1))
     assert read() == GOOD
     assert read() == GOOD
@@ -167,9 +168,7 @@ def test_a_swapped_device_reports_another_model(sdk: SimpleNamespace, bus: Dynam
     assert sdk.ph.ping(sdk.port, 2) == (1060, 0, 0)
 
 
-def test_a_brown_out_switches_torque_off_and_keeps_eeprom(
-    sdk: SimpleNamespace, bus: DynamixelBus, wait_until: Any
-) -> None:
+def test_a_brown_out_switches_torque_off_and_keeps_eeprom(sdk: SimpleNamespace, bus: DynamixelBus) -> None:
     assert sdk.ph.write1ByteTxRx(sdk.port, 1, 9, 0) == (0, 0)
     assert sdk.ph.write1ByteTxRx(sdk.port, 1, 64, 1) == (0, 0)
     bus.do(BrownOut())
@@ -185,7 +184,7 @@ def test_an_overheated_device_shuts_down(sdk: SimpleNamespace, bus: DynamixelBus
     assert sdk.ph.read1ByteTxRx(sdk.port, 1, 70) == (4, 0, 0x80)
 
 
-def test_a_frozen_sensor_looks_healthy(sdk: SimpleNamespace, bus: DynamixelBus, wait_until: Any, read: Any) -> None:
+def test_a_frozen_sensor_looks_healthy(sdk: SimpleNamespace, bus: DynamixelBus, read: Any) -> None:
     bus.do(Freeze(ids=(1,)))
     assert sdk.ph.write1ByteTxRx(sdk.port, 1, 64, 1) == (0, 0)
     assert sdk.ph.write4ByteTxRx(sdk.port, 1, 116, 2200) == (0, 0)
@@ -227,9 +226,7 @@ def test_a_fault_for_a_device_that_is_not_there_is_an_error(bus: DynamixelBus) -
         bus.do(Mute(ids=(9,)))
 
 
-def test_s06_an_unplugged_servo_goes_on_until_its_watchdog_stops_it(
-    sdk: SimpleNamespace, bus: DynamixelBus, wait_until: Any
-) -> None:
+def test_s06_an_unplugged_servo_goes_on_until_its_watchdog_stops_it(sdk: SimpleNamespace, bus: DynamixelBus) -> None:
     """The adapter is gone, the supply is not."""
     assert sdk.ph.write1ByteTxRx(sdk.port, 1, 64, 1) == (0, 0)
     assert sdk.ph.write4ByteTxRx(sdk.port, 1, 112, 10) == (0, 0)

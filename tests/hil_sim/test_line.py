@@ -6,12 +6,12 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 import serial
 
 from trade_hil_sim import ByteLog, SerialLine, SimulationError, received, sent
+from waiting import wait_until
 
 
 class Parrot:
@@ -137,8 +137,7 @@ def test_after_replugging_the_same_name_works_and_the_old_port_never_does(
 def test_an_answer_pending_at_unplugging_is_lost(line: SerialLine, port: serial.Serial, parrot: Parrot) -> None:
     parrot.answering = lambda line, data: line.send(data, late_s=30.0)
     port.write(b"x")
-    while not parrot.heard:
-        time.sleep(0.001)
+    wait_until(lambda: parrot.heard, "it was heard")
     line.unplug()
     line.replug()
     parrot.answering = lambda line, data: line.send(data)
@@ -148,7 +147,7 @@ def test_an_answer_pending_at_unplugging_is_lost(line: SerialLine, port: serial.
 
 
 def test_a_client_that_does_not_read_loses_bytes_and_stops_nobody(
-    line: SerialLine, port: serial.Serial, parrot: Parrot, log: ByteLog, wait_until: Any
+    line: SerialLine, port: serial.Serial, parrot: Parrot, log: ByteLog
 ) -> None:
     parrot.answering = lambda line, data: line.send(data * 50)
     for _ in range(10):
@@ -166,8 +165,7 @@ def test_a_peer_is_woken_when_it_asked_to_be(line: SerialLine, parrot: Parrot) -
 def test_a_late_answer_lets_others_pass(port: serial.Serial, parrot: Parrot) -> None:
     parrot.answering = lambda line, data: line.send(data, late_s=0.2 if data == b"a" else 0.0)
     port.write(b"a")
-    while parrot.heard != b"a":
-        time.sleep(0.001)
+    wait_until(lambda: parrot.heard == b"a", "the first was heard")
     port.write(b"b")
     assert port.read(2) == b"ba"
 

@@ -5,15 +5,16 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
-from typing import Any
 
 import psutil
 import pytest
 import serial
 
-from trade_hil_sim import SimProcess, SimulationError, events, instructions, read_log
+from trade_hil_sim import SimProcess, SimulationError, events, instructions, read_log, remove_leftovers
 from trade_hil_sim.dynamixel import encode
+from waiting import wait_until
 
 COMMAND = [sys.executable, "-m", "trade_hil_sim"]
 
@@ -60,7 +61,7 @@ def test_its_times_are_this_process_times(robot_file: Path) -> None:
         assert len(instructions(sim.entries(), since=before, until=after)) == 1
 
 
-def test_faults_come_in_while_it_runs(robot_file: Path, wait_until: Any) -> None:
+def test_faults_come_in_while_it_runs(robot_file: Path) -> None:
     with SimProcess(robot_file) as sim:
         sim.control.brown_out([1])
         wait_until(lambda: events(sim.entries(), "booted", device_id=1), "the servo's return")
@@ -85,7 +86,7 @@ def test_a_signal_ends_it_cleanly(robot_file: Path, tmp_path: Path, number: sign
     assert list(place.iterdir()) == []
 
 
-def test_it_ends_when_its_parent_is_killed(robot_file: Path, wait_until: Any) -> None:
+def test_it_ends_when_its_parent_is_killed(robot_file: Path) -> None:
     code = """
 import sys
 from trade_hil_sim import SimProcess
@@ -136,3 +137,18 @@ def test_the_package_alone_imports_nothing_of_ours() -> None:
     code = "import trade_hil_sim, sys; print(sorted({'trade', 'trade_drivers', 'zenoh'} & set(sys.modules)))"
     command = [sys.executable, "-W", "error", "-c", code]
     assert subprocess.run(command, capture_output=True, timeout=60, check=True).stdout == b"[]\n"
+
+
+def test_only_folders_of_its_kind_whose_owner_is_gone_are_removed(
+    robot_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "tmp"))
+    for name in ("trade-sim-dead", "trade-sim-stranger", "trade-demo-dead"):
+        (tmp_path / "tmp" / name).mkdir(parents=True)
+    for name in ("trade-sim-dead", "trade-demo-dead"):
+        (tmp_path / "tmp" / name / "_owner.pid").write_text("4711")
+    with SimProcess(robot_file) as alive:
+        assert remove_leftovers() == [tmp_path / "tmp" / "trade-sim-dead"]
+        left = sorted(path.name for path in (tmp_path / "tmp").iterdir())
+        assert left == sorted(["trade-demo-dead", "trade-sim-stranger", alive.control_path.parent.name])
+        assert ping(alive.ports["neck"], 1)

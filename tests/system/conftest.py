@@ -12,9 +12,10 @@ from typing import Any
 
 import pytest
 
+from waiting import PATIENCE_S
+
 ROOT = Path(__file__).parents[2]
 ROSIE = ROOT / "examples" / "rosie.toml"
-PATIENCE_S = 60.0
 
 
 class Program:
@@ -49,6 +50,11 @@ class Program:
         if line is None:
             pytest.fail(f"{self.process.args} ended; stderr: {''.join(self.errors)}")
         return line
+
+    def lines(self) -> list[str]:
+        """All further output, once it has ended."""
+        self.wait()
+        return list(iter(self._lines.get_nowait, None))
 
     def json(self) -> dict[str, Any]:
         return json.loads(self.line())
@@ -131,12 +137,3 @@ def rosie_up(run: Callable[..., Program], tmp_path: Path) -> Callable[[], Rosie]
         return Rosie(run("-m", "trade_gateway", "up", ROSIE, "--sim", "--sim-log", log, "--json"), log)
 
     return up
-
-
-def wait_until(condition: Callable[[], bool]) -> None:
-    """Wait for something other processes do; fails after a minute."""
-    for _ in range(2000):
-        if condition():
-            return
-        threading.Event().wait(0.03)
-    pytest.fail("it did not happen within a minute")

@@ -1,12 +1,17 @@
 import json
+import re
 import signal
 import subprocess
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 
-from system.conftest import ROSIE, wait_until
-from trade_hil_sim import events, motion_writes, read_log
+import trade
+from system.conftest import ROSIE
+from trade import where
+from trade_hil_sim import SimControl, SimProcess, events, motion_writes, read_log
+from waiting import wait_until
 
 Command = Callable[..., subprocess.CompletedProcess[str]]
 
@@ -48,7 +53,6 @@ def test_containers_are_listed(rosie_up, trade_command: Command) -> None:
         (["call", "rosie.head.move_to", "[0.1]"], "InvalidArgument"),
         (["call", "rosie.head.move_to", '["left", 0]'], "InvalidArgument: rosie.head.move_to argument 'positions_rad'"),
         (["call", "rosie.head.move_to"], "argument 'positions_rad': missing"),
-        (["call", "rosie.head.move_to", "[0.1, NaN]"], "is not JSON"),
         (["call", "rosie.head.move_to", "[0.1, 0.1]", "haste=3"], "there is no such argument"),
         (["call", "rosie.head.mvoe_to", "[0.1]", "--wait", "0"], "did you mean rosie.head.move_to"),
         (["call", "rosie.neck.move_to", "0.1"], "TooManyServices: 2 services match"),
@@ -63,6 +67,90 @@ def test_a_bad_call_is_one_line_that_says_what_to_do_and_moves_nothing(
     assert complaint in called.stderr
     assert len(called.stderr.strip().splitlines()) == 1
     assert motion_writes(read_log(rosie.log)) == []
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        (["call", "rosie.head.move_to", "[0.1, NaN]"], "UsageError: argument '[0.1, NaN]': is not JSON"),
+        (["call", "rosie.head.move_to", "[0.1,", "-0.2]"], "forgot quotes? The shell splits at spaces: '[0.1, -0.2]'"),
+        (["call", "rosie.*.stop"], "UsageError: service 'rosie.*.stop': group='rosie.*' would match nothing"),
+        (["services", "--group", "rosie*"], "UsageError: --group rosie*: group='rosie*' would match nothing"),
+        (["up", ROSIE, "--sim-log", "log"], "UsageError: --sim-log: is the log of the simulator; it needs --sim"),
+    ],
+)
+def test_wrong_words_are_one_line_and_exit_code_2(words: list[str], complaint: str, trade_command: Command) -> None:
+    ended = trade_command(*words)
+    assert ended.returncode == 2
+    assert complaint in ended.stderr
+    assert len(ended.stderr.strip().splitlines()) == 1
+
+
+def test_tables_in_a_pipe_are_whole_lines(rosie_up, trade_command: Command) -> None:
+    rosie_up()
+    lines = trade_command("services", "--group", "rosie.head").stdout.splitlines()
+    moves = [line for line in lines if line.startswith("rosie.head.move_to")]
+    assert len(lines) == 8
+    assert "move_to(positions_rad: list[float], speed_rad_s: float (> 0) | None = None) -> list[float]  act" in moves[0]
+
+
+def test_a_group_nobody_is_in_is_answered_with_those_there_are(rosie_up, trade_command: Command) -> None:
+    rosie_up()
+    said = trade_command("services", "--group", "roise").stdout
+    assert said == "no services match group='roise'; there is rosie.head, rosie.neck.pan, rosie.neck.tilt\n"
+
+
+def test_faults_that_latch_and_heal_are_told_with_what_to_do(rosie_up, trade_command: Command) -> None:
+    rosie = rosie_up()
+    assert trade_command("call", "rosie.neck.pan.enable").returncode == 0
+    with SimControl(rosie.ready["control"]) as control:
+        control.brown_out([1])
+    told = rosie.program.wait_for(lambda line: line["joint"] == "rosie.neck.pan" and "enable" in line["fault"])
+    assert told["fault"].endswith("When you have looked: trade call rosie.neck.pan.enable")
+    assert told["at"].startswith("2")
+    assert trade_command("call", "rosie.neck.pan.enable").returncode == 0
+    assert rosie.program.wait_for(lambda line: line["joint"] == "rosie.neck.pan")["fault"] == ""
+
+
+def test_a_watchdog_that_expired_under_an_earlier_driver_is_told_at_attach(system: str, run, tmp_path) -> None:
+    with SimProcess(ROSIE) as sim:
+        robot_file = tmp_path / "rosie.toml"
+        port_line = next(line for line in ROSIE.read_text(encoding="utf-8").splitlines() if line.startswith("port ="))
+        text = ROSIE.read_text(encoding="utf-8").replace(port_line, f'port = "{sim.ports["neck"]}"')
+        robot_file.write_text(text, encoding="utf-8")
+        first = run("-m", "trade_gateway", "up", robot_file, "--json")
+        first.json()
+        trade.find(where(name="enable", group="rosie.neck.pan"), wait_s=30)()
+        first.signal(signal.SIGKILL)
+        wait_until(lambda: bool(events(sim.entries(), "watchdog_expired")))
+        first.wait()
+        second = run("-m", "trade_gateway", "up", robot_file)
+        while "its watchdog stopped it" not in (line := second.line()):
+            pass
+        assert re.fullmatch(r"\d\d:\d\d:\d\d rosie\.neck\.pan: .* trade call rosie\.neck\.pan\.enable\n", line)
+        second.close()
+
+
+def test_what_a_killed_simulation_left_is_removed_by_the_next(run, system: str) -> None:
+    words = ("-m", "trade_gateway", "up", ROSIE, "--sim", "--json")
+    first = run(*words)
+    folder = Path(first.json()["control"]).parent
+    first.signal(signal.SIGKILL)
+    first.wait()
+    assert folder.exists()
+    second = run(*words)
+    second.json()
+    assert not folder.exists()
+
+
+def test_the_path_of_the_simulators_socket_and_that_nothing_is_wrong_are_said(run, system: str) -> None:
+    up = run("-m", "trade_gateway", "up", ROSIE, "--sim")
+    while "to strike the simulator with faults" not in (line := up.line()):
+        pass
+    with SimControl(line.split(": ")[1].strip()) as control:
+        assert [device.joint for bus in control.state() for device in bus.devices] == ["neck.pan", "neck.tilt"]
+    assert up.line() == "Ctrl-C leaves\n"
+    assert re.fullmatch(r"\d\d:\d\d:\d\d no joint has a fault\n", up.line())
 
 
 def test_help_names_every_command(trade_command: Command) -> None:

@@ -16,7 +16,7 @@ import pytest
 
 from system.member import PROVIDERS
 
-ROUNDS = int(os.environ.get("TRADE_SOAK_ROUNDS", "20"))
+ROUNDS = int(os.environ.get("SOAK_ROUNDS", "20"))
 MEMBER = Path(__file__).with_name("member.py")
 pytestmark = pytest.mark.timeout(120 + 15 * ROUNDS)
 

@@ -10,10 +10,11 @@ import psutil
 import pytest
 
 import trade
-from system.conftest import ROSIE, Program, wait_until
+from system.conftest import ROSIE, Program
 from trade import Handle, where
-from trade.errors import ContainerLost, DeadlineExceeded, DeviceSilent, OutcomeUnknown
+from trade.errors import ContainerLost, DeadlineExceeded, DeviceSilent, MotionStopped, OutcomeUnknown
 from trade_hil_sim import SimProcess, events, motion_writes, received, writes
+from waiting import wait_until
 
 
 class Bench:
@@ -73,6 +74,21 @@ def _answers(state: Handle) -> bool:
     except DeviceSilent:  # its newest measurement is from before
         return False
     return True
+
+
+def test_S04_a_move_that_meets_its_deadline_is_reported_as_stopped(bench: Bench, look: Handle) -> None:
+    look([0.0, 0.0])
+    told: list[type[Exception]] = []
+    for goal in (1.2, -1.2, 1.2, -1.2, 1.2):  # a busy computer may be late now and then
+        with pytest.raises((MotionStopped, OutcomeUnknown)) as ended:
+            look.with_(deadline_s=1.0)([goal, 0.0], speed_rad_s=0.1)
+        told.append(ended.type)
+        if ended.type is MotionStopped:
+            assert "the deadline of its call came" in str(ended.value)
+            break
+    assert told[-1] is MotionStopped
+    wait_until(lambda: not bench.moving())
+    assert abs(bench.rests("neck.pan")[-1]) < 1.0
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])

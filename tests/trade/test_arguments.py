@@ -217,7 +217,7 @@ class Provider:
         return 1
 
     @service
-    def untyped(self, value):  # type: ignore[no-untyped-def]
+    def untyped(self, value: Any):  # type: ignore[no-untyped-def]
         return value
 
     @service
@@ -421,7 +421,8 @@ INVALID: dict[str, tuple[Case, str, str]] = {
     "keyword-only by place": (lambda s: s("optional_named")(1, 2), "", "takes at most 1 positional argument, got 2"),
     "twice": (lambda s: s("two")(1, a=1), "a", "given twice"),
     "unknown": (lambda s: s("two")(1, c=1), "c", "there is no such argument"),
-    "limit": (lambda s: s("limited")(1.5), "speed", "Expected `float` <= 1.0"),
+    "limit": (lambda s: s("limited")(1.5), "speed", "Expected `float` <= 1.0, but is 1.5"),
+    "nan within limits": (lambda s: s("limited")(math.nan), "speed", "must be finite: no NaN, no infinity"),
     "deep": (lambda s: s("path")([Pose(0.0), {"x_m": None}]), "poses", "Expected `float`, got `None` (at [1].x_m)"),
     "nan": (lambda s: s("number")(math.nan), "value", "must be finite: no NaN, no infinity"),
     "infinity by name": (lambda s: s("number")(value=math.inf), "value", "must be finite: no NaN, no infinity"),

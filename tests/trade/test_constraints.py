@@ -98,7 +98,8 @@ def test_a_constraint_matches_what_it_says(constraint: Constraint, candidate: Ca
 
 # --- any combination means the same as evaluating it term by term
 
-_texts = st.sampled_from(["a", "b", "a.b", "a.b.c", "ab", "*", "a*", "?"])
+_dotted = st.sampled_from(["a", "b", "a.b", "a.b.c", "ab"])
+_patterns = st.sampled_from(["*", "a*", "?"])
 _TYPES: list[Any] = [int, float, str, bool, None, list[int], list[float], int | None, dict[str, int]]
 _FACTS = ["see(cup)", "on(cup, table)", "on(cup, cup)", "at(?place)"]
 _PATTERNS = ["see(?x)", "on(?x, ?x)", "on(?x, table)", "at(dock)", "?x", "see(?x), on(?x, ?y)"]
@@ -110,7 +111,8 @@ def _term(**asked: Any) -> Term:
 
 
 _terms = st.one_of(
-    st.builds(Term, st.sampled_from(["name", "group", "host", "container", "uses", "kind"]), _texts),
+    st.builds(Term, st.sampled_from(["name", "host", "container", "kind"]), st.one_of(_dotted, _patterns)),
+    st.builds(Term, st.sampled_from(["group", "uses"]), _dotted),
     st.sampled_from([Term("local", ""), Term("healthy", "")]),
     st.builds(lambda types: _term(args=types), st.lists(st.sampled_from(_TYPES), max_size=2)),
     st.builds(lambda kind: _term(returns=kind), st.sampled_from(_TYPES)),
@@ -321,3 +323,21 @@ def test_host_container_and_local_select_in_a_system(here: Container, there: Con
     assert here.find(where(name="go", container="th*")) == remote
     assert len(here.services(where(name="go", host=remote.host))) == 2
     assert here.services(where(name="go", host="elsewhere")) == []
+
+
+@pytest.mark.parametrize(
+    ("asked", "remedy"),
+    [
+        ({"group": "x*"}, "one selects all beneath it, as rosie does"),
+        ({"group": "rosie.*"}, "whole dotted segments, and one selects all beneath it; write group='rosie'"),
+        ({"group": "rosie.neck.p?n"}, "write group='rosie.neck'"),
+        ({"uses": "rosie.left*"}, "write uses='rosie'"),
+        ({"group": "rosie."}, "is no group; use words joined by dots"),
+        ({"group": "rosie head"}, "is no group; use words joined by dots"),
+    ],
+    ids=str,
+)
+def test_a_group_that_could_match_nothing_is_refused(asked: dict[str, str], remedy: str) -> None:
+    with pytest.raises(ConfigurationError) as refused:
+        where(**asked)
+    assert remedy in str(refused.value)

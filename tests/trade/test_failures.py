@@ -10,10 +10,10 @@ from typing import Any, get_type_hints
 import msgspec
 import pytest
 
-from trade import Container, errors, service, where
+from trade import Container, Secret, errors, service, where
 from trade._failures import RemoteTraceback, pack_error, unpack_error
 from trade._wire import ErrorInfo
-from trade.errors import CallerError, DeadlineExceeded, LimitExceeded, RemoteError, TradeError
+from trade.errors import CallerError, DeadlineExceeded, InvalidResult, LimitExceeded, RemoteError, TradeError
 
 CONCRETE = [
     kind
@@ -217,3 +217,44 @@ def test_looking_for_an_errors_type_runs_no_code_of_modules(monkeypatch: pytest.
     lazy.__getattr__ = lambda name: pytest.fail(f"{name} was asked for")  # type: ignore[method-assign]
     monkeypatch.setitem(sys.modules, "lazy_module", lazy)
     assert isinstance(unpack_error(ErrorInfo(type="lazy_module:Anything", message="m"), "s"), RemoteError)
+
+
+class Clumsy:
+    @service
+    def drop(self, what: str, word: Secret[str] = "") -> None:
+        raise OSError(f"dropped the {what} {word}")
+
+    @service
+    def lie(self) -> int:
+        return "text"  # type: ignore[return-value]
+
+    @service
+    def leave(self) -> None:
+        sys.exit(3)
+
+    @service
+    def refuse(self) -> None:
+        raise LimitExceeded(what="speed", value=2.0, lower=0.0, upper=1.0)
+
+
+def test_what_a_provider_raises_unmeant_is_logged_once_where_it_runs(
+    here: Container, there: Container, caplog: pytest.LogCaptureFixture
+) -> None:
+    there.register(Clumsy(), "robot")
+    names = ("drop", "lie", "leave", "refuse")
+    drop, lie, leave, refuse = (here.find(where(name=name, group="robot"), wait_s=20) for name in names)
+    with pytest.raises(OSError, match="dropped the cup"):
+        drop("cup", "hunter2")
+    with pytest.raises(InvalidResult):
+        lie()
+    with pytest.raises(RemoteError):
+        leave()
+    with pytest.raises(LimitExceeded):
+        refuse()
+    first, second, third = (record.getMessage() for record in caplog.records if record.levelname == "WARNING")
+    assert "robot.drop failed in a call of" in first
+    assert "Traceback" in first
+    assert "OSError: dropped the cup ***" in first
+    assert "hunter2" not in first
+    assert "robot.lie failed" in second
+    assert "robot.leave failed" in third

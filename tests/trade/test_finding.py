@@ -1,6 +1,7 @@
 """Looking services up: one that matches, all that match, none."""
 
 import threading
+from typing import Any
 
 import pytest
 
@@ -40,9 +41,15 @@ def test_what_stands_when_a_container_starts_is_known_from_the_start(start_conta
 
 
 def test_no_match_is_an_error_that_says_what_was_asked(here: Container) -> None:
-    with pytest.raises(NoSuchService, match="no service matches name='fly' after 0 s; `trade services` lists") as none:
+    with pytest.raises(NoSuchService, match="no service matches name='fly' after 0 s; nothing is offered") as none:
         here.find(where(name="fly"), wait_s=0)
     assert isinstance(none.value, LookupError)
+
+
+def test_no_match_says_which_groups_there_are_instead(here: Container) -> None:
+    here.register(Arm(), ["rosie.arm", "blue"])
+    with pytest.raises(NoSuchService, match=r"; there is blue, rosie\.arm; `trade services` lists what they offer"):
+        here.find(where(name="fly"), wait_s=0)
 
 
 def test_no_match_hints_at_what_looks_alike(here: Container) -> None:
@@ -53,6 +60,32 @@ def test_no_match_hints_at_what_looks_alike(here: Container) -> None:
     assert str(none.value).endswith("; did you mean rosie.arm.move_to?")
 
 
+def test_a_group_that_looks_alike_is_hinted_at(here: Container) -> None:
+    here.register(Arm(), "rosie.arm")
+    with pytest.raises(NoSuchService, match=r"did you mean rosie\.arm\?"):
+        here.find(where(group="rosie.amr"), wait_s=0)
+
+
+class Wheel:
+    @service
+    def step(self) -> None: ...
+
+    @service(effect="stop")
+    def stop(self) -> None: ...
+
+
+@pytest.mark.parametrize(
+    ("asked", "near"), [("stap", ("rosie.step",)), ("stpo", ("rosie.step",)), ("sop", ("rosie.stop",))]
+)
+def test_a_stop_is_hinted_at_only_where_nothing_else_is_near(
+    here: Container, asked: str, near: tuple[str, ...]
+) -> None:
+    here.register(Wheel(), "rosie")
+    with pytest.raises(NoSuchService) as none:
+        here.find(where(name=asked, group="rosie"), wait_s=0)
+    assert none.value.near == near
+
+
 def test_two_matches_are_an_error_that_names_them(here: Container, there: Container) -> None:
     here.register(Arm(), "rosie")
     there.register(Arm(), "rosie")
@@ -60,7 +93,25 @@ def test_two_matches_are_an_error_that_names_them(here: Container, there: Contai
     with pytest.raises(TooManyServices) as many:
         here.find(where(name="angle"))
     assert list(many.value.matches) == ["rosie.angle in here", "rosie.angle in there"]
-    assert "add a constraint" in str(many.value)
+    assert "add a constraint on what tells them apart (container)" in str(many.value)
+
+
+def test_two_objects_of_one_group_are_told_apart(here: Container) -> None:
+    here.register(Arm(), "rosie")
+    here.register(Arm(), "rosie")
+    with pytest.raises(TooManyServices, match="register them in groups or with meta of their own") as many:
+        here.find(where(name="angle"))
+    assert list(many.value.matches) == ["rosie.angle of Arm-2 in here", "rosie.angle of Arm-3 in here"]
+
+
+def test_services_of_two_containers_of_one_name_are_told_apart(here: Container, start_container: Any) -> None:
+    twins = [start_container("twin"), start_container("twin")]
+    for twin in twins:
+        twin.register(Arm(), "rosie")
+    assert here._registry.wait_for(lambda: len(here.services(where(name="angle"))) == 2, 20)
+    with pytest.raises(TooManyServices) as many:
+        here.find(where(name="angle"))
+    assert sorted(many.value.matches) == sorted(f"rosie.angle of Arm-2 in {twin.address}" for twin in twins)
 
 
 def test_find_waits_for_a_service_that_comes_late(here: Container, there: Container) -> None:

@@ -1,6 +1,8 @@
 """Handles: values that name one service of one boot, callable from anywhere."""
 
 import asyncio
+import copy
+import pickle
 from typing import Any
 
 import pytest
@@ -331,3 +333,16 @@ def test_every_call_has_an_id_of_its_own(offer: Any) -> None:
 
 def test_outside_of_a_call_there_is_no_call() -> None:
     assert current_call() is None
+
+
+def test_a_handle_cannot_be_pickled_and_says_what_to_do_instead(here: Container) -> None:
+    handle = here.services()[0]
+    for value in (handle, [handle], handle.bind(1)):
+        with pytest.raises(TypeError, match=r"Give it to the other process as an argument .* or look the service up"):
+            pickle.dumps(value)
+
+
+def test_a_copy_of_a_handle_is_the_handle(here: Container) -> None:
+    handle = here.services()[0]
+    assert copy.copy(handle) is handle
+    assert copy.deepcopy({"handle": handle})["handle"] is handle

@@ -44,11 +44,8 @@ _told = st.fixed_dictionaries(
     }
 )
 _ATOMS = [
-    *(
-        where(**{field: text})
-        for field in ("name", "container", "group", "uses", "kind")
-        for text in ("a", "a.b", "a*")
-    ),
+    *(where(**{field: text}) for field in ("name", "container", "group", "uses", "kind") for text in ("a", "a.b")),
+    *(where(**{field: "a*"}) for field in ("name", "container", "kind")),
     *(where(achieves=text) for text in ("see(?x)", "?x", "on(?x, ?y), see(?x)", "none(a)")),
     *(where(), ~where(), where(healthy=True), where(host="edge")),
 ]

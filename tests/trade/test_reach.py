@@ -72,6 +72,30 @@ def test_a_malformed_endpoint_is_refused_with_an_example(what: str, endpoint: st
         read(**{what: [endpoint]})
 
 
+@pytest.mark.parametrize(
+    ("endpoint", "problem"),
+    [
+        ("tcp/127.0.0.1:65536", "there is no port 65536; ports go up to 65535"),
+        ("tpc/127.0.0.1:7450", "there is no protocol 'tpc'; there is tcp"),
+    ],
+)
+@pytest.mark.parametrize("what", ["listen", "connect"])
+def test_an_endpoint_that_cannot_be_is_refused_in_our_words(what: str, endpoint: str, problem: str) -> None:
+    with pytest.raises(ConfigurationError, match=problem):
+        read(**{what: [endpoint]})
+
+
+@pytest.mark.parametrize(
+    ("name", "hint"),
+    [("TRADE_SYTEM", "did you mean TRADE_SYSTEM?"), ("TRADE_COLOUR", "there is TRADE_SYSTEM, TRADE_IDENTITY")],
+)
+def test_a_variable_nobody_reads_is_warned_of(name: str, hint: str, caplog: pytest.LogCaptureFixture) -> None:
+    Settings.read(environment={name: "x", "TRADE_SYSTEM": "lab", "TRADING": "x"})
+    [said] = caplog.messages
+    assert name in said
+    assert hint in said
+
+
 @pytest.mark.parametrize("name", ["a/b", "*", "a b", "@me", "x" * 81, ".", "..", "ä"])
 @pytest.mark.parametrize("what", ["system", "identity", "container"])
 def test_a_name_that_cannot_stand_in_a_key_is_refused(what: str, name: str) -> None:

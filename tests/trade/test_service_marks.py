@@ -339,3 +339,14 @@ def test_a_property_cannot_be_a_service() -> None:
             @property
             def value(self) -> int:
                 return 1
+
+
+def test_a_parameter_without_a_type_hint_is_refused_with_what_to_write(here: Container) -> None:
+    class Careless:
+        @service
+        def move(self, angle_rad, speed=1.0): ...  # type: ignore[no-untyped-def]
+
+    with pytest.raises(
+        ConfigurationError, match=r"robot\.move: argument 'angle_rad' has no type hint; write angle_rad: "
+    ):
+        here.register(Careless(), "robot")

@@ -35,8 +35,17 @@ class Robot:
         return {}
 
     @service(effect="read")
-    def plain(self, value, other=1):  # type: ignore[no-untyped-def]
+    def plain(self, value: Any, other: Any = 1):  # type: ignore[no-untyped-def]
         return value
+
+    @service(effect="read")
+    def limited(
+        self,
+        share: Annotated[float, Meta(gt=0, lt=1)],
+        name: Annotated[str, Meta(min_length=1, max_length=8)],
+        steps: list[Annotated[int, Meta(ge=1, multiple_of=5)]],
+        speed: Annotated[float, Meta(le=2.5)] | None = None,
+    ) -> None: ...
 
     @service(effect="read")
     def times(self) -> tuple[dt.datetime, ...]:
@@ -59,9 +68,11 @@ def robot(here: Container) -> dict[str, Handle]:
 
 
 TEXTS = {
-    "move": "move(joint: str, angle_rad: float, *, speed: float = 0.5) -> bool",
+    "move": "move(joint: str, angle_rad: float (-1 to 1), *, speed: float = 0.5) -> bool",
     "poses": "poses(names: list[str] | None = None) -> dict[str, Pose]",
     "plain": "plain(value, other=1)",
+    "limited": "limited(share: float (> 0, < 1), name: str (at least 1 long, at most 8 long), "
+    "steps: list[int (>= 1, a multiple of 5)], speed: float (<= 2.5) | None = None) -> None",
     "times": "times() -> tuple[datetime, ...]",
     "follow": "follow(leader: Handle, mode: Literal['near', 'far'] = 'near') -> None",
     "drive": "drive(goal: Goal) -> None",

@@ -55,7 +55,7 @@ class Robot:
     @service
     def keyword(self, *, fast: bool) -> Point: ...
     @service
-    def anything(self, value): ...  # type: ignore[no-untyped-def]
+    def anything(self, value: Any): ...  # type: ignore[no-untyped-def]
     @service
     def tell(self, who: Handle) -> Handle: ...
     @service

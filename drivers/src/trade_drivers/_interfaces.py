@@ -79,7 +79,8 @@ class Motor(ABC):
         Raises:
             LimitExceeded: outside of limits(); nothing was sent. Moving back inside is allowed from outside.
             InvalidArgument: not a finite number.
-            MotionStopped: stop(), another move, or the call's deadline came first; the joint was stopped.
+            MotionStopped: stop(), another move, or the call's deadline came first; the joint was stopped. For its
+                deadline a move ends up to 0.1 s early, so that this answer is still in time.
             DeviceFault: the device reports a fault, or it does not move; it was told to hold.
             DeviceSilent: the device does not answer.
             DeadlineExceeded: the deadline passed before anything was sent; nothing will be.

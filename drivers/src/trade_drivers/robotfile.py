@@ -24,6 +24,8 @@ _MISSING = re.compile(r"missing required field `([^`]*)`")
 _UNKNOWN = re.compile(r"contains unknown field `([^`]*)`")
 _CHOICES = {"leave": '"hold" or "relax"'}
 
+_EXAMPLES = {"port": '"/dev/serial/by-id/..." (`ls /dev/serial/by-id` shows those there are)', "driver": '"dynamixel"'}
+
 Positive = Annotated[float, Meta(gt=0)]
 
 
@@ -33,7 +35,7 @@ class Bus(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     name: str
     driver: str
     """Entry point of the group ``trade.drivers``: ``dynamixel``."""
-    port: str
+    port: Annotated[str, Meta(min_length=1)]
     """Serial device; prefer the stable name under /dev/serial/by-id."""
     baud: Annotated[int, Meta(ge=9600, le=4_500_000)] = 1_000_000
     rate_hz: Annotated[float, Meta(gt=0, le=1000)] = 100.0
@@ -174,7 +176,9 @@ def _explain(
     text = str(bad)
     keys = ", ".join(name for name in record.__struct_fields__ if name != "name")
     if missing := _MISSING.search(text):
-        return _wrong(where, key, f"missing required key {missing.group(1)!r}; the keys are {keys}")
+        example = _EXAMPLES.get(missing.group(1))
+        hint = f"write {missing.group(1)} = {example}" if example else f"the keys are {keys}"
+        return _wrong(where, key, f"missing required key {missing.group(1)!r}; {hint}")
     if unknown := _UNKNOWN.search(text):
         return _wrong(where, f"{key}.{unknown.group(1)}", f"unknown key; the keys are {keys}")
     at = _AT.search(text)

@@ -1,6 +1,7 @@
 """``trade call GROUP.NAME ARGUMENT...``: call one service and print its result."""
 
 import re
+import shlex
 import signal
 from collections.abc import Generator
 from contextlib import contextmanager
@@ -10,12 +11,14 @@ from typing import Annotated, Any
 import msgspec
 import typer
 
-from trade import Container, Handle, where
-from trade.errors import ConfigurationError, TooManyServices, TradeError
-from trade_gateway._list import Json
-from trade_gateway._output import Output, say_error
+from trade import Container, Handle
+from trade.errors import TooManyServices, TradeError
+from trade_gateway._list import Json, asked_for
+from trade_gateway._output import Output, UsageError, say_error
 from trade_gateway._system_choice import visitor
 
+_NO_NUMBER = re.compile(r"(?<![\w\"])(nan|inf|infinity)(?![\w\"])", re.IGNORECASE)
+_WORD = re.compile(r"[^\W\d][\w ./-]*")
 _NAMED = re.compile(r"([A-Za-z_]\w*)=(.*)", re.DOTALL)
 
 
@@ -73,9 +76,13 @@ def _cancel(handle: Handle) -> None:
 
 
 def find(visiting: Container, service: str, container: str | None, wait_s: float) -> Handle:
-    """The service of a group and name; one of exactly this group goes before those beneath it."""
+    """The service of a group and name; one of exactly this group goes before those beneath it.
+
+    Raises:
+        UsageError: the text names no service.
+    """
     group, _, name = service.rpartition(".")
-    constraint = where(name=name or service, group=group or None, container=container)
+    constraint = asked_for(f"service {service!r}", name=name or service, group=group or None, container=container)
     try:
         return visiting.find(constraint, wait_s=wait_s)
     except TooManyServices:
@@ -89,22 +96,38 @@ def parse_arguments(texts: list[str]) -> tuple[list[Any], dict[str, Any]]:
     """Arguments of a call from the words of a command line.
 
     Raises:
-        ConfigurationError: a word is not JSON.
+        UsageError: a word is not JSON.
     """
     args: list[Any] = []
     kwargs: dict[str, Any] = {}
-    for text in texts:
+    for place, text in enumerate(texts):
         named = _NAMED.fullmatch(text)
-        if named is None:
-            args.append(_value(text))
-        else:
-            kwargs[named.group(1)] = _value(named.group(2))
+        try:
+            if named is None:
+                args.append(msgspec.json.decode(text))
+            else:
+                kwargs[named.group(1)] = msgspec.json.decode(named.group(2))
+        except msgspec.DecodeError as bad:
+            problem = f"is not JSON ({bad}); {_remedy(named.group(2) if named else text, texts[place + 1 :])}"
+            raise UsageError(where=f"argument {text!r}", problem=problem) from None
     return args, kwargs
 
 
-def _value(text: str) -> Any:
+def _remedy(value: str, rest: list[str]) -> str:
+    """What was probably meant by a word that is not JSON, given those that follow it."""
+    if _NO_NUMBER.search(value):
+        return "JSON has no NaN and no infinity, and what moves takes neither"
+    for count in range(1, len(rest) + 1 if value[:1] in ("[", "{", '"') else 0):
+        if _is_json(whole := " ".join([value, *rest[:count]])):
+            return f"forgot quotes? The shell splits at spaces: {shlex.quote(whole)}"
+    if _WORD.fullmatch(value):
+        return f"forgot quotes? A text is written {shlex.quote(msgspec.json.encode(value).decode())}"
+    return """write numbers as 0.3, lists as '[0.3, -0.2]', texts as '"left"'; forgot quotes?"""
+
+
+def _is_json(text: str) -> bool:
     try:
-        return msgspec.json.decode(text)
-    except msgspec.DecodeError as bad:
-        problem = f"is not JSON ({bad}); write numbers as 0.3, lists as '[0.3, -0.2]', texts as '\"left\"'"
-        raise ConfigurationError(where=f"argument {text!r}", problem=problem) from None
+        msgspec.json.decode(text)
+    except msgspec.DecodeError:
+        return False
+    return True

@@ -6,8 +6,9 @@ from typing import Annotated, Any
 import typer
 from rich.markup import escape
 
-from trade import Constraint, Handle, where
-from trade_gateway._output import Output
+from trade import Constraint, Container, Handle, where
+from trade.errors import ConfigurationError
+from trade_gateway._output import Output, UsageError
 from trade_gateway._system_choice import visitor
 
 Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
@@ -22,7 +23,7 @@ def services(
     as_json: Json = False,
 ) -> None:
     """List services: group and name, arguments, where they run."""
-    constraint: Constraint = where(group=group, name=name)
+    constraint = asked_for(f"--group {group}" if group else "services", group=group, name=name)
     if not everything and group is None:
         constraint = constraint & ~where(group="trade")
     out = Output(as_json=as_json)
@@ -31,13 +32,36 @@ def services(
         if as_json:
             out.data([describe(handle) for handle in found])
         elif not found:
-            out.say(f"no services match {constraint}; is something up? [bold]trade up examples/rosie.toml --sim[/]")
+            out.say(_nothing(container, constraint))
         elif doc:
             for handle in found:
                 doc_text = indent(handle.doc or "(undocumented)", "  ")
                 out.say(f"[bold]{escape(handle.label)}[/]  {escape(handle.signature)}\n{escape(doc_text)}\n")
         else:
             out.table(("SERVICE", "CALLED AS", "EFFECT", "CONTAINER", "HOST"), [_row(handle) for handle in found])
+
+
+def asked_for(what: str, *, name: str | None, group: str | None, container: str | None = None) -> Constraint:
+    """The constraint that words of the command line ask for.
+
+    Raises:
+        UsageError: they make none.
+    """
+    try:
+        return where(name=name, group=group, container=container)
+    except ConfigurationError as bad:
+        raise UsageError(where=what, problem=bad.problem) from None
+
+
+def _nothing(container: Container, constraint: Constraint) -> str:
+    """What there is instead of what was asked for."""
+    others = container.services(~where(group="trade"))
+    groups = sorted({group for handle in others for group in handle.groups})
+    if groups:
+        return f"no services match {escape(str(constraint))}; there is {', '.join(groups)}"
+    return (
+        f"nothing is up in system {container.settings.system}; [bold]trade up examples/rosie.toml --sim[/] starts one"
+    )
 
 
 def describe(handle: Handle) -> dict[str, Any]:

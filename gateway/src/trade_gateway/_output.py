@@ -1,13 +1,23 @@
 """How the command line speaks: tables for people, JSON lines for programs, errors on stderr."""
 
+import shutil
 import sys
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Final
 
 import msgspec
 from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
+
+from trade.errors import ConfigurationError
+
+_GAP: Final = "  "
+_LEAST: Final = 20
+"""No column is cut shorter than this; columns on the right are left out before."""
+
+
+class UsageError(ConfigurationError):
+    """The words of the command line are wrong: exit code 2."""
 
 
 class Output:
@@ -26,15 +36,51 @@ class Output:
         """A line for people; programs do not get it."""
         if not self.as_json:
             self._console.print(text)
+            sys.stdout.flush()
 
     def table(self, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-        """Rows for people, as wide as the terminal."""
-        table = Table(box=None, header_style="bold", pad_edge=False)
-        for column in columns:
-            table.add_column(column, overflow="fold")
-        for row in rows:
-            table.add_row(*map(escape, row))
-        Console(highlight=False).print(table)
+        """Rows for people: in a terminal no wider than it, in a pipe whole."""
+        width = shutil.get_terminal_size().columns if sys.stdout.isatty() else None
+        head, *lines = table_lines(columns, rows, width)
+        self._console.print(f"[bold]{escape(head)}[/]")
+        for line in lines:
+            self._console.print(line, markup=False)
+        sys.stdout.flush()
+
+
+def table_lines(columns: Sequence[str], rows: Sequence[Sequence[str]], width: int | None) -> list[str]:
+    """The lines of a table, the header first.
+
+    Args:
+        columns: the headers, the most important one first.
+        rows: as many texts in each.
+        width: of the terminal, in characters: what does not fit is left out from the right, then the widest column is
+            cut. None: nothing is left out or cut.
+    """
+    widths = [max(map(len, texts)) for texts in zip(columns, *rows, strict=True)]
+    if width is not None:
+        widths = _fitted(widths, width)
+    lines = [_GAP.join(map(_cut, row, widths)).rstrip() for row in (columns, *rows)]
+    if width is not None and (left_out := columns[len(widths) :]):
+        lines.append(_cut(f"({', '.join(left_out)}: in a wider terminal, or with --json)", width).rstrip())
+    return lines
+
+
+def _fitted(widths: Sequence[int], width: int) -> list[int]:
+    fitted = list(widths)
+    while (excess := sum(fitted) + len(_GAP) * (len(fitted) - 1) - width) > 0:
+        widest = fitted.index(max(fitted))
+        if fitted[widest] - excess >= _LEAST:
+            fitted[widest] -= excess
+        elif len(fitted) > 1:
+            fitted.pop()
+        else:
+            return [width]
+    return fitted
+
+
+def _cut(text: str, width: int) -> str:
+    return text.ljust(width) if len(text) <= width else text[: width - 1] + "…"
 
 
 def say_error(error: BaseException) -> None:

@@ -14,9 +14,12 @@ from trade import Container
 from trade.errors import ConfigurationError
 from trade_drivers import attach, load
 from trade_drivers.robotfile import Robot
+from trade_gateway._faults import FaultWatch
 from trade_gateway._list import Json
-from trade_gateway._output import Output
+from trade_gateway._output import Output, UsageError
 from trade_gateway._system_choice import choice_of
+
+_LOOK_EVERY_S = 0.5
 
 
 def up(
@@ -29,8 +32,10 @@ def up(
 ) -> None:
     """Bring a robot up and keep it up; Ctrl-C or SIGTERM leaves it as its file says (hold or relax).
 
-    Attaching moves nothing and resets nothing.
+    Attaching moves nothing and resets nothing. A line tells when a joint has a fault, and when it has none any more.
     """
+    if sim_log is not None and not sim:
+        raise UsageError(where="--sim-log", problem="is the log of the simulator; it needs --sim")
     out = Output(as_json=as_json)
     robot = load(robot_file)
     with ExitStack() as stack:
@@ -40,7 +45,7 @@ def up(
         container = stack.enter_context(Container(choice_of(context).settings(name or robot.name)))
         _refuse_twice(container)
         _say_attaching(out, robot, ports)
-        stack.enter_context(
+        attached = stack.enter_context(
             attach(
                 robot,
                 register=container.register,
@@ -50,7 +55,10 @@ def up(
             )
         )
         _say_ready(out, robot, container, simulation)
-        while not asked_to_leave.wait(0.5):
+        faults = FaultWatch(attached.providers)
+        faults.begin(out)
+        while not asked_to_leave.wait(_LOOK_EVERY_S):
+            faults.tell(out)
             if simulation is not None and not simulation.running:
                 raise ConfigurationError(where="simulation", problem="its process ended; start again")
         out.say("leaving")
@@ -74,9 +82,10 @@ def _leaving() -> Generator[threading.Event]:
 
 def _simulation(robot_file: Path, log: Path | None) -> Any:
     try:
-        from trade_hil_sim import SimProcess, SimulationError  # noqa: PLC0415 - only needed without hardware
+        from trade_hil_sim import SimProcess, SimulationError, remove_leftovers  # noqa: PLC0415 - only needed without hardware
     except ImportError:
         raise ConfigurationError(where="--sim", problem="needs trade-hil-sim; pip install trade-hil-sim") from None
+    remove_leftovers()
     try:
         return SimProcess(robot_file, log=log, logged=log is not None)
     except SimulationError as problem:
@@ -108,4 +117,6 @@ def _say_ready(out: Output, robot: Robot, container: Container, simulation: Any)
     example = next((handle.label for handle in mine if handle.name == "state"), None)
     if example:
         out.say(f"in another terminal: [bold]trade services --group {robot.name}[/] or [bold]trade call {example}[/]")
+    if simulation:
+        out.say(f"to strike the simulator with faults (docs/simulators.md): {simulation.control_path}")
     out.say("Ctrl-C leaves")

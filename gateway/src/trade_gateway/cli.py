@@ -7,7 +7,7 @@ import typer
 
 from trade.errors import TradeError
 from trade_gateway import _call, _list, _up
-from trade_gateway._output import say_error
+from trade_gateway._output import UsageError, say_error
 from trade_gateway._system_choice import SystemChoice
 
 __all__ = ["app", "main"]
@@ -54,9 +54,12 @@ def options(
 
 
 def main() -> None:
-    """Run the command line; errors of ours are one line on stderr and exit code 1."""
+    """Run the command line; errors of ours are one line on stderr and exit code 1, or 2 if its words are wrong."""
     try:
         app()
+    except UsageError as error:
+        say_error(error)
+        sys.exit(2)
     except TradeError as error:
         say_error(error)
         sys.exit(1)

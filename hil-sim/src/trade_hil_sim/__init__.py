@@ -33,7 +33,7 @@ from ._faults import (
 from ._judge import events, instructions, motion_writes, read_log, received, sent, writes
 from ._line import Peer, SerialLine
 from ._log import ByteLog, Entry
-from ._process import SimProcess
+from ._process import SimProcess, remove_leftovers
 from ._state import BusState, DeviceState
 from .dynamixel import MODELS, XL430_W250, XM430_W350, DynamixelBus, Servo
 
@@ -79,6 +79,7 @@ __all__ = [
     "motion_writes",
     "read_log",
     "received",
+    "remove_leftovers",
     "sent",
     "writes",
 ]

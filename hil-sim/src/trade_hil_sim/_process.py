@@ -1,6 +1,7 @@
 """A simulator in a process of its own, as tests and demos use it."""
 
 import contextlib
+import fcntl
 import os
 import select
 import shutil
@@ -10,7 +11,7 @@ import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Final
+from typing import BinaryIO, Final
 
 import msgspec
 
@@ -19,11 +20,38 @@ from ._errors import SimulationError
 from ._judge import read_log
 from ._log import Entry
 
-__all__ = ["Ready", "SimProcess"]
+__all__ = ["Ready", "SimProcess", "remove_leftovers"]
 
+_PREFIX: Final = "trade-sim-"
+_OWNER: Final = "_owner.pid"
 READY_S: Final = 30.0
 """How long a simulator may take to start; a busy machine needs seconds to import."""
 END_S: Final = 5.0
+
+
+def _own_folder() -> tuple[Path, BinaryIO]:
+    """A new folder, and the open file that shows that its owner lives: the lock on it ends with the process."""
+    folder = Path(tempfile.mkdtemp(prefix=_PREFIX))
+    sign = (folder / _OWNER).with_suffix(".new").open("wb")
+    fcntl.flock(sign, fcntl.LOCK_EX)
+    sign.write(f"{os.getpid()}\n".encode())
+    sign.flush()
+    (folder / _OWNER).with_suffix(".new").rename(folder / _OWNER)  # now it is locked, others may look
+    return folder, sign
+
+
+def remove_leftovers() -> list[Path]:
+    """Remove the temporary folders of this user's simulators whose owner was killed; returns them."""
+    removed: list[Path] = []
+    for folder in Path(tempfile.gettempdir()).glob(f"{_PREFIX}*"):
+        with contextlib.suppress(OSError):  # another user's, or another kind of folder, or its owner lives
+            if folder.is_symlink() or folder.stat().st_uid != os.getuid():
+                continue
+            with (folder / _OWNER).open("rb") as sign:
+                fcntl.flock(sign, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                shutil.rmtree(folder)
+                removed.append(folder)
+    return removed
 
 
 class Ready(msgspec.Struct, frozen=True):
@@ -62,7 +90,7 @@ class SimProcess:
         paced: bool = True,
         ready_s: float = READY_S,
     ) -> None:
-        self._own = Path(tempfile.mkdtemp(prefix="trade-sim-"))
+        self._own, self._sign = _own_folder()
         self._control: SimControl | None = None
         where = directory or self._own
         command = [sys.executable, "-m", "trade_hil_sim", str(robot_file), "--dir", str(where)]
@@ -140,6 +168,7 @@ class SimProcess:
         if self._process.stdout is not None:
             self._process.stdout.close()
         shutil.rmtree(self._own, ignore_errors=True)
+        self._sign.close()
 
     def __enter__(self) -> "SimProcess":
         return self

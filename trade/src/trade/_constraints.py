@@ -1,6 +1,7 @@
 """``where``: what a service must be. And, or, not, kept as disjunctive normal form; plain data that can be sent."""
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from fnmatch import fnmatchcase
 from functools import lru_cache
@@ -16,6 +17,8 @@ from trade.errors import ConfigurationError
 
 __all__ = ["Candidate", "Constraint", "where"]
 
+GROUP: Final = re.compile(r"[A-Za-z0-9_-]{1,80}(\.[A-Za-z0-9_-]{1,80})*")
+"""What a group looks like: whole segments joined by dots."""
 _MOST_CLAUSES: Final = 1000
 _Field = Literal[
     "name", "group", "host", "container", "local", "args", "returns", "achieves", "uses", "kind", "meta", "healthy"
@@ -66,6 +69,10 @@ class Term(Struct, frozen=True, array_like=True, order=True):
                 parse_predicates(self.pattern)
             case "meta":
                 _key_and_value(self.pattern)
+            case "group":
+                _check_group(self.pattern)
+            case "uses":
+                _check_no_pattern(self.field, self.pattern)
             case _:
                 pass
 
@@ -113,6 +120,20 @@ class Term(Struct, frozen=True, array_like=True, order=True):
                 return f"meta {key}={value!r}"
             case _:
                 return f"{self.field}={self.pattern!r}"
+
+
+def _check_group(group: str) -> None:
+    _check_no_pattern("group", group)
+    if not GROUP.fullmatch(group):
+        raise ConfigurationError(problem=f"group={group!r} is no group; use words joined by dots, such as rosie.head")
+
+
+def _check_no_pattern(field: str, text: str) -> None:
+    if is_exact(text):
+        return
+    whole = re.split(r"\.?[^.]*[*?\[]", text)[0]
+    problem = f"{field}={text!r} would match nothing: it is whole dotted segments, and one selects all beneath it"
+    raise ConfigurationError(problem=f"{problem}; write {field}={whole!r}" if whole else f"{problem}, as rosie does")
 
 
 def under(group: str, selected: str) -> bool:
@@ -240,7 +261,8 @@ class _Where:
             healthy: whether its provider says that nothing is wrong.
 
         Raises:
-            ConfigurationError: a pattern is empty, a type cannot be sent, a predicate is malformed.
+            ConfigurationError: a pattern is empty or stands where none may, a type cannot be sent, a predicate is
+                malformed.
         """
         given: tuple[tuple[_Field, str | None], ...]
         given = (("name", name), ("group", group), ("host", host), ("container", container))

@@ -3,7 +3,6 @@
 import asyncio
 import atexit
 import contextlib
-import difflib
 import os
 import secrets
 import threading
@@ -21,6 +20,7 @@ from trade._coroutines import AsyncLoop
 from trade._deadman import Deadman
 from trade._dispatch import Dispatcher
 from trade._handle import Bound, Handle, Run
+from trade._hints import no_such_service, too_many_services
 from trade._invoke import LocalTarget, RemoteTarget, Request, container_closed
 from trade._joining import join
 from trade._lock import Lock, OnLost, OnRequest
@@ -49,7 +49,7 @@ from trade._wire import (
 )
 from trade._withdrawn import Withdrawn
 from trade._zenoh import ZenohTransport
-from trade.errors import ConfigurationError, NoSuchService, ServiceGone, TooManyServices
+from trade.errors import ConfigurationError, ServiceGone
 
 __all__ = ["Container"]
 
@@ -239,20 +239,10 @@ class Container:
             return bool(matches)
 
         if not self._registry.wait_for(found, wait_s):
-            raise NoSuchService(constraint=str(constraint), waited_s=wait_s, near=self._near(constraint))
+            raise no_such_service(constraint, self._registry.select(where()), wait_s)
         if len(matches) > 1:
-            raise TooManyServices(
-                constraint=str(constraint), matches=[f"{match.label} in {match.container}" for match in matches]
-            )
+            raise too_many_services(constraint, matches)
         return Handle(self, matches[0].key, matches[0])
-
-    def _near(self, constraint: Constraint) -> tuple[str, ...]:
-        """Labels that look like what was asked for, for the error's hint."""
-        asked = [term for clause in constraint.clauses for term in clause if not term.negated]
-        group = next((term.pattern for term in asked if term.field == "group"), "")
-        name = next((term.pattern for term in asked if term.field == "name"), "")
-        labels = {record.label for record in self._registry.select(where())}
-        return tuple(difflib.get_close_matches(".".join(filter(None, (group, name))), sorted(labels), n=2, cutoff=0.7))
 
     def addresses(self) -> list[Address]:
         """Where the containers of the system are, this one included."""

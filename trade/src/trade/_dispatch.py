@@ -42,6 +42,7 @@ from trade._wire import (
     is_chunk,
     reply_key,
 )
+from trade.errors import InvalidResult, NotSerialisable, RemoteError, TradeError
 
 _logger = logging.getLogger("trade")
 
@@ -50,6 +51,8 @@ _PARTING_S: Final = 2.0
 _KINDS: Final = frozenset(("call", "stop"))
 _MOST_REPLY_KEYS: Final = 1024
 _SYSTEM: Final = f"{DOMAIN}/{PROVIDER}"
+_DEFECTS: Final = (InvalidResult, NotSerialisable, RemoteError)
+"""Errors of ours that are mistakes of a provider; the others are answers it gives on purpose."""
 _decode_cancel: Final = msgspec.msgpack.Decoder(CancelArguments).decode
 
 
@@ -325,7 +328,10 @@ def _run(caller: str, call: Call, service: LocalService, ongoing: Ongoing | None
     try:
         return Status.OK, service.signature.encode_result(service.run(call.args, context))
     except BaseException as error:  # noqa: BLE001 - whatever a provider raises belongs to the caller
-        return Status.ERROR, Raw(encode_message(service.failure(error, call.args)))
+        info = service.failure(error, call.args)
+        if not isinstance(error, TradeError) or isinstance(error, _DEFECTS):
+            _logger.warning("%s failed in a call of %s:\n%s", service.label, caller, info.traceback or info.message)
+        return Status.ERROR, Raw(encode_message(info))
 
 
 class _Crew:

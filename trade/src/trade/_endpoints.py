@@ -2,11 +2,14 @@
 
 import ipaddress
 import socket
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from trade.errors import ConfigurationError
 
 __all__ = ["Endpoint", "accepts", "dialled_from_here", "free_endpoint", "with_free_port"]
+
+_PROTOCOLS: Final = ("tcp", "udp", "tls", "quic", "ws")
+_LAST_PORT: Final = 65535
 
 
 class Endpoint(NamedTuple):
@@ -27,6 +30,12 @@ class Endpoint(NamedTuple):
         host, colon, port = plain.rpartition(":")
         if not (protocol and slash and host and colon and port.isascii() and port.isdigit()):
             raise ConfigurationError(where=f"endpoint {text!r}", problem="must look like tcp/127.0.0.1:7450")
+        if protocol not in _PROTOCOLS:
+            problem = f"there is no protocol {protocol!r}; there is {', '.join(_PROTOCOLS)}"
+            raise ConfigurationError(where=f"endpoint {text!r}", problem=problem)
+        if int(port) > _LAST_PORT:
+            problem = f"there is no port {port}; ports go up to {_LAST_PORT}"
+            raise ConfigurationError(where=f"endpoint {text!r}", problem=problem)
         return cls(protocol, host, int(port), where[len(plain) :])
 
     @property

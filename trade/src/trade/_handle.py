@@ -7,7 +7,7 @@ import logging
 import threading
 from collections.abc import Callable, Generator, Mapping
 from types import MappingProxyType
-from typing import Any, Final, Protocol
+from typing import Any, Final, NoReturn, Protocol
 
 from trade._registry import Record
 from trade._wire import Address, Scalar, ServiceKey
@@ -307,6 +307,18 @@ class Handle:
 
     def __hash__(self) -> int:
         return hash(self.key)
+
+    def __copy__(self) -> "Handle":
+        return self
+
+    def __deepcopy__(self, memo: object) -> "Handle":
+        return self
+
+    def __reduce__(self) -> NoReturn:
+        raise TypeError(
+            f"{self!r} cannot be pickled: a handle belongs to its container. Give it to the other process as an "
+            "argument or a result of a service, or look the service up there with trade.find(...)"
+        )
 
     def __repr__(self) -> str:
         return f"<Handle {self.label} in {self.container}>"

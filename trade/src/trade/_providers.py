@@ -1,7 +1,6 @@
 """The objects a container offers: reading them into services, announcing and withdrawing them."""
 
 import os
-import re
 import socket
 import threading
 from collections.abc import Callable, Mapping, Sequence
@@ -9,7 +8,7 @@ from typing import Any, Final, NamedTuple, cast
 
 from msgspec import Struct, structs
 
-from trade._constraints import checked_meta
+from trade._constraints import GROUP, checked_meta
 from trade._coroutines import AsyncLoop
 from trade._dispatch import LocalService
 from trade._locks import LockTable
@@ -32,8 +31,6 @@ from trade._wire import (
     registry_key,
 )
 from trade.errors import ConfigurationError
-
-_GROUP: Final = re.compile(r"[A-Za-z0-9_-]{1,80}(\.[A-Za-z0-9_-]{1,80})*")
 
 _LONGEST_HEALTH: Final = 500
 
@@ -288,7 +285,7 @@ def checked_groups(provider: object, groups: str | Sequence[str]) -> tuple[str, 
     named = (groups,) if isinstance(groups, str) else tuple(groups)
     for group in named:
         is_text = isinstance(group, str)  # pyright: ignore[reportUnnecessaryIsInstance] - callers may not check types
-        if not is_text or not _GROUP.fullmatch(group) or group.split(".")[0] == DOMAIN:
+        if not is_text or not GROUP.fullmatch(group) or group.split(".")[0] == DOMAIN:
             problem = f"{group!r} is no group; use words joined by dots, such as rosie.head ({DOMAIN!r} is reserved)"
             raise ConfigurationError(where=type(provider).__qualname__, problem=problem)
     return named

@@ -1,17 +1,32 @@
 """Who a container is and where it may be reached; every default stays on this host."""
 
+import difflib
+import logging
 import os
 import socket
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
 from trade._endpoints import Endpoint
 from trade._wire import as_chunk, is_chunk
 from trade.errors import ConfigurationError
 
 __all__ = ["Settings"]
+
+_logger = logging.getLogger("trade")
+_VARIABLES: Final = (
+    "TRADE_SYSTEM",
+    "TRADE_IDENTITY",
+    "TRADE_CONTAINER",
+    "TRADE_LISTEN",
+    "TRADE_CONNECT",
+    "TRADE_CREDENTIALS",
+    "TRADE_INSECURE_LAN",
+    "TRADE_RUNTIME_DIR",
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -84,8 +99,10 @@ class Settings:
         """Settings from arguments, else from the environment, else the defaults.
 
         The environment has ``TRADE_SYSTEM``, ``TRADE_IDENTITY``, ``TRADE_CONTAINER``, ``TRADE_LISTEN`` and
-        ``TRADE_CONNECT`` (comma-separated), ``TRADE_CREDENTIALS`` (``user:password``), ``TRADE_INSECURE_LAN`` (``1``).
+        ``TRADE_CONNECT`` (comma-separated), ``TRADE_CREDENTIALS`` (``user:password``), ``TRADE_INSECURE_LAN`` (``1``)
+        and ``TRADE_RUNTIME_DIR``. Others that begin with ``TRADE_`` are warned of.
         """
+        _warn_of_unknown(environment)
         named = system or environment.get("TRADE_SYSTEM") or None
         return cls(
             system=named or f"{_user()}@{as_chunk(socket.gethostname())}",
@@ -97,6 +114,14 @@ class Settings:
             insecure_lan=environment.get("TRADE_INSECURE_LAN") == "1" if insecure_lan is None else insecure_lan,
             explicit_system=named is not None,
         )
+
+
+def _warn_of_unknown(environment: Mapping[str, str]) -> None:
+    for name in sorted(environment):
+        if name.startswith("TRADE_") and name not in _VARIABLES:
+            near = difflib.get_close_matches(name, _VARIABLES, n=1, cutoff=0.8)
+            hint = f"did you mean {near[0]}?" if near else f"there is {', '.join(_VARIABLES)}"
+            _logger.warning("the environment variable %s means nothing to TRADE; %s", name, hint)
 
 
 def _split(environment: Mapping[str, str], name: str) -> list[str]:

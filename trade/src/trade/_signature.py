@@ -14,6 +14,7 @@ import msgspec
 from msgspec import UNSET, Raw, UnsetType
 from msgspec.structs import astuple
 
+from trade._limits import NOT_FINITE, limits_text, problem_text, value_at
 from trade._records import noted
 from trade._secret import MASK, is_secret, mask
 from trade._service import ServiceMark
@@ -226,10 +227,20 @@ class Signature:
         if at is not None:
             index, name, rest = at.groups()
             argument = self._positional[int(index)] if index is not None else name
-            problem = text[: at.start()] + (f" (at {rest})" if rest else "")
+            problem = self._with_value(text[: at.start()], raw, argument, rest) + (f" (at {rest})" if rest else "")
         else:
             argument, problem = self._count_problem(text, raw)
         return InvalidArgument(service=self._service, argument=argument, problem=problem, signature=self.info.signature)
+
+    def _with_value(self, complaint: str, raw: Raw, argument: str, path: str) -> str:
+        if argument in self._secrets:
+            return complaint
+        given: Any = msgspec.msgpack.decode(raw)
+        try:
+            whole = given[self._positional.index(argument)] if isinstance(given, list) else given[argument]
+            return problem_text(complaint, value_at(whole, path))
+        except (LookupError, TypeError):
+            return complaint
 
     def _count_problem(self, text: str, raw: Raw) -> tuple[str, str]:
         given: Any = msgspec.msgpack.decode(raw)
@@ -251,8 +262,7 @@ class Signature:
     def _not_finite(self, args: Sequence[Any], kwargs: Mapping[str, Any]) -> InvalidArgument:
         named = [*zip(self._positional, args, strict=False), *kwargs.items()]
         name = next(name for name, value in named if not _finite(value))
-        problem = "must be finite: no NaN, no infinity"
-        return InvalidArgument(service=self._service, argument=name, problem=problem, signature=self.info.signature)
+        return InvalidArgument(service=self._service, argument=name, problem=NOT_FINITE, signature=self.info.signature)
 
 
 def _hints(where: str, function: Callable[..., Any]) -> dict[str, Any]:
@@ -270,6 +280,10 @@ def _parameters(where: str, function: Callable[..., Any]) -> list[inspect.Parame
     for parameter in every:
         if parameter.kind in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD):
             problem = f"a service cannot take {parameter}; name its parameters"
+            raise ConfigurationError(where=where, problem=problem)
+        if parameter.annotation is parameter.empty:
+            name = parameter.name
+            problem = f"argument {name!r} has no type hint; write {name}: float, say, or {name}: Any to take anything"
             raise ConfigurationError(where=where, problem=problem)
     return every
 
@@ -371,9 +385,10 @@ def _default_text(parameter: inspect.Parameter, hint: str) -> str:
 
 
 def _type_text(kind: Any) -> str:
-    """A type as a person would write it: without modules, notes and ``typing``."""
+    """A type as a person would write it: without modules and ``typing``, with its limits in parentheses."""
     if hasattr(kind, "__metadata__"):
-        return _type_text(kind.__origin__)
+        limits = limits_text(kind.__metadata__)
+        return _type_text(kind.__origin__) + (f" ({limits})" if limits else "")
     if kind is None or kind is type(None):
         return "None"
     if kind is Ellipsis:

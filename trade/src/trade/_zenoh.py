@@ -137,9 +137,10 @@ class ZenohTransport(Transport):
         try:
             self._session = open_session(settings)
         except zenoh.ZError as bad:
+            reason = str(bad).partition(" at /")[0]  # what follows is a place in zenoh's sources
             raise ConfigurationError(
                 where=f"listen {', '.join(settings['listen/endpoints'])}",
-                problem=f"cannot listen there: {bad}; is the address taken, or not of this host?",
+                problem=f"cannot listen there: {reason}; is the address taken, or not of this host?",
             ) from None
         self.links: Final = Links(self._session, settings)
 

@@ -61,6 +61,11 @@ def _rebuild(cls: type[TradeError], data: dict[str, object]) -> TradeError:
     return cls(**data)
 
 
+def _some(texts: Sequence[str]) -> str:
+    """The first five."""
+    return ", ".join(list(texts)[:5]) + (", ..." if len(texts) > 5 else "")
+
+
 # --- the caller must act
 
 
@@ -76,10 +81,18 @@ class NoSuchService(CallerError, LookupError):
     constraint: str
     waited_s: float = 0.0
     near: Sequence[str] = ()
+    groups: Sequence[str] = ()
+    """Some of those there are in the system."""
 
     def describe(self) -> str:
-        hint = f"; did you mean {' or '.join(self.near)}?" if self.near else "; `trade services` lists what there is"
-        return f"no service matches {self.constraint} after {self.waited_s:.3g} s{hint}"
+        return f"no service matches {self.constraint} after {self.waited_s:.3g} s; {self._hint()}"
+
+    def _hint(self) -> str:
+        if self.near:
+            return f"did you mean {' or '.join(self.near)}?"
+        if self.groups:
+            return f"there is {_some(self.groups)}; `trade services` lists what they offer"
+        return "nothing is offered in this system: is its provider up, with the same TRADE_SYSTEM?"
 
 
 @dataclass(kw_only=True, eq=False)
@@ -88,13 +101,16 @@ class TooManyServices(CallerError, LookupError):
 
     constraint: str
     matches: Sequence[str]
+    differ: Sequence[str] = ()
+    """Keywords of ``where`` that tell some of them apart."""
 
     def describe(self) -> str:
-        shown = ", ".join(list(self.matches)[:5]) + (", ..." if len(self.matches) > 5 else "")
-        return (
-            f"{len(self.matches)} services match {self.constraint}: {shown}; add a constraint (group, container, "
-            "host, local), or take them all with trade.services(...)"
-        )
+        if self.differ:
+            remedy = f"add a constraint on what tells them apart ({', '.join(self.differ)})"
+        else:
+            remedy = "nothing that can be asked for tells them apart: register them in groups or with meta of their own"
+        found = f"{len(self.matches)} services match {self.constraint}: {_some(self.matches)}"
+        return f"{found}; {remedy}, or take them all with trade.services(...)"
 
 
 @dataclass(kw_only=True, eq=False)

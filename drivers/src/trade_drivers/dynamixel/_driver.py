@@ -65,8 +65,9 @@ def open_exchange(robot: Robot, bus: Bus, port: str) -> Exchange:
     """
     axes = [Axis(f"{robot.name}.{joint.name}", port, joint) for joint in _known(robot, bus)]
     check_bus(bus, axes, robot.where)
-    wire = _wire(port, bus.baud)
-    where = f"{robot.where}: bus.{bus.name}.port"
+    table_of_bus = f"{robot.where}: bus.{bus.name}"
+    wire = _wire(port, bus.baud, table_of_bus)
+    where = f"{table_of_bus}.port"
     try:
         wire.open()
         exchange = Exchange(wire, bus, axes)
@@ -79,7 +80,7 @@ def open_exchange(robot: Robot, bus: Bus, port: str) -> Exchange:
         exchange.cycle()
     except PortLost as lost:
         wire.close()
-        problem = f"{port} cannot be used: {lost}; is its adapter plugged in? See `ls -l /dev/serial/by-id`"
+        problem = f"{port}: {lost}; is its adapter plugged in? `ls -l /dev/serial/by-id` shows those that are"
         raise ConfigurationError(where=where, problem=problem) from None
     except WireError as bad:
         wire.close()
@@ -101,10 +102,10 @@ def _known(robot: Robot, bus: Bus) -> list[Joint]:
     return joints
 
 
-def _wire(port: str, baud: int) -> "Wire":
+def _wire(port: str, baud: int, where: str) -> "Wire":
     try:
         from trade_drivers.dynamixel._sdk import Wire  # noqa: PLC0415 - the vendor library is optional
     except ImportError as missing:
         problem = f'needs dynamixel-sdk ({missing}); pip install "trade-drivers[dynamixel]"'
         raise ConfigurationError(where="driver dynamixel", problem=problem) from None
-    return Wire(port, baud)
+    return Wire(port, baud, where)

@@ -117,7 +117,7 @@ class Move(Job):
             if axis.silent or axis.age_ns(now_ns) > self.exchange.stale_after_ns:
                 return axis.deaf(now_ns)
         if self._until_ns is not None and now_ns >= self._until_ns:
-            return MotionStopped(device=self.axes[0].name, reason="the deadline of its call passed")
+            return MotionStopped(device=self.axes[0].name, reason="the deadline of its call came; give it a longer one")
         return None
 
     def _arrived(self, axis: Axis, elapsed_s: float) -> bool:

@@ -18,6 +18,8 @@ __all__ = ["DynamixelGroup", "DynamixelMotor"]
 
 _DEFAULT_EXPIRY_NS: Final = 1_000_000_000
 """How long a plain Python call may wait for its turn on the bus."""
+_ANSWER_NS: Final = 100_000_000
+"""For one exchange (48 ms at most), the hold, and the way back to the caller."""
 _HEALTH_STALE_NS: Final = 2_000_000_000
 
 
@@ -49,12 +51,12 @@ class _Joints:
         self._exchange.submit(job)
         job.wait(self._thread.alive)
 
-    def _expiry(self) -> tuple[int, int | None]:
-        """When it may begin at the latest, and when it must be over: a plain Python call ends when it ends."""
+    def _expiry(self) -> tuple[int, bool]:
+        """When it may begin at the latest, and whether it must be over then: a plain Python call ends when it ends."""
         call = current_call()
         if call is None or call.expires_ns is None:
-            return self._exchange.clock() + _DEFAULT_EXPIRY_NS, None
-        return call.expires_ns, call.expires_ns
+            return self._exchange.clock() + _DEFAULT_EXPIRY_NS, False
+        return call.expires_ns, True
 
     def _move(self, positions_rad: Sequence[float], speed_rad_s: float | None, argument: str) -> list[float]:
         service = f"{self._name}.move_to"
@@ -68,7 +70,10 @@ class _Joints:
         ]
         speed = None if speed_rad_s is None else _finite(speed_rad_s, service, "speed_rad_s")
         speeds = [_speed_counts(axis, speed) for axis in self._axes]
-        expires_ns, until_ns = self._expiry()
+        expires_ns, ends = self._expiry()
+        if ends:
+            expires_ns -= _time_to_answer_ns(expires_ns - self._exchange.clock())
+        until_ns = expires_ns if ends else None
         move = Move(
             self._exchange, self._axes, goals, speeds, service=service, expires_ns=expires_ns, until_ns=until_ns
         )
@@ -133,6 +138,14 @@ class DynamixelGroup(_Joints, JointGroup):
 
     def move_to(self, positions_rad: list[float], speed_rad_s: float | None = None) -> list[float]:
         return self._move(positions_rad, speed_rad_s, "positions_rad")
+
+
+def _time_to_answer_ns(left_ns: int) -> int:
+    """How long before its call's deadline a move ends, so that the caller is told that the joint was stopped.
+
+    Stopped at the deadline itself, the answer would come when nobody waits for it any more.
+    """
+    return min(_ANSWER_NS, max(0, left_ns) // 5)
 
 
 def _finite(value: float, service: str, argument: str) -> float:

@@ -38,6 +38,8 @@ __all__ = ["Wire"]
 _BROADCAST: Final = 254
 _ALERT: Final = 0x80
 _WHOLE_SECOND_ANSWER_S: Final = 0.005
+_BAUDS: Final = (9600, 57600, 115200, 1_000_000, 2_000_000, 3_000_000, 4_000_000)
+"""XL430 e-Manual, register 8, without 4.5 Mbaud, which the library does not know."""
 
 
 class _QuietPort(PortHandler):
@@ -135,14 +137,24 @@ class _Packets(Protocol2PacketHandler):
         return (b"", COMM_RX_TIMEOUT) if frame is None else (frame, COMM_SUCCESS)
 
 
+def _error_number(bad: BaseException | None) -> int | None:
+    """The system's number of an error, which pyserial often leaves in the error that its own stands for."""
+    if bad is None:
+        return None
+    numbers = [getattr(bad, "errno", None), *bad.args[:1]]
+    return next((number for number in numbers if isinstance(number, int)), None) or _error_number(bad.__context__)
+
+
 class Wire:
     """One serial port and the packets on it. Not thread safe: one thread owns it.
 
     After an exchange that failed, the next one first keeps silent until ``settled_at``; ``pause`` is how it waits.
     """
 
-    def __init__(self, path: str, baud: int) -> None:
+    def __init__(self, path: str, baud: int, where: str = "bus") -> None:
         self.path = path
+        self._where = where
+        """The table of the robot file that describes this bus, for messages."""
         self.settled_at = 0.0
         self.pause: Callable[[float], None] = time.sleep
         self._port = _QuietPort(path, baud)
@@ -152,7 +164,7 @@ class Wire:
         """Take the port for this process alone.
 
         Raises:
-            ConfigurationError: another driver owns it, or its baud rate or permissions are wrong.
+            ConfigurationError: another driver owns it, it is no serial port, or its baud rate or permissions are wrong.
             PortLost: there is no such device.
         """
         try:
@@ -161,17 +173,22 @@ class Wire:
             self.close()
             raise self._cannot_open(bad) from None
         if not opened:
-            raise ConfigurationError(where=self.path, problem=f"baud {self._port.baudrate} is none the library can set")
+            problem = f"{self._port.baudrate} cannot be set; the servos know {', '.join(map(str, _BAUDS))}"
+            raise ConfigurationError(where=f"{self._where}.baud", problem=problem)
 
     def _cannot_open(self, bad: Exception) -> Exception:
-        match getattr(bad, "errno", None) or (bad.args[0] if bad.args else None):
+        match _error_number(bad):
             case errno.EAGAIN | errno.EBUSY:
                 problem = f"another driver owns this port; stop it first (`fuser {self.path}` names the process)"
             case errno.EACCES | errno.EPERM:
                 problem = "no permission to open it; add yourself to its group (often dialout) and log in again"
+            case errno.ENOTTY | errno.EISDIR:
+                problem = "is no serial port; `ls -l /dev/serial/by-id` shows those there are"
+            case errno.ENOENT:
+                return PortLost("there is no such device")
             case _:
                 return PortLost(str(bad))
-        return ConfigurationError(where=self.path, problem=problem)
+        return ConfigurationError(where=f"{self._where}.port", problem=f"{self.path}: {problem}")
 
     def close(self) -> None:
         """Let go of the port; more than once is fine."""
