@@ -15,8 +15,12 @@ from trade._constraints import Constraint, where
 from trade._container import Container
 from trade._context import CallContext, current_call, progress
 from trade._handle import Bound, Handle, Run
+from trade._lock import Lock, OnLost, OnRequest
+from trade._locking import LEASE_S
+from trade._locks import LockInfo
 from trade._many import Outcome
 from trade._notifications import Callback, Notification
+from trade._resources import Permit, Resource, permit
 from trade._secret import Secret
 from trade._service import service
 from trade._settings import Settings
@@ -30,9 +34,13 @@ __all__ = [
     "Container",
     "ContainerInfo",
     "Handle",
+    "Lock",
+    "LockInfo",
     "Meta",
     "Notification",
     "Outcome",
+    "Permit",
+    "Resource",
     "Run",
     "Secret",
     "Settings",
@@ -42,6 +50,7 @@ __all__ = [
     "acall_sequence",
     "add_group",
     "alter",
+    "break_lock",
     "call",
     "call_all",
     "call_sequence",
@@ -55,9 +64,14 @@ __all__ = [
     "find",
     "joined",
     "left",
+    "lock",
+    "locks",
+    "permit",
     "progress",
     "register",
     "remove_group",
+    "request_release",
+    "resume",
     "service",
     "services",
     "set_groups",
@@ -209,3 +223,52 @@ def left(constraint: Constraint, call: Callback) -> Notification:
 def changed(constraint: Constraint, call: Callback) -> Notification:
     """Call with the handle of every service that matches and is altered; see `Container.changed`."""
     return container().changed(constraint, call)
+
+
+def lock(
+    which: Constraint | Iterable[Handle],
+    *,
+    purpose: str = "",
+    wait_s: float = 10.0,
+    lease_s: float = LEASE_S,
+    priority: int = 0,
+    delegates: Sequence[str] = (),
+    partial: bool = False,
+    on_lost: OnLost | None = None,
+    on_request: OnRequest | None = None,
+) -> Lock:
+    """Services for oneself alone: ``with trade.lock(where(group="rosie.head"), purpose="look"):``.
+
+    See `Container.lock`.
+    """
+    return container().lock(
+        which,
+        purpose=purpose,
+        wait_s=wait_s,
+        lease_s=lease_s,
+        priority=priority,
+        delegates=delegates,
+        partial=partial,
+        on_lost=on_lost,
+        on_request=on_request,
+    )
+
+
+def locks() -> list[LockInfo]:
+    """Every lock in the system; see `Container.locks`."""
+    return container().locks()
+
+
+def request_release(which: Constraint | Iterable[Handle], reason: str) -> list[str]:
+    """Ask the owners of locks to give them back; see `Container.request_release`."""
+    return container().request_release(which, reason)
+
+
+def break_lock(which: Constraint | Iterable[Handle], reason: str) -> list[LockInfo]:
+    """Take locks away from their owners; see `Container.break_lock`."""
+    return container().break_lock(which, reason)
+
+
+def resume(which: Constraint | Iterable[Handle]) -> list[str]:
+    """Let services move again after a stop by somebody else; see `Container.resume`."""
+    return container().resume(which)

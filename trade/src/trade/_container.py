@@ -25,7 +25,7 @@ from trade._invoke import LocalTarget, RemoteTarget, Request, container_closed
 from trade._joining import join
 from trade._lock import Lock, OnLost, OnRequest
 from trade._locking import LEASE_S, Locking
-from trade._locks import LockTable
+from trade._locks import LockInfo, LockTable
 from trade._notifications import Callback, Notification, Notifier
 from trade._own_services import OwnServices
 from trade._providers import Providers, checked_groups, checked_health
@@ -474,7 +474,9 @@ class Container:
         on_lost: OnLost | None = None,
         on_request: OnRequest | None = None,
     ) -> Lock:
-        """Take services for oneself alone, on all their containers or on none.
+        """Services for oneself alone, on all their containers or on none: ``with container.lock(...):``.
+
+        Nothing is taken before the context is entered (or `Lock.acquire` called).
 
         Args:
             which: the actuating services that match, as they are now, or handles.
@@ -505,6 +507,41 @@ class Container:
             on_lost=on_lost,
             on_request=on_request,
         )
+
+    def locks(self) -> list[LockInfo]:
+        """Every lock in the system: what, whose, what for, since when, who waits."""
+        self._check_open()
+        return self.locking.locks()
+
+    def request_release(self, which: Constraint | Iterable[Handle], reason: str) -> list[str]:
+        """Ask the owners of locks on these services to give them back; they hear of who asks, and why.
+
+        Returns:
+            Who was asked.
+        """
+        self._check_open()
+        return self.locking.request_release(which, reason)
+
+    def break_lock(self, which: Constraint | Iterable[Handle], reason: str) -> list[LockInfo]:
+        """Take the locks on these services away from their owners; what moves under them stops.
+
+        Returns:
+            Those that were broken.
+        """
+        self._check_open()
+        return self.locking.break_lock(which, reason)
+
+    def resume(self, which: Constraint | Iterable[Handle]) -> list[str]:
+        """Let services move again after a stop by somebody else.
+
+        Returns:
+            The resources that were stopped.
+
+        Raises:
+            LockedByOther: it is the owner of their lock who resumes.
+        """
+        self._check_open()
+        return self.locking.resume(which)
 
     # --- being
 

@@ -20,6 +20,7 @@ from trade._system import DOMAIN, PROVIDER
 from trade._wire import Address, ServiceKey, Token
 from trade.errors import (
     Busy,
+    ConfigurationError,
     ContainerLost,
     LockedByOther,
     LockLost,
@@ -35,6 +36,8 @@ _AGAIN_S: Final = 0.1
 _BEATS: Final = 4
 """Renewals within one lease."""
 
+Wanted = Callable[[], dict[Address, list[str]]]
+"""Finds what to lock, by the container that judges it, at the moment it is taken."""
 OnLost = Callable[[LockLost], object]
 OnRequest = Callable[[str, str], object]
 """Told who would like to have the lock, and why."""
@@ -49,14 +52,18 @@ class Home(Protocol):
 
 
 class Lock:
-    """Exclusive use of services; a context manager. Calls made inside carry it; nobody else's get through.
+    """Exclusive use of services; a context manager, also of asyncio. Calls made inside carry it; no others get through.
 
     It holds under leases that are renewed while this process lives. Once lost it stays lost: every actuating call
     inside raises LockLost before anything is sent.
     """
 
-    def __init__(self, keeper: "Keeper", terms: Terms, on_lost: OnLost | None, on_request: OnRequest | None) -> None:
+    def __init__(
+        self, keeper: "Keeper", terms: Terms, wanted: Wanted, on_lost: OnLost | None, on_request: OnRequest | None
+    ) -> None:
         self._keeper = keeper
+        self._terms = terms
+        self._wanted = wanted
         self._on_lost = on_lost
         self.on_request = on_request
         """Called, on a thread of its own, when somebody asks for it."""
@@ -67,11 +74,26 @@ class Lock:
         self._granted: dict[Address, Token] = {}
         self._confirmed: dict[Address, float] = {}
         self._lost: LockLost | None = None
-        self._ended = False
+        self._ended = self._taken = False
         self._guard = threading.Lock()
         self._resets: list[Reset[tuple[Held, ...]]] = []
 
     # --- being used
+
+    def acquire(self) -> "Lock":
+        """Take it: what entering the context does. Once; whoever wants it again makes another one.
+
+        Raises:
+            LockedByOther, DeviceSilent, IncompleteGroup, ServiceGone, ContainerLost, ConfigurationError: see
+                `Container.lock`; nothing is held then.
+        """
+        with self._guard:
+            if self._taken:
+                problem = "a lock is taken once; make another one with trade.lock(...), or share this one with use()"
+                raise ConfigurationError(where=f"lock for {self.purpose!r}", problem=problem)
+            self._taken = True
+        self._keeper.acquire(self, self._wanted(), self._terms)
+        return self
 
     @property
     def owner(self) -> Address:
@@ -82,7 +104,7 @@ class Lock:
     def held(self) -> bool:
         """Whether it holds now, as far as one can know here."""
         self._look()
-        return not self._ended and self._lost is None
+        return self._taken and not self._ended and self._lost is None
 
     def tokens(self) -> Iterable[Token]:
         """What shows it to those it was granted by.
@@ -113,6 +135,10 @@ class Lock:
         self._keeper.let_go(self)
 
     def __enter__(self) -> "Lock":
+        self.acquire()
+        return self._enter()
+
+    def _enter(self) -> "Lock":
         self._resets.append(holding.set((*holding.get(), self)))
         return self
 
@@ -123,14 +149,20 @@ class Lock:
             raise self._lost
 
     async def __aenter__(self) -> "Lock":
-        return self.__enter__()
+        taking = asyncio.ensure_future(asyncio.to_thread(self.acquire))
+        try:
+            await asyncio.shield(taking)
+        except asyncio.CancelledError:
+            taking.add_done_callback(lambda _: _apart(self.release))
+            raise
+        return self._enter()
 
     async def __aexit__(self, *exit_: Any) -> None:
         await asyncio.to_thread(self.release)
         self.__exit__(*exit_)
 
     def __repr__(self) -> str:
-        state = "lost" if self._lost else "released" if self._ended else "held"
+        state = "not taken" if not self._taken else "lost" if self._lost else "released" if self._ended else "held"
         return f"<Lock of {', '.join(self.resources)}, {state}>"
 
     # --- being kept

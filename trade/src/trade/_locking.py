@@ -1,9 +1,7 @@
 """What one does with locks: take them over many services, look at them, ask for them, take them away; and resume."""
 
-import asyncio
-import functools
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, Final, Protocol
+from typing import Final, Protocol
 
 from trade._constraints import Constraint
 from trade._handle import Handle
@@ -49,25 +47,19 @@ class Locking:
         on_request: OnRequest | None = None,
     ) -> Lock:
         """See `Container.lock`."""
-        handles = selected(which, self._home.services)
-        if not partial:
-            require_whole(which, handles)
         if not 0 <= wait_s <= LONGEST_WAIT_S:
             raise ConfigurationError(where="lock", problem=f"wait_s must be 0 to {LONGEST_WAIT_S:g}, not {wait_s!r}")
         if not 0.1 <= lease_s <= 60:
             raise ConfigurationError(where="lock", problem=f"lease_s must be 0.1 to 60, not {lease_s!r}")
         terms = Terms(purpose=purpose, lease_s=lease_s, wait_s=wait_s, priority=priority, delegates=tuple(delegates))
-        lock = Lock(self.keeper, terms, on_lost, on_request)
-        return self.keeper.acquire(lock, resources_of(handles), terms)
 
-    async def alock(self, which: Constraint | Iterable[Handle], **options: Any) -> Lock:
-        """`lock` from asyncio; given up, nothing stays held."""
-        taking = asyncio.ensure_future(asyncio.to_thread(functools.partial(self.lock, which, **options)))
-        try:
-            return await asyncio.shield(taking)
-        except asyncio.CancelledError:
-            taking.add_done_callback(_release_unwanted)
-            raise
+        def wanted() -> dict[Address, list[str]]:
+            handles = selected(which, self._home.services)
+            if not partial:
+                require_whole(which, handles)
+            return resources_of(handles)
+
+        return Lock(self.keeper, terms, wanted, on_lost, on_request)
 
     def locks(self) -> list[LockInfo]:
         """See `Container.locks`."""
@@ -105,11 +97,6 @@ class Locking:
 
     def _service(self, address: Address, name: str) -> Handle:
         return self._home.handle(ServiceKey(address, DOMAIN, PROVIDER, name))
-
-
-def _release_unwanted(taking: "asyncio.Future[Lock]") -> None:
-    if not taking.cancelled() and taking.exception() is None:
-        taking.result().release()
 
 
 def resources_of(handles: Sequence[Handle]) -> dict[Address, list[str]]:
