@@ -12,6 +12,8 @@ from typing import Any
 
 import pytest
 
+from system.networks import Networks, why_not
+
 ROOT = Path(__file__).parents[2]
 ROSIE = ROOT / "examples" / "rosie.toml"
 PATIENCE_S = 60.0
@@ -140,3 +142,16 @@ def wait_until(condition: Callable[[], bool]) -> None:
             return
         threading.Event().wait(0.03)
     pytest.fail("it did not happen within a minute")
+
+
+@pytest.fixture
+def networks() -> Iterator[Networks]:
+    """Hosts and networks of the test's own; skips where there can be none, and fails there in CI."""
+    reason = why_not()
+    if reason and os.environ.get("CI") == "true":
+        pytest.fail(f"{reason}; in CI this is part of what must hold")
+    if reason:
+        pytest.skip(reason)
+    made = Networks()
+    yield made
+    made.close()

@@ -2,11 +2,14 @@
 
 import ipaddress
 import socket
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from trade.errors import ConfigurationError
 
-__all__ = ["Endpoint", "accepts", "dialled_from_here", "free_endpoint", "with_free_port"]
+__all__ = ["Endpoint", "accepts", "dialled_from_here", "free_endpoint", "loopback_interface", "with_free_port"]
+
+
+_EVERYWHERE: Final = {"0.0.0.0": "127.0.0.1", "[::]": "[::1]"}  # noqa: S104 - what somebody listens on: how to dial it
 
 
 class Endpoint(NamedTuple):
@@ -36,6 +39,11 @@ class Endpoint(NamedTuple):
             return ipaddress.ip_address(self.host.strip("[]")).is_loopback
         except ValueError:
             return self.host == "localhost"
+
+    @property
+    def everywhere(self) -> bool:
+        """Whether it listens on all networks of this host."""
+        return self.host in _EVERYWHERE
 
     def resolved(self) -> list[str]:
         """The same with each address its host has now; none if its name means nothing."""
@@ -68,10 +76,14 @@ def free_endpoint() -> str:
     return str(with_free_port(Endpoint("tcp", "127.0.0.1", 0)))
 
 
+def loopback_interface() -> str:
+    """The name of this host's loopback interface; empty if there is none."""
+    return next((name for _, name in socket.if_nameindex() if name.startswith("lo")), "")
+
+
 def dialled_from_here(endpoint: Endpoint) -> str:
     """How this host dials what listens there."""
-    everywhere = {"0.0.0.0": "127.0.0.1", "[::]": "[::1]"}  # noqa: S104 - what somebody else listens on
-    return str(endpoint._replace(host=everywhere.get(endpoint.host, endpoint.host)))
+    return str(endpoint._replace(host=_EVERYWHERE.get(endpoint.host, endpoint.host)))
 
 
 def accepts(endpoint: str) -> bool:
