@@ -20,6 +20,13 @@ class Echo:
     def echo(self, value: int) -> int:
         return value
 
+    def __init__(self) -> None:
+        self.moves: list[int] = []
+
+    @service(serial=True)
+    def move(self, number: int) -> None:
+        self.moves.append(number)
+
     @service(effect="read")
     def nap(self, seconds: float) -> None:
         threading.Event().wait(seconds)
@@ -133,6 +140,14 @@ class Member:
     def call_all(self) -> int:
         handles = self.up.services(where(name="echo"))
         return sum(handle(number) == number for number, handle in enumerate(handles))
+
+    def move(self, of: str, times: str) -> None:
+        move = self.up.find(where(name="move", group=of))
+        for number in range(int(times)):
+            move(number)
+
+    def moved(self, of: str) -> list[int]:
+        return self._providers[of].moves
 
     def state(self) -> dict[str, Any]:
         """For the message of a test that failed."""

@@ -140,6 +140,39 @@ def test_a_bridge_and_its_neighbours_are_linked_while_they_run(member: StartMemb
     bridge.ask("connect", dialled)
     all_work_together([bridge, left, right])
 
+    second = member("left2", "second", "0.0.0.0:7450", bridge="net1,lo")
+    second.ask("start")
+    with pytest.raises(AssertionError, match=r"^CannotConnect: .* Those link to each other by connect in their sett"):
+        second.ask("connect", LEFT)
+
+
+@pytest.mark.parametrize("linked", [True, False])
+def test_of_two_bridges_side_by_side_one_may_die_and_no_call_runs_twice(
+    networks: Networks, member: StartMember, linked: bool
+) -> None:
+    networks.lay("net1", first="10.231.1.1", second="10.231.1.2", left="10.231.1.3")
+    networks.lay("net2", first="10.231.2.1", second="10.231.2.2", right="10.231.2.3")
+    first = member("first", "first", "10.231.1.1:7450,10.231.2.1:7450", bridge="net1,net2")
+    second = member("second", "second", "10.231.1.2:7450,10.231.2.2:7450", bridge="net1,net2")
+    first.ask("start")
+    second.ask("start", *(["tcp/10.231.1.1:7450"] if linked else []))
+    left = up(member("left", "l", "10.231.1.3:0"), "tcp/10.231.1.1:7450", "tcp/10.231.1.2:7450")
+    right = up(member("right", "r", "10.231.2.3:0"), "tcp/10.231.2.1:7450", "tcp/10.231.2.2:7450")
+    right.ask("register_one", "arm")
+    for each in (left, right):
+        each.ask("linked", "2")
+    for each in (first, second):
+        each.ask("linked", "3" if linked else "2")
+    assert len(left.ask("sees", str(2 * PROVIDERS + 1))) == 2 * PROVIDERS + 1
+    left.ask("watch")
+    left.ask("move", "arm", "200")
+    assert right.ask("moved", "arm") == list(range(200))
+    first.kill()
+    left.ask("linked", "1")
+    left.ask("move", "arm", "200")
+    assert right.ask("moved", "arm") == [*range(200), *range(200)]
+    assert left.ask("gone") == []
+
 
 @pytest.mark.parametrize(
     ("bridge", "listen", "problem"),

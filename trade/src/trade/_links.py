@@ -80,6 +80,7 @@ class Links:
         self._session = session
         self._settings = settings
         self._own = str(session.zid())
+        self.bridges: Final[bool] = settings["mode"] == "router"
         self.listen: Final = [Endpoint.read(text) for text in settings["listen/endpoints"]]
         self._tag = _tag(settings)
         self._shown = next((own for own in self.listen if not own.loopback), self.listen[0])
