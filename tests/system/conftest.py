@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 
+from system.networks import Networks, why_not
 from waiting import PATIENCE_S
 
 ROOT = Path(__file__).parents[2]
@@ -137,3 +138,16 @@ def rosie_up(run: Callable[..., Program], tmp_path: Path) -> Callable[[], Rosie]
         return Rosie(run("-m", "trade_gateway", "up", ROSIE, "--sim", "--sim-log", log, "--json"), log)
 
     return up
+
+
+@pytest.fixture
+def networks() -> Iterator[Networks]:
+    """Hosts and networks of the test's own; skips where there can be none, and fails there in CI."""
+    reason = why_not()
+    if reason and os.environ.get("CI") == "true":
+        pytest.fail(f"{reason}; in CI this is part of what must hold")
+    if reason:
+        pytest.skip(reason)
+    made = Networks()
+    yield made
+    made.close()

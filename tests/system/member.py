@@ -2,11 +2,15 @@
 
 import json
 import os
+import socket
 import sys
+import threading
+import time
 from collections.abc import Callable
 from typing import Any
 
-from trade import Container, Settings, service, where
+from trade import Container, Handle, Run, Settings, service, where
+from trade._links import _others
 
 PROVIDERS = 5
 
@@ -16,12 +20,27 @@ class Echo:
     def echo(self, value: int) -> int:
         return value
 
+    def __init__(self) -> None:
+        self.moves: list[int] = []
+
+    @service(serial=True)
+    def move(self, number: int) -> None:
+        self.moves.append(number)
+
+    @service(effect="read")
+    def nap(self, seconds: float) -> None:
+        threading.Event().wait(seconds)
+
 
 class Member:
     def __init__(self, name: str, address: str) -> None:
         self.name = name
         self.address = address
         self.container: Container | None = None
+        self._gone: list[str] = []
+        self._kept: Handle | None = None
+        self._run: Run | None = None
+        self._providers: dict[str, Echo] = {}
 
     @property
     def up(self) -> Container:
@@ -30,7 +49,7 @@ class Member:
 
     def start(self, *connect: str, turn: str = "0") -> str:
         system = f"{os.environ['TRADE_SYSTEM']}-{turn}"
-        listen = [f"tcp/{self.address}:0"]
+        listen = [f"tcp/{address}" for address in self.address.split(",") if address]
         self.container = Container(
             Settings.read(system=system, container=self.name, listen=listen, connect=connect or None)
         )
@@ -39,6 +58,66 @@ class Member:
     def find_each_other(self) -> None:
         self.up.system.set_broadcast(True)
         self.up.system.set_discovery(True)
+
+    def register_one(self, group: str) -> None:
+        self._providers[group] = Echo()
+        self.up.register(self._providers[group], group)
+
+    def deregister_one(self, group: str) -> None:
+        self.up.deregister(self._providers.pop(group))
+
+    def add_group(self, of: str, group: str) -> None:
+        self.up.add_group(self._providers[of], group)
+
+    def remove_group(self, of: str, group: str) -> None:
+        self.up.remove_group(self._providers[of], group)
+
+    def group(self, group: str, *expected: str) -> list[list[str]]:
+        """Host and label of the group's echo services once their containers are as expected, or after half a minute."""
+        wanted = where(group=group, name="echo")
+        there = lambda: sorted(handle.container for handle in self.up.services(wanted))  # noqa: E731
+        self.up._registry.wait_for(lambda: there() == sorted(expected), 30)
+        return [[handle.host, handle.label] for handle in self.up.services(wanted)]
+
+    def call_group(self, group: str) -> list[int]:
+        return [outcome.result for outcome in self.up.call_all(where(group=group, name="echo"), 7)]
+
+    def watch(self) -> None:
+        """From now on note which containers' services leave."""
+        self.up.left(where(name="echo"), lambda handle: self._gone.append(handle.container))
+
+    def gone(self) -> list[str]:
+        return self._gone
+
+    def keep(self, container: str) -> None:
+        """Hold on to a service of that container."""
+        self._kept = self.up.find(where(name="echo", group=f"{container}.p0"))
+
+    def use(self) -> int:
+        assert self._kept is not None
+        return self._kept(3)
+
+    def nap(self, container: str) -> None:
+        """Begin a call of a service of that container that takes five seconds."""
+        self._run = self.up.find(where(name="nap", group=f"{container}.p0")).with_(deadline_s=60).start(5.0)
+
+    def woken(self) -> None:
+        assert self._run is not None
+        self._run.result()
+
+    def linked(self, count: str) -> list[str]:
+        """Ids of whom it is linked to once they are so many; whoever it is after half a minute."""
+        until = time.monotonic() + 30
+        while len(found := _others(self._session)) != int(count) and time.monotonic() < until:
+            threading.Event().wait(0.02)
+        return sorted(found)
+
+    def id(self) -> str:
+        return str(self._session.zid())
+
+    @property
+    def _session(self) -> Any:
+        return self.up.reach._links._session
 
     def register(self) -> None:
         for number in range(PROVIDERS):
@@ -62,6 +141,14 @@ class Member:
         handles = self.up.services(where(name="echo"))
         return sum(handle(number) == number for number, handle in enumerate(handles))
 
+    def move(self, of: str, times: str) -> None:
+        move = self.up.find(where(name="move", group=of))
+        for number in range(int(times)):
+            move(number)
+
+    def moved(self, of: str) -> list[int]:
+        return self._providers[of].moves
+
     def state(self) -> dict[str, Any]:
         """For the message of a test that failed."""
         links = self.up.reach._links
@@ -76,7 +163,8 @@ class Member:
         self.up.close()
 
 
-def main(name: str, address: str) -> None:
+def main(host: str, name: str, address: str) -> None:
+    socket.sethostname(host)
     member = Member(name, address)
     for line in sys.stdin:
         verb, *words = line.split()

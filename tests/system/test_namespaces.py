@@ -1,137 +1,35 @@
 """Several hosts, as network namespaces joined by a cable that can be pulled."""
 
-import contextlib
-import json
 import os
-import secrets
-import shutil
-import subprocess
-import sys
-import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from system.member import PROVIDERS
+from system.networks import Member, Networks, ip
 
 ROUNDS = int(os.environ.get("SOAK_ROUNDS", "20"))
-MEMBER = Path(__file__).with_name("member.py")
 pytestmark = pytest.mark.timeout(120 + 15 * ROUNDS)
 
 
-def ip(*words: str) -> str:
-    """Runs ``ip WORDS``; raises CalledProcessError."""
-    return subprocess.run(["ip", *words], capture_output=True, text=True, check=True, timeout=20).stdout
-
-
-def _why_not() -> str:
-    """Why there can be no namespaces here; empty if there can."""
-    if shutil.which("ip") is None:
-        return "there is no `ip` (Debian: iproute2)"
-    probe = f"trade-{secrets.token_hex(3)}"
-    try:
-        ip("netns", "add", probe)
-        ip("netns", "exec", probe, "true")
-        ip("netns", "del", probe)
-    except subprocess.CalledProcessError as refused:
-        return f"network namespaces need rights this user has not: {refused.stderr.strip()}"
-    return ""
-
-
-class Member:
-    """``member.py`` in one of the namespaces."""
-
-    def __init__(self, namespace: str, name: str, address: str, runtime: Path) -> None:
-        command = ["ip", "netns", "exec", namespace, sys.executable, str(MEMBER), name, address]
-        # Each namespace is a host of its own: no folder in common.
-        environment = {
-            **os.environ,
-            "TRADE_RUNTIME_DIR": str(runtime / namespace),
-            "TRADE_INSECURE_LAN": "1",
-            "TRADE_CREDENTIALS": "lab:secret",
-        }
-        self._process = subprocess.Popen(
-            command,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            text=True,
-            env=environment,
-        )
-
-    def tell(self, *words: str) -> None:
-        assert self._process.stdin is not None
-        self._process.stdin.write(" ".join(words) + "\n")
-        self._process.stdin.flush()
-
-    def heard(self) -> Any:
-        assert self._process.stdout is not None
-        said = json.loads(self._process.stdout.readline())
-        assert "error" not in said, said["error"]
-        return said["answer"]
-
-    def ask(self, *words: str) -> Any:
-        self.tell(*words)
-        return self.heard()
-
-    def close(self) -> None:
-        for pipe in (self._process.stdin, self._process.stdout):
-            assert pipe is not None
-            with contextlib.suppress(OSError):
-                pipe.close()
-        try:
-            self._process.wait(20)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
-
-
 class Cable:
-    """Two namespaces, ``left`` at 10.231.7.1 and ``right`` at 10.231.7.2, and what joins them."""
+    """Two hosts, ``left`` at 10.231.7.1 and ``right`` at 10.231.7.2, and what joins them."""
 
-    def __init__(self) -> None:
-        mark = secrets.token_hex(3)
-        self.left, self.right = f"trade-{mark}-l", f"trade-{mark}-r"
-        self._ends = {self.left: f"tl{mark}", self.right: f"tr{mark}"}
-        for namespace in self._ends:
-            ip("netns", "add", namespace)
-            ip("-n", namespace, "link", "set", "lo", "up")
-        names = list(self._ends.values())
-        ip("-n", self.left, "link", "add", names[0], "type", "veth", "peer", "name", names[1], "netns", self.right)
-        for (namespace, end), address in zip(self._ends.items(), ("10.231.7.1/24", "10.231.7.2/24"), strict=True):
-            ip("-n", namespace, "addr", "add", address, "dev", end)
-            ip("-n", namespace, "link", "set", end, "up")
-        self._wait_until_up()
-
-    def _wait_until_up(self) -> None:
-        """The transport looks at the interfaces once a process: who starts on a dead one never scouts there."""
-        while not all("state UP" in ip("-n", namespace, "link", "show", end) for namespace, end in self._ends.items()):
-            threading.Event().wait(0.01)
+    def __init__(self, networks: Networks) -> None:
+        networks.lay("cable", left="10.231.7.1", right="10.231.7.2")
+        self.left, self.right = networks.host("left"), networks.host("right")
 
     def pull(self) -> None:
-        ip("-n", self.left, "link", "set", self._ends[self.left], "down")
+        ip("-n", self.left, "link", "set", "cable", "down")
 
     def plug(self) -> None:
-        ip("-n", self.left, "link", "set", self._ends[self.left], "up")
-
-    def close(self) -> None:
-        for namespace in self._ends:
-            with contextlib.suppress(subprocess.CalledProcessError):
-                ip("netns", "del", namespace)
+        ip("-n", self.left, "link", "set", "cable", "up")
 
 
 @pytest.fixture
-def cable() -> Iterator[Cable]:
-    reason = _why_not()
-    if reason and os.environ.get("CI") == "true":
-        pytest.fail(f"{reason}; in CI this is part of what must hold")
-    if reason:
-        pytest.skip(reason)
-    laid = Cable()
-    yield laid
-    laid.close()
+def cable(networks: Networks) -> Cable:
+    return Cable(networks)
 
 
 @pytest.fixture
@@ -139,7 +37,7 @@ def member(cable: Cable, system: str, tmp_path: Path) -> Iterator[Callable[[str,
     started: list[Member] = []
 
     def start(side: str, name: str) -> Member:
-        namespace, address = {"left": (cable.left, "10.231.7.1"), "right": (cable.right, "10.231.7.2")}[side]
+        namespace, address = {"left": (cable.left, "10.231.7.1:0"), "right": (cable.right, "10.231.7.2:0")}[side]
         started.append(Member(namespace, name, address, tmp_path))
         return started[-1]
 

@@ -54,6 +54,24 @@ def test_an_empty_system_in_the_environment_is_no_explicit_one() -> None:
     assert not Settings.read(environment={"TRADE_SYSTEM": ""}).explicit_system
 
 
+def test_S21_a_bridge_listens_beyond_loopback_no_more_than_others() -> None:
+    lan = ["tcp/192.168.1.5:7450", "tcp/10.0.0.5:7450"]
+    with pytest.raises(ConfigurationError, match="listening beyond loopback needs a policy, and none is loaded"):
+        read(system="lab", credentials=("me", "secret"), listen=lan, bridge=["eth0", "eth1"])
+
+
+@pytest.mark.parametrize("bridge", [["eth0"], ["eth0", "eth0"]])
+def test_a_bridge_to_nowhere_is_refused(bridge: list[str]) -> None:
+    with pytest.raises(ConfigurationError, match="bridge eth0: joins networks, and this is only one; name a second"):
+        read(bridge=bridge)
+    assert read(bridge=bridge, connect=["tcp/127.0.0.1:7450"]).bridge == tuple(bridge)
+
+
+def test_a_bridge_of_an_interface_that_is_not_there_is_refused_and_leaves_nothing(system: str) -> None:
+    with pytest.raises(ConfigurationError, match="bridge nosuch0: this host has no such interface, or not yet; it has"):
+        Container(Settings.read(bridge=["nosuch0", "nosuch1"]))
+
+
 LOOPBACK = ["tcp/127.0.0.1:0", "tcp/127.8.9.1:7450", "tcp/[::1]:7450", "tcp/localhost:7450", "tls/127.0.0.1:1#a=b"]
 
 
@@ -117,11 +135,14 @@ def test_settings_come_from_arguments_then_the_environment_then_defaults() -> No
         "TRADE_LISTEN": "tcp/127.0.0.1:7450, tcp/127.0.0.1:7451",
         "TRADE_CONNECT": "",
         "TRADE_CREDENTIALS": "me:sec:ret",
+        "TRADE_BRIDGE": "eth0, eth1",
     }
     settings = Settings.read(environment=environment, container="mine")
     assert (settings.system, settings.identity, settings.container) == ("lab", "arm", "mine")
     assert settings.listen == ("tcp/127.0.0.1:7450", "tcp/127.0.0.1:7451")
     assert (settings.connect, settings.credentials, settings.explicit_system) == ((), ("me", "sec:ret"), True)
+    assert settings.bridge == ("eth0", "eth1")
+    assert Settings.read(environment=environment, bridge=[]).bridge == read().bridge == ()
     assert str(os.getpid()) in read().container
 
 

@@ -6,7 +6,10 @@ from typing import Final, NamedTuple
 
 from trade.errors import ConfigurationError
 
-__all__ = ["Endpoint", "accepts", "dialled_from_here", "free_endpoint", "with_free_port"]
+__all__ = ["Endpoint", "accepts", "dialled_from_here", "free_endpoint", "loopback_interface", "with_free_port"]
+
+
+_EVERYWHERE: Final = {"0.0.0.0": "127.0.0.1", "[::]": "[::1]"}  # noqa: S104 - what somebody listens on: how to dial it
 
 _PROTOCOLS: Final = ("tcp", "udp", "tls", "quic", "ws")
 _LAST_PORT: Final = 65535
@@ -46,6 +49,11 @@ class Endpoint(NamedTuple):
         except ValueError:
             return self.host == "localhost"
 
+    @property
+    def everywhere(self) -> bool:
+        """Whether it listens on all networks of this host."""
+        return self.host in _EVERYWHERE
+
     def resolved(self) -> list[str]:
         """The same with each address its host has now; none if its name means nothing."""
         try:
@@ -77,10 +85,14 @@ def free_endpoint() -> str:
     return str(with_free_port(Endpoint("tcp", "127.0.0.1", 0)))
 
 
+def loopback_interface() -> str:
+    """The name of this host's loopback interface; empty if there is none."""
+    return next((name for _, name in socket.if_nameindex() if name.startswith("lo")), "")
+
+
 def dialled_from_here(endpoint: Endpoint) -> str:
     """How this host dials what listens there."""
-    everywhere = {"0.0.0.0": "127.0.0.1", "[::]": "[::1]"}  # noqa: S104 - what somebody else listens on
-    return str(endpoint._replace(host=everywhere.get(endpoint.host, endpoint.host)))
+    return str(endpoint._replace(host=_EVERYWHERE.get(endpoint.host, endpoint.host)))
 
 
 def accepts(endpoint: str) -> bool:

@@ -1,11 +1,14 @@
-"""How a container comes into its system: where it listens, whom it dials, with which credentials."""
+"""How a container comes into its system: where it listens, whom it dials, with which credentials, what it bridges."""
 
 import contextlib
 import logging
+import socket
+from collections.abc import Sequence
 from typing import Final
 
 from trade._credentials import user_secret
-from trade._endpoints import Endpoint, dialled_from_here, free_endpoint, with_free_port
+from trade._endpoints import Endpoint, dialled_from_here, free_endpoint, loopback_interface, with_free_port
+from trade._links import Links
 from trade._rendezvous import Rendezvous
 from trade._settings import Settings
 from trade._zenoh import ZenohTransport, configuration
@@ -19,24 +22,39 @@ _PORTS_TRIED: Final = 4
 
 def join(settings: Settings, leaving: contextlib.ExitStack) -> ZenohTransport:
     """Open the main session; what has to be undone when the container leaves goes onto the stack."""
+    networks = _networks(settings.bridge)
+    transport = _join(settings, networks, leaving)
+    try:
+        _check_bridged(settings.bridge, transport.links)
+    except ConfigurationError:
+        transport.close()
+        raise
+    return transport
+
+
+def _join(settings: Settings, networks: list[list[str]], leaving: contextlib.ExitStack) -> ZenohTransport:
     for _ in range(_PORTS_TRIED if not settings.listen else 0):
         with contextlib.suppress(ConfigurationError):  # somebody else took the free port first
-            return _join_at(settings, [free_endpoint()], leaving)
+            return _join_at(settings, [free_endpoint()], networks, leaving)
     chosen = [str(with_free_port(Endpoint.read(endpoint))) for endpoint in settings.listen]
-    return _join_at(settings, chosen or [free_endpoint()], leaving)
+    return _join_at(settings, chosen or [free_endpoint()], networks, leaving)
 
 
-def _join_at(settings: Settings, listen: list[str], leaving: contextlib.ExitStack) -> ZenohTransport:
+def _join_at(
+    settings: Settings, listen: list[str], networks: list[list[str]], leaving: contextlib.ExitStack
+) -> ZenohTransport:
     connect = list(settings.connect)
-    if not connect:
+    if settings.bridge or not connect:
         rendezvous = Rendezvous(settings.system)
         leaving.callback(rendezvous.leave)
-        connect = rendezvous.enter(_nearest(listen))
+        connect += rendezvous.enter(_nearest(listen))
     if settings.insecure_lan:
         _logger.warning("TRADE_INSECURE_LAN: %s is open to its network, unencrypted, without a policy", listen)
     credentials = settings.credentials or user_secret()
     return ZenohTransport(
-        configuration(namespace=settings.system, listen=listen, connect=connect, credentials=credentials)
+        configuration(
+            namespace=settings.system, listen=listen, connect=connect, credentials=credentials, bridge=networks
+        )
     )
 
 
@@ -44,3 +62,35 @@ def _nearest(listen: list[str]) -> str:
     """Where others of this host dial: the loopback interface if we listen there."""
     endpoints = sorted(map(Endpoint.read, listen), key=lambda endpoint: not endpoint.loopback)
     return dialled_from_here(endpoints[0])
+
+
+def _networks(bridge: Sequence[str]) -> list[list[str]]:
+    """The interfaces of each network that a bridge joins; the containers of its own host belong to the first.
+
+    Raises:
+        ConfigurationError: there is no such interface.
+    """
+    known = [name for _, name in socket.if_nameindex()] if bridge else []
+    for name in bridge:
+        if name not in known:
+            problem = f"this host has no such interface, or not yet; it has {', '.join(known)}"
+            raise ConfigurationError(where=f"bridge {name}", problem=problem)
+    networks = [[name] for name in dict.fromkeys(bridge)]
+    here = loopback_interface()
+    if networks and here and here not in bridge:
+        networks[0].append(here)
+    return networks
+
+
+def _check_bridged(bridge: Sequence[str], links: Links) -> None:
+    """Raises ConfigurationError: nobody can come in by one of the interfaces."""
+    if not bridge or any(own.everywhere for own in links.listen):
+        return
+    heard = [name for own in links.listen for name in links.interfaces(str(own))]
+    for name in bridge:
+        if name not in heard:
+            problem = (
+                f"nothing listens on it, only on {', '.join(map(str, links.listen))}; let TRADE_LISTEN name an address "
+                f"of {name}, too, or tcp/0.0.0.0:PORT"
+            )
+            raise ConfigurationError(where=f"bridge {name}", problem=problem)

@@ -10,7 +10,6 @@ import hashlib
 import hmac
 import json
 import secrets
-import socket
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, Final, NamedTuple
@@ -18,7 +17,7 @@ from typing import Any, Final, NamedTuple
 import zenoh
 
 from trade._credentials import dictionary_file
-from trade._endpoints import Endpoint, dialled_from_here
+from trade._endpoints import Endpoint, dialled_from_here, loopback_interface
 from trade.errors import ConfigurationError
 
 _NOBODY: Final[dict[str, Any]] = {"router": [], "peer": []}
@@ -33,9 +32,14 @@ _USER: Final = "transport/auth/usrpwd/user"
 _PASSWORD: Final = "transport/auth/usrpwd/password"  # noqa: S105 - the name of a setting
 
 
-def new_session_id() -> str:
-    """An id that zenoh keeps as it is written: its first digit is not zero."""
-    return secrets.choice("123456789abcdef") + secrets.token_hex(_DIGITS // 2)[1:]
+def new_session_id(*, dials: bool = False) -> str:
+    """An id that zenoh keeps as it is written: its first digit is not zero.
+
+    Of two that hear of each other the one with the greater id dials; zenoh compares the last byte first. Who listens on
+    this host only can dial others, but not be dialled from elsewhere: its id is greater than theirs.
+    """
+    digits = secrets.token_hex(_DIGITS // 2)
+    return f"{secrets.choice('123456789abcdef')}{digits[1:-2]}{secrets.randbelow(128) + 128 * dials:02x}"
 
 
 def open_session(settings: dict[str, Any]) -> zenoh.Session:
@@ -76,17 +80,26 @@ class Links:
         self._session = session
         self._settings = settings
         self._own = str(session.zid())
-        self._listen = [Endpoint.read(text) for text in settings["listen/endpoints"]]
+        self.bridges: Final[bool] = settings["mode"] == "router"
+        self.listen: Final = [Endpoint.read(text) for text in settings["listen/endpoints"]]
         self._tag = _tag(settings)
-        self._shown = next((own for own in self._listen if not own.loopback), self._listen[0])
+        self._shown = next((own for own in self.listen if not own.loopback), self.listen[0])
         self._beacon_id = f"{self._tag}{self._own[:_NAME]}{self._shown.port:04x}"
 
     def linked(self, session: str) -> bool:
         """Whether the main session is linked to one whose id begins so."""
         try:
-            return any(str(peer).startswith(session) for peer in self._session.info.peers_zid())
+            return any(other.startswith(session) for other in _others(self._session))
         except zenoh.ZError:  # closed
             return False
+
+    def interfaces(self, endpoint: str) -> list[str]:
+        """By which interfaces one comes to the main session at that endpoint of its own; none if one cannot."""
+        asking = self._beside([], [endpoint], {})
+        try:
+            return [name for link in asking.info.links() for name in link.interfaces]
+        finally:
+            asking.close()
 
     def linked_at(self, endpoint: str) -> bool:
         """Whether one of the main session's links leads there."""
@@ -126,7 +139,7 @@ class Links:
         try:
             until = time.monotonic() + wait_s
             while time.monotonic() < until and not ended():
-                there = session or next((p for p in map(str, helper.info.peers_zid()) if p != self._own), "")
+                there = session or next((p for p in _others(helper) if p != self._own), "")
                 if there and self.linked(there):
                     return there
                 time.sleep(_LOOK_S)
@@ -136,12 +149,14 @@ class Links:
 
     def _door(self) -> str:
         """Where a session of this process reaches the main one."""
-        return dialled_from_here(self._listen[0])
+        return dialled_from_here(self.listen[0])
 
     def _beside(self, listen: Sequence[str], connect: Sequence[str], more: dict[str, Any]) -> zenoh.Session:
         settings = {
             **self._settings,
             "id": new_session_id(),
+            "mode": "peer",
+            "gateway": {},
             "listen/endpoints": list(listen),
             "connect/endpoints": list(connect),
             "scouting/gossip/autoconnect": _NOBODY,
@@ -162,13 +177,18 @@ class Links:
 
     def _interface(self) -> str:
         """S21: who listens on this host only asks and answers on this host only."""
-        if not all(own.loopback for own in self._listen):
+        if not all(own.loopback for own in self.listen):
             return "auto"
-        loopback = next((name for _, name in socket.if_nameindex() if name.startswith("lo")), None)
-        if loopback is None:
+        loopback = loopback_interface()
+        if not loopback:
             problem = "no loopback interface was found, and this container may not be found from other hosts"
             raise ConfigurationError(where="discovery", problem=problem)
         return loopback
+
+
+def _others(session: zenoh.Session) -> list[str]:
+    """Ids of whom a session is linked to."""
+    return [str(other) for other in (*session.info.peers_zid(), *session.info.routers_zid())]
 
 
 def _found(beacon: str, locators: Iterable[str]) -> Found:

@@ -79,7 +79,7 @@ class Reach:
         self._may_dial(endpoint)
         there = self._dial(endpoint)
         if not there:
-            raise CannotConnect(endpoint=endpoint, reason=_why(endpoint))
+            raise CannotConnect(endpoint=endpoint, reason=_why(endpoint, self._links.bridges))
         with self._lock:
             self._check_open()
             self._kept[endpoint] = there
@@ -174,5 +174,10 @@ class Reach:
 _REFUSED: Final = "something listens there but does not let us in; do both have the same user and password?"
 
 
-def _why(endpoint: str) -> str:
-    return _REFUSED if accepts(endpoint) else "nothing accepts connections there; is it up, and the address right?"
+_BRIDGES: Final = " Or is it a bridge? Those link to each other by connect in their settings, when they start."
+
+
+def _why(endpoint: str, bridges: bool) -> str:
+    if not accepts(endpoint):
+        return "nothing accepts connections there; is it up, and the address right?"
+    return _REFUSED + _BRIDGES if bridges else _REFUSED

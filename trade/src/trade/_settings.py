@@ -24,6 +24,7 @@ _VARIABLES: Final = (
     "TRADE_LISTEN",
     "TRADE_CONNECT",
     "TRADE_CREDENTIALS",
+    "TRADE_BRIDGE",
     "TRADE_INSECURE_LAN",
     "TRADE_RUNTIME_DIR",
 )
@@ -51,6 +52,10 @@ class Settings:
     """User and password of the whole system; none: a secret that this user's containers on this host share."""
     insecure_lan: bool = False
     """Laboratories only: listen on a network without a policy and without encryption."""
+    bridge: tuple[str, ...] = ()
+    """Network interfaces such as ``eth0``: carry messages between the containers of their networks, which need no way
+    to each other. It has to listen on each; one alone will do if it dials another bridge. Everything of the system
+    crosses: there are no lists of what may, and no policy, yet."""
     explicit_system: bool = False
 
     def __post_init__(self) -> None:
@@ -67,6 +72,9 @@ class Settings:
             raise ConfigurationError(where="credentials", problem=problem)
         for endpoint in self.connect:
             self.check_may_dial(endpoint)
+        if len(set(self.bridge)) == 1 and not self.connect:
+            problem = "joins networks, and this is only one; name a second interface, or connect to another bridge"
+            raise ConfigurationError(where=f"bridge {self.bridge[0]}", problem=problem)
 
     def check_may_dial(self, endpoint: str) -> None:
         """S21: raises ConfigurationError if that would reach a network by accident."""
@@ -94,13 +102,14 @@ class Settings:
         connect: Sequence[str] | None = None,
         credentials: tuple[str, str] | None = None,
         insecure_lan: bool | None = None,
+        bridge: Sequence[str] | None = None,
         environment: Mapping[str, str] = os.environ,
     ) -> "Settings":
         """Settings from arguments, else from the environment, else the defaults.
 
         The environment has ``TRADE_SYSTEM``, ``TRADE_IDENTITY``, ``TRADE_CONTAINER``, ``TRADE_LISTEN`` and
-        ``TRADE_CONNECT`` (comma-separated), ``TRADE_CREDENTIALS`` (``user:password``), ``TRADE_INSECURE_LAN`` (``1``)
-        and ``TRADE_RUNTIME_DIR``. Others that begin with ``TRADE_`` are warned of.
+        ``TRADE_CONNECT`` (comma-separated), ``TRADE_CREDENTIALS`` (``user:password``), ``TRADE_INSECURE_LAN`` (``1``),
+        ``TRADE_BRIDGE`` (comma-separated) and ``TRADE_RUNTIME_DIR``. Others that begin with ``TRADE_`` are warned of.
         """
         _warn_of_unknown(environment)
         named = system or environment.get("TRADE_SYSTEM") or None
@@ -112,6 +121,7 @@ class Settings:
             connect=tuple(_split(environment, "TRADE_CONNECT") if connect is None else connect),
             credentials=credentials or _credentials(environment.get("TRADE_CREDENTIALS")),
             insecure_lan=environment.get("TRADE_INSECURE_LAN") == "1" if insecure_lan is None else insecure_lan,
+            bridge=tuple(_split(environment, "TRADE_BRIDGE") if bridge is None else bridge),
             explicit_system=named is not None,
         )
 

@@ -13,6 +13,7 @@ from typing import Any, Final
 import zenoh
 from zenoh import ext
 
+from trade._endpoints import Endpoint
 from trade._links import Links, new_session_id, open_session
 from trade._transport import Channel, ChannelClosed, Message, Presence, Publisher, Transport, some
 from trade.errors import ConfigurationError
@@ -27,12 +28,18 @@ _PUT: Final = zenoh.SampleKind.PUT
 
 
 def configuration(
-    *, namespace: str, listen: Sequence[str], connect: Sequence[str], credentials: tuple[str, str]
+    *,
+    namespace: str,
+    listen: Sequence[str],
+    connect: Sequence[str],
+    credentials: tuple[str, str],
+    bridge: Sequence[Sequence[str]] = (),
 ) -> dict[str, Any]:
-    """The settings of one session, as zenoh names them."""
+    """The settings of one session, as zenoh names them; ``bridge`` has the interfaces of each network it joins."""
     return {
-        "id": new_session_id(),
-        "mode": "peer",
+        "id": new_session_id(dials=all(Endpoint.read(own).loopback for own in listen)),
+        "mode": "router" if bridge else "peer",
+        "gateway": {"south": [_region(interfaces) for interfaces in bridge]} if bridge else {},
         "namespace": namespace,
         "listen/endpoints": list(listen),
         "connect/endpoints": list(connect),
@@ -41,7 +48,12 @@ def configuration(
         "connect/retry": {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2},
         "scouting/multicast/enabled": False,
         # Two that hear of each other at once must not both dial: each would refuse the other as a second link.
-        "scouting/gossip/autoconnect_strategy": {"peer": {"to_router": "always", "to_peer": "greater-zid"}},
+        # Of a bridge its neighbours do not hear by gossip; it dials them.
+        "scouting/gossip/autoconnect": {"router": ["peer"], "peer": ["router", "peer"]},
+        "scouting/gossip/autoconnect_strategy": {
+            "peer": {"to_router": "always", "to_peer": "greater-zid"},
+            "router": {"to_peer": "always"},
+        },
         "timestamping/enabled": True,
         "transport/auth/usrpwd/user": credentials[0],
         "transport/auth/usrpwd/password": credentials[1],
@@ -49,6 +61,11 @@ def configuration(
         "transport/link/tx/keep_alive": 4,
         "transport/link/tx/queue/congestion_control/block/wait_before_close": 1_000_000,
     }
+
+
+def _region(interfaces: Sequence[str]) -> dict[str, Any]:
+    """Who comes by these is of one network; routers are not: those are other bridges."""
+    return {"filters": [{"modes": ["peer", "client"], "interfaces": list(interfaces)}]}
 
 
 class ZenohChannel(Channel):
