@@ -3,6 +3,7 @@
 import contextlib
 import gc
 import tracemalloc
+import weakref
 from collections import Counter
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -15,6 +16,7 @@ from trade._registry import Registry
 from trade._rendezvous import Rendezvous, free_endpoint
 from trade._transport import Publisher
 from trade._zenoh import ZenohTransport, configuration
+from trade.errors import InvalidArgument
 
 CALLS = 20
 MOST_BYTES_OF_A_CALL = 16 * 1024
@@ -150,6 +152,43 @@ def test_signatures_are_read_at_registration_and_never_again(
     for name, call in CALL.items():
         call(find(name))
     assert read["__init__"] == len(CALL)
+
+
+def test_objects_of_one_class_share_what_their_methods_say(here: Container, monkeypatch: pytest.MonkeyPatch) -> None:
+    read = counted(monkeypatch, signatures.Signature, "__init__")
+    handles = [handle for number in range(CALLS) for handle in here.register(Arm(), f"robot.p{number}")]
+    assert read["__init__"] == len(CALL)
+    with pytest.raises(InvalidArgument, match=r"robot[.]p7[.]move"):
+        handles[7 * len(CALL)]("text", 0.2, 0.3)
+
+
+def test_what_objects_share_goes_with_the_last_of_them(here: Container) -> None:
+    class Passing(Arm):
+        @service
+        def rest(self, place: float) -> None: ...
+
+    robots = [Passing(), Passing()]
+    for robot in robots:
+        here.register(robot, "robot")
+    for robot in robots:
+        here.deregister(robot)
+    left = weakref.ref(Passing)
+    del Passing, robots, robot
+    gc.collect()
+    assert left() is None
+
+
+def test_a_class_that_has_changed_is_read_again(here: Container) -> None:
+    class Changing:
+        @service
+        def move(self, angle_rad: float) -> float:
+            return angle_rad
+
+    changing, same = Changing(), Changing()
+    move, _ = (*here.register(changing, "robot"), *here.register(same, "robot.other"))
+    Changing.move.__doc__ = "As it is now."
+    here.alter(changing)
+    assert move.doc == "As it is now."
 
 
 @pytest.mark.parametrize("name", CALL)

@@ -16,6 +16,7 @@ from msgspec import structs
 
 from trade import _many
 from trade._calls import Caller
+from trade._codec import Codec
 from trade._constraints import Constraint, checked_meta, where
 from trade._coroutines import AsyncLoop
 from trade._dispatch import Dispatcher
@@ -27,7 +28,6 @@ from trade._providers import Providers, checked_groups, checked_health
 from trade._reach import Reach
 from trade._registry import Change, Record, Registry
 from trade._settings import Settings
-from trade._signature import Codec
 from trade._system import DOMAIN, PROVIDER, ContainerInfo, System, SystemServices
 from trade._transport import ChannelClosed, Transport
 from trade._watch import Watch

@@ -34,6 +34,7 @@ from trade._wire import (
     ErrorInfo,
     Malformed,
     Reply,
+    ServiceInfo,
     Status,
     calls_to,
     decode_call,
@@ -55,11 +56,12 @@ _decode_cancel: Final = msgspec.msgpack.Decoder(CancelArguments).decode
 class LocalService:
     """A method of a registered provider, ready to be called."""
 
-    __slots__ = ("_loop", "effect", "label", "method", "serial", "signature", "strict")
+    __slots__ = ("_loop", "effect", "info", "label", "method", "serial", "signature", "strict")
 
     def __init__(
         self,
         label: str,
+        info: ServiceInfo,
         signature: Signature,
         method: Callable[..., Any],
         mark: ServiceMark,
@@ -67,6 +69,7 @@ class LocalService:
         serial: Serial | None,
     ) -> None:
         self.label = label
+        self.info = info
         self.signature = signature
         self.method = method
         self.effect = mark.effect
@@ -74,9 +77,9 @@ class LocalService:
         self.serial = serial
         self._loop = loop
 
-    def run(self, raw: Raw, context: CallContext) -> Any:
+    def run(self, raw: Raw | bytes, context: CallContext) -> Any:
         """Validate, then call. Raises what the provider raises."""
-        args, kwargs = self.signature.decode(raw)
+        args, kwargs = self.signature.decode(self.label, raw)
         return self.run_straight(args, kwargs, context)
 
     def run_straight(self, args: Sequence[Any], kwargs: dict[str, Any], context: CallContext) -> Any:
@@ -96,7 +99,7 @@ class LocalService:
         finally:
             running.reset(token)
 
-    def failure(self, error: BaseException, raw: Raw) -> ErrorInfo:
+    def failure(self, error: BaseException, raw: Raw | bytes) -> ErrorInfo:
         """What the caller is told of an error of a call with these arguments."""
         info = pack_error(error)
         return self.signature.without_secrets(info, raw) if self.signature.has_secrets else info
@@ -218,7 +221,8 @@ class Dispatcher:
 
     def _report(self, ongoing: Ongoing, value: Any) -> None:
         if ongoing.service is not None:
-            self._herald.tell(ongoing, ongoing.service.signature.encode_progress(value))
+            service = ongoing.service
+            self._herald.tell(ongoing, Raw(service.signature.encode_progress(service.label, value)))
 
     def _send_progress(self, ongoing: Ongoing, body: Raw) -> None:
         call = ongoing.call
@@ -295,7 +299,7 @@ def _run(caller: str, call: Call, service: LocalService, ongoing: Ongoing | None
     expires = None if service.effect == "stop" else call.expires_ns
     context = CallContext(call.id, service.label, caller, call.session, expires, call.chain, ongoing)
     try:
-        return Status.OK, service.signature.encode_result(service.run(call.args, context))
+        return Status.OK, Raw(service.signature.encode_result(service.label, service.run(call.args, context)))
     except BaseException as error:  # noqa: BLE001 - whatever a provider raises belongs to the caller
         return Status.ERROR, Raw(encode_message(service.failure(error, call.args)))
 

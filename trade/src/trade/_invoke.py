@@ -10,7 +10,9 @@ from typing import Any, Final
 import msgspec
 from msgspec import Raw
 
+from trade._arguments import encode_arguments
 from trade._calls import Caller, Peer
+from trade._codec import Codec
 from trade._context import CallContext, running
 from trade._dispatch import LocalService
 from trade._failures import unpack_error
@@ -19,7 +21,6 @@ from trade._ongoing import Ongoing
 from trade._records import type_from_schema
 from trade._registry import Record
 from trade._serial import Turn
-from trade._signature import Codec, encode_arguments
 from trade._system import CLOCK, DOMAIN, PROVIDER
 from trade._wire import EMPTY_ARGUMENTS, Address, ErrorInfo, Reply, ServiceInfo, Status
 from trade.errors import (
@@ -86,7 +87,7 @@ class LocalTarget:
         do = self._prepared(args, kwargs)
 
         def report(_: Ongoing, value: Any) -> None:
-            run.note_progress(service.signature.copy_progress(value) if service.strict else value)
+            run.note_progress(service.signature.copy_progress(service.label, value) if service.strict else value)
 
         ongoing = Ongoing(service, self._own.identity, None, report)
         run.on_cancel(ongoing.cancel)
@@ -99,14 +100,14 @@ class LocalTarget:
         service = self._service
         if not service.strict:
             return lambda context: service.run_straight(args, kwargs, context)
-        raw = encode_arguments(self._codec, service.signature.info, service.label, args, kwargs)
+        raw = encode_arguments(self._codec, service.info, service.label, args, kwargs)
 
         def copied(context: CallContext) -> Any:
-            return service.signature.copy_result(service.run(raw, context))
+            return service.signature.copy_result(service.label, service.run(raw, context))
 
         return copied if not service.signature.has_secrets else lambda context: self._discreet(copied, context, raw)
 
-    def _discreet(self, do: Callable[[CallContext], Any], context: CallContext, raw: Raw) -> Any:
+    def _discreet(self, do: Callable[[CallContext], Any], context: CallContext, raw: bytes) -> Any:
         """An error as it would come over the wire: without what is secret."""
         try:
             return do(context)
@@ -196,7 +197,7 @@ class RemoteTarget:
             self._start(self._clock, CLOCK, EMPTY_ARGUMENTS, None, request, clock_heard)
 
     def _encode(self, args: tuple[Any, ...], kwargs: dict[str, Any], request: Request) -> Raw:
-        raw = encode_arguments(self._codec, self._info, self._label, args, kwargs)
+        raw = Raw(encode_arguments(self._codec, self._info, self._label, args, kwargs))
         if self._is_stop:
             request.ignore_outer_deadline()
         elif request.deadline_s <= 0:

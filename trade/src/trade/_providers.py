@@ -6,16 +6,18 @@ import socket
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
+from weakref import WeakValueDictionary
 
 from msgspec import Struct, structs
 
+from trade._codec import Codec
 from trade._constraints import checked_meta
 from trade._coroutines import AsyncLoop
 from trade._dispatch import LocalService
 from trade._registry import Registry
 from trade._serial import Serial
 from trade._service import ServiceMark, kinds_of, marked_methods
-from trade._signature import Codec, Signature
+from trade._signature import Signature
 from trade._system import DOMAIN
 from trade._transport import Publisher, Transport
 from trade._wire import (
@@ -34,6 +36,8 @@ from trade.errors import ConfigurationError
 _GROUP: Final = re.compile(r"[A-Za-z0-9_-]{1,80}(\.[A-Za-z0-9_-]{1,80})*")
 
 _LONGEST_HEALTH: Final = 500
+
+_Method = tuple[str, ServiceMark, Callable[..., Any]]
 
 
 class _Registered(Struct, frozen=True):
@@ -62,6 +66,8 @@ class Providers:
         self._hosted: dict[str, _Registered] = {}
         self._names: dict[int, str] = {}
         self._counter = 0
+        self._signatures: WeakValueDictionary[_Method, Signature] = WeakValueDictionary()
+        """What objects of one class share, as long as one of them is hosted."""
 
     def add(
         self,
@@ -127,6 +133,7 @@ class Providers:
             info = change(known.info)
             services = known.services
             if reread:
+                self._signatures.clear()
                 services = self._services_of(provider, info.groups, known.implements)
                 kinds = kinds_of(type(provider), known.implements)
                 info = structs.replace(info, services=_infos(services), kinds=kinds)
@@ -187,7 +194,7 @@ class Providers:
         if not marked:
             problem = "it has no services; mark methods of its class with @trade.service"
             raise ConfigurationError(where=kind, problem=problem)
-        resources = tuple(getattr(provider, "resources", ()))
+        resources: tuple[str, ...] = tuple(getattr(provider, "resources", ()))
         _require_stop(kind, resources, [mark for mark, _ in marked.values()])
         serial = Serial()
         services: dict[str, LocalService] = {}
@@ -196,17 +203,26 @@ class Providers:
             if not mark.strict and mark.effect != "read" and (mark.uses or resources):
                 problem = "it needs physical resources, so its arguments are always checked; leave out strict=False"
                 raise ConfigurationError(where=label, problem=problem)
-            signature = Signature(label, name, mark, function, self._codec)
-            if mark.effect != "read":
-                signature.info = structs.replace(signature.info, uses=(*mark.uses, *resources))
+            signature = self._signature(label, name, mark, function)
+            info = signature.info
+            if resources and mark.effect != "read":
+                info = structs.replace(info, uses=(*mark.uses, *resources))
             services[name] = LocalService(
-                label, signature, getattr(provider, name), mark, self._loop, serial if mark.serial else None
+                label, info, signature, getattr(provider, name), mark, self._loop, serial if mark.serial else None
             )
         return services
 
+    def _signature(self, where: str, name: str, mark: ServiceMark, function: Callable[..., Any]) -> Signature:
+        """The one that other objects of the class have already, if any."""
+        key = (name, mark, function)
+        found = self._signatures.get(key)
+        if found is None:
+            found = self._signatures[key] = Signature(where, name, mark, function, self._codec)
+        return found
+
 
 def _infos(services: Mapping[str, LocalService]) -> tuple[ServiceInfo, ...]:
-    return tuple(service.signature.info for service in services.values())
+    return tuple(service.info for service in services.values())
 
 
 def _not_registered(provider: object) -> ConfigurationError:

@@ -2,9 +2,10 @@
 
 # pyright: reportUnknownVariableType=false, reportUnknownArgumentType=false, reportUnknownMemberType=false
 
+import types
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
-from typing import Any, Final
+from typing import Any, Final, Literal, Union, get_origin
 
 import msgspec
 
@@ -67,6 +68,24 @@ def _name(schema: _Schema) -> str:
     if kind == "object":
         return str(schema.get("title", "dict"))
     return str(schema.get("format") or ("bytes" if "contentEncoding" in schema else _NAMES.get(str(kind), "Any")))
+
+
+def type_text(kind: Any) -> str:
+    """A type as a person would write it: without modules, notes and ``typing``."""
+    if hasattr(kind, "__metadata__"):
+        return type_text(kind.__origin__)
+    if kind is None or kind is type(None):
+        return "None"
+    if kind is Ellipsis:
+        return "..."
+    inner = [type_text(arg) for arg in getattr(kind, "__args__", ())]
+    origin = get_origin(kind)
+    if origin in (Union, types.UnionType):
+        return " | ".join(inner)
+    if origin is Literal:
+        return f"Literal[{', '.join(map(repr, kind.__args__))}]"
+    name = getattr(origin or kind, "__name__", str(kind))
+    return f"{name}[{', '.join(inner)}]" if inner else name
 
 
 def fits(given: _Schema, given_definitions: _Schema, wanted: _Schema, wanted_definitions: _Schema) -> bool:
