@@ -9,12 +9,14 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
+from msgspec import structs
 
 import trade._signature as signatures
 from trade import Container, Handle, Settings, service, where
 from trade._registry import Registry
 from trade._rendezvous import Rendezvous, free_endpoint
 from trade._transport import Publisher
+from trade._wire import Address, ProviderInfo, decode_provider, encode_message
 from trade._zenoh import ZenohTransport, configuration
 from trade.errors import InvalidArgument
 
@@ -231,6 +233,40 @@ def test_a_local_call_allocates_little_and_keeps_nothing(here: Container) -> Non
         for _ in range(50 * CALLS):
             CALL["move"](handles["move"])
         assert blocks() - before <= MOST_BLOCKS_KEPT
+
+
+MANY = 200
+MOST_BYTES_OF_A_SERVICE = 1024
+
+
+def entries(here: Container, count: int) -> list[bytes]:
+    """What so many arms say of themselves, as it travels."""
+    services = tuple(handle.record.info for handle in here.register(Arm(), "robot"))
+    said = ProviderInfo(revision=1, groups=("robot",), kind="Arm", host="edge", pid=1, services=services)
+    return [encode_message(structs.replace(said, groups=(f"robot.p{number}",))) for number in range(count)]
+
+
+def test_equal_services_are_one_object_however_many_tell_of_them(here: Container) -> None:
+    first, second = map(decode_provider, entries(here, 2))
+    assert first.groups != second.groups
+    assert all(one is other for one, other in zip(first.services, second.services, strict=True))
+    assert (first.kind is second.kind, first.host is second.host) == (True, True)
+    left = [weakref.ref(service) for service in first.services]
+    del first, second
+    assert [ref() for ref in left] == [None] * len(CALL)
+
+
+def test_a_service_of_another_container_weighs_little(here: Container) -> None:
+    registry, said = Registry(Address("me", "late", "e1")), entries(here, MANY)
+    with traced():
+        before, _ = tracemalloc.get_traced_memory()
+        for number, entry in enumerate(said):
+            address = Address("me", "driver", "e2")
+            registry.put(address, "robot", f"Arm-{number}", decode_provider(entry))
+        registry.appear(address)
+        grown = tracemalloc.get_traced_memory()[0] - before
+    assert len(registry.select(where())) == MANY * len(CALL)
+    assert grown <= MOST_BYTES_OF_A_SERVICE * MANY * len(CALL)
 
 
 def counted(monkeypatch: pytest.MonkeyPatch, owner: type, *names: str) -> Counter[str]:

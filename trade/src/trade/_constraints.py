@@ -10,7 +10,7 @@ import msgspec
 from msgspec import Struct
 
 from trade._predicates import achieves_all, parse_predicates
-from trade._schemas import fits, read_json, read_types, readable, types_text
+from trade._schemas import fits, known_schema, read_json, read_types, readable, types_text
 from trade._wire import Scalar, ServiceInfo
 from trade.errors import ConfigurationError
 
@@ -136,7 +136,8 @@ def _takes(info: ServiceInfo, pattern: str) -> bool:
     left_out = [parameter for parameter in info.parameters if parameter not in places[: len(given)]]
     if len(given) > len(places) or any(parameter.required for parameter in left_out):
         return False
-    properties, own = info.arguments_schema.get("properties", {}), info.arguments_schema.get("$defs", {})
+    whole = known_schema(bytes(info.arguments_schema))
+    properties, own = whole.get("properties", {}), whole.get("$defs", {})
     return all(
         not schema or fits(schema, definitions, properties.get(place.name, {}), own)  # {} is Any: of whatever type
         for schema, place in zip(given, places, strict=False)
@@ -145,7 +146,8 @@ def _takes(info: ServiceInfo, pattern: str) -> bool:
 
 def _returns(info: ServiceInfo, pattern: str) -> bool:
     [wanted], definitions = read_types(pattern)
-    return fits(info.result_schema, info.result_schema.get("$defs", {}), wanted, definitions)
+    given = known_schema(bytes(info.result_schema))
+    return fits(given, given.get("$defs", {}), wanted, definitions)
 
 
 @lru_cache(1024)

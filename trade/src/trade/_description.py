@@ -11,7 +11,7 @@ from msgspec import UNSET, UnsetType
 
 from trade._codec import Codec
 from trade._records import noted
-from trade._schemas import type_text
+from trade._schemas import schema_message, type_text
 from trade._secret import MASK, is_secret
 from trade._service import ServiceMark
 from trade._wire import Parameter, ServiceInfo
@@ -62,8 +62,8 @@ def describe(
         uses=mark.uses,
         meta=dict(mark.meta),
         parameters=tuple(_parameter(parameter) for parameter in parameters),
-        arguments_schema={**arguments_schema, "$defs": inside} if inside else arguments_schema,
-        result_schema={**result_schema, "$defs": definitions} if definitions else result_schema,
+        arguments_schema=schema_message(arguments_schema, inside),
+        result_schema=schema_message(result_schema, definitions),
         types={name: f"{kind.__module__}:{kind.__qualname__}" for name, kind in known.items()},
     )
 

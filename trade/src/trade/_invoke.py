@@ -20,6 +20,7 @@ from trade._handle import Run
 from trade._ongoing import Ongoing
 from trade._records import type_from_schema
 from trade._registry import Record
+from trade._schemas import read_schema
 from trade._serial import Turn
 from trade._system import CLOCK, DOMAIN, PROVIDER
 from trade._wire import EMPTY_ARGUMENTS, Address, ErrorInfo, Reply, ServiceInfo, Status
@@ -276,7 +277,7 @@ class RemoteTarget:
 def _result_decoder(codec: Codec, info: ServiceInfo) -> Callable[[Any], Any]:
     """A decoder for the result, as typed as its description allows."""
     try:
-        return codec.decoder(type_from_schema(info.result_schema, info.types))
+        return codec.decoder(type_from_schema(read_schema(info.result_schema), info.types))
     except Exception as bad:  # noqa: BLE001 - a schema from elsewhere may be anything
         _logger.debug("the result of %s stays plain data: %s", info.name, bad)
         return codec.decoder(Any)

@@ -8,8 +8,10 @@ from functools import lru_cache
 from typing import Any, Final, Literal, Union, get_origin
 
 import msgspec
+from msgspec import Raw
 
 from trade._records import noted
+from trade._wire import encode_message
 from trade.errors import ConfigurationError
 
 _Schema = Mapping[str, Any]
@@ -17,6 +19,7 @@ _NAMES: Final = {"number": "float", "integer": "int", "string": "str", "boolean"
 _SAME: Final = ("format", "contentEncoding", "x-trade-type", "x-trade-kind")
 """What makes another kind of value of the same JSON type."""
 _MOST_REFERENCES: Final = 100
+_decode_schema: Final = msgspec.msgpack.Decoder(dict[str, Any]).decode
 
 
 def types_text(kinds: Sequence[Any]) -> str:
@@ -40,6 +43,25 @@ def read_types(text: str) -> tuple[tuple[_Schema, ...], _Schema]:
     """The schemas in such a text, and the definitions they refer to. Raises ValueError for another text."""
     schemas, definitions = read_json(text, tuple[list[dict[str, Any]], dict[str, Any]])
     return tuple(schemas), definitions
+
+
+def schema_message(schema: _Schema, definitions: _Schema) -> Raw:
+    """A schema as it travels, with the definitions it refers to."""
+    return Raw(encode_message({**schema, "$defs": definitions} if definitions else schema))
+
+
+def read_schema(raw: Raw) -> dict[str, Any]:
+    """A schema as it travels, anew each time; what cannot be read describes nothing."""
+    try:
+        return _decode_schema(raw)
+    except (msgspec.DecodeError, ValueError, RecursionError):
+        return {}
+
+
+@lru_cache(1024)
+def known_schema(data: bytes) -> _Schema:
+    """The same, kept: for looking only."""
+    return read_schema(Raw(data))
 
 
 def read_json(text: str, kind: Any) -> Any:
