@@ -17,6 +17,7 @@ from trade.errors import ConfigurationError
 __all__ = ["Candidate", "Constraint", "where"]
 
 _MOST_CLAUSES: Final = 1000
+_GLOB: Final = frozenset("*?[")
 _Field = Literal[
     "name", "group", "host", "container", "local", "args", "returns", "achieves", "uses", "kind", "meta", "healthy"
 ]
@@ -122,7 +123,7 @@ def under(group: str, selected: str) -> bool:
 
 def is_exact(pattern: str) -> bool:
     """Whether a name's pattern stands for one name only."""
-    return not any(sign in pattern for sign in "*?[")
+    return _GLOB.isdisjoint(pattern)
 
 
 def _like(name: str, pattern: str) -> bool:

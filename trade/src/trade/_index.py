@@ -67,7 +67,9 @@ class Index(Generic[_Entry]):
             return list(self._all.values())
         rarest, *others = sorted(buckets, key=len)
         entries = list(rarest.values())
-        return [entry for entry in entries if all(entry.key in other for other in others)] if others else entries
+        for other in others:
+            entries = [entry for entry in entries if entry.key in other]
+        return entries
 
 
 def _slots_of(entry: Candidate) -> Iterator[_Slot]:
