@@ -21,7 +21,7 @@ from trade._constraints import Constraint, checked_meta, where
 from trade._coroutines import AsyncLoop
 from trade._dispatch import Dispatcher
 from trade._handle import Bound, Handle, Run
-from trade._invoke import LocalTarget, RemoteTarget, Request, container_closed
+from trade._invoke import LocalTarget, RemoteTarget, container_closed, new_request
 from trade._joining import join
 from trade._notifications import Callback, Notification, Notifier
 from trade._providers import Providers, checked_groups, checked_health
@@ -324,12 +324,13 @@ class Container:
 
     def invoke(self, handle: Handle, args: tuple[Any, ...], kwargs: dict[str, Any], deadline_s: float | None) -> Any:
         """Call a service and wait; what ``handle(...)`` does."""
-        request = Request(deadline_s)
-        return self._target(handle).invoke(args, kwargs, request)
+        request = new_request(deadline_s)
+        target = self._targets.get(handle.key)
+        return (target or self._new_target(handle)).invoke(args, kwargs, request)
 
     def begin(self, handle: Handle, args: tuple[Any, ...], kwargs: dict[str, Any], deadline_s: float | None) -> Run:
         """Call a service without waiting; what ``handle.start(...)`` does."""
-        request, run = Request(deadline_s), Run(handle)
+        request, run = new_request(deadline_s), Run(handle)
         self._target(handle).begin(args, kwargs, request, run)
         return run
 

@@ -5,11 +5,11 @@ The last idle one that takes a call starts another; at the cap it answers Busy, 
 """
 
 import asyncio
-import inspect
 import logging
 import threading
 import time
 from collections.abc import Callable, Sequence
+from types import CoroutineType
 from typing import Any, Final
 
 import msgspec
@@ -47,6 +47,8 @@ _logger = logging.getLogger("trade")
 
 MOST_THREADS: Final = 64
 _PARTING_S: Final = 2.0
+_COROUTINE: Final[type] = CoroutineType
+"""What an ``async def`` gives; asked of every result, so without a call."""
 _KINDS: Final = frozenset(("call", "stop"))
 _MOST_REPLY_KEYS: Final = 1024
 _SYSTEM: Final = f"{DOMAIN}/{PROVIDER}"
@@ -80,20 +82,14 @@ class LocalService:
     def run(self, raw: Raw | bytes, context: CallContext) -> Any:
         """Validate, then call. Raises what the provider raises."""
         args, kwargs = self.signature.decode(self.label, raw)
-        return self.run_straight(args, kwargs, context)
+        return self.call(args, kwargs, context)
 
-    def run_straight(self, args: Sequence[Any], kwargs: dict[str, Any], context: CallContext) -> Any:
+    def call(self, args: Sequence[Any], kwargs: dict[str, Any], context: CallContext) -> Any:
         """Call with the arguments as they are."""
-        if self.serial is not None:
-            with self.serial.held():
-                return self._run(args, kwargs, context)
-        return self._run(args, kwargs, context)
-
-    def _run(self, args: Sequence[Any], kwargs: dict[str, Any], context: CallContext) -> Any:
         token = running.set(context)
         try:
             result = self.method(*args, **kwargs)
-            return self._loop.complete(result, context) if inspect.iscoroutine(result) else result
+            return self._loop.complete(result, context) if type(result) is _COROUTINE else result
         except (SystemExit, GeneratorExit, asyncio.CancelledError) as error:  # the provider's, not this thread's
             raise unpack_error(pack_error(error), self.label) from error
         finally:
@@ -185,7 +181,8 @@ class Dispatcher:
     def _queue(self, serial: Serial, ongoing: Ongoing, service: LocalService, replier: Publisher, call: Call) -> None:
         def begin() -> None:
             if not self._closed:
-                self._perform(ongoing, service, replier, call)
+                with serial.held():
+                    self._perform(ongoing, service, replier, call)
 
         def drop() -> None:
             if serial.withdraw(begin):

@@ -2,13 +2,13 @@
 
 import logging
 import threading
-import time
 from collections.abc import Callable
 from functools import partial
+from time import monotonic_ns
 from typing import Any, Final
 
 import msgspec
-from msgspec import Raw
+from msgspec import Raw, Struct
 
 from trade._arguments import encode_arguments
 from trade._calls import Caller, Peer
@@ -21,7 +21,7 @@ from trade._ongoing import Ongoing
 from trade._records import type_from_schema
 from trade._registry import Record
 from trade._schemas import read_schema
-from trade._serial import Turn
+from trade._serial import Serial, Turn
 from trade._system import CLOCK, DOMAIN, PROVIDER
 from trade._wire import EMPTY_ARGUMENTS, Address, ErrorInfo, Reply, ServiceInfo, Status
 from trade.errors import (
@@ -43,28 +43,36 @@ DEFAULT_DEADLINE_S: Final = 10.0
 _decode_error: Final = msgspec.msgpack.Decoder(ErrorInfo).decode
 
 
-class Request:
+_Given = bytes | tuple[tuple[Any, ...], dict[str, Any]]
+"""The arguments of a strict call, and those of one that goes straight through."""
+
+
+class Request(Struct, gc=False):
     """One call on its way out: deadline and chain, inherited from the call that makes it."""
 
-    __slots__ = ("_asked_s", "_begun_ns", "chain", "deadline_ns", "deadline_s")
-
-    def __init__(self, deadline_s: float | None) -> None:
-        self._begun_ns = now = time.monotonic_ns()
-        self._asked_s = self.deadline_s = DEFAULT_DEADLINE_S if deadline_s is None else deadline_s
-        self.deadline_ns = now + int(self.deadline_s * 1e9)
-        self.chain: tuple[str, ...] = ()
-        outer = running.get()
-        if outer is None:
-            return
-        self.chain = (*outer.chain, outer.service)
-        if outer.expires_ns is not None and outer.expires_ns < self.deadline_ns:
-            self.deadline_ns = outer.expires_ns
-            self.deadline_s = max(0.0, (outer.expires_ns - now) / 1e9)
+    deadline_s: float
+    deadline_ns: int
+    chain: tuple[str, ...]
+    asked_s: float
+    """Without the outer call's deadline, which a stop does not heed: it is sent and waited for however late that is."""
+    asked_ns: int
 
     def ignore_outer_deadline(self) -> None:
-        """A stop is sent and waited for however late the call is that makes it."""
-        self.deadline_s = self._asked_s
-        self.deadline_ns = self._begun_ns + int(self._asked_s * 1e9)
+        self.deadline_s, self.deadline_ns = self.asked_s, self.asked_ns
+
+
+def new_request(deadline_s: float | None) -> Request:
+    """A call that begins now."""
+    asked_s = DEFAULT_DEADLINE_S if deadline_s is None else deadline_s
+    now = monotonic_ns()
+    asked_ns = now + int(asked_s * 1e9)
+    outer = running.get()
+    if outer is None:
+        return Request(asked_s, asked_ns, (), asked_s, asked_ns)
+    chain = (*outer.chain, outer.service)
+    if outer.expires_ns is None or outer.expires_ns >= asked_ns:
+        return Request(asked_s, asked_ns, chain, asked_s, asked_ns)
+    return Request(max(0.0, (outer.expires_ns - now) / 1e9), outer.expires_ns, chain, asked_s, asked_ns)
 
 
 class LocalTarget:
@@ -75,74 +83,88 @@ class LocalTarget:
     ) -> None:
         self._service = service
         self._codec = codec
-        self._own = own
+        self._label = service.label
+        self._is_stop = service.effect == "stop"
+        self._straight = not service.strict and service.serial is None
+        self._identity = own.identity
         self._session = session
         self._new_id = new_id
 
     def invoke(self, args: tuple[Any, ...], kwargs: dict[str, Any], request: Request) -> Any:
-        return self._take_turn(self._prepared(args, kwargs), request, None)
+        if self._straight:
+            return self._service.call(args, kwargs, self._context(request, None))
+        given = self._taken(args, kwargs) if self._service.strict else (args, kwargs)
+        if self._service.serial is None:
+            return self._run(given, request, None)
+        return self._take_turn(self._service.serial, given, request, None)
 
     def begin(self, args: tuple[Any, ...], kwargs: dict[str, Any], request: Request, run: Run) -> None:
         """The same on a thread of its own, with the arguments as they are now."""
         service = self._service
-        do = self._prepared(args, kwargs)
+        given = self._taken(args, kwargs) if service.strict else (args, kwargs)
 
         def report(_: Ongoing, value: Any) -> None:
             run.note_progress(service.signature.copy_progress(service.label, value) if service.strict else value)
 
-        ongoing = Ongoing(service, self._own.identity, None, report)
+        ongoing = Ongoing(service, self._identity, None, report)
         run.on_cancel(ongoing.cancel)
         name = f"trade-run-{service.label}"
-        outcome = partial(self._take_turn, do, request, ongoing)
+        if service.serial is None:
+            outcome = partial(self._run, given, request, ongoing)
+        else:
+            outcome = partial(self._take_turn, service.serial, given, request, ongoing)
         threading.Thread(target=run.end, args=(outcome,), name=name, daemon=True).start()
 
-    def _prepared(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Callable[[CallContext], Any]:
-        """What to do when its time has come, with the arguments as they are now."""
-        service = self._service
-        if not service.strict:
-            return lambda context: service.run_straight(args, kwargs, context)
-        raw = encode_arguments(self._codec, service.info, service.label, args, kwargs)
+    def _taken(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> bytes:
+        """The arguments as they are now, whatever becomes of them."""
+        return encode_arguments(self._codec, self._service.info, self._service.label, args, kwargs)
 
-        def copied(context: CallContext) -> Any:
-            return service.signature.copy_result(service.label, service.run(raw, context))
-
-        return copied if not service.signature.has_secrets else lambda context: self._discreet(copied, context, raw)
-
-    def _discreet(self, do: Callable[[CallContext], Any], context: CallContext, raw: bytes) -> Any:
-        """An error as it would come over the wire: without what is secret."""
-        try:
-            return do(context)
-        except Exception as error:  # noqa: BLE001 - whatever a provider raises
-            masked = unpack_error(self._service.failure(error, raw), self._service.label)
-        raise masked
-
-    def _take_turn(self, do: Callable[[CallContext], Any], request: Request, ongoing: Ongoing | None) -> Any:
-        serial = self._service.serial
-        if serial is None or serial.mine:
-            return self._run(do, request, ongoing)
+    def _take_turn(self, serial: Serial, given: _Given, request: Request, ongoing: Ongoing | None) -> Any:
+        if serial.mine:
+            return self._run(given, request, ongoing)
         turn = Turn()
         if ongoing is not None:
             ongoing.on_cancel(lambda: serial.drop(turn))
-        if not serial.enter(turn, (request.deadline_ns - time.monotonic_ns()) / 1e9):
+        if not serial.enter(turn, (request.deadline_ns - monotonic_ns()) / 1e9):
             if ongoing is not None and ongoing.cancelled:
                 raise Cancelled(service=self._service.label)
             raise DeadlineExceeded(service=self._service.label, deadline_s=request.deadline_s)
         try:
-            return self._run(do, request, ongoing)
+            with serial.held():
+                return self._run(given, request, ongoing)
         finally:
             serial.leave()
 
-    def _run(self, do: Callable[[CallContext], Any], request: Request, ongoing: Ongoing | None) -> Any:
+    def _run(self, given: _Given, request: Request, ongoing: Ongoing | None) -> Any:
         service = self._service
         if ongoing is not None and ongoing.cancelled:
             raise Cancelled(service=service.label)
-        expires_ns = None if service.effect == "stop" else request.deadline_ns
-        if service.too_late(expires_ns):
-            raise DeadlineExceeded(service=service.label, deadline_s=request.deadline_s)
-        context = CallContext(
-            self._new_id(), service.label, self._own.identity, self._session, expires_ns, request.chain, ongoing
+        context = self._context(request, ongoing)
+        if isinstance(given, tuple):
+            return service.call(*given, context)
+        if service.signature.has_secrets:
+            return self._discreet(given, context)
+        return self._copied(given, context)
+
+    def _context(self, request: Request, ongoing: Ongoing | None) -> CallContext:
+        expires_ns = None if self._is_stop else request.deadline_ns
+        if expires_ns is not None and monotonic_ns() >= expires_ns:
+            raise DeadlineExceeded(service=self._label, deadline_s=request.deadline_s)
+        return CallContext(
+            self._new_id(), self._label, self._identity, self._session, expires_ns, request.chain, ongoing
         )
-        return do(context)
+
+    def _copied(self, raw: bytes, context: CallContext) -> Any:
+        service = self._service
+        return service.signature.copy_result(service.label, service.run(raw, context))
+
+    def _discreet(self, raw: bytes, context: CallContext) -> Any:
+        """An error as it would come over the wire: without what is secret."""
+        try:
+            return self._copied(raw, context)
+        except Exception as error:  # noqa: BLE001 - whatever a provider raises
+            masked = unpack_error(self._service.failure(error, raw), self._service.label)
+        raise masked
 
 
 class RemoteTarget:

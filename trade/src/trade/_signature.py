@@ -25,6 +25,7 @@ _AT: Final = re.compile(r" - at `\$(?:\[(\d+)\]|\.(\w+))(.*)`$")
 _MAP_HEADS: Final = frozenset([*range(0x80, 0x90), 0xDE, 0xDF])
 _POSITIONAL: Final = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
 _PLAIN: Final = frozenset([bool, int, float, str, bytes, type(None)])
+_SEVERAL: Final = (list, tuple, set, frozenset)
 _SAME_WHEN_COPIED: Final = (bool, float, type(None))
 """Every value of these can be sent, and what arrives is the same."""
 
@@ -72,7 +73,7 @@ class Signature:
             args, kwargs = self._by_name(raw) if memoryview(raw)[0] in _MAP_HEADS else (self._by_place(raw), {})
         except (msgspec.ValidationError, msgspec.DecodeError) as bad:
             raise self._explain(service, str(bad), raw) from None
-        if self._must_be_finite and not (_finite(args) and (not kwargs or _finite(kwargs))):
+        if self._must_be_finite and not (all(map(_finite, args)) and (not kwargs or _finite(kwargs))):
             raise self._not_finite(service, args, kwargs)
         return args, kwargs
 
@@ -210,12 +211,15 @@ def _mentions_float(kind: Any) -> bool:
 
 
 def _finite(value: Any) -> bool:
-    if type(value) in _PLAIN:
-        return type(value) is not float or math.isfinite(value)
+    kind = type(value)
+    if kind is float:
+        return math.isfinite(value)
+    if kind in _PLAIN:
+        return True
     if isinstance(value, float):
         return math.isfinite(value)
-    if isinstance(value, list | tuple | set | frozenset):
-        return all(map(_finite, value))  # pyright: ignore[reportUnknownArgumentType]
+    if isinstance(value, _SEVERAL):
+        return all(map(_finite, value))
     if isinstance(value, dict):
         return all(map(_finite, value.values()))  # pyright: ignore[reportUnknownArgumentType]
     if isinstance(value, msgspec.Struct):
