@@ -39,6 +39,7 @@ from trade.errors import (
 _logger = logging.getLogger("trade")
 
 DEFAULT_DEADLINE_S: Final = 10.0
+_DEFAULT_DEADLINE_NS: Final = int(DEFAULT_DEADLINE_S * 1e9)
 
 _decode_error: Final = msgspec.msgpack.Decoder(ErrorInfo).decode
 
@@ -63,10 +64,11 @@ class Request(Struct, gc=False):
 
 def new_request(deadline_s: float | None) -> Request:
     """A call that begins now."""
-    asked_s = DEFAULT_DEADLINE_S if deadline_s is None else deadline_s
-    now = monotonic_ns()
-    asked_ns = now + int(asked_s * 1e9)
-    outer = running.get()
+    now, outer = monotonic_ns(), running.get()
+    if deadline_s is None:
+        asked_s, asked_ns = DEFAULT_DEADLINE_S, now + _DEFAULT_DEADLINE_NS
+    else:
+        asked_s, asked_ns = deadline_s, now + int(deadline_s * 1e9)
     if outer is None:
         return Request(asked_s, asked_ns, (), asked_s, asked_ns)
     chain = (*outer.chain, outer.service)
