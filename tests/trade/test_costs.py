@@ -6,23 +6,25 @@ import tracemalloc
 import weakref
 from collections import Counter
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, cast
 
 import pytest
 from msgspec import structs
 
 import trade._signature as signatures
 from trade import Container, Handle, Settings, service, where
+from trade._arguments import encode_call
 from trade._registry import Registry
 from trade._rendezvous import Rendezvous, free_endpoint
 from trade._transport import Publisher
-from trade._wire import Address, ProviderInfo, decode_provider, encode_message
+from trade._wire import PROTOCOL, Address, Call, ProviderInfo, ServiceInfo, decode_provider, encode_message
 from trade._zenoh import ZenohTransport, configuration
 from trade.errors import InvalidArgument
 
 CALLS = 20
 MOST_BYTES_OF_A_CALL = 16 * 1024
 MOST_BLOCKS_KEPT = 100
+MANY_BYTES = 8 << 20
 
 
 class Arm:
@@ -233,6 +235,15 @@ def test_a_local_call_allocates_little_and_keeps_nothing(here: Container) -> Non
         for _ in range(50 * CALLS):
             CALL["move"](handles["move"])
         assert blocks() - before <= MOST_BLOCKS_KEPT
+
+
+def test_large_arguments_are_copied_once_into_their_message() -> None:
+    data = bytes(MANY_BYTES)
+    info = ServiceInfo(name="keep", signature="keep(data: bytes)")
+    codec = signatures.Codec(lambda value: value, lambda code, inside: inside)
+    call = Call(PROTOCOL, 1, "keep", "c/0", "", None, (), cast(Any, (data,)))
+    with traced():
+        assert peak_bytes(lambda: encode_call(codec, info, "robot.keep", call)) < 1.9 * MANY_BYTES
 
 
 MANY = 200

@@ -10,7 +10,7 @@ from typing import Any, Final
 import msgspec
 from msgspec import Raw, Struct
 
-from trade._arguments import encode_arguments
+from trade._arguments import encode_arguments, encode_call, given
 from trade._calls import Caller, Peer
 from trade._codec import Codec
 from trade._context import CallContext, running
@@ -23,7 +23,7 @@ from trade._registry import Record
 from trade._schemas import read_schema
 from trade._serial import Serial, Turn
 from trade._system import CLOCK, DOMAIN, PROVIDER
-from trade._wire import EMPTY_ARGUMENTS, Address, ErrorInfo, Reply, ServiceInfo, Status
+from trade._wire import EMPTY_ARGUMENTS, Address, Call, ErrorInfo, Reply, ServiceInfo, Status
 from trade.errors import (
     Busy,
     Cancelled,
@@ -44,7 +44,7 @@ _DEFAULT_DEADLINE_NS: Final = int(DEFAULT_DEADLINE_S * 1e9)
 _decode_error: Final = msgspec.msgpack.Decoder(ErrorInfo).decode
 
 
-_Given = bytes | tuple[tuple[Any, ...], dict[str, Any]]
+_Taken = bytes | tuple[tuple[Any, ...], dict[str, Any]]
 """The arguments of a strict call, and those of one that goes straight through."""
 
 
@@ -95,15 +95,15 @@ class LocalTarget:
     def invoke(self, args: tuple[Any, ...], kwargs: dict[str, Any], request: Request) -> Any:
         if self._straight:
             return self._service.call(args, kwargs, self._context(request, None))
-        given = self._taken(args, kwargs) if self._service.strict else (args, kwargs)
+        taken = self._taken(args, kwargs) if self._service.strict else (args, kwargs)
         if self._service.serial is None:
-            return self._run(given, request, None)
-        return self._take_turn(self._service.serial, given, request, None)
+            return self._run(taken, request, None)
+        return self._take_turn(self._service.serial, taken, request, None)
 
     def begin(self, args: tuple[Any, ...], kwargs: dict[str, Any], request: Request, run: Run) -> None:
         """The same on a thread of its own, with the arguments as they are now."""
         service = self._service
-        given = self._taken(args, kwargs) if service.strict else (args, kwargs)
+        taken = self._taken(args, kwargs) if service.strict else (args, kwargs)
 
         def report(_: Ongoing, value: Any) -> None:
             run.note_progress(service.signature.copy_progress(service.label, value) if service.strict else value)
@@ -112,18 +112,18 @@ class LocalTarget:
         run.on_cancel(ongoing.cancel)
         name = f"trade-run-{service.label}"
         if service.serial is None:
-            outcome = partial(self._run, given, request, ongoing)
+            outcome = partial(self._run, taken, request, ongoing)
         else:
-            outcome = partial(self._take_turn, service.serial, given, request, ongoing)
+            outcome = partial(self._take_turn, service.serial, taken, request, ongoing)
         threading.Thread(target=run.end, args=(outcome,), name=name, daemon=True).start()
 
     def _taken(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> bytes:
         """The arguments as they are now, whatever becomes of them."""
         return encode_arguments(self._codec, self._service.info, self._service.label, args, kwargs)
 
-    def _take_turn(self, serial: Serial, given: _Given, request: Request, ongoing: Ongoing | None) -> Any:
+    def _take_turn(self, serial: Serial, taken: _Taken, request: Request, ongoing: Ongoing | None) -> Any:
         if serial.mine:
-            return self._run(given, request, ongoing)
+            return self._run(taken, request, ongoing)
         turn = Turn()
         if ongoing is not None:
             ongoing.on_cancel(lambda: serial.drop(turn))
@@ -133,20 +133,20 @@ class LocalTarget:
             raise DeadlineExceeded(service=self._service.label, deadline_s=request.deadline_s)
         try:
             with serial.held():
-                return self._run(given, request, ongoing)
+                return self._run(taken, request, ongoing)
         finally:
             serial.leave()
 
-    def _run(self, given: _Given, request: Request, ongoing: Ongoing | None) -> Any:
+    def _run(self, taken: _Taken, request: Request, ongoing: Ongoing | None) -> Any:
         service = self._service
         if ongoing is not None and ongoing.cancelled:
             raise Cancelled(service=service.label)
         context = self._context(request, ongoing)
-        if isinstance(given, tuple):
-            return service.call(*given, context)
+        if isinstance(taken, tuple):
+            return service.call(*taken, context)
         if service.signature.has_secrets:
-            return self._discreet(given, context)
-        return self._copied(given, context)
+            return self._discreet(taken, context)
+        return self._copied(taken, context)
 
     def _context(self, request: Request, ongoing: Ongoing | None) -> CallContext:
         expires_ns = None if self._is_stop else request.deadline_ns
@@ -186,22 +186,25 @@ class RemoteTarget:
         self._decode_any = codec.decoder(Any)
 
     def invoke(self, args: tuple[Any, ...], kwargs: dict[str, Any], request: Request) -> Any:
-        raw = self._encode(args, kwargs, request)
-        if not (self._peer.clock_known or self._is_stop):
+        values = self._values(args, kwargs, request)
+        if not self._may_go:
             reply = self._ask(self._clock, CLOCK, EMPTY_ARGUMENTS, None, request)
             if reply.status != Status.OK:
                 raise self._not_begun(reply, request)
-        return self._unpack(self._ask(self._publisher, self._info.name, raw, self._expiry(request), request), request)
+        reply = self._ask(self._publisher, self._info.name, values, self._expiry(request), request)
+        return self._unpack(reply, request)
 
     def begin(self, args: tuple[Any, ...], kwargs: dict[str, Any], request: Request, run: Run) -> None:
         """The same without waiting; the outcome goes into the run."""
-        raw = self._encode(args, kwargs, request)
+        values = self._values(args, kwargs, request)
 
         def go() -> None:
             if run.cancelling:
                 run.fail(Cancelled(service=self._label))
                 return
-            call_id = self._start(self._publisher, self._info.name, raw, self._expiry(request), request, finish, note)
+            call_id = self._start(
+                self._publisher, self._info.name, values, self._expiry(request), request, finish, note
+            )
             run.on_cancel(lambda: self._caller.cancel(self._peer, call_id, self._label, request.deadline_ns))
 
         def note(reply: Reply) -> None:
@@ -216,37 +219,50 @@ class RemoteTarget:
         def clock_heard(reply: Reply) -> None:
             go() if reply.status == Status.OK else run.fail(self._not_begun(reply, request))
 
-        if self._peer.clock_known or self._is_stop:
+        if self._may_go:
             go()
         else:
             self._start(self._clock, CLOCK, EMPTY_ARGUMENTS, None, request, clock_heard)
 
-    def _encode(self, args: tuple[Any, ...], kwargs: dict[str, Any], request: Request) -> Raw:
-        raw = Raw(encode_arguments(self._codec, self._info, self._label, args, kwargs))
+    @property
+    def _may_go(self) -> bool:
+        """Whether nothing need be asked first."""
+        return self._is_stop or self._peer.clock_known
+
+    def _values(self, args: tuple[Any, ...], kwargs: dict[str, Any], request: Request) -> Any:
+        """The arguments, for a message that is made now; as bytes, checked already, for one that comes later."""
         if self._is_stop:
             request.ignore_outer_deadline()
         elif request.deadline_s <= 0:
             raise DeadlineExceeded(service=self._label, deadline_s=request.deadline_s)
-        return raw
+        if self._may_go:
+            return given(self._info, self._label, args, kwargs)
+        return Raw(encode_arguments(self._codec, self._info, self._label, args, kwargs))
+
+    def _message(self, call: Call) -> bytes:
+        return encode_call(self._codec, self._info, self._label, call)
 
     def _expiry(self, request: Request) -> int | None:
         return None if self._is_stop else self._peer.expiry_ns(request.deadline_ns)
 
-    def _ask(self, publisher: Any, service: str, raw: Raw, expires_ns: int | None, request: Request) -> Reply:
-        return self._caller.ask(self._peer, publisher, service, raw, request.deadline_ns, expires_ns, request.chain)
+    def _ask(self, publisher: Any, service: str, args: Any, expires_ns: int | None, request: Request) -> Reply:
+        return self._caller.ask(
+            self._peer, publisher, service, args, request.deadline_ns, expires_ns, request.chain, self._message
+        )
 
     def _start(
         self,
         publisher: Any,
         service: str,
-        raw: Raw,
+        args: Any,
         expires_ns: int | None,
         request: Request,
         then: Callable[[Reply], None],
         on_progress: Callable[[Reply], None] | None = None,
     ) -> int:
+        peer, deadline_ns, chain = self._peer, request.deadline_ns, request.chain
         return self._caller.start(
-            self._peer, publisher, service, raw, request.deadline_ns, expires_ns, request.chain, then, on_progress
+            peer, publisher, service, args, deadline_ns, expires_ns, chain, then, on_progress, self._message
         )
 
     def _unpack(self, reply: Reply, request: Request) -> Any:
