@@ -11,7 +11,7 @@ import msgspec
 from msgspec import Raw
 
 from trade._records import noted
-from trade._wire import encode_message
+from trade._wire import NO_SCHEMA, encode_message
 from trade.errors import ConfigurationError
 
 _Schema = Mapping[str, Any]
@@ -47,6 +47,8 @@ def read_types(text: str) -> tuple[tuple[_Schema, ...], _Schema]:
 
 def schema_message(schema: _Schema, definitions: _Schema) -> Raw:
     """A schema as it travels, with the definitions it refers to."""
+    if not schema and not definitions:
+        return NO_SCHEMA  # which is left out
     return Raw(encode_message({**schema, "$defs": definitions} if definitions else schema))
 
 
