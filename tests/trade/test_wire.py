@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from trade import Container, Handle, _wire, service, where
+from trade._schemas import schema_message
 from trade._wire import (
     EMPTY,
     EMPTY_ARGUMENTS,
@@ -37,6 +38,7 @@ from trade.errors import InvalidResult, RemoteError
 
 CALL = Call(PROTOCOL, 7, "echo", "raw/0", "tester/raw/0", 2**62, (), EMPTY_ARGUMENTS)
 REPLY = Reply(PROTOCOL, 7, Status.OK, 1, EMPTY)
+TEXT, NUMBER = schema_message({"type": "string"}, {}), schema_message({"type": "integer"}, {})
 PROVIDER = ProviderInfo(
     revision=1, groups=("forged",), kind="Forged", host="h", pid=1, services=(ServiceInfo(name="go", signature="go()"),)
 )
@@ -387,7 +389,7 @@ def test_a_call_goes_by_the_newest_description_of_its_service(here: Container, o
     callee.answer_clock()
     callee.answer(callee.next(), Status.OK, 5)
     assert first.result(20) == 5
-    info = ServiceInfo(name="go", signature="go() -> str", effect="read", result_schema={"type": "string"})
+    info = ServiceInfo(name="go", signature="go() -> str", effect="read", result_schema=TEXT)
     callee.entry.put(encode_message(msgspec.structs.replace(PROVIDER, revision=2, services=(info,), groups=("newer",))))
     assert here.find(where(group="newer"), wait_s=20) == callee.handle
     second = callee.handle.start()
@@ -405,7 +407,7 @@ class FakeCallee:
     def __init__(self, raw: Any, caller: Container) -> None:
         self.raw, self.caller = raw, caller
         self.calls = raw.subscribe(calls_to(FORGED, stop=False))
-        info = ServiceInfo(name="go", signature="go() -> int", effect="read", result_schema={"type": "integer"})
+        info = ServiceInfo(name="go", signature="go() -> int", effect="read", result_schema=NUMBER)
         self.sign = raw.appear(alive_key(FORGED))
         self.entry = raw.announce(registry_key("robot", FORGED, "P-1"))
         self.entry.put(encode_message(msgspec.structs.replace(PROVIDER, services=(info,))))

@@ -15,13 +15,14 @@ from msgspec import structs
 
 from trade import _many
 from trade._calls import Caller
+from trade._codec import Codec
 from trade._constraints import Constraint, checked_meta, where
 from trade._coroutines import AsyncLoop
 from trade._deadman import Deadman
 from trade._dispatch import Dispatcher
 from trade._handle import Bound, Handle, Run
 from trade._hints import no_such_service, too_many_services
-from trade._invoke import LocalTarget, RemoteTarget, Request, container_closed
+from trade._invoke import LocalTarget, RemoteTarget, container_closed, new_request
 from trade._joining import join
 from trade._lock import Lock, OnLost, OnRequest
 from trade._locking import LEASE_S, Locking
@@ -33,7 +34,6 @@ from trade._reach import Reach
 from trade._registry import Change, Record, Registry
 from trade._resources import Holder
 from trade._settings import Settings
-from trade._signature import Codec
 from trade._system import DOMAIN, PROVIDER, ContainerInfo, System
 from trade._transport import ChannelClosed, Transport
 from trade._watch import Watch
@@ -353,12 +353,13 @@ class Container:
 
     def invoke(self, handle: Handle, args: tuple[Any, ...], kwargs: dict[str, Any], deadline_s: float | None) -> Any:
         """Call a service and wait; what ``handle(...)`` does."""
-        request = Request(deadline_s)
-        return self._target(handle).invoke(args, kwargs, request)
+        request = new_request(deadline_s)
+        target = self._targets.get(handle.key)
+        return (target or self._new_target(handle)).invoke(args, kwargs, request)
 
     def begin(self, handle: Handle, args: tuple[Any, ...], kwargs: dict[str, Any], deadline_s: float | None) -> Run:
         """Call a service without waiting; what ``handle.start(...)`` does."""
-        request, run = Request(deadline_s), Run(handle)
+        request, run = new_request(deadline_s), Run(handle)
         self._target(handle).begin(args, kwargs, request, run)
         return run
 

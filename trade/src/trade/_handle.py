@@ -10,6 +10,7 @@ from types import MappingProxyType
 from typing import Any, Final, NoReturn, Protocol
 
 from trade._registry import Record
+from trade._schemas import read_schema
 from trade._wire import Address, Scalar, ServiceKey
 from trade.errors import ConfigurationError
 
@@ -272,7 +273,7 @@ class Handle:
     @property
     def meta(self) -> Mapping[str, Scalar]:
         """What it is declared with, and its provider over it."""
-        return self.record.meta
+        return dict(self.record.meta)
 
     @property
     def health(self) -> str:
@@ -288,7 +289,7 @@ class Handle:
     def schema(self) -> Mapping[str, Mapping[str, Any]]:
         """JSON Schema of ``arguments`` and ``result``."""
         info = self.record.info
-        return {"arguments": info.arguments_schema, "result": info.result_schema}
+        return {"arguments": read_schema(info.arguments_schema), "result": read_schema(info.result_schema)}
 
     def cancel_service(self) -> "Handle":
         """The service that ends this one early. Raises ConfigurationError if there is none."""

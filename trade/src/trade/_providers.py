@@ -5,9 +5,11 @@ import socket
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final, NamedTuple, cast
+from weakref import WeakValueDictionary
 
 from msgspec import Struct, structs
 
+from trade._codec import Codec
 from trade._constraints import GROUP, checked_meta
 from trade._coroutines import AsyncLoop
 from trade._dispatch import LocalService
@@ -16,7 +18,7 @@ from trade._registry import Registry
 from trade._resources import Resource
 from trade._serial import Serial
 from trade._service import ServiceMark, kinds_of, marked_methods
-from trade._signature import Codec, Signature
+from trade._signature import Signature
 from trade._system import DOMAIN
 from trade._transport import Publisher, Transport
 from trade._wire import (
@@ -33,6 +35,8 @@ from trade._wire import (
 from trade.errors import ConfigurationError
 
 _LONGEST_HEALTH: Final = 500
+
+_Method = tuple[str, ServiceMark, Callable[..., Any]]
 
 
 class _Registered(Struct, frozen=True):
@@ -73,6 +77,8 @@ class Providers:
         self._hosted: dict[str, _Registered] = {}
         self._names: dict[int, str] = {}
         self._counter = 0
+        self._signatures: WeakValueDictionary[_Method, Signature] = WeakValueDictionary()
+        """What objects of one class share, as long as one of them is hosted."""
 
     def add(
         self,
@@ -144,6 +150,7 @@ class Providers:
             info = change(known.info)
             services = known.services
             if reread:
+                self._signatures.clear()
                 services = self._services_of(provider, info.groups, known.implements, place)
                 kinds = kinds_of(type(provider), known.implements)
                 info = structs.replace(info, services=_infos(services), kinds=kinds)
@@ -236,12 +243,14 @@ class Providers:
             if not mark.strict and mark.effect != "read" and (mark.uses or resources):
                 problem = "it needs physical resources, so its arguments are always checked; leave out strict=False"
                 raise ConfigurationError(where=label, problem=problem)
-            signature = Signature(label, name, mark, function, self._codec)
-            if mark.effect != "read":
+            signature = self._signature(label, name, mark, function)
+            info = signature.info
+            if resources and mark.effect != "read":
                 names = tuple(one if isinstance(one, str) else one.name for one in resources)
-                signature.info = structs.replace(signature.info, uses=(*mark.uses, *names))
+                info = structs.replace(info, uses=(*mark.uses, *names))
             services[name] = LocalService(
                 label,
+                info,
                 signature,
                 getattr(provider, name),
                 mark,
@@ -250,6 +259,14 @@ class Providers:
                 self._adopt(mark, (*mark.uses, *resources), f"{place}/{name}"),
             )
         return services
+
+    def _signature(self, where: str, name: str, mark: ServiceMark, function: Callable[..., Any]) -> Signature:
+        """The one that other objects of the class have already, if any."""
+        key = (name, mark, function)
+        found = self._signatures.get(key)
+        if found is None:
+            found = self._signatures[key] = Signature(where, name, mark, function, self._codec)
+        return found
 
     def _adopt(self, mark: ServiceMark, needed: Sequence[Resource | str], itself: str) -> tuple[Resource, ...]:
         """What a service needs for itself; what names nothing, or only reads, can be locked as itself."""
@@ -264,7 +281,7 @@ class Providers:
 
 
 def _infos(services: Mapping[str, LocalService]) -> tuple[ServiceInfo, ...]:
-    return tuple(service.signature.info for service in services.values())
+    return tuple(service.info for service in services.values())
 
 
 def _not_registered(provider: object) -> ConfigurationError:

@@ -108,7 +108,7 @@ class Registry:
                 known = state.providers.get(provider)
                 if provider in state.removed or (known is not None and known[0] >= info.revision):
                     return
-                state.providers[provider] = (info.revision, self._make(address, domain, provider, info))
+                state.providers[provider] = (info.revision, self._make(state.address, domain, provider, info))
                 change = self._swap(known[1] if known else [], state.providers[provider][1], state.alive)
             self._tell(change)
 
@@ -164,7 +164,7 @@ class Registry:
                 pid=info.pid,
                 local=address == self._own,
                 kinds=info.kinds,
-                meta={**service.meta, **info.meta},
+                meta={**service.meta, **info.meta} if service.meta and info.meta else service.meta or info.meta,
                 health=info.health,
                 members=info.members,
             )
@@ -203,7 +203,9 @@ class Registry:
     def select(self, constraint: Constraint) -> list[Record]:
         """Records that match, ordered by label and place."""
         records = [record for record in self._records.candidates(constraint) if constraint.matches(record)]
-        return sorted(records, key=lambda record: (record.label, str(record.key.address), record.key.provider))
+        if len(records) > 1:
+            records.sort(key=lambda record: (record.label, str(record.key.address), record.key.provider))
+        return records
 
     def wait_for(self, ready: Callable[[], bool], timeout_s: float) -> bool:
         """Wait until the condition holds after some change. Returns whether it does."""

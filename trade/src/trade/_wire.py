@@ -3,10 +3,12 @@
 # pyright: reportUnknownVariableType=false
 
 import re
+from sys import intern
 from typing import Annotated, Any, Final, TypeVar
+from weakref import WeakValueDictionary
 
 import msgspec
-from msgspec import Meta, Raw, Struct
+from msgspec import Meta, Raw, Struct, structs
 
 PROTOCOL: Final = 1
 """Version of every message. A reader drops, counts and logs once what carries another."""
@@ -24,7 +26,7 @@ def as_chunk(text: str) -> str:
     return re.sub(r"[^A-Za-z0-9_.-]", "-", text)[:80] or "_"
 
 
-class Address(Struct, frozen=True, array_like=True):
+class Address(Struct, frozen=True, array_like=True, gc=False, cache_hash=True):
     """Where a container is: who speaks, under which name, in which boot."""
 
     identity: str
@@ -35,7 +37,7 @@ class Address(Struct, frozen=True, array_like=True):
         return f"{self.identity}/{self.container}/{self.epoch}"
 
 
-class ServiceKey(Struct, frozen=True, array_like=True):
+class ServiceKey(Struct, frozen=True, array_like=True, gc=False, cache_hash=True):
     """Names one service of one boot epoch; what a handle is over the wire."""
 
     address: Address
@@ -164,7 +166,7 @@ HEALTHY: Final = "healthy"
 """The health of a provider with which nothing is wrong; any other text says what is."""
 
 
-class Parameter(Struct, frozen=True, array_like=True):
+class Parameter(Struct, frozen=True, array_like=True, gc=False):
     """One parameter of a service."""
 
     name: str
@@ -173,8 +175,11 @@ class Parameter(Struct, frozen=True, array_like=True):
     positional_only: bool = False
 
 
-class ServiceInfo(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """What everybody may know of a service."""
+NO_SCHEMA: Final = Raw(msgspec.msgpack.encode({}))
+
+
+class ServiceInfo(Struct, frozen=True, kw_only=True, omit_defaults=True, weakref=True):
+    """What everybody may know of a service. Equal ones that came by message are one object: nobody changes it."""
 
     name: str
     signature: str
@@ -184,8 +189,9 @@ class ServiceInfo(Struct, frozen=True, kw_only=True, omit_defaults=True):
     achieves: tuple[str, ...] = ()
     uses: tuple[str, ...] = ()
     parameters: tuple[Parameter, ...] = ()
-    arguments_schema: dict[str, Any] = {}
-    result_schema: dict[str, Any] = {}
+    arguments_schema: Raw = NO_SCHEMA
+    """JSON Schema as it travels: few are ever looked at, see `_schemas`."""
+    result_schema: Raw = NO_SCHEMA
     types: dict[str, str] = {}
     """Schema definition -> ``module:qualified name``, so that a process that has the type gets the type."""
     meta: dict[str, Scalar] = {}
@@ -208,6 +214,12 @@ class ProviderInfo(Struct, frozen=True, kw_only=True):
     health: str = HEALTHY
     members: dict[str, tuple[str, ...]] = {}
     """What the robot's groups consist of: group -> resources, whether or not they are there."""
+
+
+class _ProviderMessage(ProviderInfo, frozen=True, kw_only=True):
+    """The same before its services are read."""
+
+    services: tuple[Raw, ...]  # pyright: ignore[reportIncompatibleVariableOverride]
 
 
 CANCEL: Final = "cancel"
@@ -233,7 +245,7 @@ EMPTY: Final = Raw(msgspec.msgpack.encode(None))
 EMPTY_ARGUMENTS: Final = Raw(msgspec.msgpack.encode(()))
 
 
-_Message = TypeVar("_Message", Call, Reply, ProviderInfo)
+_Message = TypeVar("_Message", Call, Reply, _ProviderMessage)
 
 
 class Malformed(Exception):
@@ -242,7 +254,10 @@ class Malformed(Exception):
 
 call_decoder: Final = msgspec.msgpack.Decoder(Call)
 reply_decoder: Final = msgspec.msgpack.Decoder(Reply)
-_provider_decoder: Final = msgspec.msgpack.Decoder(ProviderInfo)
+_provider_decoder: Final = msgspec.msgpack.Decoder(_ProviderMessage)
+_service_decoder: Final = msgspec.msgpack.Decoder(ServiceInfo)
+_services: Final[WeakValueDictionary[bytes, ServiceInfo]] = WeakValueDictionary()
+"""The services known now by their bytes: a thousand objects of one class tell the same."""
 encode_message: Final = msgspec.msgpack.Encoder().encode
 
 
@@ -255,7 +270,23 @@ def decode_reply(payload: bytes) -> Reply:
 
 
 def decode_provider(payload: bytes) -> ProviderInfo:
-    return _decoded(_provider_decoder, payload)
+    message = _decoded(_provider_decoder, payload)
+    try:
+        services = tuple(_service(bytes(raw)) for raw in message.services)
+    except (msgspec.DecodeError, ValueError, RecursionError, MemoryError) as bad:
+        raise Malformed(why_malformed(payload, bad)) from None
+    told: dict[str, Any] = {
+        **structs.asdict(message),
+        "services": services,
+        "kind": intern(message.kind),
+        "host": intern(message.host),
+    }
+    return ProviderInfo(**told)
+
+
+def _service(data: bytes) -> ServiceInfo:
+    known = _services.get(data)
+    return known if known is not None else _services.setdefault(data, _service_decoder.decode(data))
 
 
 def _decoded(decoder: msgspec.msgpack.Decoder[_Message], payload: bytes) -> _Message:
