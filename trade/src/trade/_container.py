@@ -15,6 +15,7 @@ import msgspec
 from msgspec import structs
 
 from trade import _many
+from trade._announcing import Announcer
 from trade._calls import Caller
 from trade._constraints import Constraint, checked_meta, where
 from trade._coroutines import AsyncLoop
@@ -91,14 +92,16 @@ class Container:
             self._registry.listen(self._notifier.changed)
             coroutines = AsyncLoop()
             leaving.callback(coroutines.close)
-            self._providers = Providers(self._transport, self._registry, self.address, self._codec, coroutines)
-            leaving.callback(self._providers.close)
+            announcer = Announcer(self._transport, self.address)
+            leaving.callback(announcer.close)
+            self._providers = Providers(announcer, self._registry, self.address, self._codec, coroutines)
             self._dispatcher = Dispatcher(self._transport, self.address, self._providers.lookup, coroutines)
             leaving.callback(self._dispatcher.close)
             self._providers.add(SystemServices(self.system), (DOMAIN,), name=PROVIDER)
             presence = self._transport.appear(alive_key(self.address))
             leaving.callback(presence.close)
-            self._watch = Watch(self._transport, self._registry, self.address, self._caller.lost)
+            lost, beat = self._caller.lost, announcer.beat
+            self._watch = Watch(self._transport, self._registry, self.address, lost, beat)
             leaving.callback(self._watch.close)
             self._leaving = leaving.pop_all()
         _live.add(self)
@@ -237,7 +240,7 @@ class Container:
         self._check_open()
         infos: list[ContainerInfo] = []
         for state in self._registry.containers():
-            records = [record for _, provided in state.providers.values() for record in provided]
+            records = [record for _, provided in list(state.providers.values()) for record in provided]
             first = records[0] if records else None
             infos.append(
                 ContainerInfo(
@@ -446,6 +449,11 @@ class Container:
     def dropped_messages(self) -> int:
         """Messages that were malformed or of another protocol version."""
         return self._dispatcher.malformed + self._caller.malformed + self._watch.malformed
+
+    @property
+    def catching_up(self) -> bool:
+        """Whether it is asking others for what it may have missed."""
+        return self._watch.busy
 
     def healthy(self) -> bool:
         """Whether it can still take a call now; what feeds hardware watchdogs asks this."""

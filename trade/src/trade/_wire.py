@@ -67,6 +67,14 @@ def alive_key(address: Address) -> str:
     return f"alive/{address}"
 
 
+TALLY: Final = "tally"
+"""The last chunk of the key, in the middleware's own domain, under which a container says how far it is."""
+
+
+def tally_key(address: Address) -> str:
+    return registry_key("trade", address, TALLY)
+
+
 REGISTRY: Final = "registry/**"
 ALIVE: Final = "alive/**"
 
@@ -175,17 +183,27 @@ class ProviderInfo(Struct, frozen=True, kw_only=True):
     """A registry entry. Identity, container, epoch, domain and provider stand in its key."""
 
     v: int = PROTOCOL
-    revision: int
+    revision: Annotated[int, Meta(ge=1, le=(1 << 63) - 1)]
+    """Counts everything its container announces: one more than what that announced before."""
     groups: tuple[str, ...]
     kind: str
     host: str
     pid: int
     services: tuple[ServiceInfo, ...]
+    """None of them: the provider was deregistered."""
     kinds: tuple[str, ...] = ()
     """Names of its class and of the bases and interfaces that have services."""
     meta: dict[str, Scalar] = {}
     """Holds for all its services, over what they say themselves."""
     health: str = HEALTHY
+
+
+class Tally(Struct, frozen=True, array_like=True, gc=False):
+    """How far a container is: the last thing it says in an answer, and what it says now and then."""
+
+    v: int
+    revision: Annotated[int, Meta(ge=0, le=(1 << 63) - 1)]
+    """Of what it announced last."""
 
 
 CANCEL: Final = "cancel"
@@ -208,7 +226,7 @@ EMPTY: Final = Raw(msgspec.msgpack.encode(None))
 EMPTY_ARGUMENTS: Final = Raw(msgspec.msgpack.encode(()))
 
 
-_Message = TypeVar("_Message", Call, Reply, ProviderInfo)
+_Message = TypeVar("_Message", Call, Reply, ProviderInfo, Tally)
 
 
 class Malformed(Exception):
@@ -218,6 +236,7 @@ class Malformed(Exception):
 call_decoder: Final = msgspec.msgpack.Decoder(Call)
 reply_decoder: Final = msgspec.msgpack.Decoder(Reply)
 _provider_decoder: Final = msgspec.msgpack.Decoder(ProviderInfo)
+_tally_decoder: Final = msgspec.msgpack.Decoder(Tally)
 encode_message: Final = msgspec.msgpack.Encoder().encode
 
 
@@ -231,6 +250,10 @@ def decode_reply(payload: bytes) -> Reply:
 
 def decode_provider(payload: bytes) -> ProviderInfo:
     return _decoded(_provider_decoder, payload)
+
+
+def decode_tally(payload: bytes) -> Tally:
+    return _decoded(_tally_decoder, payload)
 
 
 def _decoded(decoder: msgspec.msgpack.Decoder[_Message], payload: bytes) -> _Message:
