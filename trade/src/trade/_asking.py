@@ -1,6 +1,7 @@
 """Asking containers for what stands there, when something they announced may have been missed."""
 
 import logging
+import math
 import threading
 import time
 from collections.abc import Callable
@@ -12,8 +13,10 @@ from trade._wire import REGISTRY, Address, registry_key
 
 _logger = logging.getLogger("trade")
 
-_ANSWER_S: Final = 5.0
-"""An answer that takes longer is none; who is lost meanwhile is not waited for."""
+_ANSWER_S: Final = 1.5
+"""An answer that takes longer is none at first. Who starts waits longer than this for all."""
+_SLOW_ANSWER_S: Final = 10.0
+"""So long who has failed to answer is waited for, apart from the others."""
 _FIRST_PAUSE_S: Final = 0.1
 _LONGEST_PAUSE_S: Final = 5.0
 """Between two questions to a container that is alive and does not answer, or announces nonsense."""
@@ -24,7 +27,8 @@ Take = Callable[[Answer, dict[Address, ContainerState]], None]
 class Asker:
     """One thread that asks; several requests for one container are one question.
 
-    It also gives this container's own sign of how far it is, every ``Transport.beat_s``.
+    Those who have failed to answer are asked by a second one, there from the first such failure on: nobody waits behind
+    them. The first also says how far this container itself is, every ``Transport.beat_s``.
     """
 
     def __init__(self, transport: Transport, registry: Registry, take: Take, beat: Callable[[], None]) -> None:
@@ -36,14 +40,18 @@ class Asker:
         self._due: dict[Address, float] = {}
         """When to ask, in monotonic seconds."""
         self._pauses: dict[Address, float] = {}
-        """Until it is asked again, of those whose last answer left something open."""
+        """In seconds until it is asked again, of those whose last answer left something open."""
         self._asking = False
         self._closed = False
         self._next_beat = time.monotonic() + transport.beat_s
-        self._thread = threading.Thread(target=self._run, name="trade-asking", daemon=True)
+        self._threads: list[threading.Thread] = []
 
     def start(self) -> None:
-        self._thread.start()
+        self._spawn("trade-asking", slow=False)
+
+    def _spawn(self, name: str, *, slow: bool) -> None:
+        self._threads.append(threading.Thread(target=self._run, args=(slow,), name=name, daemon=True))
+        self._threads[-1].start()
 
     def request(self, address: Address, *, anew: bool = False) -> None:
         """Ask a container soon; does not wait.
@@ -61,47 +69,62 @@ class Asker:
 
     @property
     def busy(self) -> bool:
-        """Whether somebody is asked, or is to be asked without a pause."""
+        """Whether somebody is asked, or is to be asked, who has not failed to answer."""
         with self._changed:
-            return self._asking or any(address not in self._pauses for address in self._due)
+            return not self._closed and (self._asking or bool(self._mine(slow=False)))
 
-    def _run(self) -> None:
+    def wait(self, timeout_s: float) -> None:
+        """Wait until it is not busy."""
+        with self._changed:
+            self._changed.wait_for(lambda: not self.busy, timeout_s)
+
+    def _run(self, slow: bool) -> None:
         try:
             while not self._closed:
-                if time.monotonic() >= self._next_beat:
+                if not slow and time.monotonic() >= self._next_beat:
                     self._next_beat = time.monotonic() + self._transport.beat_s
                     self._beat()
-                self._ask(self._wait())
+                self._ask(self._wait(slow), slow)
         except ChannelClosed:
-            return
+            with self._changed:
+                self._closed = True
+                self._changed.notify_all()
 
-    def _wait(self) -> list[Address]:
+    def _wait(self, slow: bool) -> list[Address]:
         """Whom to ask now; nobody when it is time for something else."""
         with self._changed:
-            self._asking = False
-            soonest = min([self._next_beat, *self._due.values()])
-            if not self._closed and (left := soonest - time.monotonic()) > 0:
+            if not slow and self._asking:
+                self._asking = False
+                self._changed.notify_all()
+            soonest = min(self._mine(slow).values(), default=math.inf)
+            left = (soonest if slow else min(soonest, self._next_beat)) - time.monotonic()
+            if left > 0 and not self._closed:
                 self._changed.wait(min(left, threading.TIMEOUT_MAX))
             now = time.monotonic()
-            due = [address for address, when in self._due.items() if when <= now]
+            due = [address for address, when in self._mine(slow).items() if when <= now]
             for address in due:
                 del self._due[address]
-            self._asking = bool(due)
+            if not slow:
+                self._asking = bool(due)
             return due
 
-    def _ask(self, due: list[Address]) -> None:
+    def _mine(self, slow: bool) -> dict[Address, float]:
+        return {address: when for address, when in self._due.items() if (address in self._pauses) is slow}
+
+    def _ask(self, due: list[Address], slow: bool) -> None:
         alive = {state.address: state for state in self._registry.containers()}
         open_ones = [address for address in due if address in alive and not alive[address].heard.complete]
-        if 2 * len(open_ones) > len(alive):
-            self._ask_with(REGISTRY, alive)
+        if not slow and 2 * len(open_ones) > len(alive):
+            self._ask_with(REGISTRY, alive, _ANSWER_S)
         else:
             for address in open_ones:
-                self._ask_with(registry_key("*", address, "*"), {address: alive[address]})
+                pattern, patience_s = registry_key("*", address, "*"), _SLOW_ANSWER_S if slow else _ANSWER_S
+                self._ask_with(pattern, {address: alive[address]}, patience_s)
         for address in due:
             self._look_after(address)
 
-    def _ask_with(self, pattern: str, meant: dict[Address, ContainerState]) -> None:
-        for answer in self._transport.ask(pattern, _ANSWER_S):
+    def _ask_with(self, pattern: str, meant: dict[Address, ContainerState], patience_s: float) -> None:
+        for answer in self._transport.ask(pattern, patience_s):
             try:
                 self._take(answer, meant)
             except Exception:
@@ -115,6 +138,9 @@ class Asker:
                 pause_s = min(2 * self._pauses.get(address, _FIRST_PAUSE_S / 2), _LONGEST_PAUSE_S)
                 self._pauses[address] = pause_s
                 self._due[address] = time.monotonic() + pause_s
+                if len(self._threads) == 1 and not self._closed:
+                    self._spawn("trade-asking-slow", slow=True)
+                self._changed.notify_all()
             else:
                 self._pauses.pop(address, None)
 
@@ -123,5 +149,6 @@ class Asker:
         with self._changed:
             self._closed = True
             self._changed.notify_all()
-        if self._thread is not threading.current_thread():
-            self._thread.join(2)
+        for thread in self._threads:
+            if thread is not threading.current_thread():
+                thread.join(2)

@@ -52,15 +52,12 @@ class Watch:
         ]
         for thread in (*self._threads, self._asker):
             thread.start()
-        registry.wait_for(lambda: not any(map(registry.left_open, self._others())), _SYNC_S)
+        self._asker.wait(_SYNC_S)
 
     @property
     def busy(self) -> bool:
         """Whether somebody is being asked for what was missed."""
         return self._asker.busy
-
-    def _others(self) -> list[Address]:
-        return [state.address for state in self._registry.containers() if state.address != self._own]
 
     def _read(self, channel: Channel, take: Callable[[Message], None]) -> None:
         while True:
