@@ -54,6 +54,19 @@ def test_most_of_them_withdrawn_who_comes_late_knows_the_rest(
         assert left.key.provider == "p2000"
 
 
+def test_what_was_lost_on_the_way_is_asked_for_when_the_container_says_how_far_it_is(
+    here: Container, host: Announcer, monkeypatch: pytest.MonkeyPatch, eventually: Any
+) -> None:
+    host.announce("panels", "p1", entry(1, 1))
+    assert eventually(lambda: len(here.services(where(group="panels"))) == 1)
+    with monkeypatch.context() as lossy:
+        lossy.setattr(host._transport, "announce", lambda key, payload: None)
+        host.announce("panels", "p2", entry(2, 1))
+        host.announce("panels", "p1", entry(3, 0))
+    host.beat()
+    assert eventually(lambda: [handle.key.provider for handle in here.services(where(group="panels"))] == ["p2"])
+
+
 class Panel:
     @service
     def press(self, value: int) -> int:

@@ -4,7 +4,7 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Final
 
 from trade._registry import ContainerState, Registry
@@ -16,7 +16,7 @@ _logger = logging.getLogger("trade")
 _ANSWER_S: Final = 1.5
 """An answer that takes longer is none at first. Who starts waits longer than this for all."""
 _SLOW_ANSWER_S: Final = 10.0
-"""So long who has failed to answer is waited for, apart from the others."""
+"""So long who was waited for in vain is waited for from then on, apart from the others."""
 _FIRST_PAUSE_S: Final = 0.1
 _LONGEST_PAUSE_S: Final = 5.0
 """Between two questions to a container that is alive and does not answer, or announces nonsense."""
@@ -27,7 +27,7 @@ Take = Callable[[Answer, dict[Address, ContainerState]], None]
 class Asker:
     """One thread that asks; several requests for one container are one question.
 
-    Those who have failed to answer are asked by a second one, there from the first such failure on: nobody waits behind
+    Those who were waited for in vain are asked by a second one, there from the first such case on: nobody waits behind
     them. The first also says how far this container itself is, every ``Transport.beat_s``.
     """
 
@@ -41,6 +41,8 @@ class Asker:
         """When to ask, in monotonic seconds."""
         self._pauses: dict[Address, float] = {}
         """In seconds until it is asked again, of those whose last answer left something open."""
+        self._slow: set[Address] = set()
+        """Waited for in vain the last time."""
         self._asking = False
         self._closed = False
         self._next_beat = time.monotonic() + transport.beat_s
@@ -62,8 +64,9 @@ class Asker:
         """
         with self._changed:
             if anew:
-                self._pauses.pop(address, None)
                 self._due.pop(address, None)
+                self._pauses.pop(address, None)
+                self._slow.discard(address)
             self._due.setdefault(address, time.monotonic() + self._pauses.get(address, 0.0))
             self._changed.notify_all()
 
@@ -71,7 +74,7 @@ class Asker:
     def busy(self) -> bool:
         """Whether somebody is asked, or is to be asked, who has not failed to answer."""
         with self._changed:
-            return not self._closed and (self._asking or bool(self._mine(slow=False)))
+            return not self._closed and (self._asking or any(address not in self._pauses for address in self._due))
 
     def wait(self, timeout_s: float) -> None:
         """Wait until it is not busy."""
@@ -79,16 +82,22 @@ class Asker:
             self._changed.wait_for(lambda: not self.busy, timeout_s)
 
     def _run(self, slow: bool) -> None:
-        try:
-            while not self._closed:
-                if not slow and time.monotonic() >= self._next_beat:
-                    self._next_beat = time.monotonic() + self._transport.beat_s
-                    self._beat()
+        while not self._closed:
+            try:
+                if not slow:
+                    self._beat_if_due()
                 self._ask(self._wait(slow), slow)
-        except ChannelClosed:
-            with self._changed:
-                self._closed = True
-                self._changed.notify_all()
+            except ChannelClosed:
+                with self._changed:
+                    self._closed = True
+                    self._changed.notify_all()
+            except Exception:
+                _logger.exception("asking for what stands failed")
+
+    def _beat_if_due(self) -> None:
+        if time.monotonic() >= self._next_beat:
+            self._next_beat = time.monotonic() + self._transport.beat_s
+            self._beat()
 
     def _wait(self, slow: bool) -> list[Address]:
         """Whom to ask now; nobody when it is time for something else."""
@@ -109,43 +118,55 @@ class Asker:
             return due
 
     def _mine(self, slow: bool) -> dict[Address, float]:
-        return {address: when for address, when in self._due.items() if (address in self._pauses) is slow}
+        return {address: when for address, when in self._due.items() if (address in self._slow) is slow}
 
     def _ask(self, due: list[Address], slow: bool) -> None:
         alive = {state.address: state for state in self._registry.containers()}
         open_ones = [address for address in due if address in alive and not alive[address].heard.complete]
         if not slow and 2 * len(open_ones) > len(alive):
-            self._ask_with(REGISTRY, alive, _ANSWER_S)
-        else:
-            for address in open_ones:
-                pattern, patience_s = registry_key("*", address, "*"), _SLOW_ANSWER_S if slow else _ANSWER_S
-                self._ask_with(pattern, {address: alive[address]}, patience_s)
-        for address in due:
-            self._look_after(address)
+            in_vain = self._ask_with(REGISTRY, alive, _ANSWER_S)
+            self._look_after(due, in_vain)
+            return
+        for address in open_ones:
+            pattern, patience_s = registry_key("*", address, "*"), _SLOW_ANSWER_S if slow else _ANSWER_S
+            in_vain = self._ask_with(pattern, {address: alive[address]}, patience_s)
+            self._look_after([address], in_vain)
+        self._look_after([address for address in due if address not in open_ones], False)
 
-    def _ask_with(self, pattern: str, meant: dict[Address, ContainerState], patience_s: float) -> None:
-        for answer in self._transport.ask(pattern, patience_s):
+    def _ask_with(self, pattern: str, meant: dict[Address, ContainerState], patience_s: float) -> bool:
+        """Ask and take the answers. Returns whether somebody was waited for in vain."""
+        began = time.monotonic()
+        answers = self._transport.ask(pattern, patience_s)
+        in_vain = time.monotonic() - began >= _ANSWER_S
+        for answer in answers:
             try:
                 self._take(answer, meant)
             except Exception:
                 _logger.exception("the registry could not take an answer")
+        return in_vain
 
-    def _look_after(self, address: Address) -> None:
+    def _look_after(self, asked: Sequence[Address], in_vain: bool) -> None:
         """Whoever is alive and left something open is asked again, less and less often."""
-        left_open = self._registry.left_open(address)
+        left_open = {address for address in asked if self._registry.left_open(address)}
         with self._changed:
-            if left_open:
-                pause_s = min(2 * self._pauses.get(address, _FIRST_PAUSE_S / 2), _LONGEST_PAUSE_S)
-                self._pauses[address] = pause_s
-                self._due[address] = time.monotonic() + pause_s
-                if len(self._threads) == 1 and not self._closed:
-                    self._spawn("trade-asking-slow", slow=True)
-                self._changed.notify_all()
-            else:
-                self._pauses.pop(address, None)
+            for address in asked:
+                if address in left_open:
+                    self._put_off(address)
+                    self._slow |= {address} if in_vain else set()
+                else:
+                    self._pauses.pop(address, None)
+                    self._slow.discard(address)
+            if self._slow and len(self._threads) == 1 and not self._closed:
+                self._spawn("trade-asking-slow", slow=True)
+            self._changed.notify_all()
+
+    def _put_off(self, address: Address) -> None:
+        pause_s = min(2 * self._pauses.get(address, _FIRST_PAUSE_S / 2), _LONGEST_PAUSE_S)
+        self._pauses[address] = pause_s
+        self._due[address] = time.monotonic() + pause_s
 
     def close(self) -> None:
-        """End the thread. Idempotent."""
+        """End the threads. Idempotent."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
