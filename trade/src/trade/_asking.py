@@ -65,8 +65,7 @@ class Asker:
         with self._changed:
             if anew:
                 self._due.pop(address, None)
-                self._pauses.pop(address, None)
-                self._slow.discard(address)
+                self._forget(address)
             self._due.setdefault(address, time.monotonic() + self._pauses.get(address, 0.0))
             self._changed.notify_all()
 
@@ -124,46 +123,52 @@ class Asker:
         alive = {state.address: state for state in self._registry.containers()}
         open_ones = [address for address in due if address in alive and not alive[address].heard.complete]
         if not slow and 2 * len(open_ones) > len(alive):
-            in_vain = self._ask_with(REGISTRY, alive, _ANSWER_S)
-            self._look_after(due, in_vain)
-            return
-        for address in open_ones:
-            pattern, patience_s = registry_key("*", address, "*"), _SLOW_ANSWER_S if slow else _ANSWER_S
-            in_vain = self._ask_with(pattern, {address: alive[address]}, patience_s)
-            self._look_after([address], in_vain)
-        self._look_after([address for address in due if address not in open_ones], False)
+            self._ask_with(REGISTRY, alive, open_ones, _ANSWER_S)
+        else:
+            for address in open_ones:
+                pattern, patience_s = registry_key("*", address, "*"), _SLOW_ANSWER_S if slow else _ANSWER_S
+                self._ask_with(pattern, alive, [address], patience_s)
+        with self._changed:
+            for address in set(due).difference(open_ones):
+                self._forget(address)
 
-    def _ask_with(self, pattern: str, meant: dict[Address, ContainerState], patience_s: float) -> bool:
-        """Ask and take the answers. Returns whether somebody was waited for in vain."""
-        began = time.monotonic()
+    def _ask_with(
+        self, pattern: str, alive: dict[Address, ContainerState], asked: Sequence[Address], patience_s: float
+    ) -> None:
+        before, began = {address: alive[address].heard.answered for address in asked}, time.monotonic()
         answers = self._transport.ask(pattern, patience_s)
         in_vain = time.monotonic() - began >= _ANSWER_S
         for answer in answers:
             try:
-                self._take(answer, meant)
+                self._take(answer, alive)
             except Exception:
                 _logger.exception("the registry could not take an answer")
-        return in_vain
-
-    def _look_after(self, asked: Sequence[Address], in_vain: bool) -> None:
-        """Whoever is alive and left something open is asked again, less and less often."""
-        left_open = {address for address in asked if self._registry.left_open(address)}
+        left_open = [address for address in asked if self._registry.left_open(address)]
         with self._changed:
             for address in asked:
-                if address in left_open:
-                    self._put_off(address)
-                    self._slow |= {address} if in_vain else set()
+                if address not in left_open:
+                    self._forget(address)
+                elif alive[address].heard.answered > before[address]:  # more has been missed meanwhile
+                    self._forget(address)
+                    self._due[address] = time.monotonic()
                 else:
-                    self._pauses.pop(address, None)
-                    self._slow.discard(address)
-            if self._slow and len(self._threads) == 1 and not self._closed:
-                self._spawn("trade-asking-slow", slow=True)
+                    self._put_off(address, in_vain)
             self._changed.notify_all()
 
-    def _put_off(self, address: Address) -> None:
+    def _forget(self, address: Address) -> None:
+        """That it ever failed to answer."""
+        self._pauses.pop(address, None)
+        self._slow.discard(address)
+
+    def _put_off(self, address: Address, in_vain: bool) -> None:
+        """Who is alive and does not answer is asked again, less and less often."""
         pause_s = min(2 * self._pauses.get(address, _FIRST_PAUSE_S / 2), _LONGEST_PAUSE_S)
         self._pauses[address] = pause_s
         self._due[address] = time.monotonic() + pause_s
+        if in_vain:
+            self._slow.add(address)
+            if len(self._threads) == 1 and not self._closed:
+                self._spawn("trade-asking-slow", slow=True)
 
     def close(self) -> None:
         """End the threads. Idempotent."""
