@@ -49,11 +49,11 @@ OnReply = Callable[[Reply], None]
 class Peer:
     """Another container as callers see it: whether it is there, and how its clock runs against ours."""
 
-    def __init__(self, address: Address) -> None:
+    def __init__(self, address: Address, *, lost: bool = False) -> None:
         self.address = address
         self.answers_on = f"reply/{address.identity}/"
         """How the keys of its answers begin."""
-        self.lost = False
+        self.lost = lost
         self._low_ns = -_NEVER
         self._high_ns = _NEVER
         self._at_ns = 0
@@ -70,10 +70,6 @@ class Peer:
         if low > high:  # its clock or ours was set or stood still: what was known is void
             low, high = clock_ns - received_ns, clock_ns - sent_ns
         self._low_ns, self._high_ns, self._at_ns = low, high, received_ns
-
-    def forget_clock(self) -> None:
-        """While it is out of sight its clock may stand still: a computer that sleeps."""
-        self._low_ns, self._high_ns = -_NEVER, _NEVER
 
     def expiry_ns(self, deadline_ns: int) -> int | None:
         """Our deadline in its clock, never later than it is meant; None while the clock is unknown."""
@@ -159,8 +155,8 @@ class Caller:
     # --- what a call needs to know
 
     def peer(self, address: Address) -> Peer:
-        with self._lock:
-            return self._peers.setdefault(address, Peer(address))
+        """Another container; one whose sign of life does not stand is lost."""
+        return self._peers.get(address) or Peer(address, lost=True)
 
     def publisher(self, callee: Address, domain: str, provider: str, *, stop: bool) -> Publisher:
         """The declared key of one provider's calls, made once."""
@@ -387,13 +383,14 @@ class Caller:
     # --- ends without an answer
 
     def lost(self, address: Address, *, back: bool = False) -> None:
-        """The callee's container is gone (or back): end what waits for it."""
-        peer = self.peer(address)
-        peer.lost = not back
+        """The callee's container is gone (or back): end what waits for it.
+
+        Nothing is kept of it: while it is out of sight its clock may stand still, as that of a computer that sleeps.
+        """
         if back:
-            self.resend(peer)
-        else:
-            peer.forget_clock()
+            self.resend(self._peers.setdefault(address, Peer(address)))
+        elif (peer := self._peers.pop(address, None)) is not None:
+            peer.lost = True
             self._end(lambda waiting, _: waiting is peer, Status.LOST)
 
     def _watch_deadlines(self) -> None:

@@ -14,6 +14,7 @@ import msgspec
 from msgspec import structs
 
 from trade import _many
+from trade._announcing import Announcer
 from trade._calls import Caller
 from trade._codec import Codec
 from trade._constraints import Constraint, checked_meta, where
@@ -101,13 +102,11 @@ class Container:
             leaving.callback(coroutines.close)
             self.locking: Final = Locking(self)
             """Its locks on what others offer, and on what it offers itself."""
-            leaving.callback(self.locking.keeper.close)
             self._table = LockTable(self.address.epoch, self.name)
             leaving.callback(self._table.close)
-            self._providers = Providers(
-                self._transport, self._registry, self.address, self._codec, coroutines, self._table
-            )
-            leaving.callback(self._providers.close)
+            announcer = Announcer(self._transport, self.address)
+            leaving.callback(announcer.close)
+            self._providers = Providers(announcer, self._registry, self.address, self._codec, coroutines, self._table)
             self._deadman = Deadman(self._providers.stop_of, self._table.resources)
             self._table.stop_with(self._deadman.stop)
             self.withdrawn: Final = Withdrawn(self._providers)
@@ -118,7 +117,7 @@ class Container:
             self._providers.add(own, (DOMAIN,), name=PROVIDER)
             presence = self._transport.appear(alive_key(self.address))
             leaving.callback(presence.close)
-            self._watch = Watch(self._transport, self._registry, self.address, self._lost)
+            self._watch = Watch(self._transport, self._registry, self.address, self._lost, announcer.beat)
             leaving.callback(self._watch.close)
             self._leaving = leaving.pop_all()
         _live.add(self)
@@ -253,7 +252,7 @@ class Container:
         self._check_open()
         infos: list[ContainerInfo] = []
         for state in self._registry.containers():
-            records = [record for _, provided in state.providers.values() for record in provided]
+            records = [record for _, provided in list(state.providers.values()) for record in provided]
             first = records[0] if records else None
             infos.append(
                 ContainerInfo(
@@ -561,6 +560,11 @@ class Container:
         """Messages that were malformed or of another protocol version."""
         return self._dispatcher.malformed + self._caller.malformed + self._watch.malformed
 
+    @property
+    def catching_up(self) -> bool:
+        """Whether it is asking others for what it may have missed."""
+        return self._watch.busy
+
     def healthy(self) -> bool:
         """Whether it can still take a call now; what feeds hardware watchdogs asks this."""
         return not self._closed and self._dispatcher.draining
@@ -577,6 +581,7 @@ class Container:
         with self._closing:  # who comes second waits until it is done
             if self._closed:
                 return
+            self.locking.keeper.close()  # gives back what it holds, while it can still be heard
             self._closed = True
             self._targets.clear()
             self._leaving.close()

@@ -9,6 +9,7 @@ from weakref import WeakValueDictionary
 
 from msgspec import Struct, structs
 
+from trade._announcing import Announcer
 from trade._codec import Codec
 from trade._constraints import GROUP, checked_meta
 from trade._coroutines import AsyncLoop
@@ -20,7 +21,6 @@ from trade._serial import Serial
 from trade._service import ServiceMark, kinds_of, marked_methods
 from trade._signature import Signature
 from trade._system import DOMAIN
-from trade._transport import Publisher, Transport
 from trade._wire import (
     Address,
     ProviderInfo,
@@ -29,8 +29,6 @@ from trade._wire import (
     ServiceKey,
     as_chunk,
     domain_of,
-    encode_message,
-    registry_key,
 )
 from trade.errors import ConfigurationError
 
@@ -44,7 +42,6 @@ class _Registered(Struct, frozen=True):
 
     provider: Any
     services: dict[str, LocalService]
-    announcement: Publisher
     implements: tuple[type, ...]
     info: ProviderInfo
     """As it was announced last."""
@@ -63,9 +60,9 @@ class Providers:
     """Owns what this container hosts; the registry and the rest of the system are told from here."""
 
     def __init__(
-        self, transport: Transport, registry: Registry, own: Address, codec: Codec, loop: AsyncLoop, table: LockTable
+        self, announcer: Announcer, registry: Registry, own: Address, codec: Codec, loop: AsyncLoop, table: LockTable
     ) -> None:
-        self._transport = transport
+        self._announcer = announcer
         self._registry = registry
         self._own = own
         self._codec = codec
@@ -74,6 +71,7 @@ class Providers:
         self._lock = threading.Lock()
         self._announcing = threading.RLock()
         """Revisions go out in order, one at a time."""
+        self._revision = 0
         self._hosted: dict[str, _Registered] = {}
         self._names: dict[int, str] = {}
         self._counter = 0
@@ -110,7 +108,7 @@ class Providers:
         place = f"{domain}/{chunk}"
         services = self._services_of(provider, groups, implements, place)
         info = ProviderInfo(
-            revision=1,
+            revision=1,  # told before it is announced
             groups=groups,
             kind=kind,
             host=socket.gethostname(),
@@ -123,9 +121,8 @@ class Providers:
         with self._announcing:
             with self._lock:
                 self._require_new(provider)
-                announcement = self._transport.announce(registry_key(domain, self._own, chunk))
                 self._names[id(provider)] = place
-                self._hosted[place] = _Registered(provider, services, announcement, tuple(implements), info)
+                self._hosted[place] = _Registered(provider, services, tuple(implements), info)
             self._announce(place, info)
         return [ServiceKey(self._own, domain, chunk, service) for service in services]
 
@@ -156,7 +153,6 @@ class Providers:
                 info = structs.replace(info, services=_infos(services), kinds=kinds)
             if not reread and info == known.info:
                 return
-            info = structs.replace(info, revision=known.info.revision + 1)
             with self._lock:
                 self._hosted[place] = structs.replace(known, services=services, info=info)
             if reread:
@@ -171,9 +167,12 @@ class Providers:
             return place, self._hosted[place]
 
     def _announce(self, place: str, info: ProviderInfo) -> None:
+        """Known here first, then everywhere; in the next revision."""
+        self._revision += 1
+        info = structs.replace(info, revision=self._revision)
         domain, _, chunk = place.partition("/")
         self._registry.put(self._own, domain, chunk, info)
-        self._hosted[place].announcement.put(encode_message(info))
+        self._announcer.announce(domain, chunk, info)
 
     def remove(self, provider: object) -> None:
         """Stop hosting an object: gone from the registry first, uncallable then.
@@ -187,8 +186,7 @@ class Providers:
                 if place is None:
                     raise _not_registered(provider)
                 registered = self._hosted.pop(place)
-            self._registry.remove(self._own, place.partition("/")[2])
-            registered.announcement.close()
+            self._announce(place, structs.replace(registered.info, services=()))
             self._drop(registered.services)
 
     def _drop(self, services: Mapping[str, LocalService]) -> None:
@@ -220,11 +218,6 @@ class Providers:
         """
         registered = self._hosted.get(place)
         return None if registered is None else registered.services.get(service)
-
-    def close(self) -> None:
-        """Withdraw everything. Idempotent."""
-        for registered in list(self._hosted.values()):
-            registered.announcement.close()
 
     def _services_of(
         self, provider: object, groups: tuple[str, ...], implements: Sequence[type], place: str

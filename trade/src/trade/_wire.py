@@ -69,6 +69,14 @@ def alive_key(address: Address) -> str:
     return f"alive/{address}"
 
 
+TALLY: Final = "tally"
+"""The last chunk of the key, in the middleware's own domain, under which a container says how far it is."""
+
+
+def tally_key(address: Address) -> str:
+    return registry_key("trade", address, TALLY)
+
+
 REGISTRY: Final = "registry/**"
 ALIVE: Final = "alive/**"
 
@@ -201,12 +209,14 @@ class ProviderInfo(Struct, frozen=True, kw_only=True):
     """A registry entry. Identity, container, epoch, domain and provider stand in its key."""
 
     v: int = PROTOCOL
-    revision: int
+    revision: Annotated[int, Meta(ge=1, le=(1 << 63) - 1)]
+    """Counts everything its container announces: one more than what that announced before."""
     groups: tuple[str, ...]
     kind: str
     host: str
     pid: int
     services: tuple[ServiceInfo, ...]
+    """None of them: the provider was deregistered."""
     kinds: tuple[str, ...] = ()
     """Names of its class and of the bases and interfaces that have services."""
     meta: dict[str, Scalar] = {}
@@ -220,6 +230,14 @@ class _ProviderMessage(ProviderInfo, frozen=True, kw_only=True):
     """The same before its services are read."""
 
     services: tuple[Raw, ...]  # pyright: ignore[reportIncompatibleVariableOverride]
+
+
+class Tally(Struct, frozen=True, array_like=True, gc=False):
+    """How far a container is: the last thing it says in an answer, and what it says now and then."""
+
+    v: int
+    revision: Annotated[int, Meta(ge=0, le=(1 << 63) - 1)]
+    """Of what it announced last."""
 
 
 CANCEL: Final = "cancel"
@@ -245,7 +263,7 @@ EMPTY: Final = Raw(msgspec.msgpack.encode(None))
 EMPTY_ARGUMENTS: Final = Raw(msgspec.msgpack.encode(()))
 
 
-_Message = TypeVar("_Message", Call, Reply, _ProviderMessage)
+_Message = TypeVar("_Message", Call, Reply, _ProviderMessage, Tally)
 
 
 class Malformed(Exception):
@@ -258,6 +276,7 @@ _provider_decoder: Final = msgspec.msgpack.Decoder(_ProviderMessage)
 _service_decoder: Final = msgspec.msgpack.Decoder(ServiceInfo)
 _services: Final[WeakValueDictionary[bytes, ServiceInfo]] = WeakValueDictionary()
 """The services known now by their bytes: a thousand objects of one class tell the same."""
+_tally_decoder: Final = msgspec.msgpack.Decoder(Tally)
 encode_message: Final = msgspec.msgpack.Encoder().encode
 
 
@@ -287,6 +306,10 @@ def decode_provider(payload: bytes) -> ProviderInfo:
 def _service(data: bytes) -> ServiceInfo:
     known = _services.get(data)
     return known if known is not None else _services.setdefault(data, _service_decoder.decode(data))
+
+
+def decode_tally(payload: bytes) -> Tally:
+    return _decoded(_tally_decoder, payload)
 
 
 def _decoded(decoder: msgspec.msgpack.Decoder[_Message], payload: bytes) -> _Message:

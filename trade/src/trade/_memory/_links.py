@@ -16,15 +16,14 @@ class Kind(enum.Enum):
     PUT = "put"
     URGENT = "urgent"
     ANNOUNCE = "announce"
-    WITHDRAW = "withdraw"
     RISE = "rise"
     """A sign of life goes up."""
     FALL = "fall"
     """A sign of life is taken down."""
     ASK = "ask"
-    """What do you announce?"""
+    """What stands?"""
     ANSWER = "answer"
-    """An announcement that stands."""
+    """Something that stands."""
     LEAVE = "leave"
     """The transport closes."""
 
@@ -42,9 +41,6 @@ _LANES: Final = {
     Kind.PUT: Lane.DATA,
     Kind.URGENT: Lane.URGENT,
     Kind.ANNOUNCE: Lane.ANNOUNCEMENTS,
-    Kind.WITHDRAW: Lane.ANNOUNCEMENTS,
-    Kind.ASK: Lane.ANNOUNCEMENTS,
-    Kind.ANSWER: Lane.ANNOUNCEMENTS,
     Kind.RISE: Lane.PRESENCE,
     Kind.FALL: Lane.PRESENCE,
     Kind.LEAVE: Lane.PRESENCE,
