@@ -5,7 +5,7 @@ from typing import Annotated
 
 from msgspec import Struct
 
-from trade import Meta, service
+from trade import Meta, Resource, service
 
 __all__ = ["JointGroup", "JointLimits", "Motor", "MotorState"]
 
@@ -54,8 +54,8 @@ class Motor(ABC):
 
     @property
     @abstractmethod
-    def resources(self) -> tuple[str, ...]:
-        """The joint, as what locks and fences attach to: ``("rosie.neck.pan",)``."""
+    def resources(self) -> tuple[Resource, ...]:
+        """The joint, as what locks, fences and stops attach to: one, named ``rosie.neck.pan``."""
 
     @service(effect="read")
     @abstractmethod
@@ -122,8 +122,8 @@ class JointGroup(ABC):
 
     @property
     @abstractmethod
-    def resources(self) -> tuple[str, ...]:
-        """The joints, as what locks and fences attach to."""
+    def resources(self) -> tuple[Resource, ...]:
+        """The joints, each the same object as its motor's."""
 
     @service(effect="read")
     @abstractmethod

@@ -17,6 +17,7 @@ from trade._context import CallContext, current_call, progress
 from trade._handle import Bound, Handle, Run
 from trade._many import Outcome
 from trade._notifications import Callback, Notification
+from trade._resources import Permit, Resource, permit
 from trade._secret import Secret
 from trade._service import service
 from trade._settings import Settings
@@ -33,6 +34,8 @@ __all__ = [
     "Meta",
     "Notification",
     "Outcome",
+    "Permit",
+    "Resource",
     "Run",
     "Secret",
     "Settings",
@@ -55,6 +58,7 @@ __all__ = [
     "find",
     "joined",
     "left",
+    "permit",
     "progress",
     "register",
     "remove_group",

@@ -5,13 +5,13 @@ from collections.abc import Sequence
 from math import isfinite
 from typing import Final
 
-from trade import current_call
+from trade import Resource, current_call, permit
 from trade.errors import DeviceError, DeviceSilent, InvalidArgument, LimitExceeded
 from trade_drivers._interfaces import JointGroup, JointLimits, Motor, MotorState
 from trade_drivers.dynamixel import _table as table
 from trade_drivers.dynamixel._axis import Axis, Health, Sample
 from trade_drivers.dynamixel._bus import BusThread
-from trade_drivers.dynamixel._jobs import Enable, Relax
+from trade_drivers.dynamixel._jobs import Command, Enable, Relax
 from trade_drivers.dynamixel._motion import Move
 
 __all__ = ["DynamixelGroup", "DynamixelMotor"]
@@ -31,8 +31,8 @@ class _Joints:
         self._axes = tuple(axes)
 
     @property
-    def resources(self) -> tuple[str, ...]:
-        return tuple(axis.name for axis in self._axes)
+    def resources(self) -> tuple[Resource, ...]:
+        return tuple(axis.resource for axis in self._axes)
 
     def stop(self) -> None:
         self._exchange.stop(self._axes).wait(self._thread.alive)
@@ -45,7 +45,11 @@ class _Joints:
 
     def _do(self, kind: type[Enable] | type[Relax]) -> None:
         expires_ns, _ = self._expiry()
-        job = kind(self._exchange, self._axes, f"{self._name}.{kind.__name__.lower()}", expires_ns)
+        service = f"{self._name}.{kind.__name__.lower()}"
+        with permit(self.resources) as permitted:
+            self._finish(kind(self._exchange, self._axes, service=service, expires_ns=expires_ns, permit=permitted))
+
+    def _finish(self, job: Command) -> None:
         self._exchange.submit(job)
         job.wait(self._thread.alive)
 
@@ -69,11 +73,18 @@ class _Joints:
         speed = None if speed_rad_s is None else _finite(speed_rad_s, service, "speed_rad_s")
         speeds = [_speed_counts(axis, speed) for axis in self._axes]
         expires_ns, until_ns = self._expiry()
-        move = Move(
-            self._exchange, self._axes, goals, speeds, service=service, expires_ns=expires_ns, until_ns=until_ns
-        )
-        self._exchange.submit(move)
-        move.wait(self._thread.alive)
+        with permit(self.resources) as permitted:
+            move = Move(
+                self._exchange,
+                self._axes,
+                goals,
+                speeds,
+                service=service,
+                expires_ns=expires_ns,
+                until_ns=until_ns,
+                permit=permitted,
+            )
+            self._finish(move)
         return [axis.scale.angle_rad(counts) for axis, counts in zip(self._axes, move.final_counts, strict=True)]
 
     def _states(self) -> list[MotorState]:
