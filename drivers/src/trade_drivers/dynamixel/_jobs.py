@@ -13,7 +13,7 @@ from trade_drivers.dynamixel._wire import NoAnswer, Refused
 if TYPE_CHECKING:
     from trade_drivers.dynamixel._exchange import Exchange
 
-__all__ = ["Command", "Enable", "Job", "Leave", "Relax", "Steps", "StopTicket", "enabling"]
+__all__ = ["Command", "Enable", "Halt", "Job", "Leave", "Relax", "Steps", "StopTicket", "enabling"]
 
 Steps = Generator[None, None, None]
 """Yields after each exchange on the wire, so that stops and cycles come in between."""
@@ -126,6 +126,17 @@ class Enable(Command):
                 yield from _read_health(self, axis)
             if not axis.ready:
                 yield from enabling(self, axis)
+
+
+class Halt(Command):
+    """Whatever moves the joints ends, and they hold; unlike a stop it needs leave and makes nothing void."""
+
+    def steps(self) -> Steps:
+        self.gate()
+        self.exchange.halt(self.axes, f"{self.service} said so")
+        yield
+        for axis in self.axes:
+            _require_answering(self, axis)
 
 
 class Relax(Command):

@@ -36,7 +36,21 @@ class _Progress(Struct):
 
 
 class Motion(Command):
-    """What keeps joints moving, or about to, until something ends it."""
+    """What sets joints moving, and is watched until something ends it."""
+
+    def steps(self) -> Steps:
+        """Enable what is relaxed, then launch."""
+        exchange = self.exchange
+        for axis in self.axes:
+            axis.check_usable(exchange.clock(), exchange.stale_after_ns)
+        for axis in self.axes:
+            if not axis.ready:
+                yield from enabling(self, axis)
+        self.launch()
+
+    def launch(self) -> None:
+        """Write all goals in one packet, and take the joints over."""
+        raise NotImplementedError
 
     def goal_of(self, axis: Axis) -> int:
         """Where one of its joints is going, in counts."""
@@ -77,17 +91,7 @@ class Move(Motion):
     def goal_of(self, axis: Axis) -> int:
         return self._goals[axis]
 
-    def steps(self) -> Steps:
-        """Enable what is relaxed, then write all goals in one packet."""
-        exchange = self.exchange
-        for axis in self.axes:
-            axis.check_usable(exchange.clock(), exchange.stale_after_ns)
-        for axis in self.axes:
-            if not axis.ready:
-                yield from enabling(self, axis)
-        self._launch()
-
-    def _launch(self) -> None:
+    def launch(self) -> None:
         exchange, now_ns = self.exchange, self.exchange.clock()
         samples = [axis.check_usable(now_ns, exchange.stale_after_ns) for axis in self.axes]
         distances = [abs(self._goals[axis] - sample.position) for axis, sample in zip(self.axes, samples, strict=True)]
