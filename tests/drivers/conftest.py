@@ -105,7 +105,7 @@ class Rig:
     def __init__(self, tmp_path: Path, undo: ExitStack) -> None:
         self._tmp_path, self._undo = tmp_path, undo
         self.robot: Robot = parse(HEAD, "head.toml")
-        self.announced: list[str] = []
+        self.announced: list[object] = []
 
     def configure(self, *changes: tuple[str, str]) -> None:
         """Change the robot file's text."""
@@ -130,7 +130,7 @@ class Rig:
         """Attach the driver; it is closed with the test, whatever that says."""
         options.setdefault("ports", {"neck": str(self.sim.port)})
         robot = attach(
-            self.robot, register=lambda _, group: self.announced.append(group), deregister=lambda _: None, **options
+            self.robot, register=lambda _, groups: self.announced.append(groups), deregister=lambda _: None, **options
         )
         self._undo.callback(_close, robot)
         return robot

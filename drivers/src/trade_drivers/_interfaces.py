@@ -1,6 +1,8 @@
 """What a motor and a group of joints can do, in SI units, whoever built them."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Annotated, Final
 
 from msgspec import Struct
@@ -44,6 +46,7 @@ class JointLimits(Struct, frozen=True, kw_only=True):
 
 Position = Annotated[float, Meta(description="joint angle in rad, within limits()")]
 LONGEST_VALID_S: Final = 1.0
+Members = Mapping[str, Sequence[str]]
 Velocity = Annotated[float, Meta(description="speed in rad/s with the joint's sign, within limits(); 0 stands still")]
 Valid = Annotated[float, Meta(gt=0, le=LONGEST_VALID_S, description="seconds after which it ends unless it is renewed")]
 Speed = Annotated[float, Meta(gt=0, description="greatest speed in rad/s; by default the joint's limit")]
@@ -54,6 +57,9 @@ class Motor(ABC):
 
     Everything raises ``DeviceSilent`` when the device has not answered for too long: an old value is no value.
     """
+
+    members: Members = MappingProxyType({})
+    """Who belongs to the groups of its robot, from the robot file; a lock over a group is one over all of them."""
 
     @property
     @abstractmethod
@@ -136,6 +142,9 @@ class Motor(ABC):
 
 class JointGroup(ABC):
     """Joints that are commanded together; values are in the order of ``joints()``. Errors are those of ``Motor``."""
+
+    members: Members = MappingProxyType({})
+    """As of a ``Motor``."""
 
     @property
     @abstractmethod

@@ -202,7 +202,8 @@ class Exchange:
     # --- parts of a cycle
 
     def _pause(self, seconds: float) -> None:
-        """Keep silent, except for stops."""
+        """Keep silent, except for stops; at least those that have come are served before every exchange."""
+        self.serve_stops()
         until = time.monotonic() + seconds
         while (left_s := until - time.monotonic()) > 0:
             if self.wake.wait(left_s):
