@@ -3,17 +3,22 @@
 import json
 import os
 import queue
+import re
 import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from trade_hil_sim import SimProcess, events
+
 ROOT = Path(__file__).parents[2]
 ROSIE = ROOT / "examples" / "rosie.toml"
+DORA = ROOT / "examples" / "dora.toml"
 PATIENCE_S = 60.0
 
 
@@ -131,6 +136,52 @@ def rosie_up(run: Callable[..., Program], tmp_path: Path) -> Callable[[], Rosie]
         return Rosie(run("-m", "trade_gateway", "up", ROSIE, "--sim", "--sim-log", log, "--json"), log)
 
     return up
+
+
+class Bench:
+    """Simulated servos and, apart from them, a driver process that can be killed and started again."""
+
+    def __init__(self, sim: SimProcess, up: Callable[[], Program]) -> None:
+        self.sim = sim
+        self._up = up
+        self.restart()
+
+    def restart(self) -> None:
+        """Start the driver; whoever ran before must have ended."""
+        self.driver = self._up()
+        self.driver.json()
+
+    def rests(self, joint: str, since: float = 0.0) -> list[float]:
+        """Where a joint came to rest."""
+        entries = events(self.sim.entries(), "at_rest", since=since)
+        return [entry.position_rad or 0.0 for entry in entries if entry.joint == joint]
+
+    def moving(self) -> bool:
+        return any(abs(device.velocity_rad_s) > 0 for bus in self.sim.control.state() for device in bus.devices)
+
+
+@pytest.fixture
+def benches(system: str, tmp_path: Path, run: Callable[..., Program]) -> Iterator[Callable[[Path], Bench]]:
+    """Brings a robot up, its servos and its driver in processes of their own."""
+    with ExitStack() as undo:
+
+        def start(robot_file: Path) -> Bench:
+            sim = undo.enter_context(SimProcess(robot_file))
+            text = robot_file.read_text(encoding="utf-8")
+            for bus, port in sim.ports.items():
+                text = re.sub(rf'(\[bus\.{bus}\][^\[]*?port = )"[^"]*"', rf'\g<1>"{port}"', text)
+            copy = tmp_path / robot_file.name
+            copy.write_text(text, encoding="utf-8")
+            bench = Bench(sim, lambda: run("-m", "trade_gateway", "up", copy, "--json"))
+            undo.callback(lambda: bench.driver.close())  # noqa: PLW0108 - the driver there is then
+            return bench
+
+        yield start
+
+
+@pytest.fixture
+def bench(benches: Callable[[Path], Bench]) -> Bench:
+    return benches(ROSIE)
 
 
 def wait_until(condition: Callable[[], bool]) -> None:
