@@ -23,6 +23,8 @@ _ROOT = Path(__file__).parents[2]
 _ROSIE = _ROOT / "examples" / "rosie.toml"
 _MOVER = _ROOT / "tests" / "system" / "mover.py"
 _PATIENCE_S = 30.0
+_START_COUNTS = 1300
+"""Far enough from where the client goes that it never gets there."""
 _SIGNALS = {"killed": (signal.SIGKILL, 0.5), "frozen": (signal.SIGSTOP, 2.0)}
 _WAYS = {"killed": ("call", "start"), "frozen": ("call", "jog")}
 
@@ -43,6 +45,7 @@ def run(rounds: int) -> None:
         for i in range(rounds):
             for end, ways in _WAYS.items():
                 for how in ways:
+                    sim.control.place(_START_COUNTS, ids=(1,))
                     results.setdefault((end, how), []).append(_stopped_after_s(log, how, _SIGNALS[end][0]))
             print(f"deadman: round {i + 1} of {rounds}", file=sys.stderr, flush=True)
     print(f"deadman: seconds from the client's end to the joint's rest, {rounds} rounds; 95th percentile of each")
