@@ -17,13 +17,14 @@ from statistics import quantiles
 
 from tests.bench._report import print_target
 
+import trade
 from trade_hil_sim import SimProcess, events, read_log
 
 _ROOT = Path(__file__).parents[2]
 _ROSIE = _ROOT / "examples" / "rosie.toml"
 _MOVER = _ROOT / "tests" / "system" / "mover.py"
 _PATIENCE_S = 30.0
-_START_COUNTS = 1300
+_HOME_RAD = -1.2
 """Far enough from where the client goes that it never gets there."""
 _SIGNALS = {"killed": (signal.SIGKILL, 0.5), "frozen": (signal.SIGSTOP, 2.0)}
 _WAYS = {"killed": ("call", "start"), "frozen": ("call", "jog")}
@@ -41,11 +42,13 @@ def run(rounds: int) -> None:
             "\n".join(f'port = "{sim.ports["neck"]}"' if line.startswith("port =") else line for line in lines)
         )
         _started(stack, "-m", "trade_gateway", "up", str(robot_file), "--json")
+        stack.callback(trade.close)
+        home = trade.find(trade.where(name="move_to", group="rosie.neck.pan"), wait_s=_PATIENCE_S)
         results: dict[tuple[str, str], list[float]] = {}
         for i in range(rounds):
             for end, ways in _WAYS.items():
                 for how in ways:
-                    sim.control.place(_START_COUNTS, ids=(1,))
+                    home(_HOME_RAD)
                     results.setdefault((end, how), []).append(_stopped_after_s(log, how, _SIGNALS[end][0]))
             print(f"deadman: round {i + 1} of {rounds}", file=sys.stderr, flush=True)
     print(f"deadman: seconds from the client's end to the joint's rest, {rounds} rounds; 95th percentile of each")
