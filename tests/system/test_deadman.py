@@ -26,14 +26,6 @@ def moving_client(bench: Bench, run: Run, how: str) -> Program:
     return client
 
 
-def stopped_short(bench: Bench, since: float) -> None:
-    """The pan joint comes to rest before halfway, told to by the driver and not by its own watchdog."""
-    wait_until(lambda: bool(bench.rests("neck.pan", since)))
-    assert bench.rests("neck.pan", since)[0] < HALFWAY_RAD
-    assert writes(bench.sim.entries(), device_id=1, register="goal_position", since=since)
-    assert not events(bench.sim.entries(), "watchdog_expired")
-
-
 @pytest.mark.parametrize(
     ("how", "number"),
     [
@@ -55,7 +47,7 @@ def test_S05_what_a_client_moves_stops_with_it_and_nothing_else_does(
     ended_at = time.monotonic()
     client.signal(number)
     try:
-        stopped_short(bench, ended_at)
+        bench.stopped_short(ended_at, HALFWAY_RAD)
         assert not writes(bench.sim.entries(), device_id=2, register="goal_position", since=ended_at)
         assert not bench.rests("neck.tilt")
         assert not tilting.done()
@@ -70,4 +62,4 @@ def test_S03_a_motion_ends_with_any_session_on_whose_behalf_it_is(bench: Bench, 
     planner = moving_client(bench, run, "plan")
     ended_at = time.monotonic()
     (planner if killed == "plan" else relay).signal(signal.SIGKILL)
-    stopped_short(bench, ended_at)
+    bench.stopped_short(ended_at, HALFWAY_RAD)
