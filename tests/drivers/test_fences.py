@@ -217,6 +217,30 @@ def test_S07_a_stop_needs_no_lock_and_only_the_owner_lets_it_move_again(
         assert service(planner, "move_to")(0.1) == pytest.approx(0.1, abs=0.03)
 
 
+def test_S05_a_motion_ends_with_its_session_whoever_else_used_the_joint_meanwhile(
+    head: Rig, pan: Motor, planner: Container, operator: Container
+) -> None:
+    service(planner, "move_to").start(1.3, 0.2)
+    began = head.wait_for("motion_started", 1)
+    service(operator, "enable")()  # disturbs nothing
+    planner.close()
+    rest = head.wait_for("at_rest", 1, began.t)
+    assert rest.position_rad is not None
+    assert rest.position_rad < 1.2
+
+
+def test_S08_ones_own_stop_does_not_hold_whoever_else_used_the_joint_meanwhile(
+    head: Rig, pan: Motor, planner: Container, operator: Container
+) -> None:
+    move = service(planner, "move_to")
+    run = move.start(1.3, 0.2)
+    head.wait_for("motion_started", 1)
+    service(operator, "enable")()
+    service(planner, "stop")()
+    assert isinstance(run.exception(20), MotionStopped)
+    assert move(0.1) == pytest.approx(0.1, abs=0.03)
+
+
 # --- S16
 
 

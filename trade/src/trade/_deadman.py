@@ -25,7 +25,9 @@ class Deadman:
 
     def session_ended(self, session: str) -> None:
         """What it set moving stops, and nothing else (S05)."""
-        its_own = [one for one in self._resources() if one.busy and any(within(mover, session) for mover in one.movers)]
+        its_own = [
+            one for one in self._resources() if one.busy and any(within(mover, session) for mover in one.sessions)
+        ]
         if its_own:
             self.stop(its_own, f"session {session} has ended", _log_failure)
 
