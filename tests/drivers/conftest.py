@@ -115,14 +115,16 @@ class Rig:
             text = text.replace(before, after)
         self.robot = parse(text, "head.toml")
 
-    def plug(self, *servos: Servo, prepare: Callable[[DynamixelBus], None] = lambda _: None) -> DynamixelBus:
-        """Simulate the bus of the robot file, or these servos."""
+    def plug(
+        self, *servos: Servo, prepare: Callable[[DynamixelBus], None] = lambda _: None, paced: bool = False
+    ) -> DynamixelBus:
+        """Simulate the bus of the robot file, or these servos; paced, the bytes take the time they take."""
         port = self._tmp_path / "neck"
         if servos:
-            self.sim = DynamixelBus(servos, port, name="neck", paced=False)
+            self.sim = DynamixelBus(servos, port, name="neck", paced=paced)
         else:
             bus = self.robot.buses[0]
-            self.sim = DynamixelBus.from_robot(bus, self.robot.joints_on(bus.name), port, paced=False)
+            self.sim = DynamixelBus.from_robot(bus, self.robot.joints_on(bus.name), port, paced=paced)
         prepare(self.sim)
         return self._undo.enter_context(self.sim)
 
