@@ -8,7 +8,7 @@ export UV_SYSTEM_CERTS ?= true
 RUN := $(UV) run --locked
 ARGS ?=
 
-.PHONY: demo test soak-registry check bench clean
+.PHONY: demo test soak-registry chaos check bench clean
 .DEFAULT_GOAL := help
 
 help: ## show the targets
@@ -30,6 +30,9 @@ test: $(UV) ## the whole test suite
 
 soak-registry: $(UV) ## three containers on two hosts register at the same moment, 200 times (root, iproute2)
 	@SOAK_ROUNDS=200 $(RUN) pytest tests/system/test_namespaces.py -k same_moment $(ARGS)
+
+chaos: $(UV) ## a lock over two robots while a driver is killed and started again, 50 times
+	@TRADE_CHAOS_ROUNDS=50 $(RUN) pytest tests/system/test_two_robots.py $(ARGS)
 
 check: $(UV) ## lint, formatting, types, import rules, isolated install of the core
 	@$(RUN) ruff check

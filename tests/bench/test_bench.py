@@ -68,3 +68,8 @@ def test_the_bench_of_the_servo_bus_prints_its_targets() -> None:
     assert "156 bytes a cycle" in printed
     assert "190 bytes a cycle" in printed
     assert printed.count("target") == 3
+
+
+def test_the_bench_of_the_deadman_prints_every_way_to_end() -> None:
+    printed = bench("deadman", "--rounds", "1")
+    assert targets(printed) == ["killed in a call", "killed in a start", "frozen in a call", "frozen in a jog"]

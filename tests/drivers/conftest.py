@@ -67,7 +67,7 @@ class Rig:
     def __init__(self, tmp_path: Path, undo: ExitStack) -> None:
         self._tmp_path, self._undo = tmp_path, undo
         self.robot: Robot = parse(HEAD, "head.toml")
-        self.announced: list[str] = []
+        self.announced: list[object] = []
 
     def configure(self, *changes: tuple[str, str]) -> None:
         """Change the robot file's text."""
@@ -77,14 +77,16 @@ class Rig:
             text = text.replace(before, after)
         self.robot = parse(text, "head.toml")
 
-    def plug(self, *servos: Servo, prepare: Callable[[DynamixelBus], None] = lambda _: None) -> DynamixelBus:
-        """Simulate the bus of the robot file, or these servos."""
+    def plug(
+        self, *servos: Servo, prepare: Callable[[DynamixelBus], None] = lambda _: None, paced: bool = False
+    ) -> DynamixelBus:
+        """Simulate the bus of the robot file, or these servos; paced, the bytes take the time they take."""
         port = self._tmp_path / "neck"
         if servos:
-            self.sim = DynamixelBus(servos, port, name="neck", paced=False)
+            self.sim = DynamixelBus(servos, port, name="neck", paced=paced)
         else:
             bus = self.robot.buses[0]
-            self.sim = DynamixelBus.from_robot(bus, self.robot.joints_on(bus.name), port, paced=False)
+            self.sim = DynamixelBus.from_robot(bus, self.robot.joints_on(bus.name), port, paced=paced)
         prepare(self.sim)
         return self._undo.enter_context(self.sim)
 
@@ -92,7 +94,7 @@ class Rig:
         """Attach the driver; it is closed with the test, whatever that says."""
         options.setdefault("ports", {"neck": str(self.sim.port)})
         robot = attach(
-            self.robot, register=lambda _, group: self.announced.append(group), deregister=lambda _: None, **options
+            self.robot, register=lambda _, groups: self.announced.append(groups), deregister=lambda _: None, **options
         )
         self._undo.callback(_close, robot)
         return robot

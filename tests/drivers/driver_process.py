@@ -11,7 +11,7 @@ ROBOT, PORT = sys.argv[1:3]
 def main() -> None:
     robot = trade_drivers.parse(Path(ROBOT).read_text(encoding="utf-8"), ROBOT)
     with trade_drivers.attach(
-        robot, register=lambda provider, group: None, deregister=lambda provider: None, ports={"neck": PORT}
+        robot, register=lambda provider, groups: None, deregister=lambda provider: None, ports={"neck": PORT}
     ) as head:
         print("attached", flush=True)
         try:

@@ -14,7 +14,7 @@ class MotorContract:
 
     def test_state_tells_what_was_measured_and_when(self, motor: Motor) -> None:
         state = motor.state()
-        assert state.name == motor.resources[0]
+        assert state.name == motor.resources[0].name
         assert motor.limits().min_rad <= state.position_rad <= motor.limits().max_rad
         assert 0 <= state.age_s < 2
         assert (state.enabled, state.moving, state.fault) == (False, False, "")

@@ -3,7 +3,7 @@
 import builtins
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any
@@ -165,7 +165,7 @@ def test_a_file_that_cannot_work_is_refused_before_a_byte_is_sent(
     assert not sim.received(rig.log)
 
 
-def test_a_group_over_two_buses_is_refused(rig: Rig) -> None:
+def test_the_motors_of_a_group_over_two_buses_stand_in_it_themselves(rig: Rig) -> None:
     rig.configure(
         (
             '[joint."neck.pan"]\nbus = "neck"',
@@ -175,8 +175,10 @@ def test_a_group_over_two_buses_is_refused(rig: Rig) -> None:
     rig.plug(Servo(1), Servo(2))
     other = DynamixelBus([Servo(1)], rig.sim.port.with_name("arm"), paced=False)
     with other:
-        text = refused(rig, ports={"neck": str(rig.sim.port), "arm": str(other.port)})
-    assert "group.head.joints: are on arm and neck" in text
+        robot = rig.attach(ports={"neck": str(rig.sim.port), "arm": str(other.port)})
+        assert rig.announced == [("rosie.neck.pan", "rosie.head"), ("rosie.neck.tilt", "rosie.head")]
+        assert robot.motor("neck.pan").members["rosie.head"] == ["rosie.neck.pan", "rosie.neck.tilt"]
+        robot.close()
 
 
 # --- what is installed
@@ -224,8 +226,8 @@ def test_nothing_is_announced_and_the_port_is_free_when_announcing_fails(head: R
 
     announced: list[object] = []
 
-    def register(provider: object, group: str) -> None:
-        if group == "rosie.head":
+    def register(provider: object, groups: Sequence[str]) -> None:
+        if "rosie.head" in groups:
             raise ConfigurationError(problem="no")
         announced.append(provider)
 
@@ -246,7 +248,7 @@ def test_close_withdraws_what_was_announced_and_can_be_repeated(head: Rig) -> No
     announced: list[object] = []
     robot = attach(
         head.robot,
-        register=lambda provider, group: announced.append(provider),
+        register=lambda provider, groups: announced.append(provider),
         deregister=announced.remove,
         ports={"neck": str(head.sim.port)},
     )

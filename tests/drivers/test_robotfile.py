@@ -18,8 +18,30 @@ def test_a_robot_file_becomes_records() -> None:
     assert robot.groups[0].joints == ["neck.pan", "neck.tilt"]
 
 
+def test_a_robot_knows_who_belongs_to_its_groups_and_to_what_its_joints_are_named_after() -> None:
+    robot = parse(f'{HEAD}[group.first]\njoints = ["neck.pan"]', "head.toml")
+    both = ["rosie.neck.pan", "rosie.neck.tilt"]
+    assert robot.members() == {
+        "rosie": both,
+        "rosie.neck": both,
+        "rosie.head": both,
+        "rosie.first": ["rosie.neck.pan"],
+    }
+
+
+def test_coupled_joints_name_each_other() -> None:
+    robot = parse(f'{HEAD}[[coupled]]\njoints = ["neck.pan", "neck.tilt"]', "head.toml")
+    assert robot.coupled_to("neck.pan") == ["rosie.neck.tilt"]
+    assert robot.coupled_to("neck.tilt") == ["rosie.neck.pan"]
+    assert parse(HEAD, "head.toml").coupled_to("neck.pan") == []
+
+
 MISTAKES = [
-    ("[robot]\nname", "name", "head.toml: [name]: unknown table; a robot file has [robot], [bus], [joint], [group]"),
+    (
+        "[robot]\nname",
+        "name",
+        "head.toml: [name]: unknown table; a robot file has [robot], [bus], [joint], [group], [[coupled]]",
+    ),
     ('name = "rosie"', "", 'head.toml: [robot]: missing; write [robot] and name = "rosie"'),
     ('name = "rosie"', 'name = "Rosie"', "robot.name: 'Rosie' is no name"),
     ('name = "rosie"', 'name = "rosie"\nage = 3', "robot.age: unknown key; [robot] has only name"),
@@ -65,6 +87,20 @@ MISTAKES = [
         "group.head.joints: there is no joint 'neck.nod'; there is neck.pan, neck.tilt",
     ),
     ('"neck.pan", "neck.tilt"]', '"neck.pan", "neck.pan"]', "names a joint twice"),
+    (
+        "[group.head]",
+        '[[coupled]]\njoints = ["neck.pan", "neck.nod"]\n[group.head]',
+        "coupled 1.joints: there is no joint 'neck.nod'; there is neck.pan, neck.tilt",
+    ),
+    (
+        "[group.head]",
+        '[[coupled]]\njoints = ["neck.pan"]\n[group.head]',
+        "coupled 1.joints: Expected `array` of length",
+    ),
+    ("[group.head]", '[[coupled]]\njoints = ["neck.pan", "neck.pan"]\n[group.head]', "coupled 1.joints: names a joint"),
+    ("[group.head]", "[[coupled]]\n[group.head]", "coupled 1: missing required key 'joints'"),
+    ("[group.head]", "[coupled]\n[group.head]", "coupled: must be a list of tables, each with a heading of its own"),
+    ("[robot]", "coupled = [3]\n[robot]", "coupled 1"),
     ('["neck.pan", "neck.tilt"]', "[]", "group.head.joints: Expected `array` of length >= 1"),
 ]
 

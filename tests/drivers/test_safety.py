@@ -15,7 +15,7 @@ import pytest
 import trade_hil_sim
 from drivers.conftest import Outcome, Rig, call, goal_counts, sleep_past, written_now
 from robots import HEAD
-from trade import service
+from trade import permit, service
 from trade.errors import (
     ConfigurationError,
     DeadlineExceeded,
@@ -514,10 +514,13 @@ def test_S22_the_bus_thread_looks_at_the_limits_itself(head: Rig) -> None:
     mark = written_now()
     exchange, axes = pan._exchange, pan._axes  # type: ignore[attr-defined]
     expires_ns = exchange.clock() + 10**9
-    move = Move(exchange, axes, [4000], [50], service="forged", expires_ns=expires_ns, until_ns=None)
-    exchange.submit(move)
-    with pytest.raises(LimitExceeded):
-        move.wait(lambda: True)
+    with permit(pan.resources) as permitted:
+        move = Move(
+            exchange, axes, [4000], [50], service="forged", expires_ns=expires_ns, until_ns=None, permit=permitted
+        )
+        exchange.submit(move)
+        with pytest.raises(LimitExceeded):
+            move.wait(lambda: True)
     assert not head.moves(since=mark)
 
 

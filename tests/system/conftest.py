@@ -3,28 +3,37 @@
 import json
 import os
 import queue
+import re
 import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from system.networks import Networks, why_not
-from waiting import PATIENCE_S
+from trade_hil_sim import SimProcess, events, writes
+from waiting import PATIENCE_S, wait_until
 
 ROOT = Path(__file__).parents[2]
 ROSIE = ROOT / "examples" / "rosie.toml"
+DORA = ROOT / "examples" / "dora.toml"
 
 
 class Program:
     """A child process whose output is read line by line, with a deadline on every wait."""
 
-    def __init__(self, *words: str | Path) -> None:
+    def __init__(self, *words: str | Path, inside: str = "") -> None:
+        namespace = ("ip", "netns", "exec", inside) if inside else ()
         self.process = subprocess.Popen(
-            [sys.executable, *map(str, words)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, bufsize=1
+            [*namespace, sys.executable, *map(str, words)],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            bufsize=1,
         )
         self._lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
         self.errors: list[str] = []
@@ -91,11 +100,11 @@ class Program:
 
 @pytest.fixture
 def run(system: str) -> Iterator[Callable[..., Program]]:
-    """Starts Python programs in the test's system; ends them."""
+    """Starts Python programs in the test's system, also inside of a network namespace; ends them."""
     programs: list[Program] = []
 
-    def start(*words: str | Path) -> Program:
-        programs.append(Program(*words))
+    def start(*words: str | Path, inside: str = "") -> Program:
+        programs.append(Program(*words, inside=inside))
         return programs[-1]
 
     yield start
@@ -151,3 +160,56 @@ def networks() -> Iterator[Networks]:
     made = Networks()
     yield made
     made.close()
+
+
+class Bench:
+    """Simulated servos and, apart from them, a driver process that can be killed and started again."""
+
+    def __init__(self, sim: SimProcess, up: Callable[[], Program]) -> None:
+        self.sim = sim
+        self._up = up
+        self.restart()
+
+    def restart(self) -> None:
+        """Start the driver; whoever ran before must have ended."""
+        self.driver = self._up()
+        self.driver.json()
+
+    def rests(self, joint: str, since: float = 0.0) -> list[float]:
+        """Where a joint came to rest."""
+        entries = events(self.sim.entries(), "at_rest", since=since)
+        return [entry.position_rad or 0.0 for entry in entries if entry.joint == joint]
+
+    def stopped_short(self, since: float, most_rad: float) -> None:
+        """The pan joint comes to rest before that, told to by the driver and not by its own watchdog."""
+        wait_until(lambda: bool(self.rests("neck.pan", since)))
+        assert self.rests("neck.pan", since)[0] < most_rad
+        assert writes(self.sim.entries(), device_id=1, register="goal_position", since=since)
+        assert not events(self.sim.entries(), "watchdog_expired")
+
+    def moving(self) -> bool:
+        return any(abs(device.velocity_rad_s) > 0 for bus in self.sim.control.state() for device in bus.devices)
+
+
+@pytest.fixture
+def benches(system: str, tmp_path: Path, run: Callable[..., Program]) -> Iterator[Callable[..., Bench]]:
+    """Brings a robot up, its servos and its driver in processes of their own."""
+    with ExitStack() as undo:
+
+        def start(robot_file: Path, inside: str = "") -> Bench:
+            sim = undo.enter_context(SimProcess(robot_file))
+            text = robot_file.read_text(encoding="utf-8")
+            for bus, port in sim.ports.items():
+                text = re.sub(rf'(\[bus\.{bus}\][^\[]*?port = )"[^"]*"', rf'\g<1>"{port}"', text)
+            copy = tmp_path / robot_file.name
+            copy.write_text(text, encoding="utf-8")
+            bench = Bench(sim, lambda: run("-m", "trade_gateway", "up", copy, "--json", inside=inside))
+            undo.callback(lambda: bench.driver.close())  # noqa: PLW0108 - the driver there is then
+            return bench
+
+        yield start
+
+
+@pytest.fixture
+def bench(benches: Callable[..., Bench]) -> Bench:
+    return benches(ROSIE)

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import trade
-from system.conftest import ROSIE
+from system.conftest import DORA, ROSIE
 from trade import where
 from trade_hil_sim import SimControl, SimProcess, events, motion_writes, read_log
 from waiting import wait_until
@@ -32,6 +32,15 @@ def test_a_call_moves_the_simulated_servos_and_prints_where_they_are(rosie_up, t
     assert json.loads(called.stdout) == pytest.approx([0.3, -0.2], abs=0.02)
     rests = {entry.joint: entry.position_rad for entry in events(read_log(rosie.log), "at_rest")}
     assert [rests["neck.pan"], rests["neck.tilt"]] == pytest.approx([0.3, -0.2], abs=0.02)
+
+
+def test_a_robot_on_two_buses_comes_up(run, tmp_path, trade_command: Command) -> None:
+    log = tmp_path / "bytes.jsonl"
+    run("-m", "trade_gateway", "up", DORA, "--sim", "--sim-log", log, "--json").json()
+    called = trade_command("call", "dora.right_arm.move_to", "[0.3, 0.2, -0.1]", "--json")
+    assert called.returncode == 0, called.stderr
+    rests = {entry.joint: entry.position_rad for entry in events(read_log(log), "at_rest")}
+    assert rests == pytest.approx({"right.shoulder": 0.3, "right.elbow": 0.2, "right.wrist": -0.1}, abs=0.02)
 
 
 def test_a_negative_number_and_a_named_argument_are_no_options(rosie_up, trade_command: Command) -> None:

@@ -1,15 +1,21 @@
 """Several hosts, as network namespaces joined by a cable that can be pulled."""
 
 import os
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
+from system.conftest import ROSIE, Bench, Program
 from system.member import PROVIDERS
 from system.networks import Member, Networks, ip
+from trade_hil_sim import events
+from waiting import wait_until
 
 ROUNDS = int(os.environ.get("SOAK_ROUNDS", "20"))
+MOVER = Path(__file__).with_name("mover.py")
+HALFWAY_RAD = 0.65
 pytestmark = pytest.mark.timeout(120 + 15 * ROUNDS)
 
 
@@ -104,3 +110,24 @@ def test_services_come_back_after_a_partition_without_a_restart(
         for each in (left, right):
             assert len(each.ask("sees", str(2 * PROVIDERS))) == 2 * PROVIDERS
             assert each.ask("call_all") == 2 * PROVIDERS
+
+
+def test_S05_what_a_client_moves_stops_when_its_link_is_cut(
+    cable: Cable,
+    benches: Callable[..., Bench],
+    run: Callable[..., Program],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("TRADE_INSECURE_LAN", "1")
+    monkeypatch.setenv("TRADE_CREDENTIALS", "lab:secret")
+    monkeypatch.setenv("TRADE_LISTEN", "tcp/10.231.7.1:7447")
+    bench = benches(ROSIE, inside=cable.left)
+    monkeypatch.setenv("TRADE_RUNTIME_DIR", str(tmp_path / "right"))
+    monkeypatch.setenv("TRADE_LISTEN", "tcp/10.231.7.2:0")
+    monkeypatch.setenv("TRADE_CONNECT", "tcp/10.231.7.1:7447")
+    run(MOVER, "call", inside=cable.right).json()
+    wait_until(lambda: bool(events(bench.sim.entries(), "motion_started", device_id=1)))
+    cut_at = time.monotonic()
+    cable.pull()
+    bench.stopped_short(cut_at, HALFWAY_RAD)

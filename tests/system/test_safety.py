@@ -3,48 +3,18 @@
 import os
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import psutil
 import pytest
 
 import trade
-from system.conftest import ROSIE, Program
+from system.conftest import Bench, Program
 from trade import Handle, where
 from trade.errors import ContainerLost, DeadlineExceeded, DeviceSilent, MotionStopped, OutcomeUnknown
-from trade_hil_sim import SimProcess, events, motion_writes, received, writes
+from trade_hil_sim import events, motion_writes, received, writes
 from waiting import wait_until
-
-
-class Bench:
-    """Simulated servos and, apart from them, a driver process."""
-
-    def __init__(self, sim: SimProcess, driver: Program) -> None:
-        self.sim = sim
-        self.driver = driver
-        driver.json()
-
-    def rests(self, joint: str) -> list[float]:
-        entries = events(self.sim.entries(), "at_rest")
-        return [entry.position_rad or 0.0 for entry in entries if entry.joint == joint]
-
-    def moving(self) -> bool:
-        return any(abs(device.velocity_rad_s) > 0 for bus in self.sim.control.state() for device in bus.devices)
-
-
-@pytest.fixture
-def bench(system: str, tmp_path: Path, run: Callable[..., Program]) -> Iterator[Bench]:
-    with SimProcess(ROSIE) as sim:
-        text = "\n".join(
-            f'port = "{sim.ports["neck"]}"' if line.startswith("port =") else line
-            for line in ROSIE.read_text(encoding="utf-8").splitlines()
-        )
-        robot_file = tmp_path / "rosie.toml"
-        robot_file.write_text(text, encoding="utf-8")
-        bench = Bench(sim, run("-m", "trade_gateway", "up", robot_file, "--json"))
-        yield bench
-        bench.driver.close()
 
 
 @pytest.fixture

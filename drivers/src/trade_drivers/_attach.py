@@ -3,7 +3,7 @@
 import atexit
 import logging
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 
 import trade
@@ -16,7 +16,7 @@ __all__ = ["AttachedRobot", "attach"]
 
 _log = logging.getLogger(__name__)
 
-Register = Callable[[object, str], object]
+Register = Callable[[object, Sequence[str]], object]
 Deregister = Callable[[object], object]
 
 
@@ -77,11 +77,12 @@ def attach(
     """Attach all devices of a robot, then announce their services. Nothing is moved or enabled; what moves is stopped.
 
     Joint ``neck.pan`` of robot ``rosie`` becomes a Motor in group ``rosie.neck.pan``, group ``head`` a JointGroup in
-    ``rosie.head``. If anything is wrong, nothing is announced and every port is let go of.
+    ``rosie.head``. Of a group whose joints share no bus, the motors themselves are in its group. If anything is wrong,
+    nothing is announced and every port is let go of.
 
     Args:
         robot: what ``load`` read.
-        register: what announces a provider; ``trade.register`` by default.
+        register: what announces a provider in its groups; ``trade.register`` by default.
         deregister: its opposite; ``trade.deregister`` by default.
         ports: bus name -> serial device, instead of the file's: for simulated devices.
         healthy: asked by every bus thread in every cycle; while it says no, devices are told to hold once and the bus
@@ -93,8 +94,8 @@ def attach(
     with ExitStack() as undo:
         buses = _attach_buses(robot, ports or {}, healthy, undo)
         providers = _providers(robot, buses)
-        for group, provider in providers.items():
-            (register or trade.register)(provider, group)
+        for name, provider in providers.items():
+            (register or trade.register)(provider, (name, *_scattered(robot, name)))
             undo.callback(_withdraw, deregister or trade.deregister, provider)
         return AttachedRobot(robot, providers, undo.pop_all())
 
@@ -122,16 +123,26 @@ def _providers(robot: Robot, buses: Mapping[str, AttachedBus]) -> dict[str, Moto
     }
     for group in robot.groups:
         name = f"{robot.name}.{group.name}"
-        providers[name] = buses[_bus_of(robot, group)].group(name, group.joints)
+        on = _buses_of(robot, group)
+        if len(on) == 1:
+            providers[name] = buses[on[0]].group(name, group.joints)
+    members = robot.members()
+    for provider in providers.values():
+        provider.members = members
     return providers
 
 
-def _bus_of(robot: Robot, group: Group) -> str:
-    buses = sorted({joint.bus for joint in robot.joints if joint.name in group.joints})
-    if len(buses) > 1:
-        problem = f"are on {' and '.join(buses)}; joints that move together have to share a bus"
-        raise ConfigurationError(where=f"{robot.where}: group.{group.name}.joints", problem=problem)
-    return buses[0]
+def _buses_of(robot: Robot, group: Group) -> list[str]:
+    return sorted({joint.bus for joint in robot.joints if joint.name in group.joints})
+
+
+def _scattered(robot: Robot, motor: str) -> list[str]:
+    """The groups a motor stands in itself, because their joints share no bus and have no provider of their own."""
+    return [
+        f"{robot.name}.{group.name}"
+        for group in robot.groups
+        if len(_buses_of(robot, group)) > 1 and motor.removeprefix(f"{robot.name}.") in group.joints
+    ]
 
 
 def _withdraw(deregister: Deregister, provider: object) -> None:

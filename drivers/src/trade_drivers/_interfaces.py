@@ -1,11 +1,13 @@
 """What a motor and a group of joints can do, in SI units, whoever built them."""
 
 from abc import ABC, abstractmethod
-from typing import Annotated
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+from typing import Annotated, Final
 
 from msgspec import Struct
 
-from trade import Meta, service
+from trade import Meta, Resource, service
 
 __all__ = ["JointGroup", "JointLimits", "Motor", "MotorState"]
 
@@ -43,6 +45,10 @@ class JointLimits(Struct, frozen=True, kw_only=True):
 
 
 Position = Annotated[float, Meta(description="joint angle in rad, within limits()")]
+LONGEST_VALID_S: Final = 1.0
+Members = Mapping[str, Sequence[str]]
+Velocity = Annotated[float, Meta(description="speed in rad/s with the joint's sign, within limits(); 0 stands still")]
+Valid = Annotated[float, Meta(gt=0, le=LONGEST_VALID_S, description="seconds after which it ends unless it is renewed")]
 Speed = Annotated[float, Meta(gt=0, description="greatest speed in rad/s; by default the joint's limit")]
 
 
@@ -52,10 +58,13 @@ class Motor(ABC):
     Everything raises ``DeviceSilent`` when the device has not answered for too long: an old value is no value.
     """
 
+    members: Members = MappingProxyType({})
+    """Who belongs to the groups of its robot, from the robot file; a lock over a group is one over all of them."""
+
     @property
     @abstractmethod
-    def resources(self) -> tuple[str, ...]:
-        """The joint, as what locks and fences attach to: ``("rosie.neck.pan",)``."""
+    def resources(self) -> tuple[Resource, ...]:
+        """The joint, as what locks, fences and stops attach to: one, named ``rosie.neck.pan``."""
 
     @service(effect="read")
     @abstractmethod
@@ -84,6 +93,20 @@ class Motor(ABC):
             DeviceFault: the device reports a fault, or it does not move; it was told to hold.
             DeviceSilent: the device does not answer.
             DeadlineExceeded: the deadline passed before anything was sent; nothing will be.
+        """
+
+    @service(effect="actuate", cancel="stop")
+    @abstractmethod
+    def set_velocity(self, velocity_rad_s: Velocity, valid_s: Valid = 0.2) -> None:
+        """Turn at a speed for ``valid_s`` seconds, then ramp to a stop, unless it is called again before.
+
+        Returns once the device was told; a relaxed joint is enabled first. The joint brakes before it comes to the end
+        of its range and stands there. A call that is refused renews nothing.
+
+        Raises:
+            LimitExceeded: faster or slower than limits() and the device allow, or outwards from outside the range.
+            InvalidArgument: not a finite number, or a time that is none.
+            MotionStopped, DeviceFault, DeviceSilent, DeadlineExceeded: as with move_to().
         """
 
     @service(effect="stop")
@@ -121,10 +144,13 @@ class Motor(ABC):
 class JointGroup(ABC):
     """Joints that are commanded together; values are in the order of ``joints()``. Errors are those of ``Motor``."""
 
+    members: Members = MappingProxyType({})
+    """As of a ``Motor``."""
+
     @property
     @abstractmethod
-    def resources(self) -> tuple[str, ...]:
-        """The joints, as what locks and fences attach to."""
+    def resources(self) -> tuple[Resource, ...]:
+        """The joints, each the same object as its motor's."""
 
     @service(effect="read")
     @abstractmethod
@@ -147,6 +173,14 @@ class JointGroup(ABC):
         """Move all joints so that they start together and arrive together; the angles measured at rest.
 
         ``speed_rad_s`` bounds every joint. If one is refused, stopped, faulty or silent, all are stopped.
+        """
+
+    @service(effect="actuate", cancel="stop")
+    @abstractmethod
+    def servo(self, positions_rad: list[Position], valid_s: Valid = 0.2) -> None:
+        """Follow positions that are given again and again: each holds for ``valid_s`` seconds, then all joints stop.
+
+        Every joint goes for its own at its limits of speed and acceleration; returns once the devices were told.
         """
 
     @service(effect="stop")

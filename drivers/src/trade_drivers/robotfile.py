@@ -16,7 +16,7 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib  # pyright: ignore[reportMissingImports]
 
-__all__ = ["Bus", "Group", "Joint", "Robot", "parse"]
+__all__ = ["Bus", "Coupled", "Group", "Joint", "Robot", "parse"]
 
 _SEGMENTS = re.compile(r"[a-z][a-z0-9_]*(\.[a-z][a-z0-9_]*)*")
 _AT = re.compile(r" - at `\$\.?([^`]*)`$")
@@ -74,6 +74,12 @@ class Group(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     joints: Annotated[list[str], Meta(min_length=1)]
 
 
+class Coupled(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Joints that hinder each other, so that none is locked without the others."""
+
+    joints: Annotated[list[str], Meta(min_length=2)]
+
+
 class Robot(Struct, frozen=True, kw_only=True):
     """A robot file, read and checked."""
 
@@ -81,12 +87,34 @@ class Robot(Struct, frozen=True, kw_only=True):
     buses: list[Bus]
     joints: list[Joint]
     groups: list[Group]
+    coupled: list[Coupled]
     where: str
     """The file the robot was read from."""
 
     def joints_on(self, bus: str) -> list[Joint]:
         """The joints on one bus, in file order."""
         return [joint for joint in self.joints if joint.bus == bus]
+
+    def coupled_to(self, joint: str) -> list[str]:
+        """The joints that are only locked together with this one, with the robot's name before them."""
+        names = dict.fromkeys(name for pair in self.coupled if joint in pair.joints for name in pair.joints)
+        return [f"{self.name}.{name}" for name in names if name != joint]
+
+    def members(self) -> dict[str, list[str]]:
+        """The joints of the robot, of its groups and of every part its joints are named after, all with full names.
+
+        A lock over one of these is a lock over all of its members, or over none.
+        """
+        found: dict[str, dict[str, None]] = {}
+        for joint in self.joints:
+            full = f"{self.name}.{joint.name}"
+            for end, letter in enumerate(full):
+                if letter == ".":
+                    found.setdefault(full[:end], {})[full] = None
+        for group in self.groups:
+            joints = found.setdefault(f"{self.name}.{group.name}", {})
+            joints.update(dict.fromkeys(f"{self.name}.{joint}" for joint in group.joints))
+        return {group: list(joints) for group, joints in found.items()}
 
 
 _Record = TypeVar("_Record", Bus, Joint, Group)
@@ -112,6 +140,7 @@ def parse(text: str, where: str) -> Robot:
         buses=_records(raw, "bus", Bus, where),
         joints=_records(raw, "joint", Joint, where),
         groups=_records(raw, "group", Group, where),
+        coupled=_coupled(raw.get("coupled", []), where),
         where=where,
     )
     _check_links(robot)
@@ -123,10 +152,10 @@ def _wrong(where: str, key: str, problem: str) -> ConfigurationError:
 
 
 def _only_known(raw: Mapping[str, object], where: str) -> None:
-    known = ("robot", "bus", "joint", "group")
+    known = {"robot": "[robot]", "bus": "[bus]", "joint": "[joint]", "group": "[group]", "coupled": "[[coupled]]"}
     for key in raw:
         if key not in known:
-            raise _wrong(where, f"[{key}]", f"unknown table; a robot file has {', '.join(f'[{k}]' for k in known)}")
+            raise _wrong(where, f"[{key}]", f"unknown table; a robot file has {', '.join(known.values())}")
 
 
 def _robot_name(table: object, where: str) -> str:
@@ -167,6 +196,19 @@ def _record(table: object, section: str, name: str, record: type[_Record], where
     except msgspec.ValidationError as bad:
         raise _explain(bad, table, key, record, where) from None  # pyright: ignore[reportUnknownArgumentType]
     _check_finite(made, key, where)
+    return made
+
+
+def _coupled(tables: object, where: str) -> list[Coupled]:
+    if not isinstance(tables, list):
+        raise _wrong(where, "coupled", "must be a list of tables, each with a heading of its own: [[coupled]]")
+    made: list[Coupled] = []
+    for number, table in enumerate(tables, 1):  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]
+        try:
+            made.append(msgspec.convert(table, Coupled))
+        except msgspec.ValidationError as bad:
+            values = table if isinstance(table, dict) else {}  # pyright: ignore[reportUnknownVariableType]
+            raise _explain(bad, values, f"coupled {number}", Coupled, where) from None  # pyright: ignore[reportUnknownArgumentType]
     return made
 
 
@@ -225,11 +267,16 @@ def _check_ports(robot: Robot) -> None:
 def _check_groups(robot: Robot) -> None:
     names = {joint.name for joint in robot.joints}
     for group in robot.groups:
-        key = f"group.{group.name}.joints"
-        for joint in group.joints:
-            if joint not in names:
-                raise _wrong(robot.where, key, f"there is no joint {joint!r}; there is {', '.join(sorted(names))}")
-        if len(set(group.joints)) < len(group.joints):
-            raise _wrong(robot.where, key, f"names a joint twice: {group.joints}")
+        _check_joints(robot, group.joints, f"group.{group.name}.joints", names)
         if group.name in names:
             raise _wrong(robot.where, f"group.{group.name}", "a joint has this name already")
+    for number, coupled in enumerate(robot.coupled, 1):
+        _check_joints(robot, coupled.joints, f"coupled {number}.joints", names)
+
+
+def _check_joints(robot: Robot, joints: list[str], key: str, names: set[str]) -> None:
+    for joint in joints:
+        if joint not in names:
+            raise _wrong(robot.where, key, f"there is no joint {joint!r}; there is {', '.join(sorted(names))}")
+    if len(set(joints)) < len(joints):
+        raise _wrong(robot.where, key, f"names a joint twice: {joints}")

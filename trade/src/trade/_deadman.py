@@ -25,7 +25,9 @@ class Deadman:
 
     def session_ended(self, session: str) -> None:
         """What it set moving stops, and nothing else (S05)."""
-        its_own = [one for one in self._resources() if one.busy and any(within(mover, session) for mover in one.movers)]
+        its_own = [
+            one for one in self._resources() if one.busy and any(within(mover, session) for mover in one.sessions)
+        ]
         if moving := [one for one in its_own if self._stop_of(one) is not None]:
             self.stop(moving, f"session {session} has ended", _log_failure)
 

@@ -106,9 +106,21 @@ class Resource:
         """
         self.stops += 1
         asking = set(sessions)
-        own = {*self.movers, *((self.holder.session,) if self.holder else ())}
-        if asking and not asking & own and (own or self.busy):
+        used = self.holder is not None or self.busy or self.movers
+        if asking and used and not self._is_of(asking):
             self.latch = Latch(by, reason)
+
+    def _is_of(self, asking: set[str]) -> bool:
+        """Whether all that moves it belongs to these, or its lock does."""
+        if self.holder is not None and self.holder.session in asking:
+            return True
+        begun = [permit.sessions for permit in list(self.calls.values())] or [self.movers]
+        return all(not asking.isdisjoint(sessions) for sessions in begun)
+
+    @property
+    def sessions(self) -> frozenset[str]:
+        """For whom it moves: of the calls that run, and of the last one that was let in."""
+        return frozenset(self.movers).union(*(permit.sessions for permit in list(self.calls.values())))
 
     @property
     def busy(self) -> bool:

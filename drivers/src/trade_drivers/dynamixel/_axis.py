@@ -1,17 +1,19 @@
 """One joint as the bus thread knows it: what was read last, how it is, and how counts become radians."""
 
 import struct
+from collections.abc import Sequence
 from math import ceil, floor
 from typing import TYPE_CHECKING, Final
 
 from msgspec import Struct
 
+from trade import Resource
 from trade.errors import DeviceFault, DeviceSilent, LimitExceeded
 from trade_drivers.dynamixel import _table as table
 from trade_drivers.robotfile import Joint
 
 if TYPE_CHECKING:
-    from trade_drivers.dynamixel._motion import Move
+    from trade_drivers.dynamixel._motion import Motion
 
 __all__ = ["CYCLIC", "SLOW", "Axis", "Health", "Sample", "Scale"]
 
@@ -22,6 +24,7 @@ SLOW: Final = (table.TORQUE_ENABLE.address, table.TEMPERATURE.end - table.TORQUE
 _CYCLIC_LAYOUT: Final = struct.Struct("<hii")
 _STILL_VELOCITY: Final = 1
 _STILL_COUNTS: Final = 1
+_AT_REST: Final = 2
 _TICK_TOLERANCE_MS: Final = 250
 _TICK_AMBIGUOUS_MS: Final = 16_000
 
@@ -98,10 +101,12 @@ class Scale:
 
 
 class Axis:
-    """The state of one joint. The bus thread writes it; other threads read whole values, and raise the stop number."""
+    """The state of one joint. The bus thread writes it; other threads read whole values."""
 
-    def __init__(self, name: str, bus: str, joint: Joint) -> None:
+    def __init__(self, name: str, bus: str, joint: Joint, coupled: Sequence[str] = ()) -> None:
         self.name = name
+        self.resource = Resource(name, coupled=coupled)
+        """What locks and stops attach to."""
         self.bus = bus
         """The port, for messages."""
         self.joint = joint
@@ -119,8 +124,7 @@ class Axis:
         self.fault = ""
         self.ready = False
         """Enabled by this driver, which has checked and armed it since."""
-        self.stop_number = 0
-        self.motion: Move | None = None
+        self.motion: Motion | None = None
         self.halting_since_ns = 0
         """When it was told to hold; 0 once it was seen at rest."""
         self.held_ns = 0
@@ -179,6 +183,12 @@ class Axis:
                 table.GOAL_POSITION.encode(goal),
             )
         )
+
+    def tell_moving(self) -> None:
+        """Let the resource know whether it moves: as last measured or commanded, turned by hand does not count."""
+        under_way = self.motion is not None or self.halting_since_ns > 0
+        if under_way or not (self.silent or self.doubted):
+            self.resource.moving = under_way or (self.still < _AT_REST and self.may_hold_torque)
 
     @property
     def moved_since_held(self) -> bool:

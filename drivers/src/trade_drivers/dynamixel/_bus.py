@@ -22,7 +22,6 @@ __all__ = ["BusThread"]
 _log = logging.getLogger(__name__)
 _REOPEN_FIRST_S: Final = 0.1
 _REOPEN_MOST_S: Final = 1.0
-_LEAVE_S: Final = 3.0
 
 
 class BusThread:
@@ -69,7 +68,7 @@ class BusThread:
         with suppress(TradeError):  # a joint that cannot be heard keeps its watchdog; the others are left properly
             exchange.stop(exchange.axes, "its driver is leaving").wait(self.alive)
         relax = self._bus.leave == "relax"
-        leave = Leave(exchange, exchange.axes, relax=relax, expires_ns=exchange.clock() + int(_LEAVE_S * 1e9))
+        leave = Leave(exchange, exchange.axes, relax=relax)
         exchange.submit(leave)
         leave.wait(self.alive)
 

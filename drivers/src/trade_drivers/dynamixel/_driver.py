@@ -63,7 +63,9 @@ def open_exchange(robot: Robot, bus: Bus, port: str) -> Exchange:
     Raises:
         ConfigurationError: the port cannot be had, or a device is absent, another, or set wrongly.
     """
-    axes = [Axis(f"{robot.name}.{joint.name}", port, joint) for joint in _known(robot, bus)]
+    axes = [
+        Axis(f"{robot.name}.{joint.name}", port, joint, robot.coupled_to(joint.name)) for joint in _known(robot, bus)
+    ]
     check_bus(bus, axes, robot.where)
     table_of_bus = f"{robot.where}: bus.{bus.name}"
     wire = _wire(port, bus.baud, table_of_bus)

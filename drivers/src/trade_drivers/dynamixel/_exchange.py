@@ -11,7 +11,7 @@ from trade.errors import MotionStopped, TradeError
 from trade_drivers.dynamixel import _table as table
 from trade_drivers.dynamixel._axis import CYCLIC, SLOW, Axis, Health
 from trade_drivers.dynamixel._jobs import Job, StopTicket
-from trade_drivers.dynamixel._motion import Move
+from trade_drivers.dynamixel._motion import Motion
 from trade_drivers.dynamixel._wire import NoAnswer, Refused
 
 if TYPE_CHECKING:
@@ -54,7 +54,6 @@ class Exchange:
         self._period_ns = int(1e9 / bus.rate_hz)
         self._gap_ns = int(bus.watchdog_s * 5e8)
         self._chunk = max(1, int(_CHUNK_S * bus.baud / 10 / (12 + CYCLIC[1])))
-        self._lock = threading.Lock()
         self._inbox: deque[Job] = deque()
         self._stops: deque[StopTicket] = deque()
         self._working: list[Job] = []
@@ -75,9 +74,8 @@ class Exchange:
 
     def stop(self, axes: Sequence[Axis], reason: str = "stop() was called") -> StopTicket:
         """Void what was admitted for these joints, and have them hold before anything else happens on the bus."""
-        with self._lock:
-            for axis in axes:
-                axis.stop_number += 1
+        for axis in axes:
+            axis.resource.stop("its driver", reason=reason)
         ticket = StopTicket(self, axes, reason)
         if self.refusing is not None:
             ticket.finish(self.refusing(axes[0]))
@@ -132,7 +130,7 @@ class Exchange:
         if (motion := axis.motion) is not None:
             self.halt(motion.axes, reason)
 
-    def release(self, motion: Move, error: TradeError | None) -> None:
+    def release(self, motion: Motion, error: TradeError | None) -> None:
         """A watched motion has ended: well, or with an error and all its joints held."""
         try:
             if error is not None:
@@ -140,11 +138,12 @@ class Exchange:
         finally:
             self._forget(motion, error)
 
-    def take_over(self, motion: Move) -> None:
+    def take_over(self, motion: Motion) -> None:
         """A motion's goals are out: those it replaces have ended, and what they left behind holds."""
         replaced = dict.fromkeys(axis.motion for axis in motion.axes if axis.motion is not None)
         for axis in motion.axes:
             axis.motion, axis.still, axis.halting_since_ns = motion, 0, 0
+            axis.tell_moving()
         for old in replaced:
             left = [axis for axis in old.axes if axis.motion is old]
             self._forget(old, MotionStopped(device=motion.axes[0].name, reason="another move took over"))
@@ -203,7 +202,8 @@ class Exchange:
     # --- parts of a cycle
 
     def _pause(self, seconds: float) -> None:
-        """Keep silent, except for stops."""
+        """Keep silent, except for stops; at least those that have come are served before every exchange."""
+        self.serve_stops()
         until = time.monotonic() + seconds
         while (left_s := until - time.monotonic()) > 0:
             if self.wake.wait(left_s):
@@ -294,6 +294,8 @@ class Exchange:
             if axis.halting_since_ns:
                 self._watch_halt(axis, now_ns, again)
         self._hold(again, now_ns)
+        for axis in self.axes:
+            axis.tell_moving()
         for ticket in tuple(self._stopping):
             self._answer(ticket, now_ns)
 
@@ -354,10 +356,11 @@ class Exchange:
         axis.take_health(Health.decode(self.wire.read(axis.id, *SLOW).data, asked_ns))
         axis.health_due_ns = asked_ns + _HEALTH_NS
 
-    def _forget(self, motion: Move, error: TradeError | None) -> None:
+    def _forget(self, motion: Motion, error: TradeError | None) -> None:
         for axis in motion.axes:
             if axis.motion is motion:
                 axis.motion = None
+                axis.tell_moving()
         motion.finish(error)
 
     @staticmethod

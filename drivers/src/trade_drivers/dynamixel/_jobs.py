@@ -4,7 +4,8 @@ import threading
 from collections.abc import Callable, Generator, Sequence
 from typing import TYPE_CHECKING, Final, TypeVar
 
-from trade.errors import DeadlineExceeded, DeviceSilent, MotionStopped, OutcomeUnknown, TradeError
+from trade import Permit
+from trade.errors import DeadlineExceeded, DeviceSilent, OutcomeUnknown, TradeError
 from trade_drivers.dynamixel import _table as table
 from trade_drivers.dynamixel._axis import SLOW, Axis, Health
 from trade_drivers.dynamixel._wire import NoAnswer, Refused
@@ -12,7 +13,7 @@ from trade_drivers.dynamixel._wire import NoAnswer, Refused
 if TYPE_CHECKING:
     from trade_drivers.dynamixel._exchange import Exchange
 
-__all__ = ["Enable", "Job", "Leave", "Relax", "Steps", "StopTicket", "enabling"]
+__all__ = ["Command", "Enable", "Halt", "Job", "Leave", "Relax", "Steps", "StopTicket", "enabling"]
 
 Steps = Generator[None, None, None]
 """Yields after each exchange on the wire, so that stops and cycles come in between."""
@@ -26,15 +27,11 @@ _GOAL_BLOCK: Final = (
 
 
 class Job:
-    """Something a service waits for, admitted under the joints' stop numbers of now: a later stop makes it void."""
+    """Something that is waited for. As it stands it needs no leave: it ends motion."""
 
-    def __init__(self, exchange: "Exchange", axes: Sequence[Axis], service: str, expires_ns: int) -> None:
+    def __init__(self, exchange: "Exchange", axes: Sequence[Axis]) -> None:
         self.exchange = exchange
         self.axes = tuple(axes)
-        self.service = service
-        self.expires_ns = expires_ns
-        self._admitted_ns = exchange.clock()
-        self._stop_numbers = tuple(axis.stop_number for axis in axes)
         self._ended = threading.Event()
         self._error: TradeError | None = None
         self._steps: Steps | None = None
@@ -45,18 +42,7 @@ class Job:
         return self._ended.is_set()
 
     def gate(self) -> None:
-        """The last look before its bytes go out.
-
-        Raises:
-            DeadlineExceeded: it is late, and late is never.
-            MotionStopped: a stop came after it was admitted.
-        """
-        if self.exchange.clock() >= self.expires_ns:
-            patience_s = (self.expires_ns - self._admitted_ns) / 1e9
-            raise DeadlineExceeded(service=self.service, deadline_s=max(0.0, patience_s))
-        for axis, admitted in zip(self.axes, self._stop_numbers, strict=True):
-            if axis.stop_number != admitted:
-                raise MotionStopped(device=axis.name, reason="stop() was called")
+        """The last look before its bytes go out; what it raises keeps them in."""
 
     def steps(self) -> Steps:
         """The work."""
@@ -98,18 +84,40 @@ class Job:
             raise self._error
 
 
-class StopTicket(Job):
-    """A stop: it has no expiry and no number of its own, and ends when all its joints are at rest."""
+class Command(Job):
+    """What may set something moving: it carries an expiry, and the permit under which its call was admitted."""
 
-    def __init__(self, exchange: "Exchange", axes: Sequence[Axis], reason: str) -> None:
-        super().__init__(exchange, axes, "stop", exchange.clock())
-        self.reason = reason
+    def __init__(
+        self, exchange: "Exchange", axes: Sequence[Axis], *, service: str, expires_ns: int, permit: Permit
+    ) -> None:
+        super().__init__(exchange, axes)
+        self.service = service
+        self.expires_ns = expires_ns
+        self.permit = permit
+        self._admitted_ns = exchange.clock()
 
     def gate(self) -> None:
-        """Nothing holds a stop back."""
+        """The last look before its bytes go out.
+
+        Raises:
+            DeadlineExceeded: it is late, and late is never.
+            MotionStopped, LockLost, LockedByOther: a stop, or another owner, came after it was admitted.
+        """
+        if self.exchange.clock() >= self.expires_ns:
+            patience_s = (self.expires_ns - self._admitted_ns) / 1e9
+            raise DeadlineExceeded(service=self.service, deadline_s=max(0.0, patience_s))
+        self.permit.gate()
 
 
-class Enable(Job):
+class StopTicket(Job):
+    """A stop: it has no expiry and needs no permit, and ends when all its joints are at rest."""
+
+    def __init__(self, exchange: "Exchange", axes: Sequence[Axis], reason: str) -> None:
+        super().__init__(exchange, axes)
+        self.reason = reason
+
+
+class Enable(Command):
     """Torque on, holding where the joints are. A joint that is enabled already is only looked at, not disturbed."""
 
     def steps(self) -> Steps:
@@ -120,7 +128,18 @@ class Enable(Job):
                 yield from enabling(self, axis)
 
 
-class Relax(Job):
+class Halt(Command):
+    """Whatever moves the joints ends, and they hold; unlike a stop it needs leave and makes nothing void."""
+
+    def steps(self) -> Steps:
+        self.gate()
+        self.exchange.halt(self.axes, f"{self.service} said so")
+        yield
+        for axis in self.axes:
+            _require_answering(self, axis)
+
+
+class Relax(Command):
     """Torque off."""
 
     def steps(self) -> Steps:
@@ -143,12 +162,9 @@ class Leave(Job):
     watchdog would only lock its goal for whoever comes next. Not seen at rest, or silent: its watchdog stays armed.
     """
 
-    def __init__(self, exchange: "Exchange", axes: Sequence[Axis], *, relax: bool, expires_ns: int) -> None:
-        super().__init__(exchange, axes, "close", expires_ns)
+    def __init__(self, exchange: "Exchange", axes: Sequence[Axis], *, relax: bool) -> None:
+        super().__init__(exchange, axes)
         self._relax = relax
-
-    def gate(self) -> None:
-        """Leaving is not a motion; only its time is limited, by whoever waits for it."""
 
     def steps(self) -> Steps:
         for axis in self.axes:

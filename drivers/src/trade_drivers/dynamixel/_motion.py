@@ -5,16 +5,17 @@ from typing import TYPE_CHECKING, Final
 
 from msgspec import Struct
 
+from trade import Permit
 from trade.errors import MotionStopped, TradeError
 from trade_drivers.dynamixel import _table as table
 from trade_drivers.dynamixel._axis import Axis
-from trade_drivers.dynamixel._jobs import Job, Steps, enabling
+from trade_drivers.dynamixel._jobs import Command, Steps, enabling
 from trade_drivers.dynamixel._profile import Leg, together
 
 if TYPE_CHECKING:
     from trade_drivers.dynamixel._exchange import Exchange
 
-__all__ = ["Move"]
+__all__ = ["Motion", "Move"]
 
 _ARRIVED_COUNTS: Final = 4
 """Closer than this (0.35 degrees) and at rest: arrived."""
@@ -34,7 +35,36 @@ class _Progress(Struct):
     """How long it has not come closer."""
 
 
-class Move(Job):
+class Motion(Command):
+    """What sets joints moving, and is watched until something ends it."""
+
+    def steps(self) -> Steps:
+        """Enable what is relaxed, then launch."""
+        exchange = self.exchange
+        for axis in self.axes:
+            axis.check_usable(exchange.clock(), exchange.stale_after_ns)
+        for axis in self.axes:
+            if not axis.ready:
+                yield from enabling(self, axis)
+        self.launch()
+
+    def launch(self) -> None:
+        """Write all goals in one packet, and take the joints over."""
+        raise NotImplementedError
+
+    def goal_of(self, axis: Axis) -> int:
+        """Where one of its joints is going, in counts."""
+        raise NotImplementedError
+
+    def watch(self, now_ns: int) -> None:
+        """Look at the newest measurements; end it if it is over or must not go on."""
+        raise NotImplementedError
+
+    def done_stepping(self) -> None:
+        """Launched; now it is watched. (It has ended already if anything was refused.)"""
+
+
+class Move(Motion):
     """A move of one or more joints to goals in counts."""
 
     def __init__(
@@ -47,8 +77,9 @@ class Move(Job):
         service: str,
         expires_ns: int,
         until_ns: int | None,
+        permit: Permit,
     ) -> None:
-        super().__init__(exchange, axes, service, expires_ns)
+        super().__init__(exchange, axes, service=service, expires_ns=expires_ns, permit=permit)
         self._goals = dict(zip(axes, goals, strict=True))
         self._speeds = tuple(speeds)
         self._until_ns = until_ns
@@ -58,23 +89,9 @@ class Move(Job):
         self.final_counts: tuple[int, ...] = ()
 
     def goal_of(self, axis: Axis) -> int:
-        """Where one of its joints is going, in counts."""
         return self._goals[axis]
 
-    def steps(self) -> Steps:
-        """Enable what is relaxed, then write all goals in one packet."""
-        exchange = self.exchange
-        for axis in self.axes:
-            axis.check_usable(exchange.clock(), exchange.stale_after_ns)
-        for axis in self.axes:
-            if not axis.ready:
-                yield from enabling(self, axis)
-        self._launch()
-
-    def done_stepping(self) -> None:
-        """Launched; now it is watched. (It has ended already if anything was refused.)"""
-
-    def _launch(self) -> None:
+    def launch(self) -> None:
         exchange, now_ns = self.exchange, self.exchange.clock()
         samples = [axis.check_usable(now_ns, exchange.stale_after_ns) for axis in self.axes]
         distances = [abs(self._goals[axis] - sample.position) for axis, sample in zip(self.axes, samples, strict=True)]
@@ -96,7 +113,6 @@ class Move(Job):
         self._patience_s = 1.0 + 2 * max(profile.duration_s for profile in profiles)
 
     def watch(self, now_ns: int) -> None:
-        """Look at the newest measurements; end the move if it has arrived or must not go on."""
         ending = self._trouble(now_ns)
         if ending is None:
             elapsed_s = min((now_ns - self._watched_ns) / 1e9, _MOST_PER_CYCLE_S)

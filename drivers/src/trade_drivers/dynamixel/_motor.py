@@ -5,14 +5,15 @@ from collections.abc import Sequence
 from math import isfinite
 from typing import Final
 
-from trade import current_call
+from trade import Resource, current_call, permit
 from trade.errors import DeviceError, DeviceSilent, InvalidArgument, LimitExceeded
-from trade_drivers._interfaces import JointGroup, JointLimits, Motor, MotorState
+from trade_drivers._interfaces import LONGEST_VALID_S, JointGroup, JointLimits, Motor, MotorState
 from trade_drivers.dynamixel import _table as table
 from trade_drivers.dynamixel._axis import Axis, Health, Sample
 from trade_drivers.dynamixel._bus import BusThread
-from trade_drivers.dynamixel._jobs import Enable, Relax
+from trade_drivers.dynamixel._jobs import Command, Enable, Halt, Relax
 from trade_drivers.dynamixel._motion import Move
+from trade_drivers.dynamixel._setpoint import SetPoint
 
 __all__ = ["DynamixelGroup", "DynamixelMotor"]
 
@@ -20,6 +21,8 @@ _DEFAULT_EXPIRY_NS: Final = 1_000_000_000
 """How long a plain Python call may wait for its turn on the bus."""
 _ANSWER_NS: Final = 100_000_000
 """For one exchange (48 ms at most), the hold, and the way back to the caller."""
+_BEYOND_COUNTS: Final = 4
+"""Farther than this outside of its range, a joint is not told to go on outwards."""
 _HEALTH_STALE_NS: Final = 2_000_000_000
 
 
@@ -33,21 +36,25 @@ class _Joints:
         self._axes = tuple(axes)
 
     @property
-    def resources(self) -> tuple[str, ...]:
-        return tuple(axis.name for axis in self._axes)
+    def resources(self) -> tuple[Resource, ...]:
+        return tuple(axis.resource for axis in self._axes)
 
     def stop(self) -> None:
         self._exchange.stop(self._axes).wait(self._thread.alive)
 
     def enable(self) -> None:
-        self._do(Enable)
+        self._do(Enable, "enable")
 
     def relax(self) -> None:
-        self._do(Relax)
+        self._do(Relax, "relax")
 
-    def _do(self, kind: type[Enable] | type[Relax]) -> None:
+    def _do(self, kind: type[Enable | Relax | Halt], name: str) -> None:
         expires_ns, _ = self._expiry()
-        job = kind(self._exchange, self._axes, f"{self._name}.{kind.__name__.lower()}", expires_ns)
+        service = f"{self._name}.{name}"
+        with permit(self.resources) as permitted:
+            self._finish(kind(self._exchange, self._axes, service=service, expires_ns=expires_ns, permit=permitted))
+
+    def _finish(self, job: Command) -> None:
         self._exchange.submit(job)
         job.wait(self._thread.alive)
 
@@ -60,26 +67,54 @@ class _Joints:
 
     def _move(self, positions_rad: Sequence[float], speed_rad_s: float | None, argument: str) -> list[float]:
         service = f"{self._name}.move_to"
-        if len(positions_rad) != len(self._axes):
-            names = ", ".join(axis.name for axis in self._axes)
-            problem = f"has {len(positions_rad)} values; it takes {len(self._axes)}, for {names}"
-            raise InvalidArgument(service=service, argument=argument, problem=problem)
-        goals = [
-            _goal_counts(axis, _finite(value, service, argument))
-            for axis, value in zip(self._axes, positions_rad, strict=True)
-        ]
+        goals = self._goals(positions_rad, service, argument)
         speed = None if speed_rad_s is None else _finite(speed_rad_s, service, "speed_rad_s")
         speeds = [_speed_counts(axis, speed) for axis in self._axes]
         expires_ns, ends = self._expiry()
         if ends:
             expires_ns -= _time_to_answer_ns(expires_ns - self._exchange.clock())
         until_ns = expires_ns if ends else None
-        move = Move(
-            self._exchange, self._axes, goals, speeds, service=service, expires_ns=expires_ns, until_ns=until_ns
-        )
-        self._exchange.submit(move)
-        move.wait(self._thread.alive)
+        with permit(self.resources) as permitted:
+            move = Move(
+                self._exchange,
+                self._axes,
+                goals,
+                speeds,
+                service=service,
+                expires_ns=expires_ns,
+                until_ns=until_ns,
+                permit=permitted,
+            )
+            self._finish(move)
         return [axis.scale.angle_rad(counts) for axis, counts in zip(self._axes, move.final_counts, strict=True)]
+
+    def _set(self, goals: Sequence[int], speeds: Sequence[int], service: str, valid_s: float) -> None:
+        """Begin a set-point, or take over from the one before; returns once it is on the wire."""
+        until_ns = self._exchange.clock() + int(valid_s * 1e9)
+        expires_ns, _ = self._expiry()
+        with permit(self.resources) as permitted:
+            self._finish(
+                SetPoint(
+                    self._exchange,
+                    self._axes,
+                    goals,
+                    speeds,
+                    service=service,
+                    expires_ns=expires_ns,
+                    until_ns=until_ns,
+                    permit=permitted,
+                )
+            )
+
+    def _goals(self, positions_rad: Sequence[float], service: str, argument: str) -> list[int]:
+        if len(positions_rad) != len(self._axes):
+            names = ", ".join(axis.name for axis in self._axes)
+            problem = f"has {len(positions_rad)} values; it takes {len(self._axes)}, for {names}"
+            raise InvalidArgument(service=service, argument=argument, problem=problem)
+        return [
+            _goal_counts(axis, _finite(value, service, argument))
+            for axis, value in zip(self._axes, positions_rad, strict=True)
+        ]
 
     def _states(self) -> list[MotorState]:
         return [self._state(axis) for axis in self._axes]
@@ -123,6 +158,15 @@ class DynamixelMotor(_Joints, Motor):
     def move_to(self, position_rad: float, speed_rad_s: float | None = None) -> float:
         return self._move([position_rad], speed_rad_s, "position_rad")[0]
 
+    def set_velocity(self, velocity_rad_s: float, valid_s: float = 0.2) -> None:
+        service = f"{self._name}.set_velocity"
+        velocity, valid_s = _finite(velocity_rad_s, service, "velocity_rad_s"), _valid(valid_s, service)
+        if velocity == 0:
+            self._do(Halt, "set_velocity")
+            return
+        [axis] = self._axes
+        self._set([_end_counts(axis, velocity)], [_speed_counts(axis, abs(velocity))], service, valid_s)
+
 
 class DynamixelGroup(_Joints, JointGroup):
     """Servos of one bus as a group."""
@@ -139,6 +183,11 @@ class DynamixelGroup(_Joints, JointGroup):
     def move_to(self, positions_rad: list[float], speed_rad_s: float | None = None) -> list[float]:
         return self._move(positions_rad, speed_rad_s, "positions_rad")
 
+    def servo(self, positions_rad: list[float], valid_s: float = 0.2) -> None:
+        service = f"{self._name}.servo"
+        goals = self._goals(positions_rad, service, "positions_rad")
+        self._set(goals, [axis.speed_counts for axis in self._axes], service, _valid(valid_s, service))
+
 
 def _time_to_answer_ns(left_ns: int) -> int:
     """How long before its call's deadline a move ends, so that the caller is told that the joint was stopped.
@@ -152,6 +201,23 @@ def _finite(value: float, service: str, argument: str) -> float:
     if not isinstance(value, int | float) or isinstance(value, bool) or not isfinite(value):  # pyright: ignore[reportUnnecessaryIsInstance]
         raise InvalidArgument(service=service, argument=argument, problem=f"{value!r} is not a finite number")
     return float(value)
+
+
+def _valid(valid_s: float, service: str) -> float:
+    if not 0 < _finite(valid_s, service, "valid_s") <= LONGEST_VALID_S:
+        problem = f"{valid_s!r} is not above 0 and at most {LONGEST_VALID_S:g}"
+        raise InvalidArgument(service=service, argument="valid_s", problem=problem)
+    return valid_s
+
+
+def _end_counts(axis: Axis, velocity_rad_s: float) -> int:
+    """Where a motion in this direction ends at the latest: the servo brakes by itself before it gets there."""
+    joint, sample = axis.joint, axis.sample
+    end = joint.max_rad if velocity_rad_s > 0 else joint.min_rad
+    angle_rad = end if sample is None else axis.scale.angle_rad(sample.position)
+    if (angle_rad - end) * velocity_rad_s > abs(velocity_rad_s) * _BEYOND_COUNTS * table.RAD_PER_COUNT:
+        raise LimitExceeded(what=axis.name, value=angle_rad, lower=joint.min_rad, upper=joint.max_rad, unit="rad")
+    return round(axis.scale.counts(end))
 
 
 def _goal_counts(axis: Axis, position_rad: float) -> int:

@@ -148,7 +148,8 @@ def _error_number(bad: BaseException | None) -> int | None:
 class Wire:
     """One serial port and the packets on it. Not thread safe: one thread owns it.
 
-    After an exchange that failed, the next one first keeps silent until ``settled_at``; ``pause`` is how it waits.
+    After an exchange that failed, the next one first keeps silent until ``settled_at``. ``pause`` is how it waits; it
+    is called before every exchange, so that whoever gives it can put in what must not wait.
     """
 
     def __init__(self, path: str, baud: int, where: str = "bus") -> None:
@@ -299,9 +300,7 @@ class Wire:
             self._port.is_using = False
 
     def _settle(self) -> None:
-        left = self.settled_at - time.monotonic()
-        if left > 0:
-            self.pause(left)
+        self.pause(max(0.0, self.settled_at - time.monotonic()))
 
     def _unsettle(self) -> None:
         self.settled_at = time.monotonic() + DRAIN_S

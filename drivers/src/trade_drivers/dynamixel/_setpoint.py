@@ -1,0 +1,61 @@
+"""A set-point: goals that hold for a short while only; not renewed in time, the joints ramp to a stop."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from trade import Permit
+from trade.errors import TradeError
+from trade_drivers.dynamixel import _table as table
+from trade_drivers.dynamixel._axis import Axis
+from trade_drivers.dynamixel._motion import Motion
+
+if TYPE_CHECKING:
+    from trade_drivers.dynamixel._exchange import Exchange
+
+__all__ = ["SetPoint"]
+
+
+class SetPoint(Motion):
+    """Goals in counts and the speed to go there; whoever waits for it is let go as soon as it is on the wire.
+
+    Each renewal is a set-point of its own, admitted anew, that takes over from the one before.
+    """
+
+    def __init__(
+        self,
+        exchange: "Exchange",
+        axes: Sequence[Axis],
+        goals: Sequence[int],
+        speeds: Sequence[int],
+        *,
+        service: str,
+        expires_ns: int,
+        until_ns: int,
+        permit: Permit,
+    ) -> None:
+        super().__init__(exchange, axes, service=service, expires_ns=min(expires_ns, until_ns), permit=permit)
+        self._goals = dict(zip(axes, goals, strict=True))
+        self._speeds = dict(zip(axes, speeds, strict=True))
+        self._until_ns = until_ns
+
+    def goal_of(self, axis: Axis) -> int:
+        return self._goals[axis]
+
+    def launch(self) -> None:
+        data: dict[int, bytes] = {}
+        for axis in self.axes:
+            axis.check_goal(self._goals[axis])
+            data[axis.id] = axis.goal_block(self._goals[axis], speed=self._speeds[axis])
+        self.exchange.wire.sync_write(table.PROFILE_ACCELERATION.address, data, self.gate)
+        self.exchange.take_over(self)
+        self.expires_ns = self._until_ns  # on its way, it lasts as long as it was said to
+        self.finish()
+
+    def watch(self, now_ns: int) -> None:
+        """What would keep it off the wire ends it, too: its time, a stop, a lock, a fault, silence."""
+        try:
+            self.gate()
+            for axis in self.axes:
+                axis.check_usable(now_ns, self.exchange.stale_after_ns)
+        except TradeError as ending:
+            self.exchange.release(self, ending)

@@ -1,0 +1,66 @@
+"""Motion ends with its session: clients are killed, frozen and interrupted; the judge is the simulator's log."""
+
+import signal
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+import trade
+from system.conftest import Bench, Program
+from trade import where
+from trade_hil_sim import events, writes
+from waiting import wait_until
+
+MOVER = Path(__file__).with_name("mover.py")
+HALFWAY_RAD = 0.65
+"""Where a joint that is not stopped gets to long after everything that stops it should have."""
+
+Run = Callable[..., Program]
+
+
+def moving_client(bench: Bench, run: Run, how: str) -> Program:
+    client = run(MOVER, how)
+    client.json()
+    wait_until(lambda: bool(events(bench.sim.entries(), "motion_started", device_id=1)))
+    return client
+
+
+@pytest.mark.parametrize(
+    ("how", "number"),
+    [
+        ("call", signal.SIGKILL),
+        ("call", signal.SIGSTOP),
+        ("call", signal.SIGINT),
+        ("start", signal.SIGKILL),
+        ("jog", signal.SIGKILL),
+        ("jog", signal.SIGSTOP),
+    ],
+)
+def test_S05_what_a_client_moves_stops_with_it_and_nothing_else_does(
+    bench: Bench, run: Run, how: str, number: int
+) -> None:
+    tilt = trade.find(where(name="move_to", group="rosie.neck.tilt"), wait_s=30)
+    tilting = tilt.with_(deadline_s=120).start(0.55, 0.05)
+    client = moving_client(bench, run, how)
+    wait_until(lambda: bool(events(bench.sim.entries(), "motion_started", device_id=2)))
+    ended_at = time.monotonic()
+    client.signal(number)
+    try:
+        bench.stopped_short(ended_at, HALFWAY_RAD)
+        assert not writes(bench.sim.entries(), device_id=2, register="goal_position", since=ended_at)
+        assert not bench.rests("neck.tilt")
+        assert not tilting.done()
+    finally:
+        client.process.kill()
+
+
+@pytest.mark.parametrize("killed", ["plan", "relay"])
+def test_S03_a_motion_ends_with_any_session_on_whose_behalf_it_is(bench: Bench, run: Run, killed: str) -> None:
+    relay = run(MOVER, "relay")
+    relay.json()
+    planner = moving_client(bench, run, "plan")
+    ended_at = time.monotonic()
+    (planner if killed == "plan" else relay).signal(signal.SIGKILL)
+    bench.stopped_short(ended_at, HALFWAY_RAD)
