@@ -64,8 +64,10 @@ class CountingTransport(ZenohTransport):
         super().__init__(settings)
         self._sent = sent
 
-    def publish(self, key: str, *, urgent: bool = False) -> Publisher:
-        return Counted(super().publish(key, urgent=urgent), key.split("/", maxsplit=1)[0], self._sent)
+    def publish(self, key: str, *, urgent: bool = False, droppable: bool = False) -> Publisher:
+        return Counted(
+            super().publish(key, urgent=urgent, droppable=droppable), key.split("/", maxsplit=1)[0], self._sent
+        )
 
     def announce(self, key: str) -> Publisher:
         return Counted(super().announce(key), "registry", self._sent)

@@ -8,7 +8,7 @@ from typing import Final, NamedTuple
 
 from trade._constraints import Constraint
 from trade._index import Index
-from trade._wire import HEALTHY, Address, ProviderInfo, Scalar, ServiceInfo, ServiceKey
+from trade._wire import HEALTHY, Address, Estop, ProviderInfo, Scalar, ServiceInfo, ServiceKey
 
 __all__ = ["ContainerState", "Record", "Registry"]
 
@@ -28,6 +28,7 @@ class Record:
     meta: Mapping[str, Scalar]
     health: str
     members: Mapping[str, tuple[str, ...]]
+    estops: tuple[Estop, ...] = ()
 
     @property
     def healthy(self) -> bool:
@@ -167,6 +168,7 @@ class Registry:
                 meta={**service.meta, **info.meta},
                 health=info.health,
                 members=info.members,
+                estops=info.estops,
             )
             for service in info.services
         ]

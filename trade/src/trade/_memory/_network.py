@@ -61,6 +61,7 @@ class Network:
         self.traffic: Final = Traffic(self.clock, self._under_lock)
         self._random = random.Random(seed)  # noqa: S311 - no secret
         self._delay = Delay()
+        self._loss = 0.0
         self._nodes: list[Node] = []
         self._named: dict[str, Node] = {}
         self._links: dict[frozenset[Node], Link] = {}
@@ -197,7 +198,7 @@ class Network:
         self.sent[kind] += 1
         self._tell_taps(Passage(kind, source.name, target.name, message.key, message.payload, arrived=False))
         link = self._links.get(frozenset((source, target)))
-        if link is None or not link.up:
+        if link is None or not link.up or (kind is Kind.DROPPABLE and self._random.random() < self._loss):
             return
 
         def arrived() -> None:
@@ -233,6 +234,11 @@ class Network:
             for link in self._links.values() if between is None else [self._links[frozenset(between)]]:
                 for way in link.ways.values():
                     way.delay = delay
+
+    def lose(self, share: float) -> None:
+        """Lose this share of all droppable messages; the generator draws which."""
+        with self.lock:
+            self._loss = share
 
     def partition(self, one: Node, other: Node, *, one_way: bool = False) -> None:
         """Cut a link; ``one_way``: only from the first to the second. A cut that outlasts the lease ends the link."""

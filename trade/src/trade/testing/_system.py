@@ -4,6 +4,7 @@ import contextlib
 import threading
 import time
 from collections.abc import Callable, Generator
+from pathlib import Path
 from typing import Final
 
 from trade._container import Container
@@ -28,7 +29,8 @@ class MemorySystem:
     moved by ``advance`` and its kind alone; deadlines of calls go by the real one.
     """
 
-    def __init__(self, *, seed: int = 0, lease_s: float = 2.0) -> None:
+    def __init__(self, *, seed: int = 0, lease_s: float = 2.0, state_dir: Path | None = None) -> None:
+        self._state_dir = state_dir
         self.network: Final = Network(seed=seed, lease_s=lease_s)
         self._containers: dict[str, Container] = {}
         self._every: list[Container] = []
@@ -45,7 +47,7 @@ class MemorySystem:
         node = self.network.node(name)
         if node is not None and not node.closed:
             return self._containers[name]
-        settings = Settings(system="memory", identity=identity, container=name)
+        settings = Settings(system="memory", identity=identity, container=name, state_dir=self._state_dir)
         container = Container(settings, transport=MemoryTransport(self.network, name))
         self._containers[name] = container
         self._every.append(container)
@@ -87,6 +89,10 @@ class MemorySystem:
         """
         nodes = None if between is None else (self._node(between[0]), self._node(between[1]))
         self.network.delay(least_s, jitter_s=jitter_s, between=nodes)
+
+    def lose(self, share: float) -> None:
+        """Lose this share (0 to 1) of the droppable messages, those of e-stops; the system's seed says which."""
+        self.network.lose(share)
 
     def _node(self, named: Named) -> Node:
         name = named if isinstance(named, str) else named.name
@@ -138,14 +144,17 @@ class MemorySystem:
 
 
 @contextlib.contextmanager
-def memory_system(*, seed: int = 0, lease_s: float = 2.0) -> Generator[MemorySystem, None, None]:
+def memory_system(
+    *, seed: int = 0, lease_s: float = 2.0, state_dir: Path | None = None
+) -> Generator[MemorySystem, None, None]:
     """A system in memory for one test; its containers are closed at the end.
 
     Args:
         seed: of the generator that draws jitter.
         lease_s: how long a partition lasts, on the network's clock, until containers lose each other.
+        state_dir: where containers keep what outlives them, such as open e-stops; none: nowhere.
     """
-    system = MemorySystem(seed=seed, lease_s=lease_s)
+    system = MemorySystem(seed=seed, lease_s=lease_s, state_dir=state_dir)
     try:
         yield system
     finally:
