@@ -16,12 +16,14 @@ from msgspec import structs
 from trade import _many
 from trade._calls import Caller
 from trade._constraints import Constraint, checked_meta, where
+from trade._context import handed_down
 from trade._coroutines import AsyncLoop
 from trade._dispatch import Dispatcher
 from trade._estop_line import EstopReport
 from trade._estopping import LIMIT_S, Estopping
 from trade._handle import Bound, Handle, Run
 from trade._hints import no_such_service, too_many_services
+from trade._inherited import InheritedLock
 from trade._invoke import LocalTarget, RemoteTarget, Request, container_closed
 from trade._joining import join
 from trade._lock import Lock, OnLost, OnRequest
@@ -97,6 +99,10 @@ class Container:
             leaving.callback(self._caller.close)
             self._notifier = Notifier(lambda record: Handle(self, record.key, record))
             leaving.callback(self._notifier.close)
+            self._inherited = InheritedLock(self._settings.lock, self.address) if self._settings.lock else None
+            if self._inherited is not None:
+                handed_down[self.address] = self._inherited
+                leaving.callback(handed_down.pop, self.address)
             self._registry.listen(self._changed)
             self._registry.listen(self._notifier.changed)
             coroutines = AsyncLoop()
@@ -352,6 +358,8 @@ class Container:
         self._caller.lost(address, back=back)
         if not back:
             self.locking.keeper.lost(address)
+            if self._inherited is not None:
+                self._inherited.lost(address)
             self._table.session_ended(str(address), f"its owner {address.container} has ended or cannot be reached")
             self._deadman.session_ended(str(address))
 

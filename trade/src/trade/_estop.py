@@ -118,7 +118,8 @@ class Estops:
             ended.set()
 
         self._deadman.everything(stopped)
-        _logger.error("%s by %s: everything here stops", reason, estop.by)
+        if self._keeps():
+            _logger.error("%s, by %s: everything here stops", reason, estop.by)
 
         def finish() -> None:
             unwritten = self._written(estop) if self._keeps() else ""

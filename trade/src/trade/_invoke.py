@@ -11,7 +11,7 @@ import msgspec
 from msgspec import Raw
 
 from trade._calls import Caller, Peer
-from trade._context import CallContext, holding, running
+from trade._context import CallContext, handed_down, holding, running
 from trade._dispatch import LocalService
 from trade._failures import unpack_error
 from trade._handle import Run
@@ -67,6 +67,8 @@ class Request:
             LockLost: it actuates, and would do so under a lock that holds no more.
         """
         outer, around = self._outer, holding.get()
+        if own in handed_down:
+            around = (handed_down[own], *around)
         if outer is None and not around:
             return None
         locks = [lock for lock in around if lock.owner == own]

@@ -26,6 +26,7 @@ _VARIABLES: Final = (
     "TRADE_CREDENTIALS",
     "TRADE_BRIDGE",
     "TRADE_INSECURE_LAN",
+    "TRADE_LOCK",
     "TRADE_RUNTIME_DIR",
     "TRADE_STATE_DIR",
 )
@@ -58,6 +59,8 @@ class Settings:
     to each other. It has to listen on each; one alone will do if it dials another bridge. Everything of the system
     crosses: there are no lists of what may, and no policy, yet."""
     explicit_system: bool = False
+    lock: str = ""
+    """A lock that the process around this one holds for it; see `Lock.environment`."""
     state_dir: Path | None = None
     """Where what must outlive a process is kept, such as open e-stops; none: nowhere."""
 
@@ -112,8 +115,8 @@ class Settings:
 
         The environment has ``TRADE_SYSTEM``, ``TRADE_IDENTITY``, ``TRADE_CONTAINER``, ``TRADE_LISTEN`` and
         ``TRADE_CONNECT`` (comma-separated), ``TRADE_CREDENTIALS`` (``user:password``), ``TRADE_INSECURE_LAN`` (``1``),
-        ``TRADE_BRIDGE`` (comma-separated), ``TRADE_RUNTIME_DIR`` and ``TRADE_STATE_DIR`` (else the user's folder for
-        state). Others that begin with ``TRADE_`` are warned of.
+        ``TRADE_BRIDGE`` (comma-separated), ``TRADE_LOCK`` (set by ``trade lock``), ``TRADE_RUNTIME_DIR`` and
+        ``TRADE_STATE_DIR`` (else the user's folder for state). Others that begin with ``TRADE_`` are warned of.
         """
         _warn_of_unknown(environment)
         named = system or environment.get("TRADE_SYSTEM") or None
@@ -127,6 +130,7 @@ class Settings:
             insecure_lan=environment.get("TRADE_INSECURE_LAN") == "1" if insecure_lan is None else insecure_lan,
             bridge=tuple(_split(environment, "TRADE_BRIDGE") if bridge is None else bridge),
             explicit_system=named is not None,
+            lock=environment.get("TRADE_LOCK", ""),
             state_dir=_state_dir(environment),
         )
 
