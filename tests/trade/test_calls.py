@@ -9,7 +9,7 @@ import msgspec
 import pytest
 
 from trade._calls import Caller, Peer
-from trade._transport import Channel, ChannelClosed, Message, Publisher, Transport
+from trade._transport import Answer, Channel, ChannelClosed, Message, Publisher, Questions, Transport
 from trade._wire import EMPTY, EMPTY_ARGUMENTS, PROTOCOL, Address, Reply, Status, decode_call, encode_message
 
 OWN = Address("me", "here", "e0")
@@ -68,9 +68,10 @@ class PaperTransport(Transport):
         payload = encode_message(Reply(PROTOCOL, call_id, status, 1, EMPTY))
         self.channels[f"me/{box}"].queue.put(Message(f"reply/{speaker}/me/{box}", payload))
 
-    def announce(self, key: str) -> Publisher: ...  # type: ignore[empty-body]
+    def announce(self, key: str, payload: bytes) -> None: ...
     def announcements(self, pattern: str) -> Channel: ...  # type: ignore[empty-body]
-    def standing(self, pattern: str, timeout_s: float) -> list[Message]: ...  # type: ignore[empty-body]
+    def questions(self, pattern: str) -> Questions: ...  # type: ignore[empty-body]
+    def ask(self, pattern: str, timeout_s: float) -> list[Answer]: ...  # type: ignore[empty-body]
     def appear(self, key: str) -> None: ...  # type: ignore[override]
     def presences(self, pattern: str) -> Channel: ...  # type: ignore[empty-body]
     def present(self, pattern: str, timeout_s: float) -> list[str]: ...  # type: ignore[empty-body]
@@ -85,6 +86,7 @@ def transport() -> PaperTransport:
 @pytest.fixture
 def caller(transport: PaperTransport) -> Iterator[Caller]:
     caller = Caller(transport, OWN, "session")
+    caller.lost(OTHER, back=True)
     yield caller
     caller.close()
 
@@ -180,6 +182,7 @@ def test_the_loss_of_a_container_ends_what_waits_for_it_and_nothing_else(
 
     transport.on_call = note
     neighbour = Address("arm", "other", "e1")
+    caller.lost(neighbour, back=True)
     threads = [
         threading.Thread(target=lambda to=to: statuses.update({to.container: ask(caller, to=to).status}))
         for to in (OTHER, neighbour)
@@ -303,5 +306,18 @@ def test_a_lost_container_has_an_unknown_clock(caller: Caller) -> None:
     peer = caller.peer(OTHER)
     now = time.monotonic_ns()
     peer.heard(now, now - 1000, now)
+    assert caller.peer(OTHER).clock_known
     caller.lost(OTHER)
-    assert peer.expiry_ns(now) is None
+    assert not caller.peer(OTHER).clock_known
+    caller.lost(OTHER, back=True)
+    assert not caller.peer(OTHER).clock_known
+
+
+def test_nothing_is_kept_of_containers_that_have_ended(caller: Caller) -> None:
+    for boot in range(300):
+        address = Address("arm", "short-lived", f"e{boot}")
+        caller.lost(address, back=True)
+        assert not caller.peer(address).lost
+        caller.lost(address)
+        assert caller.peer(address).lost
+    assert list(caller._peers) == [OTHER]

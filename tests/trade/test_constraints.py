@@ -11,9 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from trade import Constraint, Container, Handle, service, where
+from trade._codec import Codec
 from trade._constraints import Term
 from trade._service import ServiceMark
-from trade._signature import Codec, Signature
+from trade._signature import Signature
 from trade._wire import ServiceInfo
 from trade.errors import ConfigurationError
 

@@ -3,22 +3,28 @@
 import contextlib
 import gc
 import tracemalloc
+import weakref
 from collections import Counter
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, cast
 
 import pytest
+from msgspec import structs
 
 import trade._signature as signatures
 from trade import Container, Handle, Settings, service, where
+from trade._arguments import encode_call
 from trade._registry import Registry
 from trade._rendezvous import Rendezvous, free_endpoint
 from trade._transport import Publisher
+from trade._wire import PROTOCOL, TALLY, Address, Call, ProviderInfo, ServiceInfo, decode_provider, encode_message
 from trade._zenoh import ZenohTransport, configuration
+from trade.errors import InvalidArgument
 
 CALLS = 20
 MOST_BYTES_OF_A_CALL = 16 * 1024
 MOST_BLOCKS_KEPT = 100
+MANY_BYTES = 8 << 20
 
 
 class Arm:
@@ -69,8 +75,9 @@ class CountingTransport(ZenohTransport):
             super().publish(key, urgent=urgent, droppable=droppable), key.split("/", maxsplit=1)[0], self._sent
         )
 
-    def announce(self, key: str) -> Publisher:
-        return Counted(super().announce(key), "registry", self._sent)
+    def announce(self, key: str, payload: bytes) -> None:
+        self._sent["registry"] += not key.endswith(f"/{TALLY}")  # that comes with time, whatever happens
+        super().announce(key, payload)
 
     def wake(self, key: str, payload: bytes) -> None:
         self._sent["wake"] += 1
@@ -154,6 +161,43 @@ def test_signatures_are_read_at_registration_and_never_again(
     assert read["__init__"] == len(CALL)
 
 
+def test_objects_of_one_class_share_what_their_methods_say(here: Container, monkeypatch: pytest.MonkeyPatch) -> None:
+    read = counted(monkeypatch, signatures.Signature, "__init__")
+    handles = [handle for number in range(CALLS) for handle in here.register(Arm(), f"robot.p{number}")]
+    assert read["__init__"] == len(CALL)
+    with pytest.raises(InvalidArgument, match=r"robot[.]p7[.]move"):
+        handles[7 * len(CALL)]("text", 0.2, 0.3)
+
+
+def test_what_objects_share_goes_with_the_last_of_them(here: Container) -> None:
+    class Passing(Arm):
+        @service
+        def rest(self, place: float) -> None: ...
+
+    robots = [Passing(), Passing()]
+    for robot in robots:
+        here.register(robot, "robot")
+    for robot in robots:
+        here.deregister(robot)
+    left = weakref.ref(Passing)
+    del Passing, robots, robot
+    gc.collect()
+    assert left() is None
+
+
+def test_a_class_that_has_changed_is_read_again(here: Container) -> None:
+    class Changing:
+        @service
+        def move(self, angle_rad: float) -> float:
+            return angle_rad
+
+    changing, same = Changing(), Changing()
+    move, _ = (*here.register(changing, "robot"), *here.register(same, "robot.other"))
+    Changing.move.__doc__ = "As it is now."
+    here.alter(changing)
+    assert move.doc == "As it is now."
+
+
 @pytest.mark.parametrize("name", CALL)
 def test_decoders_are_made_before_the_second_call(
     offer: Callable[..., Callable[[str], Handle]], monkeypatch: pytest.MonkeyPatch, name: str
@@ -194,6 +238,48 @@ def test_a_local_call_allocates_little_and_keeps_nothing(here: Container) -> Non
         for _ in range(50 * CALLS):
             CALL["move"](handles["move"])
         assert blocks() - before <= MOST_BLOCKS_KEPT
+
+
+def test_large_arguments_are_copied_once_into_their_message() -> None:
+    data = bytes(MANY_BYTES)
+    info = ServiceInfo(name="keep", signature="keep(data: bytes)")
+    codec = signatures.Codec(lambda value: value, lambda code, inside: inside)
+    call = Call(PROTOCOL, 1, "keep", "c/0", "", None, (), cast(Any, (data,)))
+    with traced():
+        assert peak_bytes(lambda: encode_call(codec, info, "robot.keep", call)) < 1.9 * MANY_BYTES
+
+
+MANY = 200
+MOST_BYTES_OF_A_SERVICE = 1024
+
+
+def entries(here: Container, count: int) -> list[bytes]:
+    """What so many arms say of themselves, as it travels."""
+    services = tuple(handle.record.info for handle in here.register(Arm(), "robot"))
+    said = ProviderInfo(revision=1, groups=("robot",), kind="Arm", host="edge", pid=1, services=services)
+    return [encode_message(structs.replace(said, groups=(f"robot.p{number}",))) for number in range(count)]
+
+
+def test_equal_services_are_one_object_however_many_tell_of_them(here: Container) -> None:
+    first, second = map(decode_provider, entries(here, 2))
+    assert first.groups != second.groups
+    assert all(one is other for one, other in zip(first.services, second.services, strict=True))
+    assert (first.kind is second.kind, first.host is second.host) == (True, True)
+    left = [weakref.ref(service) for service in first.services]
+    del first, second
+    assert [ref() for ref in left] == [None] * len(CALL)
+
+
+def test_a_service_of_another_container_weighs_little(here: Container) -> None:
+    registry, said = Registry(Address("me", "late", "e1")), entries(here, MANY)
+    with traced():
+        before, _ = tracemalloc.get_traced_memory()
+        registry.appear(Address("me", "driver", "e2"))
+        for number, entry in enumerate(said):
+            registry.put(Address("me", "driver", "e2"), "robot", f"Arm-{number}", decode_provider(entry))
+        grown = tracemalloc.get_traced_memory()[0] - before
+    assert len(registry.select(where())) == MANY * len(CALL)
+    assert grown <= MOST_BYTES_OF_A_SERVICE * MANY * len(CALL)
 
 
 def counted(monkeypatch: pytest.MonkeyPatch, owner: type, *names: str) -> Counter[str]:

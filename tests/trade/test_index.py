@@ -7,9 +7,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from trade import Constraint, where
+from trade._constraints import Term
 from trade._index import Index
-from trade._registry import Record
-from trade._wire import HEALTHY, Address, ServiceInfo, ServiceKey
+from trade._registry import Record, Registry
+from trade._wire import HEALTHY, Address, ProviderInfo, ServiceInfo, ServiceKey
 
 
 def record(number: int, **told: Any) -> Record:
@@ -100,7 +101,7 @@ LOOKED_AT = [
     (where(group="r7"), 200),
     (where(name="s5"), 100),
     (where(name="s7", group="r7"), 100),
-    (where(name="s5", group="r9"), 100),
+    (where(name="s5", group="r9"), 0),
     (where(name="s5", achieves="done5(?x)"), 10),
     (where(uses="r3"), 200),
     (where(name="s1") | where(name="s2"), 200),
@@ -113,8 +114,24 @@ LOOKED_AT = [
 
 
 @pytest.mark.parametrize(("constraint", "count"), LOOKED_AT, ids=str)
-def test_only_what_has_the_rarest_thing_is_looked_at(many: Index[Record], constraint: Constraint, count: int) -> None:
+def test_only_what_has_all_that_is_asked_is_looked_at(many: Index[Record], constraint: Constraint, count: int) -> None:
     assert len(many.candidates(constraint)) == count
+
+
+def test_one_by_name_and_group_is_found_by_one_look(monkeypatch: pytest.MonkeyPatch) -> None:
+    address = Address("me", "driver", "e1")
+    registry = Registry(address)
+    services = tuple(ServiceInfo(name=f"move_{number}", signature="()") for number in range(10))
+    for number in range(200):
+        info = ProviderInfo(revision=1, groups=(f"r.p{number}",), kind="Arm", host="edge", pid=1, services=services)
+        registry.put(address, "r", f"Arm-{number}", info)
+    asked: list[str] = []
+    matches = Term.matches
+    monkeypatch.setattr(Term, "matches", lambda term, entry: asked.append(entry.label) or matches(term, entry))
+    for number in range(200):
+        [found] = registry.select(where(name="move_7", group=f"r.p{number}"))
+        assert asked == [found.label] * 2 == [f"r.p{number}.move_7"] * 2
+        asked.clear()
 
 
 def test_what_left_leaves_nothing_behind() -> None:

@@ -125,14 +125,15 @@ def test_what_is_known_of_a_clock_is_void_once_its_container_was_out_of_sight(he
     """A computer that sleeps stops its clock: an expiry reckoned by the old offset would be too late."""
     hang = found(here, "hang")
     assert found(here, "pid")() == driver.process.pid
-    peer = here._caller.peer(hang.key.address)
-    assert peer.clock_known
-    here._caller.lost(hang.key.address)
-    assert not peer.clock_known
-    assert peer.expiry_ns(10**12) is None
-    here._caller.lost(hang.key.address, back=True)
+    caller, address = here._caller, hang.key.address
+    assert caller.peer(address).clock_known
+    caller.lost(address)
+    assert caller.peer(address).expiry_ns(10**12) is None
+    caller.lost(address, back=True)
+    assert not caller.peer(address).clock_known
+    here._targets.clear()
     assert found(here, "pid")() == driver.process.pid
-    assert peer.clock_known
+    assert caller.peer(address).clock_known
 
 
 def test_the_death_of_one_container_leaves_calls_to_others_alone(

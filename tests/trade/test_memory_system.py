@@ -1,18 +1,22 @@
 """A whole system in one process: it converges whatever the network does, and nobody hangs whoever dies."""
 
 import concurrent.futures
+import contextlib
 import random
 import re
+import threading
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from trade import Container, Handle, errors, service, where
-from trade._memory import Passage
+from trade._announcing import Announcer
+from trade._memory import MemoryTransport, Passage
 from trade._transport import ChannelClosed
+from trade._wire import Address, ProviderInfo, ServiceInfo, alive_key
 from trade.errors import ContainerLost, NoSuchService, ServiceGone, TradeError
 from trade.testing import Kind, MemorySystem, memory_system
 
@@ -114,6 +118,7 @@ def test_a_call_takes_two_messages_after_the_first() -> None:
         system.container("c")
         b.register(Lamp(), "robot")
         handle = found(a)
+        system.settle()
         before = system.sent()
         handle(0.1)
         assert system.sent() - before == 4  # it asks for the clock first
@@ -126,11 +131,13 @@ def test_a_call_takes_two_messages_after_the_first() -> None:
 def test_joining_takes_as_many_messages_as_there_are_containers_and_providers() -> None:
     with memory_system() as system:
         for size in range(5):
+            system.settle()
             before = system.sent()
             container = system.container(f"c{size}")
+            system.settle()
             hosts, providers = size, size * 2  # others, and what they offer beyond the middleware's own
-            each = 2 + 1 + 2 + 2  # two signs of life, one entry, asked and answered twice
-            assert system.sent() - before <= hosts * each + providers * 2
+            each = 2 + 1 + 3 + 3  # two signs of life, one entry; each asks the other for its own services and tally
+            assert system.sent() - before == hosts * each + providers
             for group in ("one", "two"):
                 container.register(Lamp(), group)
 
@@ -138,10 +145,11 @@ def test_joining_takes_as_many_messages_as_there_are_containers_and_providers() 
 def test_registering_takes_one_message_for_each_other_container() -> None:
     with memory_system() as system:
         a, *_ = [system.container(name) for name in "abcd"]
+        system.settle()
         lamp, before = Lamp(), system.network.sent.copy()
         a.register(lamp, "robot")
         a.deregister(lamp)
-        assert system.network.sent - before == Counter({Kind.ANNOUNCE: 3, Kind.WITHDRAW: 3})
+        assert system.network.sent - before == Counter({Kind.ANNOUNCE: 6})
 
 
 # --- partitions
@@ -250,6 +258,162 @@ def test_a_partition_of_two_leaves_calls_of_a_third_alone(pair: Pair) -> None:
         assert found(third)(0.3) == 0.3
 
 
+# --- messages that get lost
+
+
+def losing(*payloads_of: str) -> Callable[[Passage], bool]:
+    """What is announced of providers whose names begin so gets lost."""
+    return lambda passage: passage.kind is Kind.ANNOUNCE and passage.key.rpartition("/")[2].startswith(payloads_of)
+
+
+def test_a_lost_announcement_is_known_with_the_next_one() -> None:
+    with memory_system() as system:
+        a, b = system.container("a"), system.container("b")
+        end = system.lose(losing("Lamp"))
+        b.register(Lamp(), "lost")
+        end()
+        system.settle()
+        assert labels(a) == []
+        b.register(Lamp(), "heard")
+        system.settle()
+        assert labels(a) == ["b/heard.dim", "b/lost.dim"]
+
+
+def test_a_lost_withdrawal_is_known_with_the_next_announcement(lamp: Lamp) -> None:
+    with memory_system() as system:
+        a, b = system.container("a"), system.container("b")
+        b.register(lamp, "lost")
+        system.settle()
+        end = system.lose(losing("Lamp"))
+        b.deregister(lamp)
+        end()
+        assert labels(a) == ["b/lost.dim"]
+        b.register(Lamp(), "heard")
+        system.settle()
+        assert labels(a) == ["b/heard.dim"]
+
+
+def test_when_the_last_announcement_is_lost_the_next_sign_of_how_far_it_is_tells(
+    lamp: Lamp, eventually: Eventually
+) -> None:
+    with memory_system(beat_s=0.05) as system:
+        a, b = system.container("a"), system.container("b")
+        end = system.lose(losing("Lamp"))
+        b.register(lamp, "lost")
+        assert eventually(lambda: labels(a) == ["b/lost.dim"])
+        b.deregister(lamp)
+        assert eventually(lambda: labels(a) == [])
+        end()
+
+
+def test_what_is_lost_with_a_whole_storm_is_one_question() -> None:
+    with memory_system() as system:
+        a, b = system.container("a"), system.container("b")
+        random_ = random.Random(1)
+        end = system.lose(lambda passage: passage.kind is Kind.ANNOUNCE and random_.random() < 0.5)
+        system.settle()
+        before = system.sent(Kind.ASK)
+        with held(a):
+            for number in range(200):
+                b.register(Lamp(), f"robot-{number}")
+        end()
+        b.register(Lamp(), "last")
+        system.settle()
+        assert len(labels(a)) == 201
+        assert system.sent(Kind.ASK) - before <= 3
+
+
+@contextlib.contextmanager
+def held(container: Container) -> Iterator[None]:
+    """While this lasts a container asks nobody: whatever it misses comes together."""
+    asker, unlocked = container._watch._asker, threading.Event()
+    asker._beat, asker._next_beat = lambda: unlocked.wait(20), 0.0
+    with asker._changed:
+        asker._changed.notify_all()
+    try:
+        yield
+    finally:
+        unlocked.set()
+
+
+def test_a_container_that_says_nothing_of_itself_is_asked_again_less_and_less_often(
+    monkeypatch: pytest.MonkeyPatch, eventually: Eventually
+) -> None:
+    monkeypatch.setattr("trade._asking._FIRST_PAUSE_S", 0.001)
+    with memory_system() as system:
+        a = system.container("a")
+        ghost = MemoryTransport(system.network, "ghost")
+        questions = ghost.questions("registry/*/it/ghost/e1/*")
+        ghost.appear("alive/it/ghost/e1")
+        pauses = list[float]()
+        for _ in range(5):
+            questions.receive().close()
+            assert eventually(lambda: a._watch._asker._pauses.get(Address("it", "ghost", "e1"), 0) not in [0, *pauses])
+            pauses.append(a._watch._asker._pauses[Address("it", "ghost", "e1")])
+        assert pauses == [0.001 * 2**turn for turn in range(5)]
+        system.container("b").register(Lamp(), "robot")
+        assert found(a)(0.5) == 0.5
+        ghost.close()
+
+
+def test_who_asks_in_vain_still_takes_signs_of_life(lamp: Lamp, eventually: Eventually) -> None:
+    with memory_system() as system:
+        a = system.container("a")
+        ghost = MemoryTransport(system.network, "ghost")
+        questions = ghost.questions("registry/*/it/ghost/e1/*")
+        ghost.appear("alive/it/ghost/e1")
+        question = questions.receive()  # and no answer
+        b = system.container("b")
+        assert eventually(lambda: {info.name for info in a.containers()} == {"a", "b", "ghost"})
+        b.register(lamp, "robot")
+        assert found(a)(0.5) == 0.5
+        b.close()
+        assert eventually(lambda: {info.name for info in a.containers()} == {"a", "ghost"})
+        question.close()
+        ghost.close()
+
+
+def test_nobody_waits_behind_who_has_failed_to_answer(monkeypatch: pytest.MonkeyPatch, eventually: Eventually) -> None:
+    monkeypatch.setattr("trade._asking._ANSWER_S", 0.02)
+    monkeypatch.setattr("trade._asking._SLOW_ANSWER_S", 3600.0)
+    with memory_system() as system:
+        a, silent, other = (
+            system.container("a"),
+            *(MemoryTransport(system.network, name) for name in ("silent", "other")),
+        )
+        questions = silent.questions("registry/*/it/silent/e1/*")
+        silent.appear("alive/it/silent/e1")
+        questions.receive()
+        question = questions.receive()  # from now on it is waited for as long as it takes
+        address = Address("it", "other", "e1")
+        announcer = Announcer(other, address)
+        info = ServiceInfo(name="dim", signature="dim()")
+        entry = ProviderInfo(revision=1, groups=("hall",), kind="Lamp", host="h", pid=1, services=(info,))
+        announcer.announce("hall", "lamp", entry)
+        other.appear(alive_key(address))
+        assert eventually(lambda: labels(a) == ["other/hall.dim"])
+        announcer.close()
+        question.close()
+        silent.close()
+
+
+def test_more_containers_than_ever_end_and_one_of_them_returns_with_all_its_services(eventually: Eventually) -> None:
+    with memory_system() as system:
+        a, b = system.container("a"), system.container("b")
+        b.register(Lamp(), "robot")
+        system.partition(a, b)
+        system.advance(2)
+        for number in range(300):
+            ghost = MemoryTransport(system.network, f"ghost-{number}")
+            ghost.appear(f"alive/it/ghost/e{number}")
+            ghost.close()
+        assert eventually(lambda: not a._watch.busy)
+        system.heal()
+        system.settle()
+        assert labels(a) == ["b/robot.dim"]
+        assert len(a._registry._containers) == len(a._caller._peers) + 1 == 2
+
+
 # --- deaths, at every message
 
 
@@ -291,6 +455,7 @@ def meet_offer_and_call(system: MemorySystem, death: Death) -> list[BaseExceptio
         callee = system.container("callee")
 
     of_callee(join)
+    system.settle()  # each has asked the other
     if callee is not None:
         joined: Container = callee
         of_callee(lambda: joined.register(offered, "robot"))

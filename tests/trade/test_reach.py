@@ -175,19 +175,21 @@ def test_an_endpoint_that_is_taken_is_refused_and_leaves_nothing(here: Container
         Container(Settings.read(container="second", listen=[f"tcp/127.0.0.1:{taken}"]))
 
 
+@pytest.mark.parametrize("listen", [[], ["tcp/127.0.0.1:0"]])
 def test_when_a_free_port_is_taken_in_between_another_one_is_tried(
-    here: Container, system: str, monkeypatch: pytest.MonkeyPatch
+    here: Container, system: str, monkeypatch: pytest.MonkeyPatch, listen: list[str]
 ) -> None:
     from trade import _joining
+    from trade._endpoints import Endpoint, free_endpoint
 
     taken = next(
         connection.laddr.port
         for connection in psutil.Process().net_connections("tcp")
         if connection.status == psutil.CONN_LISTEN
     )
-    endpoints = iter([f"tcp/127.0.0.1:{taken}", f"tcp/127.0.0.1:{taken}", _joining.free_endpoint()])
-    monkeypatch.setattr(_joining, "free_endpoint", lambda: next(endpoints))
-    with Container(Settings.read(container="second")) as second:
+    endpoints = map(Endpoint.read, [f"tcp/127.0.0.1:{taken}", f"tcp/127.0.0.1:{taken}", free_endpoint()])
+    monkeypatch.setattr(_joining, "with_free_port", lambda _: next(endpoints))
+    with Container(Settings.read(container="second", listen=listen)) as second:
         assert {info.name for info in second.containers()} == {"here", "second"}
 
 

@@ -1,5 +1,6 @@
 """The transport in memory keeps the guarantees of every transport; its time, delays and faults do what they say."""
 
+import concurrent.futures
 import contextlib
 from collections.abc import Callable, Iterator
 
@@ -253,26 +254,34 @@ def test_a_partition_of_two_leaves_a_third_alone(room: Room) -> None:
     assert heard(signs) == [b""]
 
 
-def test_a_withdrawal_that_was_missed_is_never_told(room: Room) -> None:
-    announcements = room.other.announcements("shop/**")
-    bread = room.one.announce("shop/bread")
-    bread.put(b"fresh")
-    room.cut()
-    room.network.clock.advance(2)
-    bread.close()
-    room.network.heal()
-    assert heard(announcements) == [b"fresh"]
-    assert room.other.standing("shop/**", 0) == []
+def tell(transport: MemoryTransport, key: str, payload: bytes) -> None:
+    """Answer the question that was asked first."""
+    question = transport.node.asked[0].receive()
+    question.answer(key, payload)
+    question.close()
 
 
-def test_who_is_lost_gives_no_answer(room: Room) -> None:
-    bread = room.one.announce("shop/bread")
-    bread.put(b"fresh")
+def test_who_is_cut_off_answers_until_it_is_lost(room: Room) -> None:
+    room.one.questions("shop/*")
     room.cut(one_way=True)
-    assert room.other.standing("shop/**", 0) == [Message("shop/bread", b"fresh")]
+    with concurrent.futures.ThreadPoolExecutor(1) as pool:
+        asked = pool.submit(room.other.ask, "shop/*", 20)
+        tell(room.one, "shop/bread", b"fresh")
+        [answer] = asked.result()
+    assert answer.messages == [Message("shop/bread", b"fresh")]
     room.network.clock.advance(2)
-    assert room.other.standing("shop/**", 0) == []
+    assert room.other.ask("shop/*", 20) == []
     assert room.other.present("alive/**", 0) == []
+
+
+def test_a_message_may_be_lost_while_its_ends_stay_linked(room: Room) -> None:
+    end = room.network.lose(lambda passage: passage.payload == b"b")
+    room.say(*"abc")
+    end()
+    room.say("b")
+    room.network.clock.advance(10)
+    assert heard(room.ear) == [b"a", b"c", b"b"]
+    assert heard(room.signs) == []
 
 
 # --- kills
@@ -280,16 +289,16 @@ def test_who_is_lost_gives_no_answer(room: Room) -> None:
 
 def test_signs_of_the_killed_fall_at_once_and_what_it_sent_is_lost(room: Room) -> None:
     announcements = room.other.announcements("shop/**")
-    bread = room.one.announce("shop/bread")
-    bread.put(b"fresh")
+    room.one.announce("shop/bread", b"fresh")
     room.network.delay(0.1)
     room.say("lost")
+    room.one.announce("shop/bread", b"lost")
     room.network.kill(room.one.node)
     room.network.traffic.settle()
     assert (heard(room.ear), heard(room.signs), heard(announcements)) == ([], [None], [b"fresh"])
     with pytest.raises(ChannelClosed):
-        bread.put(b"stale")
-    for thing in (bread, room.sign, room.one):
+        room.one.announce("shop/bread", b"stale")
+    for thing in (room.sign, room.one):
         thing.close()
 
 

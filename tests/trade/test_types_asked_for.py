@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from msgspec import Meta, Struct
 
 from trade import Container, Handle, service, where
-from trade._schemas import fits
-from trade._wire import Parameter, ServiceInfo
+from trade._schemas import fits, schema_message
+from trade._wire import NO_SCHEMA, Parameter, ServiceInfo
 
 
 class Point(Struct):
@@ -186,8 +186,8 @@ def test_foreign_schemas_break_nothing(schema: dict[str, Any], more: Any) -> Non
     info = ServiceInfo(
         name="go",
         signature="go(a)",
-        arguments_schema={"properties": {"a": schema}, "$defs": more} if isinstance(more, dict) else {},
-        result_schema=schema,
+        arguments_schema=schema_message({"properties": {"a": schema}}, more) if isinstance(more, dict) else NO_SCHEMA,
+        result_schema=schema_message(schema, {}),
         parameters=(Parameter("a"),),
     )
     decoded = msgspec.msgpack.decode(msgspec.msgpack.encode(info), type=ServiceInfo)

@@ -2,6 +2,7 @@
 
 import logging
 import threading
+from collections.abc import Iterator
 from typing import Any
 
 import msgspec
@@ -10,6 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from trade import Container, Handle, _wire, service, where
+from trade._announcing import Announcer
+from trade._schemas import schema_message
 from trade._wire import (
     EMPTY,
     EMPTY_ARGUMENTS,
@@ -21,6 +24,7 @@ from trade._wire import (
     Reply,
     ServiceInfo,
     Status,
+    Tally,
     alive_key,
     as_chunk,
     call_key,
@@ -32,11 +36,14 @@ from trade._wire import (
     is_chunk,
     registry_key,
     reply_key,
+    tally_key,
 )
 from trade.errors import InvalidResult, RemoteError
+from trade.testing._ear import Teller
 
 CALL = Call(PROTOCOL, 7, "echo", "raw/0", "tester/raw/0", 2**62, (), EMPTY_ARGUMENTS)
 REPLY = Reply(PROTOCOL, 7, Status.OK, 1, EMPTY)
+TEXT, NUMBER = schema_message({"type": "string"}, {}), schema_message({"type": "integer"}, {})
 PROVIDER = ProviderInfo(
     revision=1, groups=("forged",), kind="Forged", host="h", pid=1, services=(ServiceInfo(name="go", signature="go()"),)
 )
@@ -324,12 +331,10 @@ def test_a_malformed_registry_entry_is_dropped_and_counted(
 ) -> None:
     raw = open_raw(here)
     ghost = raw.appear(alive_key(FORGED))
-    entry = raw.announce(key)
-    entry.put(payload)
+    raw.announce(key, payload)
     assert eventually(lambda: here.dropped_messages >= 1)
     assert here.services(where(group="forged")) == []
     assert still_works(here, raw)
-    entry.close()
     ghost.close()
 
 
@@ -348,37 +353,95 @@ def test_a_late_joiner_survives_malformed_entries_that_stand(
     here: Container, start_container: Any, open_raw: Any, echo: Echo
 ) -> None:
     raw = open_raw(here)
-    raw.announce(registry_key("robot", FORGED, "P-1")).put(b"garbage")
-    raw.announce(registry_key("robot", FORGED, "P-2")).put(encode_message(msgspec.structs.replace(PROVIDER, v=FUTURE)))
+    standing = {
+        registry_key("robot", FORGED, "P-1"): b"garbage",
+        registry_key("robot", FORGED, "P-2"): encode_message(msgspec.structs.replace(PROVIDER, v=FUTURE)),
+        registry_key("robot", FORGED, "P-3"): encode_message(PROVIDER),
+        tally_key(FORGED): encode_message(Tally(PROTOCOL, 3)),
+    }
+    Teller(raw, registry_key("*", FORGED, "*"), standing)
+    _sign = raw.appear(alive_key(FORGED))
     late = start_container("late")
     assert late.find(where(name="echo"), wait_s=20)(3) == 3
+    assert late.find(where(group="forged"), wait_s=20).key.provider == "P-3"
+    assert late.dropped_messages == 2
 
 
-def test_entries_count_only_while_their_container_shows_itself(here: Container, open_raw: Any, eventually: Any) -> None:
+@pytest.fixture
+def announcer(here: Container, open_raw: Any) -> Iterator[tuple[Any, Announcer]]:
+    """A bare transport linked with the container, and what announces there for an address of no container."""
     raw = open_raw(here)
-    raw.announce(registry_key("robot", FORGED, "P-1")).put(encode_message(PROVIDER))
+    announcing = Announcer(raw, FORGED)
+    yield raw, announcing
+    announcing.close()
+
+
+def test_entries_count_only_while_their_container_shows_itself(
+    here: Container, announcer: tuple[Any, Announcer], eventually: Any
+) -> None:
+    raw, announcing = announcer
+    announcing.announce("robot", "P-1", PROVIDER)
     assert here.services(where(group="forged")) == []
     sign = raw.appear(alive_key(FORGED))
     assert here.find(where(group="forged"), wait_s=20).container == "ghost"
     sign.close()
     assert eventually(lambda: here.services(where(group="forged")) == [])
+    assert FORGED not in here._registry._containers
 
 
 def test_a_newer_revision_of_an_entry_replaces_it_and_an_older_one_does_not(
-    here: Container, open_raw: Any, eventually: Any
+    here: Container, announcer: tuple[Any, Announcer], eventually: Any
 ) -> None:
-    raw = open_raw(here)
-    sign = raw.appear(alive_key(FORGED))
-    entry = raw.announce(registry_key("robot", FORGED, "P-1"))
-    entry.put(encode_message(PROVIDER))
+    raw, announcing = announcer
+    _sign = raw.appear(alive_key(FORGED))
+    announcing.announce("robot", "P-1", PROVIDER)
     handle = here.find(where(group="forged"), wait_s=20)
-    entry.put(encode_message(msgspec.structs.replace(PROVIDER, revision=3, groups=("newer",))))
+    announcing.announce("robot", "P-1", msgspec.structs.replace(PROVIDER, revision=3, groups=("newer",)))
     assert here.find(where(group="newer"), wait_s=20) == handle
-    entry.put(encode_message(msgspec.structs.replace(PROVIDER, revision=2, groups=("older",))))
-    entry.put(encode_message(msgspec.structs.replace(PROVIDER, revision=4, groups=("newest",))))
+    older = msgspec.structs.replace(PROVIDER, revision=2, groups=("older",))
+    raw.announce(registry_key("robot", FORGED, "P-1"), encode_message(older))
+    announcing.announce("robot", "P-1", msgspec.structs.replace(PROVIDER, revision=4, groups=("newest",)))
     assert here.find(where(group="newest"), wait_s=20).groups == ("newest",)
     assert here.services(where(group="older")) == here.services(where(group="forged")) == []
-    sign.close()
+
+
+def test_who_answers_for_somebody_else_is_not_listened_to(
+    here: Container, start_container: Any, open_raw: Any, eventually: Any
+) -> None:
+    here.register(Echo(), "robot")
+    raw = open_raw(here)
+    standing = {
+        registry_key("robot", FORGED, "P-1"): encode_message(PROVIDER),
+        registry_key("robot", here.address, "P-1"): encode_message(PROVIDER),
+        tally_key(FORGED): encode_message(Tally(PROTOCOL, 3)),
+        tally_key(here.address): encode_message(Tally(PROTOCOL, 3)),
+    }
+    Teller(raw, "registry/**", standing)
+    _sign = raw.appear(alive_key(FORGED))
+    late = start_container("late")  # asks everybody
+    assert late.dropped_messages == 1
+    assert late.find(where(name="echo", group="robot"), wait_s=20)(3) == 3
+    [forged] = late.services(where(group="forged")) or [late.find(where(group="forged"), wait_s=20)]
+    assert forged.key.address == FORGED  # that one was asked alone, then
+
+
+def test_a_flood_of_entries_ends_at_a_limit_and_disturbs_nobody(
+    here: Container,
+    there: Container,
+    announcer: tuple[Any, Announcer],
+    monkeypatch: pytest.MonkeyPatch,
+    eventually: Any,
+) -> None:
+    monkeypatch.setattr("trade._registry._MOST_PROVIDERS", 100)
+    raw, _ = announcer
+    _sign = raw.appear(alive_key(FORGED))
+    assert eventually(lambda: FORGED in here._registry._containers)
+    for number in range(2000):
+        entry = msgspec.structs.replace(PROVIDER, revision=3 * number + 1)
+        raw.announce(registry_key("robot", FORGED, f"P-{number}"), encode_message(entry))
+    there.register(Echo(), "other")
+    assert here.find(where(name="echo", group="other"), wait_s=20)(3) == 3
+    assert len(here.services(where(group="forged"))) <= 100
 
 
 def test_a_call_goes_by_the_newest_description_of_its_service(here: Container, open_raw: Any) -> None:
@@ -387,8 +450,8 @@ def test_a_call_goes_by_the_newest_description_of_its_service(here: Container, o
     callee.answer_clock()
     callee.answer(callee.next(), Status.OK, 5)
     assert first.result(20) == 5
-    info = ServiceInfo(name="go", signature="go() -> str", effect="read", result_schema={"type": "string"})
-    callee.entry.put(encode_message(msgspec.structs.replace(PROVIDER, revision=2, services=(info,), groups=("newer",))))
+    info = ServiceInfo(name="go", signature="go() -> str", effect="read", result_schema=TEXT)
+    callee.describe(msgspec.structs.replace(PROVIDER, revision=2, services=(info,), groups=("newer",)))
     assert here.find(where(group="newer"), wait_s=20) == callee.handle
     second = callee.handle.start()
     callee.answer(callee.next(), Status.OK, "text")
@@ -405,11 +468,15 @@ class FakeCallee:
     def __init__(self, raw: Any, caller: Container) -> None:
         self.raw, self.caller = raw, caller
         self.calls = raw.subscribe(calls_to(FORGED, stop=False))
-        info = ServiceInfo(name="go", signature="go() -> int", effect="read", result_schema={"type": "integer"})
+        info = ServiceInfo(name="go", signature="go() -> int", effect="read", result_schema=NUMBER)
         self.sign = raw.appear(alive_key(FORGED))
-        self.entry = raw.announce(registry_key("robot", FORGED, "P-1"))
-        self.entry.put(encode_message(msgspec.structs.replace(PROVIDER, services=(info,))))
+        self.describe(msgspec.structs.replace(PROVIDER, services=(info,)))
         self.handle: Handle = caller.find(where(group="forged"), wait_s=20)
+
+    def describe(self, entry: ProviderInfo) -> None:
+        registry = self.caller._registry
+        assert registry.wait_for(lambda: registry.is_alive(FORGED), 20)
+        self.raw.announce(registry_key("robot", FORGED, "P-1"), encode_message(entry))
 
     def answer_clock(self) -> None:
         self.answer(self.next(), Status.OK)

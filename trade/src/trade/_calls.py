@@ -11,7 +11,7 @@ import secrets
 import threading
 import time
 from collections.abc import Callable
-from typing import Final
+from typing import Any, Final
 
 from msgspec import Raw, structs
 
@@ -30,6 +30,7 @@ from trade._wire import (
     Reply,
     Status,
     call_key,
+    decode_call,
     decode_reply,
     encode_message,
     reply_key,
@@ -48,11 +49,11 @@ OnReply = Callable[[Reply], None]
 class Peer:
     """Another container as callers see it: whether it is there, and how its clock runs against ours."""
 
-    def __init__(self, address: Address) -> None:
+    def __init__(self, address: Address, *, lost: bool = False) -> None:
         self.address = address
         self.answers_on = f"reply/{address.identity}/"
         """How the keys of its answers begin."""
-        self.lost = False
+        self.lost = lost
         self._low_ns = -_NEVER
         self._high_ns = _NEVER
         self._at_ns = 0
@@ -70,10 +71,6 @@ class Peer:
             low, high = clock_ns - received_ns, clock_ns - sent_ns
         self._low_ns, self._high_ns, self._at_ns = low, high, received_ns
 
-    def forget_clock(self) -> None:
-        """While it is out of sight its clock may stand still: a computer that sleeps."""
-        self._low_ns, self._high_ns = -_NEVER, _NEVER
-
     def expiry_ns(self, deadline_ns: int) -> int | None:
         """Our deadline in its clock, never later than it is meant; None while the clock is unknown."""
         low, slack = self._low_ns, (time.monotonic_ns() - self._at_ns) * _DRIFT
@@ -84,7 +81,10 @@ _Waiting = tuple[int, Peer, int]
 """Call id, who is to answer, deadline: swapped as a whole, so that whoever ends a wait ends the one it looked at."""
 
 
-_Sent = tuple[Publisher, Call]
+Encode = Callable[[Call], bytes]
+"""Makes a message of a call whose arguments may still be values; raises what the caller is to know of them."""
+
+_Sent = tuple[Publisher, bytes]
 """What was put where, to be put once more if the link had gone."""
 
 
@@ -155,8 +155,8 @@ class Caller:
     # --- what a call needs to know
 
     def peer(self, address: Address) -> Peer:
-        with self._lock:
-            return self._peers.setdefault(address, Peer(address))
+        """Another container; one whose sign of life does not stand is lost."""
+        return self._peers.get(address) or Peer(address, lost=True)
 
     def publisher(self, callee: Address, domain: str, provider: str, *, stop: bool) -> Publisher:
         """The declared key of one provider's calls, made once."""
@@ -183,11 +183,12 @@ class Caller:
         peer: Peer,
         publisher: Publisher,
         service: str,
-        args: Raw,
+        args: Any,
         deadline_ns: int,
         expires_ns: int | None,
         chain: tuple[str, ...],
         behalf: Behalf | None = None,
+        encode: Encode = encode_message,
     ) -> Reply:
         """Call and wait for the answer; it always comes, if only from ourselves at the deadline."""
         call_id = self.new_id()
@@ -197,14 +198,15 @@ class Caller:
             return _ended(call_id, Status.UNSENT)
         try:
             call = Call(PROTOCOL, call_id, service, box.name, self._session, expires_ns, chain, args, behalf)
-            box.sent = (publisher, call)
+            data = encode(call)
+            box.sent = (publisher, data)
             box.waiting = (call_id, peer, deadline_ns)
             if deadline_ns < self._next_deadline_ns:
                 self._sooner.set()
             if peer.lost or self._closed:
                 return _ended(call_id, Status.UNSENT)
             sent_ns = time.monotonic_ns()
-            publisher.put(encode_message(call))
+            publisher.put(data)
             return self._await_reply(box, call_id, peer, sent_ns)
         except ChannelClosed:  # the publisher went with its provider, or everything does
             return _ended(call_id, Status.UNSENT)
@@ -236,13 +238,14 @@ class Caller:
         peer: Peer,
         publisher: Publisher,
         service: str,
-        args: Raw,
+        args: Any,
         deadline_ns: int,
         expires_ns: int | None,
         chain: tuple[str, ...],
         on_reply: OnReply,
         on_progress: OnReply | None = None,
         behalf: Behalf | None = None,
+        encode: Encode = encode_message,
     ) -> int:
         """Call without waiting; answer and progress go there on a thread of ours. Returns the call's id."""
         try:
@@ -251,15 +254,15 @@ class Caller:
             on_reply(_ended(0, Status.UNSENT))
             return 0
         call_id = self.new_id()
-        call = Call(PROTOCOL, call_id, service, shared.name, self._session, expires_ns, chain, args, behalf)
-        self._pending[call_id] = _Pending(peer, deadline_ns, on_reply, on_progress, (publisher, call))
+        data = encode(Call(PROTOCOL, call_id, service, shared.name, self._session, expires_ns, chain, args, behalf))
+        self._pending[call_id] = _Pending(peer, deadline_ns, on_reply, on_progress, (publisher, data))
         if deadline_ns < self._next_deadline_ns:
             self._sooner.set()
         if peer.lost or self._closed:
             self._finish(_ended(call_id, Status.UNSENT))
             return call_id
         try:
-            publisher.put(encode_message(call))
+            publisher.put(data)
         except ChannelClosed:
             self._finish(_ended(call_id, Status.UNSENT))
         return call_id
@@ -289,8 +292,8 @@ class Caller:
 
             def clock_heard(reply: Reply) -> None:
                 if reply.status == Status.OK:
-                    for publisher, call in due:
-                        self._put_again(peer, publisher, call)
+                    for publisher, data in due:
+                        self._put_again(peer, publisher, decode_call(data))
 
             self.start(peer, clock, CLOCK, EMPTY_ARGUMENTS, soon, None, (), clock_heard)
 
@@ -380,13 +383,14 @@ class Caller:
     # --- ends without an answer
 
     def lost(self, address: Address, *, back: bool = False) -> None:
-        """The callee's container is gone (or back): end what waits for it."""
-        peer = self.peer(address)
-        peer.lost = not back
+        """The callee's container is gone (or back): end what waits for it.
+
+        Nothing is kept of it: while it is out of sight its clock may stand still, as that of a computer that sleeps.
+        """
         if back:
-            self.resend(peer)
-        else:
-            peer.forget_clock()
+            self.resend(self._peers.setdefault(address, Peer(address)))
+        elif (peer := self._peers.pop(address, None)) is not None:
+            peer.lost = True
             self._end(lambda waiting, _: waiting is peer, Status.LOST)
 
     def _watch_deadlines(self) -> None:

@@ -11,7 +11,7 @@ import msgspec
 from msgspec import Struct
 
 from trade._predicates import achieves_all, parse_predicates
-from trade._schemas import fits, read_json, read_types, readable, types_text
+from trade._schemas import fits, known_schema, read_json, read_types, readable, types_text
 from trade._wire import Scalar, ServiceInfo
 from trade.errors import ConfigurationError
 
@@ -20,6 +20,7 @@ __all__ = ["Candidate", "Constraint", "where"]
 GROUP: Final = re.compile(r"[A-Za-z0-9_-]{1,80}(\.[A-Za-z0-9_-]{1,80})*")
 """What a group looks like: whole segments joined by dots."""
 _MOST_CLAUSES: Final = 1000
+_GLOB: Final = frozenset("*?[")
 _Field = Literal[
     "name", "group", "host", "container", "local", "args", "returns", "achieves", "uses", "kind", "meta", "healthy"
 ]
@@ -143,7 +144,7 @@ def under(group: str, selected: str) -> bool:
 
 def is_exact(pattern: str) -> bool:
     """Whether a name's pattern stands for one name only."""
-    return not any(sign in pattern for sign in "*?[")
+    return _GLOB.isdisjoint(pattern)
 
 
 def _like(name: str, pattern: str) -> bool:
@@ -157,7 +158,8 @@ def _takes(info: ServiceInfo, pattern: str) -> bool:
     left_out = [parameter for parameter in info.parameters if parameter not in places[: len(given)]]
     if len(given) > len(places) or any(parameter.required for parameter in left_out):
         return False
-    properties, own = info.arguments_schema.get("properties", {}), info.arguments_schema.get("$defs", {})
+    whole = known_schema(bytes(info.arguments_schema))
+    properties, own = whole.get("properties", {}), whole.get("$defs", {})
     return all(
         not schema or fits(schema, definitions, properties.get(place.name, {}), own)  # {} is Any: of whatever type
         for schema, place in zip(given, places, strict=False)
@@ -166,7 +168,8 @@ def _takes(info: ServiceInfo, pattern: str) -> bool:
 
 def _returns(info: ServiceInfo, pattern: str) -> bool:
     [wanted], definitions = read_types(pattern)
-    return fits(info.result_schema, info.result_schema.get("$defs", {}), wanted, definitions)
+    given = known_schema(bytes(info.result_schema))
+    return fits(given, given.get("$defs", {}), wanted, definitions)
 
 
 @lru_cache(1024)

@@ -14,7 +14,9 @@ import msgspec
 from msgspec import structs
 
 from trade import _many
+from trade._announcing import Announcer
 from trade._calls import Caller
+from trade._codec import Codec
 from trade._constraints import Constraint, checked_meta, where
 from trade._context import handed_down
 from trade._coroutines import AsyncLoop
@@ -24,7 +26,7 @@ from trade._estopping import LIMIT_S, Estopping
 from trade._handle import Bound, Handle, Run
 from trade._hints import no_such_service, too_many_services
 from trade._inherited import InheritedLock
-from trade._invoke import LocalTarget, RemoteTarget, Request, container_closed
+from trade._invoke import LocalTarget, RemoteTarget, container_closed, new_request
 from trade._joining import join
 from trade._lock import Lock, OnLost, OnRequest
 from trade._locking import LEASE_S, Locking
@@ -36,7 +38,6 @@ from trade._reach import Reach
 from trade._registry import Change, Record, Registry
 from trade._resources import Holder
 from trade._settings import Settings
-from trade._signature import Codec
 from trade._system import DOMAIN, PROVIDER, ContainerInfo, System
 from trade._transport import ChannelClosed, Transport
 from trade._watch import Watch
@@ -109,13 +110,11 @@ class Container:
             leaving.callback(coroutines.close)
             self.locking: Final = Locking(self)
             """Its locks on what others offer, and on what it offers itself."""
-            leaving.callback(self.locking.keeper.close)
             self._table = LockTable(self.address.epoch, self.name)
             leaving.callback(self._table.close)
-            self._providers = Providers(
-                self._transport, self._registry, self.address, self._codec, coroutines, self._table
-            )
-            leaving.callback(self._providers.close)
+            announcer = Announcer(self._transport, self.address)
+            leaving.callback(announcer.close)
+            self._providers = Providers(announcer, self._registry, self.address, self._codec, coroutines, self._table)
             state = self._settings.state_dir
             self._estopping = Estopping(
                 self._transport,
@@ -144,7 +143,7 @@ class Container:
             self._estopping.begin(own)
             presence = self._transport.appear(alive_key(self.address))
             leaving.callback(presence.close)
-            self._watch = Watch(self._transport, self._registry, self.address, self._lost)
+            self._watch = Watch(self._transport, self._registry, self.address, self._lost, announcer.beat)
             leaving.callback(self._watch.close)
             self._leaving = leaving.pop_all()
         _live.add(self)
@@ -279,7 +278,7 @@ class Container:
         self._check_open()
         infos: list[ContainerInfo] = []
         for state in self._registry.containers():
-            records = [record for _, provided in state.providers.values() for record in provided]
+            records = [record for _, provided in list(state.providers.values()) for record in provided]
             first = records[0] if records else None
             infos.append(
                 ContainerInfo(
@@ -381,12 +380,13 @@ class Container:
 
     def invoke(self, handle: Handle, args: tuple[Any, ...], kwargs: dict[str, Any], deadline_s: float | None) -> Any:
         """Call a service and wait; what ``handle(...)`` does."""
-        request = Request(deadline_s)
-        return self._target(handle).invoke(args, kwargs, request)
+        request = new_request(deadline_s)
+        target = self._targets.get(handle.key)
+        return (target or self._new_target(handle)).invoke(args, kwargs, request)
 
     def begin(self, handle: Handle, args: tuple[Any, ...], kwargs: dict[str, Any], deadline_s: float | None) -> Run:
         """Call a service without waiting; what ``handle.start(...)`` does."""
-        request, run = Request(deadline_s), Run(handle)
+        request, run = new_request(deadline_s), Run(handle)
         self._target(handle).begin(args, kwargs, request, run)
         return run
 
@@ -624,6 +624,11 @@ class Container:
         """Messages that were malformed or of another protocol version."""
         return self._dispatcher.malformed + self._caller.malformed + self._watch.malformed + self._estopping.malformed
 
+    @property
+    def catching_up(self) -> bool:
+        """Whether it is asking others for what it may have missed."""
+        return self._watch.busy
+
     def healthy(self) -> bool:
         """Whether it can still take a call now; what feeds hardware watchdogs asks this."""
         return not self._closed and self._dispatcher.draining
@@ -640,6 +645,7 @@ class Container:
         with self._closing:  # who comes second waits until it is done
             if self._closed:
                 return
+            self.locking.keeper.close()  # gives back what it holds, while it can still be heard
             self._closed = True
             self._targets.clear()
             self._leaving.close()

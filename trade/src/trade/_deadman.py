@@ -32,8 +32,8 @@ class Deadman:
     def session_ended(self, session: str) -> None:
         """What it set moving stops, and nothing else (S05)."""
         its_own = [one for one in self._resources() if one.busy and any(within(mover, session) for mover in one.movers)]
-        if its_own:
-            self.stop(its_own, f"session {session} has ended", _log_failure)
+        if moving := [one for one in its_own if self._stop_of(one) is not None]:
+            self.stop(moving, f"session {session} has ended", _log_failure)
 
     def stop(self, resources: Sequence[Resource], reason: str, done: Callable[[Resource, str], None]) -> None:
         """Void what was admitted for these, ask what runs to end, and have them stop; does not wait.

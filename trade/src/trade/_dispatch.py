@@ -5,11 +5,11 @@ The last idle one that takes a call starts another; at the cap it answers Busy, 
 """
 
 import asyncio
-import inspect
 import logging
 import threading
 import time
 from collections.abc import Callable, Sequence
+from types import CoroutineType
 from typing import Any, Final
 
 import msgspec
@@ -35,6 +35,7 @@ from trade._wire import (
     ErrorInfo,
     Malformed,
     Reply,
+    ServiceInfo,
     Status,
     calls_to,
     decode_call,
@@ -48,6 +49,8 @@ _logger = logging.getLogger("trade")
 
 MOST_THREADS: Final = 64
 _PARTING_S: Final = 2.0
+_COROUTINE: Final[type] = CoroutineType
+"""What an ``async def`` gives; asked of every result, so without a call."""
 _KINDS: Final = frozenset(("call", "stop"))
 _MOST_REPLY_KEYS: Final = 1024
 _SYSTEM: Final = f"{DOMAIN}/{PROVIDER}"
@@ -59,11 +62,12 @@ _decode_cancel: Final = msgspec.msgpack.Decoder(CancelArguments).decode
 class LocalService:
     """A method of a registered provider, ready to be called."""
 
-    __slots__ = ("_loop", "effect", "label", "method", "resources", "serial", "signature", "strict")
+    __slots__ = ("_loop", "effect", "info", "label", "method", "resources", "serial", "signature", "strict")
 
     def __init__(
         self,
         label: str,
+        info: ServiceInfo,
         signature: Signature,
         method: Callable[..., Any],
         mark: ServiceMark,
@@ -72,6 +76,7 @@ class LocalService:
         resources: tuple[Resource, ...] = (),
     ) -> None:
         self.label = label
+        self.info = info
         self.signature = signature
         self.method = method
         self.effect = mark.effect
@@ -81,20 +86,13 @@ class LocalService:
         """What it needs for itself, or stops."""
         self._loop = loop
 
-    def run(self, raw: Raw, context: CallContext) -> Any:
+    def run(self, raw: Raw | bytes, context: CallContext) -> Any:
         """Validate, then call. Raises what the provider raises."""
-        args, kwargs = self.signature.decode(raw)
-        return self.run_straight(args, kwargs, context)
+        args, kwargs = self.signature.decode(self.label, raw)
+        return self.call(args, kwargs, context)
 
-    def run_straight(self, args: Sequence[Any], kwargs: dict[str, Any], context: CallContext) -> Any:
+    def call(self, args: Sequence[Any], kwargs: dict[str, Any], context: CallContext) -> Any:
         """Call with the arguments as they are."""
-        if self.serial is not None:
-            with self.serial.held():
-                return self._admitted(args, kwargs, context)
-        return self._admitted(args, kwargs, context)
-
-    def _admitted(self, args: Sequence[Any], kwargs: dict[str, Any], context: CallContext) -> Any:
-        """Call once its resources are its own to use; a stop needs no leave, and comes before whatever was given it."""
         if not self.resources:
             return self.run_admitted(args, kwargs, context)
         if self.effect == "read":  # open to all, unless it was locked by its own handle
@@ -117,7 +115,7 @@ class LocalService:
         token = running.set(context)
         try:
             result = self.method(*args, **kwargs)
-            return self._loop.complete(result, context) if inspect.iscoroutine(result) else result
+            return self._loop.complete(result, context) if type(result) is _COROUTINE else result
         except (SystemExit, GeneratorExit, asyncio.CancelledError) as error:  # the provider's, not this thread's
             raise unpack_error(pack_error(error), self.label) from error
         finally:
@@ -125,7 +123,7 @@ class LocalService:
             if context.behalf is not None:  # what it began and left running inherits nothing any more
                 structs.force_setattr(context, "behalf", None)
 
-    def failure(self, error: BaseException, raw: Raw) -> ErrorInfo:
+    def failure(self, error: BaseException, raw: Raw | bytes) -> ErrorInfo:
         """What the caller is told of an error of a call with these arguments."""
         info = pack_error(error)
         return self.signature.without_secrets(info, raw) if self.signature.has_secrets else info
@@ -211,7 +209,8 @@ class Dispatcher:
     def _queue(self, serial: Serial, ongoing: Ongoing, service: LocalService, replier: Publisher, call: Call) -> None:
         def begin() -> None:
             if not self._closed:
-                self._perform(ongoing, service, replier, call)
+                with serial.held():
+                    self._perform(ongoing, service, replier, call)
 
         def drop() -> None:
             if serial.withdraw(begin):
@@ -247,7 +246,8 @@ class Dispatcher:
 
     def _report(self, ongoing: Ongoing, value: Any) -> None:
         if ongoing.service is not None:
-            self._herald.tell(ongoing, ongoing.service.signature.encode_progress(value))
+            service = ongoing.service
+            self._herald.tell(ongoing, Raw(service.signature.encode_progress(service.label, value)))
 
     def _send_progress(self, ongoing: Ongoing, body: Raw) -> None:
         call = ongoing.call
@@ -326,7 +326,7 @@ def _run(caller: str, call: Call, service: LocalService, ongoing: Ongoing | None
     expires = None if service.effect == "stop" else call.expires_ns
     context = CallContext(call.id, service.label, caller, call.session, expires, call.chain, ongoing, call.behalf)
     try:
-        return Status.OK, service.signature.encode_result(service.run(call.args, context))
+        return Status.OK, Raw(service.signature.encode_result(service.label, service.run(call.args, context)))
     except BaseException as error:  # noqa: BLE001 - whatever a provider raises belongs to the caller
         info = service.failure(error, call.args)
         if not isinstance(error, TradeError) or isinstance(error, _DEFECTS):

@@ -9,7 +9,9 @@ from collections.abc import Callable, Generator, Mapping
 from types import MappingProxyType
 from typing import Any, Final, NoReturn, Protocol
 
+from trade._bell import Bell
 from trade._registry import Record
+from trade._schemas import read_schema
 from trade._wire import Address, Scalar, ServiceKey
 from trade.errors import ConfigurationError
 
@@ -43,6 +45,8 @@ class Run:
         self._handle = handle
         self._future: concurrent.futures.Future[Any] = concurrent.futures.Future()
         self._future.set_running_or_notify_cancel()  # only its end ends it
+        self._ended = Bell()
+        self._future.add_done_callback(lambda _: self._ended.ring())
         self._progress: Any = None
         self._cancelling = False
         self._cancel_call: Callable[[], None] | None = None
@@ -53,12 +57,9 @@ class Run:
         Args:
             timeout_s: give up waiting (not the call) after this long; raises TimeoutError.
         """
-        try:
-            return self._future.result(timeout_s)
-        except concurrent.futures.TimeoutError:
-            if self._future.done():
-                raise
-            raise TimeoutError(f"{self._handle} has not ended after {timeout_s} s; it goes on") from None
+        if not self._ended.wait_for(self._future.done, timeout_s):
+            raise TimeoutError(f"{self._handle} has not ended after {timeout_s} s; it goes on")
+        return self._future.result()
 
     def done(self) -> bool:
         """Whether it has ended, well or not."""
@@ -66,7 +67,9 @@ class Run:
 
     def exception(self, timeout_s: float | None = None) -> BaseException | None:
         """The error it ended with, or None."""
-        return self._future.exception(timeout_s)
+        if not self._ended.wait_for(self._future.done, timeout_s):
+            raise TimeoutError(f"{self._handle} has not ended after {timeout_s} s; it goes on")
+        return self._future.exception()
 
     def when_done(self, tell: "Callable[[Run], object]") -> None:
         """Have this called once it has ended, on the thread that learns of it; at once if it has."""
@@ -272,7 +275,7 @@ class Handle:
     @property
     def meta(self) -> Mapping[str, Scalar]:
         """What it is declared with, and its provider over it."""
-        return self.record.meta
+        return dict(self.record.meta)
 
     @property
     def health(self) -> str:
@@ -288,7 +291,7 @@ class Handle:
     def schema(self) -> Mapping[str, Mapping[str, Any]]:
         """JSON Schema of ``arguments`` and ``result``."""
         info = self.record.info
-        return {"arguments": info.arguments_schema, "result": info.result_schema}
+        return {"arguments": read_schema(info.arguments_schema), "result": read_schema(info.result_schema)}
 
     def cancel_service(self) -> "Handle":
         """The service that ends this one early. Raises ConfigurationError if there is none."""

@@ -1,6 +1,6 @@
 """Services by what constraints ask for most, so that one among ten thousand is found without looking at all."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import Generic, Protocol, TypeVar
 
 from trade._constraints import Candidate, Constraint, Term, is_exact
@@ -53,18 +53,23 @@ class Index(Generic[_Entry]):
 
     def candidates(self, constraint: Constraint) -> list[_Entry]:
         """Everything the constraint may match and as little else as the index allows, each once."""
+        if len(constraint.clauses) == 1:
+            return self._of(constraint.clauses[0])
         found: dict[ServiceKey, _Entry] = {}
         for clause in constraint.clauses:
-            bucket = self._smallest(clause)
-            if bucket is self._all:
-                return list(self._all.values())
-            found.update(bucket)
+            found.update((entry.key, entry) for entry in self._of(clause))
         return list(found.values())
 
-    def _smallest(self, clause: frozenset[Term]) -> Mapping[ServiceKey, _Entry]:
-        """The services with the rarest thing the clause insists on."""
+    def _of(self, clause: frozenset[Term]) -> list[_Entry]:
+        """What stands everywhere the clause insists on: those of the rarest thing that have the other ones, too."""
         buckets = [self._slots.get(slot, {}) for term in clause if not term.negated for slot in _slots_asked(term)]
-        return min(buckets, key=len, default=self._all)
+        if not buckets:
+            return list(self._all.values())
+        rarest, *others = sorted(buckets, key=len)
+        entries = list(rarest.values())
+        for other in others:
+            entries = [entry for entry in entries if entry.key in other]
+        return entries
 
 
 def _slots_of(entry: Candidate) -> Iterator[_Slot]:

@@ -2,26 +2,28 @@
 
 import logging
 import threading
-import time
 from collections.abc import Callable
 from functools import partial
+from time import monotonic_ns
 from typing import Any, Final
 
 import msgspec
-from msgspec import Raw
+from msgspec import Raw, Struct
 
+from trade._arguments import encode_arguments, encode_call, given
 from trade._calls import Caller, Peer
-from trade._context import CallContext, handed_down, holding, running
+from trade._codec import Codec
+from trade._context import CallContext, Held, handed_down, holding, running
 from trade._dispatch import LocalService
 from trade._failures import unpack_error
 from trade._handle import Run
 from trade._ongoing import Ongoing
 from trade._records import type_from_schema
 from trade._registry import Record
-from trade._serial import Turn
-from trade._signature import Codec, encode_arguments
+from trade._schemas import read_schema
+from trade._serial import Serial, Turn
 from trade._system import CLOCK, DOMAIN, PROVIDER
-from trade._wire import EMPTY_ARGUMENTS, Address, Behalf, ErrorInfo, Reply, ServiceInfo, Status, Token
+from trade._wire import EMPTY_ARGUMENTS, Address, Behalf, Call, ErrorInfo, Reply, ServiceInfo, Status, Token
 from trade.errors import (
     Busy,
     Cancelled,
@@ -37,28 +39,29 @@ from trade.errors import (
 _logger = logging.getLogger("trade")
 
 DEFAULT_DEADLINE_S: Final = 10.0
+_DEFAULT_DEADLINE_NS: Final = int(DEFAULT_DEADLINE_S * 1e9)
 
 _NOBODY: Final = Behalf()
 _decode_error: Final = msgspec.msgpack.Decoder(ErrorInfo).decode
 
 
-class Request:
+_Taken = bytes | tuple[tuple[Any, ...], dict[str, Any]]
+"""The arguments of a strict call, and those of one that goes straight through."""
+
+
+class Request(Struct, gc=False):
     """One call on its way out: deadline and chain, inherited from the call that makes it."""
 
-    __slots__ = ("_asked_s", "_begun_ns", "_outer", "chain", "deadline_ns", "deadline_s")
-
-    def __init__(self, deadline_s: float | None) -> None:
-        self._begun_ns = now = time.monotonic_ns()
-        self._asked_s = self.deadline_s = DEFAULT_DEADLINE_S if deadline_s is None else deadline_s
-        self.deadline_ns = now + int(self.deadline_s * 1e9)
-        self.chain: tuple[str, ...] = ()
-        self._outer = outer = running.get()
-        if outer is None:
-            return
-        self.chain = (*outer.chain, outer.service)
-        if outer.expires_ns is not None and outer.expires_ns < self.deadline_ns:
-            self.deadline_ns = outer.expires_ns
-            self.deadline_s = max(0.0, (outer.expires_ns - now) / 1e9)
+    deadline_s: float
+    deadline_ns: int
+    chain: tuple[str, ...]
+    asked_s: float
+    """Without the outer call's deadline, which a stop does not heed: it is sent and waited for however late that is."""
+    asked_ns: int
+    outer: CallContext | None
+    """The call that makes it."""
+    around: tuple[Held, ...]
+    """The locks it is made under."""
 
     def behalf(self, effect: str, own: Address) -> Behalf | None:
         """What the call inherits; the locks around it unless it stops, which needs none.
@@ -66,7 +69,7 @@ class Request:
         Raises:
             LockLost: it actuates, and would do so under a lock that holds no more.
         """
-        outer, around = self._outer, holding.get()
+        outer, around = self.outer, self.around
         if own in handed_down:
             around = (handed_down[own], *around)
         if outer is None and not around:
@@ -83,9 +86,23 @@ class Request:
         return Behalf(outer.sessions, (outer.id, *inherited.calls), tokens)
 
     def ignore_outer_deadline(self) -> None:
-        """A stop is sent and waited for however late the call is that makes it."""
-        self.deadline_s = self._asked_s
-        self.deadline_ns = self._begun_ns + int(self._asked_s * 1e9)
+        self.deadline_s, self.deadline_ns = self.asked_s, self.asked_ns
+
+
+def new_request(deadline_s: float | None) -> Request:
+    """A call that begins now."""
+    now, outer, around = monotonic_ns(), running.get(), holding.get()
+    if deadline_s is None:
+        asked_s, asked_ns = DEFAULT_DEADLINE_S, now + _DEFAULT_DEADLINE_NS
+    else:
+        asked_s, asked_ns = deadline_s, now + int(deadline_s * 1e9)
+    if outer is None:
+        return Request(asked_s, asked_ns, (), asked_s, asked_ns, None, around)
+    chain = (*outer.chain, outer.service)
+    if outer.expires_ns is None or outer.expires_ns >= asked_ns:
+        return Request(asked_s, asked_ns, chain, asked_s, asked_ns, outer, around)
+    left_s = max(0.0, (outer.expires_ns - now) / 1e9)
+    return Request(left_s, outer.expires_ns, chain, asked_s, asked_ns, outer, around)
 
 
 class LocalTarget:
@@ -96,75 +113,91 @@ class LocalTarget:
     ) -> None:
         self._service = service
         self._codec = codec
+        self._label = service.label
+        self._is_stop = service.effect == "stop"
+        self._straight = not service.strict and service.serial is None
+        self._effect = service.effect
         self._own = own
+        self._identity = own.identity
         self._session = session
         self._new_id = new_id
 
     def invoke(self, args: tuple[Any, ...], kwargs: dict[str, Any], request: Request) -> Any:
-        return self._take_turn(self._prepared(args, kwargs), request, None)
+        if self._straight:
+            return self._service.call(args, kwargs, self._context(request, None))
+        taken = self._taken(args, kwargs) if self._service.strict else (args, kwargs)
+        if self._service.serial is None:
+            return self._run(taken, request, None)
+        return self._take_turn(self._service.serial, taken, request, None)
 
     def begin(self, args: tuple[Any, ...], kwargs: dict[str, Any], request: Request, run: Run) -> None:
         """The same on a thread of its own, with the arguments as they are now."""
         service = self._service
-        do = self._prepared(args, kwargs)
+        taken = self._taken(args, kwargs) if service.strict else (args, kwargs)
 
         def report(_: Ongoing, value: Any) -> None:
-            run.note_progress(service.signature.copy_progress(value) if service.strict else value)
+            run.note_progress(service.signature.copy_progress(service.label, value) if service.strict else value)
 
-        ongoing = Ongoing(service, self._own.identity, None, report)
+        ongoing = Ongoing(service, self._identity, None, report)
         run.on_cancel(ongoing.cancel)
         name = f"trade-run-{service.label}"
-        outcome = partial(self._take_turn, do, request, ongoing)
+        if service.serial is None:
+            outcome = partial(self._run, taken, request, ongoing)
+        else:
+            outcome = partial(self._take_turn, service.serial, taken, request, ongoing)
         threading.Thread(target=run.end, args=(outcome,), name=name, daemon=True).start()
 
-    def _prepared(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Callable[[CallContext], Any]:
-        """What to do when its time has come, with the arguments as they are now."""
-        service = self._service
-        if not service.strict:
-            return lambda context: service.run_straight(args, kwargs, context)
-        raw = encode_arguments(self._codec, service.signature.info, service.label, args, kwargs)
+    def _taken(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> bytes:
+        """The arguments as they are now, whatever becomes of them."""
+        return encode_arguments(self._codec, self._service.info, self._service.label, args, kwargs)
 
-        def copied(context: CallContext) -> Any:
-            return service.signature.copy_result(service.run(raw, context))
-
-        return copied if not service.signature.has_secrets else lambda context: self._discreet(copied, context, raw)
-
-    def _discreet(self, do: Callable[[CallContext], Any], context: CallContext, raw: Raw) -> Any:
-        """An error as it would come over the wire: without what is secret."""
-        try:
-            return do(context)
-        except Exception as error:  # noqa: BLE001 - whatever a provider raises
-            masked = unpack_error(self._service.failure(error, raw), self._service.label)
-        raise masked
-
-    def _take_turn(self, do: Callable[[CallContext], Any], request: Request, ongoing: Ongoing | None) -> Any:
-        serial = self._service.serial
-        if serial is None or serial.mine:
-            return self._run(do, request, ongoing)
+    def _take_turn(self, serial: Serial, taken: _Taken, request: Request, ongoing: Ongoing | None) -> Any:
+        if serial.mine:
+            return self._run(taken, request, ongoing)
         turn = Turn()
         if ongoing is not None:
             ongoing.on_cancel(lambda: serial.drop(turn))
-        if not serial.enter(turn, (request.deadline_ns - time.monotonic_ns()) / 1e9):
+        if not serial.enter(turn, (request.deadline_ns - monotonic_ns()) / 1e9):
             if ongoing is not None and ongoing.cancelled:
                 raise Cancelled(service=self._service.label)
             raise DeadlineExceeded(service=self._service.label, deadline_s=request.deadline_s)
         try:
-            return self._run(do, request, ongoing)
+            with serial.held():
+                return self._run(taken, request, ongoing)
         finally:
             serial.leave()
 
-    def _run(self, do: Callable[[CallContext], Any], request: Request, ongoing: Ongoing | None) -> Any:
+    def _run(self, taken: _Taken, request: Request, ongoing: Ongoing | None) -> Any:
         service = self._service
         if ongoing is not None and ongoing.cancelled:
             raise Cancelled(service=service.label)
-        expires_ns = None if service.effect == "stop" else request.deadline_ns
-        if service.too_late(expires_ns):
-            raise DeadlineExceeded(service=service.label, deadline_s=request.deadline_s)
-        behalf = request.behalf(service.effect, self._own)
-        identity, session = self._own.identity, self._session
-        return do(
-            CallContext(self._new_id(), service.label, identity, session, expires_ns, request.chain, ongoing, behalf)
+        context = self._context(request, ongoing)
+        if isinstance(taken, tuple):
+            return service.call(*taken, context)
+        if service.signature.has_secrets:
+            return self._discreet(taken, context)
+        return self._copied(taken, context)
+
+    def _context(self, request: Request, ongoing: Ongoing | None) -> CallContext:
+        expires_ns = None if self._is_stop else request.deadline_ns
+        if expires_ns is not None and monotonic_ns() >= expires_ns:
+            raise DeadlineExceeded(service=self._label, deadline_s=request.deadline_s)
+        behalf = request.behalf(self._effect, self._own)
+        return CallContext(
+            self._new_id(), self._label, self._identity, self._session, expires_ns, request.chain, ongoing, behalf
         )
+
+    def _copied(self, raw: bytes, context: CallContext) -> Any:
+        service = self._service
+        return service.signature.copy_result(service.label, service.run(raw, context))
+
+    def _discreet(self, raw: bytes, context: CallContext) -> Any:
+        """An error as it would come over the wire: without what is secret."""
+        try:
+            return self._copied(raw, context)
+        except Exception as error:  # noqa: BLE001 - whatever a provider raises
+            masked = unpack_error(self._service.failure(error, raw), self._service.label)
+        raise masked
 
 
 class RemoteTarget:
@@ -184,22 +217,25 @@ class RemoteTarget:
         self._decode_any = codec.decoder(Any)
 
     def invoke(self, args: tuple[Any, ...], kwargs: dict[str, Any], request: Request) -> Any:
-        raw = self._encode(args, kwargs, request)
-        if not (self._peer.clock_known or self._is_stop):
+        values = self._values(args, kwargs, request)
+        if not self._may_go:
             reply = self._ask(self._clock, CLOCK, EMPTY_ARGUMENTS, None, request)
             if reply.status != Status.OK:
                 raise self._not_begun(reply, request)
-        return self._unpack(self._ask(self._publisher, self._info.name, raw, self._expiry(request), request), request)
+        reply = self._ask(self._publisher, self._info.name, values, self._expiry(request), request)
+        return self._unpack(reply, request)
 
     def begin(self, args: tuple[Any, ...], kwargs: dict[str, Any], request: Request, run: Run) -> None:
         """The same without waiting; the outcome goes into the run."""
-        raw = self._encode(args, kwargs, request)
+        values = self._values(args, kwargs, request)
 
         def go() -> None:
             if run.cancelling:
                 run.fail(Cancelled(service=self._label))
                 return
-            call_id = self._start(self._publisher, self._info.name, raw, self._expiry(request), request, finish, note)
+            call_id = self._start(
+                self._publisher, self._info.name, values, self._expiry(request), request, finish, note
+            )
             run.on_cancel(lambda: self._caller.cancel(self._peer, call_id, self._label, request.deadline_ns))
 
         def note(reply: Reply) -> None:
@@ -214,41 +250,52 @@ class RemoteTarget:
         def clock_heard(reply: Reply) -> None:
             go() if reply.status == Status.OK else run.fail(self._not_begun(reply, request))
 
-        if self._peer.clock_known or self._is_stop:
+        if self._may_go:
             go()
         else:
             self._start(self._clock, CLOCK, EMPTY_ARGUMENTS, None, request, clock_heard)
 
-    def _encode(self, args: tuple[Any, ...], kwargs: dict[str, Any], request: Request) -> Raw:
-        raw = encode_arguments(self._codec, self._info, self._label, args, kwargs)
+    @property
+    def _may_go(self) -> bool:
+        """Whether nothing need be asked first."""
+        return self._is_stop or self._peer.clock_known
+
+    def _values(self, args: tuple[Any, ...], kwargs: dict[str, Any], request: Request) -> Any:
+        """The arguments, for a message that is made now; as bytes, checked already, for one that comes later."""
         if self._is_stop:
             request.ignore_outer_deadline()
         elif request.deadline_s <= 0:
             raise DeadlineExceeded(service=self._label, deadline_s=request.deadline_s)
-        return raw
+        if self._may_go:
+            return given(self._info, self._label, args, kwargs)
+        return Raw(encode_arguments(self._codec, self._info, self._label, args, kwargs))
+
+    def _message(self, call: Call) -> bytes:
+        return encode_call(self._codec, self._info, self._label, call)
 
     def _expiry(self, request: Request) -> int | None:
         return None if self._is_stop else self._peer.expiry_ns(request.deadline_ns)
 
-    def _ask(self, publisher: Any, service: str, raw: Raw, expires_ns: int | None, request: Request) -> Reply:
-        behalf = request.behalf(self._info.effect, self._caller.own)
+    def _ask(self, publisher: Any, service: str, args: Any, expires_ns: int | None, request: Request) -> Reply:
+        behalf, chain = request.behalf(self._info.effect, self._caller.own), request.chain
         return self._caller.ask(
-            self._peer, publisher, service, raw, request.deadline_ns, expires_ns, request.chain, behalf
+            self._peer, publisher, service, args, request.deadline_ns, expires_ns, chain, behalf, self._message
         )
 
     def _start(
         self,
         publisher: Any,
         service: str,
-        raw: Raw,
+        args: Any,
         expires_ns: int | None,
         request: Request,
         then: Callable[[Reply], None],
         on_progress: Callable[[Reply], None] | None = None,
     ) -> int:
-        behalf, chain = request.behalf(self._info.effect, self._caller.own), request.chain
+        peer, deadline_ns, chain = self._peer, request.deadline_ns, request.chain
+        behalf = request.behalf(self._info.effect, self._caller.own)
         return self._caller.start(
-            self._peer, publisher, service, raw, request.deadline_ns, expires_ns, chain, then, on_progress, behalf
+            peer, publisher, service, args, deadline_ns, expires_ns, chain, then, on_progress, behalf, self._message
         )
 
     def _unpack(self, reply: Reply, request: Request) -> Any:
@@ -303,7 +350,7 @@ class RemoteTarget:
 def _result_decoder(codec: Codec, info: ServiceInfo) -> Callable[[Any], Any]:
     """A decoder for the result, as typed as its description allows."""
     try:
-        return codec.decoder(type_from_schema(info.result_schema, info.types))
+        return codec.decoder(type_from_schema(read_schema(info.result_schema), info.types))
     except Exception as bad:  # noqa: BLE001 - a schema from elsewhere may be anything
         _logger.debug("the result of %s stays plain data: %s", info.name, bad)
         return codec.decoder(Any)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Final
 
 from trade._credentials import user_secret
-from trade._endpoints import Endpoint, dialled_from_here, free_endpoint, loopback_interface, with_free_port
+from trade._endpoints import Endpoint, dialled_from_here, loopback_interface, with_free_port
 from trade._links import Links
 from trade._rendezvous import Rendezvous
 from trade._settings import Settings
@@ -17,6 +17,7 @@ from trade.errors import ConfigurationError
 __all__ = ["join"]
 
 _logger = logging.getLogger("trade")
+_ANYWHERE_HERE: Final = Endpoint("tcp", "127.0.0.1", 0)
 _PORTS_TRIED: Final = 4
 
 
@@ -33,11 +34,15 @@ def join(settings: Settings, leaving: contextlib.ExitStack) -> ZenohTransport:
 
 
 def _join(settings: Settings, networks: list[list[str]], leaving: contextlib.ExitStack) -> ZenohTransport:
-    for _ in range(_PORTS_TRIED if not settings.listen else 0):
+    wanted = [Endpoint.read(endpoint) for endpoint in settings.listen] or [_ANYWHERE_HERE]
+    for _ in range(0 if all(endpoint.port for endpoint in wanted) else _PORTS_TRIED):
         with contextlib.suppress(ConfigurationError):  # somebody else took the free port first
-            return _join_at(settings, [free_endpoint()], networks, leaving)
-    chosen = [str(with_free_port(Endpoint.read(endpoint))) for endpoint in settings.listen]
-    return _join_at(settings, chosen or [free_endpoint()], networks, leaving)
+            return _join_at(settings, _chosen(wanted), networks, leaving)
+    return _join_at(settings, _chosen(wanted), networks, leaving)
+
+
+def _chosen(wanted: list[Endpoint]) -> list[str]:
+    return [str(with_free_port(endpoint)) for endpoint in wanted]
 
 
 def _join_at(

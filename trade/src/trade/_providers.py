@@ -5,9 +5,12 @@ import socket
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final, NamedTuple, cast
+from weakref import WeakValueDictionary
 
 from msgspec import Struct, structs
 
+from trade._announcing import Announcer
+from trade._codec import Codec
 from trade._constraints import GROUP, checked_meta
 from trade._coroutines import AsyncLoop
 from trade._dispatch import LocalService
@@ -16,9 +19,8 @@ from trade._registry import Registry
 from trade._resources import Resource
 from trade._serial import Serial
 from trade._service import ServiceMark, kinds_of, marked_methods
-from trade._signature import Codec, Signature
+from trade._signature import Signature
 from trade._system import DOMAIN
-from trade._transport import Publisher, Transport
 from trade._wire import (
     Address,
     ProviderInfo,
@@ -27,12 +29,12 @@ from trade._wire import (
     ServiceKey,
     as_chunk,
     domain_of,
-    encode_message,
-    registry_key,
 )
 from trade.errors import ConfigurationError
 
 _LONGEST_HEALTH: Final = 500
+
+_Method = tuple[str, ServiceMark, Callable[..., Any]]
 
 
 class _Registered(Struct, frozen=True):
@@ -40,7 +42,6 @@ class _Registered(Struct, frozen=True):
 
     provider: Any
     services: dict[str, LocalService]
-    announcement: Publisher
     implements: tuple[type, ...]
     info: ProviderInfo
     """As it was announced last."""
@@ -59,9 +60,9 @@ class Providers:
     """Owns what this container hosts; the registry and the rest of the system are told from here."""
 
     def __init__(
-        self, transport: Transport, registry: Registry, own: Address, codec: Codec, loop: AsyncLoop, table: LockTable
+        self, announcer: Announcer, registry: Registry, own: Address, codec: Codec, loop: AsyncLoop, table: LockTable
     ) -> None:
-        self._transport = transport
+        self._announcer = announcer
         self._registry = registry
         self._own = own
         self._codec = codec
@@ -70,9 +71,12 @@ class Providers:
         self._lock = threading.Lock()
         self._announcing = threading.RLock()
         """Revisions go out in order, one at a time."""
+        self._revision = 0
         self._hosted: dict[str, _Registered] = {}
         self._names: dict[int, str] = {}
         self._counter = 0
+        self._signatures: WeakValueDictionary[_Method, Signature] = WeakValueDictionary()
+        """What objects of one class share, as long as one of them is hosted."""
 
     def add(
         self,
@@ -104,7 +108,7 @@ class Providers:
         place = f"{domain}/{chunk}"
         services = self._services_of(provider, groups, implements, place)
         info = ProviderInfo(
-            revision=1,
+            revision=1,  # told before it is announced
             groups=groups,
             kind=kind,
             host=socket.gethostname(),
@@ -118,9 +122,8 @@ class Providers:
         with self._announcing:
             with self._lock:
                 self._require_new(provider)
-                announcement = self._transport.announce(registry_key(domain, self._own, chunk))
                 self._names[id(provider)] = place
-                self._hosted[place] = _Registered(provider, services, announcement, tuple(implements), info)
+                self._hosted[place] = _Registered(provider, services, tuple(implements), info)
             self._announce(place, info)
         return [ServiceKey(self._own, domain, chunk, service) for service in services]
 
@@ -145,12 +148,12 @@ class Providers:
             info = change(known.info)
             services = known.services
             if reread:
+                self._signatures.clear()
                 services = self._services_of(provider, info.groups, known.implements, place)
                 kinds = kinds_of(type(provider), known.implements)
                 info = structs.replace(info, services=_infos(services), kinds=kinds)
             if not reread and info == known.info:
                 return
-            info = structs.replace(info, revision=known.info.revision + 1)
             with self._lock:
                 self._hosted[place] = structs.replace(known, services=services, info=info)
             if reread:
@@ -165,9 +168,12 @@ class Providers:
             return place, self._hosted[place]
 
     def _announce(self, place: str, info: ProviderInfo) -> None:
+        """Known here first, then everywhere; in the next revision."""
+        self._revision += 1
+        info = structs.replace(info, revision=self._revision)
         domain, _, chunk = place.partition("/")
         self._registry.put(self._own, domain, chunk, info)
-        self._hosted[place].announcement.put(encode_message(info))
+        self._announcer.announce(domain, chunk, info)
 
     def remove(self, provider: object) -> None:
         """Stop hosting an object: gone from the registry first, uncallable then.
@@ -181,8 +187,7 @@ class Providers:
                 if place is None:
                     raise _not_registered(provider)
                 registered = self._hosted.pop(place)
-            self._registry.remove(self._own, place.partition("/")[2])
-            registered.announcement.close()
+            self._announce(place, structs.replace(registered.info, services=()))
             self._drop(registered.services)
 
     def _drop(self, services: Mapping[str, LocalService]) -> None:
@@ -225,11 +230,6 @@ class Providers:
         registered = self._hosted.get(place)
         return None if registered is None else registered.services.get(service)
 
-    def close(self) -> None:
-        """Withdraw everything. Idempotent."""
-        for registered in list(self._hosted.values()):
-            registered.announcement.close()
-
     def _services_of(
         self, provider: object, groups: tuple[str, ...], implements: Sequence[type], place: str
     ) -> dict[str, LocalService]:
@@ -247,12 +247,14 @@ class Providers:
             if not mark.strict and mark.effect != "read" and (mark.uses or resources):
                 problem = "it needs physical resources, so its arguments are always checked; leave out strict=False"
                 raise ConfigurationError(where=label, problem=problem)
-            signature = Signature(label, name, mark, function, self._codec)
-            if mark.effect != "read":
+            signature = self._signature(label, name, mark, function)
+            info = signature.info
+            if resources and mark.effect != "read":
                 names = tuple(one if isinstance(one, str) else one.name for one in resources)
-                signature.info = structs.replace(signature.info, uses=(*mark.uses, *names))
+                info = structs.replace(info, uses=(*mark.uses, *names))
             services[name] = LocalService(
                 label,
+                info,
                 signature,
                 getattr(provider, name),
                 mark,
@@ -261,6 +263,14 @@ class Providers:
                 self._adopt(mark, (*mark.uses, *resources), f"{place}/{name}"),
             )
         return services
+
+    def _signature(self, where: str, name: str, mark: ServiceMark, function: Callable[..., Any]) -> Signature:
+        """The one that other objects of the class have already, if any."""
+        key = (name, mark, function)
+        found = self._signatures.get(key)
+        if found is None:
+            found = self._signatures[key] = Signature(where, name, mark, function, self._codec)
+        return found
 
     def _adopt(self, mark: ServiceMark, needed: Sequence[Resource | str], itself: str) -> tuple[Resource, ...]:
         """What a service needs for itself; what names nothing, or only reads, can be locked as itself."""
@@ -275,7 +285,7 @@ class Providers:
 
 
 def _infos(services: Mapping[str, LocalService]) -> tuple[ServiceInfo, ...]:
-    return tuple(service.signature.info for service in services.values())
+    return tuple(service.info for service in services.values())
 
 
 def _not_registered(provider: object) -> ConfigurationError:

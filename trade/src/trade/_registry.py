@@ -1,12 +1,13 @@
 """Which services exist, here and elsewhere; every container looks them up locally."""
 
 import threading
-import time
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
+from trade._bell import Bell
 from trade._constraints import Constraint
+from trade._heard import Heard
 from trade._index import Index
 from trade._wire import HEALTHY, Address, Estop, ProviderInfo, Scalar, ServiceInfo, ServiceKey
 
@@ -50,14 +51,14 @@ class Record:
 
 @dataclass(slots=True)
 class ContainerState:
-    """What is known of one boot of one container."""
+    """What is known of one boot of one container while its sign of life stands."""
 
     address: Address
-    alive: bool
-    providers: dict[str, tuple[int, list[Record]]]
-    removed: set[str]
-    lost: bool = False
-    """Whether it was alive before."""
+    providers: dict[str, tuple[int, list[Record]]] = field(default_factory=dict)
+    """Name to revision and services."""
+    removed: dict[str, None] = field(default_factory=dict)
+    """Deregistered, in this order: a name is never used twice in one boot."""
+    heard: Heard = field(default_factory=Heard)
 
 
 class Change(NamedTuple):
@@ -71,22 +72,23 @@ class Change(NamedTuple):
     """What was known of those, in the same order."""
 
 
-_MOST_ENDED: Final = 256
-"""So many ended containers are remembered, for the one that comes back."""
+_MOST_PROVIDERS: Final = 65_536
+"""Of one container: what it announces beyond that is ignored, and of more no withdrawal is remembered."""
 
 
 class Registry:
     """Fed by the container's reader threads; asked by everybody.
 
-    Entries of a container count while its sign of life stands, whichever of the two is heard first. Listeners are told
-    in order, after the change, on the thread that fed it, with no lock held.
+    Of a container something is known only while its sign of life stands: when that rises it is asked for all it
+    offers. Listeners are told in order, after the change, on the thread that fed it, with no lock held.
     """
 
     def __init__(self, own: Address) -> None:
         self._own = own
         self._containers: dict[Address, ContainerState] = {}
         self._records: Index[Record] = Index()
-        self._changed = threading.Condition()
+        self._lock = threading.RLock()
+        self._bell = Bell()
         self._telling = threading.RLock()
         self._listeners: list[Callable[[Change], None]] = []
         self.appear(own)
@@ -101,58 +103,81 @@ class Registry:
 
     # --- feeding
 
-    def put(self, address: Address, domain: str, provider: str, info: ProviderInfo) -> None:
-        """A provider's entry is there, or is there in a newer revision."""
+    def put(self, address: Address, domain: str, provider: str, info: ProviderInfo) -> bool:
+        """A container announces a provider, or that one is gone. Returns whether nothing was missed before it."""
         with self._telling:
-            with self._changed:
-                state = self._state(address)
-                known = state.providers.get(provider)
-                if provider in state.removed or (known is not None and known[0] >= info.revision):
+            with self._lock:
+                state = self._containers.get(address)
+                if state is None:
+                    return True
+                if info.revision <= state.heard.answered:  # its answer told of that, and of what came after it
+                    return state.heard.complete
+                state.heard.told(info.revision)
+                change = self._change(state, {provider: (domain, info)}, [] if info.services else [provider])
+            self._tell(change)
+            return state.heard.complete
+
+    def count(self, address: Address, revision: int) -> bool:
+        """A container says how much it has announced. Returns whether nothing of it was missed."""
+        with self._lock:
+            state = self._containers.get(address)
+            if state is None:
+                return True
+            state.heard.counted(revision)
+            return state.heard.complete
+
+    def settle(self, state: ContainerState, revision: int, offered: Mapping[str, tuple[str, ProviderInfo]]) -> None:
+        """A container has answered with all it offered at a revision: provider to domain and entry.
+
+        An answer to what was asked before its sign of life fell is none.
+        """
+        with self._telling:
+            with self._lock:
+                if self._containers.get(state.address) is not state or revision < state.heard.answered:
                     return
-                state.providers[provider] = (info.revision, self._make(address, domain, provider, info))
-                change = self._swap(known[1] if known else [], state.providers[provider][1], state.alive)
+                known = state.providers.items()
+                gone = [name for name, (since, _) in known if name not in offered and since <= revision]
+                state.heard.all_told(revision)
+                change = self._change(state, offered, gone)
+                self._bell.ring()
             self._tell(change)
 
-    def remove(self, address: Address, provider: str, *, for_good: bool = True) -> None:
-        """A provider was deregistered; in this boot it never comes back, if that is sure."""
-        with self._telling:
-            with self._changed:
-                state = self._state(address)
-                if for_good:
-                    state.removed.add(provider)
-                _, records = state.providers.pop(provider, (0, []))
-                change = self._swap(records, [], state.alive)
-            self._tell(change)
-
-    def appear(self, address: Address) -> None:
-        """A container's sign of life rose."""
-        with self._telling:
-            with self._changed:
-                state = self._state(address)
-                was, state.alive, state.lost = state.alive, True, False
-                change = self._swap([], [] if was else _all(state), alive=True)
-            self._tell(change)
+    def appear(self, address: Address) -> bool:
+        """A container's sign of life rose. Returns whether it is news."""
+        with self._lock:
+            if address in self._containers:
+                return False
+            self._containers[address] = ContainerState(address)
+            self._bell.ring()
+            return True
 
     def vanish(self, address: Address) -> None:
-        """A container's sign of life fell; what it offered is gone unless the same boot comes back."""
+        """A container's sign of life fell; it is known no more, until it returns and is asked."""
         with self._telling:
-            with self._changed:
-                state = self._state(address)
-                was, state.alive, state.lost = state.alive, False, True
-                change = self._swap(_all(state) if was else [], [], alive=True)
-                self._forget_ended()
+            with self._lock:
+                state = self._containers.pop(address, None)
+                change = self._swap([] if state is None else _all(state), [])
             self._tell(change)
 
-    def _state(self, address: Address) -> ContainerState:
-        state = self._containers.get(address)
-        if state is None:
-            state = self._containers[address] = ContainerState(address, alive=False, providers={}, removed=set())
-        return state
-
-    def _forget_ended(self) -> None:
-        ended = [address for address, state in self._containers.items() if not state.alive]
-        for address in ended[:-_MOST_ENDED]:
-            del self._containers[address]
+    def _change(
+        self, state: ContainerState, entries: Mapping[str, tuple[str, ProviderInfo]], gone: Sequence[str]
+    ) -> Change:
+        """Take up what is newer than known, and let go of what is gone for good. Under the lock."""
+        before, after = list[Record](), list[Record]()
+        for provider in gone:
+            before += state.providers.pop(provider, (0, []))[1]
+        state.removed.update(dict.fromkeys(gone))
+        for provider in list(state.removed)[: max(0, len(state.removed) - _MOST_PROVIDERS)]:
+            del state.removed[provider]
+        for provider, (domain, info) in entries.items():
+            since, records = state.providers.get(provider, (0, []))
+            full = not since and len(state.providers) >= _MOST_PROVIDERS
+            if provider in state.removed or since >= info.revision or full:
+                continue
+            state.providers[provider] = (info.revision, self._make(state.address, domain, provider, info))
+            before += records
+            after += state.providers[provider][1]
+        return self._swap(before, after)
 
     def _make(self, address: Address, domain: str, provider: str, info: ProviderInfo) -> list[Record]:
         return [
@@ -165,7 +190,7 @@ class Registry:
                 pid=info.pid,
                 local=address == self._own,
                 kinds=info.kinds,
-                meta={**service.meta, **info.meta},
+                meta={**service.meta, **info.meta} if service.meta and info.meta else service.meta or info.meta,
                 health=info.health,
                 members=info.members,
                 estops=info.estops,
@@ -173,10 +198,8 @@ class Registry:
             for service in info.services
         ]
 
-    def _swap(self, before: Iterable[Record], after: Iterable[Record], alive: bool) -> Change:
+    def _swap(self, before: Iterable[Record], after: Iterable[Record]) -> Change:
         """Replace records in the index, under the lock. What stays under its key neither joins nor leaves."""
-        if not alive:
-            return Change([], [], [], [])
         old = {record.key: record for record in before}
         new = {record.key: record for record in after}
         for record in new.values():
@@ -184,7 +207,7 @@ class Registry:
         for key in old:
             if key not in new:
                 self._records.remove(key)
-        self._changed.notify_all()
+        self._bell.ring()
         return Change(
             joined=[new[key] for key in new if key not in old],
             left=[old[key] for key in old if key not in new],
@@ -205,31 +228,31 @@ class Registry:
     def select(self, constraint: Constraint) -> list[Record]:
         """Records that match, ordered by label and place."""
         records = [record for record in self._records.candidates(constraint) if constraint.matches(record)]
-        return sorted(records, key=lambda record: (record.label, str(record.key.address), record.key.provider))
+        if len(records) > 1:
+            records.sort(key=lambda record: (record.label, str(record.key.address), record.key.provider))
+        return records
 
     def wait_for(self, ready: Callable[[], bool], timeout_s: float) -> bool:
         """Wait until the condition holds after some change. Returns whether it does."""
-        deadline = time.monotonic() + timeout_s
-        with self._changed:
-            while not ready():
-                left = deadline - time.monotonic()
-                if left <= 0:
-                    return False
-                self._changed.wait(left)
-            return True
 
-    def known_before(self, address: Address) -> set[str]:
-        """The providers of a container whose sign of life fell: what it offered when it was heard last."""
-        state = self._containers.get(address)
-        return set(state.providers) if state is not None and state.lost else set()
+        def holds() -> bool:
+            with self._lock:
+                return ready()
+
+        return self._bell.wait_for(holds, timeout_s)
 
     def is_alive(self, address: Address) -> bool:
+        return address in self._containers
+
+    def left_open(self, address: Address) -> bool:
+        """Whether a container is alive and something it announced may have been missed."""
         state = self._containers.get(address)
-        return state is not None and state.alive
+        return state is not None and not state.heard.complete
 
     def containers(self) -> list[ContainerState]:
         """The containers that are alive, by address."""
-        return sorted((s for s in list(self._containers.values()) if s.alive), key=lambda s: str(s.address))
+        states = list(self._containers.values())  # at once, as others change it
+        return sorted(states, key=lambda state: str(state.address))
 
     def removed(self, key: ServiceKey) -> bool:
         """Whether the provider was deregistered in a boot that still lives."""

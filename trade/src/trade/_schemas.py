@@ -2,13 +2,17 @@
 
 # pyright: reportUnknownVariableType=false, reportUnknownArgumentType=false, reportUnknownMemberType=false
 
+import types
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
-from typing import Any, Final
+from typing import Any, Final, Literal, Union, get_origin
 
 import msgspec
+from msgspec import Raw
 
+from trade._limits import limits_text
 from trade._records import noted
+from trade._wire import NO_SCHEMA, encode_message
 from trade.errors import ConfigurationError
 
 _Schema = Mapping[str, Any]
@@ -16,6 +20,7 @@ _NAMES: Final = {"number": "float", "integer": "int", "string": "str", "boolean"
 _SAME: Final = ("format", "contentEncoding", "x-trade-type", "x-trade-kind")
 """What makes another kind of value of the same JSON type."""
 _MOST_REFERENCES: Final = 100
+_decode_schema: Final = msgspec.msgpack.Decoder(dict[str, Any]).decode
 
 
 def types_text(kinds: Sequence[Any]) -> str:
@@ -39,6 +44,27 @@ def read_types(text: str) -> tuple[tuple[_Schema, ...], _Schema]:
     """The schemas in such a text, and the definitions they refer to. Raises ValueError for another text."""
     schemas, definitions = read_json(text, tuple[list[dict[str, Any]], dict[str, Any]])
     return tuple(schemas), definitions
+
+
+def schema_message(schema: _Schema, definitions: _Schema) -> Raw:
+    """A schema as it travels, with the definitions it refers to."""
+    if not schema and not definitions:
+        return NO_SCHEMA  # which is left out
+    return Raw(encode_message({**schema, "$defs": definitions} if definitions else schema))
+
+
+def read_schema(raw: Raw) -> dict[str, Any]:
+    """A schema as it travels, anew each time; what cannot be read describes nothing."""
+    try:
+        return _decode_schema(raw)
+    except (msgspec.DecodeError, ValueError, RecursionError):
+        return {}
+
+
+@lru_cache(1024)
+def known_schema(data: bytes) -> _Schema:
+    """The same, kept: for looking only."""
+    return read_schema(Raw(data))
 
 
 def read_json(text: str, kind: Any) -> Any:
@@ -67,6 +93,25 @@ def _name(schema: _Schema) -> str:
     if kind == "object":
         return str(schema.get("title", "dict"))
     return str(schema.get("format") or ("bytes" if "contentEncoding" in schema else _NAMES.get(str(kind), "Any")))
+
+
+def type_text(kind: Any) -> str:
+    """A type as a person would write it: without modules and ``typing``, with its limits in parentheses."""
+    if hasattr(kind, "__metadata__"):
+        limits = limits_text(kind.__metadata__)
+        return type_text(kind.__origin__) + (f" ({limits})" if limits else "")
+    if kind is None or kind is type(None):
+        return "None"
+    if kind is Ellipsis:
+        return "..."
+    inner = [type_text(arg) for arg in getattr(kind, "__args__", ())]
+    origin = get_origin(kind)
+    if origin in (Union, types.UnionType):
+        return " | ".join(inner)
+    if origin is Literal:
+        return f"Literal[{', '.join(map(repr, kind.__args__))}]"
+    name = getattr(origin or kind, "__name__", str(kind))
+    return f"{name}[{', '.join(inner)}]" if inner else name
 
 
 def fits(given: _Schema, given_definitions: _Schema, wanted: _Schema, wanted_definitions: _Schema) -> bool:

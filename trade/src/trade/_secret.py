@@ -28,7 +28,7 @@ def is_secret(kind: Any) -> bool:
     return any(map(is_secret, get_args(kind)))
 
 
-def mask(info: ErrorInfo, raw: Raw, names: Sequence[str], secrets: frozenset[str]) -> ErrorInfo:
+def mask(info: ErrorInfo, raw: Raw | bytes, names: Sequence[str], secrets: frozenset[str]) -> ErrorInfo:
     """An error without the values of secret arguments.
 
     Args:

@@ -21,9 +21,9 @@ _MARK = "__trade_service__"
 _EFFECTS = ("read", "actuate", "stop")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class ServiceMark:
-    """What ``@service`` notes on a method."""
+    """What ``@service`` notes on a method; each decoration is one of its own."""
 
     effect: Effect = "actuate"
     cancel: str | None = None

@@ -1,7 +1,7 @@
 """The seam between the middleware and whatever carries its bytes.
 
-Five verbs: publish, subscribe, announce (kept for late joiners), be present, close. Everything above is the same on any
-implementation; ``_zenoh`` is the real one.
+Five verbs: publish, subscribe, announce (and answer who asks what stands), be present, close. Everything above is the
+same on any implementation; ``_zenoh`` is the real one.
 """
 
 from abc import ABC, abstractmethod
@@ -20,11 +20,13 @@ class Message(Struct, frozen=True, gc=False):
     payload: bytes | None
 
 
-def some(value: bytes) -> bytes:
-    """The value of an announcement; raises ValueError for an empty one."""
-    if not value:
-        raise ValueError("an announcement has a value of at least one byte; close it to withdraw it")
-    return value
+class Answer(Struct, frozen=True):
+    """All that one who was asked has said."""
+
+    who: str
+    """Tells those apart that answer."""
+    messages: list[Message]
+    """In the order they were said."""
 
 
 class Channel(ABC):
@@ -51,7 +53,34 @@ class Publisher(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Stop. For an announcement: everybody learns that it is gone. Idempotent."""
+        """Stop. Idempotent."""
+
+
+class Question(ABC):
+    """Somebody asks what stands, and waits until it is closed."""
+
+    @abstractmethod
+    def answer(self, key: str, payload: bytes) -> None:
+        """Say one thing that stands; what does not match what was asked is left out.
+
+        May wait like a put. Raises ChannelClosed if nobody can hear it any more.
+        """
+
+    @abstractmethod
+    def close(self) -> None:
+        """That was all. Idempotent."""
+
+
+class Questions(ABC):
+    """A queue of questions, filled by the transport and read by our own threads."""
+
+    @abstractmethod
+    def receive(self) -> Question:
+        """Wait for the next question. Raises ChannelClosed once closed."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Wake and end every reader. Idempotent."""
 
 
 class Presence(ABC):
@@ -65,11 +94,15 @@ class Presence(ABC):
 class Transport(ABC):
     """What carries keys and bytes between the containers of one system.
 
-    Guarantees: messages on one key from one publisher arrive in order; what is subscribed before something is announced
-    hears all that follows the announcement; announcements reach those who come later; presence falls within the lease.
-    Channels, publishers and signs of life last while they are kept. Once closed, every verb but ``wake`` and ``close``
-    raises ChannelClosed.
+    Guarantees: messages on one key from one publisher arrive in order, and so do all announcements of one transport;
+    what is subscribed before something is announced hears all that follows the announcement; once a sign of life has
+    risen, its transport can be asked; presence falls within the lease. Nothing is kept of an announcement: who must
+    have heard it asks. Channels, publishers and signs of life last while they are kept. Once closed, every verb but
+    ``wake`` and ``close`` raises ChannelClosed.
     """
+
+    beat_s: float = 2.0
+    """How often who announces here says how far it is: so long a lost announcement may go unnoticed."""
 
     @abstractmethod
     def publish(self, key: str, *, urgent: bool = False, droppable: bool = False) -> Publisher:
@@ -86,19 +119,23 @@ class Transport(ABC):
         """Hear what is put on keys that match."""
 
     @abstractmethod
-    def announce(self, key: str) -> Publisher:
-        """Like publish, but the last value is kept for those who come later.
-
-        A value is never empty: putting none raises ValueError.
-        """
+    def announce(self, key: str, payload: bytes) -> None:
+        """Put once on one of very many keys: nothing is declared. Waits like a put of a publisher."""
 
     @abstractmethod
     def announcements(self, pattern: str) -> Channel:
-        """Hear announcements of others: those standing now, and all changes."""
+        """Hear what others announce from now on."""
 
     @abstractmethod
-    def standing(self, pattern: str, timeout_s: float) -> list[Message]:
-        """The announcements that stand now, one's own included, asked for and waited for."""
+    def questions(self, pattern: str) -> Questions:
+        """Be asked what stands on keys that match."""
+
+    @abstractmethod
+    def ask(self, pattern: str, timeout_s: float) -> list[Answer]:
+        """Ask all others at once what stands; what they have said when all are done, or when the time is over.
+
+        Who is lost meanwhile is not waited for.
+        """
 
     @abstractmethod
     def appear(self, key: str) -> Presence:

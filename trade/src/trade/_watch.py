@@ -5,10 +5,21 @@ import threading
 from collections.abc import Callable
 from typing import Final
 
-from trade._registry import Registry
-from trade._system import PROVIDER
-from trade._transport import Channel, ChannelClosed, Message, Transport
-from trade._wire import ALIVE, REGISTRY, Address, Malformed, decode_provider, is_chunk, registry_key
+from trade._asking import Asker
+from trade._registry import ContainerState, Registry
+from trade._system import DOMAIN
+from trade._transport import Answer, Channel, ChannelClosed, Message, Transport
+from trade._wire import (
+    ALIVE,
+    REGISTRY,
+    TALLY,
+    Address,
+    Malformed,
+    ProviderInfo,
+    decode_provider,
+    decode_tally,
+    is_chunk,
+)
 
 _logger = logging.getLogger("trade")
 
@@ -18,24 +29,35 @@ _SYNC_S: Final = 2.0
 class Watch:
     """Feeds a registry from the network. Construction ends with the first sync: what stands now is known then."""
 
-    def __init__(self, transport: Transport, registry: Registry, own: Address, lost: Callable[..., None]) -> None:
-        self._transport = transport
+    def __init__(
+        self,
+        transport: Transport,
+        registry: Registry,
+        own: Address,
+        lost: Callable[..., None],
+        beat: Callable[[], None],
+    ) -> None:
         self._registry = registry
         self._own = own
         self._lost = lost
         self.malformed = 0
+        self._asker = Asker(transport, registry, self._answer, beat)
         entries, signs = transport.announcements(REGISTRY), transport.presences(ALIVE)
         for key in transport.present(ALIVE, _SYNC_S):
             self._sign(Message(key, b""))
-        for message in transport.standing(REGISTRY, _SYNC_S):
-            self._entry(message)
         self._channels = (entries, signs)
         self._threads = [
             threading.Thread(target=self._read, args=(entries, self._entry), name="trade-registry", daemon=True),
             threading.Thread(target=self._read, args=(signs, self._sign), name="trade-presence", daemon=True),
         ]
-        for thread in self._threads:
+        for thread in (*self._threads, self._asker):
             thread.start()
+        self._asker.wait(_SYNC_S)
+
+    @property
+    def busy(self) -> bool:
+        """Whether somebody is being asked for what was missed."""
+        return self._asker.busy
 
     def _read(self, channel: Channel, take: Callable[[Message], None]) -> None:
         while True:
@@ -48,14 +70,16 @@ class Watch:
 
     def _entry(self, message: Message) -> None:
         try:
-            domain, identity, container, epoch, provider = _chunks(message.key, 5)
-            address = Address(identity, container, epoch)
+            address, domain, provider = _place(message.key)
             if address == self._own:
                 return
-            if message.payload is None:
-                self._registry.remove(address, provider)
+            payload = message.payload or b""
+            if (domain, provider) == (DOMAIN, TALLY):
+                complete = self._registry.count(address, decode_tally(payload).revision)
             else:
-                self._registry.put(address, domain, provider, decode_provider(message.payload))
+                complete = self._registry.put(address, domain, provider, decode_provider(payload))
+            if not complete:
+                self._asker.request(address)
         except Malformed as bad:
             self._drop(message.key, bad)
 
@@ -72,19 +96,27 @@ class Watch:
             self._registry.vanish(address)
         else:
             self._lost(address, back=True)
-            self._catch_up(address)
-            self._registry.appear(address)
+            if self._registry.appear(address):
+                self._asker.request(address, anew=True)
 
-    def _catch_up(self, address: Address) -> None:
-        """Nobody tells what a container withdrew while it was out of sight; so ask what still stands."""
-        known = self._registry.known_before(address)
-        if not known:
-            return
-        standing = self._transport.standing(registry_key("*", address, "*"), _SYNC_S)
-        offered = {message.key.rpartition("/")[2] for message in standing}
-        if PROVIDER in offered:  # every container offers that; without it, nobody answered
-            for provider in known - offered:
-                self._registry.remove(address, provider, for_good=False)
+    def _answer(self, answer: Answer, meant: dict[Address, ContainerState]) -> None:
+        """Take what a container says that it offers. Who speaks for anybody else is not listened to at all."""
+        offered: dict[str, tuple[str, ProviderInfo]] = {}
+        speakers, revision = set[Address](), None
+        for message in answer.messages:
+            try:
+                address, domain, provider = _place(message.key)
+                speakers.add(address)
+                if (domain, provider) == (DOMAIN, TALLY):
+                    revision = decode_tally(message.payload or b"").revision
+                else:
+                    offered[provider] = (domain, decode_provider(message.payload or b""))
+            except Malformed as bad:
+                self._drop(message.key, bad)
+        if len(speakers) > 1:
+            self._drop(answer.messages[0].key, Malformed("one container answered for several"))
+        elif revision is not None and (state := meant.get(speakers.pop())) is not None:
+            self._registry.settle(state, revision, offered)  # without the tally, which comes last, it is not all
 
     def _drop(self, key: str, bad: Exception) -> None:
         self.malformed += 1
@@ -93,11 +125,18 @@ class Watch:
 
     def close(self) -> None:
         """End the threads. Idempotent."""
+        self._asker.close()
         for channel in self._channels:
             channel.close()
         for thread in self._threads:
             if thread is not threading.current_thread():
                 thread.join(2)
+
+
+def _place(key: str) -> tuple[Address, str, str]:
+    """Whose entry it is, in which domain, of which provider."""
+    domain, identity, container, epoch, provider = _chunks(key, 5)
+    return Address(identity, container, epoch), domain, provider
 
 
 def _chunks(key: str, count: int) -> list[str]:

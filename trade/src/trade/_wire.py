@@ -3,10 +3,12 @@
 # pyright: reportUnknownVariableType=false
 
 import re
+from sys import intern
 from typing import Annotated, Any, Final, TypeVar
+from weakref import WeakValueDictionary
 
 import msgspec
-from msgspec import Meta, Raw, Struct
+from msgspec import Meta, Raw, Struct, structs
 
 PROTOCOL: Final = 1
 """Version of every message. A reader drops, counts and logs once what carries another."""
@@ -24,7 +26,7 @@ def as_chunk(text: str) -> str:
     return re.sub(r"[^A-Za-z0-9_.-]", "-", text)[:80] or "_"
 
 
-class Address(Struct, frozen=True, array_like=True):
+class Address(Struct, frozen=True, array_like=True, gc=False, cache_hash=True):
     """Where a container is: who speaks, under which name, in which boot."""
 
     identity: str
@@ -35,7 +37,7 @@ class Address(Struct, frozen=True, array_like=True):
         return f"{self.identity}/{self.container}/{self.epoch}"
 
 
-class ServiceKey(Struct, frozen=True, array_like=True):
+class ServiceKey(Struct, frozen=True, array_like=True, gc=False, cache_hash=True):
     """Names one service of one boot epoch; what a handle is over the wire."""
 
     address: Address
@@ -77,6 +79,16 @@ def estop_confirmed_key(address: Address) -> str:
 
 
 ESTOPS: Final = "estop/**"
+
+
+TALLY: Final = "tally"
+"""The last chunk of the key, in the middleware's own domain, under which a container says how far it is."""
+
+
+def tally_key(address: Address) -> str:
+    return registry_key("trade", address, TALLY)
+
+
 REGISTRY: Final = "registry/**"
 ALIVE: Final = "alive/**"
 
@@ -174,7 +186,7 @@ HEALTHY: Final = "healthy"
 """The health of a provider with which nothing is wrong; any other text says what is."""
 
 
-class Parameter(Struct, frozen=True, array_like=True):
+class Parameter(Struct, frozen=True, array_like=True, gc=False):
     """One parameter of a service."""
 
     name: str
@@ -183,8 +195,11 @@ class Parameter(Struct, frozen=True, array_like=True):
     positional_only: bool = False
 
 
-class ServiceInfo(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """What everybody may know of a service."""
+NO_SCHEMA: Final = Raw(msgspec.msgpack.encode({}))
+
+
+class ServiceInfo(Struct, frozen=True, kw_only=True, omit_defaults=True, weakref=True):
+    """What everybody may know of a service. Equal ones that came by message are one object: nobody changes it."""
 
     name: str
     signature: str
@@ -194,8 +209,9 @@ class ServiceInfo(Struct, frozen=True, kw_only=True, omit_defaults=True):
     achieves: tuple[str, ...] = ()
     uses: tuple[str, ...] = ()
     parameters: tuple[Parameter, ...] = ()
-    arguments_schema: dict[str, Any] = {}
-    result_schema: dict[str, Any] = {}
+    arguments_schema: Raw = NO_SCHEMA
+    """JSON Schema as it travels: few are ever looked at, see `_schemas`."""
+    result_schema: Raw = NO_SCHEMA
     types: dict[str, str] = {}
     """Schema definition -> ``module:qualified name``, so that a process that has the type gets the type."""
     meta: dict[str, Scalar] = {}
@@ -235,12 +251,14 @@ class ProviderInfo(Struct, frozen=True, kw_only=True):
     """A registry entry. Identity, container, epoch, domain and provider stand in its key."""
 
     v: int = PROTOCOL
-    revision: int
+    revision: Annotated[int, Meta(ge=1, le=(1 << 63) - 1)]
+    """Counts everything its container announces: one more than what that announced before."""
     groups: tuple[str, ...]
     kind: str
     host: str
     pid: int
     services: tuple[ServiceInfo, ...]
+    """None of them: the provider was deregistered."""
     kinds: tuple[str, ...] = ()
     """Names of its class and of the bases and interfaces that have services."""
     meta: dict[str, Scalar] = {}
@@ -250,6 +268,20 @@ class ProviderInfo(Struct, frozen=True, kw_only=True):
     """What the robot's groups consist of: group -> resources, whether or not they are there."""
     estops: tuple[Estop, ...] = ()
     """Of the middleware's own provider: what is open in its container; who hears it takes the union."""
+
+
+class _ProviderMessage(ProviderInfo, frozen=True, kw_only=True):
+    """The same before its services are read."""
+
+    services: tuple[Raw, ...]  # pyright: ignore[reportIncompatibleVariableOverride]
+
+
+class Tally(Struct, frozen=True, array_like=True, gc=False):
+    """How far a container is: the last thing it says in an answer, and what it says now and then."""
+
+    v: int
+    revision: Annotated[int, Meta(ge=0, le=(1 << 63) - 1)]
+    """Of what it announced last."""
 
 
 CANCEL: Final = "cancel"
@@ -275,7 +307,7 @@ EMPTY: Final = Raw(msgspec.msgpack.encode(None))
 EMPTY_ARGUMENTS: Final = Raw(msgspec.msgpack.encode(()))
 
 
-_Message = TypeVar("_Message", Call, Reply, ProviderInfo, EstopOrder, EstopConfirmed)
+_Message = TypeVar("_Message", Call, Reply, _ProviderMessage, Tally, EstopOrder, EstopConfirmed)
 
 
 class Malformed(Exception):
@@ -284,7 +316,11 @@ class Malformed(Exception):
 
 call_decoder: Final = msgspec.msgpack.Decoder(Call)
 reply_decoder: Final = msgspec.msgpack.Decoder(Reply)
-_provider_decoder: Final = msgspec.msgpack.Decoder(ProviderInfo)
+_provider_decoder: Final = msgspec.msgpack.Decoder(_ProviderMessage)
+_service_decoder: Final = msgspec.msgpack.Decoder(ServiceInfo)
+_services: Final[WeakValueDictionary[bytes, ServiceInfo]] = WeakValueDictionary()
+"""The services known now by their bytes: a thousand objects of one class tell the same."""
+_tally_decoder: Final = msgspec.msgpack.Decoder(Tally)
 _estop_order_decoder: Final = msgspec.msgpack.Decoder(EstopOrder)
 _estop_confirmed_decoder: Final = msgspec.msgpack.Decoder(EstopConfirmed)
 encode_message: Final = msgspec.msgpack.Encoder().encode
@@ -299,7 +335,27 @@ def decode_reply(payload: bytes) -> Reply:
 
 
 def decode_provider(payload: bytes) -> ProviderInfo:
-    return _decoded(_provider_decoder, payload)
+    message = _decoded(_provider_decoder, payload)
+    try:
+        services = tuple(_service(bytes(raw)) for raw in message.services)
+    except (msgspec.DecodeError, ValueError, RecursionError, MemoryError) as bad:
+        raise Malformed(why_malformed(payload, bad)) from None
+    told: dict[str, Any] = {
+        **structs.asdict(message),
+        "services": services,
+        "kind": intern(message.kind),
+        "host": intern(message.host),
+    }
+    return ProviderInfo(**told)
+
+
+def _service(data: bytes) -> ServiceInfo:
+    known = _services.get(data)
+    return known if known is not None else _services.setdefault(data, _service_decoder.decode(data))
+
+
+def decode_tally(payload: bytes) -> Tally:
+    return _decoded(_tally_decoder, payload)
 
 
 def decode_estop_order(payload: bytes, identity: str) -> EstopOrder:

@@ -11,11 +11,20 @@ from collections.abc import Callable, Generator, Sequence
 from typing import Any, Final
 
 import zenoh
-from zenoh import ext
 
 from trade._endpoints import Endpoint
 from trade._links import Links, new_session_id, open_session
-from trade._transport import Channel, ChannelClosed, Message, Presence, Publisher, Transport, some
+from trade._transport import (
+    Answer,
+    Channel,
+    ChannelClosed,
+    Message,
+    Presence,
+    Publisher,
+    Question,
+    Questions,
+    Transport,
+)
 from trade.errors import ConfigurationError
 
 LEASE_MS: Final = 2000
@@ -108,14 +117,6 @@ class ZenohChannel(Channel):
             self._forget(self._session)
 
 
-class ZenohAnnouncements(ZenohChannel):
-    """What a cache repeats of a withdrawal comes as an empty put; no announcement is empty, so we can tell."""
-
-    def receive(self) -> Message:
-        message = super().receive()
-        return message if message.payload else Message(message.key, None)
-
-
 class ZenohPublisher(Publisher):
     def __init__(self, publisher: Any, forget_key: Callable[[], Any] | None = None) -> None:
         self._publisher = publisher
@@ -133,13 +134,35 @@ class ZenohPublisher(Publisher):
             _quietly(self._forget_key)
 
 
-class ZenohAnnouncement(ZenohPublisher):
-    def put(self, payload: bytes) -> None:
-        super().put(some(payload))
+class ZenohQuestion(Question):
+    def __init__(self, query: zenoh.Query) -> None:
+        self._query = query
+        self._asked = query.key_expr
+
+    def answer(self, key: str, payload: bytes) -> None:
+        if not self._asked.intersects(key):
+            return
+        try:
+            self._query.reply(key, payload)
+        except _CLOSED:
+            raise ChannelClosed from None
 
     def close(self) -> None:
-        _quietly(self._publisher.delete)
-        super().close()
+        _quietly(self._query.drop)
+
+
+class ZenohQuestions(Questions):
+    def __init__(self, queryable: Any) -> None:
+        self._queryable = queryable
+
+    def receive(self) -> Question:
+        try:
+            return ZenohQuestion(self._queryable.handler.recv())
+        except zenoh.ZError:
+            raise ChannelClosed from None
+
+    def close(self) -> None:
+        _quietly(self._queryable.undeclare)
 
 
 class ZenohPresence(Presence):
@@ -175,45 +198,38 @@ class ZenohTransport(Transport):
         with _refusing():
             return ZenohChannel(self._session.declare_subscriber(pattern, _fifo()), declare_on=self._session)
 
-    def announce(self, key: str) -> Publisher:
+    def announce(self, key: str, payload: bytes) -> None:
         with _refusing():
-            declared = ext.declare_advanced_publisher(
-                self._session,
-                key,
-                congestion_control=_BLOCK,
-                express=True,
-                cache=ext.CacheConfig(max_samples=1),
-                publisher_detection=True,
-                sample_miss_detection=ext.MissDetectionConfig(sporadic_heartbeat=0.5),
-            )
-        return ZenohAnnouncement(declared)
+            self._session.put(key, payload, congestion_control=_BLOCK, express=True)
 
     def announcements(self, pattern: str) -> Channel:
         with _refusing():
-            declared = ext.declare_advanced_subscriber(
-                self._session,
-                pattern,
-                _fifo(),
-                allowed_origin=zenoh.Locality.REMOTE,
-                history=ext.HistoryConfig(detect_late_publishers=True),
-                recovery=ext.RecoveryConfig(heartbeat=True),
+            return ZenohChannel(
+                self._session.declare_subscriber(pattern, _fifo(), allowed_origin=zenoh.Locality.REMOTE)
             )
-        return ZenohAnnouncements(declared)
 
-    def standing(self, pattern: str, timeout_s: float) -> list[Message]:
-        # The caches of announcements answer on keys below @adv, with samples of the plain key.
+    def questions(self, pattern: str) -> Questions:
+        with _refusing():
+            return ZenohQuestions(self._session.declare_queryable(pattern, _fifo()))
+
+    def ask(self, pattern: str, timeout_s: float) -> list[Answer]:
         with _refusing():
             replies = self._session.get(
-                f"{pattern}/@adv/**",
+                pattern,
                 _fifo(),
                 target=zenoh.QueryTarget.ALL,
-                accept_replies=zenoh.ReplyKeyExpr.ANY,
                 consolidation=zenoh.ConsolidationMode.NONE,
+                congestion_control=_BLOCK,
+                allowed_destination=zenoh.Locality.REMOTE,
                 timeout=timeout_s,
             )
-        samples = [reply.ok for reply in replies if reply.ok is not None]
-        found = [Message(str(sample.key_expr), sample.payload.to_bytes()) for sample in samples]
-        return [message for message in found if message.payload]  # those withdrawn just now are empty
+        answers: dict[str, Answer] = {}
+        for reply in replies:
+            if reply.ok is not None:
+                who = str(reply.replier_id)
+                answer = answers.setdefault(who, Answer(who, []))
+                answer.messages.append(Message(str(reply.ok.key_expr), reply.ok.payload.to_bytes()))
+        return list(answers.values())
 
     def appear(self, key: str) -> Presence:
         with _refusing():

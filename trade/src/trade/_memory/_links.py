@@ -18,15 +18,14 @@ class Kind(enum.Enum):
     DROPPABLE = "droppable"
     """Urgent, and lost where it would have to wait."""
     ANNOUNCE = "announce"
-    WITHDRAW = "withdraw"
     RISE = "rise"
     """A sign of life goes up."""
     FALL = "fall"
     """A sign of life is taken down."""
     ASK = "ask"
-    """What do you announce?"""
+    """What stands?"""
     ANSWER = "answer"
-    """An announcement that stands."""
+    """Something that stands."""
     LEAVE = "leave"
     """The transport closes."""
 
@@ -45,9 +44,6 @@ _LANES: Final = {
     Kind.URGENT: Lane.URGENT,
     Kind.DROPPABLE: Lane.URGENT,
     Kind.ANNOUNCE: Lane.ANNOUNCEMENTS,
-    Kind.WITHDRAW: Lane.ANNOUNCEMENTS,
-    Kind.ASK: Lane.ANNOUNCEMENTS,
-    Kind.ANSWER: Lane.ANNOUNCEMENTS,
     Kind.RISE: Lane.PRESENCE,
     Kind.FALL: Lane.PRESENCE,
     Kind.LEAVE: Lane.PRESENCE,

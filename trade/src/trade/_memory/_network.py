@@ -1,7 +1,7 @@
 """A network in memory: which nodes can reach each other, what passes between them, and what goes wrong on the way."""
 
-import functools
 import itertools
+import math
 import random
 import threading
 from collections import Counter
@@ -12,9 +12,10 @@ from typing import Final
 from trade._memory._clock import Clock
 from trade._memory._keys import meet
 from trade._memory._links import Delay, Kind, Link, Way
-from trade._memory._node import Node, Sample
+from trade._memory._node import Node
+from trade._memory._questions import MemoryQuestion
 from trade._memory._traffic import Arrive, Traffic
-from trade._transport import ChannelClosed, Message
+from trade._transport import Answer, ChannelClosed, Message
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,35 +38,40 @@ class Network:
     """Where the memory transports of one system meet.
 
     Messages arrive at once, before ``put`` returns, unless their link has a delay or is cut. Nothing else takes time:
-    questions (``standing``, ``present``) are answered at once by all whose link has not been given up, and who joins is
-    linked with all others. Time is the network's own and stands still until it is moved: see ``clock`` and ``traffic``.
-    Containers keep their deadlines by the real clock.
+    questions (``ask``, ``present``) and answers arrive at once wherever the link has not been given up, and who joins
+    is linked with all others. Time is the network's own and stands still until it is moved: see ``clock`` and
+    ``traffic``. Containers keep their deadlines by the real clock.
 
     A link that is cut (``partition``) keeps what is put on it, as a TCP connection would. Healed within the lease, it
     delivers all of that. Else the link is given up: signs of life fall on both sides and what it kept is lost; when it
-    heals, they rise again, and the last values of announcements that were missed are told anew. A withdrawal that was
-    missed is not: nothing is left that could tell it.
+    heals, they rise again. Single messages are lost where ``lose`` says so.
 
     Args:
         seed: of the generator that draws jitter.
         lease_s: how long a cut is borne.
+        beat_s: see ``Transport``, in seconds of the real clock; never, by default.
         clock: another one than a new one at zero.
     """
 
-    def __init__(self, *, seed: int = 0, lease_s: float = 2.0, clock: Clock | None = None) -> None:
+    def __init__(
+        self, *, seed: int = 0, lease_s: float = 2.0, beat_s: float = math.inf, clock: Clock | None = None
+    ) -> None:
         self.clock: Final = clock or Clock()
         self.sent: Final[Counter[Kind]] = Counter()
         """How many messages of each kind were sent from one transport to another."""
         self.lock: Final = threading.RLock()
+        self.changed: Final = threading.Condition(self.lock)
+        """Told when a question may have ended."""
+        self.beat_s: Final = beat_s
         self._lease_s = lease_s
         self.traffic: Final = Traffic(self.clock, self._under_lock)
         self._random = random.Random(seed)  # noqa: S311 - no secret
         self._delay = Delay()
-        self._loss = 0.0
         self._nodes: list[Node] = []
         self._named: dict[str, Node] = {}
         self._links: dict[frozenset[Node], Link] = {}
         self._taps: list[Tap] = []
+        self._losing: list[Callable[[Passage], bool]] = []
         self._numbers = itertools.count(1)
 
     def _under_lock(self, arrive: Arrive) -> None:
@@ -83,7 +89,7 @@ class Network:
                 self._links[frozenset((node, other))] = Link(node, other, self.traffic, self._random, self._delay)
             for other in others:
                 for token, key in list(other.tokens.items()):
-                    self._pass(
+                    self.pass_on(
                         Kind.RISE, other, node, Message(key, b""), _seeing(node, other, token, key), at_once=True
                     )
             return node
@@ -101,7 +107,7 @@ class Network:
             node.end()
             for link in self._links_of(node):
                 other = link.far_end(node)
-                self._pass(Kind.LEAVE, node, other, Message("", None), lambda link=link: self._forget(link))
+                self.pass_on(Kind.LEAVE, node, other, Message("", None), lambda link=link: self._forget(link))
 
     def kill(self, node: Node) -> None:
         """The end of a process without a goodbye: what it sent and has not arrived is lost. Idempotent."""
@@ -126,18 +132,14 @@ class Network:
         """A number nobody else in this network has."""
         return next(self._numbers)
 
-    def spread(self, source: Node, sample: Sample, kind: Kind) -> None:
+    def spread(self, source: Node, message: Message, kind: Kind) -> None:
         """To all who would read it; to readers of the source itself at once."""
         with self.lock:
             _check_open(source)
-            if kind is Kind.ANNOUNCE:
-                source.announced[sample.publisher] = sample
-            elif kind is Kind.WITHDRAW:
-                source.announced.pop(sample.publisher, None)
-            source.take(sample, own=True)
+            source.take(message, own=True)
             for target in self._others(source):
-                if target.hears(sample.message.key):
-                    self._pass(kind, source, target, sample.message, _taking(target, sample))
+                if target.hears(message.key):
+                    self.pass_on(kind, source, target, message, _taking(target, message))
 
     def show(self, source: Node, token: int, key: str) -> None:
         """A sign of life for everybody."""
@@ -146,7 +148,7 @@ class Network:
             source.tokens[token] = key
             source.see(source, token, key)
             for target in self._others(source):
-                self._pass(Kind.RISE, source, target, Message(key, b""), _seeing(target, source, token, key))
+                self.pass_on(Kind.RISE, source, target, Message(key, b""), _seeing(target, source, token, key))
 
     def hide(self, source: Node, token: int) -> None:
         """Take a sign of life down. Idempotent."""
@@ -156,49 +158,45 @@ class Network:
                 return
             source.lose_sight(token)
             for target in self._others(source):
-                self._pass(Kind.FALL, source, target, Message(key, None), _losing(target, token))
+                self.pass_on(Kind.FALL, source, target, Message(key, None), _losing(target, token))
 
-    def ask_all(self, asking: Node, pattern: str) -> None:
-        """Let everybody tell what they announce and the asking node has not heard."""
+    def ask(self, source: Node, pattern: str, timeout_s: float) -> list[Answer]:
+        """Ask all others; wait, by the real clock, until those that are not lost have said all."""
         with self.lock:
-            for target in self._others(asking):
-                self._ask(asking, target, pattern)
+            _check_open(source)
+            questions = [
+                MemoryQuestion(self, source, target, pattern, asked)
+                for target in self._others(source)
+                for asked in target.asked
+                if meet(pattern, asked.pattern)
+            ]
+            for question in questions:
+                question.send()
+            self.changed.wait_for(lambda: source.closed or all(question.ended for question in questions), timeout_s)
+            _check_open(source)
+            return [question.said for question in questions if question.said.messages]
 
-    def _ask(self, asking: Node, target: Node, pattern: str) -> None:
-        self._pass(Kind.ASK, asking, target, Message(pattern, None), lambda: self._answer(target, asking, pattern))
-
-    def _answer(self, source: Node, asking: Node, pattern: str) -> None:
-        for sample in list(source.announced.values()):
-            if meet(pattern, sample.message.key):
-                self._pass(Kind.ANSWER, source, asking, sample.message, _taking(asking, sample, history=True))
-
-    def announced(self, asking: Node, pattern: str) -> list[Message]:
-        """What stands at everybody it is linked with, asked and answered at once."""
-        with self.lock:
-            _check_open(asking)
-            found = [sample.message for sample in asking.announced.values() if meet(pattern, sample.message.key)]
-            for target in self._others(asking):
-                self._ask_at_once(asking, target, pattern, found.append)
-            return found
-
-    def _ask_at_once(self, asking: Node, target: Node, pattern: str, take: Callable[[Message], None]) -> None:
-        self._pass(Kind.ASK, asking, target, Message(pattern, None), _nothing, at_once=True)
-        for message in [sample.message for sample in target.announced.values() if meet(pattern, sample.message.key)]:
-            self._pass(Kind.ANSWER, target, asking, message, functools.partial(take, message), at_once=True)
+    def linked(self, one: Node, other: Node) -> bool:
+        """Whether there is a link that is up, between two that are open."""
+        link = self._links.get(frozenset((one, other)))
+        return link is not None and link.up and not (one.closed or other.closed)
 
     def _others(self, node: Node) -> list[Node]:
         """Those it has a link to that is up."""
         others = [link.far_end(node) for link in self._links_of(node) if link.up]
         return [other for other in others if not other.closed]
 
-    def _pass(
+    def pass_on(
         self, kind: Kind, source: Node, target: Node, message: Message, arrive: Arrive, *, at_once: bool = False
     ) -> None:
         """One message over one link; the link may be gone by the time a tap has seen it."""
         self.sent[kind] += 1
-        self._tell_taps(Passage(kind, source.name, target.name, message.key, message.payload, arrived=False))
+        passage = Passage(kind, source.name, target.name, message.key, message.payload, arrived=False)
+        self._tell_taps(passage)
+        if any(loses(passage) for loses in list(self._losing)):
+            return
         link = self._links.get(frozenset((source, target)))
-        if link is None or not link.up or (kind is Kind.DROPPABLE and self._random.random() < self._loss):
+        if link is None or not link.up:
             return
 
         def arrived() -> None:
@@ -219,6 +217,18 @@ class Network:
         self._taps.append(hear)
         return lambda: self._taps.remove(hear)
 
+    def lose(self, which: Callable[[Passage], bool]) -> Callable[[], None]:
+        """Lose messages on their way; both ends stay linked.
+
+        Args:
+            which: tells of a message before it is sent whether it is lost. It may do what a tap may.
+
+        Returns:
+            A function that ends it.
+        """
+        self._losing.append(which)
+        return lambda: self._losing.remove(which)
+
     def _tell_taps(self, passage: Passage) -> None:
         for tap in list(self._taps):
             tap(passage)
@@ -234,11 +244,6 @@ class Network:
             for link in self._links.values() if between is None else [self._links[frozenset(between)]]:
                 for way in link.ways.values():
                     way.delay = delay
-
-    def lose(self, share: float) -> None:
-        """Lose this share of all droppable messages; the generator draws which."""
-        with self.lock:
-            self._loss = share
 
     def partition(self, one: Node, other: Node, *, one_way: bool = False) -> None:
         """Cut a link; ``one_way``: only from the first to the second. A cut that outlasts the lease ends the link."""
@@ -270,6 +275,7 @@ class Network:
             other.lose_all_of(one)
             if one.closed or other.closed:
                 self._links.pop(frozenset(link.ends), None)
+            self.changed.notify_all()
 
     def heal(self, one: Node | None = None, other: Node | None = None) -> None:
         """Mend the link of two nodes, or all links of one, or all."""
@@ -283,14 +289,12 @@ class Network:
                     self._link_again(link)
 
     def _link_again(self, link: Link) -> None:
-        """Both tell what they show and ask what they missed."""
+        """Both tell what they show."""
         link.up = True
         for source in link.ends:
             target = link.far_end(source)
             for token, key in list(source.tokens.items()):
-                self._pass(Kind.RISE, source, target, Message(key, b""), _seeing(target, source, token, key))
-            for pattern in [ear.pattern for ear in source.ears if ear.of_others]:
-                self._ask(source, target, pattern)
+                self.pass_on(Kind.RISE, source, target, Message(key, b""), _seeing(target, source, token, key))
 
 
 def _check_open(node: Node) -> None:
@@ -298,11 +302,8 @@ def _check_open(node: Node) -> None:
         raise ChannelClosed
 
 
-def _nothing() -> None: ...
-
-
-def _taking(target: Node, sample: Sample, *, history: bool = False) -> Arrive:
-    return lambda: target.take_history(sample) if history else target.take(sample, own=False)
+def _taking(target: Node, message: Message) -> Arrive:
+    return lambda: target.take(message, own=False)
 
 
 def _seeing(target: Node, owner: Node, token: int, key: str) -> Arrive:

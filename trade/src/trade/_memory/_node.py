@@ -2,32 +2,21 @@
 
 import queue
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Final
+from typing import Final, Generic, TypeVar
 
 from trade._memory._keys import meet
-from trade._transport import Channel, ChannelClosed, Message
+from trade._transport import Channel, ChannelClosed, Message, Question, Questions
+
+_T = TypeVar("_T")
 
 
-@dataclass(frozen=True, slots=True)
-class Sample:
-    """A message with its publisher and its place in that one's sequence."""
-
-    message: Message
-    publisher: int
-    number: int
-
-
-class MemoryChannel(Channel):
+class Inbox(Generic[_T]):
     """A queue of one node. Like zenoh's, it gives what came before it was closed, and ends then."""
 
-    def __init__(self, pattern: str, forget: Callable[["MemoryChannel"], None], *, of_others: bool = False) -> None:
+    def __init__(self, pattern: str, forget: Callable[["Inbox[_T]"], None]) -> None:
         self.pattern: Final = pattern
-        self.of_others: Final = of_others
-        """Whether it hears announcements: those of others, and none of them twice."""
         self._forget = forget
-        self._queue: queue.SimpleQueue[Message | None] = queue.SimpleQueue()
-        self._newest: dict[int, int] = {}
+        self._queue: queue.SimpleQueue[_T | None] = queue.SimpleQueue()
         self._given = self._taken = self._dealt_with = 0
 
     @property
@@ -38,28 +27,35 @@ class MemoryChannel(Channel):
     def fits(self, key: str) -> bool:
         return meet(self.pattern, key)
 
-    def take(self, message: Message) -> None:
+    def take(self, item: _T) -> None:
         self._given += 1
-        self._queue.put(message)
+        self._queue.put(item)
 
-    def take_newer(self, sample: Sample) -> None:
-        """Take it unless this one, or a later one of the same publisher, was there already."""
-        if self._newest.get(sample.publisher, -1) < sample.number:
-            self._newest[sample.publisher] = sample.number
-            self.take(sample.message)
-
-    def receive(self) -> Message:
+    def receive(self) -> _T:
         self._dealt_with = self._taken
-        message = self._queue.get()
-        if message is None:
+        item = self._queue.get()
+        if item is None:
             self._queue.put(None)  # for the next reader
             raise ChannelClosed
         self._taken += 1
-        return message
+        return item
 
     def close(self) -> None:
         self._forget(self)
         self._queue.put(None)
+
+
+class MemoryChannel(Inbox[Message], Channel):
+    """What one subscription hears."""
+
+    def __init__(self, pattern: str, forget: Callable[[Inbox[Message]], None], *, of_others: bool = False) -> None:
+        super().__init__(pattern, forget)
+        self.of_others: Final = of_others
+        """Whether it hears announcements, those of others."""
+
+
+class MemoryQuestions(Inbox[Question], Questions):
+    """What one is asked."""
 
 
 class Node:
@@ -68,14 +64,13 @@ class Node:
     def __init__(self, name: str) -> None:
         self.name: Final = name
         self.closed = False
-        self.announced: dict[int, Sample] = {}
-        """Publisher to its last value."""
         self.tokens: dict[int, str] = {}
         """Its own signs of life."""
         self.seen: dict[int, tuple[Node, str]] = {}
         """Signs of life that it knows to stand, its own included."""
         self.ears: list[MemoryChannel] = []
         self.watches: list[MemoryChannel] = []
+        self.asked: list[MemoryQuestions] = []
 
     def __repr__(self) -> str:
         return f"<Node {self.name}>"
@@ -84,21 +79,11 @@ class Node:
         """Whether anybody here would read what is put on a key."""
         return any(ear.fits(key) for ear in self.ears)
 
-    def take(self, sample: Sample, *, own: bool) -> None:
+    def take(self, message: Message, *, own: bool) -> None:
         """A message arrives."""
         for ear in self.ears:
-            if not ear.fits(sample.message.key):
-                continue
-            if not ear.of_others:
-                ear.take(sample.message)
-            elif not own:
-                ear.take_newer(sample)
-
-    def take_history(self, sample: Sample) -> None:
-        """The answer to a question for what stands arrives; only who hears announcements asked."""
-        for ear in self.ears:
-            if ear.of_others and ear.fits(sample.message.key):
-                ear.take_newer(sample)
+            if ear.fits(message.key) and not (own and ear.of_others):
+                ear.take(message)
 
     def see(self, owner: "Node", token: int, key: str) -> None:
         """A sign of life rises."""
@@ -125,14 +110,13 @@ class Node:
 
     @property
     def busy(self) -> bool:
-        """Whether somebody still has to take up an announcement or a sign of life."""
-        return any(channel.busy for channel in [*self.watches, *(ear for ear in self.ears if ear.of_others)])
+        """Whether somebody still has to take up an announcement, a sign of life or a question."""
+        return any(inbox.busy for inbox in [*self.watches, *self.asked, *(ear for ear in self.ears if ear.of_others)])
 
     def end(self) -> None:
         """Close every channel."""
         self.closed = True
-        self.announced.clear()
         self.tokens.clear()
         self.seen.clear()
-        for channel in [*self.ears, *self.watches]:
-            channel.close()
+        for inbox in [*self.ears, *self.watches, *self.asked]:
+            inbox.close()

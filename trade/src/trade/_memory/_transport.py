@@ -1,10 +1,22 @@
 """The five verbs on a network in memory."""
 
+from collections.abc import Callable
+from typing import Any
+
 from trade._memory._keys import meet
 from trade._memory._links import Kind
 from trade._memory._network import Network
-from trade._memory._node import MemoryChannel, Sample
-from trade._transport import Channel, ChannelClosed, Message, Presence, Publisher, Transport, some
+from trade._memory._node import Inbox, MemoryChannel, MemoryQuestions
+from trade._transport import (
+    Answer,
+    Channel,
+    ChannelClosed,
+    Message,
+    Presence,
+    Publisher,
+    Questions,
+    Transport,
+)
 
 
 class MemoryPublisher(Publisher):
@@ -12,33 +24,15 @@ class MemoryPublisher(Publisher):
         self._transport = transport
         self._key = key
         self._kind = kind
-        self._id = transport.network.next_number()
-        self._count = 0
         self._closed = False
 
     def put(self, payload: bytes) -> None:
-        self._spread(Message(self._key, payload), self._kind)
-
-    def _spread(self, message: Message, kind: Kind) -> None:
-        with self._transport.network.lock:
-            if self._closed:
-                raise ChannelClosed
-            self._count += 1
-            self._transport.network.spread(self._transport.node, Sample(message, self._id, self._count), kind)
+        if self._closed:
+            raise ChannelClosed
+        self._transport.network.spread(self._transport.node, Message(self._key, payload), self._kind)
 
     def close(self) -> None:
         self._closed = True
-
-
-class MemoryAnnouncement(MemoryPublisher):
-    def put(self, payload: bytes) -> None:
-        super().put(some(payload))
-
-    def close(self) -> None:
-        with self._transport.network.lock:
-            if not (self._closed or self._transport.closed):
-                self._spread(Message(self._key, None), Kind.WITHDRAW)
-            super().close()
 
 
 class MemoryPresence(Presence):
@@ -61,6 +55,7 @@ class MemoryTransport(Transport):
 
     def __init__(self, network: Network, name: str = "") -> None:
         self.network = network
+        self.beat_s = network.beat_s
         self.node = network.join(name)
 
     @property
@@ -75,18 +70,21 @@ class MemoryTransport(Transport):
     def subscribe(self, pattern: str) -> Channel:
         return self._listen(pattern, self.node.ears)
 
-    def announce(self, key: str) -> Publisher:
-        self._check_open()
-        return MemoryAnnouncement(self, key, Kind.ANNOUNCE)
+    def announce(self, key: str, payload: bytes) -> None:
+        self.network.spread(self.node, Message(key, payload), Kind.ANNOUNCE)
 
     def announcements(self, pattern: str) -> Channel:
-        with self.network.lock:
-            channel = self._listen(pattern, self.node.ears, of_others=True)
-            self.network.ask_all(self.node, pattern)
-            return channel
+        return self._listen(pattern, self.node.ears, of_others=True)
 
-    def standing(self, pattern: str, timeout_s: float) -> list[Message]:  # noqa: ARG002 - nothing takes time
-        return self.network.announced(self.node, pattern)
+    def questions(self, pattern: str) -> Questions:
+        with self.network.lock:
+            self._check_open()
+            questions = MemoryQuestions(pattern, self._forget_in(self.node.asked))
+            self.node.asked.append(questions)
+            return questions
+
+    def ask(self, pattern: str, timeout_s: float) -> list[Answer]:
+        return self.network.ask(self.node, pattern, timeout_s)
 
     def appear(self, key: str) -> Presence:
         return MemoryPresence(self, key)
@@ -108,7 +106,7 @@ class MemoryTransport(Transport):
 
     def wake(self, key: str, payload: bytes) -> None:
         with self.network.lock:
-            self.node.take(Sample(Message(key, payload), 0, 0), own=True)
+            self.node.take(Message(key, payload), own=True)
 
     def close(self) -> None:
         self.network.leave(self.node)
@@ -118,13 +116,16 @@ class MemoryTransport(Transport):
             raise ChannelClosed
 
     def _listen(self, pattern: str, among: list[MemoryChannel], *, of_others: bool = False) -> MemoryChannel:
-        def forget(channel: MemoryChannel) -> None:
-            with self.network.lock:
-                if channel in among:
-                    among.remove(channel)
-
         with self.network.lock:
             self._check_open()
-            channel = MemoryChannel(pattern, forget, of_others=of_others)
+            channel = MemoryChannel(pattern, self._forget_in(among), of_others=of_others)
             among.append(channel)
             return channel
+
+    def _forget_in(self, among: list[Any]) -> Callable[[Inbox[Any]], None]:
+        def forget(inbox: Inbox[Any]) -> None:
+            with self.network.lock:
+                if inbox in among:
+                    among.remove(inbox)
+
+        return forget

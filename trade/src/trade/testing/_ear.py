@@ -1,11 +1,13 @@
 """What the suites listen with: a channel read with a deadline, and meeting points."""
 
+import contextlib
 import itertools
 import queue
 import threading
+from collections.abc import Mapping
 from typing import Final
 
-from trade._transport import Channel, ChannelClosed, Message, Publisher, Transport
+from trade._transport import Channel, ChannelClosed, Message, Transport
 
 PATIENCE_S: Final = 10.0
 """How long a test waits for what must come; far above what it takes."""
@@ -55,11 +57,22 @@ class Ear:
         return not any(thread.is_alive() for thread in self._threads)
 
 
-def announce(transport: Transport, key: str, payload: bytes) -> Publisher:
-    """An announcement with a value; it stands while it is kept."""
-    announcement = transport.announce(key)
-    announcement.put(payload)
-    return announcement
+class Teller:
+    """Answers whoever asks with what stands, on a thread of its own that ends when the transport closes."""
+
+    def __init__(self, transport: Transport, pattern: str, standing: Mapping[str, bytes]) -> None:
+        self.questions: Final = transport.questions(pattern)
+        self._standing = standing
+        threading.Thread(target=self._tell, name="teller", daemon=True).start()
+
+    def _tell(self) -> None:
+        with contextlib.suppress(ChannelClosed):
+            while True:
+                question = self.questions.receive()
+                with contextlib.suppress(ChannelClosed):
+                    for key, payload in list(self._standing.items()):
+                        question.answer(key, payload)
+                question.close()
 
 
 def listen(listener: Transport, pattern: str, *, speaker: Transport) -> Ear:
@@ -70,11 +83,11 @@ def listen(listener: Transport, pattern: str, *, speaker: Transport) -> Ear:
 
 
 def meet(*, listener: Transport, speaker: Transport) -> None:
-    """What the listener has subscribed, the speaker reaches from now on: it hears an announcement made after it."""
+    """What the listener has subscribed, the speaker reaches from now on: it sees a sign that rose after it."""
     point = f"meeting/{next(_meetings)}"
-    ear = Ear(speaker.announcements(point))
-    announcement = announce(listener, point, b"here")
-    ear.until(point, b"here")
-    announcement.close()
+    ear = Ear(speaker.presences(point))
+    sign = listener.appear(point)
+    assert ear.next().key == point  # noqa: S101
+    sign.close()
     ear.channel.close()
     ear.ends()

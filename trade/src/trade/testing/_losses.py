@@ -4,11 +4,12 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from typing import NamedTuple
 
 from trade._transport import Message, Transport
-from trade.testing._ear import PATIENCE_S, Ear
+from trade.testing._ear import PATIENCE_S, Ear, Teller, meet
 
 __all__ = ["LossConformance", "Severable"]
 
@@ -45,35 +46,38 @@ class LossConformance(ABC):
             mend()
             assert [ear.next().payload for ear in far] == [b"", b""]
 
-    def test_what_was_announced_meanwhile_is_told_and_what_is_known_is_not_repeated(self) -> None:
-        with self.severable() as (one, other, sever, mend):
-            announcements = {name: one.announce(f"shop/{name}") for name in ("bread", "milk")}
-            ear = Ear(other.announcements("shop/**"))
-            for announcement in announcements.values():
-                announcement.put(b"1")
-            assert {ear.next().key for _ in range(2)} == {"shop/bread", "shop/milk"}
-            lost = _Lost(one, other, sever)
-            announcements["bread"].put(b"2")
-            announcements["bread"].put(b"3")
-            cheese = one.announce("shop/cheese")
-            cheese.put(b"1")
-            mend()
-            assert lost.returns()
-            assert {ear.next() for _ in range(2)} == {Message("shop/bread", b"3"), Message("shop/cheese", b"1")}
-            announcements["milk"].put(b"2")
-            assert ear.next() == Message("shop/milk", b"2")
-
     def test_once_a_sign_has_risen_again_all_that_stands_is_told_when_asked(self) -> None:
         with self.severable() as (one, other, sever, mend):
-            announcements = [one.announce(f"shop/{number}") for number in range(50)]
-            for announcement in announcements:
-                announcement.put(b"1")
+            standing = {f"shop/{number}": b"1" for number in range(50)}
+            Teller(one, "shop/*", standing)
             lost = _Lost(one, other, sever)
-            announcements.pop().close()
+            del standing["shop/49"]
             mend()
             assert lost.returns()
-            standing = {message.key for message in other.standing("shop/**", PATIENCE_S)}
-            assert standing == {f"shop/{number}" for number in range(49)}
+            [answer] = other.ask("shop/**", PATIENCE_S)
+            assert answer.messages == [Message(f"shop/{number}", b"1") for number in range(49)]
+
+    def test_who_is_lost_amid_a_question_is_not_waited_for(self) -> None:
+        with self.severable() as (one, other, sever, _mend):
+            questions = one.questions("shop/*")
+            meet(listener=one, speaker=other)
+            with ThreadPoolExecutor(1) as pool:
+                asked = pool.submit(other.ask, "shop/*", 3600.0)
+                question = questions.receive()
+                sever()
+                assert asked.result(2 * PATIENCE_S) == []
+            question.close()
+
+    def test_once_a_sign_has_risen_again_announcements_are_heard_as_before(self) -> None:
+        with self.severable() as (one, other, sever, mend):
+            ear = Ear(other.announcements("shop/**"))
+            lost = _Lost(one, other, sever)
+            one.announce("shop/bread", b"missed")
+            mend()
+            assert lost.returns()
+            meet(listener=other, speaker=one)
+            one.announce("shop/bread", b"heard")
+            assert ear.next() == Message("shop/bread", b"heard")
 
     def test_once_a_sign_has_risen_again_messages_arrive_as_before(self) -> None:
         with self.severable() as (one, other, sever, mend):

@@ -5,10 +5,11 @@
 import contextlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 
-from trade._transport import Message, Transport
-from trade.testing._ear import PATIENCE_S, Ear, announce, meet
+from trade._transport import ChannelClosed, Message, Transport
+from trade.testing._ear import PATIENCE_S, Ear, Teller, meet
 
 
 class StandingConformance(ABC):
@@ -31,117 +32,143 @@ class StandingConformance(ABC):
 
     # --- announcements
 
-    def test_an_announcement_its_changes_and_its_withdrawal_are_heard(self) -> None:
+    def test_announcements_are_heard_in_order_whatever_their_keys(self) -> None:
         with self.pair() as (one, other):
             ear = Ear(other.announcements("shop/**"))
-            announcement = announce(one, "shop/bread", b"fresh")
-            assert ear.next() == Message("shop/bread", b"fresh")
-            announcement.put(b"dry")
-            announcement.put(b"sold out")
-            announcement.close()
-            assert [ear.next().payload for _ in range(3)] == [b"dry", b"sold out", None]
+            meet(listener=other, speaker=one)
+            said = [Message(f"shop/{number % 7}/{number}", str(number).encode()) for number in range(2000)]
+            for message in said:
+                one.announce(message.key, message.payload or b"")
+            assert [ear.next() for _ in said] == said
 
-    def test_who_comes_later_hears_the_last_value_only(self) -> None:
-        with self.network() as open_transport:
-            one = open_transport()
-            announcement = one.announce("shop/bread")
-            for value in (b"1", b"2", b"3"):
-                announcement.put(value)
-            ear = Ear(open_transport().announcements("shop/**"))
-            assert ear.next() == Message("shop/bread", b"3")
-            announcement.put(b"4")
-            assert ear.next() == Message("shop/bread", b"4")
-
-    def test_who_listens_later_hears_the_last_value_only(self) -> None:
+    def test_who_listens_later_hears_nothing_of_what_was_announced(self) -> None:
         with self.pair() as (one, other):
-            announcement = one.announce("shop/bread")
-            for value in (b"1", b"2", b"3"):
-                announcement.put(value)
-            meet(listener=one, speaker=other)
-            ear = Ear(other.announcements("shop/**"))
-            assert ear.next().payload == b"3"
-
-    def test_who_comes_after_a_withdrawal_hears_nothing_of_it(self) -> None:
-        with self.network() as open_transport:
-            one = open_transport()
-            announcement = one.announce("shop/bread")
-            announcement.put(b"fresh")
-            announcement.close()
-            late = open_transport()
-            ear = Ear(late.announcements("shop/**"))
-            _milk = announce(one, "shop/milk", b"cold")
-            assert ear.next() == Message("shop/milk", b"cold")
-            assert late.standing("shop/**", PATIENCE_S) == [Message("shop/milk", b"cold")]
-
-    def test_what_was_withdrawn_can_be_announced_again(self) -> None:
-        with self.pair() as (one, other):
-            ear = Ear(other.announcements("shop/**"))
-            for value in (b"old", b"new"):
-                announcement = announce(one, "shop/bread", value)
-                assert ear.next() == Message("shop/bread", value)
-                announcement.close()
-                assert ear.next() == Message("shop/bread", None)
-
-    def test_who_hears_of_an_announcement_hears_of_its_withdrawal_however_soon(self) -> None:
-        with self.pair() as (one, other):
-            for turn in range(200):
-                ear, last = Ear(other.announcements(f"shop-{turn}/**")), dict[str, bytes | None]()
-                for number in range(2):
-                    announce(one, f"shop-{turn}/{number}", b"gone soon").close()
-                stays = announce(one, f"shop-{turn}/end", b"stays")
-                for message in ear.until(f"shop-{turn}/end", b"stays"):
-                    last[message.key] = message.payload
-                while not set(last.values()) <= {None}:  # announcements are in order each, not among each other
-                    message = ear.next()
-                    last[message.key] = message.payload
-                ear.channel.close()
-                stays.close()
-
-    def test_an_announcement_has_a_value(self) -> None:
-        with self.pair() as (one, _):
-            announcement, refused = one.announce("shop/bread"), False
-            try:
-                announcement.put(b"")
-            except ValueError:
-                refused = True
-            assert refused
+            early = Ear(other.announcements("shop/**"))
+            meet(listener=other, speaker=one)
+            one.announce("shop/bread", b"1")
+            assert early.next().payload == b"1"
+            late = Ear(other.announcements("shop/**"))
+            meet(listener=other, speaker=one)
+            one.announce("shop/bread", b"2")
+            assert late.next().payload == b"2"
 
     def test_nobody_hears_announcements_of_their_own(self) -> None:
         with self.pair() as (one, other):
             ear = Ear(one.announcements("shop/**"))
-            _kept = announce(one, "shop/own", b"1"), announce(other, "shop/other", b"1")
+            meet(listener=one, speaker=other)
+            one.announce("shop/own", b"1")
+            other.announce("shop/other", b"1")
             assert ear.next() == Message("shop/other", b"1")
 
-    def test_announcements_that_stand_can_be_asked_for(self) -> None:
+    # --- questions
+
+    def test_who_asks_is_told_all_that_stands_by_each_who_answers(self) -> None:
         with self.network() as open_transport:
             one, other = open_transport(), open_transport()
-            bread = one.announce("shop/bread")
-            bread.put(b"old")
-            bread.put(b"fresh")
-            _kept = announce(other, "shop/milk", b"cold"), announce(other, "bank/money", b"1")
+            Teller(one, "shop/one/*", {"shop/one/bread": b"fresh", "shop/one/milk": b"cold"})
+            Teller(other, "shop/other/*", {"shop/other/eggs": b"12"})
+            _signs = one.appear("alive/one"), other.appear("alive/other")
             late = open_transport()
-            standing = sorted((message.key, message.payload) for message in late.standing("shop/**", PATIENCE_S))
-            assert standing == [("shop/bread", b"fresh"), ("shop/milk", b"cold")]
+            _wait_for(late, 2)
+            answers = late.ask("shop/**", PATIENCE_S)
+            assert sorted([(message.key, message.payload) for message in answer.messages] for answer in answers) == [
+                [("shop/one/bread", b"fresh"), ("shop/one/milk", b"cold")],
+                [("shop/other/eggs", b"12")],
+            ]
+            assert len({answer.who for answer in answers}) == 2
 
-    def test_announcements_of_ones_own_stand_too(self) -> None:
-        with self.pair() as (one, _):
-            _bread = announce(one, "shop/bread", b"fresh")
-            assert one.standing("shop/**", PATIENCE_S) == [Message("shop/bread", b"fresh")]
-
-    def test_an_announcement_without_a_value_does_not_stand(self) -> None:
+    def test_once_a_sign_of_life_has_risen_its_transport_can_be_asked(self) -> None:
         with self.pair() as (one, other):
-            _kept = one.announce("shop/bread"), announce(one, "shop/milk", b"cold")
+            signs = Ear(other.presences("alive/*"))
+            for turn in range(50):
+                Teller(one, f"shop-{turn}/*", {f"shop-{turn}/bread": b"fresh"})
+                sign = one.appear(f"alive/{turn}")
+                signs.until(f"alive/{turn}", b"")
+                [answer] = other.ask(f"shop-{turn}/*", PATIENCE_S)
+                assert answer.messages == [Message(f"shop-{turn}/bread", b"fresh")]
+                sign.close()
+
+    def test_ten_thousand_things_are_told_in_order(self) -> None:
+        with self.pair() as (one, other):
+            standing = {f"shop/{number}": str(number).encode() * 100 for number in range(10_000)}
+            Teller(one, "shop/*", standing)
             meet(listener=one, speaker=other)
-            assert other.standing("shop/**", PATIENCE_S) == [Message("shop/milk", b"cold")]
+            [answer] = other.ask("shop/**", 6 * PATIENCE_S)
+            assert [(message.key, message.payload) for message in answer.messages] == list(standing.items())
 
-    def test_announcements_go_with_their_transport(self) -> None:
+    def test_only_what_was_asked_for_is_told_and_by_those_who_are_asked_for_it(self) -> None:
         with self.pair() as (one, other):
-            ear = Ear(other.presences("alive/**"))
-            _kept = one.appear("alive/one"), announce(one, "shop/bread", b"fresh")
-            assert ear.next() == Message("alive/one", b"")
-            one.close()
-            assert ear.next() == Message("alive/one", None)
-            assert other.standing("shop/**", PATIENCE_S) == []
+            Teller(one, "shop/*/one/*", {"shop/food/one/bread": b"fresh", "shop/tools/one/saw": b"sharp"})
+            Teller(one, "bank/*", {"shop/food/one/poison": b"", "bank/money": b"1"})
+            meet(listener=one, speaker=other)
+            [answer] = other.ask("shop/food/one/*", PATIENCE_S)
+            assert answer.messages == [Message("shop/food/one/bread", b"fresh")]
+
+    def test_nobody_asks_themselves(self) -> None:
+        with self.pair() as (one, _):
+            Teller(one, "shop/*", {"shop/bread": b"fresh"})
+            assert one.ask("shop/**", PATIENCE_S) == []
+
+    def test_a_question_that_is_not_ended_ends_at_its_deadline_with_what_was_said(self) -> None:
+        with self.pair() as (one, other):
+            questions = one.questions("shop/*")
+            meet(listener=one, speaker=other)
+            with ThreadPoolExecutor(1) as pool:
+                asked = pool.submit(other.ask, "shop/*", 1.0)
+                question = questions.receive()
+                question.answer("shop/bread", b"fresh")
+                [answer] = asked.result(PATIENCE_S)
+                assert answer.messages == [Message("shop/bread", b"fresh")]
+            question.close()
+
+    def test_who_closes_amid_a_question_is_not_waited_for(self) -> None:
+        with self.pair() as (one, other):
+            questions = one.questions("shop/*")
+            meet(listener=one, speaker=other)
+            with ThreadPoolExecutor(1) as pool:
+                asked = pool.submit(other.ask, "shop/*", 3600.0)
+                question = questions.receive()
+                one.close()
+                assert asked.result(PATIENCE_S) == []
+            question.close()
+
+    def test_who_asks_and_closes_waits_no_longer(self) -> None:
+        with self.pair() as (one, other):
+            questions = one.questions("shop/*")
+            meet(listener=one, speaker=other)
+            with ThreadPoolExecutor(1) as pool:
+                asked = pool.submit(other.ask, "shop/*", 3600.0)
+                question = questions.receive()
+                other.close()
+                with contextlib.suppress(ChannelClosed):
+                    assert asked.result(PATIENCE_S) == []
+            question.close()
+
+    def test_a_question_that_was_closed_takes_no_answer(self) -> None:
+        with self.pair() as (one, other):
+            questions, refused = one.questions("shop/*"), False
+            meet(listener=one, speaker=other)
+            with ThreadPoolExecutor(1) as pool:
+                asked = pool.submit(other.ask, "shop/*", PATIENCE_S)
+                question = questions.receive()
+                question.close()
+                question.close()
+                try:
+                    question.answer("shop/bread", b"stale")
+                except ChannelClosed:
+                    refused = True
+                assert refused
+                assert asked.result(PATIENCE_S) == []
+
+    def test_who_is_closed_is_asked_nothing(self) -> None:
+        with self.pair() as (one, other):
+            teller = Teller(one, "shop/*", {"shop/bread": b"fresh"})
+            meet(listener=one, speaker=other)
+            assert len(other.ask("shop/*", PATIENCE_S)) == 1
+            teller.questions.close()
+            teller.questions.close()
+            meet(listener=one, speaker=other)
+            assert other.ask("shop/*", PATIENCE_S) == []
 
     # --- presence
 
@@ -187,3 +214,10 @@ class StandingConformance(ABC):
             _kept = one.appear("alive/one"), other.appear("alive/other"), one.appear("dead/one")
             one.appear("alive/gone").close()
             assert sorted(open_transport().present("alive/*", PATIENCE_S)) == ["alive/one", "alive/other"]
+
+
+def _wait_for(transport: Transport, signs: int) -> None:
+    ear = Ear(transport.presences("alive/**"))
+    for _ in range(signs):
+        ear.next()
+    ear.channel.close()

@@ -1,6 +1,7 @@
 """A whole system in one process: containers on a network in memory, with faults on demand and no waiting for time."""
 
 import contextlib
+import math
 import threading
 import time
 from collections.abc import Callable, Generator
@@ -29,9 +30,11 @@ class MemorySystem:
     moved by ``advance`` and its kind alone; deadlines of calls go by the real one.
     """
 
-    def __init__(self, *, seed: int = 0, lease_s: float = 2.0, state_dir: Path | None = None) -> None:
+    def __init__(
+        self, *, seed: int = 0, lease_s: float = 2.0, beat_s: float = math.inf, state_dir: Path | None = None
+    ) -> None:
         self._state_dir = state_dir
-        self.network: Final = Network(seed=seed, lease_s=lease_s)
+        self.network: Final = Network(seed=seed, lease_s=lease_s, beat_s=beat_s)
         self._containers: dict[str, Container] = {}
         self._every: list[Container] = []
 
@@ -90,9 +93,9 @@ class MemorySystem:
         nodes = None if between is None else (self._node(between[0]), self._node(between[1]))
         self.network.delay(least_s, jitter_s=jitter_s, between=nodes)
 
-    def lose(self, share: float) -> None:
-        """Lose this share (0 to 1) of the droppable messages, those of e-stops; the system's seed says which."""
-        self.network.lose(share)
+    def lose(self, which: Callable[[Passage], bool]) -> Callable[[], None]:
+        """Lose messages between two containers that stay linked; see `Network.lose`. Returns what ends it."""
+        return self.network.lose(which)
 
     def _node(self, named: Named) -> Node:
         name = named if isinstance(named, str) else named.name
@@ -115,10 +118,13 @@ class MemorySystem:
 
     def _take_note(self) -> None:
         deadline = time.monotonic() + _TAKING_NOTE_S
-        while any(self._node(name).busy for name in list(self._containers)):
+        while any(self._node(name).busy for name in list(self._containers)) or self._catching_up():
             if time.monotonic() > deadline:
                 raise TimeoutError(f"a container has not taken note of what arrived within {_TAKING_NOTE_S} s")
             threading.Event().wait(_LOOK_AGAIN_S)
+
+    def _catching_up(self) -> bool:
+        return any(c.catching_up for name, c in list(self._containers.items()) if not self._node(name).closed)
 
     def drive(self, until: Callable[[], bool], limit_s: float = 10.0) -> None:
         """Move the network's time on, message by message, until something holds that containers bring about.
@@ -145,16 +151,17 @@ class MemorySystem:
 
 @contextlib.contextmanager
 def memory_system(
-    *, seed: int = 0, lease_s: float = 2.0, state_dir: Path | None = None
+    *, seed: int = 0, lease_s: float = 2.0, beat_s: float = math.inf, state_dir: Path | None = None
 ) -> Generator[MemorySystem, None, None]:
     """A system in memory for one test; its containers are closed at the end.
 
     Args:
         seed: of the generator that draws jitter.
         lease_s: how long a partition lasts, on the network's clock, until containers lose each other.
+        beat_s: how often a container says how far it is, in seconds of the real clock: who lost a message asks then.
         state_dir: where containers keep what outlives them, such as open e-stops; none: nowhere.
     """
-    system = MemorySystem(seed=seed, lease_s=lease_s, state_dir=state_dir)
+    system = MemorySystem(seed=seed, lease_s=lease_s, beat_s=beat_s, state_dir=state_dir)
     try:
         yield system
     finally:

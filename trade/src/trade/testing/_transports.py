@@ -10,7 +10,7 @@ import threading
 from collections.abc import Callable, Generator
 
 from trade._transport import Channel, ChannelClosed, Message, Transport
-from trade.testing._ear import Ear, announce, listen, meet
+from trade.testing._ear import Ear, listen, meet
 from trade.testing._standing import StandingConformance
 
 __all__ = ["TransportConformance"]
@@ -57,9 +57,10 @@ class TransportConformance(StandingConformance):
     def test_what_is_subscribed_before_an_announcement_hears_all_that_follows_it(self) -> None:
         with self.pair() as (one, other):
             announced = Ear(one.announcements("here/**"))
+            meet(listener=one, speaker=other)
             for turn in range(50):
                 ear = Ear(other.subscribe(f"room/{turn}"))
-                _here = announce(other, f"here/{turn}", b"1")
+                other.announce(f"here/{turn}", b"1")
                 announced.until(f"here/{turn}", b"1")
                 one.publish(f"room/{turn}").put(b"first")
                 assert ear.next().payload == b"first"
@@ -180,31 +181,28 @@ class TransportConformance(StandingConformance):
 
     def test_a_closed_publisher_puts_nothing(self) -> None:
         with self.pair() as (one, _):
-            for publisher in (
-                one.publish("room/a"),
-                one.publish("room/a", urgent=True, droppable=True),
-                one.announce("room/b"),
-            ):
+            for publisher in (one.publish("room/a"), one.publish("room/a", urgent=True, droppable=True)):
                 publisher.close()
                 publisher.close()
                 assert _refuses(lambda publisher=publisher: publisher.put(b"late"))
 
     def test_publishers_and_signs_of_a_closed_transport_can_be_closed(self) -> None:
         with self.pair() as (one, _):
-            publishers, sign = [one.publish("room/a"), one.announce("room/b")], one.appear("alive/one")
-            channels = _channels(one)
+            publishers, sign = [one.publish("room/a"), one.publish("room/b", urgent=True)], one.appear("alive/one")
+            channels, questions = _channels(one), one.questions("shop/**")
             one.close()
             assert all(_refuses(lambda publisher=publisher: publisher.put(b"late")) for publisher in publishers)
-            for thing in (*publishers, sign, *channels):
+            for thing in (*publishers, sign, *channels, questions):
                 thing.close()
 
     def test_a_closed_transport_refuses_every_verb(self) -> None:
         verbs: dict[str, Callable[[Transport], object]] = {
             "publish": lambda closed: closed.publish("room/a"),
             "subscribe": lambda closed: closed.subscribe("room/a"),
-            "announce": lambda closed: closed.announce("room/a"),
+            "announce": lambda closed: closed.announce("room/a", b"1"),
             "announcements": lambda closed: closed.announcements("room/**"),
-            "standing": lambda closed: closed.standing("room/**", 1.0),
+            "questions": lambda closed: closed.questions("room/**"),
+            "ask": lambda closed: closed.ask("room/**", 1.0),
             "appear": lambda closed: closed.appear("alive/one"),
             "presences": lambda closed: closed.presences("alive/**"),
             "present": lambda closed: closed.present("alive/**", 1.0),

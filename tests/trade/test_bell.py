@@ -1,0 +1,59 @@
+"""Waiting that an interrupt may end at any instant."""
+
+import threading
+import time
+
+import pytest
+
+from trade._bell import Bell
+
+
+def test_it_wakes_everybody_who_waits() -> None:
+    bell, rung, woken = Bell(), threading.Event(), threading.Semaphore(0)
+
+    def wait() -> None:
+        if bell.wait_for(rung.is_set, 20):
+            woken.release()
+
+    threads = [threading.Thread(target=wait) for _ in range(5)]
+    for thread in threads:
+        thread.start()
+    rung.set()
+    bell.ring()
+    for thread in threads:
+        thread.join(20)
+    assert sum(woken.acquire(blocking=False) for _ in range(6)) == 5
+
+
+def test_it_looks_at_once_and_gives_up_in_time() -> None:
+    bell = Bell()
+    assert bell.wait_for(lambda: True, 0)
+    assert not bell.wait_for(lambda: False, 0)
+    assert not bell.wait_for(lambda: False, 0.01)
+
+
+def test_a_ring_between_looking_and_waiting_is_not_missed() -> None:
+    bell, looks = Bell(), list[float]()
+
+    def ready() -> bool:
+        looks.append(time.monotonic())
+        if len(looks) == 1:
+            bell.ring()
+            return False
+        return True
+
+    assert bell.wait_for(ready, 20)
+    assert len(looks) == 2
+
+
+def test_nobody_is_kept_once_waiting_is_over() -> None:
+    bell = Bell()
+    bell.wait_for(lambda: False, 0)
+    assert not bell._gates
+
+
+def test_an_error_of_what_is_looked_at_is_the_waiters() -> None:
+    bell = Bell()
+    with pytest.raises(ZeroDivisionError):
+        bell.wait_for(lambda: bool(1 / 0), 1)
+    assert not bell._gates

@@ -1,0 +1,100 @@
+"""Ten thousand services on the real transport: who listens and who comes late know all of them, and can call."""
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+from trade import Container, Handle, service, where
+from trade._announcing import Announcer
+from trade._wire import Address, ProviderInfo, ServiceInfo, alive_key
+
+HOST = Address("somebody", "host", "e1")
+
+
+def entry(revision: int, services: int) -> ProviderInfo:
+    infos = tuple(ServiceInfo(name=f"press_{number}", signature="press()") for number in range(services))
+    return ProviderInfo(revision=revision, groups=("panels",), kind="Panel", host="h", pid=1, services=infos)
+
+
+@pytest.fixture
+def host(here: Container, open_raw: Any) -> Iterator[Announcer]:
+    """Announces whatever a test wants; linked with the container, for which it is alive."""
+    raw = open_raw(here)
+    announcer = Announcer(raw, HOST)
+    sign = raw.appear(alive_key(HOST))
+    assert here._registry.wait_for(lambda: here._registry.is_alive(HOST), 20)
+    yield announcer
+    sign.close()
+    announcer.close()
+
+
+@pytest.mark.parametrize(("providers", "services"), [(10_000, 1), (1000, 10)])
+def test_ten_thousand_services_are_known_to_who_listens_and_to_who_comes_late(
+    here: Container, start_container: Any, host: Announcer, eventually: Any, providers: int, services: int
+) -> None:
+    for revision in range(1, providers + 1):
+        host.announce("panels", f"p{revision}", entry(revision, services))
+    assert eventually(lambda: len(here.services(where(group="panels"))) == 10_000)
+    late = start_container("late")
+    assert eventually(lambda: len(late.services(where(group="panels"))) == 10_000)
+
+
+def test_most_of_them_withdrawn_who_comes_late_knows_the_rest(
+    here: Container, start_container: Any, host: Announcer, eventually: Any
+) -> None:
+    for revision in range(1, 2001):
+        host.announce("panels", f"p{revision}", entry(revision, 1))
+    for revision in range(2001, 4000):
+        host.announce("panels", f"p{revision - 2000}", entry(revision, 0))
+    late = start_container("late")
+    for container in (here, late):
+        assert eventually(lambda container=container: len(container.services(where(group="panels"))) == 1)
+        [left] = container.services(where(group="panels"))
+        assert left.key.provider == "p2000"
+
+
+def test_what_was_lost_on_the_way_is_asked_for_when_the_container_says_how_far_it_is(
+    here: Container, host: Announcer, monkeypatch: pytest.MonkeyPatch, eventually: Any
+) -> None:
+    host.announce("panels", "p1", entry(1, 1))
+    assert eventually(lambda: len(here.services(where(group="panels"))) == 1)
+    with monkeypatch.context() as lossy:
+        lossy.setattr(host._transport, "announce", lambda key, payload: None)
+        host.announce("panels", "p2", entry(2, 1))
+        host.announce("panels", "p1", entry(3, 0))
+    host.beat()
+    assert eventually(lambda: [handle.key.provider for handle in here.services(where(group="panels"))] == ["p2"])
+
+
+class Panel:
+    @service
+    def press(self, value: int) -> int:
+        return value
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_who_calls_at_once_on_hearing_of_a_service_is_answered(
+    here: Container, there: Container, start_container: Callable[[str], Container], eventually: Any, late: bool
+) -> None:
+    """The callee listens before it announces; whether one hears of it from an announcement or from an answer."""
+    pressed: list[int] = []
+
+    def press(handle: Handle) -> None:
+        pressed.append(handle.with_(deadline_s=20)(1))
+
+    def register() -> None:
+        for number in range(100):
+            there.register(Panel(), f"panel.p{number}")
+
+    if late:
+        register()
+        caller = start_container("caller")
+    else:
+        caller = here
+    notification = caller.joined(where(name="press"), press, existing=True)
+    if not late:
+        register()
+    assert eventually(lambda: len(pressed) == 100)
+    notification.cancel()
+    assert pressed == [1] * 100
