@@ -7,8 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from trade import Container, EstopReport, Resource, current_call, service, where
-from trade.errors import ConfigurationError, MotionStopped, NoSuchEstop, Stopped
+from trade import Container, Estop, EstopReport, Resource, current_call, service, where
+from trade._dispatch import MOST_THREADS
+from trade._memory import MemoryTransport
+from trade._wire import PROTOCOL, EstopOrder, encode_message
+from trade.errors import Busy, ConfigurationError, MotionStopped, NoSuchEstop, Stopped
 from trade.testing import Kind, MemorySystem, memory_system
 
 Eventually = Callable[[Callable[[], bool]], bool]
@@ -310,3 +313,39 @@ def test_S09_who_was_away_during_clearing_needs_another_one(system: MemorySystem
     assert caller.estop_clear([report.id], limit_s=GENEROUS_S).complete
     assert call(caller, "move_to", "away", 0.1) == 0.1
     assert away.written == [0.1]
+
+
+FORGED = Estop("abc", "mallory/x/e", "", 0.0)
+BAD = {
+    "garbage": ("estop/tester", b"\xc1"),
+    "another's name": ("estop/tester", encode_message(EstopOrder(PROTOCOL, "abc", FORGED))),
+    "another version": ("estop/mallory", encode_message(EstopOrder(PROTOCOL + 1, "abc", FORGED))),
+    "another request": ("estop/mallory", encode_message(EstopOrder(PROTOCOL, "abcd", FORGED))),
+    "a path": ("estop/mallory", encode_message(EstopOrder(PROTOCOL, "../a", Estop("../a", "mallory/x/e", "", 0.0)))),
+    "a path to clear": ("estop/mallory", encode_message(EstopOrder(PROTOCOL, "abc", None, ("../a",)))),
+    "garbage of a confirmation": ("estop/tester/one/e1", b"\xc1"),
+}
+
+
+@pytest.mark.parametrize("what", BAD)
+def test_a_malformed_message_is_dropped_counted_and_latches_nothing(
+    system: MemorySystem, eventually: Eventually, what: str
+) -> None:
+    drivers(system, "one")
+    one = system.container("one")
+    key, payload = BAD[what]
+    MemoryTransport(system.network, "raw").publish(key).put(payload)
+    assert eventually(lambda: one.dropped_messages == 1)
+    assert one.estops() == []
+    assert call(one, "move_to", "one", 0.1) == 0.1
+
+
+def test_S09_orders_reach_who_is_busy_with_calls(system: MemorySystem) -> None:
+    [axis] = drivers(system, "one")
+    caller = system.container("caller")
+    run = caller.find(where(name="run"), wait_s=20).with_(deadline_s=GENEROUS_S)
+    runs = [run.start() for _ in range(MOST_THREADS)]
+    assert axis.begun.wait(GENEROUS_S)
+    assert caller.estop(limit_s=GENEROUS_S).complete
+    for one in runs:
+        assert one.exception(GENEROUS_S) is None or isinstance(one.exception(), (Stopped, Busy))

@@ -20,7 +20,6 @@ _logger = logging.getLogger("trade")
 _ANSWER_S: Final = 2.5
 """When a container says what did not come to rest; a stop service that does not return is reported after 2 s."""
 _LOOK_AGAIN_S: Final = 0.005
-_MOST_OPEN: Final = 64
 _MOST_REQUESTS: Final = 4096
 
 Confirm = Callable[[str, str], None]
@@ -95,7 +94,7 @@ class Estops:
             if request in self._answers:
                 return (self._answers[request],)
             self._answers[request] = None
-            if opened is not None and len(self._open) < _MOST_OPEN:
+            if opened is not None:
                 self._open[opened.id] = opened
             while len(self._answers) > _MOST_REQUESTS:
                 self._answers.pop(next(iter(self._answers)))
