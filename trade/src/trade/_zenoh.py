@@ -64,7 +64,6 @@ def configuration(
             "peer": {"to_router": "always", "to_peer": "greater-zid"},
             "router": {"to_peer": "always"},
         },
-        "timestamping/enabled": True,
         "transport/auth/usrpwd/user": credentials[0],
         "transport/auth/usrpwd/password": credentials[1],
         "transport/link/tx/lease": LEASE_MS,
