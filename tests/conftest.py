@@ -23,6 +23,7 @@ _SETTLE_S = 5.0
 def _warm_up(tmp_path_factory: pytest.TempPathFactory) -> None:
     """The transport's runtime and the event loop's selector open files once a process; that is no leak."""
     os.environ["TRADE_RUNTIME_DIR"] = str(tmp_path_factory.mktemp("runtime"))
+    os.environ["TRADE_STATE_DIR"] = str(tmp_path_factory.mktemp("state"))
     for _ in range(2):
         with (
             Container(Settings.read(system="warm-up", container="a")) as one,
@@ -93,6 +94,7 @@ def system(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     name = f"test-{secrets.token_hex(4)}"
     monkeypatch.setenv("TRADE_SYSTEM", name)
     monkeypatch.setenv("TRADE_RUNTIME_DIR", str(tmp_path / "runtime"))
+    monkeypatch.setenv("TRADE_STATE_DIR", str(tmp_path / "state"))
     return name
 
 

@@ -26,6 +26,17 @@ def test_the_readme_program_does_what_it_says(system: str, tmp_path: Path) -> No
     assert said in ended.stderr.splitlines()[-1].removeprefix("trade.errors.")
 
 
+def test_the_guide_on_locks_and_stops_does_what_it_says(system: str, tmp_path: Path) -> None:
+    page = (ROOT / "docs" / "guide.md").read_text(encoding="utf-8")
+    section = page.split("## Locks, stops, e-stop")[1].split("\n## ")[0]
+    program = "\n".join(re.findall(r"```python\n(.*?)```", section, re.DOTALL))
+    path = tmp_path / "program.py"
+    path.write_text(program, encoding="utf-8")
+    ended = subprocess.run([sys.executable, path], capture_output=True, text=True, timeout=60, check=False)
+    assert ended.returncode == 0, ended.stderr
+    assert ended.stdout.splitlines() == re.findall(r"print\(.*\) +# (.*)", program)
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_links_lead_somewhere(page: Path) -> None:
     for target in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", page.read_text(encoding="utf-8")):

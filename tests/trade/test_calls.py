@@ -53,7 +53,7 @@ class PaperTransport(Transport):
         self.wakes: list[tuple[str, int]] = []
         self.on_call: Callable[[bytes], None] = lambda payload: None
 
-    def publish(self, key: str, *, urgent: bool = False) -> Publisher:
+    def publish(self, key: str, *, urgent: bool = False, droppable: bool = False) -> Publisher:
         return PaperPublisher(self)
 
     def subscribe(self, pattern: str) -> Channel:

@@ -70,8 +70,10 @@ class CountingTransport(ZenohTransport):
         super().__init__(settings)
         self._sent = sent
 
-    def publish(self, key: str, *, urgent: bool = False) -> Publisher:
-        return Counted(super().publish(key, urgent=urgent), key.split("/", maxsplit=1)[0], self._sent)
+    def publish(self, key: str, *, urgent: bool = False, droppable: bool = False) -> Publisher:
+        return Counted(
+            super().publish(key, urgent=urgent, droppable=droppable), key.split("/", maxsplit=1)[0], self._sent
+        )
 
     def announce(self, key: str, payload: bytes) -> None:
         self._sent["registry"] += not key.endswith(f"/{TALLY}")  # that comes with time, whatever happens

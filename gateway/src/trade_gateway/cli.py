@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from trade.errors import TradeError
-from trade_gateway import _call, _list, _up
+from trade_gateway import _call, _estop, _list, _lock, _locks, _up
 from trade_gateway._output import UsageError, say_error
 from trade_gateway._system_choice import SystemChoice
 
@@ -25,6 +25,11 @@ app.command("up")(_up.up)
 app.command("services")(_list.services)
 app.command("containers")(_list.containers)
 app.command("call", context_settings={"ignore_unknown_options": True})(_call.call)
+app.command("lock", cls=_lock.WithCommand)(_lock.lock)
+app.command("locks")(_locks.locks)
+app.command("unlock")(_locks.unlock)
+app.command("resume")(_locks.resume)
+app.command("estop")(_estop.estop)
 
 
 def _version(wanted: bool) -> None:

@@ -14,6 +14,8 @@ from trade import errors
 from trade._constraints import Constraint, where
 from trade._container import Container
 from trade._context import CallContext, current_call, progress
+from trade._estop_line import EstopReport
+from trade._estopping import LIMIT_S
 from trade._handle import Bound, Handle, Run
 from trade._lock import Lock, OnLost, OnRequest
 from trade._locking import LEASE_S
@@ -25,7 +27,7 @@ from trade._secret import Secret
 from trade._service import service
 from trade._settings import Settings
 from trade._system import ContainerInfo, System
-from trade._wire import HEALTHY, Scalar
+from trade._wire import HEALTHY, Estop, Scalar
 
 __all__ = [
     "Bound",
@@ -33,6 +35,8 @@ __all__ = [
     "Constraint",
     "Container",
     "ContainerInfo",
+    "Estop",
+    "EstopReport",
     "Handle",
     "Lock",
     "LockInfo",
@@ -61,6 +65,9 @@ __all__ = [
     "current_call",
     "deregister",
     "errors",
+    "estop",
+    "estop_clear",
+    "estops",
     "find",
     "joined",
     "left",
@@ -272,3 +279,18 @@ def break_lock(which: Constraint | Iterable[Handle], reason: str) -> list[LockIn
 def resume(which: Constraint | Iterable[Handle]) -> list[str]:
     """Let services move again after a stop by somebody else; see `Container.resume`."""
     return container().resume(which)
+
+
+def estop(reason: str = "", *, limit_s: float = LIMIT_S) -> EstopReport:
+    """Stop everything in the whole system until it is cleared; see `Container.estop`. Not safety-rated."""
+    return container().estop(reason, limit_s=limit_s)
+
+
+def estops() -> list[Estop]:
+    """The e-stops that are open; see `Container.estops`."""
+    return container().estops()
+
+
+def estop_clear(ids: Sequence[str], *, limit_s: float = LIMIT_S) -> EstopReport:
+    """Clear e-stops by their ids; see `Container.estop_clear`."""
+    return container().estop_clear(ids, limit_s=limit_s)

@@ -18,11 +18,14 @@ from trade._announcing import Announcer
 from trade._calls import Caller
 from trade._codec import Codec
 from trade._constraints import Constraint, checked_meta, where
+from trade._context import handed_down
 from trade._coroutines import AsyncLoop
-from trade._deadman import Deadman
 from trade._dispatch import Dispatcher
+from trade._estop_line import EstopReport
+from trade._estopping import LIMIT_S, Estopping
 from trade._handle import Bound, Handle, Run
 from trade._hints import no_such_service, too_many_services
+from trade._inherited import InheritedLock
 from trade._invoke import LocalTarget, RemoteTarget, container_closed, new_request
 from trade._joining import join
 from trade._lock import Lock, OnLost, OnRequest
@@ -41,6 +44,7 @@ from trade._watch import Watch
 from trade._wire import (
     HEALTHY,
     Address,
+    Estop,
     ProviderInfo,
     Scalar,
     ServiceKey,
@@ -96,6 +100,10 @@ class Container:
             leaving.callback(self._caller.close)
             self._notifier = Notifier(lambda record: Handle(self, record.key, record))
             leaving.callback(self._notifier.close)
+            self._inherited = InheritedLock(self._settings.lock, self.address) if self._settings.lock else None
+            if self._inherited is not None:
+                handed_down[self.address] = self._inherited
+                leaving.callback(handed_down.pop, self.address)
             self._registry.listen(self._changed)
             self._registry.listen(self._notifier.changed)
             coroutines = AsyncLoop()
@@ -107,14 +115,32 @@ class Container:
             announcer = Announcer(self._transport, self.address)
             leaving.callback(announcer.close)
             self._providers = Providers(announcer, self._registry, self.address, self._codec, coroutines, self._table)
-            self._deadman = Deadman(self._providers.stop_of, self._table.resources)
+            state = self._settings.state_dir
+            self._estopping = Estopping(
+                self._transport,
+                self.address,
+                self._registry,
+                self._table,
+                self._providers,
+                None if state is None else state / self._settings.system / "estop",
+            )
+            leaving.callback(self._estopping.close)
+            self._deadman = self._estopping.deadman
             self._table.stop_with(self._deadman.stop)
             self.withdrawn: Final = Withdrawn(self._providers)
             """What was taken off from elsewhere and can be offered again."""
             self._dispatcher = Dispatcher(self._transport, self.address, self._providers.lookup, coroutines)
             leaving.callback(self._dispatcher.close)
-            own = OwnServices(self.system, self._table, self.address, self._ask_for_release, self.locking.keeper.asked)
+            own = OwnServices(
+                self.system,
+                self._table,
+                self.address,
+                self._ask_for_release,
+                self.locking.keeper.asked,
+                self._estopping.open_here,
+            )
             self._providers.add(own, (DOMAIN,), name=PROVIDER)
+            self._estopping.begin(own)
             presence = self._transport.appear(alive_key(self.address))
             leaving.callback(presence.close)
             self._watch = Watch(self._transport, self._registry, self.address, self._lost, announcer.beat)
@@ -331,6 +357,8 @@ class Container:
         self._caller.lost(address, back=back)
         if not back:
             self.locking.keeper.lost(address)
+            if self._inherited is not None:
+                self._inherited.lost(address)
             self._table.session_ended(str(address), f"its owner {address.container} has ended or cannot be reached")
             self._deadman.session_ended(str(address))
 
@@ -543,6 +571,42 @@ class Container:
         self._check_open()
         return self.locking.resume(which)
 
+    # --- e-stops
+
+    def estop(self, reason: str = "", *, limit_s: float = LIMIT_S) -> EstopReport:
+        """Stop everything in the whole system, and let nothing move until the e-stop is cleared (S09).
+
+        It waits for nobody to be told, and is repeated until every container that has a stop service has confirmed
+        that all of it is at rest. Read the report: `EstopReport.complete`. This is software, not safety-rated.
+
+        Args:
+            reason: why, for people.
+            limit_s: how long to try, in seconds; also if nobody is found.
+        """
+        self._check_open()
+        return self._estopping.estop(reason, limit_s)
+
+    def estops(self) -> list[Estop]:
+        """The e-stops that are open anywhere in the system, oldest first."""
+        self._check_open()
+        return self._estopping.open()
+
+    def estop_clear(self, ids: Sequence[str], *, limit_s: float = LIMIT_S) -> EstopReport:
+        """Clear e-stops by their ids; once none is open, calls are let through again. Nothing moves by itself.
+
+        What somebody else's e-stop stopped while it was in use holds until `resume`, too (S08). A container that does
+        not hear this, being away, keeps them open until they are cleared again.
+
+        Args:
+            ids: as `estops` tells them.
+            limit_s: how long to try, in seconds.
+
+        Raises:
+            NoSuchEstop: an id that nobody knows as open; nothing is cleared then.
+        """
+        self._check_open()
+        return self._estopping.clear(ids, limit_s)
+
     # --- being
 
     @property
@@ -558,7 +622,7 @@ class Container:
     @property
     def dropped_messages(self) -> int:
         """Messages that were malformed or of another protocol version."""
-        return self._dispatcher.malformed + self._caller.malformed + self._watch.malformed
+        return self._dispatcher.malformed + self._caller.malformed + self._watch.malformed + self._estopping.malformed
 
     @property
     def catching_up(self) -> bool:

@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable, Iterable
 from contextvars import ContextVar
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from msgspec import Struct
 
@@ -114,6 +114,9 @@ class Held(Protocol):
 
 holding: ContextVar[tuple[Held, ...]] = ContextVar("trade_locks", default=())
 """The locks around the running code, outermost first."""
+
+handed_down: Final[dict[Address, Held]] = {}
+"""Locks that other processes passed on to this one, by the container whose calls carry them."""
 
 running: ContextVar[CallContext | None] = ContextVar("trade_call", default=None)
 

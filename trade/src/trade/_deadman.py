@@ -2,7 +2,7 @@
 
 import logging
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Final
 
 from trade._context import CallContext
@@ -19,8 +19,14 @@ _STOP_S: Final = 2.0
 class Deadman:
     """Calls the stop services of this container's own resources."""
 
-    def __init__(self, stop_of: Callable[[Resource], LocalService | None], resources: Callable[[], Sequence[Resource]]):
+    def __init__(
+        self,
+        stop_of: Callable[[Resource], LocalService | None],
+        stops: Callable[[], Sequence[LocalService]],
+        resources: Callable[[], Sequence[Resource]],
+    ) -> None:
         self._stop_of = stop_of
+        self._stops = stops
         self._resources = resources
 
     def session_ended(self, session: str) -> None:
@@ -52,15 +58,33 @@ class Deadman:
                 by_stop.setdefault(service, []).append(resource)
         for service, stopped in by_stop.items():
             _logger.warning("stopping %s: %s", ", ".join(resource.name for resource in stopped), reason)
-            threading.Thread(
-                target=self._stop, args=(service, stopped, done), name="trade-deadman", daemon=True
-            ).start()
+            self._begin(service, _each(stopped, done))
 
-    def _stop(self, service: LocalService, resources: list[Resource], done: Callable[[Resource, str], None]) -> None:
-        def tell(problem: str) -> None:
-            for resource in resources:
-                done(resource, problem)
+    def everything(self, done: Callable[[list[str]], None]) -> None:
+        """Ask all that runs here to end, and call every stop there is, once for what several share; does not wait.
 
+        What could not be stopped is unsafe from then on (S14).
+
+        Args:
+            done: told when all is over, with what is wrong.
+        """
+        resources = self._resources()
+        stops: dict[LocalService, list[Resource]] = {service: [] for service in self._stops() if not service.resources}
+        for resource in resources:
+            for permit in list(resource.calls.values()):
+                if permit.cancel is not None:
+                    permit.cancel()
+            service = self._stop_of(resource)
+            if service is not None:
+                stops.setdefault(service, []).append(resource)
+        together = _Together(stops, done)
+        for service in stops:
+            self._begin(service, together.told_by(service))
+
+    def _begin(self, service: LocalService, tell: Callable[[str], None]) -> None:
+        threading.Thread(target=self._stop, args=(service, tell), name="trade-deadman", daemon=True).start()
+
+    def _stop(self, service: LocalService, tell: Callable[[str], None]) -> None:
         timer = threading.Timer(_STOP_S, tell, (f"{service.label} did not end within {_STOP_S:g} s",))
         timer.daemon = True
         timer.start()
@@ -71,6 +95,44 @@ class Deadman:
             problem = f"{service.label} failed: {error}"
         timer.cancel()
         tell(problem)
+
+
+class _Together:
+    """Stops that were begun together, until the last one is over."""
+
+    def __init__(self, stops: Mapping[LocalService, Sequence[Resource]], done: Callable[[list[str]], None]) -> None:
+        self._stops = stops
+        self._done = done
+        self._left = set(stops)
+        self._problems: list[str] = []
+        self._guard = threading.Lock()
+        if not stops:
+            done([])
+
+    def told_by(self, service: LocalService) -> Callable[[str], None]:
+        return lambda problem: self._over(service, problem)
+
+    def _over(self, service: LocalService, problem: str) -> None:
+        """The first word of each counts: who was too late was too late."""
+        with self._guard:
+            if service not in self._left:
+                return
+            self._left.remove(service)
+            if problem:
+                self._problems.append(problem)
+            last = not self._left
+        for resource in self._stops[service] if problem else ():
+            resource.unsafe = problem
+        if last:
+            self._done(self._problems)
+
+
+def _each(resources: Sequence[Resource], done: Callable[[Resource, str], None]) -> Callable[[str], None]:
+    def tell(problem: str) -> None:
+        for resource in resources:
+            done(resource, problem)
+
+    return tell
 
 
 def _log_failure(resource: Resource, problem: str) -> None:

@@ -97,7 +97,7 @@ class LocalService:
             return self.run_admitted(args, kwargs, context)
         if self.effect == "read":  # open to all, unless it was locked by its own handle
             for resource in self.resources:
-                resource.check(context.tokens, context.caller, context.session)
+                resource.check_lock(context.tokens, context.caller, context.session)
             return self.run_admitted(args, kwargs, context)
         if self.effect == "stop":
             for resource in self.resources:

@@ -13,7 +13,7 @@ from msgspec import Raw, Struct
 from trade._arguments import encode_arguments, encode_call, given
 from trade._calls import Caller, Peer
 from trade._codec import Codec
-from trade._context import CallContext, Held, holding, running
+from trade._context import CallContext, Held, handed_down, holding, running
 from trade._dispatch import LocalService
 from trade._failures import unpack_error
 from trade._handle import Run
@@ -70,6 +70,8 @@ class Request(Struct, gc=False):
             LockLost: it actuates, and would do so under a lock that holds no more.
         """
         outer, around = self.outer, self.around
+        if own in handed_down:
+            around = (handed_down[own], *around)
         if outer is None and not around:
             return None
         locks = [lock for lock in around if lock.owner == own]

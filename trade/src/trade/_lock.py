@@ -15,6 +15,7 @@ from msgspec import structs
 
 from trade._context import Held, holding
 from trade._handle import Bound, Handle, Run
+from trade._inherited import VARIABLE, passed_on
 from trade._locks import Granted, Terms
 from trade._system import DOMAIN, PROVIDER
 from trade._wire import Address, ServiceKey, Token
@@ -125,6 +126,10 @@ class Lock:
             yield self
         finally:
             holding.reset(reset)
+
+    def environment(self) -> dict[str, str]:
+        """What lets a child process make all its calls under it; raises LockLost if it holds no more."""
+        return {VARIABLE: passed_on(self.owner, self.resources, list(self.tokens()))}
 
     def release(self) -> None:
         """Give it back. Idempotent."""

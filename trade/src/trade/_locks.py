@@ -11,7 +11,7 @@ from typing import Final
 
 from msgspec import Struct
 
-from trade._resources import Holder, Resource, locked
+from trade._resources import Holder, Latch, Resource, locked
 from trade._wire import Token
 from trade.errors import DeviceSilent, LockedByOther, ServiceGone, TradeError
 
@@ -101,6 +101,7 @@ class LockTable:
         self._sooner = threading.Event()
         self._thread: threading.Thread | None = None
         self._closed = False
+        self._estop: Latch | None = None
 
     def stop_with(self, stop: Stop) -> None:
         """How to stop what moves under a lock that is lost."""
@@ -121,9 +122,17 @@ class LockTable:
             if isinstance(named, Resource) and resource is not named:
                 raise ValueError(f"resource {name} is another object already; share one trade.Resource")
             resource.epoch, resource.grants = self._epoch, self._grants
+            resource.estop = self._estop
             resource.on_rest(self._rested)
             self._resources[name] = (resource, uses + 1)
             return resource
+
+    def estop(self, latch: Latch | None) -> None:
+        """Latch every resource, those to come, too, or none any more."""
+        with self._changed:
+            self._estop = latch
+            for resource, _ in self._resources.values():
+                resource.estop = latch
 
     def drop(self, resource: Resource) -> None:
         """One service less uses it."""

@@ -117,6 +117,7 @@ class Providers:
             kinds=kinds_of(type(provider), implements),
             meta=checked_meta(meta or {}),
             members={group: tuple(names) for group, names in getattr(provider, "members", {}).items()},
+            estops=getattr(provider, "open_estops", ()) if domain == DOMAIN else (),
         )
         with self._announcing:
             with self._lock:
@@ -203,6 +204,16 @@ class Providers:
             if service.effect == "stop" and resource in service.resources
         ]
         return min(found, key=lambda service: len(service.resources), default=None)
+
+    def stops(self) -> list[LocalService]:
+        """Every stop service that needs no arguments, the middleware's own left out."""
+        return [
+            service
+            for place, registered in list(self._hosted.items())
+            for service in registered.services.values()
+            if service.effect == "stop" and not place.startswith(f"{DOMAIN}/")
+            if not any(parameter.required for parameter in service.signature.info.parameters)
+        ]
 
     def offer(self, place: str) -> Offer | None:
         """What is registered at a place (``domain/provider``)."""

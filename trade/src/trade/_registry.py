@@ -9,7 +9,7 @@ from trade._bell import Bell
 from trade._constraints import Constraint
 from trade._heard import Heard
 from trade._index import Index
-from trade._wire import HEALTHY, Address, ProviderInfo, Scalar, ServiceInfo, ServiceKey
+from trade._wire import HEALTHY, Address, Estop, ProviderInfo, Scalar, ServiceInfo, ServiceKey
 
 __all__ = ["ContainerState", "Record", "Registry"]
 
@@ -29,6 +29,7 @@ class Record:
     meta: Mapping[str, Scalar]
     health: str
     members: Mapping[str, tuple[str, ...]]
+    estops: tuple[Estop, ...] = ()
 
     @property
     def healthy(self) -> bool:
@@ -192,6 +193,7 @@ class Registry:
                 meta={**service.meta, **info.meta} if service.meta and info.meta else service.meta or info.meta,
                 health=info.health,
                 members=info.members,
+                estops=info.estops,
             )
             for service in info.services
         ]

@@ -143,6 +143,14 @@ class Resource:
         latch = self.estop or self.latch
         if latch is not None:
             raise Stopped(resource=self.name, by=latch.by, reason=latch.reason, estop=self.estop is not None)
+        self.check_lock(tokens, caller, session)
+
+    def check_lock(self, tokens: Iterable[Token], caller: str, session: str = "") -> None:
+        """The same for what only reads, which goes on after a stop.
+
+        Raises:
+            LockedByOther, LockLost: see `check`.
+        """
         holder = self.holder
         if self.live:
             if holder is not None and (caller == holder.identity or caller in holder.delegates):

@@ -26,7 +26,9 @@ _VARIABLES: Final = (
     "TRADE_CREDENTIALS",
     "TRADE_BRIDGE",
     "TRADE_INSECURE_LAN",
+    "TRADE_LOCK",
     "TRADE_RUNTIME_DIR",
+    "TRADE_STATE_DIR",
 )
 
 
@@ -57,6 +59,10 @@ class Settings:
     to each other. It has to listen on each; one alone will do if it dials another bridge. Everything of the system
     crosses: there are no lists of what may, and no policy, yet."""
     explicit_system: bool = False
+    lock: str = ""
+    """A lock that the process around this one holds for it; see `Lock.environment`."""
+    state_dir: Path | None = None
+    """Where what must outlive a process is kept, such as open e-stops; none: nowhere."""
 
     def __post_init__(self) -> None:
         for what, text in (("system", self.system), ("identity", self.identity), ("container", self.container)):
@@ -109,7 +115,8 @@ class Settings:
 
         The environment has ``TRADE_SYSTEM``, ``TRADE_IDENTITY``, ``TRADE_CONTAINER``, ``TRADE_LISTEN`` and
         ``TRADE_CONNECT`` (comma-separated), ``TRADE_CREDENTIALS`` (``user:password``), ``TRADE_INSECURE_LAN`` (``1``),
-        ``TRADE_BRIDGE`` (comma-separated) and ``TRADE_RUNTIME_DIR``. Others that begin with ``TRADE_`` are warned of.
+        ``TRADE_BRIDGE`` (comma-separated), ``TRADE_LOCK`` (set by ``trade lock``), ``TRADE_RUNTIME_DIR`` and
+        ``TRADE_STATE_DIR`` (else the user's folder for state). Others that begin with ``TRADE_`` are warned of.
         """
         _warn_of_unknown(environment)
         named = system or environment.get("TRADE_SYSTEM") or None
@@ -123,6 +130,8 @@ class Settings:
             insecure_lan=environment.get("TRADE_INSECURE_LAN") == "1" if insecure_lan is None else insecure_lan,
             bridge=tuple(_split(environment, "TRADE_BRIDGE") if bridge is None else bridge),
             explicit_system=named is not None,
+            lock=environment.get("TRADE_LOCK", ""),
+            state_dir=_state_dir(environment),
         )
 
 
@@ -132,6 +141,17 @@ def _warn_of_unknown(environment: Mapping[str, str]) -> None:
             near = difflib.get_close_matches(name, _VARIABLES, n=1, cutoff=0.8)
             hint = f"did you mean {near[0]}?" if near else f"there is {', '.join(_VARIABLES)}"
             _logger.warning("the environment variable %s means nothing to TRADE; %s", name, hint)
+
+
+def _state_dir(environment: Mapping[str, str]) -> Path | None:
+    named = environment.get("TRADE_STATE_DIR")
+    if named:
+        return Path(named)
+    base = environment.get("LOCALAPPDATA" if os.name == "nt" else "XDG_STATE_HOME")
+    try:
+        return Path(base) / "trade" if base else Path.home() / ".local" / "state" / "trade"
+    except RuntimeError:  # nobody's home
+        return None
 
 
 def _split(environment: Mapping[str, str], name: str) -> list[str]:

@@ -105,8 +105,14 @@ class Transport(ABC):
     """How often who announces here says how far it is: so long a lost announcement may go unnoticed."""
 
     @abstractmethod
-    def publish(self, key: str, *, urgent: bool = False) -> Publisher:
-        """Declare a key to put on. Urgent ones overtake all others."""
+    def publish(self, key: str, *, urgent: bool = False, droppable: bool = False) -> Publisher:
+        """Declare a key to put on.
+
+        Args:
+            key: a literal one.
+            urgent: what is put overtakes all others.
+            droppable: ``put`` waits for nobody; what a stalled receiver cannot take at once it never gets.
+        """
 
     @abstractmethod
     def subscribe(self, pattern: str) -> Channel:

@@ -69,6 +69,18 @@ def alive_key(address: Address) -> str:
     return f"alive/{address}"
 
 
+def estop_key(identity: str) -> str:
+    """Orders of whoever speaks as that identity, for everybody."""
+    return f"estop/{identity}"
+
+
+def estop_confirmed_key(address: Address) -> str:
+    return f"estop/{address}"
+
+
+ESTOPS: Final = "estop/**"
+
+
 TALLY: Final = "tally"
 """The last chunk of the key, in the middleware's own domain, under which a container says how far it is."""
 
@@ -205,6 +217,36 @@ class ServiceInfo(Struct, frozen=True, kw_only=True, omit_defaults=True, weakref
     meta: dict[str, Scalar] = {}
 
 
+class Estop(Struct, frozen=True, array_like=True, gc=False):
+    """An e-stop that is open until somebody clears its id."""
+
+    id: Annotated[str, Meta(min_length=1, max_length=80)]
+    by: Annotated[str, Meta(max_length=300)]
+    """The session of who gave it."""
+    reason: Annotated[str, Meta(max_length=500)]
+    at: float
+    """``time.time()`` there."""
+
+
+class EstopOrder(Struct, array_like=True, gc=False):
+    """Put on ``estop/<identity>`` until all have confirmed: one e-stop is opened, or some are cleared."""
+
+    v: int
+    request: Annotated[str, Meta(min_length=1, max_length=80)]
+    """Names the order; of an e-stop, its id."""
+    opened: Estop | None = None
+    cleared: Annotated[tuple[str, ...], Meta(max_length=64)] = ()
+
+
+class EstopConfirmed(Struct, array_like=True, gc=False):
+    """Put on ``estop/<identity>/<container>/<epoch>`` by who did what an order says."""
+
+    v: int
+    request: str
+    problem: str = ""
+    """What of it failed."""
+
+
 class ProviderInfo(Struct, frozen=True, kw_only=True):
     """A registry entry. Identity, container, epoch, domain and provider stand in its key."""
 
@@ -224,6 +266,8 @@ class ProviderInfo(Struct, frozen=True, kw_only=True):
     health: str = HEALTHY
     members: dict[str, tuple[str, ...]] = {}
     """What the robot's groups consist of: group -> resources, whether or not they are there."""
+    estops: tuple[Estop, ...] = ()
+    """Of the middleware's own provider: what is open in its container; who hears it takes the union."""
 
 
 class _ProviderMessage(ProviderInfo, frozen=True, kw_only=True):
@@ -263,7 +307,7 @@ EMPTY: Final = Raw(msgspec.msgpack.encode(None))
 EMPTY_ARGUMENTS: Final = Raw(msgspec.msgpack.encode(()))
 
 
-_Message = TypeVar("_Message", Call, Reply, _ProviderMessage, Tally)
+_Message = TypeVar("_Message", Call, Reply, _ProviderMessage, Tally, EstopOrder, EstopConfirmed)
 
 
 class Malformed(Exception):
@@ -277,6 +321,8 @@ _service_decoder: Final = msgspec.msgpack.Decoder(ServiceInfo)
 _services: Final[WeakValueDictionary[bytes, ServiceInfo]] = WeakValueDictionary()
 """The services known now by their bytes: a thousand objects of one class tell the same."""
 _tally_decoder: Final = msgspec.msgpack.Decoder(Tally)
+_estop_order_decoder: Final = msgspec.msgpack.Decoder(EstopOrder)
+_estop_confirmed_decoder: Final = msgspec.msgpack.Decoder(EstopConfirmed)
 encode_message: Final = msgspec.msgpack.Encoder().encode
 
 
@@ -310,6 +356,21 @@ def _service(data: bytes) -> ServiceInfo:
 
 def decode_tally(payload: bytes) -> Tally:
     return _decoded(_tally_decoder, payload)
+
+
+def decode_estop_order(payload: bytes, identity: str) -> EstopOrder:
+    """An order, given by that identity."""
+    order = _decoded(_estop_order_decoder, payload)
+    estop = order.opened
+    if estop is not None and (estop.id != order.request or not estop.by.startswith(f"{identity}/")):
+        raise Malformed(f"e-stop {estop.id!r} of {estop.by!r} is not one of {identity}")
+    if not all(map(is_chunk, (order.request, *order.cleared))):  # they name files, too
+        raise Malformed("an e-stop's id is one chunk")
+    return order
+
+
+def decode_estop_confirmed(payload: bytes) -> EstopConfirmed:
+    return _decoded(_estop_confirmed_decoder, payload)
 
 
 def _decoded(decoder: msgspec.msgpack.Decoder[_Message], payload: bytes) -> _Message:

@@ -31,6 +31,7 @@ LEASE_MS: Final = 2000
 _CHANNEL_CAPACITY: Final = 4096
 _MOST_KNOWN_KEYS: Final = 1024
 _BLOCK: Final = zenoh.CongestionControl.BLOCK
+_DROP: Final = zenoh.CongestionControl.DROP
 _CLOSED: Final = (zenoh.ZError, RuntimeError)
 """What zenoh raises for something closed already, and for something that another thread closes or uses right now."""
 _PUT: Final = zenoh.SampleKind.PUT
@@ -183,12 +184,12 @@ class ZenohTransport(Transport):
             ) from None
         self.links: Final = Links(self._session, settings)
 
-    def publish(self, key: str, *, urgent: bool = False) -> Publisher:
+    def publish(self, key: str, *, urgent: bool = False, droppable: bool = False) -> Publisher:
         priority = zenoh.Priority.REAL_TIME if urgent else zenoh.Priority.DATA
         with _refusing():
             known = self._session.declare_keyexpr(key)
             declared = self._session.declare_publisher(
-                known, congestion_control=_BLOCK, express=True, priority=priority
+                known, congestion_control=_DROP if droppable else _BLOCK, express=True, priority=priority
             )
         return ZenohPublisher(declared, lambda: self._session.undeclare(known))
 

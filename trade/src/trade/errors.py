@@ -29,6 +29,7 @@ __all__ = [
     "LockLost",
     "LockedByOther",
     "MotionStopped",
+    "NoSuchEstop",
     "NoSuchService",
     "NotSerialisable",
     "OutcomeUnknown",
@@ -234,6 +235,19 @@ class Stopped(CallerError, RuntimeError):
     def describe(self) -> str:
         remedy = "`trade estop --clear`" if self.estop else "trade.resume(...) or `trade resume`"
         return f"{self.resource} was stopped by {self.by}: {self.reason}. When it is safe to move, call {remedy}"
+
+
+@dataclass(kw_only=True, eq=False)
+class NoSuchEstop(CallerError, LookupError):
+    """Nobody in the system knows an e-stop of that id as open; nothing was cleared."""
+
+    ids: Sequence[str]
+    open: Sequence[str]
+    """Those that are."""
+
+    def describe(self) -> str:
+        there = f"open {'is' if len(self.open) == 1 else 'are'} {_some(self.open)}" if self.open else "none is open"
+        return f"there is no open e-stop {', '.join(self.ids)}; {there}"
 
 
 @dataclass(kw_only=True, eq=False)

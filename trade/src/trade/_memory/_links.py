@@ -15,6 +15,8 @@ class Kind(enum.Enum):
 
     PUT = "put"
     URGENT = "urgent"
+    DROPPABLE = "droppable"
+    """Urgent, and lost where it would have to wait."""
     ANNOUNCE = "announce"
     RISE = "rise"
     """A sign of life goes up."""
@@ -40,6 +42,7 @@ class Lane(enum.Enum):
 _LANES: Final = {
     Kind.PUT: Lane.DATA,
     Kind.URGENT: Lane.URGENT,
+    Kind.DROPPABLE: Lane.URGENT,
     Kind.ANNOUNCE: Lane.ANNOUNCEMENTS,
     Kind.RISE: Lane.PRESENCE,
     Kind.FALL: Lane.PRESENCE,
@@ -81,7 +84,8 @@ class Way:
     def send(self, kind: Kind, arrive: Arrive) -> None:
         """Let something arrive after its delay, behind what went before it in its lane; leaving goes behind all."""
         if self.cut:
-            self._held.append((kind, arrive))
+            if kind is not Kind.DROPPABLE:
+                self._held.append((kind, arrive))
             return
         behind = list(Lane) if kind is Kind.LEAVE else [_LANES[kind]]
         now_ns = self._traffic.clock.monotonic_ns()

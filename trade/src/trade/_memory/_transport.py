@@ -63,9 +63,9 @@ class MemoryTransport(Transport):
         """Whether it was closed or killed."""
         return self.node.closed
 
-    def publish(self, key: str, *, urgent: bool = False) -> Publisher:
+    def publish(self, key: str, *, urgent: bool = False, droppable: bool = False) -> Publisher:
         self._check_open()
-        return MemoryPublisher(self, key, Kind.URGENT if urgent else Kind.PUT)
+        return MemoryPublisher(self, key, Kind.DROPPABLE if droppable else Kind.URGENT if urgent else Kind.PUT)
 
     def subscribe(self, pattern: str) -> Channel:
         return self._listen(pattern, self.node.ears)

@@ -5,6 +5,7 @@ import math
 import threading
 import time
 from collections.abc import Callable, Generator
+from pathlib import Path
 from typing import Final
 
 from trade._container import Container
@@ -29,7 +30,10 @@ class MemorySystem:
     moved by ``advance`` and its kind alone; deadlines of calls go by the real one.
     """
 
-    def __init__(self, *, seed: int = 0, lease_s: float = 2.0, beat_s: float = math.inf) -> None:
+    def __init__(
+        self, *, seed: int = 0, lease_s: float = 2.0, beat_s: float = math.inf, state_dir: Path | None = None
+    ) -> None:
+        self._state_dir = state_dir
         self.network: Final = Network(seed=seed, lease_s=lease_s, beat_s=beat_s)
         self._containers: dict[str, Container] = {}
         self._every: list[Container] = []
@@ -46,7 +50,7 @@ class MemorySystem:
         node = self.network.node(name)
         if node is not None and not node.closed:
             return self._containers[name]
-        settings = Settings(system="memory", identity=identity, container=name)
+        settings = Settings(system="memory", identity=identity, container=name, state_dir=self._state_dir)
         container = Container(settings, transport=MemoryTransport(self.network, name))
         self._containers[name] = container
         self._every.append(container)
@@ -147,7 +151,7 @@ class MemorySystem:
 
 @contextlib.contextmanager
 def memory_system(
-    *, seed: int = 0, lease_s: float = 2.0, beat_s: float = math.inf
+    *, seed: int = 0, lease_s: float = 2.0, beat_s: float = math.inf, state_dir: Path | None = None
 ) -> Generator[MemorySystem, None, None]:
     """A system in memory for one test; its containers are closed at the end.
 
@@ -155,8 +159,9 @@ def memory_system(
         seed: of the generator that draws jitter.
         lease_s: how long a partition lasts, on the network's clock, until containers lose each other.
         beat_s: how often a container says how far it is, in seconds of the real clock: who lost a message asks then.
+        state_dir: where containers keep what outlives them, such as open e-stops; none: nowhere.
     """
-    system = MemorySystem(seed=seed, lease_s=lease_s, beat_s=beat_s)
+    system = MemorySystem(seed=seed, lease_s=lease_s, beat_s=beat_s, state_dir=state_dir)
     try:
         yield system
     finally:

@@ -136,6 +136,15 @@ class TransportConformance(StandingConformance):
                     stop.put(b"stop")
                     assert urgent.next().payload == b"stop"
 
+    def test_droppable_messages_arrive_in_order_where_nobody_stalls(self) -> None:
+        with self.pair() as (one, other):
+            ear = listen(other, "room/a", speaker=one)
+            publisher = one.publish("room/a", urgent=True, droppable=True)
+            numbers = [str(number).encode() for number in range(100)]
+            for number in numbers:  # one at a time: two that come at once may be one too many
+                publisher.put(number)
+                assert ear.next().payload == number
+
     # --- waking
 
     def test_waking_reaches_the_readers_of_the_same_transport_and_nobody_else(self) -> None:
@@ -172,7 +181,7 @@ class TransportConformance(StandingConformance):
 
     def test_a_closed_publisher_puts_nothing(self) -> None:
         with self.pair() as (one, _):
-            for publisher in (one.publish("room/a"), one.publish("room/a", urgent=True)):
+            for publisher in (one.publish("room/a"), one.publish("room/a", urgent=True, droppable=True)):
                 publisher.close()
                 publisher.close()
                 assert _refuses(lambda publisher=publisher: publisher.put(b"late"))

@@ -1,0 +1,241 @@
+"""``trade lock``, ``locks``, ``unlock``, ``resume`` and ``estop`` on a simulated robot, as a user types them."""
+
+import json
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+import trade
+from trade import Container, where
+from trade.errors import LockedByOther, Stopped
+from waiting import PATIENCE_S, wait_until
+
+Command = Callable[..., subprocess.CompletedProcess[str]]
+
+MOVES = """
+import sys, threading, trade
+from trade import where
+move = trade.find(where(name="move_to", group="rosie.neck.pan"), wait_s=30).with_(deadline_s=30)
+threads = [threading.Thread(target=lambda: print("moved", round(move(0.1), 1), flush=True))]  # of another thread, too
+for thread in threads:
+    thread.start()
+    thread.join()
+for line in sys.stdin:
+    try:
+        print("again", round(move(float(line)), 1), flush=True)
+    except trade.errors.TradeError as error:
+        print(type(error).__name__, flush=True)
+sys.exit(7)
+"""
+WAITS = """
+import signal, sys, time
+def end(number, frame):
+    print("told", signal.Signals(number).name, flush=True)
+    sys.exit(9)
+signal.signal(signal.SIGTERM, end)
+signal.signal(signal.SIGINT, end)
+print("waiting", flush=True)
+time.sleep(600)
+"""
+
+
+class Lock:
+    """``trade lock WORDS -- python SOURCE``, talked to."""
+
+    def __init__(self, source: str, *words: str) -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "trade_gateway", "lock", *words, "--", sys.executable, "-c", source],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+
+    def line(self) -> str:
+        assert self.process.stdout is not None
+        line = self.process.stdout.readline().strip()
+        if not line:
+            pytest.fail(f"it ended with {self.process.wait(PATIENCE_S)}: {self.end()[1]}")
+        return line
+
+    def tell(self, text: str) -> None:
+        assert self.process.stdin is not None
+        self.process.stdin.write(f"{text}\n")
+        self.process.stdin.flush()
+
+    def close(self) -> None:
+        """Tell it to end, and its program with it."""
+        if self.process.poll() is None:
+            self.process.terminate()
+        if self.process.stdout is not None and not self.process.stdout.closed:
+            self.end()
+
+    def end(self) -> tuple[str, str]:
+        """Let its input end; the rest of its output, and its complaints."""
+        return self.process.communicate(timeout=PATIENCE_S)
+
+
+@pytest.fixture
+def locked(rosie_up):
+    """Brings rosie up and holds locks around programs; ends them."""
+    rosie_up()
+    started: list[Lock] = []
+
+    def start(source: str, *words: str) -> Lock:
+        started.append(Lock(source, *words))
+        return started[-1]
+
+    yield start
+    for lock in started:
+        lock.close()
+
+
+def move(joint: str = "pan") -> float:
+    return trade.find(where(name="move_to", group=f"rosie.neck.{joint}"), wait_s=30).with_(deadline_s=30)(0.05)
+
+
+def test_a_program_under_a_lock_moves_and_nobody_else_does(locked, trade_command: Command) -> None:
+    program = locked(MOVES, "rosie.neck.pan", "--purpose", "look around")
+    assert program.line() == "moved 0.1"
+    with pytest.raises(LockedByOther, match="look around"):
+        move()
+    assert move("tilt") == pytest.approx(0.05, abs=0.02)
+    [told] = json.loads(trade_command("locks", "--json").stdout)
+    assert (told["resources"], told["purpose"]) == (["rosie.neck.pan"], "look around")
+    assert "look around" in trade_command("locks").stdout
+    program.end()
+    assert program.process.returncode == 7
+    assert "nothing is locked" in trade_command("locks").stdout
+    assert move() == pytest.approx(0.05, abs=0.02)
+
+
+def test_a_lock_by_names_is_of_all_of_them(locked, trade_command: Command) -> None:
+    program = locked(WAITS, "--name", "move_*", "--name", "enable")
+    assert program.line() == "waiting"
+    [told] = json.loads(trade_command("locks", "--json").stdout)
+    assert told["resources"] == ["rosie.neck.pan", "rosie.neck.tilt"]
+    assert told["purpose"].startswith(sys.executable)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_is_passed_on_and_the_exit_code_comes_back(locked, trade_command: Command, number: int) -> None:
+    program = locked(WAITS, "rosie.head")
+    assert program.line() == "waiting"
+    program.process.send_signal(number)
+    assert program.line() == f"told {signal.Signals(number).name}"
+    program.end()
+    assert program.process.returncode == 9
+    assert json.loads(trade_command("locks", "--json").stdout) == []
+
+
+def test_breaking_a_lock_ends_the_program_and_says_why(locked, trade_command: Command) -> None:
+    program = locked(WAITS, "rosie.neck.pan")
+    assert program.line() == "waiting"
+    broken = trade_command("unlock", "rosie.neck", "--break", "my turn")
+    assert "rosie.neck.pan" in broken.stdout
+    assert program.line() == "told SIGTERM"
+    _, complaints = program.end()
+    assert complaints.startswith("the lock of rosie.neck.pan is lost: container rosie granted it to nobody any more")
+    assert len(complaints.splitlines()) == 1
+    assert program.process.returncode == 1
+    assert "nothing of rosie.neck was locked" in trade_command("unlock", "rosie.neck", "--break", "again").stdout
+
+
+def test_once_the_command_line_is_killed_its_program_is_refused(locked) -> None:
+    program = locked(MOVES, "rosie.neck.pan")
+    assert program.line() == "moved 0.1"
+    program.process.kill()
+    program.process.wait(PATIENCE_S)
+    wait_until(lambda: not trade.locks(), "its lock fell")
+    program.tell("0.2")
+    assert program.line() == "LockLost"
+    assert move() == pytest.approx(0.05, abs=0.02)
+
+
+def test_a_lock_that_cannot_be_had_runs_nothing(locked, trade_command: Command, tmp_path: Path) -> None:
+    program = locked(WAITS, "rosie.head")
+    assert program.line() == "waiting"
+    ran = tmp_path / "ran"
+    refused = trade_command("lock", "rosie.neck.pan", "--wait", "0", "--", "touch", ran)
+    assert refused.returncode == 1
+    assert refused.stderr.startswith("LockedByOther: rosie.neck.pan is locked by")
+    assert not ran.exists()
+    nothing = trade_command("lock", "rosie.*", "--", "/no/such/program")
+    assert (nothing.returncode, nothing.stderr[:10]) == (2, "UsageError")
+    program.close()
+    nothing = trade_command("lock", "rosie.head", "--", "/no/such/program")
+    assert nothing.returncode == 2
+    assert nothing.stderr.startswith("UsageError: /no/such/program: cannot be run: No such file")
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "complaint"),
+    [
+        (["lock", "rosie.head"], 2, "UsageError: trade lock: say what to run"),
+        (["lock", "--", "true"], 2, "UsageError: trade lock: say what to lock"),
+        (["lock", "nowhere", "--", "true"], 1, "ConfigurationError: lock of group='nowhere'"),
+        (["lock", "a b", "--", "true"], 2, "UsageError: lock a b:"),
+        (["estop", "abc"], 2, "UsageError: trade estop: ids are for clearing"),
+        (["estop", "--clear", "abc"], 1, "NoSuchEstop: there is no open e-stop abc; none is open"),
+    ],
+)
+def test_wrong_words_are_answered_in_one_line(
+    trade_command: Command, words: list[str], code: int, complaint: str
+) -> None:
+    said = trade_command(*words)
+    assert said.returncode == code
+    assert said.stderr.startswith(complaint)
+    assert len(said.stderr.splitlines()) == 1
+
+
+# --- stops
+
+
+def test_S09_an_estop_holds_the_robot_until_it_is_cleared(rosie_up, trade_command: Command) -> None:
+    rosie = rosie_up()
+    stopped = trade_command("estop", "--reason", "smoke", "--json")
+    report = json.loads(stopped.stdout)
+    assert stopped.returncode == 0, stopped.stderr
+    assert [name.rpartition("/")[2] for name in report["confirmed"]] == ["rosie"]
+    refused = trade_command("call", "rosie.neck.pan.move_to", "0.1")
+    assert refused.returncode == 1
+    assert "smoke" in refused.stderr
+    rosie.program.signal(signal.SIGTERM)
+    rosie.program.wait()
+    rosie_up()  # a restart changes nothing
+    with pytest.raises(Stopped, match="smoke"):
+        move()
+    cleared = trade_command("estop", "--clear")
+    assert (cleared.returncode, "cleared:" in cleared.stdout) == (0, True)
+    assert move() == pytest.approx(0.05, abs=0.02)
+    assert "no e-stop is open" in trade_command("estop", "--clear").stdout
+
+
+def test_S09_an_estop_that_misses_somebody_or_finds_nobody_is_no_success(rosie_up, trade_command: Command) -> None:
+    nobody = trade_command("estop", "--limit", "0.2")
+    assert nobody.returncode == 1
+    assert "nobody was found" in nobody.stdout
+    rosie = rosie_up()
+    rosie.program.signal(signal.SIGSTOP)
+    try:
+        missed = trade_command("estop", "--limit", "0.5")
+    finally:
+        rosie.program.signal(signal.SIGCONT)
+    assert missed.returncode == 1
+
+
+def test_S08_what_somebody_else_stopped_moves_again_after_resume(
+    rosie_up, trade_command: Command, start_container: Callable[..., Container]
+) -> None:
+    rosie_up()
+    move()
+    start_container("other").find(where(name="stop", group="rosie.neck.pan"), wait_s=30)()
+    with pytest.raises(Stopped):
+        move()
+    assert "may move again: rosie.neck.pan" in trade_command("resume", "rosie.neck.pan").stdout
+    assert move() == pytest.approx(0.05, abs=0.02)
+    assert "nothing of rosie.neck was held" in trade_command("resume", "rosie.neck").stdout

@@ -1,0 +1,351 @@
+"""S09: one e-stop for the whole system, with messages lost, drivers restarted, and ids cleared."""
+
+import random
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from trade import Container, Estop, EstopReport, Resource, current_call, service, where
+from trade._dispatch import MOST_THREADS
+from trade._memory import MemoryTransport
+from trade._wire import PROTOCOL, EstopOrder, encode_message
+from trade.errors import Busy, ConfigurationError, MotionStopped, NoSuchEstop, Stopped
+from trade.testing import Kind, MemorySystem, memory_system
+
+Eventually = Callable[[Callable[[], bool]], bool]
+GENEROUS_S = 30.0
+
+
+class Axis:
+    """One joint that moves until it is stopped."""
+
+    def __init__(self, name: str, *, stops: bool = True, failing: bool = False) -> None:
+        self.joint = Resource(name)
+        self.resources = [self.joint]
+        self.stopped = 0
+        self.written: list[float] = []
+        self.begun = threading.Event()
+        self._stops = stops
+        self._failing = failing
+
+    @service
+    def move_to(self, goal: float) -> float:
+        self.written.append(goal)
+        return goal
+
+    @service
+    def run(self) -> str:
+        """Move on and on; what stopped it."""
+        call = current_call()
+        assert call is not None
+        assert call.permit is not None
+        self.joint.moving = True
+        self.begun.set()
+        call.wait_cancelled(GENEROUS_S)
+        try:
+            call.permit.gate()
+        except MotionStopped as stopped:
+            return str(stopped)
+        return "not stopped"
+
+    @service(effect="read")
+    def position(self) -> float:
+        return self.written[-1] if self.written else 0.0
+
+    @service(effect="stop")
+    def stop(self) -> None:
+        self.stopped += 1
+        if self._failing:
+            raise OSError("the cable is off")
+        if self._stops:
+            self.joint.moving = False
+
+
+class Bare:
+    """Something with a stop and no resources."""
+
+    def __init__(self) -> None:
+        self.stopped = 0
+
+    @service
+    def go(self) -> None: ...
+
+    @service(effect="stop")
+    def halt(self) -> None:
+        self.stopped += 1
+
+
+def call(container: Container, name: str, group: str, *arguments: object) -> object:
+    return container.find(where(name=name, group=group), wait_s=20).with_(deadline_s=20)(*arguments)
+
+
+@pytest.fixture
+def system(tmp_path: Path) -> Iterator[MemorySystem]:
+    with memory_system(state_dir=tmp_path / "state") as made:
+        yield made
+
+
+def drivers(system: MemorySystem, *names: str) -> list[Axis]:
+    axes = [Axis(f"{name}.joint") for name in names]
+    for name, axis in zip(names, axes, strict=True):
+        system.container(name).register(axis, name)
+    return axes
+
+
+def test_S09_everybody_stops_latches_and_confirms(system: MemorySystem) -> None:
+    one, other = drivers(system, "one", "other")
+    caller = system.container("caller")
+    report = caller.estop("smoke", limit_s=GENEROUS_S)
+    assert report == EstopReport(id=report.id, confirmed=("tester/one", "tester/other"))
+    assert report.complete
+    assert (one.stopped, other.stopped) == (1, 1)
+    for name in ("one", "other"):
+        with pytest.raises(Stopped, match="smoke") as refused:
+            call(caller, "move_to", name, 0.5)
+        assert refused.value.estop
+        assert call(caller, "position", name) == 0.0
+    assert [estop.reason for estop in system.container("one").estops()] == ["smoke"]
+
+
+def test_S09_a_motion_under_way_is_stopped_and_what_was_admitted_is_void(system: MemorySystem) -> None:
+    [axis] = drivers(system, "one")
+    caller = system.container("caller")
+    run = caller.find(where(name="run"), wait_s=20).with_(deadline_s=GENEROUS_S).start()
+    assert axis.begun.wait(GENEROUS_S)
+    system.container("other").estop(limit_s=GENEROUS_S)
+    assert "e-stop" in str(run.result(GENEROUS_S))
+    assert not axis.joint.moving
+
+
+def test_S09_what_does_not_stop_is_told(system: MemorySystem) -> None:
+    system.container("bad").register(Axis("bad.joint", failing=True), "bad")
+    drivers(system, "good")
+    report = system.container("caller").estop(limit_s=GENEROUS_S)
+    assert report.confirmed == ("tester/good",)
+    assert "the cable is off" in report.failed["tester/bad"]
+    assert not report.complete
+
+
+def test_S09_what_still_moves_after_its_stop_is_told(system: MemorySystem) -> None:
+    axis = Axis("heavy.joint", stops=False)
+    system.container("heavy").register(axis, "heavy")
+    axis.joint.moving = True
+    report = system.container("caller").estop(limit_s=GENEROUS_S)
+    assert report.failed == {"tester/heavy": "heavy.joint still moves"}
+
+
+def test_S09_a_stop_that_names_no_resources_is_called_too(system: MemorySystem) -> None:
+    bare = Bare()
+    system.container("bare").register(bare, "bare")
+    caller = system.container("caller")
+    assert caller.estop(limit_s=GENEROUS_S).confirmed == ("tester/bare",)
+    assert bare.stopped == 1
+    with pytest.raises(Stopped):
+        call(caller, "go", "bare")
+
+
+def test_S09_the_callers_own_container_stops_too() -> None:
+    with memory_system() as system:
+        [axis] = drivers(system, "alone")
+        assert system.container("alone").estop(limit_s=GENEROUS_S).confirmed == ("tester/alone",)
+        assert axis.stopped == 1
+
+
+def test_S09_nobody_found_is_no_success_and_is_repeated_to_the_end(system: MemorySystem) -> None:
+    system.container("planner")
+    report = system.container("caller").estop(limit_s=0.35)
+    assert (report.confirmed, report.missing, report.complete) == ((), (), False)
+    assert system.sent(Kind.DROPPABLE) >= 3
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_S09_it_is_repeated_until_it_gets_through_a_network_that_loses_most(seed: int) -> None:
+    with memory_system(seed=seed) as system:
+        axes = drivers(system, "one", "two", "three")
+        caller = system.container("caller")
+        draw = random.Random(seed)
+        system.lose(lambda passage: passage.kind is Kind.DROPPABLE and draw.random() < 0.6)
+        report = caller.estop(limit_s=GENEROUS_S)
+        assert report.complete
+        assert report.confirmed == ("tester/one", "tester/three", "tester/two")
+        assert [axis.stopped for axis in axes] == [1, 1, 1]
+        cleared = caller.estop_clear([report.id], limit_s=GENEROUS_S)
+        assert cleared.complete
+        assert caller.estops() == []
+
+
+def test_S09_who_cannot_be_reached_is_missing_and_takes_it_over_once_it_is_back(
+    system: MemorySystem, eventually: Eventually
+) -> None:
+    away, _ = drivers(system, "away", "near")
+    caller = system.container("caller")
+    for other in ("caller", "near"):
+        system.partition("away", other)
+    report = caller.estop(limit_s=0.5)
+    assert (report.confirmed, report.missing) == (("tester/near",), ("tester/away",))
+    assert away.stopped == 0
+    system.advance(2)
+    system.heal()
+    system.settle()
+    assert eventually(lambda: away.stopped == 1)
+    with pytest.raises(Stopped):
+        call(caller, "move_to", "away", 0.5)
+
+
+def test_S09_a_late_joiner_takes_the_union(system: MemorySystem) -> None:
+    drivers(system, "one")
+    caller = system.container("caller")
+    ids = {caller.estop(reason, limit_s=GENEROUS_S).id for reason in ("first", "second")}
+    late = system.container("late")
+    late.register(Axis("late.joint"), "late")
+    assert {estop.id for estop in late.estops()} == ids
+    with pytest.raises(Stopped, match="first"):
+        call(late, "move_to", "late", 0.1)
+
+
+def test_S09_a_driver_restarted_while_one_is_open_stays_latched(tmp_path: Path) -> None:
+    with memory_system(state_dir=tmp_path) as system:
+        drivers(system, "one")
+        report = system.container("one").estop("spill", limit_s=GENEROUS_S)
+    with memory_system(state_dir=tmp_path) as system:  # everybody was gone
+        drivers(system, "one")
+        with pytest.raises(Stopped, match="spill"):
+            call(system.container("one"), "move_to", "one", 0.1)
+        assert system.container("one").estop_clear([report.id], limit_s=GENEROUS_S).complete
+    with memory_system(state_dir=tmp_path) as system:
+        drivers(system, "one")
+        assert call(system.container("one"), "move_to", "one", 0.1) == 0.1
+
+
+def test_S09_what_cannot_be_read_is_open_all_the_same(tmp_path: Path) -> None:
+    folder = tmp_path / "memory" / "estop"
+    folder.mkdir(parents=True)
+    (folder / "abc.json").write_text("half of")
+    with memory_system(state_dir=tmp_path) as system:
+        drivers(system, "one")
+        [estop] = system.container("one").estops()
+        assert estop.id == "abc"
+        assert "cannot be read" in estop.reason
+
+
+def test_S09_who_cannot_write_it_down_stops_and_says_so(tmp_path: Path) -> None:
+    (tmp_path / "memory").write_text("a file where a folder should be")
+    with memory_system(state_dir=tmp_path) as system:
+        [axis] = drivers(system, "one")
+        report = system.container("one").estop(limit_s=GENEROUS_S)
+        assert "not written down" in report.failed["tester/one"]
+        assert axis.stopped == 1
+
+
+def test_S09_who_has_nothing_to_stop_writes_nothing(tmp_path: Path) -> None:
+    with memory_system(state_dir=tmp_path) as system:
+        system.container("caller").estop(limit_s=0.2)
+        assert list(tmp_path.rglob("*.json")) == []
+        drivers(system, "caller")  # has something from now on
+        assert len(list(tmp_path.rglob("*.json"))) == 1
+
+
+def test_S09_two_at_once_are_cleared_one_by_one(system: MemorySystem) -> None:
+    drivers(system, "one", "two")
+    reports: list[EstopReport] = []
+
+    def estop(name: str) -> None:
+        reports.append(system.container(name).estop(name, limit_s=GENEROUS_S))
+
+    threads = [threading.Thread(target=estop, args=(name,)) for name in ("one", "two")]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(GENEROUS_S)
+    caller = system.container("caller")
+    first, second = reports
+    assert first.complete
+    assert second.complete
+    assert caller.estop_clear([first.id], limit_s=GENEROUS_S).complete
+    with pytest.raises(Stopped):
+        call(caller, "move_to", "one", 0.1)
+    assert caller.estop_clear([second.id], limit_s=GENEROUS_S).complete
+    assert call(caller, "move_to", "one", 0.1) == 0.1
+
+
+def test_S09_clearing_what_nobody_knows_tells_what_is_open(system: MemorySystem) -> None:
+    drivers(system, "one")
+    caller = system.container("caller")
+    report = caller.estop(limit_s=GENEROUS_S)
+    with pytest.raises(NoSuchEstop, match=f"no open e-stop nonsense; open is {report.id}"):
+        caller.estop_clear(["nonsense", report.id])
+    with pytest.raises(Stopped):
+        call(caller, "move_to", "one", 0.1)
+    with pytest.raises(ConfigurationError, match="in a list"):
+        caller.estop_clear(report.id)
+
+
+def test_S09_after_clearing_nothing_moves_by_itself(system: MemorySystem) -> None:
+    [axis] = drivers(system, "one")
+    mover, other = system.container("mover"), system.container("other")
+    run = mover.find(where(name="run"), wait_s=20).with_(deadline_s=GENEROUS_S).start()
+    assert axis.begun.wait(GENEROUS_S)
+    other.estop_clear([other.estop("look", limit_s=GENEROUS_S).id], limit_s=GENEROUS_S)
+    run.result(GENEROUS_S)
+    assert not axis.joint.moving
+    with pytest.raises(Stopped, match=r"trade\.resume"):
+        call(mover, "move_to", "one", 0.1)
+    mover.resume(where(group="one"))
+    assert call(mover, "move_to", "one", 0.1) == 0.1
+
+
+def test_S09_who_was_away_during_clearing_needs_another_one(system: MemorySystem) -> None:
+    away, _ = drivers(system, "away", "near")
+    caller = system.container("caller")
+    report = caller.estop(limit_s=GENEROUS_S)
+    for other in ("caller", "near"):
+        system.partition("away", other)
+    assert caller.estop_clear([report.id], limit_s=0.5).missing == ("tester/away",)
+    system.advance(2)
+    system.heal()
+    system.settle()
+    assert call(caller, "move_to", "near", 0.1) == 0.1
+    with pytest.raises(Stopped):
+        call(caller, "move_to", "away", 0.1)
+    assert [estop.id for estop in caller.estops()] == [report.id]
+    assert caller.estop_clear([report.id], limit_s=GENEROUS_S).complete
+    assert call(caller, "move_to", "away", 0.1) == 0.1
+    assert away.written == [0.1]
+
+
+FORGED = Estop("abc", "mallory/x/e", "", 0.0)
+BAD = {
+    "garbage": ("estop/tester", b"\xc1"),
+    "another's name": ("estop/tester", encode_message(EstopOrder(PROTOCOL, "abc", FORGED))),
+    "another version": ("estop/mallory", encode_message(EstopOrder(PROTOCOL + 1, "abc", FORGED))),
+    "another request": ("estop/mallory", encode_message(EstopOrder(PROTOCOL, "abcd", FORGED))),
+    "a path": ("estop/mallory", encode_message(EstopOrder(PROTOCOL, "../a", Estop("../a", "mallory/x/e", "", 0.0)))),
+    "a path to clear": ("estop/mallory", encode_message(EstopOrder(PROTOCOL, "abc", None, ("../a",)))),
+    "garbage of a confirmation": ("estop/tester/one/e1", b"\xc1"),
+}
+
+
+@pytest.mark.parametrize("what", BAD)
+def test_a_malformed_message_is_dropped_counted_and_latches_nothing(
+    system: MemorySystem, eventually: Eventually, what: str
+) -> None:
+    drivers(system, "one")
+    one = system.container("one")
+    key, payload = BAD[what]
+    MemoryTransport(system.network, "raw").publish(key).put(payload)
+    assert eventually(lambda: one.dropped_messages == 1)
+    assert one.estops() == []
+    assert call(one, "move_to", "one", 0.1) == 0.1
+
+
+def test_S09_orders_reach_who_is_busy_with_calls(system: MemorySystem) -> None:
+    [axis] = drivers(system, "one")
+    caller = system.container("caller")
+    run = caller.find(where(name="run"), wait_s=20).with_(deadline_s=GENEROUS_S)
+    runs = [run.start() for _ in range(MOST_THREADS)]
+    assert axis.begun.wait(GENEROUS_S)
+    assert caller.estop(limit_s=GENEROUS_S).complete
+    for one in runs:
+        assert one.exception(GENEROUS_S) is None or isinstance(one.exception(), (Stopped, Busy))

@@ -1,0 +1,159 @@
+"""The line that e-stops travel on (S09): orders and confirmations that wait for nobody, and are repeated instead."""
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Iterable
+from functools import partial
+from typing import Final
+
+import msgspec
+from msgspec import Struct
+
+from trade._transport import ChannelClosed, Message, Transport
+from trade._wire import (
+    ESTOPS,
+    PROTOCOL,
+    Address,
+    EstopConfirmed,
+    EstopOrder,
+    Malformed,
+    decode_estop_confirmed,
+    decode_estop_order,
+    encode_message,
+    estop_confirmed_key,
+    estop_key,
+    is_chunk,
+)
+
+_logger = logging.getLogger("trade")
+
+_AGAIN_S: Final = 0.1
+
+Expected = Callable[[], set[Address]]
+
+
+class EstopReport(Struct, frozen=True):
+    """Who did what an e-stop, or its clearing, told them."""
+
+    id: str
+    """Of the e-stop; of a clearing all ids, with commas."""
+    confirmed: tuple[str, ...]
+    """Containers (``identity/container``) that did it: what they drive is at rest."""
+    missing: tuple[str, ...] = ()
+    """Containers with something to stop that did not answer in time."""
+    failed: dict[str, str] = {}
+    """Containers that answered that something of it failed, and what."""
+
+    @property
+    def complete(self) -> bool:
+        """Whether somebody was found, and all of them did it."""
+        return bool(self.confirmed) and not self.missing and not self.failed
+
+
+class EstopLine:
+    """Where one container hears orders and confirmations, and gives its own."""
+
+    def __init__(self, transport: Transport, own: Address) -> None:
+        self._orders = transport.publish(estop_key(own.identity), urgent=True, droppable=True)
+        self._confirmations = transport.publish(estop_confirmed_key(own), urgent=True, droppable=True)
+        self._channel = transport.subscribe(ESTOPS)
+        self._take: Callable[[EstopOrder], None] | None = None
+        self._asked: dict[str, dict[Address, str]] = {}
+        """By request: who has confirmed it, and what failed there."""
+        self._changed = threading.Condition()
+        self._thread = threading.Thread(target=self._read, name="trade-estop", daemon=True)
+        self.malformed = 0
+
+    def listen(self, take: Callable[[EstopOrder], None]) -> None:
+        """Begin to hear; what was put before waits until then."""
+        self._take = take
+        self._thread.start()
+
+    def confirm(self, request: str, problem: str) -> None:
+        """Say that it was done, and what of it failed."""
+        try:
+            self._confirmations.put(encode_message(EstopConfirmed(PROTOCOL, request, problem[:500])))
+        except ChannelClosed:
+            _logger.debug("e-stop %s is not confirmed: the container is closing", request)
+
+    def ask(self, order: EstopOrder, expected: Expected, limit_s: float, over: Callable[[], bool]) -> EstopReport:
+        """Repeat an order until all that are expected have confirmed it.
+
+        Args:
+            order: what to do.
+            expected: whose confirmation to wait for, as far as is known; who was expected once stays expected.
+            limit_s: how long to try, in seconds; also if nobody is found.
+            over: whether it is to be repeated no more, for somebody has cleared it.
+        """
+        until = time.monotonic() + limit_s
+        data = encode_message(order)
+        awaited: set[Address] = set()
+        heard: dict[Address, str] = {}
+        with self._changed:
+            self._asked[order.request] = heard
+        if self._take is not None:
+            self._take(order)
+        while (left_s := until - time.monotonic()) > 0 and not over():
+            self._orders.put(data)
+            awaited.update(expected())
+            with self._changed:
+                if self._changed.wait_for(partial(_all_of, awaited, heard), min(_AGAIN_S, left_s)):
+                    break
+        with self._changed:
+            del self._asked[order.request]
+        return EstopReport(
+            id=order.opened.id if order.opened is not None else ",".join(order.cleared),
+            confirmed=_names(address for address in awaited & heard.keys() if not heard[address]),
+            missing=_names(awaited - heard.keys()),
+            failed={_name(address): problem for address, problem in heard.items() if problem},
+        )
+
+    # --- hearing
+
+    def _read(self) -> None:
+        while True:
+            try:
+                self._heard(self._channel.receive())
+            except ChannelClosed:
+                return
+            except (Malformed, msgspec.DecodeError) as bad:
+                self.malformed += 1
+                if self.malformed == 1:
+                    _logger.warning("dropped an e-stop message: %s (further ones are counted, not logged)", bad)
+            except Exception:
+                _logger.exception("an e-stop could not be dealt with")
+
+    def _heard(self, message: Message) -> None:
+        _, *chunks = message.key.split("/")
+        if not all(map(is_chunk, chunks)):
+            raise Malformed(f"{message.key!r} is a pattern")
+        if len(chunks) == 1 and self._take is not None:
+            self._take(decode_estop_order(message.payload or b"", chunks[0]))
+        elif len(chunks) == 3:
+            self._hear_confirmed(Address(*chunks), decode_estop_confirmed(message.payload or b""))
+
+    def _hear_confirmed(self, address: Address, confirmed: EstopConfirmed) -> None:
+        with self._changed:
+            heard = self._asked.get(confirmed.request)
+            if heard is not None:
+                heard[address] = confirmed.problem
+                self._changed.notify_all()
+
+    def close(self) -> None:
+        """End the thread. Idempotent."""
+        self._channel.close()
+        if self._thread.is_alive() and self._thread is not threading.current_thread():
+            self._thread.join(2)
+
+
+def _all_of(awaited: set[Address], heard: dict[Address, str]) -> bool:
+    return bool(awaited) and awaited <= heard.keys()
+
+
+def _names(addresses: Iterable[Address]) -> tuple[str, ...]:
+    return tuple(sorted(map(_name, addresses)))
+
+
+def _name(address: Address) -> str:
+    return f"{address.identity}/{address.container}"

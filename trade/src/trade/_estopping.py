@@ -1,0 +1,160 @@
+"""E-stops of one container, tied together: hearing and giving orders, telling of what is open, taking the union."""
+
+import secrets
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+from msgspec import structs
+
+from trade._deadman import Deadman
+from trade._estop import Estops
+from trade._estop_line import EstopLine, EstopReport
+from trade._estop_store import EstopStore
+from trade._locks import LockTable
+from trade._providers import Providers
+from trade._registry import Change, ContainerState, Record, Registry
+from trade._system import DOMAIN
+from trade._transport import ChannelClosed, Transport
+from trade._wire import PROTOCOL, Address, Estop, EstopOrder, ProviderInfo
+from trade.errors import ConfigurationError, NoSuchEstop
+
+LIMIT_S: Final = 3.0
+_LONGEST_LIMIT_S: Final = 60.0
+_LONGEST_REASON: Final = 500
+
+
+class Estopping:
+    """``container.estop`` and its kind."""
+
+    def __init__(
+        self,
+        transport: Transport,
+        own: Address,
+        registry: Registry,
+        table: LockTable,
+        providers: Providers,
+        folder: Path | None,
+    ) -> None:
+        self._own = own
+        self._registry = registry
+        self._providers = providers
+        self._line = EstopLine(transport, own)
+        self.deadman: Final = Deadman(providers.stop_of, providers.stops, table.resources)
+        self._estops = Estops(
+            table,
+            self.deadman,
+            EstopStore(folder),
+            self._line.confirm,
+            self._tell,
+            lambda: bool(providers.stops()),
+        )
+        self._provider: object = None
+
+    def open_here(self) -> tuple[Estop, ...]:
+        """What is open in this very container."""
+        return self._estops.open()
+
+    def begin(self, provider: object) -> None:
+        """Hear orders from now on.
+
+        Args:
+            provider: the middleware's own, registered; its entry tells what is open, as its ``open_estops``.
+        """
+        self._provider = provider
+        self._registry.listen(self._heard)
+        self._line.listen(self._estops.take)
+
+    @property
+    def malformed(self) -> int:
+        """Messages that were dropped."""
+        return self._line.malformed
+
+    # --- asking
+
+    def estop(self, reason: str, limit_s: float) -> EstopReport:
+        """See `Container.estop`."""
+        _check_limit(limit_s)
+        estop = Estop(secrets.token_hex(4), str(self._own), reason[:_LONGEST_REASON], time.time())
+        order = EstopOrder(PROTOCOL, estop.id, estop)
+
+        def cleared() -> bool:
+            return all(known.id != estop.id for known in self._estops.open())
+
+        return self._line.ask(order, self._with_stops, limit_s, cleared)
+
+    def open(self) -> list[Estop]:
+        """See `Container.estops`."""
+        told = {estop.id: estop for record in self._own_records() for estop in record.estops}
+        told.update((estop.id, estop) for estop in self._estops.open())
+        return sorted(told.values(), key=lambda estop: (estop.at, estop.id))
+
+    def clear(self, ids: Sequence[str], limit_s: float) -> EstopReport:
+        """See `Container.estop_clear`."""
+        _check_limit(limit_s)
+        if isinstance(ids, str) or not ids:
+            problem = "name the e-stops to clear in a list; trade.estops() tells which are open"
+            raise ConfigurationError(where="estop_clear", problem=problem)
+        there = [estop.id for estop in self.open()]
+        if unknown := [name for name in ids if name not in there]:
+            raise NoSuchEstop(ids=unknown, open=there)
+        order = EstopOrder(PROTOCOL, secrets.token_hex(4), None, tuple(ids))
+
+        def expected() -> set[Address]:
+            knowing = (r.key.address for r in self._own_records() if any(estop.id in ids for estop in r.estops))
+            return {*self._with_stops(), *knowing}
+
+        return self._line.ask(order, expected, limit_s, lambda: False)
+
+    def _with_stops(self) -> set[Address]:
+        return {state.address for state in self._registry.containers() if _has_stop(state)}
+
+    def _own_records(self) -> list[Record]:
+        """One record of each container, of the provider that tells what is open there."""
+        containers = self._registry.containers()
+        return [records[0] for state in containers for _, records in state.providers.values() if _tells(records)]
+
+    # --- telling and hearing of what is open
+
+    def _tell(self) -> None:
+        """Let our registry entry say what is open, for those who join."""
+        try:
+            self._providers.alter(self._provider, lambda info: _with(info, self._estops.open()))
+        except (ChannelClosed, ConfigurationError):  # the container is closing
+            return
+
+    def _heard(self, change: Change) -> None:
+        """Told by the registry."""
+        for record in (*change.joined, *change.replaced):
+            if record.estops and not record.local:
+                self._estops.learn(record.estops)
+        if self._estops.open() and any(record.local and _is_stop(record) for record in change.joined):
+            self._estops.keep()
+
+    def close(self) -> None:
+        """Hear no more. Idempotent."""
+        self._line.close()
+        self._estops.close()
+
+
+def _with(info: ProviderInfo, estops: tuple[Estop, ...]) -> ProviderInfo:
+    return structs.replace(info, estops=estops)
+
+
+def _is_stop(record: Record) -> bool:
+    return record.info.effect == "stop" and record.key.domain != DOMAIN
+
+
+def _has_stop(state: ContainerState) -> bool:
+    return any(_is_stop(record) for _, records in list(state.providers.values()) for record in records)
+
+
+def _tells(records: Sequence[Record]) -> bool:
+    return bool(records) and records[0].key.domain == DOMAIN
+
+
+def _check_limit(limit_s: float) -> None:
+    if not 0 < limit_s <= _LONGEST_LIMIT_S:
+        problem = f"limit_s must be above 0 and at most {_LONGEST_LIMIT_S:g}, not {limit_s!r}"
+        raise ConfigurationError(where="estop", problem=problem)

@@ -1,0 +1,55 @@
+"""A lock that another process holds and passed on to this one in its environment (``trade lock GROUP -- COMMAND``)."""
+
+import json
+from typing import Final
+
+from trade._wire import Address, Token
+from trade.errors import ConfigurationError, LockLost
+
+VARIABLE: Final = "TRADE_LOCK"
+
+
+def passed_on(holder: Address, resources: tuple[str, ...], tokens: list[Token]) -> str:
+    """What stands in the variable."""
+    numbers = [[token.epoch, token.number] for token in tokens]
+    return json.dumps([[holder.identity, holder.container, holder.epoch], list(resources), numbers])
+
+
+class InheritedLock:
+    """Every call of one container of this process is made under it, in all threads, while its holder lives.
+
+    Args:
+        text: what `passed_on` gave.
+        owner: the container of this process that makes the calls.
+
+    Raises:
+        ConfigurationError: the text is something else.
+    """
+
+    def __init__(self, text: str, owner: Address) -> None:
+        self.owner: Final = owner
+        try:
+            holder, resources, tokens = json.loads(text)
+            self._holder = Address(*map(str, holder))
+            self._resources = tuple(map(str, resources))
+            self._tokens = [Token(str(epoch), int(number)) for epoch, number in tokens]
+        except (ValueError, TypeError):
+            problem = "is what `trade lock` passes to the command it runs; unset it"
+            raise ConfigurationError(where=VARIABLE, problem=problem) from None
+        self._lost = False
+
+    @property
+    def held(self) -> bool:
+        """Whether it holds, as far as one can know here: those who granted it judge."""
+        return not self._lost
+
+    def tokens(self) -> list[Token]:
+        """What shows it to those it was granted by; raises LockLost once its holder is gone."""
+        if self._lost:
+            reason = f"{self._holder.container}, which held it, has ended or cannot be reached"
+            raise LockLost(resources=self._resources, reason=reason)
+        return self._tokens
+
+    def lost(self, address: Address) -> None:
+        """A container has ended or cannot be reached."""
+        self._lost = self._lost or address == self._holder
