@@ -17,7 +17,6 @@ from trade._context import CallContext, current_call, progress
 from trade._handle import Bound, Handle, Run
 from trade._lock import Lock, OnLost, OnRequest
 from trade._locking import LEASE_S
-from trade._locks import LockInfo
 from trade._many import Outcome
 from trade._notifications import Callback, Notification
 from trade._resources import Permit, Resource, permit
@@ -25,6 +24,7 @@ from trade._secret import Secret
 from trade._service import service
 from trade._settings import Settings
 from trade._system import ContainerInfo, System
+from trade._terms import LockInfo
 from trade._wire import HEALTHY, Scalar
 
 __all__ = [

@@ -25,7 +25,7 @@ from trade._invoke import LocalTarget, RemoteTarget, Request, container_closed
 from trade._joining import join
 from trade._lock import Lock, OnLost, OnRequest
 from trade._locking import LEASE_S, Locking
-from trade._locks import LockInfo, LockTable
+from trade._locks import LockTable
 from trade._notifications import Callback, Notification, Notifier
 from trade._own_services import OwnServices
 from trade._providers import Providers, checked_groups, checked_health
@@ -35,6 +35,7 @@ from trade._resources import Holder
 from trade._settings import Settings
 from trade._signature import Codec
 from trade._system import DOMAIN, PROVIDER, ContainerInfo, System
+from trade._terms import LockInfo
 from trade._transport import ChannelClosed, Transport
 from trade._watch import Watch
 from trade._wire import (

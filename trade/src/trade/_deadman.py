@@ -40,14 +40,14 @@ class Deadman:
         by_stop: dict[LocalService, list[Resource]] = {}
         for resource in resources:
             resource.stop("trade", (), reason)
-            for permit in list(resource.calls.values()):
-                if permit.cancel is not None:
-                    permit.cancel()
             service = self._stop_of(resource)
-            if service is None:  # nothing physical: its calls were told to end
+            if service is None:  # nothing physical: its calls are told to end
                 done(resource, "")
             else:
                 by_stop.setdefault(service, []).append(resource)
+        cancels = [one.cancel for resource in resources for one in list(resource.calls.values()) if one.cancel]
+        if cancels:
+            threading.Thread(target=_end_calls, args=(cancels,), name="trade-deadman", daemon=True).start()
         for service, stopped in by_stop.items():
             _logger.warning("stopping %s: %s", ", ".join(resource.name for resource in stopped), reason)
             threading.Thread(
@@ -55,9 +55,12 @@ class Deadman:
             ).start()
 
     def _stop(self, service: LocalService, resources: list[Resource], done: Callable[[Resource, str], None]) -> None:
+        first = threading.Lock()
+
         def tell(problem: str) -> None:
-            for resource in resources:
-                done(resource, problem)
+            if first.acquire(blocking=False):  # what comes after the time-out counts no more
+                for resource in resources:
+                    done(resource, problem)
 
         timer = threading.Timer(_STOP_S, tell, (f"{service.label} did not end within {_STOP_S:g} s",))
         timer.daemon = True
@@ -69,6 +72,14 @@ class Deadman:
             problem = f"{service.label} failed: {error}"
         timer.cancel()
         tell(problem)
+
+
+def _end_calls(cancels: Sequence[Callable[[], None]]) -> None:
+    for cancel in cancels:
+        try:
+            cancel()
+        except Exception:
+            _logger.exception("a call whose lock or session has ended failed to end")
 
 
 def _log_failure(resource: Resource, problem: str) -> None:

@@ -45,13 +45,14 @@ _decode_error: Final = msgspec.msgpack.Decoder(ErrorInfo).decode
 class Request:
     """One call on its way out: deadline and chain, inherited from the call that makes it."""
 
-    __slots__ = ("_asked_s", "_begun_ns", "_outer", "chain", "deadline_ns", "deadline_s")
+    __slots__ = ("_around", "_asked_s", "_begun_ns", "_outer", "chain", "deadline_ns", "deadline_s")
 
     def __init__(self, deadline_s: float | None) -> None:
         self._begun_ns = now = time.monotonic_ns()
         self._asked_s = self.deadline_s = DEFAULT_DEADLINE_S if deadline_s is None else deadline_s
         self.deadline_ns = now + int(self.deadline_s * 1e9)
         self.chain: tuple[str, ...] = ()
+        self._around = holding.get()
         self._outer = outer = running.get()
         if outer is None:
             return
@@ -66,7 +67,7 @@ class Request:
         Raises:
             LockLost: it actuates, and would do so under a lock that holds no more.
         """
-        outer, around = self._outer, holding.get()
+        outer, around = self._outer, self._around
         if outer is None and not around:
             return None
         locks = [lock for lock in around if lock.owner == own]
