@@ -5,6 +5,7 @@ parts:
   in-flight  the same with 32 calls under way: calls/s as a share of the bare transport's
   local      a call in the same container, of three numbers
   registry   10,000 services as a late joiner sees them: time, memory, finding one (--full: of 10,000 providers, too)
+  locks      taking and giving back four services of two containers; what the checks of resources add to a call
   servo      the Dynamixel driver against what a bus of 1 Mbaud can carry
 
 Progress goes to stderr, tables and targets (met or missed) to stdout. Peers that are not installed are skipped.
@@ -13,7 +14,7 @@ Progress goes to stderr, tables and targets (met or missed) to stdout. Peers tha
 import argparse
 from collections.abc import Callable, Mapping
 
-from tests.bench import _calls, _local, _registry, _servo
+from tests.bench import _calls, _local, _locks, _registry, _servo
 
 _SERVICES_EACH = 10
 
@@ -29,6 +30,7 @@ _PARTS: Mapping[str, Callable[[argparse.Namespace], None]] = {
     "in-flight": lambda options: _calls.run_in_flight(options.n, options.rounds),
     "local": lambda options: _local.run(50 * options.n, options.rounds),
     "registry": _run_registry,
+    "locks": lambda options: _locks.run(options.n, options.rounds),
     "servo": lambda options: _servo.run(options.n, options.rounds, options.seconds),
 }
 _QUICK = {"n": 200, "rounds": 8, "seconds": 1.5}

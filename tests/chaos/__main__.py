@@ -169,7 +169,7 @@ class Run:
     def _cut(self) -> None:
         slot = self._any(drivers=0.0)
         self._note("cut", slot)
-        slot.tell("cut", 0.2 + 1.8 * self._random.random())
+        slot.tell("cut", 0.2 + 2.3 * self._random.random())
 
     def end(self) -> None:
         """Have everybody end by himself, clients first; who does not is killed, and will be missed."""
@@ -209,12 +209,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m tests.chaos", description=__doc__)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--seconds", type=float, default=20.0)
+    parser.add_argument("--minutes", type=float, help="instead of seconds")
     parser.add_argument("--clients", type=int, default=4, help="processes of clients")
     parser.add_argument("--threads", type=int, default=10, help="clients in each")
     parser.add_argument("--drivers", type=int, default=2)
     parser.add_argument("--faults", type=float, default=2.6, help="of each kind, each second")
     given = parser.parse_args()
-    plan = Plan(given.seed, given.seconds, given.clients, given.threads, given.drivers, given.faults)
+    seconds = given.seconds if given.minutes is None else 60 * given.minutes
+    plan = Plan(given.seed, seconds, given.clients, given.threads, given.drivers, given.faults)
     multiprocessing.set_forkserver_preload(["tests.chaos._client", "tests.chaos._driver"])
     with tempfile.TemporaryDirectory(prefix="trade-chaos-") as folder:
         verdict = run(plan, Path(folder))

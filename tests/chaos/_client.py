@@ -1,6 +1,8 @@
 """A client's process: many threads that lock, move, give back, and now and then try what they must not."""
 
 import contextlib
+import logging
+import os
 import queue
 import random
 import threading
@@ -19,7 +21,7 @@ from trade._wire import Address, Token
 from trade._zenoh import ZenohTransport
 from trade.errors import TradeError
 
-LEASE_S = 0.6
+LEASE_S = 0.5
 _WAITS_S = (0.0, 0.3, 1.0, 3.0)
 _FORGED = 400
 
@@ -108,7 +110,7 @@ class Client:
         self._count = 0
 
     def run(self) -> None:
-        acts = [self._lock_and_move] * 8 + [self._move_freely, self._move_as_a_zombie]
+        acts = [self._lock_and_move] * 7 + [self._move_freely] * 2 + [self._move_as_a_zombie]
         while not self._ended.is_set():
             try:
                 handles = self._container.services(where(name="move", group="robot"))
@@ -158,8 +160,9 @@ class Client:
             if not self._still(lock, hold):
                 return
             handle = self._random.choice(some).with_(deadline_s=3)
-            if self._random.random() < 0.4:
+            if self._random.random() < 0.6:
                 handle.start(hold)
+                self._ended.wait(self._random.choice((0.0, 0.02, 0.3)))
             else:
                 handle(hold)
 
@@ -173,6 +176,8 @@ class Client:
 
 def main(pipe: Connection, name: str, seed: int, folder: Path, threads: int) -> None:
     """Be some clients until the pipe says or its other end is gone."""
+    logging.getLogger("trade").setLevel(logging.ERROR)
+    os.environ.pop("TRADE_MUTANT", None)  # for drivers
     log, slow, ended = Log(folder, name), Slow(), threading.Event()
     _hold_back(slow)
     with Container(Settings.read(container=name)) as container:

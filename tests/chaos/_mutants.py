@@ -61,6 +61,6 @@ MUTANTS: dict[str, Callable[[], None]] = {
 
 def mutate() -> None:
     """Become what ``TRADE_MUTANT`` says; raises KeyError for one there is not."""
-    name = os.environ.get("TRADE_MUTANT", "")
+    name = os.environ.pop("TRADE_MUTANT", "")  # TRADE itself knows no such variable, and would say so
     if name:
         MUTANTS[name]()

@@ -121,16 +121,16 @@ def _commands_without_a_grant(grants: list[Grant], ends: list[End], commands: li
         for grant in shown:
             end = ended.get((grant.epoch, grant.number))
             if end is not None and command.t > end.after_t:
-                found.append(
-                    f"{command.hold} commanded {command.resource} at {command.t:.6f}, after its grant had ended"
-                )
+                found.append(f"{_of(command)}, after its grant had ended")
         for grant in here if not shown else ():
             end = ended.get((grant.epoch, grant.number))
             if grant.t < command.t and end is not None and command.t < end.t and command.resource in grant.resources:
-                found.append(
-                    f"{command.hold} commanded {command.resource} at {command.t:.6f} without the grant that held"
-                )
+                found.append(f"{_of(command)}, without the grant that held")
     return found
+
+
+def _of(command: Command) -> str:
+    return f"{command.hold} commanded {command.resource} at {command.t:.6f}"
 
 
 def _grants_that_outlive_their_lease(known: dict[type, list]) -> list[str]:
@@ -151,7 +151,7 @@ def _grants_that_outlive_their_lease(known: dict[type, list]) -> list[str]:
         lasted_s = until - last - _not_had(signs, last, until)
         if lasted_s > _LEASES * grant.lease_s:
             found.append(
-                f"grant {grant.number} of {grant.epoch} lasted {lasted_s:.2f} s, its lease {grant.lease_s:g} s"
+                f"grant {grant.number} lasted {lasted_s:.2f} s after its last lease of {grant.lease_s:g} s began"
             )
     return found
 

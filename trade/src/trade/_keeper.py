@@ -1,6 +1,7 @@
 """Every lock a container has or wants: asked for everywhere, renewed, given back. One of them: `_lock`."""
 
 import contextlib
+import math
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -39,7 +40,7 @@ class Keeper:
         self._locks: list[Lock] = []
         self._changed = threading.Condition()
         self._thread: threading.Thread | None = None
-        self._new = self._closed = False
+        self._closed = False
 
     @property
     def owner(self) -> Address:
@@ -127,24 +128,26 @@ class Keeper:
     def _keep(self, lock: Lock) -> None:
         with self._changed:
             self._locks.append(lock)
-            self._new = True
             if self._thread is None:
                 self._thread = threading.Thread(target=self._run, name="trade-locks", daemon=True)
                 self._thread.start()
             self._changed.notify_all()
 
     def _run(self) -> None:
+        renewed = time.monotonic()
         while True:
             with self._changed:
-                while not self._locks and not self._closed:
-                    self._changed.wait()
+                while not self._closed:
+                    beat_s = min((lock.lease_s for lock in self._locks), default=math.inf) / _BEATS
+                    left_s = renewed + beat_s - time.monotonic()
+                    if left_s <= 0:
+                        break
+                    self._changed.wait(None if left_s == math.inf else left_s)
                 if self._closed:
                     return
-                locks, self._new = list(self._locks), False
+                locks = list(self._locks)
+            renewed = time.monotonic()
             self._renew(locks)
-            with self._changed:
-                beat_s = min(lock.lease_s for lock in locks) / _BEATS
-                self._changed.wait_for(lambda: self._closed or self._new, beat_s)
 
     def _renew(self, locks: Sequence[Lock]) -> None:
         """One call for each container, whatever the number of locks; nobody waits for the answers here."""
