@@ -40,6 +40,8 @@ class Keeper:
         self._locks: list[Lock] = []
         self._changed = threading.Condition()
         self._thread: threading.Thread | None = None
+        self._due = math.inf
+        """When the next renewals go out."""
         self._closed = False
 
     @property
@@ -131,15 +133,16 @@ class Keeper:
             if self._thread is None:
                 self._thread = threading.Thread(target=self._run, name="trade-locks", daemon=True)
                 self._thread.start()
-            self._changed.notify_all()
+            if time.monotonic() + lock.lease_s / _BEATS < self._due:
+                self._changed.notify_all()
 
     def _run(self) -> None:
         renewed = time.monotonic()
         while True:
             with self._changed:
                 while not self._closed:
-                    beat_s = min((lock.lease_s for lock in self._locks), default=math.inf) / _BEATS
-                    left_s = renewed + beat_s - time.monotonic()
+                    self._due = renewed + min((lock.lease_s for lock in self._locks), default=math.inf) / _BEATS
+                    left_s = self._due - time.monotonic()
                     if left_s <= 0:
                         break
                     self._changed.wait(None if left_s == math.inf else left_s)

@@ -4,6 +4,7 @@ All of it is this container's own: grants are made here, leases run on this cloc
 lock, who asks and renews, is `_locking`.
 """
 
+import math
 import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -58,6 +59,8 @@ class LockTable:
         self._count = 0
         self._changed = threading.Condition(threading.RLock())
         self._sooner = threading.Event()
+        self._next_end = math.inf
+        """When the thread of the leases looks again."""
         self._thread: threading.Thread | None = None
         self._closed = False
 
@@ -230,7 +233,7 @@ class LockTable:
         for resource in waiter.resources:
             resource.holder, resource.live = holder, number
             resource.uses, resource.used_at = 0, 0.0
-        self._watch_leases()
+        self._watch_leases(grant.until)
         return Granted(Token(self._epoch, number), tuple(one.name for one in grant.resources), now - asked)
 
     # --- while it is held
@@ -326,11 +329,12 @@ class LockTable:
             with self._changed:
                 self._changed.notify_all()
 
-    def _watch_leases(self) -> None:
+    def _watch_leases(self, until: float) -> None:
         if self._thread is None:
             self._thread = threading.Thread(target=self._run, name="trade-leases", daemon=True)
             self._thread.start()
-        self._sooner.set()
+        if until < self._next_end:
+            self._sooner.set()
 
     def _run(self) -> None:
         while not self._closed:
@@ -342,10 +346,13 @@ class LockTable:
         with self._changed:
             now = self._clock()
             over = [grant.number for grant in self._grants.values() if grant.until <= now]
-            soonest = min((grant.until for grant in self._grants.values() if grant.until > now), default=None)
+            self._next_end = min(
+                (grant.until for grant in self._grants.values() if grant.until > now), default=math.inf
+            )
+            left_s = self._next_end - now
         for number in over:
             self.lose(number, "its lease ended")
-        return None if soonest is None else soonest - now
+        return None if left_s == math.inf else left_s
 
     def close(self) -> None:
         """End every wait. Idempotent."""
