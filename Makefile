@@ -7,8 +7,10 @@ export UV_PYTHON_DOWNLOADS ?= never
 export UV_SYSTEM_CERTS ?= true
 RUN := $(UV) run --locked
 ARGS ?=
+SEED ?= 1
+MINUTES ?= 3
 
-.PHONY: demo test soak-registry chaos check bench clean
+.PHONY: demo test soak-registry chaos chaos-robots check bench clean
 .DEFAULT_GOAL := help
 
 help: ## show the targets
@@ -28,11 +30,14 @@ demo: $(UV) ## a simulated pan-tilt head moves through remote service calls (ARG
 test: $(UV) ## the whole test suite
 	@$(RUN) pytest $(ARGS)
 
+chaos: $(UV) ## locks under kill -9, freezes, cuts and delays; 240 clients (SEED=.. MINUTES=..; exits 1 on a violation)
+	@$(RUN) python -m tests.chaos --seed $(SEED) --minutes $(MINUTES) --clients 8 --threads 30 --drivers 3 $(ARGS)
+
+chaos-robots: $(UV) ## a lock over two robots while a driver is killed and started again, 50 times
+	@CHAOS_ROUNDS=50 $(RUN) pytest tests/system/test_two_robots.py $(ARGS)
+
 soak-registry: $(UV) ## three containers on two hosts register at the same moment, 200 times (root, iproute2)
 	@SOAK_ROUNDS=200 $(RUN) pytest tests/system/test_namespaces.py -k same_moment $(ARGS)
-
-chaos: $(UV) ## a lock over two robots while a driver is killed and started again, 50 times
-	@TRADE_CHAOS_ROUNDS=50 $(RUN) pytest tests/system/test_two_robots.py $(ARGS)
 
 check: $(UV) ## lint, formatting, types, import rules, isolated install of the core
 	@$(RUN) ruff check

@@ -6,6 +6,7 @@ parts:
   local      a call in the same container, of three numbers
   registry   10,000 services as a late joiner sees them: time, memory, finding one (--full: of 10,000 providers, too)
   deadman    how long a joint moves on after its client was killed or frozen
+  locks      taking and giving back four services of two containers; what the checks of resources add to a call
   servo      the Dynamixel driver against what a bus of 1 Mbaud can carry
 
 Progress goes to stderr, tables and targets (met or missed) to stdout. Peers that are not installed are skipped.
@@ -14,7 +15,7 @@ Progress goes to stderr, tables and targets (met or missed) to stdout. Peers tha
 import argparse
 from collections.abc import Callable, Mapping
 
-from tests.bench import _calls, _deadman, _local, _registry, _servo
+from tests.bench import _calls, _deadman, _local, _locks, _registry, _servo
 
 _SERVICES_EACH = 10
 
@@ -31,6 +32,7 @@ _PARTS: Mapping[str, Callable[[argparse.Namespace], None]] = {
     "local": lambda options: _local.run(50 * options.n, options.rounds),
     "registry": _run_registry,
     "deadman": lambda options: _deadman.run(options.rounds),
+    "locks": lambda options: _locks.run(options.n, options.rounds),
     "servo": lambda options: _servo.run(options.n, options.rounds, options.seconds),
 }
 _QUICK = {"n": 200, "rounds": 8, "seconds": 1.5}

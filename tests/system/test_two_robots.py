@@ -15,7 +15,7 @@ from trade.errors import ContainerLost, IncompleteGroup, LockedByOther, LockLost
 from trade_hil_sim import events, writes
 from waiting import wait_until
 
-ROUNDS = int(os.environ.get("TRADE_CHAOS_ROUNDS", "5"))
+ROUNDS = int(os.environ.get("CHAOS_ROUNDS", "5"))
 BOTH = where(group="rosie") | where(group="dora")
 pytestmark = pytest.mark.timeout(120 + 20 * ROUNDS)
 

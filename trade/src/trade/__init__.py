@@ -19,7 +19,6 @@ from trade._estopping import LIMIT_S
 from trade._handle import Bound, Handle, Run
 from trade._lock import Lock, OnLost, OnRequest
 from trade._locking import LEASE_S
-from trade._locks import LockInfo
 from trade._many import Outcome
 from trade._notifications import Callback, Notification
 from trade._resources import Permit, Resource, permit
@@ -27,6 +26,7 @@ from trade._secret import Secret
 from trade._service import service
 from trade._settings import Settings
 from trade._system import ContainerInfo, System
+from trade._terms import LockInfo
 from trade._wire import HEALTHY, Estop, Scalar
 
 __all__ = [

@@ -30,7 +30,7 @@ from trade._invoke import LocalTarget, RemoteTarget, container_closed, new_reque
 from trade._joining import join
 from trade._lock import Lock, OnLost, OnRequest
 from trade._locking import LEASE_S, Locking
-from trade._locks import LockInfo, LockTable
+from trade._locks import LockTable
 from trade._notifications import Callback, Notification, Notifier
 from trade._own_services import OwnServices
 from trade._providers import Providers, checked_groups, checked_health
@@ -39,6 +39,7 @@ from trade._registry import Change, Record, Registry
 from trade._resources import Holder
 from trade._settings import Settings
 from trade._system import DOMAIN, PROVIDER, ContainerInfo, System
+from trade._terms import LockInfo
 from trade._transport import ChannelClosed, Transport
 from trade._watch import Watch
 from trade._wire import (
@@ -463,7 +464,10 @@ class Container:
 
     def _make_target(self, record: Record) -> LocalTarget | RemoteTarget | None:
         if not record.local:
-            return RemoteTarget(record, self._caller, self._codec)
+            try:
+                return RemoteTarget(record, self._caller, self._codec)
+            except ChannelClosed:  # closed meanwhile
+                raise container_closed(self.address) from None
         service = self._providers.lookup(f"{record.key.domain}/{record.key.provider}", record.key.name)
         if service is None:  # deregistered since we looked
             return None

@@ -48,14 +48,12 @@ class Deadman:
         by_stop: dict[LocalService, list[Resource]] = {}
         for resource in resources:
             resource.stop("trade", (), reason)
-            for permit in list(resource.calls.values()):
-                if permit.cancel is not None:
-                    permit.cancel()
             service = self._stop_of(resource)
-            if service is None:  # nothing physical: its calls were told to end
+            if service is None:  # nothing physical: its calls are told to end
                 done(resource, "")
             else:
                 by_stop.setdefault(service, []).append(resource)
+        _ask_to_end(resources)
         for service, stopped in by_stop.items():
             _logger.warning("stopping %s: %s", ", ".join(resource.name for resource in stopped), reason)
             self._begin(service, _each(stopped, done))
@@ -70,10 +68,8 @@ class Deadman:
         """
         resources = self._resources()
         stops: dict[LocalService, list[Resource]] = {service: [] for service in self._stops() if not service.resources}
+        _ask_to_end(resources)
         for resource in resources:
-            for permit in list(resource.calls.values()):
-                if permit.cancel is not None:
-                    permit.cancel()
             service = self._stop_of(resource)
             if service is not None:
                 stops.setdefault(service, []).append(resource)
@@ -84,7 +80,13 @@ class Deadman:
     def _begin(self, service: LocalService, tell: Callable[[str], None]) -> None:
         threading.Thread(target=self._stop, args=(service, tell), name="trade-deadman", daemon=True).start()
 
-    def _stop(self, service: LocalService, tell: Callable[[str], None]) -> None:
+    def _stop(self, service: LocalService, told: Callable[[str], None]) -> None:
+        first = threading.Lock()
+
+        def tell(problem: str) -> None:
+            if first.acquire(blocking=False):  # what comes after the time-out counts no more
+                told(problem)
+
         timer = threading.Timer(_STOP_S, tell, (f"{service.label} did not end within {_STOP_S:g} s",))
         timer.daemon = True
         timer.start()
@@ -133,6 +135,21 @@ def _each(resources: Sequence[Resource], done: Callable[[Resource, str], None]) 
             done(resource, problem)
 
     return tell
+
+
+def _ask_to_end(resources: Sequence[Resource]) -> None:
+    """What runs on these is to end; what it does then keeps nobody waiting."""
+    cancels = [one.cancel for resource in resources for one in list(resource.calls.values()) if one.cancel]
+    if cancels:
+        threading.Thread(target=_end_calls, args=(cancels,), name="trade-deadman", daemon=True).start()
+
+
+def _end_calls(cancels: Sequence[Callable[[], None]]) -> None:
+    for cancel in cancels:
+        try:
+            cancel()
+        except Exception:
+            _logger.exception("a call whose lock or session has ended failed to end")
 
 
 def _log_failure(resource: Resource, problem: str) -> None:

@@ -109,6 +109,7 @@ class LocalService:
             return self.run_admitted(args, kwargs, context)
         finally:
             permit.close()
+            structs.force_setattr(context, "permit", None)
 
     def run_admitted(self, args: Sequence[Any], kwargs: dict[str, Any], context: CallContext) -> Any:
         """Call with the arguments as they are and nothing more asked: its resources are its own, or it stops them."""

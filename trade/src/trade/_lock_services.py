@@ -6,9 +6,10 @@ from collections.abc import Callable
 from typing import Final
 
 from trade._context import CallContext, current_call
-from trade._locks import Granted, LockInfo, LockTable, Terms
+from trade._locks import LockTable
 from trade._resources import Holder, Resource
 from trade._service import service
+from trade._terms import Granted, LockInfo, Terms
 from trade._wire import Address, Token
 from trade.errors import Busy, LockedByOther
 

@@ -1,13 +1,15 @@
 """What one does with locks: take them over many services, look at them, ask for them, take them away; and resume."""
 
+import contextlib
 from collections.abc import Callable, Iterable, Sequence
 from typing import Final, Protocol
 
 from trade._constraints import Constraint
-from trade._handle import Handle
-from trade._lock import Keeper, Lock, OnLost, OnRequest
-from trade._locks import LockInfo, Terms
+from trade._handle import Handle, Run
+from trade._keeper import Keeper
+from trade._lock import Lock, OnLost, OnRequest
 from trade._system import DOMAIN, PROVIDER
+from trade._terms import LockInfo, Terms
 from trade._wire import Address, ServiceKey
 from trade.errors import ConfigurationError, IncompleteGroup, TradeError
 
@@ -63,13 +65,14 @@ class Locking:
 
     def locks(self) -> list[LockInfo]:
         """See `Container.locks`."""
-        runs = [self._service(address, "locks").start() for address in self._home.addresses()]
+        runs: list[Run] = []
         found: list[LockInfo] = []
+        for address in self._home.addresses():
+            with contextlib.suppress(TradeError):  # it left meanwhile
+                runs.append(self._service(address, "locks").start())
         for run in runs:
-            try:
+            with contextlib.suppress(TradeError):
                 found.extend(run.result())
-            except TradeError:  # it left meanwhile
-                continue
         return sorted(found, key=lambda info: (info.resources, info.container))
 
     def request_release(self, which: Constraint | Iterable[Handle], reason: str) -> list[str]:

@@ -4,14 +4,16 @@ All of it is this container's own: grants are made here, leases run on this cloc
 lock, who asks and renews, is `_locking`.
 """
 
+import math
 import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
 from typing import Final
 
-from msgspec import Struct
+from msgspec import Struct, structs
 
 from trade._resources import Holder, Latch, Resource, locked
+from trade._terms import Granted, LockInfo, Terms
 from trade._wire import Token
 from trade.errors import DeviceSilent, LockedByOther, ServiceGone, TradeError
 
@@ -19,48 +21,6 @@ _STOPPING: Final = Holder("trade", "", "", "stopping what moved under a lock tha
 
 Stop = Callable[[Sequence[Resource], str, Callable[[Resource, str], None]], None]
 """Stops resources for a reason, without waiting; tells of each when it is over, and why if it could not be done."""
-
-
-class Terms(Struct, frozen=True):
-    """How somebody wants a lock."""
-
-    purpose: str = ""
-    lease_s: float = 2.0
-    wait_s: float = 0.0
-    """How long to stand in the queue."""
-    drain_s: float = 0.0
-    """How long to wait, once it is one's turn, for what still runs and moves."""
-    priority: int = 0
-    """Higher ones come first; whoever has it keeps it."""
-    delegates: tuple[str, ...] = ()
-    """Identities that may use it, too."""
-
-
-class Granted(Struct, frozen=True):
-    """A lock's part in one container."""
-
-    token: Token | None
-    """None: everything asked for was locked by the asking call already."""
-    resources: tuple[str, ...]
-    waited_s: float = 0.0
-    """How long after it was asked for; the lease began then."""
-
-
-class LockInfo(Struct, frozen=True):
-    """One grant, as `trade.locks` tells it."""
-
-    token: Token
-    container: str
-    resources: tuple[str, ...]
-    holder: Holder
-    left_s: float
-    """What is left of the lease."""
-    uses: int
-    """Calls made under it."""
-    last_use: float
-    """``time.time()`` of the last one; 0 for none."""
-    waiting: tuple[str, ...]
-    """Who waits for any of it, next first."""
 
 
 class _Grant(Struct, eq=False):
@@ -75,11 +35,10 @@ class _Waiter(Struct, eq=False):
     order: tuple[int, int]
     resources: tuple[Resource, ...]
     holder: Holder
-    tokens: frozenset[Token]
     calls: frozenset[int]
     """Of the asking chain: they are not waited for."""
-    gone: bool = False
-    """Its session has ended."""
+    gone: str = ""
+    """Why it waits in vain."""
 
 
 class LockTable:
@@ -94,11 +53,14 @@ class LockTable:
         """By name, with the number of services that use it."""
         self._grants: dict[int, _Grant] = {}
         self._waiting: list[_Waiter] = []
-        self._acquiring = 0
-        """How many wait for their turn or for what still runs."""
+        """For their turn, next first."""
+        self._acquiring: list[_Waiter] = []
+        """For their turn or for what still runs."""
         self._count = 0
         self._changed = threading.Condition(threading.RLock())
         self._sooner = threading.Event()
+        self._next_end = math.inf
+        """When the thread of the leases looks again."""
         self._thread: threading.Thread | None = None
         self._closed = False
         self._estop: Latch | None = None
@@ -121,7 +83,7 @@ class LockTable:
             resource = known or (named if isinstance(named, Resource) else Resource(name))
             if isinstance(named, Resource) and resource is not named:
                 raise ValueError(f"resource {name} is another object already; share one trade.Resource")
-            resource.epoch, resource.grants = self._epoch, self._grants
+            resource.epoch, resource.over = self._epoch, self._over
             resource.estop = self._estop
             resource.on_rest(self._rested)
             self._resources[name] = (resource, uses + 1)
@@ -135,13 +97,18 @@ class LockTable:
                 resource.estop = latch
 
     def drop(self, resource: Resource) -> None:
-        """One service less uses it."""
+        """One service less uses it. With the last one it is gone: locks of it are lost, who waits for it is refused."""
         with self._changed:
             known, uses = self._resources[resource.name]
             if uses > 1:
                 self._resources[resource.name] = (known, uses - 1)
-            else:
-                del self._resources[resource.name]
+                return
+            del self._resources[resource.name]
+            for waiter in self._acquiring:
+                if resource in waiter.resources:
+                    waiter.gone = f"{resource.name} is no longer offered"
+            self._changed.notify_all()
+        self.lose(resource.live, f"{resource.name} is no longer offered")
 
     def resources(self) -> list[Resource]:
         """All of them, by name."""
@@ -190,24 +157,24 @@ class LockTable:
             DeviceSilent: one could not be stopped when it had to be, and is given to nobody.
             ServiceGone: one is not here.
         """
-        mine = frozenset(tokens)
+        mine = set(tokens)
         resources = tuple(one for one in self.named(names) if Token(self._epoch, one.live) not in mine)
         if not resources:
             return Granted(None, ())
         asked = self._clock()
         with self._changed:
             self._count += 1
-            waiter = _Waiter((-terms.priority, self._count), resources, holder, mine, frozenset(calls))
-            self._acquiring += 1
+            waiter = _Waiter((-terms.priority, self._count), resources, holder, frozenset(calls))
+            self._acquiring.append(waiter)
             try:
                 self._take_turn(waiter, asked + terms.wait_s)
                 return self._empty_and_grant(waiter, terms, asked)
             finally:
-                self._acquiring -= 1
+                self._acquiring.remove(waiter)
 
     def _empty_and_grant(self, waiter: _Waiter, terms: Terms, asked: float) -> Granted:
         try:
-            self._drain(waiter, self._clock() + terms.drain_s)
+            self._drain(waiter, asked + terms.wait_s)
             return self._grant(waiter, terms, asked)
         finally:
             for resource in waiter.resources:
@@ -220,10 +187,7 @@ class LockTable:
         self._waiting.sort(key=lambda one: one.order)
         try:
             while (obstacle := self._obstacle(waiter)) is not None:
-                left = until - self._clock()
-                if left <= 0 or waiter.gone or self._closed:
-                    raise obstacle
-                self._changed.wait(left)
+                self._wait(waiter, until, obstacle)
         finally:
             self._waiting.remove(waiter)
             self._changed.notify_all()
@@ -234,6 +198,7 @@ class LockTable:
         for resource in waiter.resources:
             if resource.unsafe:
                 return DeviceSilent(device=resource.name, bus=self._container, waited_s=0.0)
+        for resource in waiter.resources:
             if resource.live:
                 return locked(resource, resource.holder, waiter.holder.session)
             if resource.pending is not None:
@@ -248,14 +213,15 @@ class LockTable:
 
     def _drain(self, waiter: _Waiter, until: float) -> None:
         while (running := self._running(waiter)) is not None:
-            left = until - self._clock()
-            if left <= 0 or waiter.gone or self._closed:
-                raise LockedByOther(
-                    resources=(running.name,),
-                    owner=", ".join(running.movers) or "somebody",
-                    purpose="a call or a motion that has not ended",
-                )
-            self._changed.wait(left)
+            owner = ", ".join(running.movers) or "somebody"
+            purpose = "a call or a motion that has not ended"
+            self._wait(waiter, until, LockedByOther(resources=(running.name,), owner=owner, purpose=purpose))
+
+    def _wait(self, waiter: _Waiter, until: float, obstacle: TradeError) -> None:
+        left = until - self._clock()
+        if left <= 0 or waiter.gone or self._closed or isinstance(obstacle, DeviceSilent):
+            raise obstacle
+        self._changed.wait(left)
 
     def _running(self, waiter: _Waiter) -> Resource | None:
         """One of them that is still in use by others than the asking chain."""
@@ -266,15 +232,17 @@ class LockTable:
         return None
 
     def _grant(self, waiter: _Waiter, terms: Terms, asked: float) -> Granted:
+        if waiter.gone:
+            raise ServiceGone(service=", ".join(one.name for one in waiter.resources), reason=waiter.gone)
         self._count += 1
-        number = self._count
-        for resource in waiter.resources:
-            resource.holder, resource.live = waiter.holder, number
-            resource.uses, resource.used_at = 0, 0.0
-        now = self._clock()
-        grant = _Grant(number, waiter.resources, waiter.holder, terms.lease_s, now + terms.lease_s)
+        now, number = self._clock(), self._count
+        holder = structs.replace(waiter.holder, since=time.time())
+        grant = _Grant(number, waiter.resources, holder, terms.lease_s, now + terms.lease_s)
         self._grants[number] = grant
-        self._watch_leases()
+        for resource in waiter.resources:
+            resource.holder, resource.live = holder, number
+            resource.uses, resource.used_at = 0, 0.0
+        self._watch_leases(grant.until)
         return Granted(Token(self._epoch, number), tuple(one.name for one in grant.resources), now - asked)
 
     # --- while it is held
@@ -284,7 +252,7 @@ class LockTable:
         with self._changed:
             now = self._clock()
             held = [self._grants[number] for number in numbers if number in self._grants]
-            own = [grant for grant in held if grant.holder.identity == identity]
+            own = [grant for grant in held if grant.holder.identity == identity and grant.until > now]
             for grant in own:
                 grant.until = now + grant.lease_s
             return [grant.number for grant in own]
@@ -308,15 +276,19 @@ class LockTable:
             self._end(grant)
             for resource in busy:
                 resource.pending = _STOPPING
-        if busy:
+        try:
             self._stop(busy, reason, self._stopped)
+        except Exception as error:  # noqa: BLE001 - other locks depend on this very thread
+            for resource in busy:
+                self._stopped(resource, f"it could not be stopped: {error}")
         return True
 
     def session_ended(self, session: str, reason: str) -> None:
         """Nobody of that session (or of one within it) is there any more: its locks fall, its waiting ends."""
         with self._changed:
-            for waiter in self._waiting:
-                waiter.gone = waiter.gone or within(waiter.holder.session, session)
+            for waiter in self._acquiring:
+                if within(waiter.holder.session, session):
+                    waiter.gone = reason
             fallen = [grant.number for grant in self._grants.values() if within(grant.holder.session, session)]
             self._changed.notify_all()
         for number in fallen:
@@ -357,27 +329,39 @@ class LockTable:
                 resource.pending = None
             self._changed.notify_all()
 
+    def _over(self, number: int) -> bool:
+        grant = self._grants.get(number)
+        return grant is None or grant.until <= self._clock()
+
     def _rested(self) -> None:
         if self._acquiring:
             with self._changed:
                 self._changed.notify_all()
 
-    def _watch_leases(self) -> None:
+    def _watch_leases(self, until: float) -> None:
         if self._thread is None:
             self._thread = threading.Thread(target=self._run, name="trade-leases", daemon=True)
             self._thread.start()
-        self._sooner.set()
+        if until < self._next_end:
+            self._sooner.set()
 
     def _run(self) -> None:
         while not self._closed:
             self._sooner.clear()
-            with self._changed:
-                now = self._clock()
-                over = [grant.number for grant in self._grants.values() if grant.until <= now]
-                soonest = min((grant.until for grant in self._grants.values() if grant.until > now), default=None)
-            for number in over:
-                self.lose(number, "its lease ended")
-            self._sooner.wait(None if soonest is None else max(0.0, soonest - now))
+            self._sooner.wait(self.expire())
+
+    def expire(self) -> float | None:
+        """Take away what outlived its lease. Returns in how many seconds the next one may end, if any."""
+        with self._changed:
+            now = self._clock()
+            over = [grant.number for grant in self._grants.values() if grant.until <= now]
+            self._next_end = min(
+                (grant.until for grant in self._grants.values() if grant.until > now), default=math.inf
+            )
+            left_s = self._next_end - now
+        for number in over:
+            self.lose(number, "its lease ended")
+        return None if left_s == math.inf else left_s
 
     def close(self) -> None:
         """End every wait. Idempotent."""
@@ -390,7 +374,6 @@ class LockTable:
 
 
 def _leave_it(resources: Sequence[Resource], _: str, done: Callable[[Resource, str], None]) -> None:
-    """Where nothing is known that stops."""
     for resource in resources:
         done(resource, "")
 

@@ -7,7 +7,7 @@ the permit once more right before bytes go out: any lock, unlock or stop in betw
 import contextlib
 import itertools
 import time
-from collections.abc import Callable, Container, Generator, Iterable, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
 from typing import Any, Final, NamedTuple
 
 from msgspec import Struct
@@ -49,8 +49,8 @@ class Resource:
     """
 
     __slots__ = (
-        *("_moving", "_rested", "calls", "coupled", "epoch", "estop", "grants", "holder", "latch"),
-        *("live", "movers", "name", "pending", "stops", "unsafe", "used_at", "uses"),
+        *("_moving", "_rested", "calls", "coupled", "epoch", "estop", "holder", "latch"),
+        *("live", "movers", "name", "over", "pending", "stops", "unsafe", "used_at", "uses"),
     )
 
     def __init__(self, name: str, *, coupled: Sequence[str] = ()) -> None:
@@ -59,8 +59,8 @@ class Resource:
         """Names of resources of the same container that are only locked together with it."""
         self.epoch = ""
         """Of the container that judges."""
-        self.grants: Container[int] = ()
-        """Every grant that holds there, of whatever."""
+        self.over: Callable[[int], bool] = _every_grant_is_over
+        """Whether a grant of that container holds no more, by the clock of its leases."""
         self.live = 0
         """The grant that holds now; 0 is none."""
         self.holder: Holder | None = None
@@ -156,17 +156,28 @@ class Resource:
             if holder is not None and (caller == holder.identity or caller in holder.delegates):
                 for token in tokens:
                     if token.number == self.live and token.epoch == self.epoch:
+                        if self.over(token.number):
+                            raise lapsed(self)
                         self.uses, self.used_at = self.uses + 1, time.time()
                         return
             raise locked(self, holder, session)
         if self.pending is not None:
             raise locked(self, self.pending, session)
         for token in tokens:
-            if token.epoch == self.epoch and token.number not in self.grants:
-                raise LockLost(resources=(self.name,), reason="its lease ended or it was taken away")
+            if token.epoch == self.epoch and self.over(token.number):
+                raise lapsed(self)
 
     def __repr__(self) -> str:
         return f"<Resource {self.name}>"
+
+
+def _every_grant_is_over(_: int) -> bool:
+    return True
+
+
+def lapsed(resource: Resource) -> LockLost:
+    """The error of who comes under a grant that holds no more."""
+    return LockLost(resources=(resource.name,), reason="its lease ended or it was taken away")
 
 
 def locked(resource: Resource, holder: Holder | None, session: str = "") -> LockedByOther:
@@ -209,9 +220,9 @@ class Permit:
                 latch = resource.estop or resource.latch
                 reason = "it was stopped" if latch is None else f"{latch.by}: {latch.reason}"
                 raise MotionStopped(device=resource.name, reason=reason)
+            if live and (resource.live != live or resource.over(live)):
+                raise lapsed(resource)
             if resource.live != live:
-                if live:
-                    raise LockLost(resources=(resource.name,), reason="its lease ended or it was taken away")
                 raise locked(resource, resource.holder)
 
     def covers(self, resources: Iterable[Resource]) -> bool:

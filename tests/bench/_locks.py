@@ -1,0 +1,115 @@
+"""Locks: what taking and giving back costs beside a call, and what the checks of resources add to a call."""
+
+import sys
+import time
+from collections.abc import Callable
+from multiprocessing.connection import Connection
+from statistics import median
+from typing import Final
+
+from tests.bench._alone import alone
+from tests.bench._children import child, hear
+from tests.bench._places import own_folder
+from tests.bench._report import print_target
+
+_SYSTEM, _GROUP = "bench-locks", "bench"
+_HOSTS: Final = ("one", "other")
+_MOST_CALLS: Final = 3.0
+_MOST_CHECKS: Final = 1.05
+_LOCK, _CALL, _UNCHECKED = "lock and unlock", "call", "call, unchecked"
+
+Results = dict[str, list[float]]
+
+
+def run(n: int, rounds: int) -> None:
+    """Measure and print.
+
+    Args:
+        n: calls, or locks, of each kind in a round.
+        rounds: how often each kind has its turn.
+    """
+    with own_folder(), child(_serve) as server:
+        hear(server)
+        results = alone(_measure, n, rounds)
+    print(f"\nfour services on two containers, uncontended: medians over {rounds} rounds of {n}")
+    for name, us in results.items():
+        print(f"{name:16}{median(us):8.1f} us")
+    pairs = list(zip(results[_LOCK], results[_CALL], results[_UNCHECKED], strict=True))
+    costs = [lock / call for lock, call, _ in pairs]
+    print_target("lock and unlock / call", costs, f"at most {_MOST_CALLS:g}", lambda share: share <= _MOST_CALLS)
+    checks = [call / unchecked for _, call, unchecked in pairs]
+    print_target("checked / unchecked call", checks, f"at most {_MOST_CHECKS:g}", lambda share: share <= _MOST_CHECKS)
+
+
+def _serve(pipe: Connection) -> None:
+    from contextlib import ExitStack
+
+    from trade import Container, Settings, service
+
+    class Joint:
+        def __init__(self, name: str) -> None:
+            self.resources = (name,)
+
+        @service
+        def move(self, angle_rad: float) -> float:
+            return angle_rad
+
+        @service
+        def move_unchecked(self, angle_rad: float) -> float:
+            return angle_rad
+
+        @service(effect="stop")
+        def stop(self) -> None:
+            """Nothing moves here."""
+
+    with ExitStack() as stack:
+        for host in _HOSTS:
+            container = stack.enter_context(Container(Settings.read(container=host, system=_SYSTEM)))
+            for name in ("pan", "tilt"):
+                for handle in container.register(Joint(f"{host}.{name}"), f"{_GROUP}.{host}.{name}"):
+                    local = container._providers.lookup(f"{_GROUP}/{handle.key.provider}", handle.name)
+                    if handle.name == "move_unchecked" and local is not None:
+                        local.resources = ()
+        pipe.send("ready")
+        try:
+            pipe.recv()
+        except (EOFError, OSError):  # the parent is done with us
+            return
+
+
+def _measure(n: int, rounds: int) -> Results:
+    from trade import Container, Settings, where
+
+    with Container(Settings.read(container="client", system=_SYSTEM)) as container:
+        checked, unchecked = (
+            container.find(where(name=name, group=f"{_GROUP}.one.pan"), wait_s=10)
+            for name in ("move", "move_unchecked")
+        )
+        container.find(where(name="move", group=f"{_GROUP}.other.tilt"), wait_s=10)
+        four = container.services(where(name="move", group=_GROUP))
+
+        def lock() -> None:
+            with container.lock(four):
+                pass
+
+        kinds: dict[str, Callable[[], object]] = {
+            _LOCK: lock,
+            _CALL: lambda: checked(0.1),
+            _UNCHECKED: lambda: unchecked(0.1),
+        }
+        results: Results = {name: [] for name in kinds}
+        for i in range(rounds):
+            for name, do in kinds.items():
+                results[name].append(_p50_us(do, n))
+            print(f"locks: round {i + 1} of {rounds}", file=sys.stderr, flush=True)
+        return results
+
+
+def _p50_us(do: Callable[[], object], n: int) -> float:
+    do()
+    took_us: list[float] = []
+    for _ in range(n):
+        began = time.perf_counter_ns()
+        do()
+        took_us.append((time.perf_counter_ns() - began) / 1e3)
+    return median(took_us)

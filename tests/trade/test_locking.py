@@ -1,0 +1,581 @@
+"""Locks over containers, S11 to S17: all or nothing, carried by calls, renewed, lost as a whole."""
+
+import asyncio
+import contextvars
+import math
+import threading
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+from trade import Container, Handle, Resource, permit, service, where
+from trade._wire import Address
+from trade.errors import (
+    ConfigurationError,
+    DeviceSilent,
+    IncompleteGroup,
+    LockedByOther,
+    LockLost,
+    ServiceGone,
+    Stopped,
+)
+from trade.testing import MemorySystem, memory_system
+from waiting import wait_until
+
+
+class Joint:
+    """One joint: every write goes through the gate, as a driver's does."""
+
+    def __init__(self, name: str = "joint") -> None:
+        self.resource = Resource(name)
+        self.resources = [self.resource]
+        self.written: list[float] = []
+        self.stopped = threading.Event()
+        self.stop_fails = False
+        self.hold = threading.Event()
+        self.hold.set()
+        self.entered = threading.Event()
+
+    @service
+    def move(self, value: float) -> float:
+        with permit(self.resources) as permitted:
+            self.entered.set()
+            self.hold.wait(30)
+            permitted.gate()
+            self.written.append(value)
+        return value
+
+    @service
+    def go_on(self, value: float) -> None:
+        """Comes back at once and moves until it is stopped."""
+        with permit(self.resources) as permitted:
+            permitted.gate()
+            self.resource.moving = True
+
+    @service(effect="read")
+    def where_is_it(self) -> float:
+        return self.written[-1] if self.written else 0.0
+
+    @service(effect="stop")
+    def stop(self) -> None:
+        if self.stop_fails:
+            raise DeviceSilent(device=self.resource.name, bus="/dev/ttyX", waited_s=0.1)
+        self.resource.moving = False
+        self.stopped.set()
+
+
+class Robot:
+    """Joints ``a``, ``b``, ... each on a container of its own, and who uses them."""
+
+    def __init__(self, system: MemorySystem, names: str = "ab") -> None:
+        self.system = system
+        self.me, self.other = system.container("me"), system.container("other")
+        self.joints = {name: Joint(name) for name in names}
+        for name, joint in self.joints.items():
+            system.container(name).register(joint, f"robot.{name}")
+        system.settle()
+
+    def find(self, name: str, what: str = "move", whose: Container | None = None) -> Handle:
+        return (whose or self.me).find(where(group=f"robot.{name}", name=what), wait_s=20)
+
+    def __getitem__(self, name: str) -> Joint:
+        return self.joints[name]
+
+
+@pytest.fixture
+def robot() -> Iterator[Robot]:
+    with memory_system() as system:
+        made = Robot(system)
+        yield made
+        for joint in made.joints.values():
+            joint.hold.set()
+
+
+WHOLE = where(group="robot")
+
+
+def test_S13_services_of_several_containers_are_locked_together_or_not_at_all(robot: Robot) -> None:
+    with robot.me.lock(WHOLE, purpose="walk") as lock:
+        assert lock.resources == ("a", "b")
+        assert (robot.find("a")(0.1), robot.find("b")(0.2)) == (0.1, 0.2)
+        for name in "ab":
+            with pytest.raises(LockedByOther, match="is locked by tester/me for 'walk'") as refused:
+                robot.find(name, whose=robot.other)(0.9)
+            assert (refused.value.resources, refused.value.own) == ([name], False)
+            assert refused.value.since > 0
+    assert robot.find("a", whose=robot.other)(0.3) == 0.3
+    with robot.other.lock(where(group="robot.b")):
+        with pytest.raises(LockedByOther), robot.me.lock(WHOLE, wait_s=0):
+            pass
+        assert robot.find("a", whose=robot.other)(0.4) == 0.4  # nothing of it stayed locked
+    assert robot.me.locks() == []
+
+
+def test_a_lock_is_only_held_once_it_is_whole(robot: Robot) -> None:
+    lock = robot.me.lock(where(group="nothing.there"))
+    with pytest.raises(ConfigurationError):
+        lock.acquire()
+    assert not lock.held
+    with pytest.raises(ConfigurationError, match="a lock is taken once"):
+        lock.acquire()
+
+
+@pytest.mark.parametrize("where_it_is", ["local", "remote"])
+def test_S15_a_started_call_carries_the_locks_around_it(robot: Robot, where_it_is: str) -> None:
+    """Also the first one to a container, which has to ask for its clock before."""
+    me = robot.system.container("a" if where_it_is == "local" else "fresh")
+    handle = robot.find("a", whose=me)
+    with me.lock([handle]):
+        assert handle.start(0.5).result(20) == 0.5
+
+
+def test_S15_the_first_started_call_under_a_lock_of_elsewhere_carries_it(robot: Robot) -> None:
+    fresh = robot.system.container("fresh")
+    handle, unasked = robot.find("a", whose=fresh), robot.find("b", whose=fresh)
+    with fresh.lock([handle, unasked]):
+        peer = fresh._caller.peer(unasked.key.address)
+        peer._low_ns, peer._high_ns = -math.inf, math.inf  # as if it had never been heard
+        assert unasked.start(0.5).result(20) == 0.5
+
+
+def test_S15_another_thread_needs_use_and_the_refusal_says_so(robot: Robot) -> None:
+    handle, outcomes = robot.find("a"), list[Any]()
+
+    def without() -> None:
+        try:
+            handle(0.1)
+        except LockedByOther as error:
+            outcomes.append(error)
+
+    def with_use() -> None:
+        with lock.use():
+            outcomes.append(handle(0.2))
+
+    with robot.me.lock([handle]) as lock:
+        for what in (without, with_use):
+            thread = threading.Thread(target=what)
+            thread.start()
+            thread.join(20)
+    assert outcomes[0].own
+    assert "in another thread use `with lock.use():`" in str(outcomes[0])
+    assert outcomes[1] == 0.2
+
+
+def test_async_with_and_its_tasks(robot: Robot) -> None:
+    handle = robot.find("a")
+
+    async def main() -> list[float]:
+        async with robot.me.lock([handle]):
+            results = await asyncio.gather(handle.acall(0.1), handle.acall(0.2))
+            with pytest.raises(LockedByOther):
+                await robot.find("a", whose=robot.other).acall(0.3)
+        await robot.find("a", whose=robot.other).acall(0.4)
+        return results
+
+    assert asyncio.run(main()) == [0.1, 0.2]
+
+
+def test_a_cancelled_async_with_leaves_nothing_locked(robot: Robot) -> None:
+    async def main() -> None:
+        async with robot.me.lock(WHOLE, wait_s=30):
+            raise AssertionError("it cannot be had")
+
+    async def cancelled() -> None:
+        task = asyncio.create_task(main())
+        await asyncio.to_thread(wait_until, lambda: any(info.waiting for info in robot.me.locks()))
+        task.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await task
+        taken.release()
+
+    taken = robot.other.lock(WHOLE).acquire()
+    asyncio.run(cancelled())
+    wait_until(lambda: robot.me.locks() == [])
+
+
+def test_the_locks_around_a_task_are_forgotten_even_if_giving_back_is_cancelled(robot: Robot) -> None:
+    from trade._context import holding
+
+    async def main() -> None:
+        lock = robot.me.lock(WHOLE)
+        try:
+            async with lock:
+                asyncio.current_task().cancel()  # type: ignore[union-attr]
+        except asyncio.CancelledError:
+            assert holding.get() == ()
+            wait_until(lambda: robot.other.locks() == [])
+
+    asyncio.run(main())
+
+
+# --- S15: inheritance
+
+
+class Relay:
+    """A provider that uses the joint on behalf of its callers."""
+
+    def __init__(self, joint: Handle) -> None:
+        self._joint = joint
+        self.later: Callable[[], Any] = lambda: None
+        self.plain: Callable[[], Any] | None = None
+
+    @service
+    def pass_on(self, value: float) -> float:
+        context = contextvars.copy_context()
+        self.later = lambda: context.run(self._joint, value)
+        return self._joint(value)
+
+    @service
+    def call_plainly(self) -> None:
+        assert self.plain is not None
+        self.plain()
+
+
+def relay(robot: Robot, identity: str = "tester") -> tuple[Relay, Handle]:
+    between = robot.system.container("between", identity=identity)
+    provider = Relay(robot.find("a", whose=between))
+    between.register(provider, "relay")
+    return provider, robot.me.find(where(name="pass_on"), wait_s=20)
+
+
+def test_S15_nested_calls_inherit_while_the_parent_runs_and_no_longer(robot: Robot) -> None:
+    provider, pass_on = relay(robot)
+    with robot.me.lock([robot.find("a")]):
+        assert pass_on(0.1) == 0.1
+        with pytest.raises(LockedByOther):
+            provider.later()
+
+
+def test_S15_a_lock_is_used_by_delegates_only(robot: Robot) -> None:
+    _, pass_on = relay(robot, identity="servant")
+    with robot.me.lock([robot.find("a")]), pytest.raises(LockedByOther):
+        pass_on(0.1)
+    with robot.me.lock([robot.find("a")], delegates=["servant"]):
+        assert pass_on(0.2) == 0.2
+
+
+def test_S15_a_plain_python_call_has_no_lock_even_on_behalf_of_its_owner(robot: Robot) -> None:
+    provider, _ = relay(robot)
+    provider.plain = lambda: robot["a"].move(0.5)
+    with robot.me.lock([robot.find("a")]), pytest.raises(LockedByOther):
+        robot.me.find(where(name="call_plainly"), wait_s=20)()
+    robot["a"].move(0.5)
+
+
+def test_S15_what_a_provider_leaves_running_has_no_permit_any_more() -> None:
+    class Lingering(Joint):
+        later: Callable[[], None]
+
+        @service
+        def linger(self) -> None:
+            context = contextvars.copy_context()
+            self.later = lambda: context.run(self.write)
+
+        def write(self) -> None:
+            with permit(self.resources) as permitted:
+                permitted.gate()
+
+    with memory_system() as system:
+        joint, me = Lingering(), system.container("me")
+        system.container("there").register(joint, "robot")
+        linger = me.find(where(name="linger"), wait_s=20)
+        with me.lock([linger]):
+            linger()
+            with pytest.raises(LockedByOther):
+                joint.later()
+
+
+# --- S12 and S14: loss
+
+
+class Losses:
+    def __init__(self) -> None:
+        self.told: list[LockLost] = []
+
+    def __call__(self, lost: LockLost) -> None:
+        self.told.append(lost)
+
+
+@pytest.mark.parametrize("victim", ["a", "b"])
+def test_S14_a_member_that_dies_loses_the_whole_and_the_rest_stops(robot: Robot, victim: str) -> None:
+    losses, rest = Losses(), "b" if victim == "a" else "a"
+    with pytest.raises(LockLost), robot.me.lock(WHOLE, lease_s=60, on_lost=losses) as lock:
+        robot.find(rest, "go_on")(0.1)
+        handle = robot.find(rest)
+        robot.system.kill(victim)
+        assert robot[rest].stopped.wait(20)
+        wait_until(lambda: losses.told)
+        assert not lock.held
+        with pytest.raises(LockLost, match=f"container {victim} has ended"):
+            handle(0.2)
+    assert robot[rest].written == []
+    wait_until(lambda: robot.other.locks() == [])
+
+
+def test_S14_a_dead_owner_is_noticed_and_what_it_moved_stops(robot: Robot) -> None:
+    robot.me.lock(WHOLE, lease_s=60).acquire()
+    with robot.me.locking.keeper._changed:
+        locks = list(robot.me.locking.keeper._locks)
+    with locks[0].use():
+        robot.find("a", "go_on")(0.1)
+    robot.system.kill("me")
+    assert robot["a"].stopped.wait(20)
+    assert not robot["b"].stopped.is_set()
+    with robot.other.lock(WHOLE, wait_s=20):
+        assert robot.find("b", whose=robot.other)(0.3) == 0.3
+
+
+def test_S12_a_partition_ends_the_lock_on_both_sides(robot: Robot) -> None:
+    losses = Losses()
+    lock = robot.me.lock(WHOLE, lease_s=60, on_lost=losses).acquire()
+    robot.system.partition("me", "a")
+    robot.system.advance(2)
+    wait_until(lambda: losses.told)
+    assert not lock.held
+    with robot.other.lock(WHOLE, wait_s=20):
+        robot.system.heal()
+        robot.system.settle()
+        with lock.use(), pytest.raises(LockLost):
+            robot.find("b")(0.5)
+    assert robot["b"].written == []
+
+
+def test_S12_on_waking_what_could_not_be_renewed_is_lost_before_anything_is_done(
+    robot: Robot,
+) -> None:
+    lock, handle = robot.me.lock([robot.find("a")], lease_s=60).acquire(), robot.find("a")
+    before = robot.system.sent()
+    lock._confirmed = {address: at - 60 for address, at in lock._confirmed.items()}
+    with lock.use(), pytest.raises(LockLost, match="could not be renewed within its lease"):
+        handle(0.1)
+    assert robot["a"].written == []
+    assert robot.system.sent() - before <= 2  # its release and the answer, no call
+
+
+def test_S12_a_short_lease_is_renewed_in_time_beside_a_long_one(robot: Robot) -> None:
+    with robot.me.lock([robot.find("a")], lease_s=60), robot.me.lock([robot.find("b")], lease_s=1.0) as short:
+        first = short._confirmed.copy()
+        wait_until(lambda: all(short._confirmed[address] > first[address] for address in first))
+        assert short.held
+
+
+def test_renewals_go_on_after_one_to_a_container_that_left(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
+    keeper, gone = robot.me.locking.keeper, []
+    real = keeper._service
+
+    def service_of(address: Address, name: str) -> Handle:
+        if name == "renew" and address.container == "a":
+            gone.append(address)
+            raise ServiceGone(service="renew")
+        return real(address, name)
+
+    monkeypatch.setattr(keeper, "_service", service_of)
+    kept = robot.me.lock([robot.find("b")], lease_s=1.0).acquire()
+    doomed = robot.me.lock([robot.find("a")], lease_s=1.0).acquire()
+    wait_until(lambda: gone and not doomed.held)
+    first = kept._confirmed.copy()
+    wait_until(lambda: all(kept._confirmed[address] > first[address] for address in first))
+    kept.release()
+
+
+def test_a_renewal_that_was_under_way_says_nothing_of_what_was_taken_since(robot: Robot) -> None:
+    """It asks for the number of a part that was given back, and taken again under another one."""
+    keeper, lock = robot.me.locking.keeper, robot.me.lock([robot.find("a")], lease_s=60).acquire()
+    [(address, token)] = lock.granted.items()
+    keeper._renewed(address, [(lock, token.number - 1)], 0.0, _Answered([]))
+    assert lock.held
+    lock.release()
+    keeper._renewed(address, [(lock, token.number)], 0.0, _Answered([token.number]))
+
+
+class _Answered:
+    def __init__(self, live: list[int]) -> None:
+        self._live = live
+
+    def result(self, _: float) -> list[int]:
+        return self._live
+
+
+def test_what_is_lost_while_it_waits_for_the_rest_is_no_lock(robot: Robot) -> None:
+    taken = robot.other.lock([robot.find("b", whose=robot.other)], lease_s=60).acquire()
+    lock, outcome = robot.me.lock(WHOLE, wait_s=30, lease_s=60), list[BaseException]()
+
+    def acquire() -> None:
+        try:
+            lock.acquire()
+        except LockLost as error:
+            outcome.append(error)
+
+    waiting = threading.Thread(target=acquire)
+    waiting.start()
+    wait_until(lambda: any(info.waiting for info in robot.other.locks()))  # it has a, and waits for b
+    robot.other.break_lock([robot.find("a", whose=robot.other)], "to see")
+    lock.lose("its part of a was taken back")
+    taken.release()
+    waiting.join(30)
+    assert outcome
+    assert not lock.held
+    wait_until(lambda: robot.other.locks() == [])
+
+
+def test_S14_what_could_not_be_stopped_is_given_to_nobody_until_it_is_resumed(robot: Robot) -> None:
+    robot["a"].stop_fails = True
+    lock = robot.me.lock(WHOLE, lease_s=4).acquire()
+    with lock.use():
+        robot.find("a", "go_on")(0.1)
+    assert len(robot.other.break_lock(WHOLE, "maintenance")) == 2
+    with pytest.raises(DeviceSilent):
+        robot.other.lock(WHOLE, wait_s=20).acquire()
+    robot["a"].resource.moving = False
+    assert robot.other.resume(WHOLE) == ["a"]
+    with robot.other.lock(WHOLE, wait_s=20):
+        pass
+    wait_until(lambda: not lock.held)
+
+
+def test_S08_a_stop_by_another_latches_until_the_owner_of_the_lock_resumes(robot: Robot) -> None:
+    with robot.me.lock(WHOLE):
+        robot.find("a")(0.1)
+        robot.find("a", "stop", robot.other)()
+        with pytest.raises(Stopped):
+            robot.find("a")(0.2)
+        with pytest.raises(LockedByOther):
+            robot.other.resume(WHOLE)
+        assert robot.me.resume(WHOLE) == ["a"]
+        assert robot.find("a")(0.3) == 0.3
+
+
+def test_a_call_under_a_lock_that_is_taken_away_writes_nothing_any_more(robot: Robot) -> None:
+    robot["a"].hold.clear()
+    handle = robot.find("a")
+    lock = robot.me.lock([handle], lease_s=60).acquire()
+    with lock.use():
+        run = handle.start(0.1)
+    assert robot["a"].entered.wait(20)
+    robot.other.break_lock([handle], "to see")
+    robot["a"].hold.set()
+    assert run.exception(20) is not None
+    assert robot["a"].written == []
+
+
+# --- taking turns
+
+
+def test_request_release_reaches_the_owner(robot: Robot) -> None:
+    heard = list[tuple[str, str]]()
+    told = threading.Event()
+
+    def on_request(who: str, reason: str) -> None:
+        heard.append((who, reason))
+        told.set()
+
+    with robot.me.lock(WHOLE, on_request=on_request):
+        assert set(robot.other.request_release(WHOLE, "the door")) == {"tester/me"}
+        assert told.wait(20)
+    assert ("tester/other", "the door") in heard
+    assert robot.other.request_release(WHOLE, "again") == []
+
+
+def test_two_who_want_the_same_in_opposite_order_both_get_it(robot: Robot) -> None:
+    turns = list[str]()
+
+    def take(container: Container, names: str) -> None:
+        handles = [robot.find(name, whose=container) for name in names]
+        for _ in range(20):
+            with container.lock(handles, wait_s=60):
+                turns.append(container.name)
+
+    threads = [threading.Thread(target=take, args=pair) for pair in ((robot.me, "ab"), (robot.other, "ba"))]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(60)
+    assert sorted(turns) == ["me"] * 20 + ["other"] * 20
+
+
+def test_S13_whoever_waits_in_order_keeps_what_it_has_renewed(robot: Robot) -> None:
+    taken = robot.other.lock([robot.find("b", whose=robot.other)], lease_s=60).acquire()
+    lock = robot.me.lock(WHOLE, wait_s=60, lease_s=1.0)
+    waiting = threading.Thread(target=lock.acquire)
+    waiting.start()
+    wait_until(lambda: len(robot.other.locks()) == 2)
+    part = next(info for info in robot.other.locks() if info.resources == ("a",))
+    first = dict(lock._confirmed)
+    wait_until(lambda: lock._confirmed.keys() == first.keys() and min(lock._confirmed.values()) > max(first.values()))
+    assert part.token in [info.token for info in robot.other.locks()]
+    taken.release()
+    waiting.join(60)
+    assert lock.held
+    lock.release()
+
+
+def test_S13_a_nested_lock_does_not_wait_for_its_own_callers(robot: Robot) -> None:
+    class Careful(Joint):
+        def __init__(self, container: Container) -> None:
+            super().__init__("c")
+            self._container = container
+
+        @service
+        def twice(self) -> float:
+            with self._container.lock(where(name="move", group="careful"), wait_s=0):
+                return self._container.find(where(name="move", group="careful"))(0.7)
+
+    home = robot.system.container("careful")
+    home.register(Careful(home), "careful")
+    assert robot.me.find(where(name="twice"), wait_s=20)() == 0.7
+
+
+def test_re_entry_takes_nothing_twice_and_gives_nothing_back_early(robot: Robot) -> None:
+    with robot.me.lock(WHOLE) as outer:
+        with robot.me.lock([robot.find("a")], wait_s=0) as inner:
+            assert inner.held
+            assert robot.find("a")(0.1) == 0.1
+        assert outer.held
+        with pytest.raises(LockedByOther):
+            robot.find("a", whose=robot.other)(0.2)
+
+
+# --- S16 and S17: what is locked
+
+
+def test_S16_an_empty_selection_locks_nothing(robot: Robot) -> None:
+    for nothing in ([], where(group="elsewhere"), where(group="robot", name="where_is_it")):
+        with pytest.raises(ConfigurationError):
+            robot.me.lock(nothing).acquire()
+
+
+def test_S16_an_incomplete_group_is_refused_unless_a_part_will_do(robot: Robot) -> None:
+    joint = Joint("pan")
+    joint.members = {"rosie.head": ("pan", "tilt")}  # type: ignore[attr-defined]
+    robot.system.container("head").register(joint, "rosie.head")
+    robot.me.find(where(group="rosie.head", name="move"), wait_s=20)
+    with pytest.raises(IncompleteGroup, match="tilt"):
+        robot.me.lock(where(group="rosie")).acquire()
+    with robot.me.lock(where(group="rosie"), partial=True) as lock:
+        assert lock.resources == ("pan",)
+
+
+def test_S17_reading_stays_open_unless_it_is_locked_by_its_handle(robot: Robot) -> None:
+    read, mine = robot.find("a", "where_is_it", robot.other), robot.find("a", "where_is_it")
+    with robot.me.lock(WHOLE):
+        assert read() == 0.0
+    with robot.me.lock([mine]):
+        assert mine() == 0.0
+        with pytest.raises(LockedByOther):
+            read()
+
+
+def test_a_stop_is_everybodys(robot: Robot) -> None:
+    with pytest.raises(ConfigurationError, match="cannot be locked"):
+        robot.me.lock([robot.find("a", "stop")]).acquire()
+    with robot.me.lock(WHOLE):
+        robot.find("a", "stop", robot.other)()
+    assert robot["a"].stopped.is_set()
+
+
+def test_a_container_that_closes_under_its_locks_closes_without_an_error(robot: Robot) -> None:
+    lock = robot.me.lock(WHOLE, lease_s=60).acquire()
+    robot.me.close()
+    assert not lock.held
+    wait_until(lambda: robot.other.locks() == [])

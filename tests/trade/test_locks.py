@@ -1,0 +1,560 @@
+"""The lock table by itself, on a clock of the test's: against a model so naive that it is plainly right."""
+
+import concurrent.futures
+import itertools
+import threading
+from collections.abc import Callable, Iterable, Iterator, Sequence
+
+import hypothesis
+import pytest
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
+
+from trade._locks import LockTable
+from trade._resources import Holder, Permit, Resource, admit
+from trade._terms import Granted, Terms
+from trade._wire import Token
+from trade.errors import DeviceSilent, LockedByOther, LockLost, MotionStopped, ServiceGone, Stopped
+from waiting import wait_until
+
+EPOCH = "epoch"
+LONG_S = 1e6
+NAMES = ("a", "b", "c", "d")
+COUPLED = {"c": ("d",), "d": ("c",)}
+
+
+class Table:
+    """A lock table whose clock and whose stops are the test's."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+        self.table = LockTable(EPOCH, "home", lambda: self.now)
+        self.resources = {name: self.table.adopt(Resource(name, coupled=COUPLED.get(name, ()))) for name in NAMES}
+        self.stopping: list[tuple[Resource, Callable[[Resource, str], None]]] = []
+        self.table.stop_with(self._stop)
+        self.pool = concurrent.futures.ThreadPoolExecutor(40)
+
+    def _stop(self, resources: Sequence[Resource], _: str, done: Callable[[Resource, str], None]) -> None:
+        for resource in resources:
+            resource.stop("trade")
+            self.stopping.append((resource, done))
+
+    def acquire(self, names: Iterable[str], session: str = "s", calls: Iterable[int] = (), **terms: object) -> Granted:
+        holder = Holder("tester", session, session, "test", 0.0)
+        tokens = terms.pop("tokens", ())
+        return self.table.acquire(list(names), holder, Terms(**terms), tokens, calls)  # type: ignore[arg-type]
+
+    def take(self, names: Iterable[str], session: str = "s", **terms: object) -> Token:
+        token = self.acquire(names, session, **terms).token
+        assert token is not None
+        return token
+
+    def ask(self, names: Iterable[str], session: str = "s", **terms: object) -> "concurrent.futures.Future[Granted]":
+        """Ask on a thread; returns once it is granted, refused or waits."""
+        before = self.table._count
+        asking = self.pool.submit(self.acquire, list(names), session, **{"wait_s": LONG_S, **terms})
+        wait_until(lambda: asking.done() or self.table._count > before)
+        return asking
+
+    def call(self, names: Iterable[str], tokens: Iterable[Token] = (), session: str = "s", call_id: int = 0) -> Permit:
+        resources = [self.resources[name] for name in names]
+        return admit(
+            resources, call_id=call_id, caller="tester", tokens=tuple(tokens), sessions=(session,), cancel=None
+        )
+
+    def advance(self, duration_s: float) -> None:
+        self.now += duration_s
+        self.table.expire()
+        with self.table._changed:
+            self.table._changed.notify_all()
+
+    def close(self) -> None:
+        self.table.close()
+        self.pool.shutdown()
+
+
+@pytest.fixture
+def table() -> Iterator[Table]:
+    made = Table()
+    yield made
+    made.close()
+
+
+# --- turns
+
+
+def test_who_waits_is_served_in_order_of_arrival(table: Table) -> None:
+    token = table.take("ab")
+    waiting = [table.ask(names, f"s{index}") for index, names in enumerate(["a", "ab", "b", "a"])]
+    table.table.release(token.number, "tester")
+    first = waiting[0].result(60).token
+    assert [asking.done() for asking in waiting[1:]] == [False] * 3  # b is free, but the second one stands before it
+    assert first is not None
+    table.table.release(first.number, "tester")
+    second = waiting[1].result(60).token
+    assert second is not None
+    table.table.release(second.number, "tester")
+    concurrent.futures.wait(waiting, 60)
+    assert all(asking.done() for asking in waiting)
+
+
+def test_a_higher_priority_comes_first_and_takes_nothing_away(table: Table) -> None:
+    token = table.take("a")
+    low, high = table.ask("a", "low"), table.ask("a", "high", priority=1)
+    assert table.resources["a"].live == token.number
+    table.table.release(token.number, "tester")
+    assert high.result(60).token is not None
+    assert not low.done()
+
+
+def test_what_is_coupled_is_locked_together(table: Table) -> None:
+    assert table.acquire("c").resources == ("c", "d")
+    with pytest.raises(LockedByOther):
+        table.acquire("d", "other")
+
+
+def test_nothing_is_held_or_pending_after_a_refusal(table: Table) -> None:
+    table.take("b")
+    with pytest.raises(LockedByOther):
+        table.acquire("ab", "other")
+    table.call("a").gate()
+
+
+def test_re_entry_asks_only_for_what_is_not_held_under_the_calls_own_tokens(table: Table) -> None:
+    token = table.take("a")
+    assert table.acquire("a", tokens=(token,)) == Granted(None, ())
+    assert table.acquire("ab", tokens=(token,)).resources == ("b",)
+
+
+def test_turn_and_emptying_together_last_no_longer_than_was_asked(table: Table) -> None:
+    token = table.take("a")
+    table.call("a", [token])
+    asking = table.ask("a", "other", wait_s=10.0)
+    table.now = 6.0
+    table.table.release(token.number, "tester")
+    wait_until(lambda: table.resources["a"].pending is not None)
+    assert not asking.done()
+    table.advance(5.0)
+    with pytest.raises(LockedByOther, match="a call or a motion that has not ended"):
+        asking.result(60)
+
+
+def test_since_is_the_time_of_the_grant_not_of_the_question(table: Table, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("time.time", lambda: 1000.0)
+    token = table.take("a")
+    asking = table.ask("a", "other")
+    monkeypatch.setattr("time.time", lambda: 2000.0)
+    table.table.release(token.number, "tester")
+    asking.result(60)
+    assert [info.holder.since for info in table.table.infos()] == [2000.0]
+
+
+# --- leases
+
+
+@pytest.mark.parametrize("use", ["renew", "call", "gate"])
+def test_S12_what_outlived_its_lease_is_over_even_before_anybody_looked(table: Table, use: str) -> None:
+    """A provider that was frozen wakes: whoever is first must not find a lock that holds."""
+    token = table.take("a", lease_s=2.0)
+    permitted = table.call("a", [token])
+    table.now = 2.0
+    if use == "renew":
+        assert table.table.renew([token.number], "tester") == []
+    else:
+        with pytest.raises(LockLost):
+            permitted.gate() if use == "gate" else table.call("a", [token], call_id=1)
+
+
+def test_S12_a_renewed_lease_begins_anew_and_a_lost_one_never_does(table: Table) -> None:
+    token = table.take("a", lease_s=2.0)
+    table.advance(1.5)
+    assert table.table.renew([token.number], "tester") == [token.number]
+    table.advance(1.5)
+    assert table.table.renew([token.number], "tester") == [token.number]
+    table.advance(2.0)
+    assert table.table.renew([token.number], "tester") == []
+    assert table.table.infos() == []
+
+
+def test_a_lease_ends_on_its_own_thread_too() -> None:
+    real = LockTable(EPOCH, "home")
+    real.adopt("a")
+    real.acquire(["a"], Holder("tester", "one", "one", "", 0.0), Terms(lease_s=0.1))
+    wait_until(lambda: real.infos() == [])
+    real.close()
+
+
+def test_leases_go_on_ending_after_a_stop_that_raised(table: Table) -> None:
+    def fail(*_: object) -> None:
+        raise RuntimeError("can't start new thread")
+
+    table.table.stop_with(fail)
+    table.take("a", lease_s=2.0)
+    table.take("b", lease_s=2.0)
+    for name in "ab":
+        table.resources[name].moving = True
+    table.advance(2.0)
+    assert table.table.infos() == []
+    with pytest.raises(DeviceSilent):
+        table.acquire("a")
+
+
+def test_only_its_owner_renews_and_releases(table: Table) -> None:
+    token = table.take("a")
+    assert table.table.renew([token.number], "stranger") == []
+    assert not table.table.release(token.number, "stranger")
+    assert table.table.release(token.number, "tester")
+
+
+# --- loss
+
+
+def test_S14_what_moves_under_a_lost_lock_stops_before_it_is_given_on(table: Table) -> None:
+    token = table.take("ab")
+    table.resources["a"].moving = True
+    asking = table.ask("a", "other")
+    table.table.lose(token.number, "gone")
+    [(resource, done)] = table.stopping
+    assert (resource.name, asking.done()) == ("a", False)
+    with pytest.raises(LockedByOther, match="stopping what moved"):
+        table.call("a")
+    table.call("b").close()
+    table.resources["a"].moving = False
+    done(resource, "")
+    assert asking.result(60).resources == ("a",)
+
+
+def test_S14_who_waits_for_what_could_not_be_stopped_is_told_at_once_until_it_is_resumed(table: Table) -> None:
+    token = table.take("ab")
+    table.resources["a"].moving = True
+    waiting = [table.ask(names, names) for names in ("a", "ab")]
+    table.table.lose(token.number, "gone")
+    [(resource, done)] = table.stopping
+    done(resource, "no answer")
+    for asking in waiting:
+        with pytest.raises(DeviceSilent):
+            asking.result(60)
+    resource.moving = False
+    with pytest.raises(DeviceSilent):
+        table.acquire("ab")
+    resource.resume()
+    table.acquire("ab")
+
+
+def test_a_lock_of_what_is_no_longer_offered_is_lost_and_who_waits_for_it_is_refused(table: Table) -> None:
+    token = table.take("ab")
+    asking = table.ask("a", "other")
+    table.table.drop(table.resources["a"])
+    with pytest.raises(ServiceGone, match="a is no longer offered"):
+        asking.result(60)
+    assert table.table.renew([token.number], "tester") == []
+    table.acquire("b")
+    with pytest.raises(ServiceGone):
+        table.acquire("a")
+
+
+def test_a_session_that_ends_while_it_waits_for_a_call_to_end_gets_nothing(table: Table) -> None:
+    running = table.call("a")
+    asking = table.ask("a", "dead/x")
+    table.table.session_ended("dead", "killed")
+    running.close()
+    with pytest.raises((LockedByOther, ServiceGone)):
+        asking.result(60)
+    assert table.table.infos() == []
+
+
+# --- emptying
+
+
+def test_S13_no_call_is_admitted_and_all_are_waited_for_but_the_asking_chain(table: Table) -> None:
+    own, other = table.call("a", call_id=1), table.call("a", call_id=2)
+    asking = table.ask("a", "asking", calls=[1])
+    with pytest.raises(LockedByOther):
+        table.call("a", call_id=3)
+    other.gate()  # what was admitted goes on
+    assert not asking.done()
+    other.close()
+    asking.result(60)
+    with pytest.raises(LockedByOther):
+        own.gate()  # its call goes on, but without the lock
+
+
+def test_S13_a_motion_that_a_call_left_running_is_waited_for(table: Table) -> None:
+    table.resources["a"].moving = True
+    asking = table.ask("a")
+    assert not asking.done()
+    table.resources["a"].moving = False
+    asking.result(60)
+
+
+def test_S11_equal_is_asked_for_not_at_least(table: Table) -> None:
+    old = table.take("a")
+    admitted = table.call("a", [old])
+    table.table.release(old.number, "tester")
+    admitted.close()
+    new = table.take("a", "other")
+    with pytest.raises(LockLost):
+        admitted.gate()
+    for number in (old.number, new.number + 1):
+        with pytest.raises(LockedByOther):
+            table.call("a", [Token(EPOCH, number)])
+    with pytest.raises(LockedByOther):
+        table.call("a", [Token("another epoch", new.number)])
+
+
+def test_S08_a_stop_voids_what_was_admitted_before_it_however_the_lock_stands(table: Table) -> None:
+    token = table.take("a")
+    admitted = table.call("a", [token])
+    table.resources["a"].stop("owner", ["s"])
+    with pytest.raises(MotionStopped):
+        admitted.gate()
+    table.call("a", [token], call_id=1).gate()
+    table.resources["a"].stop("stranger", ["else"])
+    with pytest.raises(Stopped):
+        table.call("a", [token], call_id=2)
+
+
+def test_admitting_and_emptying_at_the_same_moment_never_both_succeed(table: Table) -> None:
+    """A call that passes while a lock is granted is either waited for or refused."""
+    rounds, both = 300, 0
+    ready = threading.Barrier(2)
+
+    def call(number: int) -> bool:
+        ready.wait()
+        try:
+            permitted = table.call("a", call_id=number)
+        except LockedByOther:
+            return False
+        return bool(permitted)
+
+    for number in range(1, rounds):
+        calling = table.pool.submit(call, number)
+        ready.wait()
+        try:
+            granted = table.acquire("a")
+        except LockedByOther:
+            granted = None
+        both += calling.result(60) and granted is not None
+        table.resources["a"].calls.clear()
+        if granted is not None and granted.token is not None:
+            table.table.release(granted.token.number, "tester")
+    assert both == 0
+
+
+# --- against the model
+
+
+class Model(RuleBasedStateMachine):
+    """Who has what, written down as it comes; the table must agree after every step."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.real = Table()
+        self.numbers = itertools.count(1)
+        self.free_from: dict[str, str] = dict.fromkeys(NAMES, "")
+        """Resource -> why nobody gets it: who has it, who empties it, or ``!`` for one that stops."""
+        self.unsafe: set[str] = set()
+        self.moving: set[str] = set()
+        self.queue: list[tuple[tuple[int, int], str, frozenset[str]]] = []
+        self.emptying: list[tuple[str, frozenset[str]]] = []
+        self.until: dict[str, float] = {}
+        self.has: dict[str, frozenset[str]] = {}
+        self.refused: set[str] = set()
+        self.calls: dict[int, tuple[frozenset[str], Permit]] = {}
+        self.asked: dict[str, concurrent.futures.Future[Granted]] = {}
+
+    def teardown(self) -> None:
+        self.real.close()
+        assert all(asking.done() for asking in self.asked.values())  # every acquire ends
+
+    # what the model thinks
+
+    def _whole(self, names: Iterable[str]) -> frozenset[str]:
+        return frozenset(itertools.chain(names, *(COUPLED.get(name, ()) for name in names)))
+
+    def _busy(self, names: Iterable[str]) -> bool:
+        used = set[str]().union(*(used for used, _ in self.calls.values()))
+        return any(name in used or name in self.moving for name in names)
+
+    def _settle(self) -> None:
+        """Give on whatever can be given on."""
+        changed = True
+        while changed:
+            changed = False
+            for order, who, names in sorted(self.queue):
+                earlier = [others for before, _, others in self.queue if before < order]
+                if names & self.unsafe:
+                    self.refused.add(who)
+                elif any(self.free_from[name] for name in names) or any(names & others for others in earlier):
+                    continue
+                else:
+                    self.emptying.append((who, names))
+                    self.free_from.update(dict.fromkeys(names, who))
+                self.queue.remove((order, who, names))
+                changed = True
+                break
+            for who, names in list(self.emptying):
+                if not self._busy(names):
+                    self.emptying.remove((who, names))
+                    self.has[who], self.until[who] = names, self.real.now + 2.0
+                    changed = True
+
+    def _end(self, who: str) -> frozenset[str]:
+        names = self.has.pop(who)
+        self.until.pop(who)
+        self.free_from.update(dict.fromkeys(names, ""))
+        return names
+
+    def _lose(self, who: str) -> None:
+        names = self._end(who)
+        self.free_from.update({name: "!" for name in names if self._busy([name])})
+
+    def _token(self, who: str) -> Token:
+        token = self.asked[who].result(60).token
+        assert token is not None
+        return token
+
+    # what happens
+
+    some = st.sets(st.sampled_from(NAMES), min_size=1, max_size=3)
+
+    @rule(names=some, priority=st.integers(0, 2))
+    def ask(self, names: set[str], priority: int) -> None:
+        number = next(self.numbers)
+        who, whole = f"s{number}", self._whole(names)
+        self.queue.append(((-priority, number), who, whole))
+        self._settle()
+        self.asked[who] = self.real.ask(sorted(names), who, priority=priority, lease_s=2.0)
+
+    @rule(names=some)
+    def try_it(self, names: set[str]) -> None:
+        whole = self._whole(names)
+        waiting = any(whole & others for _, _, others in self.queue)
+        free = not waiting and not any(self.free_from[name] for name in whole) and not self._busy(whole)
+        try:
+            token = self.real.take(sorted(names), "try")
+            assert free and not whole & self.unsafe
+            self.real.table.release(token.number, "tester")
+        except DeviceSilent:
+            assert whole & self.unsafe
+        except LockedByOther:
+            assert not free
+
+    @precondition(lambda self: self.has)
+    @rule(data=st.data(), how=st.sampled_from(["release", "lose", "renew", "session"]))
+    def owner(self, data: st.DataObject, how: str) -> None:
+        who = data.draw(st.sampled_from(sorted(self.has)))
+        number = self._token(who).number
+        if how == "renew":
+            assert self.real.table.renew([number], "tester") == [number]
+            self.until[who] = self.real.now + 2.0
+        elif how == "release":
+            self._end(who)
+            assert self.real.table.release(number, "tester")
+        else:
+            self._lose(who)
+            if how == "lose":
+                assert self.real.table.lose(number, "")
+            self.real.table.session_ended(who, "")
+        self._settle()
+
+    @precondition(lambda self: self.queue or self.emptying)
+    @rule(data=st.data())
+    def waiter_dies(self, data: st.DataObject) -> None:
+        waiting = [who for _, who, _ in self.queue] + [who for who, _ in self.emptying]
+        who = data.draw(st.sampled_from(waiting))
+        self.queue = [one for one in self.queue if one[1] != who]
+        for gone, names in [one for one in self.emptying if one[0] == who]:
+            self.emptying.remove((gone, names))
+            self.free_from.update(dict.fromkeys(names, ""))
+        self.refused.add(who)
+        self.real.table.session_ended(who, "killed")
+        self._settle()
+
+    @rule(duration_s=st.sampled_from([0.5, 1.5, 2.0]))
+    def advance(self, duration_s: float) -> None:
+        for who in [who for who, until in self.until.items() if until <= self.real.now + duration_s]:
+            self._lose(who)
+        self.real.advance(duration_s)
+        self._settle()
+
+    @precondition(lambda self: self.real.stopping)
+    @rule(problem=st.sampled_from(["", "", "no answer"]))
+    def stop_ends(self, problem: str) -> None:
+        resource, done = self.real.stopping.pop(0)
+        self.moving.discard(resource.name)
+        resource.moving = False
+        done(resource, problem)
+        (self.unsafe.add if problem else self.unsafe.discard)(resource.name)
+        if self.free_from[resource.name] == "!":
+            self.free_from[resource.name] = ""
+        self._settle()
+
+    @precondition(lambda self: self.unsafe)
+    @rule()
+    def resume(self) -> None:
+        for name in self.unsafe:
+            self.real.resources[name].resume()
+        self.unsafe.clear()
+        self._settle()
+
+    @rule(names=some, data=st.data())
+    def call(self, names: set[str], data: st.DataObject) -> None:
+        who = data.draw(st.sampled_from(["", *sorted(self.has)]))
+        tokens = [self._token(who)] if who else []
+        number = next(self.numbers)
+        allowed = all(self.free_from[name] in ("", who) for name in names)
+        try:
+            self.calls[number] = (frozenset(names), self.real.call(sorted(names), tokens, call_id=number))
+            assert allowed
+        except LockedByOther:
+            assert not allowed
+        self._settle()
+
+    @precondition(lambda self: self.calls)
+    @rule(data=st.data(), leaves_it_moving=st.booleans())
+    def call_ends(self, data: st.DataObject, leaves_it_moving: bool) -> None:
+        number = data.draw(st.sampled_from(sorted(self.calls)))
+        names, permitted = self.calls.pop(number)
+        for name in names if leaves_it_moving else ():
+            self.moving.add(name)
+            self.real.resources[name].moving = True
+        permitted.close()
+        self._settle()
+
+    @precondition(lambda self: self.moving)
+    @rule()
+    def comes_to_rest(self) -> None:
+        for name in self.moving:
+            self.real.resources[name].moving = False
+        self.moving.clear()
+        self._settle()
+
+    # what must hold
+
+    @invariant()
+    def the_table_agrees(self) -> None:
+        wait_until(lambda: {info.holder.session: frozenset(info.resources) for info in self._infos()} == self.has)
+        wait_until(lambda: all(self.asked[who].done() for who in (*self.has, *self.refused)))
+        assert all(self.asked[who].exception(60) for who in self.refused)
+        waiting = {who for _, who, _ in self.queue} | {who for who, _ in self.emptying}
+        assert not any(self.asked[who].done() for who in waiting)
+
+    @invariant()
+    def a_gate_is_open_only_under_the_grant_that_holds(self) -> None:
+        for names, permitted in self.calls.values():
+            fences = {resource.name: live for resource, live, _ in permitted.fences}
+            now = {name: self.real.resources[name].live for name in names}
+            stopped = any(resource.stops != stops for resource, _, stops in permitted.fences)
+            try:
+                permitted.gate()
+                assert fences == now
+            except (LockLost, LockedByOther, MotionStopped):
+                assert fences != now or stopped
+
+    def _infos(self) -> list:
+        return self.real.table.infos()
+
+
+TestModel = Model.TestCase
+TestModel.settings = hypothesis.settings(max_examples=150, stateful_step_count=40, deadline=None)
