@@ -499,7 +499,7 @@ def test_S13_whoever_waits_in_order_keeps_what_it_has_renewed(robot: Robot) -> N
     lock = robot.me.lock(WHOLE, wait_s=60, lease_s=1.0)
     waiting = threading.Thread(target=lock.acquire)
     waiting.start()
-    wait_until(lambda: len(robot.other.locks()) == 2)
+    wait_until(lambda: any(info.waiting for info in robot.other.locks()))  # it has a, and waits for b
     part = next(info for info in robot.other.locks() if info.resources == ("a",))
     first = dict(lock._confirmed)
     wait_until(lambda: lock._confirmed.keys() == first.keys() and min(lock._confirmed.values()) > max(first.values()))
