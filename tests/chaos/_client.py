@@ -68,8 +68,8 @@ class Slow:
 def _hold_back(slow: Slow) -> None:
     publish = ZenohTransport.publish
 
-    def published(self: ZenohTransport, key: str, *, urgent: bool = False) -> Any:
-        return _Held(publish(self, key, urgent=urgent), slow)
+    def published(self: ZenohTransport, key: str, **how: bool) -> Any:
+        return _Held(publish(self, key, **how), slow)
 
     ZenohTransport.publish = published  # type: ignore[method-assign,assignment]
 

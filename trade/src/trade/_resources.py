@@ -18,6 +18,7 @@ from trade.errors import LockedByOther, LockLost, MotionStopped, Stopped
 
 __all__ = ["Permit", "Resource", "permit"]
 
+_stop_numbers: Final = itertools.count(1).__next__
 _permit_ids: Final = itertools.count(-1, -1).__next__
 """Plain Python calls have no id of the system's; theirs are below zero."""
 
@@ -104,7 +105,7 @@ class Resource:
             sessions: of who stops; none: whoever drives the resource, which never latches.
             reason: why.
         """
-        self.stops += 1
+        self.stops = _stop_numbers()  # not += 1: of two at once one would be lost
         asking = set(sessions)
         used = self.holder is not None or self.busy or self.movers
         if asking and used and not self._is_of(asking):
