@@ -1,7 +1,7 @@
 """The main job, on simulated hardware: a head moves through remote service calls, and what is unsafe is refused.
 
-Three processes: the simulated servos, the driver container, a behaviour. What the behaviour says is checked against the
-simulator's own log of what the servos did; the demo fails if they disagree.
+Processes: the simulated servos, the driver container, the behaviours, of which two want the same head. What they say is
+checked against the simulator's own log of what the servos did; the demo fails if they disagree.
 
     make demo                  the story, then everything ends
     make demo ARGS=--stay      and the robot stays up for you to play with
@@ -16,8 +16,9 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from pathlib import Path
+from typing import TypeVar
 
 import trade
 from trade import Settings, errors, where
@@ -29,6 +30,8 @@ LOOKS_RAD = (0.6, -0.6, 0.0)
 AGREE_RAD = 0.02
 """The servo's own dead band is about a tenth of this."""
 PATIENCE_S = 60.0
+
+_T = TypeVar("_T")
 
 
 class DemoFailed(Exception):
@@ -78,6 +81,56 @@ def compare_with_log(path: Path, began_s: float) -> None:
         raise DemoFailed("the refused command reached the wire")
 
 
+@contextlib.contextmanager
+def behaviour(role: str) -> Generator["subprocess.Popen[str]"]:
+    """One of the two that want the head, in a process of its own."""
+    command = [sys.executable, str(HERE / "who_has_the_head.py"), role]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def hear(process: "subprocess.Popen[str]", until: str) -> None:
+    """Repeat what a behaviour says, up to a line that it must say."""
+    assert process.stdout is not None
+    for line in process.stdout:
+        print(f"  {line}", end="")
+        if until in line:
+            return
+    raise DemoFailed(f"a behaviour ended without saying {until!r}")
+
+
+def arbitrate(log: Path) -> None:
+    """Two behaviours want the head; then the one that has it is killed."""
+    print("\ntwo behaviours want the same head:")
+    with behaviour("find-target") as finding, behaviour("navigate") as navigating:
+        hear(finding, "I have the head")
+        hear(navigating, "has the head, for 'finding a target'")
+        hear(finding, "I have let go")
+        hear(navigating, "I have the head")
+        wait_for(lambda: bool(events(read_log(log), "motion_started", device_id=1, since=time.monotonic() - 0.5)))
+        killed_s = time.monotonic()
+        navigating.kill()
+        rests = wait_for(
+            lambda: [one for one in events(read_log(log), "at_rest", since=killed_s) if "pan" in one.joint]
+        )
+    print(f"  navigate was killed (kill -9); {rests[0].t - killed_s:.3f} s later the pan servo was at rest")
+    with trade.lock(where(group="rosie.head"), purpose="a look at the end", wait_s=10):
+        print(f"  {time.monotonic() - killed_s:.3f} s after the kill the demo itself has the head")
+
+
+def wait_for(what: Callable[[], _T]) -> _T:
+    """What the simulator's log shows, once it does."""
+    until = time.monotonic() + PATIENCE_S
+    while not (found := what()):
+        if time.monotonic() > until:
+            raise DemoFailed("the simulator's log does not show what should have happened")
+        time.sleep(0.05)
+    return found
+
+
 def tell(log: Path, *, mute: bool, stay: bool) -> None:
     with robot_up(log) as ready:
         print(f"rosie is up: simulated servos, driver container {ready['container']!r}, system {ready['system']!r}\n")
@@ -89,6 +142,7 @@ def tell(log: Path, *, mute: bool, stay: bool) -> None:
         behave()
         print()
         compare_with_log(log, began_s)
+        arbitrate(log)
         look = trade.find(where(name="move_to", group="rosie.head"))
         if stay:
             wait_for_the_user(log)
