@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from trade import Container, Handle, service, where
+from trade import Container, Handle, _process, service, where
 from trade.errors import Busy, Cancelled, ConfigurationError, DeadlineExceeded
 
 
@@ -68,9 +68,7 @@ def test_serial_calls_run_one_at_a_time_in_order_of_arrival(offer: Any, bench: B
 
 def work_serial(work: Handle) -> Any:
     """The queue behind a handle, wherever its provider lives."""
-    from trade._container import _live
-
-    [home] = [one for one in _live if one.address == work.key.address]
+    [home] = [one for one in _process.live if one.address == work.key.address]
     service = home._providers.lookup(f"{work.key.domain}/{work.key.provider}", work.name)
     assert service is not None
     return service.serial

@@ -1,53 +1,41 @@
 """One participant: starts, joins, hosts providers, looks up, leaves. Ties the other modules together."""
 
-import asyncio
-import atexit
 import contextlib
-import os
 import secrets
 import threading
-import weakref
-from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Final
 
 import msgspec
-from msgspec import structs
 
-from trade import _many
+from trade import _process
 from trade._announcing import Announcer
 from trade._calls import Caller
 from trade._codec import Codec
-from trade._constraints import Constraint, checked_meta, where
 from trade._context import handed_down
 from trade._coroutines import AsyncLoop
 from trade._dispatch import Dispatcher
-from trade._estop_line import EstopReport
-from trade._estopping import LIMIT_S, Estopping
-from trade._handle import Bound, Handle, Run
-from trade._hints import no_such_service, too_many_services
+from trade._estopping import Estopping
+from trade._guarding import Guarding
+from trade._handle import Handle, Run
+from trade._hosting import Hosting
 from trade._inherited import InheritedLock
 from trade._invoke import LocalTarget, RemoteTarget, container_closed, new_request
 from trade._joining import join
-from trade._lock import Lock, OnLost, OnRequest
-from trade._locking import LEASE_S, Locking
+from trade._locking import Locking
 from trade._locks import LockTable
-from trade._notifications import Callback, Notification, Notifier
+from trade._looking import Looking
+from trade._notifications import Notifier
 from trade._own_services import OwnServices
-from trade._providers import Providers, checked_groups, checked_health
+from trade._providers import Providers
 from trade._reach import Reach
 from trade._registry import Change, Record, Registry
 from trade._resources import Holder
 from trade._settings import Settings
 from trade._system import DOMAIN, PROVIDER, ContainerInfo, System
-from trade._terms import LockInfo
 from trade._transport import ChannelClosed, Transport
 from trade._watch import Watch
 from trade._wire import (
-    HEALTHY,
     Address,
-    Estop,
-    ProviderInfo,
-    Scalar,
     ServiceKey,
     Token,
     alive_key,
@@ -63,10 +51,8 @@ _HANDLE_EXT: Final = 1
 _PATIENCE_S: Final = 1.0
 """How long a call waits for the registry to hear of a handle that came by message before its registry entry did."""
 
-_live: "weakref.WeakSet[Container]" = weakref.WeakSet()
 
-
-class Container:
+class Container(Hosting, Looking, Guarding):
     """A participant of a system; most programs use the default one through the functions of ``trade``.
 
     Joins on construction. A context manager; ``close()`` leaves and is idempotent.
@@ -77,10 +63,10 @@ class Container:
     """
 
     def __init__(self, settings: Settings | None = None, *, transport: Transport | None = None) -> None:
-        _refuse_after_fork()
-        _note_start()
+        _process.refuse_after_fork()
+        _process.note_start()
         self._settings = settings or Settings.read()
-        self.address: Final = Address(self._settings.identity, self._settings.container, secrets.token_hex(6))
+        self.address = Address(self._settings.identity, self._settings.container, secrets.token_hex(6))
         self.session: Final = str(self.address)
         self._closing = threading.RLock()
         self._closed = False
@@ -109,7 +95,7 @@ class Container:
             self._registry.listen(self._notifier.changed)
             coroutines = AsyncLoop()
             leaving.callback(coroutines.close)
-            self.locking: Final = Locking(self)
+            self.locking = Locking(self)
             """Its locks on what others offer, and on what it offers itself."""
             self._table = LockTable(self.address.epoch, self.name)
             leaving.callback(self._table.close)
@@ -128,7 +114,7 @@ class Container:
             leaving.callback(self._estopping.close)
             self._deadman = self._estopping.deadman
             self._table.stop_with(self._deadman.stop)
-            self.withdrawn: Final = Withdrawn(self._providers)
+            self.withdrawn = Withdrawn(self._providers)
             """What was taken off from elsewhere and can be offered again."""
             self._dispatcher = Dispatcher(self._transport, self.address, self._providers.lookup, coroutines)
             leaving.callback(self._dispatcher.close)
@@ -147,128 +133,9 @@ class Container:
             self._watch = Watch(self._transport, self._registry, self.address, self._lost, announcer.beat)
             leaving.callback(self._watch.close)
             self._leaving = leaving.pop_all()
-        _live.add(self)
-
-    # --- hosting
-
-    def register(
-        self,
-        provider: object,
-        groups: str | Sequence[str] = (),
-        *,
-        implements: Sequence[type] = (),
-        meta: Mapping[str, Scalar] | None = None,
-    ) -> tuple[Handle, ...]:
-        """Offer an object's services to the whole system.
-
-        Args:
-            provider: an object whose class, bases or interfaces have ``@service`` methods.
-            groups: dotted labels such as ``"rosie.head"``.
-            implements: interfaces (protocols) the object fits without inheriting from them.
-            meta: numbers, texts, booleans by name; holds for all its services, over what they say themselves.
-
-        Returns:
-            Handles of its services.
-
-        Raises:
-            ConfigurationError: nothing to offer, a type that cannot be sent, a malformed group, or it is registered
-                already.
-        """
-        self._check_open()
-        try:
-            keys = self._providers.add(provider, checked_groups(provider, groups), implements, meta=meta)
-        except ChannelClosed:  # closed by another thread meanwhile
-            raise container_closed(self.address) from None
-        self.withdrawn.forget(provider)
-        return tuple(self.handle(key) for key in keys)
-
-    def deregister(self, provider: object) -> None:
-        """Withdraw an object's services from the whole system; handles of them fail from now on.
-
-        Raises:
-            ConfigurationError: it is not registered here.
-        """
-        self._check_open()
-        if not self.withdrawn.forget(provider):
-            self._providers.remove(provider)
-
-    def set_groups(self, provider: object, groups: str | Sequence[str]) -> None:
-        """Put a live provider into other groups. Handles stay valid: its place was settled when it was registered.
-
-        Raises:
-            ConfigurationError: a malformed group, or it is not registered here.
-        """
-        named = checked_groups(provider, groups)
-        self._alter(provider, lambda info: structs.replace(info, groups=named))
-
-    def add_group(self, provider: object, group: str) -> None:
-        """Put a live provider into one more group. Raises like `set_groups`."""
-        [named] = checked_groups(provider, (group,))
-        self._alter(provider, lambda info: structs.replace(info, groups=tuple(dict.fromkeys((*info.groups, named)))))
-
-    def remove_group(self, provider: object, group: str) -> None:
-        """Take a live provider out of a group; one it is not in is fine. Raises like `set_groups`."""
-        self._alter(
-            provider,
-            lambda info: structs.replace(info, groups=tuple(known for known in info.groups if known != group)),
-        )
-
-    def set_health(self, provider: object, health: str = HEALTHY) -> None:
-        """Say what is wrong with a provider, such as ``"degraded: overheating"``, or that nothing is any more.
-
-        Raises:
-            ConfigurationError: no text, or it is not registered here.
-        """
-        said = checked_health(provider, health)
-        self._alter(provider, lambda info: structs.replace(info, health=said))
-
-    def alter(self, provider: object, *, meta: Mapping[str, Scalar] | None = None) -> None:
-        """Read a live provider again, as if it were registered anew: its class's marks, its resources. Handles hold.
-
-        Args:
-            provider: the object.
-            meta: instead of the metadata it was registered with; by default that stays.
-
-        Raises:
-            ConfigurationError: like `register`, or it is not registered here.
-        """
-        new = None if meta is None else checked_meta(meta)
-        self._alter(provider, lambda info: info if new is None else structs.replace(info, meta=new), reread=True)
-
-    def _alter(self, provider: object, change: Callable[[ProviderInfo], ProviderInfo], *, reread: bool = False) -> None:
-        self._check_open()
-        try:
-            self._providers.alter(provider, change, reread=reread)
-        except ChannelClosed:  # closed by another thread meanwhile
-            raise container_closed(self.address) from None
+        _process.live.add(self)
 
     # --- looking up
-
-    def services(self, constraint: Constraint | None = None) -> list[Handle]:
-        """Handles of all services that match, ordered by group and name; without a constraint, of everything."""
-        self._check_open()
-        wanted = where() if constraint is None else constraint
-        return [Handle(self, record.key, record) for record in self._registry.select(wanted)]
-
-    def find(self, constraint: Constraint, *, wait_s: float = 2.0) -> Handle:
-        """The only service that matches; waits for it to appear.
-
-        Raises:
-            NoSuchService: none within ``wait_s`` seconds.
-            TooManyServices: more than one.
-        """
-        self._check_open()
-        matches: list[Record] = []
-
-        def found() -> bool:
-            matches[:] = self._registry.select(constraint)
-            return bool(matches)
-
-        if not self._registry.wait_for(found, wait_s):
-            raise no_such_service(constraint, self._registry.select(where()), wait_s)
-        if len(matches) > 1:
-            raise too_many_services(constraint, matches)
-        return Handle(self, matches[0].key, matches[0])
 
     def addresses(self) -> list[Address]:
         """Where the containers of the system are, this one included."""
@@ -319,40 +186,6 @@ class Container:
 
     # --- being told
 
-    def joined(self, constraint: Constraint, call: Callback, *, existing: bool = False) -> Notification:
-        """Call with the handle of every service that comes and matches.
-
-        Args:
-            constraint: which services.
-            call: a handle, or a function of this process.
-            existing: also once for each that is there already.
-        """
-        return self._notify("joined", constraint, call, existing=existing)
-
-    def left(self, constraint: Constraint, call: Callback) -> Notification:
-        """Call with the (dead) handle of every service that goes and matched."""
-        return self._notify("left", constraint, call, existing=False)
-
-    def changed(self, constraint: Constraint, call: Callback) -> Notification:
-        """Call with the handle of every service whose groups, metadata, health or description become others.
-
-        It fires for what matches, and once more for what has just ceased to. Who is quick may find several changes in
-        one.
-        """
-        return self._notify("changed", constraint, call, existing=False)
-
-    def _notify(self, occasion: str, constraint: Constraint, call: Callback, *, existing: bool) -> Notification:
-        self._check_open()
-        if not callable(call):
-            raise ConfigurationError(
-                where=f"trade.{occasion}", problem=f"call must be a handle or a function, not {call!r}"
-            )
-        notification = Notification(occasion, constraint, call)
-        self._registry.between_changes(
-            lambda: self._notifier.add(notification, self._registry.select(constraint) if existing else [])
-        )
-        return notification
-
     def _lost(self, address: Address, *, back: bool = False) -> None:
         """Told by the watch: a container is out of sight, or there again."""
         self._caller.lost(address, back=back)
@@ -390,58 +223,6 @@ class Container:
         request, run = new_request(deadline_s), Run(handle)
         self._target(handle).begin(args, kwargs, request, run)
         return run
-
-    def call(self, constraint: Constraint, /, *args: Any, **kwargs: Any) -> Any:
-        """Call the only service that matches. Raises what `find` raises, and what the call does."""
-        return self.find(constraint)(*args, **kwargs)
-
-    def call_all(
-        self, which: Constraint | Iterable[Handle | Bound], /, *args: Any, **kwargs: Any
-    ) -> list[_many.Outcome]:
-        """Call several services at once and wait for all of them.
-
-        Args:
-            which: a constraint (all that match now), or handles; bound calls bring arguments of their own.
-            args: for each.
-            kwargs: for each.
-
-        Returns:
-            An outcome for each, in order; what one raises is its own outcome and stops no other.
-        """
-        return _many.all_outcomes(self._bound(which, args, kwargs))
-
-    def call_sequence(self, calls: Iterable[Handle | Bound], /, *, go_on: bool = False) -> list[_many.Outcome]:
-        """Make calls one after the other.
-
-        Args:
-            calls: bound calls, or handles of services without arguments.
-            go_on: also after an error, at which it stops otherwise.
-
-        Returns:
-            Outcomes of those that ran.
-        """
-        return _many.sequence(self._bound(calls, (), {}), go_on=go_on)
-
-    async def acall(self, constraint: Constraint, /, *args: Any, **kwargs: Any) -> Any:
-        """`call` from asyncio."""
-        handle = await asyncio.to_thread(self.find, constraint)
-        return await handle.acall(*args, **kwargs)
-
-    async def acall_all(
-        self, which: Constraint | Iterable[Handle | Bound], /, *args: Any, **kwargs: Any
-    ) -> list[_many.Outcome]:
-        """`call_all` from asyncio."""
-        return await _many.all_outcomes_async(self._bound(which, args, kwargs))
-
-    async def acall_sequence(self, calls: Iterable[Handle | Bound], /, *, go_on: bool = False) -> list[_many.Outcome]:
-        """`call_sequence` from asyncio."""
-        return await _many.sequence_async(self._bound(calls, (), {}), go_on=go_on)
-
-    def _bound(
-        self, which: Constraint | Iterable[Handle | Bound], args: tuple[Any, ...], kwargs: dict[str, Any]
-    ) -> list[Bound]:
-        self._check_open()
-        return _many.bound(self.services(which) if isinstance(which, Constraint) else which, args, kwargs)
 
     def _target(self, handle: Handle) -> LocalTarget | RemoteTarget:
         target = self._targets.get(handle.key)
@@ -491,126 +272,6 @@ class Container:
             raise msgspec.ValidationError(f"Unknown extension {code}")
         return self.handle(msgspec.msgpack.decode(data, type=ServiceKey))
 
-    # --- locks
-
-    def lock(
-        self,
-        which: Constraint | Iterable[Handle],
-        *,
-        purpose: str = "",
-        wait_s: float = 10.0,
-        lease_s: float = LEASE_S,
-        priority: int = 0,
-        delegates: Sequence[str] = (),
-        partial: bool = False,
-        on_lost: OnLost | None = None,
-        on_request: OnRequest | None = None,
-    ) -> Lock:
-        """Services for oneself alone, on all their containers or on none: ``with container.lock(...):``.
-
-        Nothing is taken before the context is entered (or `Lock.acquire` called).
-
-        Args:
-            which: the actuating services that match, as they are now, or handles.
-            purpose: what for, as others are told who would like to have them.
-            wait_s: how long to wait for others, in seconds; 0 tries.
-            lease_s: how long it outlives its owner, in seconds.
-            priority: who waits with a higher one comes first.
-            delegates: identities that may use it, too.
-            partial: take a robot's group even if members of it are not there.
-            on_lost: called with the error, on a thread of its own, when it is lost.
-            on_request: called with who and why, on a thread of its own, when somebody asks for it.
-
-        Raises:
-            LockedByOther: somebody has one of them, or something still moves, after ``wait_s``.
-            IncompleteGroup: the robot file says that more belongs to the group.
-            ConfigurationError: nothing to lock.
-            DeviceSilent: one of them could not be stopped when it had to be.
-        """
-        self._check_open()
-        return self.locking.lock(
-            which,
-            purpose=purpose,
-            wait_s=wait_s,
-            lease_s=lease_s,
-            priority=priority,
-            delegates=delegates,
-            partial=partial,
-            on_lost=on_lost,
-            on_request=on_request,
-        )
-
-    def locks(self) -> list[LockInfo]:
-        """Every lock in the system: what, whose, what for, since when, who waits."""
-        self._check_open()
-        return self.locking.locks()
-
-    def request_release(self, which: Constraint | Iterable[Handle], reason: str) -> list[str]:
-        """Ask the owners of locks on these services to give them back; they hear of who asks, and why.
-
-        Returns:
-            Who was asked.
-        """
-        self._check_open()
-        return self.locking.request_release(which, reason)
-
-    def break_lock(self, which: Constraint | Iterable[Handle], reason: str) -> list[LockInfo]:
-        """Take the locks on these services away from their owners; what moves under them stops.
-
-        Returns:
-            Those that were broken.
-        """
-        self._check_open()
-        return self.locking.break_lock(which, reason)
-
-    def resume(self, which: Constraint | Iterable[Handle]) -> list[str]:
-        """Let services move again after a stop by somebody else.
-
-        Returns:
-            The resources that were stopped.
-
-        Raises:
-            LockedByOther: it is the owner of their lock who resumes.
-        """
-        self._check_open()
-        return self.locking.resume(which)
-
-    # --- e-stops
-
-    def estop(self, reason: str = "", *, limit_s: float = LIMIT_S) -> EstopReport:
-        """Stop everything in the whole system, and let nothing move until the e-stop is cleared (S09).
-
-        It waits for nobody to be told, and is repeated until every container that has a stop service has confirmed
-        that all of it is at rest. Read the report: `EstopReport.complete`. This is software, not safety-rated.
-
-        Args:
-            reason: why, for people.
-            limit_s: how long to try, in seconds; also if nobody is found.
-        """
-        self._check_open()
-        return self._estopping.estop(reason, limit_s)
-
-    def estops(self) -> list[Estop]:
-        """The e-stops that are open anywhere in the system, oldest first."""
-        self._check_open()
-        return self._estopping.open()
-
-    def estop_clear(self, ids: Sequence[str], *, limit_s: float = LIMIT_S) -> EstopReport:
-        """Clear e-stops by their ids; once none is open, calls are let through again. Nothing moves by itself.
-
-        What somebody else's e-stop stopped while it was in use holds until `resume`, too (S08). A container that does
-        not hear this, being away, keeps them open until they are cleared again.
-
-        Args:
-            ids: as `estops` tells them.
-            limit_s: how long to try, in seconds.
-
-        Raises:
-            NoSuchEstop: an id that nobody knows as open; nothing is cleared then.
-        """
-        self._check_open()
-        return self._estopping.clear(ids, limit_s)
-
     # --- being
 
     @property
@@ -638,13 +299,13 @@ class Container:
         return not self._closed and self._dispatcher.draining
 
     def _check_open(self) -> None:
-        _refuse_after_fork()
+        _process.refuse_after_fork()
         if self._closed:
             raise container_closed(self.address)
 
     def close(self) -> None:
         """Leave: services, handles and notifications end; nothing stays behind. Idempotent."""
-        if _forked:
+        if _process.forked():
             return
         with self._closing:  # who comes second waits until it is done
             if self._closed:
@@ -668,39 +329,3 @@ class Container:
 
     def __repr__(self) -> str:
         return f"<Container {self.address} of {self._settings.system}>"
-
-
-@atexit.register
-def _close_all() -> None:
-    """The interpreter must not end under threads that wait inside the transport."""
-    for container in list(_live):
-        container.close()
-
-
-_started = False
-_forked = False
-
-
-def _note_start() -> None:
-    global _started  # noqa: PLW0603 - a fact about the process: the transport's runtime stays for good
-    _started = True
-
-
-def _after_fork() -> None:
-    global _forked  # noqa: PLW0603 - a fact about the process
-    _forked = _forked or _started
-    for container in list(_live):
-        container.abandon()
-    _live.clear()
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_after_fork)
-
-
-def _refuse_after_fork() -> None:
-    if _forked:
-        problem = (
-            "this process was forked from one that had a container, which cannot work; start it with spawn, not fork"
-        )
-        raise ConfigurationError(problem=problem)

@@ -1,0 +1,141 @@
+"""The part of a container that locks services, lets them move again, and stops everything."""
+
+from collections.abc import Iterable, Sequence
+
+from trade._constraints import Constraint
+from trade._estop_line import EstopReport
+from trade._estopping import LIMIT_S, Estopping
+from trade._handle import Handle
+from trade._lock import Lock, OnLost, OnRequest
+from trade._locking import LEASE_S, Locking
+from trade._member import Member
+from trade._terms import LockInfo
+from trade._wire import Estop
+
+
+class Guarding(Member):
+    """Who may use what, and who may not move at all."""
+
+    locking: Locking
+    """Its locks on what others offer, and on what it offers itself."""
+    _estopping: Estopping
+
+    # --- locks
+
+    def lock(
+        self,
+        which: Constraint | Iterable[Handle],
+        *,
+        purpose: str = "",
+        wait_s: float = 10.0,
+        lease_s: float = LEASE_S,
+        priority: int = 0,
+        delegates: Sequence[str] = (),
+        partial: bool = False,
+        on_lost: OnLost | None = None,
+        on_request: OnRequest | None = None,
+    ) -> Lock:
+        """Services for oneself alone, on all their containers or on none: ``with container.lock(...):``.
+
+        Nothing is taken before the context is entered (or `Lock.acquire` called).
+
+        Args:
+            which: the actuating services that match, as they are now, or handles.
+            purpose: what for, as others are told who would like to have them.
+            wait_s: how long to wait for others, in seconds; 0 tries.
+            lease_s: how long it outlives its owner, in seconds.
+            priority: who waits with a higher one comes first.
+            delegates: identities that may use it, too.
+            partial: take a robot's group even if members of it are not there.
+            on_lost: called with the error, on a thread of its own, when it is lost.
+            on_request: called with who and why, on a thread of its own, when somebody asks for it.
+
+        Raises:
+            LockedByOther: somebody has one of them, or something still moves, after ``wait_s``.
+            IncompleteGroup: the robot file says that more belongs to the group.
+            ConfigurationError: nothing to lock.
+            DeviceSilent: one of them could not be stopped when it had to be.
+        """
+        self._check_open()
+        return self.locking.lock(
+            which,
+            purpose=purpose,
+            wait_s=wait_s,
+            lease_s=lease_s,
+            priority=priority,
+            delegates=delegates,
+            partial=partial,
+            on_lost=on_lost,
+            on_request=on_request,
+        )
+
+    def locks(self) -> list[LockInfo]:
+        """Every lock in the system: what, whose, what for, since when, who waits."""
+        self._check_open()
+        return self.locking.locks()
+
+    def request_release(self, which: Constraint | Iterable[Handle], reason: str) -> list[str]:
+        """Ask the owners of locks on these services to give them back; they hear of who asks, and why.
+
+        Returns:
+            Who was asked.
+        """
+        self._check_open()
+        return self.locking.request_release(which, reason)
+
+    def break_lock(self, which: Constraint | Iterable[Handle], reason: str) -> list[LockInfo]:
+        """Take the locks on these services away from their owners; what moves under them stops.
+
+        Returns:
+            Those that were broken.
+        """
+        self._check_open()
+        return self.locking.break_lock(which, reason)
+
+    def resume(self, which: Constraint | Iterable[Handle]) -> list[str]:
+        """Let services move again after a stop by somebody else.
+
+        Returns:
+            The resources that were stopped.
+
+        Raises:
+            LockedByOther: it is the owner of their lock who resumes.
+        """
+        self._check_open()
+        return self.locking.resume(which)
+
+    # --- e-stops
+
+    def estop(self, reason: str = "", *, limit_s: float = LIMIT_S) -> EstopReport:
+        """Stop everything in the whole system, and let nothing move until the e-stop is cleared (S09).
+
+        It waits for nobody to be told, and is repeated until every container that has a stop service has confirmed
+        that all of it is at rest. Read the report: `EstopReport.complete`. This is software, not safety-rated.
+
+        Args:
+            reason: why, for people.
+            limit_s: how long to try, in seconds; also if nobody is found.
+        """
+        self._check_open()
+        return self._estopping.estop(reason, limit_s)
+
+    def estops(self) -> list[Estop]:
+        """The e-stops that are open anywhere in the system, oldest first."""
+        self._check_open()
+        return self._estopping.open()
+
+    def estop_clear(self, ids: Sequence[str], *, limit_s: float = LIMIT_S) -> EstopReport:
+        """Clear e-stops by their ids; once none is open, calls are let through again. Nothing moves by itself.
+
+        What somebody else's e-stop stopped while it was in use holds until `resume`, too (S08). A container that does
+        not hear this, being away, keeps them open until they are cleared again.
+
+        Args:
+            ids: as `estops` tells them.
+            limit_s: how long to try, in seconds.
+
+        Raises:
+            NoSuchEstop: an id that nobody knows as open; nothing is cleared then.
+        """
+        self._check_open()
+        return self._estopping.clear(ids, limit_s)

@@ -1,0 +1,139 @@
+"""The part of a container that looks services up, is told of them, and calls them by what they are."""
+
+import asyncio
+from collections.abc import Iterable
+from typing import Any
+
+from trade import _many
+from trade._constraints import Constraint, where
+from trade._handle import Bound, Handle
+from trade._hints import no_such_service, too_many_services
+from trade._member import Member
+from trade._notifications import Callback, Notification, Notifier
+from trade._registry import Record, Registry
+from trade.errors import ConfigurationError
+
+
+class Looking(Member):
+    """Finds services here and elsewhere."""
+
+    _registry: Registry
+    _notifier: Notifier
+
+    # --- looking up
+
+    def services(self, constraint: Constraint | None = None) -> list[Handle]:
+        """Handles of all services that match, ordered by group and name; without a constraint, of everything."""
+        self._check_open()
+        wanted = where() if constraint is None else constraint
+        return [Handle(self, record.key, record) for record in self._registry.select(wanted)]
+
+    def find(self, constraint: Constraint, *, wait_s: float = 2.0) -> Handle:
+        """The only service that matches; waits for it to appear.
+
+        Raises:
+            NoSuchService: none within ``wait_s`` seconds.
+            TooManyServices: more than one.
+        """
+        self._check_open()
+        matches: list[Record] = []
+
+        def found() -> bool:
+            matches[:] = self._registry.select(constraint)
+            return bool(matches)
+
+        if not self._registry.wait_for(found, wait_s):
+            raise no_such_service(constraint, self._registry.select(where()), wait_s)
+        if len(matches) > 1:
+            raise too_many_services(constraint, matches)
+        return Handle(self, matches[0].key, matches[0])
+
+    # --- being told
+
+    def joined(self, constraint: Constraint, call: Callback, *, existing: bool = False) -> Notification:
+        """Call with the handle of every service that comes and matches.
+
+        Args:
+            constraint: which services.
+            call: a handle, or a function of this process.
+            existing: also once for each that is there already.
+        """
+        return self._notify("joined", constraint, call, existing=existing)
+
+    def left(self, constraint: Constraint, call: Callback) -> Notification:
+        """Call with the (dead) handle of every service that goes and matched."""
+        return self._notify("left", constraint, call, existing=False)
+
+    def changed(self, constraint: Constraint, call: Callback) -> Notification:
+        """Call with the handle of every service whose groups, metadata, health or description become others.
+
+        It fires for what matches, and once more for what has just ceased to. Who is quick may find several changes in
+        one.
+        """
+        return self._notify("changed", constraint, call, existing=False)
+
+    def _notify(self, occasion: str, constraint: Constraint, call: Callback, *, existing: bool) -> Notification:
+        self._check_open()
+        if not callable(call):
+            raise ConfigurationError(
+                where=f"trade.{occasion}", problem=f"call must be a handle or a function, not {call!r}"
+            )
+        notification = Notification(occasion, constraint, call)
+        self._registry.between_changes(
+            lambda: self._notifier.add(notification, self._registry.select(constraint) if existing else [])
+        )
+        return notification
+
+    # --- calling
+
+    def call(self, constraint: Constraint, /, *args: Any, **kwargs: Any) -> Any:
+        """Call the only service that matches. Raises what `find` raises, and what the call does."""
+        return self.find(constraint)(*args, **kwargs)
+
+    def call_all(
+        self, which: Constraint | Iterable[Handle | Bound], /, *args: Any, **kwargs: Any
+    ) -> list[_many.Outcome]:
+        """Call several services at once and wait for all of them.
+
+        Args:
+            which: a constraint (all that match now), or handles; bound calls bring arguments of their own.
+            args: for each.
+            kwargs: for each.
+
+        Returns:
+            An outcome for each, in order; what one raises is its own outcome and stops no other.
+        """
+        return _many.all_outcomes(self._bound(which, args, kwargs))
+
+    def call_sequence(self, calls: Iterable[Handle | Bound], /, *, go_on: bool = False) -> list[_many.Outcome]:
+        """Make calls one after the other.
+
+        Args:
+            calls: bound calls, or handles of services without arguments.
+            go_on: also after an error, at which it stops otherwise.
+
+        Returns:
+            Outcomes of those that ran.
+        """
+        return _many.sequence(self._bound(calls, (), {}), go_on=go_on)
+
+    async def acall(self, constraint: Constraint, /, *args: Any, **kwargs: Any) -> Any:
+        """`call` from asyncio."""
+        handle = await asyncio.to_thread(self.find, constraint)
+        return await handle.acall(*args, **kwargs)
+
+    async def acall_all(
+        self, which: Constraint | Iterable[Handle | Bound], /, *args: Any, **kwargs: Any
+    ) -> list[_many.Outcome]:
+        """`call_all` from asyncio."""
+        return await _many.all_outcomes_async(self._bound(which, args, kwargs))
+
+    async def acall_sequence(self, calls: Iterable[Handle | Bound], /, *, go_on: bool = False) -> list[_many.Outcome]:
+        """`call_sequence` from asyncio."""
+        return await _many.sequence_async(self._bound(calls, (), {}), go_on=go_on)
+
+    def _bound(
+        self, which: Constraint | Iterable[Handle | Bound], args: tuple[Any, ...], kwargs: dict[str, Any]
+    ) -> list[Bound]:
+        self._check_open()
+        return _many.bound(self.services(which) if isinstance(which, Constraint) else which, args, kwargs)

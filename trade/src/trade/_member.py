@@ -1,0 +1,38 @@
+"""What the parts of a container have in common."""
+
+from abc import ABC, abstractmethod
+from typing import Any
+
+from trade._handle import Handle, Run
+from trade._registry import Record
+from trade._wire import Address, ServiceKey
+
+
+class Member(ABC):
+    """A container, as its parts see it: one part hosts, one looks up and calls, one guards."""
+
+    address: Address
+
+    @abstractmethod
+    def _check_open(self) -> None:
+        """Raises ConfigurationError if it is closed, or if this is a forked child."""
+
+    @abstractmethod
+    def handle(self, key: ServiceKey) -> Handle:
+        """A handle of a service whose key is known."""
+
+    @abstractmethod
+    def has(self, key: ServiceKey) -> bool:
+        """Whether the registry has the service now."""
+
+    @abstractmethod
+    def record(self, handle: Handle) -> Record:
+        """What is known of a service; raises ServiceGone if nothing ever was."""
+
+    @abstractmethod
+    def invoke(self, handle: Handle, args: tuple[Any, ...], kwargs: dict[str, Any], deadline_s: float | None) -> Any:
+        """Call a service and wait; what ``handle(...)`` does."""
+
+    @abstractmethod
+    def begin(self, handle: Handle, args: tuple[Any, ...], kwargs: dict[str, Any], deadline_s: float | None) -> Run:
+        """Call a service without waiting; what ``handle.start(...)`` does."""
