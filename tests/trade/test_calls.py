@@ -8,7 +8,8 @@ from collections.abc import Callable, Iterator
 import msgspec
 import pytest
 
-from trade._calls import Caller, Peer
+from trade._calls import Caller
+from trade._peer import Peer
 from trade._transport import Answer, Channel, ChannelClosed, Message, Publisher, Questions, Transport
 from trade._wire import EMPTY, EMPTY_ARGUMENTS, PROTOCOL, Address, Reply, Status, decode_call, encode_message
 

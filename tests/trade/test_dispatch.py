@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from trade import Container, Handle, _dispatch, current_call, service, where
+from trade import Container, Handle, _crew, _dispatch, current_call, service, where
 from trade._memory import MemoryTransport
 from trade._transport import Channel, Message
 from trade._wire import reply_key
@@ -60,7 +60,7 @@ def test_services_run_side_by_side(here: Container, there: Container, crowd: Cro
 def test_at_the_cap_a_call_is_refused_and_stops_still_get_through(
     here: Container, there: Container, crowd: Crowd, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(_dispatch, "MOST_THREADS", 8)
+    monkeypatch.setattr(_crew, "MOST_THREADS", 8)
     there.register(crowd, "robot")
     enter, stop = found(here, "enter"), found(here, "stop")
     assert stop() == 1
@@ -81,7 +81,7 @@ def test_at_the_cap_a_call_is_refused_and_stops_still_get_through(
 def test_a_container_at_its_cap_still_drains(
     here: Container, there: Container, crowd: Crowd, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(_dispatch, "MOST_THREADS", 2)
+    monkeypatch.setattr(_crew, "MOST_THREADS", 2)
     there.register(crowd, "robot")
     enter = found(here, "enter")
     run = enter.start()

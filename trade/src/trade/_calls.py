@@ -6,7 +6,6 @@ the reply key, from the deadline thread or from whoever learns that the callee i
 
 import itertools
 import logging
-import math
 import secrets
 import threading
 import time
@@ -15,6 +14,7 @@ from typing import Any, Final
 
 from msgspec import Raw, structs
 
+from trade._peer import NEVER, Peer
 from trade._system import CLOCK, DOMAIN, PROVIDER
 from trade._transport import Channel, ChannelClosed, Message, Publisher, Transport
 from trade._wire import (
@@ -37,44 +37,9 @@ from trade._wire import (
 )
 
 _logger = logging.getLogger("trade")
-_NEVER: Final = math.inf
-_DRIFT: Final = 200e-6
-"""Two monotonic clocks run apart at most this fast (quartz is specified to 100 ppm)."""
-
 _CANCEL_S: Final = 2.0
 
 OnReply = Callable[[Reply], None]
-
-
-class Peer:
-    """Another container as callers see it: whether it is there, and how its clock runs against ours."""
-
-    def __init__(self, address: Address, *, lost: bool = False) -> None:
-        self.address = address
-        self.answers_on = f"reply/{address.identity}/"
-        """How the keys of its answers begin."""
-        self.lost = lost
-        self._low_ns = -_NEVER
-        self._high_ns = _NEVER
-        self._at_ns = 0
-
-    @property
-    def clock_known(self) -> bool:
-        return self._low_ns > -_NEVER
-
-    def heard(self, clock_ns: int, sent_ns: int, received_ns: int) -> None:
-        """Its clock stood at ``clock_ns`` some time between our sending and our receiving."""
-        slack = (received_ns - self._at_ns) * _DRIFT
-        low = max(self._low_ns - slack, clock_ns - received_ns)
-        high = min(self._high_ns + slack, clock_ns - sent_ns)
-        if low > high:  # its clock or ours was set or stood still: what was known is void
-            low, high = clock_ns - received_ns, clock_ns - sent_ns
-        self._low_ns, self._high_ns, self._at_ns = low, high, received_ns
-
-    def expiry_ns(self, deadline_ns: int) -> int | None:
-        """Our deadline in its clock, never later than it is meant; None while the clock is unknown."""
-        low, slack = self._low_ns, (time.monotonic_ns() - self._at_ns) * _DRIFT
-        return int(deadline_ns + low - slack) if low > -_NEVER else None
 
 
 _Waiting = tuple[int, Peer, int]
@@ -137,7 +102,7 @@ class Caller:
         self._shared: _Box | None = None
         self._threads: list[threading.Thread] = []
         self._closed = False
-        self._next_deadline_ns: float = _NEVER
+        self._next_deadline_ns: float = NEVER
         self._sooner = threading.Event()
         self.malformed = 0
         self._spawn("trade-deadlines", self._watch_deadlines)
@@ -396,12 +361,12 @@ class Caller:
     def _watch_deadlines(self) -> None:
         while not self._closed:
             self._sooner.clear()
-            self._next_deadline_ns = _NEVER  # whoever starts during the scan wakes us
+            self._next_deadline_ns = NEVER  # whoever starts during the scan wakes us
             now = time.monotonic_ns()
             self._end_overdue(now)
-            soonest = min(self._deadlines(), default=_NEVER)
+            soonest = min(self._deadlines(), default=NEVER)
             self._next_deadline_ns = soonest
-            self._sooner.wait(None if soonest == _NEVER else max(0.0, (soonest - now) / 1e9))
+            self._sooner.wait(None if soonest == NEVER else max(0.0, (soonest - now) / 1e9))
 
     def _deadlines(self) -> list[int]:
         waiting = [(box.waiting, box.ended_id) for box in list(self._every)]

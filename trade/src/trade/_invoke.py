@@ -11,13 +11,14 @@ import msgspec
 from msgspec import Raw, Struct
 
 from trade._arguments import encode_arguments, encode_call, given
-from trade._calls import Caller, Peer
+from trade._calls import Caller
 from trade._codec import Codec
 from trade._context import CallContext, Held, handed_down, holding, running
 from trade._dispatch import LocalService
 from trade._failures import unpack_error
 from trade._handle import Run
 from trade._ongoing import Ongoing
+from trade._peer import Peer
 from trade._records import type_from_schema
 from trade._registry import Record
 from trade._schemas import read_schema

@@ -2,6 +2,8 @@
 
 Every error carries its data as attributes, crosses the wire with them, and says what to do next. Each also inherits the
 builtin a Python programmer would catch for it, so ``except TimeoutError`` finds a deadline that passed.
+
+One module on purpose, however long: whoever catches reads the tree as a whole.
 """
 
 import time
