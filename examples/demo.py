@@ -105,17 +105,17 @@ def hear(process: "subprocess.Popen[str]", until: str) -> None:
 def arbitrate(log: Path) -> None:
     """Two behaviours want the head; then the one that has it is killed."""
     print("\ntwo behaviours want the same head:")
-    with behaviour("find-target") as finding, behaviour("navigate") as navigating:
+    with behaviour("find-target") as finding:
         hear(finding, "I have the head")
-        hear(navigating, "has the head, for 'finding a target'")
-        hear(finding, "I have let go")
-        hear(navigating, "I have the head")
-        wait_for(lambda: bool(events(read_log(log), "motion_started", device_id=1, since=time.monotonic() - 0.5)))
-        killed_s = time.monotonic()
-        navigating.kill()
-        rests = wait_for(
-            lambda: [one for one in events(read_log(log), "at_rest", since=killed_s) if "pan" in one.joint]
-        )
+        with behaviour("navigate") as navigating:
+            hear(navigating, "has the head, for 'finding a target'")
+            hear(finding, "I have let go")
+            free_s = time.monotonic()
+            hear(navigating, "I have the head")
+            wait_for(lambda: events(read_log(log), "motion_started", device_id=1, since=free_s - 0.5))
+            killed_s = time.monotonic()
+            navigating.kill()
+            rests = wait_for(lambda: events(read_log(log), "at_rest", device_id=1, since=killed_s))
     print(f"  navigate was killed (kill -9); {rests[0].t - killed_s:.3f} s later the pan servo was at rest")
     with trade.lock(where(group="rosie.head"), purpose="a look at the end", wait_s=10):
         print(f"  {time.monotonic() - killed_s:.3f} s after the kill the demo itself has the head")

@@ -4,11 +4,12 @@ import json
 import os
 import queue
 import re
+import signal
 import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,7 @@ class Program:
             stderr=subprocess.PIPE,
             text=True,
             bufsize=1,
+            start_new_session=True,
         )
         self._lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
         self.errors: list[str] = []
@@ -92,6 +94,8 @@ class Program:
                 self.process.wait(10)
             except subprocess.TimeoutExpired:
                 self.process.kill()
+        with suppress(ProcessLookupError):  # whoever it started and left keeps its pipes open
+            os.killpg(self.process.pid, signal.SIGKILL)
         self.wait()
         for stream in (self.process.stdout, self.process.stderr):
             assert stream is not None

@@ -37,12 +37,12 @@ def test_navigation_asks_for_the_head_and_gets_it(
     assert "find-target has the head, for 'finding a target'" in told(navigating, "has the head")
     assert "navigate asks for the head: there is something ahead of me" in told(finding, "asks for the head")
     told(finding, "I have let go")
+    began = time.monotonic()
     told(navigating, "I have the head")
     assert finding.wait() == 0, finding.errors
     [lock] = onlooker.locks()
     assert (lock.holder.container, lock.holder.purpose) == ("navigate", "navigation")
 
-    began = time.monotonic()
     wait_until(lambda: events(read_log(log), "motion_started", device_id=1, since=began - 1))
     killed = time.monotonic()
     navigating.signal(signal.SIGKILL)
