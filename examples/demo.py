@@ -112,7 +112,7 @@ def arbitrate(log: Path) -> None:
             hear(finding, "I have let go")
             free_s = time.monotonic()
             hear(navigating, "I have the head")
-            wait_for(lambda: events(read_log(log), "motion_started", device_id=1, since=free_s - 0.5))
+            wait_for(lambda: events(read_log(log), "motion_started", device_id=1, since=free_s))  # not the sweep before
             killed_s = time.monotonic()
             navigating.kill()
             rests = wait_for(lambda: events(read_log(log), "at_rest", device_id=1, since=killed_s))

@@ -43,7 +43,7 @@ def test_navigation_asks_for_the_head_and_gets_it(
     [lock] = onlooker.locks()
     assert (lock.holder.container, lock.holder.purpose) == ("navigate", "navigation")
 
-    wait_until(lambda: events(read_log(log), "motion_started", device_id=1, since=began - 1))
+    wait_until(lambda: events(read_log(log), "motion_started", device_id=1, since=began))
     killed = time.monotonic()
     navigating.signal(signal.SIGKILL)
     wait_until(lambda: events(read_log(log), "at_rest", device_id=1, since=killed))
