@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from trade import Container, Estop, EstopReport, Resource, current_call, service, where
-from trade._dispatch import MOST_THREADS
+from trade._crew import MOST_THREADS
 from trade._memory import MemoryTransport
 from trade._wire import PROTOCOL, EstopOrder, encode_message
 from trade.errors import Busy, ConfigurationError, MotionStopped, NoSuchEstop, Stopped
