@@ -89,9 +89,9 @@ def _record(log: Log) -> None:
         log.note(Grant(t=now(), epoch=self._epoch, number=number, resources=resources, lease_s=terms.lease_s))
         return granted
 
-    def ending(self: Any, ended: Any) -> None:
+    def ending(self: Any, ended: Any, reason: str) -> None:
         before_t = now()
-        end(self, ended)
+        end(self, ended, reason)
         log.note(End(t=before_t, epoch=self._epoch, number=ended.number, after_t=now()))
 
     def renewing(self: Any, numbers: Any, identity: str) -> list[int]:

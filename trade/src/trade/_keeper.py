@@ -171,15 +171,15 @@ class Keeper:
 
     def _renewed(self, address: Address, held: list[tuple[Lock, int]], asked_at: float, run: Run) -> None:
         try:
-            live = set(run.result(0))
+            over: dict[int, str] = run.result(0)
         except (TradeError, TimeoutError) as error:
             self._not_renewed(address, held, error)
             return
         for lock, number in held:
-            if number in live:
+            if number not in over:
                 lock.confirm(address, number, asked_at)
             elif lock.has(address, number):
-                lock.lose(f"container {address.container} has taken it back, or its lease ended there")
+                lock.lose(over[number])
 
     def _not_renewed(self, address: Address, held: list[tuple[Lock, int]], error: Exception) -> None:
         if not isinstance(error, (ServiceGone, ContainerLost)):  # too late or refused: its own lease judges

@@ -53,9 +53,10 @@ class LockServices:
             self._places.release()
 
     @service(effect="stop")
-    def renew(self, grants: list[int]) -> list[int]:
-        """Begin the leases of these grants anew; those that still hold."""
-        return self._table.renew(grants, _call().caller)
+    def renew(self, grants: list[int]) -> dict[int, str]:
+        """Begin the leases of these grants anew; why those that hold no more do not."""
+        held = self._table.renew(grants, _call().caller)
+        return {number: self._table.over(number) or "it is another's" for number in grants if number not in held}
 
     @service(effect="stop")
     def release(self, grant: int, lost: str = "") -> bool:

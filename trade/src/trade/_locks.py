@@ -19,6 +19,10 @@ from trade.errors import DeviceSilent, LockedByOther, ServiceGone, TradeError
 
 _STOPPING: Final = Holder("trade", "", "", "stopping what moved under a lock that was lost", 0.0)
 
+_REMEMBERED: Final = 256
+"""So many grants that ended are known with the reason."""
+_LEASE_ENDED: Final = "its lease ended"
+
 Stop = Callable[[Sequence[Resource], str, Callable[[Resource, str], None]], None]
 """Stops resources for a reason, without waiting; tells of each when it is over, and why if it could not be done."""
 
@@ -52,6 +56,8 @@ class LockTable:
         self._resources: dict[str, tuple[Resource, int]] = {}
         """By name, with the number of services that use it."""
         self._grants: dict[int, _Grant] = {}
+        self._ended: dict[int, str] = {}
+        """Why the last few grants ended."""
         self._waiting: list[_Waiter] = []
         """For their turn, next first."""
         self._acquiring: list[_Waiter] = []
@@ -83,7 +89,7 @@ class LockTable:
             resource = known or (named if isinstance(named, Resource) else Resource(name))
             if isinstance(named, Resource) and resource is not named:
                 raise ValueError(f"resource {name} is another object already; share one trade.Resource")
-            resource.epoch, resource.over = self._epoch, self._over
+            resource.epoch, resource.over = self._epoch, self.over
             resource.estop = self._estop
             resource.on_rest(self._rested)
             self._resources[name] = (resource, uses + 1)
@@ -257,13 +263,20 @@ class LockTable:
                 grant.until = now + grant.lease_s
             return [grant.number for grant in own]
 
+    def over(self, number: int) -> str:
+        """Why a grant holds no more; empty if it holds."""
+        grant = self._grants.get(number)
+        if grant is None:
+            return self._ended.get(number, "it ended long ago")
+        return "" if grant.until > self._clock() else _LEASE_ENDED
+
     def release(self, number: int, identity: str) -> bool:
         """Give it back; what its owner left moving goes on, and the next one waits for it. Returns whether it held."""
         with self._changed:
             grant = self._grants.get(number)
             if grant is None or grant.holder.identity != identity:
                 return False
-            self._end(grant)
+            self._end(grant, "it was given back")
             return True
 
     def lose(self, number: int, reason: str) -> bool:
@@ -273,7 +286,7 @@ class LockTable:
             if grant is None:
                 return False
             busy = [resource for resource in grant.resources if resource.busy]
-            self._end(grant)
+            self._end(grant, reason)
             for resource in busy:
                 resource.pending = _STOPPING
         try:
@@ -315,8 +328,11 @@ class LockTable:
 
     # --- its end
 
-    def _end(self, grant: _Grant) -> None:
+    def _end(self, grant: _Grant, reason: str) -> None:
+        self._ended[grant.number] = reason  # first: who does not find the grant looks here
         del self._grants[grant.number]
+        if len(self._ended) > _REMEMBERED:
+            del self._ended[next(iter(self._ended))]
         for resource in grant.resources:
             if resource.live == grant.number:
                 resource.live, resource.holder = 0, None
@@ -328,10 +344,6 @@ class LockTable:
             if resource.pending is _STOPPING:
                 resource.pending = None
             self._changed.notify_all()
-
-    def _over(self, number: int) -> bool:
-        grant = self._grants.get(number)
-        return grant is None or grant.until <= self._clock()
 
     def _rested(self) -> None:
         if self._acquiring:
@@ -360,7 +372,7 @@ class LockTable:
             )
             left_s = self._next_end - now
         for number in over:
-            self.lose(number, "its lease ended")
+            self.lose(number, _LEASE_ENDED)
         return None if left_s == math.inf else left_s
 
     def close(self) -> None:

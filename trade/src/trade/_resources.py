@@ -60,8 +60,8 @@ class Resource:
         """Names of resources of the same container that are only locked together with it."""
         self.epoch = ""
         """Of the container that judges."""
-        self.over: Callable[[int], bool] = _every_grant_is_over
-        """Whether a grant of that container holds no more, by the clock of its leases."""
+        self.over: Callable[[int], str] = _every_grant_is_over
+        """Why a grant of that container holds no more, by the clock of its leases; empty if it holds."""
         self.live = 0
         """The grant that holds now; 0 is none."""
         self.holder: Holder | None = None
@@ -157,28 +157,28 @@ class Resource:
             if holder is not None and (caller == holder.identity or caller in holder.delegates):
                 for token in tokens:
                     if token.number == self.live and token.epoch == self.epoch:
-                        if self.over(token.number):
-                            raise lapsed(self)
+                        if why := self.over(token.number):
+                            raise lapsed(self, why)
                         self.uses, self.used_at = self.uses + 1, time.time()
                         return
             raise locked(self, holder, session)
         if self.pending is not None:
             raise locked(self, self.pending, session)
         for token in tokens:
-            if token.epoch == self.epoch and self.over(token.number):
-                raise lapsed(self)
+            if token.epoch == self.epoch and (why := self.over(token.number)):
+                raise lapsed(self, why)
 
     def __repr__(self) -> str:
         return f"<Resource {self.name}>"
 
 
-def _every_grant_is_over(_: int) -> bool:
-    return True
+def _every_grant_is_over(_: int) -> str:
+    return "nobody judges locks of it"
 
 
-def lapsed(resource: Resource) -> LockLost:
+def lapsed(resource: Resource, why: str) -> LockLost:
     """The error of who comes under a grant that holds no more."""
-    return LockLost(resources=(resource.name,), reason="its lease ended or it was taken away")
+    return LockLost(resources=(resource.name,), reason=why)
 
 
 def locked(resource: Resource, holder: Holder | None, session: str = "") -> LockedByOther:
@@ -221,8 +221,8 @@ class Permit:
                 latch = resource.estop or resource.latch
                 reason = "it was stopped" if latch is None else f"{latch.by}: {latch.reason}"
                 raise MotionStopped(device=resource.name, reason=reason)
-            if live and (resource.live != live or resource.over(live)):
-                raise lapsed(resource)
+            if live and ((why := resource.over(live)) or resource.live != live):
+                raise lapsed(resource, why)
             if resource.live != live:
                 raise locked(resource, resource.holder)
 
