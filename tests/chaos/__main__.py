@@ -173,9 +173,10 @@ class Run:
 
     def end(self) -> None:
         """Have everybody end by himself, clients first; who does not is killed, and will be missed."""
+        for slot in (*self._drivers, *self._clients):
+            slot.thaw()
         for slots in (self._clients, self._drivers):
             for slot in slots:
-                slot.thaw()
                 slot.tell("stop")
             until = now() + _END_S
             for slot in slots:
