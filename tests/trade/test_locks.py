@@ -263,6 +263,31 @@ def test_a_session_that_ends_while_it_waits_for_a_call_to_end_gets_nothing(table
     assert table.table.infos() == []
 
 
+def test_who_had_it_is_told_why_not_anymore_even_while_it_is_being_stopped_or_another_has_it(table: Table) -> None:
+    token = table.take("a")
+    table.resources["a"].moving = True
+    table.table.lose(token.number, "broken by an operator: my turn")
+    [(resource, done)] = table.stopping
+    with pytest.raises(LockLost, match="my turn"):
+        table.call("a", [token])
+    resource.moving = False
+    done(resource, "")
+    table.take("a", "other")
+    with pytest.raises(LockLost, match="my turn"):
+        table.call("a", [token])
+    with pytest.raises(LockedByOther):
+        table.call("a")
+
+
+def test_why_grants_ended_is_known_of_the_last_few_and_never_of_more(table: Table) -> None:
+    numbers: list[int] = []
+    for _ in range(300):
+        numbers.append(table.take("a").number)
+        table.table.release(numbers[-1], "tester")
+    assert table.table.over(numbers[-1]) == "it was given back"
+    assert table.table.over(numbers[0]) == "it ended long ago"
+
+
 # --- emptying
 
 
@@ -296,7 +321,7 @@ def test_S11_equal_is_asked_for_not_at_least(table: Table) -> None:
     with pytest.raises(LockLost):
         admitted.gate()
     for number in (old.number, new.number + 1):
-        with pytest.raises(LockedByOther):
+        with pytest.raises(LockLost):
             table.call("a", [Token(EPOCH, number)])
     with pytest.raises(LockedByOther):
         table.call("a", [Token("another epoch", new.number)])

@@ -152,21 +152,18 @@ class Resource:
         Raises:
             LockedByOther, LockLost: see `check`.
         """
-        holder = self.holder
-        if self.live:
-            if holder is not None and (caller == holder.identity or caller in holder.delegates):
-                for token in tokens:
-                    if token.number == self.live and token.epoch == self.epoch:
-                        if why := self.over(token.number):
-                            raise lapsed(self, why)
-                        self.uses, self.used_at = self.uses + 1, time.time()
-                        return
-            raise locked(self, holder, session)
-        if self.pending is not None:
-            raise locked(self, self.pending, session)
+        live, holder, shown = self.live, self.holder, False
         for token in tokens:
-            if token.epoch == self.epoch and (why := self.over(token.number)):
-                raise lapsed(self, why)
+            if token.epoch == self.epoch:
+                if why := self.over(token.number):
+                    raise lapsed(self, why)
+                shown = shown or token.number == live
+        if live:
+            if not shown or holder is None or not (caller == holder.identity or caller in holder.delegates):
+                raise locked(self, holder, session)
+            self.uses, self.used_at = self.uses + 1, time.time()
+        elif self.pending is not None:
+            raise locked(self, self.pending, session)
 
     def __repr__(self) -> str:
         return f"<Resource {self.name}>"
