@@ -24,6 +24,7 @@ from trade._notifications import Callback, Notification
 from trade._resources import Permit, Resource, permit
 from trade._secret import Secret
 from trade._service import service
+from trade._session import Session
 from trade._settings import Settings
 from trade._system import ContainerInfo, System
 from trade._terms import LockInfo
@@ -47,6 +48,7 @@ __all__ = [
     "Resource",
     "Run",
     "Secret",
+    "Session",
     "Settings",
     "System",
     "acall",
@@ -73,6 +75,7 @@ __all__ = [
     "left",
     "lock",
     "locks",
+    "open_session",
     "permit",
     "progress",
     "register",
@@ -284,6 +287,11 @@ def resume(which: Constraint | Iterable[Handle]) -> list[str]:
 def estop(reason: str = "", *, limit_s: float = LIMIT_S) -> EstopReport:
     """Stop everything in the whole system until it is cleared; see `Container.estop`. Not safety-rated."""
     return container().estop(reason, limit_s=limit_s)
+
+
+def open_session(client: str) -> Session:
+    """A presence for one client of a program that acts for many; see `Container.open_session`."""
+    return container().open_session(client)
 
 
 def estops() -> list[Estop]:

@@ -154,6 +154,7 @@ class Caller:
         chain: tuple[str, ...],
         behalf: Behalf | None = None,
         encode: Encode = encode_message,
+        session: str = "",
     ) -> Reply:
         """Call and wait for the answer; it always comes, if only from ourselves at the deadline."""
         call_id = self.new_id()
@@ -162,7 +163,8 @@ class Caller:
         except ChannelClosed:
             return _ended(call_id, Status.UNSENT)
         try:
-            call = Call(PROTOCOL, call_id, service, box.name, self._session, expires_ns, chain, args, behalf)
+            speaker = session or self._session
+            call = Call(PROTOCOL, call_id, service, box.name, speaker, expires_ns, chain, args, behalf)
             data = encode(call)
             box.sent = (publisher, data)
             box.waiting = (call_id, peer, deadline_ns)
@@ -211,6 +213,7 @@ class Caller:
         on_progress: OnReply | None = None,
         behalf: Behalf | None = None,
         encode: Encode = encode_message,
+        session: str = "",
     ) -> int:
         """Call without waiting; answer and progress go there on a thread of ours. Returns the call's id."""
         try:
@@ -218,8 +221,8 @@ class Caller:
         except ChannelClosed:
             on_reply(_ended(0, Status.UNSENT))
             return 0
-        call_id = self.new_id()
-        data = encode(Call(PROTOCOL, call_id, service, shared.name, self._session, expires_ns, chain, args, behalf))
+        call_id, speaker = self.new_id(), session or self._session
+        data = encode(Call(PROTOCOL, call_id, service, shared.name, speaker, expires_ns, chain, args, behalf))
         self._pending[call_id] = _Pending(peer, deadline_ns, on_reply, on_progress, (publisher, data))
         if deadline_ns < self._next_deadline_ns:
             self._sooner.set()

@@ -1,6 +1,7 @@
 """One participant: starts, joins, hosts providers, looks up, leaves. Ties the other modules together."""
 
 import contextlib
+import itertools
 import secrets
 import threading
 from typing import Any, Final
@@ -30,6 +31,7 @@ from trade._providers import Providers
 from trade._reach import Reach
 from trade._registry import Change, Record, Registry
 from trade._resources import Holder
+from trade._session import Session
 from trade._settings import Settings
 from trade._system import DOMAIN, PROVIDER, ContainerInfo, System
 from trade._transport import ChannelClosed, Transport
@@ -39,6 +41,7 @@ from trade._wire import (
     ServiceKey,
     Token,
     alive_key,
+    as_chunk,
     encode_message,
 )
 from trade._withdrawn import Withdrawn
@@ -68,6 +71,7 @@ class Container(Hosting, Looking, Guarding):
         self._settings = settings or Settings.read()
         self.address = Address(self._settings.identity, self._settings.container, secrets.token_hex(6))
         self.session: Final = str(self.address)
+        self._clients = itertools.count(1)
         self._closing = threading.RLock()
         self._closed = False
         self.system: Final = System(lambda: self)
@@ -114,7 +118,7 @@ class Container(Hosting, Looking, Guarding):
             leaving.callback(self._estopping.close)
             self._deadman = self._estopping.deadman
             self._table.stop_with(self._deadman.stop)
-            self.withdrawn = Withdrawn(self._providers)
+            self.withdrawn = Withdrawn(self._providers, self._deadman.rest)
             """What was taken off from elsewhere and can be offered again."""
             self._dispatcher = Dispatcher(self._transport, self.address, self._providers.lookup, coroutines)
             leaving.callback(self._dispatcher.close)
@@ -130,7 +134,9 @@ class Container(Hosting, Looking, Guarding):
             self._estopping.begin(own)
             presence = self._transport.appear(alive_key(self.address))
             leaving.callback(presence.close)
-            self._watch = Watch(self._transport, self._registry, self.address, self._lost, announcer.beat)
+            self._watch = Watch(
+                self._transport, self._registry, self.address, self._lost, self._session_ended, announcer.beat
+            )
             leaving.callback(self._watch.close)
             self._leaving = leaving.pop_all()
         _process.live.add(self)
@@ -193,8 +199,14 @@ class Container(Hosting, Looking, Guarding):
             self.locking.keeper.lost(address)
             if self._inherited is not None:
                 self._inherited.lost(address)
-            self._table.session_ended(str(address), f"its owner {address.container} has ended or cannot be reached")
-            self._deadman.session_ended(str(address))
+            self._session_ended(str(address), f"its container {address.container} has ended or cannot be reached")
+        else:
+            self._table.session_back(str(address))
+
+    def _session_ended(self, session: str, reason: str = "it was closed") -> None:
+        """Nobody of it is there any more: nothing more is let in for it, its locks fall, what it moves stops."""
+        self._table.session_ended(session, reason)
+        self._deadman.session_ended(session)
 
     def _ask_for_release(self, holder: Holder, token: Token, who: str, reason: str) -> None:
         """Told by the lock services: somebody would like to have what another one holds."""
@@ -273,6 +285,26 @@ class Container(Hosting, Looking, Guarding):
         return self.handle(msgspec.msgpack.decode(data, type=ServiceKey))
 
     # --- being
+
+    def open_session(self, client: str) -> Session:
+        """A presence for one client of a program that acts for many: a page, a connection (S03).
+
+        Inside ``with container.open_session("page"):`` calls and locks are the client's: when it is closed, what the
+        client set moving stops and its locks fall, and nothing else does.
+
+        Args:
+            client: a word for it; others see ``identity/container/epoch/client.number``.
+
+        Raises:
+            ConfigurationError: the container is closed.
+        """
+        self._check_open()
+        name = f"{self.address}/{as_chunk(client)[:60]}.{next(self._clients)}"
+        try:
+            presence = self._transport.appear(alive_key(name))
+        except ChannelClosed:  # closed by another thread meanwhile
+            raise container_closed(self.address) from None
+        return Session(self.address, name, presence, self._session_ended)
 
     @property
     def name(self) -> str:

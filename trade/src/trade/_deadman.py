@@ -35,7 +35,22 @@ class Deadman:
             one for one in self._resources() if one.busy and any(within(mover, session) for mover in one.sessions)
         ]
         if moving := [one for one in its_own if self._stop_of(one) is not None]:
-            self.stop(moving, f"session {session} has ended", _log_failure)
+            self.stop(moving, f"session {session} has ended", _unsafe)
+
+    def rest(self, resources: Sequence[Resource], reason: str) -> list[str]:
+        """Stop those of these that move, and wait until that is over; what could not be stopped, and why."""
+        busy = [one for one in resources if one.busy and self._stop_of(one) is not None]
+        problems, over = list[str](), threading.Semaphore(0)
+
+        def done(resource: Resource, problem: str) -> None:
+            if problem:
+                problems.append(f"{resource.name}: {problem}")
+            over.release()
+
+        self.stop(busy, reason, done)
+        for _ in busy:
+            over.acquire(timeout=2 * _STOP_S)
+        return problems
 
     def stop(self, resources: Sequence[Resource], reason: str, done: Callable[[Resource, str], None]) -> None:
         """Void what was admitted for these, ask what runs to end, and have them stop; does not wait.
@@ -152,6 +167,8 @@ def _end_calls(cancels: Sequence[Callable[[], None]]) -> None:
             _logger.exception("a call whose lock or session has ended failed to end")
 
 
-def _log_failure(resource: Resource, problem: str) -> None:
+def _unsafe(resource: Resource, problem: str) -> None:
+    """What could not be stopped is locked by nobody before somebody resumes it (S14)."""
+    resource.unsafe = problem
     if problem:
         _logger.error("%s could not be stopped: %s", resource.name, problem)

@@ -1,10 +1,12 @@
 """The part of a container that hosts: registering objects, altering and withdrawing them."""
 
+import logging
 from collections.abc import Callable, Mapping, Sequence
 
 from msgspec import structs
 
 from trade._constraints import checked_meta
+from trade._deadman import Deadman
 from trade._handle import Handle
 from trade._invoke import container_closed
 from trade._member import Member
@@ -13,11 +15,14 @@ from trade._transport import ChannelClosed
 from trade._wire import HEALTHY, ProviderInfo, Scalar
 from trade._withdrawn import Withdrawn
 
+_logger = logging.getLogger("trade")
+
 
 class Hosting(Member):
     """Offers objects to the whole system."""
 
     _providers: Providers
+    _deadman: Deadman
     withdrawn: Withdrawn
 
     def register(
@@ -54,11 +59,15 @@ class Hosting(Member):
     def deregister(self, provider: object) -> None:
         """Withdraw an object's services from the whole system; handles of them fail from now on.
 
+        What it moves is stopped first, because afterwards nobody could. It is withdrawn even if that fails.
+
         Raises:
             ConfigurationError: it is not registered here.
         """
         self._check_open()
         if not self.withdrawn.forget(provider):
+            for problem in self._deadman.rest(self._providers.alone_with(provider), "its services are withdrawn"):
+                _logger.error("withdrawn without having been stopped: %s", problem)
             self._providers.remove(provider)
 
     def set_groups(self, provider: object, groups: str | Sequence[str]) -> None:

@@ -23,6 +23,7 @@ from trade._records import type_from_schema
 from trade._registry import Record
 from trade._schemas import read_schema
 from trade._serial import Serial, Turn
+from trade._session import Session, speaking
 from trade._system import CLOCK, DOMAIN, PROVIDER
 from trade._wire import EMPTY_ARGUMENTS, Address, Behalf, Call, ErrorInfo, Reply, ServiceInfo, Status, Token
 from trade.errors import (
@@ -63,6 +64,19 @@ class Request(Struct, gc=False):
     """The call that makes it."""
     around: tuple[Held, ...]
     """The locks it is made under."""
+    client: Session | None
+    """For whom it is made; none: the container itself."""
+
+    def session(self, own: Address) -> str:
+        """The client's session, if that container acts for one; else nothing.
+
+        Raises:
+            SessionEnded: the client is gone.
+        """
+        if self.client is None or self.client.owner != own:
+            return ""
+        self.client.check()
+        return self.client.name
 
     def behalf(self, effect: str, own: Address) -> Behalf | None:
         """What the call inherits; the locks around it unless it stops, which needs none.
@@ -92,18 +106,18 @@ class Request(Struct, gc=False):
 
 def new_request(deadline_s: float | None) -> Request:
     """A call that begins now."""
-    now, outer, around = monotonic_ns(), running.get(), holding.get()
+    now, outer, around, client = monotonic_ns(), running.get(), holding.get(), speaking.get()
     if deadline_s is None:
         asked_s, asked_ns = DEFAULT_DEADLINE_S, now + _DEFAULT_DEADLINE_NS
     else:
         asked_s, asked_ns = deadline_s, now + int(deadline_s * 1e9)
     if outer is None:
-        return Request(asked_s, asked_ns, (), asked_s, asked_ns, None, around)
+        return Request(asked_s, asked_ns, (), asked_s, asked_ns, None, around, client)
     chain = (*outer.chain, outer.service)
     if outer.expires_ns is None or outer.expires_ns >= asked_ns:
-        return Request(asked_s, asked_ns, chain, asked_s, asked_ns, outer, around)
+        return Request(asked_s, asked_ns, chain, asked_s, asked_ns, outer, around, client)
     left_s = max(0.0, (outer.expires_ns - now) / 1e9)
-    return Request(left_s, outer.expires_ns, chain, asked_s, asked_ns, outer, around)
+    return Request(left_s, outer.expires_ns, chain, asked_s, asked_ns, outer, around, client)
 
 
 class LocalTarget:
@@ -183,9 +197,9 @@ class LocalTarget:
         expires_ns = None if self._is_stop else request.deadline_ns
         if expires_ns is not None and monotonic_ns() >= expires_ns:
             raise DeadlineExceeded(service=self._label, deadline_s=request.deadline_s)
-        behalf = request.behalf(self._effect, self._own)
+        behalf, session = request.behalf(self._effect, self._own), request.session(self._own) or self._session
         return CallContext(
-            self._new_id(), self._label, self._identity, self._session, expires_ns, request.chain, ongoing, behalf
+            self._new_id(), self._label, self._identity, session, expires_ns, request.chain, ongoing, behalf
         )
 
     def _copied(self, raw: bytes, context: CallContext) -> Any:
@@ -278,9 +292,10 @@ class RemoteTarget:
         return None if self._is_stop else self._peer.expiry_ns(request.deadline_ns)
 
     def _ask(self, publisher: Any, service: str, args: Any, expires_ns: int | None, request: Request) -> Reply:
-        behalf, chain = request.behalf(self._info.effect, self._caller.own), request.chain
+        own, chain = self._caller.own, request.chain
+        behalf, session = request.behalf(self._info.effect, own), request.session(own)
         return self._caller.ask(
-            self._peer, publisher, service, args, request.deadline_ns, expires_ns, chain, behalf, self._message
+            self._peer, publisher, service, args, request.deadline_ns, expires_ns, chain, behalf, self._message, session
         )
 
     def _start(
@@ -294,9 +309,10 @@ class RemoteTarget:
         on_progress: Callable[[Reply], None] | None = None,
     ) -> int:
         peer, deadline_ns, chain = self._peer, request.deadline_ns, request.chain
-        behalf = request.behalf(self._info.effect, self._caller.own)
+        own, encode = self._caller.own, self._message
+        behalf, session = request.behalf(self._info.effect, own), request.session(own)
         return self._caller.start(
-            peer, publisher, service, args, deadline_ns, expires_ns, chain, then, on_progress, behalf, self._message
+            peer, publisher, service, args, deadline_ns, expires_ns, chain, then, on_progress, behalf, encode, session
         )
 
     def _unpack(self, reply: Reply, request: Request) -> Any:

@@ -15,12 +15,13 @@ from msgspec import Struct, structs
 from trade._resources import Holder, Latch, Resource, locked
 from trade._terms import Granted, LockInfo, Terms
 from trade._wire import Token
-from trade.errors import DeviceSilent, LockedByOther, ServiceGone, TradeError
+from trade.errors import DeviceSilent, LockedByOther, ServiceGone, SessionEnded, TradeError
 
 _STOPPING: Final = Holder("trade", "", "", "stopping what moved under a lock that was lost", 0.0)
 
 _REMEMBERED: Final = 256
 """So many grants that ended are known with the reason."""
+_SESSIONS_REMEMBERED: Final = 4096
 _LEASE_ENDED: Final = "its lease ended"
 
 Stop = Callable[[Sequence[Resource], str, Callable[[Resource, str], None]], None]
@@ -58,6 +59,8 @@ class LockTable:
         self._grants: dict[int, _Grant] = {}
         self._ended: dict[int, str] = {}
         """Why the last few grants ended."""
+        self._sessions_ended: dict[str, str] = {}
+        """The last few that did, and why."""
         self._waiting: list[_Waiter] = []
         """For their turn, next first."""
         self._acquiring: list[_Waiter] = []
@@ -89,7 +92,7 @@ class LockTable:
             resource = known or (named if isinstance(named, Resource) else Resource(name))
             if isinstance(named, Resource) and resource is not named:
                 raise ValueError(f"resource {name} is another object already; share one trade.Resource")
-            resource.epoch, resource.over = self._epoch, self.over
+            resource.epoch, resource.over, resource.gone = self._epoch, self.over, self.gone
             resource.estop = self._estop
             resource.on_rest(self._rested)
             self._resources[name] = (resource, uses + 1)
@@ -162,6 +165,7 @@ class LockTable:
             LockedByOther: not within the times given; nothing is held then.
             DeviceSilent: one could not be stopped when it had to be, and is given to nobody.
             ServiceGone: one is not here.
+            SessionEnded: who asks is not there any more.
         """
         mine = set(tokens)
         resources = tuple(one for one in self.named(names) if Token(self._epoch, one.live) not in mine)
@@ -169,6 +173,8 @@ class LockTable:
             return Granted(None, ())
         asked = self._clock()
         with self._changed:
+            if (ended := self.gone((holder.session,))) is not None:
+                raise ended
             self._count += 1
             waiter = _Waiter((-terms.priority, self._count), resources, holder, frozenset(calls))
             self._acquiring.append(waiter)
@@ -297,8 +303,14 @@ class LockTable:
         return True
 
     def session_ended(self, session: str, reason: str) -> None:
-        """Nobody of that session (or of one within it) is there any more: its locks fall, its waiting ends."""
+        """Nobody of that session (or of one within it) is there any more: its locks fall, its waiting ends.
+
+        What comes from it later is refused: a call may have been under way, or have waited for its turn.
+        """
         with self._changed:
+            self._sessions_ended[session] = reason
+            if len(self._sessions_ended) > _SESSIONS_REMEMBERED:
+                del self._sessions_ended[next(iter(self._sessions_ended))]
             for waiter in self._acquiring:
                 if within(waiter.holder.session, session):
                     waiter.gone = reason
@@ -306,6 +318,19 @@ class LockTable:
             self._changed.notify_all()
         for number in fallen:
             self.lose(number, reason)
+
+    def session_back(self, session: str) -> None:
+        """It could not be reached, and is there again."""
+        self._sessions_ended.pop(session, None)
+
+    def gone(self, sessions: Iterable[str]) -> SessionEnded | None:
+        """Which of these has ended, as an error; None if all are there."""
+        if self._sessions_ended:
+            for session in sessions:
+                whole = "/".join(session.split("/")[:3])
+                if (reason := self._sessions_ended.get(session) or self._sessions_ended.get(whole)) is not None:
+                    return SessionEnded(session=session, reason=reason)
+        return None
 
     def infos(self) -> list[LockInfo]:
         """What is held, and who waits."""

@@ -195,6 +195,14 @@ class Providers:
             for resource in service.resources:
                 self._table.drop(resource)
 
+    def alone_with(self, provider: object) -> list[Resource]:
+        """What services of a registered object use, and those of no other."""
+        used: dict[bool, set[Resource]] = {True: set(), False: set()}
+        for registered in list(self._hosted.values()):
+            for service in registered.services.values():
+                used[registered.provider is provider].update(service.resources)
+        return sorted(used[True] - used[False], key=lambda resource: resource.name)
+
     def stop_of(self, resource: Resource) -> LocalService | None:
         """The service that stops a resource, and as few others as there are."""
         found = [

@@ -14,7 +14,7 @@ from msgspec import Struct
 
 from trade._context import CallContext, running
 from trade._wire import Token
-from trade.errors import LockedByOther, LockLost, MotionStopped, Stopped
+from trade.errors import LockedByOther, LockLost, MotionStopped, SessionEnded, Stopped
 
 __all__ = ["Permit", "Resource", "permit"]
 
@@ -50,8 +50,8 @@ class Resource:
     """
 
     __slots__ = (
-        *("_moving", "_rested", "calls", "coupled", "epoch", "estop", "holder", "latch"),
-        *("live", "movers", "name", "over", "pending", "stops", "unsafe", "used_at", "uses"),
+        *("_moving", "_rested", "calls", "coupled", "epoch", "estop", "gone", "holder"),
+        *("latch", "live", "movers", "name", "over", "pending", "stops", "unsafe", "used_at", "uses"),
     )
 
     def __init__(self, name: str, *, coupled: Sequence[str] = ()) -> None:
@@ -62,6 +62,8 @@ class Resource:
         """Of the container that judges."""
         self.over: Callable[[int], str] = _every_grant_is_over
         """Why a grant of that container holds no more, by the clock of its leases; empty if it holds."""
+        self.gone: Callable[[Iterable[str]], SessionEnded | None] = _all_are_there
+        """Which of some sessions has ended."""
         self.live = 0
         """The grant that holds now; 0 is none."""
         self.holder: Holder | None = None
@@ -169,6 +171,10 @@ class Resource:
         return f"<Resource {self.name}>"
 
 
+def _all_are_there(_: Iterable[str]) -> None:
+    return None
+
+
 def _every_grant_is_over(_: int) -> str:
     return "nobody judges locks of it"
 
@@ -251,6 +257,7 @@ def admit(
 
     Raises:
         Stopped, LockedByOther, LockLost: see `Resource.check`; nothing is counted then.
+        SessionEnded: one for whom it is made is not there any more; likewise.
     """
     permitted = Permit(resources, call_id, sessions, cancel)
     for resource in resources:
@@ -258,6 +265,8 @@ def admit(
     try:
         for resource in resources:
             resource.check(tokens, caller, sessions[0] if sessions else "")
+            if (ended := resource.gone(sessions)) is not None:
+                raise ended
         permitted.gate()
     except BaseException:
         permitted.close()

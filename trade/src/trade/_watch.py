@@ -35,11 +35,13 @@ class Watch:
         registry: Registry,
         own: Address,
         lost: Callable[..., None],
+        ended: Callable[[str], None],
         beat: Callable[[], None],
     ) -> None:
         self._registry = registry
         self._own = own
         self._lost = lost
+        self._ended = ended
         self.malformed = 0
         self._asker = Asker(transport, registry, self._answer, beat)
         entries, signs = transport.announcements(REGISTRY), transport.presences(ALIVE)
@@ -85,13 +87,17 @@ class Watch:
 
     def _sign(self, message: Message) -> None:
         try:
-            address = Address(*_chunks(message.key, 3))
+            identity, container, epoch, *client = _chunks(message.key, 3, most=4)
         except Malformed as bad:
             self._drop(message.key, bad)
             return
+        address = Address(identity, container, epoch)
         if address == self._own:
             return
-        if message.payload is None:
+        if client:
+            if message.payload is None:
+                self._ended(f"{address}/{client[0]}")
+        elif message.payload is None:
             self._lost(address)
             self._registry.vanish(address)
         else:
@@ -139,9 +145,9 @@ def _place(key: str) -> tuple[Address, str, str]:
     return Address(identity, container, epoch), domain, provider
 
 
-def _chunks(key: str, count: int) -> list[str]:
+def _chunks(key: str, count: int, most: int = 0) -> list[str]:
     """The chunks of a key after its first; one may put on a pattern, too, and that is nobody's key."""
     chunks = key.split("/")[1:]
-    if len(chunks) != count or not all(map(is_chunk, chunks)):
+    if not count <= len(chunks) <= max(count, most) or not all(map(is_chunk, chunks)):
         raise Malformed(f"{key!r} is a pattern or of another shape")
     return chunks

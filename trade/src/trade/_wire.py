@@ -65,8 +65,9 @@ def registry_key(domain: str, address: Address, provider: str) -> str:
     return f"registry/{domain}/{address}/{provider}"
 
 
-def alive_key(address: Address) -> str:
-    return f"alive/{address}"
+def alive_key(session: Address | str) -> str:
+    """Of a container, or of a session within one."""
+    return f"alive/{session}"
 
 
 def estop_key(identity: str) -> str:

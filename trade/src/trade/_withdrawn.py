@@ -1,34 +1,41 @@
 """Providers that were taken off from anywhere in the system, kept by their container to be offered again."""
 
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Final
 
 from trade._providers import Offer, Providers, checked_groups
+from trade._resources import Resource
 from trade._system import DOMAIN, WithdrawnInfo
 from trade._wire import ServiceKey
-from trade.errors import ConfigurationError
+from trade.errors import ConfigurationError, DeviceFault
 
 
 class Withdrawn:
     """Owns what is not offered at the moment; whoever registered the object keeps the last word on it."""
 
-    def __init__(self, providers: Providers) -> None:
+    def __init__(self, providers: Providers, rest: Callable[[Sequence[Resource], str], list[str]]) -> None:
         self._providers: Final = providers
+        self._rest: Final = rest
         self._lock = threading.Lock()
         self._kept: dict[str, Offer] = {}
 
     def take_off(self, key: ServiceKey) -> str:
         """Stop offering the provider of a service; returns the name it is put back by.
 
+        What it moves is stopped first: afterwards nobody could.
+
         Raises:
             ConfigurationError: it is not offered here, or is the middleware's own.
+            DeviceFault: it could not be stopped; it is offered as before.
         """
         if key.domain == DOMAIN:
             raise ConfigurationError(where=key.provider, problem="the middleware's own services cannot be withdrawn")
         offer = self._providers.offer(f"{key.domain}/{key.provider}")
         if offer is None:
             raise ConfigurationError(where=key.provider, problem=f"container {key.address.container} does not offer it")
+        if problems := self._rest(self._providers.alone_with(offer.provider), "its services are withdrawn"):
+            raise DeviceFault(device=key.provider, bus=key.address.container, fault="; ".join(problems))
         with self._lock:
             self._kept[key.provider] = offer
         try:

@@ -37,6 +37,7 @@ __all__ = [
     "OutcomeUnknown",
     "RemoteError",
     "ServiceGone",
+    "SessionEnded",
     "SetupError",
     "Stopped",
     "TooLarge",
@@ -284,6 +285,17 @@ class LockLost(CallerError, ConnectionError):
 
     def describe(self) -> str:
         return f"the lock of {', '.join(self.resources)} is lost: {self.reason}; take it anew with trade.lock(...)"
+
+
+@dataclass(kw_only=True, eq=False)
+class SessionEnded(CallerError, ConnectionError):
+    """Whoever asks is not there any more: nothing was done, and what he had set moving was told to stop."""
+
+    session: str
+    reason: str
+
+    def describe(self) -> str:
+        return f"session {self.session} has ended: {self.reason}; open another one with trade.open_session(...)"
 
 
 @dataclass(kw_only=True, eq=False)

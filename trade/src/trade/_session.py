@@ -1,0 +1,67 @@
+"""One client of a program that acts for many: what it sets moving is its own, and stops with it (S03)."""
+
+import contextlib
+from collections.abc import Callable, Generator
+from contextvars import ContextVar
+from typing import Final
+
+from trade._transport import Presence
+from trade._wire import Address
+from trade.errors import SessionEnded
+
+speaking: ContextVar["Session | None"] = ContextVar("trade_session", default=None)
+"""The session that calls are made in now; none: the container's own."""
+
+
+class Session:
+    """A client's presence within a container's: a context manager; calls made inside are the client's.
+
+    Locks taken inside are the client's, too. When it is closed, or the container ends, what was moved in it stops and
+    its locks fall; nothing else does. Made by `Container.open_session`.
+    """
+
+    def __init__(self, owner: Address, name: str, presence: Presence, ended: Callable[[str], None]) -> None:
+        self.owner: Final = owner
+        """The container that acts for the client."""
+        self.name: Final = name
+        """As everybody sees it: ``identity/container/epoch/client``."""
+        self._presence = presence
+        self._ended = ended
+        self._closed = False
+
+    @property
+    def closed(self) -> bool:
+        """Whether it has ended."""
+        return self._closed
+
+    def check(self) -> None:
+        """Raises SessionEnded if it has."""
+        if self._closed:
+            raise SessionEnded(session=self.name, reason="it was closed")
+
+    @contextlib.contextmanager
+    def use(self) -> Generator["Session", None, None]:
+        """Make calls in it, in any thread or task, without closing it afterwards."""
+        reset = speaking.set(self)
+        try:
+            yield self
+        finally:
+            speaking.reset(reset)
+
+    def close(self) -> None:
+        """The client is gone: what it set moving stops. Does not wait for that. Idempotent."""
+        if not self._closed:
+            self._closed = True
+            self._presence.close()
+            self._ended(self.name)
+
+    def __enter__(self) -> "Session":
+        self._using = self.use()
+        return self._using.__enter__()
+
+    def __exit__(self, *error: object) -> None:
+        self._using.__exit__(None, None, None)
+        self.close()
+
+    def __repr__(self) -> str:
+        return f"<Session {self.name}{', ended' if self._closed else ''}>"
