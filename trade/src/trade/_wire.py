@@ -93,9 +93,13 @@ REGISTRY: Final = "registry/**"
 ALIVE: Final = "alive/**"
 
 
+NO_GROUP: Final = "_"
+"""The domain of a provider without a group."""
+
+
 def domain_of(groups: tuple[str, ...]) -> str:
-    """The first segment of a provider's first group: the grain of export lists."""
-    return groups[0].split(".")[0] if groups else "_"
+    """A provider's first group, whole, in one chunk: the grain of access rules and export lists."""
+    return groups[0] if groups else NO_GROUP
 
 
 # --- messages
