@@ -42,6 +42,7 @@ class Hosting(Member):
         Raises:
             ConfigurationError: nothing to offer, a type that cannot be sent, a malformed group, or it is registered
                 already.
+            AccessDenied: the policy does not let this container offer it in one of these groups.
         """
         self._check_open()
         try:
