@@ -67,6 +67,7 @@ class Hosting(Member):
 
         Raises:
             ConfigurationError: a malformed group, or it is not registered here.
+            AccessDenied: the policy does not let this container offer it in one of these groups.
         """
         named = checked_groups(provider, groups)
         self._alter(provider, lambda info: structs.replace(info, groups=named))
