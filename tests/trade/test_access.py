@@ -1,5 +1,6 @@
 """The access policy at work: refused by who calls before anything is sent, and once more by who is called."""
 
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -348,6 +349,33 @@ def test_a_lock_that_may_no_longer_be_held_is_lost(member: Member, neck: Neck, p
         assert drv.locks() == []
         with pytest.raises(LockLost, match="planner may not lock"):
             find(planner, "move")(0.1)
+
+
+def test_who_waits_for_a_lock_gets_none_that_it_may_no_longer_hold(
+    member: Member, memory: MemorySystem, neck: Neck, policy: Path, eventually: Callable[[Callable[[], bool]], bool]
+) -> None:
+    drv, chief = member("drv"), memory.container("unchecked", identity="chief")
+    rewritten(policy, 'chief = ["chief"]', 'chief = ["chief", "operator"]')
+    drv.load_policy(policy)
+    other = memory.container("careless", identity="planner")
+    memory.settle()
+    refused = list[Exception]()
+
+    def wait() -> None:
+        try:
+            other.lock(where(group="rosie.neck"), wait_s=20).acquire()
+        except AccessDenied as denied:
+            refused.append(denied)
+
+    with chief.lock(where(group="rosie.neck")):
+        waiting = threading.Thread(target=wait)
+        waiting.start()
+        assert eventually(lambda: any(info.waiting for info in drv.locks()))
+        drv.load_policy(rewritten(policy, 'planner = ["operator"]', 'planner = ["viewer"]'))
+        assert [info.holder.identity for info in drv.locks()] == ["chief"]
+    waiting.join(20)
+    assert [str(denied).split(":")[0] for denied in refused] == ["planner may not lock rosie.neck.pan"]
+    assert drv.locks() == []
 
 
 # --- what a nested call may do

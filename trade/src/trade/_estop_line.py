@@ -132,10 +132,10 @@ class EstopLine:
             raise Malformed(f"{message.key!r} is a pattern")
         if len(chunks) == 1 and self._take is not None:
             order = decode_estop_order(message.payload or b"", chunks[0])
-            if (denied := self._access.denied_order(chunks[0], clears=bool(order.cleared))) is None:
-                self._take(order)
-            else:
-                _logger.warning("an e-stop order is not heeded: %s", denied)
+            denied = self._access.denied_order(chunks[0], clears=order.opened is None)
+            if denied is not None:
+                raise Malformed(str(denied))
+            self._take(order)
         elif len(chunks) == 3:
             self._hear_confirmed(Address(*chunks), decode_estop_confirmed(message.payload or b""))
 

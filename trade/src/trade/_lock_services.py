@@ -12,7 +12,7 @@ from trade._resources import Holder, Resource
 from trade._service import service
 from trade._terms import Granted, LockInfo, Terms
 from trade._wire import Address, Token
-from trade.errors import Busy, LockedByOther
+from trade.errors import AccessDenied, Busy, LockedByOther
 
 _MOST_WAITING: Final = 24
 """So many may stand in the queues of a container at once; who comes then asks again."""
@@ -56,9 +56,16 @@ class LockServices:
         if not self._places.acquire(blocking=False):
             raise Busy(service="trade.acquire", container=self._own.container)
         try:
-            return self._table.acquire(resources, holder, terms, call.tokens, (call.id, *calls))
+            granted = self._table.acquire(resources, holder, terms, call.tokens, (call.id, *calls))
         finally:
             self._places.release()
+        try:
+            self._require(call, "lock", granted.resources)  # once more: it may have waited for long
+        except AccessDenied:
+            if granted.token is not None:
+                self._table.release(granted.token.number, call.caller)
+            raise
+        return granted
 
     @service(effect="stop")
     def renew(self, grants: list[int]) -> dict[int, str]:

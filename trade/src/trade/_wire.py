@@ -93,8 +93,7 @@ REGISTRY: Final = "registry/**"
 ALIVE: Final = "alive/**"
 
 
-NO_GROUP: Final = "_"
-"""The domain of a provider without a group."""
+NO_GROUP: Final = "_"  # the domain of a provider without one
 
 
 def domain_of(groups: tuple[str, ...]) -> str:
@@ -309,7 +308,6 @@ _MOST_MESSAGE_BYTES: Final = MOST_BYTES + (1 << 20)
 
 EMPTY: Final = Raw(msgspec.msgpack.encode(None))
 EMPTY_ARGUMENTS: Final = Raw(msgspec.msgpack.encode(()))
-
 
 _Message = TypeVar("_Message", Call, Reply, _ProviderMessage, Tally, EstopOrder, EstopConfirmed)
 
