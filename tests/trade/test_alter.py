@@ -68,7 +68,7 @@ def test_groups_of_a_live_provider_change_and_handles_hold(
     assert (move.groups, move.label) == (("lab.bench", "spare"), "lab.bench.move")
     assert here.find(where(name="move", group="lab")) == move
     assert here.services(where(group="rosie")) == []
-    assert (move.key.domain, move(0.5)) == ("rosie", 0.5)
+    assert (move.key.domain, move(0.5)) == ("rosie.neck", 0.5)
 
 
 def test_single_groups_come_and_go(there: Container, motor: Motor, move: Handle, heard: Heard) -> None:

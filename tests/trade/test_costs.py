@@ -6,6 +6,7 @@ import tracemalloc
 import weakref
 from collections import Counter
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any, cast
 
 import pytest
@@ -121,6 +122,23 @@ def test_a_call_is_two_messages_once_the_first_one_was_made(
         call(handle)
     request = "stop" if name == "stop" else "call"
     assert sent == {request: CALLS, "reply": CALLS}
+
+
+def test_a_call_is_two_messages_under_a_policy_too(
+    pair: tuple[Container, Container], sent: Counter[str], tmp_path: Path
+) -> None:
+    policy = tmp_path / "policy.toml"
+    policy.write_text('[roles.all]\ncall = ["*"]\nregister = ["*"]\n[identities]\n"*" = ["all"]\n')
+    here, there = pair
+    for container in pair:
+        container.load_policy(policy)
+    there.register(Arm(), "robot")
+    move = here.find(where(name="move", group="robot"), wait_s=20)
+    move(0.1, 0.2, 0.3)
+    sent.clear()
+    for _ in range(CALLS):
+        move(0.1, 0.2, 0.3)
+    assert sent == {"call": CALLS, "reply": CALLS}
 
 
 def test_a_started_call_is_two_messages_too(pair: tuple[Container, Container], sent: Counter[str]) -> None:

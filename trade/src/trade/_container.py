@@ -4,11 +4,13 @@ import contextlib
 import itertools
 import secrets
 import threading
+from pathlib import Path
 from typing import Any, Final
 
 import msgspec
 
 from trade import _process
+from trade._access import Access
 from trade._announcing import Announcer
 from trade._calls import Caller
 from trade._codec import Codec
@@ -76,9 +78,11 @@ class Container(Hosting, Looking, Guarding):
         self._closed = False
         self.system: Final = System(lambda: self)
         """Its own switches: who it is linked to, and whether it lets itself be found."""
+        self.access: Final = Access(self._settings.policy)
+        """What the policy means for it."""
         self._targets: dict[ServiceKey, LocalTarget | RemoteTarget] = {}
         self._codec = Codec(self._handle_to_data, self._data_to_handle, (Handle,))
-        self._registry = Registry(self.address)
+        self._registry = Registry(self.address, self.access.may_offer)
         with contextlib.ExitStack() as leaving:  # what has begun ends again if the rest cannot begin
             self._reach: Reach | None = None
             self._transport = transport or join(self._settings, leaving)
@@ -105,7 +109,9 @@ class Container(Hosting, Looking, Guarding):
             leaving.callback(self._table.close)
             announcer = Announcer(self._transport, self.address)
             leaving.callback(announcer.close)
-            self._providers = Providers(announcer, self._registry, self.address, self._codec, coroutines, self._table)
+            self._providers = Providers(
+                announcer, self._registry, self.address, self._codec, coroutines, self._table, self.access
+            )
             state = self._settings.state_dir
             self._estopping = Estopping(
                 self._transport,
@@ -114,13 +120,16 @@ class Container(Hosting, Looking, Guarding):
                 self._table,
                 self._providers,
                 None if state is None else state / self._settings.system / "estop",
+                self.access,
             )
             leaving.callback(self._estopping.close)
             self._deadman = self._estopping.deadman
             self._table.stop_with(self._deadman.stop)
             self.withdrawn = Withdrawn(self._providers, self._deadman.rest)
             """What was taken off from elsewhere and can be offered again."""
-            self._dispatcher = Dispatcher(self._transport, self.address, self._providers.lookup, coroutines)
+            self._dispatcher = Dispatcher(
+                self._transport, self.address, self._providers.lookup, coroutines, self.access
+            )
             leaving.callback(self._dispatcher.close)
             own = OwnServices(
                 self.system,
@@ -129,6 +138,8 @@ class Container(Hosting, Looking, Guarding):
                 self._ask_for_release,
                 self.locking.keeper.asked,
                 self._estopping.open_here,
+                self.access,
+                self._providers.groups_of,
             )
             self._providers.add(own, (DOMAIN,), name=PROVIDER)
             self._estopping.begin(own)
@@ -141,6 +152,24 @@ class Container(Hosting, Looking, Guarding):
             self._leaving = leaving.pop_all()
         _process.live.add(self)
 
+    def load_policy(self, path: Path | str) -> None:
+        """Go by another access policy, or by the same file as it is now; calls under way go on.
+
+        What may no longer be offered leaves the registry, and locks that may no longer be held are lost.
+
+        Raises:
+            ConfigurationError: it is wrong, and says where; what was loaded before stays.
+        """
+        self._check_open()
+        self.access.load(Path(path))
+        self._targets.clear()
+        self._registry.judge_anew()
+        for info in self._table.infos():
+            held = [(name, self._providers.groups_of(name)) for name in info.resources]
+            denied = self.access.denied_lock(info.holder.identity, held)
+            if denied is not None:
+                self._table.lose(info.token.number, str(denied))
+
     # --- looking up
 
     def addresses(self) -> list[Address]:
@@ -152,7 +181,7 @@ class Container(Hosting, Looking, Guarding):
         self._check_open()
         infos: list[ContainerInfo] = []
         for state in self._registry.containers():
-            records = [record for _, provided in list(state.providers.values()) for record in provided]
+            records = [record for entry in list(state.providers.values()) for record in entry.records]
             first = records[0] if records else None
             infos.append(
                 ContainerInfo(
@@ -242,16 +271,19 @@ class Container(Hosting, Looking, Guarding):
 
     def _new_target(self, handle: Handle) -> LocalTarget | RemoteTarget:
         self._check_open()
-        key = handle.key
+        key, policy = handle.key, self.access.policy
         known = self._registry.get(key) is not None or handle.last_record is not None or self._registry.removed(key)
         if not known:
             self._registry.wait_for(lambda: self._registry.get(key) is not None, _PATIENCE_S)
         record = self._registry.get(key)
+        if record is not None:
+            self.access.require_call(self.address.identity, key.domain, key.name, record.info.effect, record.label)
         target = None if record is None else self._make_target(record)
         if target is None:
             raise self._gone(handle)
         self._targets[key] = target
-        if self._closed or self._registry.get(key) is not record:  # it left, or is another one, since we looked
+        changed = self._registry.get(key) is not record or self.access.policy is not policy
+        if self._closed or changed:  # it left, or is another one, since we looked
             self._targets.pop(key, None)
         return target
 

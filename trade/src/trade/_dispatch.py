@@ -15,11 +15,13 @@ from typing import Any, Final
 import msgspec
 from msgspec import Raw, structs
 
+from trade._access import Access
 from trade._context import CallContext, running
 from trade._coroutines import AsyncLoop
 from trade._crew import Crew
 from trade._failures import pack_error, unpack_error
 from trade._ongoing import Answer, Herald, Once, Ongoing, cancelled
+from trade._policies import Policy
 from trade._resources import Resource, admitted
 from trade._serial import Serial
 from trade._service import ServiceMark
@@ -44,7 +46,7 @@ from trade._wire import (
     is_chunk,
     reply_key,
 )
-from trade.errors import InvalidResult, NotSerialisable, RemoteError, TradeError
+from trade.errors import AccessDenied, InvalidResult, NotSerialisable, RemoteError, TradeError
 
 _logger = logging.getLogger("trade")
 
@@ -53,6 +55,8 @@ _COROUTINE: Final[type] = CoroutineType
 """What an ``async def`` gives; asked of every result, so without a call."""
 _KINDS: Final = frozenset(("call", "stop"))
 _MOST_REPLY_KEYS: Final = 1024
+_MOST_CALLERS: Final = 1024
+"""Of one service, whose admission is kept."""
 _SYSTEM: Final = f"{DOMAIN}/{PROVIDER}"
 _DEFECTS: Final = (InvalidResult, NotSerialisable, RemoteError)
 """Errors of ours that are mistakes of a provider; the others are answers it gives on purpose."""
@@ -62,7 +66,7 @@ _decode_cancel: Final = msgspec.msgpack.Decoder(CancelArguments).decode
 class LocalService:
     """A method of a registered provider, ready to be called."""
 
-    __slots__ = ("_loop", "effect", "info", "label", "method", "resources", "serial", "signature", "strict")
+    __slots__ = ("_loop", "admitted", "effect", "info", "label", "method", "resources", "serial", "signature", "strict")
 
     def __init__(
         self,
@@ -84,6 +88,8 @@ class LocalService:
         self.serial = serial
         self.resources = resources
         """What it needs for itself, or stops."""
+        self.admitted: dict[str, Policy] = {}
+        """Who may call it, and by which policy that was decided."""
         self._loop = loop
 
     def run(self, raw: Raw | bytes, context: CallContext) -> Any:
@@ -145,8 +151,9 @@ Lookup = Callable[[str, str], LocalService | None]
 class Dispatcher:
     """Every incoming call of one container."""
 
-    def __init__(self, transport: Transport, own: Address, lookup: Lookup, loop: AsyncLoop) -> None:
+    def __init__(self, transport: Transport, own: Address, lookup: Lookup, loop: AsyncLoop, access: Access) -> None:
         self._transport = transport
+        self._access = access
         self._loop = loop
         self._own = own
         self._here = f"{own}/"
@@ -180,6 +187,9 @@ class Dispatcher:
             else:
                 self._refuse(replier, caller, call, Status.GONE)
             return
+        if (denied := self._denied(caller, provider, service)) is not None:
+            self._refuse(replier, caller, call, Status.ERROR, Raw(encode_message(pack_error(denied))))
+            return
         if urgent:
             self._answer(replier, caller, call, *_run(caller, call, service, None))
             return
@@ -191,6 +201,19 @@ class Dispatcher:
             self._perform(ongoing, service, replier, call)
         else:
             self._queue(service.serial, ongoing, service, replier, call)
+
+    def _denied(self, caller: str, place: str, service: LocalService) -> AccessDenied | None:
+        """Why a caller may not call a service; decided once for each policy."""
+        policy = self._access.policy
+        if policy is None or service.admitted.get(caller) is policy:
+            return None
+        domain = place.partition("/")[0]
+        denied = self._access.denied_call(policy, caller, domain, service.info.name, service.effect, service.label)
+        if denied is None:
+            if len(service.admitted) >= _MOST_CALLERS:
+                service.admitted.clear()
+            service.admitted[caller] = policy
+        return denied
 
     def _perform(self, ongoing: Ongoing, service: LocalService, replier: Publisher, call: Call) -> None:
         if service.too_late(call.expires_ns):
@@ -229,13 +252,13 @@ class Dispatcher:
         if answer is not None:
             self._answer(replier, caller, call, *answer)
 
-    def _refuse(self, replier: Publisher, caller: str, call: Call, status: int) -> None:
+    def _refuse(self, replier: Publisher, caller: str, call: Call, status: int, body: Raw = EMPTY) -> None:
         """It does not run now; but it may have before."""
         first = self._once.find(caller, call)
         if first is not None:
             self._again(first, replier, caller, call)
         else:
-            self._answer(replier, caller, call, status, EMPTY)
+            self._answer(replier, caller, call, status, body)
 
     def _cancel(self, caller: str, call: Call) -> Answer:
         try:

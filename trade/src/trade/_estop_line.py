@@ -10,6 +10,7 @@ from typing import Final
 import msgspec
 from msgspec import Struct
 
+from trade._access import Access
 from trade._transport import ChannelClosed, Message, Transport
 from trade._wire import (
     ESTOPS,
@@ -54,7 +55,8 @@ class EstopReport(Struct, frozen=True):
 class EstopLine:
     """Where one container hears orders and confirmations, and gives its own."""
 
-    def __init__(self, transport: Transport, own: Address) -> None:
+    def __init__(self, transport: Transport, own: Address, access: Access) -> None:
+        self._access = access
         self._orders = transport.publish(estop_key(own.identity), urgent=True, droppable=True)
         self._confirmations = transport.publish(estop_confirmed_key(own), urgent=True, droppable=True)
         self._channel = transport.subscribe(ESTOPS)
@@ -129,7 +131,11 @@ class EstopLine:
         if not all(map(is_chunk, chunks)):
             raise Malformed(f"{message.key!r} is a pattern")
         if len(chunks) == 1 and self._take is not None:
-            self._take(decode_estop_order(message.payload or b"", chunks[0]))
+            order = decode_estop_order(message.payload or b"", chunks[0])
+            denied = self._access.denied_order(chunks[0], clears=order.opened is None)
+            if denied is not None:
+                raise Malformed(str(denied))
+            self._take(order)
         elif len(chunks) == 3:
             self._hear_confirmed(Address(*chunks), decode_estop_confirmed(message.payload or b""))
 

@@ -8,6 +8,7 @@ from typing import Final
 
 from msgspec import structs
 
+from trade._access import Access
 from trade._deadman import Deadman
 from trade._estop import Estops
 from trade._estop_line import EstopLine, EstopReport
@@ -36,11 +37,13 @@ class Estopping:
         table: LockTable,
         providers: Providers,
         folder: Path | None,
+        access: Access,
     ) -> None:
         self._own = own
         self._registry = registry
         self._providers = providers
-        self._line = EstopLine(transport, own)
+        self._access = access
+        self._line = EstopLine(transport, own, access)
         self.deadman: Final = Deadman(providers.stop_of, providers.stops, table.resources)
         self._estops = Estops(
             table,
@@ -99,6 +102,7 @@ class Estopping:
         there = [estop.id for estop in self.open()]
         if unknown := [name for name in ids if name not in there]:
             raise NoSuchEstop(ids=unknown, open=there)
+        self._access.require(self._own.identity, "administer", DOMAIN, f"e-stop {', '.join(ids)}")
         order = EstopOrder(PROTOCOL, secrets.token_hex(4), None, tuple(ids))
 
         def expected() -> set[Address]:
@@ -113,7 +117,8 @@ class Estopping:
     def _own_records(self) -> list[Record]:
         """One record of each container, of the provider that tells what is open there."""
         containers = self._registry.containers()
-        return [records[0] for state in containers for _, records in state.providers.values() if _tells(records)]
+        entries = [entry for state in containers for entry in list(state.providers.values())]
+        return [entry.records[0] for entry in entries if _tells(entry.records)]
 
     # --- telling and hearing of what is open
 
@@ -147,7 +152,7 @@ def _is_stop(record: Record) -> bool:
 
 
 def _has_stop(state: ContainerState) -> bool:
-    return any(_is_stop(record) for _, records in list(state.providers.values()) for record in records)
+    return any(_is_stop(record) for entry in list(state.providers.values()) for record in entry.records)
 
 
 def _tells(records: Sequence[Record]) -> bool:

@@ -54,6 +54,7 @@ class Guarding(Member):
             LockedByOther: somebody has one of them, or something still moves, after ``wait_s``.
             IncompleteGroup: the robot file says that more belongs to the group.
             ConfigurationError: nothing to lock.
+            AccessDenied: the policy does not let this container lock one of them.
             DeviceSilent: one of them could not be stopped when it had to be.
         """
         self._check_open()
@@ -88,6 +89,9 @@ class Guarding(Member):
 
         Returns:
             Those that were broken.
+
+        Raises:
+            AccessDenied: the policy does not let this container administer one of them.
         """
         self._check_open()
         return self.locking.break_lock(which, reason)
@@ -100,6 +104,7 @@ class Guarding(Member):
 
         Raises:
             LockedByOther: it is the owner of their lock who resumes.
+            AccessDenied: without a lock of one's own it is for who administers them, says the policy.
         """
         self._check_open()
         return self.locking.resume(which)
@@ -136,6 +141,7 @@ class Guarding(Member):
 
         Raises:
             NoSuchEstop: an id that nobody knows as open; nothing is cleared then.
+            AccessDenied: the policy does not let this container administer the system.
         """
         self._check_open()
         return self._estopping.clear(ids, limit_s)

@@ -47,6 +47,7 @@ class Hosting(Member):
         Raises:
             ConfigurationError: nothing to offer, a type that cannot be sent, a malformed group, or it is registered
                 already.
+            AccessDenied: the policy does not let this container offer it in one of these groups.
         """
         self._check_open()
         try:
@@ -75,6 +76,7 @@ class Hosting(Member):
 
         Raises:
             ConfigurationError: a malformed group, or it is not registered here.
+            AccessDenied: the policy does not let this container offer it in one of these groups.
         """
         named = checked_groups(provider, groups)
         self._alter(provider, lambda info: structs.replace(info, groups=named))

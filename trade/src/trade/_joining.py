@@ -54,7 +54,7 @@ def _join_at(
         leaving.callback(rendezvous.leave)
         connect += rendezvous.enter(_nearest(listen))
     if settings.insecure_lan:
-        _logger.warning("TRADE_INSECURE_LAN: %s is open to its network, unencrypted, without a policy", listen)
+        _logger.warning("TRADE_INSECURE_LAN: %s is open to its network, unencrypted", listen)
     credentials = settings.credentials or user_secret()
     return ZenohTransport(
         configuration(

@@ -2,20 +2,23 @@
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Final
 
+from trade._access import Access
 from trade._context import CallContext, current_call
 from trade._locks import LockTable
 from trade._resources import Holder, Resource
 from trade._service import service
 from trade._terms import Granted, LockInfo, Terms
 from trade._wire import Address, Token
-from trade.errors import Busy, LockedByOther
+from trade.errors import AccessDenied, Busy, LockedByOther
 
 _MOST_WAITING: Final = 24
 """So many may stand in the queues of a container at once; who comes then asks again."""
 
+GroupsOf = Callable[[str], set[str]]
+"""The groups of the services that use a resource."""
 Ask = Callable[[Holder, Token, str, str], None]
 """Passes a wish on to the holder of a grant: whose, which, who asks and why."""
 Asked = Callable[[Token, str, str], bool]
@@ -25,8 +28,12 @@ Asked = Callable[[Token, str, str], bool]
 class LockServices:
     """The wire's side of a `LockTable`."""
 
-    def __init__(self, table: LockTable, own: Address, ask: Ask, asked: Asked) -> None:
+    def __init__(
+        self, table: LockTable, own: Address, ask: Ask, asked: Asked, access: Access, groups: GroupsOf
+    ) -> None:
         self._table = table
+        self._access = access
+        self._groups = groups
         self._own = own
         self._ask = ask
         self._asked = asked
@@ -36,6 +43,7 @@ class LockServices:
     def acquire(self, resources: list[str], terms: Terms) -> Granted:
         """Take all of these and what is coupled to them for the calling session."""
         call = _call()
+        self._require(call, "lock", [resource.name for resource in self._table.named(resources)])
         calls = () if call.behalf is None else call.behalf.calls
         holder = Holder(
             identity=call.caller,
@@ -48,9 +56,16 @@ class LockServices:
         if not self._places.acquire(blocking=False):
             raise Busy(service="trade.acquire", container=self._own.container)
         try:
-            return self._table.acquire(resources, holder, terms, call.tokens, (call.id, *calls))
+            granted = self._table.acquire(resources, holder, terms, call.tokens, (call.id, *calls))
         finally:
             self._places.release()
+        try:
+            self._require(call, "lock", granted.resources)  # once more: it may have waited for long
+        except AccessDenied:
+            if granted.token is not None:
+                self._table.release(granted.token.number, call.caller)
+            raise
+        return granted
 
     @service(effect="stop")
     def renew(self, grants: list[int]) -> dict[int, str]:
@@ -74,7 +89,10 @@ class LockServices:
     @service(effect="stop")
     def break_lock(self, grant: int, reason: str) -> bool:
         """Take a lock away from its owner; what it moves stops. Whether it was held."""
-        return self._table.lose(grant, f"broken by {_call().caller}: {reason}")
+        call = _call()
+        held = [info.resources for info in self._table.infos() if info.token.number == grant]
+        self._require(call, "administer", held[0] if held else ())
+        return self._table.lose(grant, f"broken by {call.caller}: {reason}")
 
     @service
     def request_release(self, resources: list[str], reason: str) -> list[str]:
@@ -96,7 +114,7 @@ class LockServices:
 
     @service
     def resume(self, resources: list[str]) -> list[str]:
-        """Let these move again after a stop; for the owner of their lock, or anybody if they are not locked."""
+        """Let these move again after a stop; for the owner of their lock, or who administers what is not locked."""
         call = _call()
         found = self._table.named(resources)
         for resource in found:
@@ -108,7 +126,17 @@ class LockServices:
                     purpose=resource.holder.purpose,
                     since=resource.holder.since,
                 )
+        self._require(call, "administer", [resource.name for resource in found if resource.holder is None])
         return [resource.name for resource in found if _resumed(resource)]
+
+    def _require(self, call: CallContext, verb: str, resources: Iterable[str]) -> None:
+        """Of each resource one service that uses it is enough for the caller to have the right over.
+
+        Raises:
+            AccessDenied: the policy gives it over none.
+        """
+        for name in resources if self._access.policy is not None else ():
+            self._access.require_any(call.caller, verb, self._groups(name), name)
 
 
 def _resumed(resource: Resource) -> bool:

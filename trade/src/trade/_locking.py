@@ -4,6 +4,7 @@ import contextlib
 from collections.abc import Callable, Iterable, Sequence
 from typing import Final, Protocol
 
+from trade._access import Access
 from trade._constraints import Constraint
 from trade._handle import Handle, Run
 from trade._keeper import Keeper
@@ -20,6 +21,8 @@ LEASE_S: Final = 2.0
 
 class Home(Protocol):
     """What locking asks of its container."""
+
+    access: Final[Access]
 
     @property
     def address(self) -> Address: ...
@@ -59,6 +62,7 @@ class Locking:
             handles = selected(which, self._home.services)
             if not partial:
                 require_whole(which, handles)
+            self._require("lock", handles)
             return resources_of(handles)
 
         return Lock(self.keeper, terms, wanted, on_lost, on_request)
@@ -86,12 +90,17 @@ class Locking:
     def break_lock(self, which: Constraint | Iterable[Handle], reason: str) -> list[LockInfo]:
         """See `Container.break_lock`."""
         handles = selected(which, self._home.services)
+        self._require("administer", handles)
         wanted = resources_of(handles)
         broken: list[LockInfo] = []
         for address, names in wanted.items():
             hit = [info for info in self._service(address, "locks")() if not set(names).isdisjoint(info.resources)]
             broken += [info for info in hit if self._service(address, "break_lock")(info.token.number, reason)]
         return broken
+
+    def _require(self, verb: str, handles: Sequence[Handle]) -> None:
+        for handle in handles:
+            self._home.access.require(self._home.address.identity, verb, handle.key.domain, handle.label)
 
     def _everywhere(self, name: str, which: Constraint | Iterable[Handle], *rest: str) -> list[str]:
         wanted = resources_of(selected(which, self._home.services))

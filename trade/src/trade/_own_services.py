@@ -2,7 +2,8 @@
 
 from collections.abc import Callable
 
-from trade._lock_services import Ask, Asked, LockServices
+from trade._access import Access
+from trade._lock_services import Ask, Asked, GroupsOf, LockServices
 from trade._locks import LockTable
 from trade._system import System, SystemServices
 from trade._wire import Address, Estop
@@ -14,10 +15,18 @@ class OwnServices(SystemServices, LockServices):
     """One provider, so that one registry entry tells of all its container's own functions."""
 
     def __init__(
-        self, system: System, locks: LockTable, own: Address, ask: Ask, asked: Asked, open_estops: Open
+        self,
+        system: System,
+        locks: LockTable,
+        own: Address,
+        ask: Ask,
+        asked: Asked,
+        open_estops: Open,
+        access: Access,
+        groups: GroupsOf,
     ) -> None:
         SystemServices.__init__(self, system)
-        LockServices.__init__(self, locks, own, ask, asked)
+        LockServices.__init__(self, locks, own, ask, asked, access, groups)
         self._open_estops = open_estops
 
     @property

@@ -9,6 +9,7 @@ from weakref import WeakValueDictionary
 
 from msgspec import Struct, structs
 
+from trade._access import Access
 from trade._announcing import Announcer
 from trade._codec import Codec
 from trade._constraints import GROUP, checked_meta
@@ -20,7 +21,7 @@ from trade._resources import Resource
 from trade._serial import Serial
 from trade._service import ServiceMark, kinds_of, marked_methods
 from trade._signature import Signature
-from trade._system import DOMAIN
+from trade._system import DOMAIN, PROVIDER
 from trade._wire import (
     Address,
     ProviderInfo,
@@ -29,6 +30,7 @@ from trade._wire import (
     ServiceKey,
     as_chunk,
     domain_of,
+    is_chunk,
 )
 from trade.errors import ConfigurationError
 
@@ -60,8 +62,16 @@ class Providers:
     """Owns what this container hosts; the registry and the rest of the system are told from here."""
 
     def __init__(
-        self, announcer: Announcer, registry: Registry, own: Address, codec: Codec, loop: AsyncLoop, table: LockTable
+        self,
+        announcer: Announcer,
+        registry: Registry,
+        own: Address,
+        codec: Codec,
+        loop: AsyncLoop,
+        table: LockTable,
+        access: Access,
     ) -> None:
+        self._access = access
         self._announcer = announcer
         self._registry = registry
         self._own = own
@@ -97,10 +107,12 @@ class Providers:
             name: of the provider in keys; by default its class and a number.
 
         Raises:
-            ConfigurationError: see `Container.register`.
+            ConfigurationError, AccessDenied: see `Container.register`.
         """
         kind = type(provider).__qualname__
         domain = domain_of(groups)
+        if name != PROVIDER:
+            self._access.require_offer(self._own.identity, groups, kind)
         with self._lock:
             self._require_new(provider)
             self._counter += 1
@@ -142,10 +154,13 @@ class Providers:
 
         Raises:
             ConfigurationError: it is not registered here, or the class has become wrong.
+            AccessDenied: this container may not offer it in these groups.
         """
         with self._announcing:
             place, known = self._known(provider)
             info = change(known.info)
+            if info.groups != known.info.groups:
+                self._access.require_offer(self._own.identity, info.groups, info.kind)
             services = known.services
             if reread:
                 self._signatures.clear()
@@ -212,6 +227,15 @@ class Providers:
             if service.effect == "stop" and resource in service.resources
         ]
         return min(found, key=lambda service: len(service.resources), default=None)
+
+    def groups_of(self, resource: str) -> set[str]:
+        """The groups, as keys name them, of the services that use a resource."""
+        return {
+            place.partition("/")[0]
+            for place, registered in list(self._hosted.items())
+            for service in registered.services.values()
+            if any(one.name == resource for one in service.resources)
+        }
 
     def stops(self) -> list[LocalService]:
         """Every stop service that needs no arguments, the middleware's own left out."""
@@ -314,8 +338,11 @@ def checked_groups(provider: object, groups: str | Sequence[str]) -> tuple[str, 
     named = (groups,) if isinstance(groups, str) else tuple(groups)
     for group in named:
         is_text = isinstance(group, str)  # pyright: ignore[reportUnnecessaryIsInstance] - callers may not check types
-        if not is_text or not GROUP.fullmatch(group) or group.split(".")[0] == DOMAIN:
-            problem = f"{group!r} is no group; use words joined by dots, such as rosie.head ({DOMAIN!r} is reserved)"
+        if not is_text or not GROUP.fullmatch(group) or not is_chunk(group) or group.split(".")[0] == DOMAIN:
+            problem = (
+                f"{group!r} is no group; use words joined by dots, such as rosie.head, 80 characters at most "
+                f"({DOMAIN!r} is reserved)"
+            )
             raise ConfigurationError(where=type(provider).__qualname__, problem=problem)
     return named
 

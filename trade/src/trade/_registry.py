@@ -49,13 +49,30 @@ class Record:
         return f"{self.groups[0] if self.groups else self.kind}.{self.info.name}"
 
 
+class Entry(NamedTuple):
+    """What a container says of one provider, and what is known by it."""
+
+    domain: str
+    info: ProviderInfo
+    records: list[Record]
+    """None of them if the container may not offer it."""
+
+
+MayOffer = Callable[[str, str, str, Sequence[str]], bool]
+"""Whether an identity may offer a provider: identity, domain, provider, groups."""
+
+
+def _anybody(_identity: str, _domain: str, _provider: str, _groups: Sequence[str]) -> bool:
+    return True
+
+
 @dataclass(slots=True)
 class ContainerState:
     """What is known of one boot of one container while its sign of life stands."""
 
     address: Address
-    providers: dict[str, tuple[int, list[Record]]] = field(default_factory=dict)
-    """Name to revision and services."""
+    providers: dict[str, "Entry"] = field(default_factory=dict)
+    """By name."""
     removed: dict[str, None] = field(default_factory=dict)
     """Deregistered, in this order: a name is never used twice in one boot."""
     heard: Heard = field(default_factory=Heard)
@@ -83,8 +100,9 @@ class Registry:
     offers. Listeners are told in order, after the change, on the thread that fed it, with no lock held.
     """
 
-    def __init__(self, own: Address) -> None:
+    def __init__(self, own: Address, may_offer: MayOffer = _anybody) -> None:
         self._own = own
+        self._may_offer = may_offer
         self._containers: dict[Address, ContainerState] = {}
         self._records: Index[Record] = Index()
         self._lock = threading.RLock()
@@ -136,7 +154,7 @@ class Registry:
                 if self._containers.get(state.address) is not state or revision < state.heard.answered:
                     return
                 known = state.providers.items()
-                gone = [name for name, (since, _) in known if name not in offered and since <= revision]
+                gone = [name for name, entry in known if name not in offered and entry.info.revision <= revision]
                 state.heard.all_told(revision)
                 change = self._change(state, offered, gone)
                 self._bell.ring()
@@ -165,21 +183,40 @@ class Registry:
         """Take up what is newer than known, and let go of what is gone for good. Under the lock."""
         before, after = list[Record](), list[Record]()
         for provider in gone:
-            before += state.providers.pop(provider, (0, []))[1]
+            before += _records(state.providers.pop(provider, None))
         state.removed.update(dict.fromkeys(gone))
         for provider in list(state.removed)[: max(0, len(state.removed) - _MOST_PROVIDERS)]:
             del state.removed[provider]
         for provider, (domain, info) in entries.items():
-            since, records = state.providers.get(provider, (0, []))
-            full = not since and len(state.providers) >= _MOST_PROVIDERS
-            if provider in state.removed or since >= info.revision or full:
+            known = state.providers.get(provider)
+            if provider in state.removed or (known is not None and known.info.revision >= info.revision):
                 continue
-            state.providers[provider] = (info.revision, self._make(state.address, domain, provider, info))
-            before += records
-            after += state.providers[provider][1]
+            if known is None and len(state.providers) >= _MOST_PROVIDERS:
+                continue
+            made = self._make(state.address, domain, provider, info)
+            state.providers[provider] = Entry(domain, info, made)
+            before += _records(known)
+            after += made
         return self._swap(before, after)
 
+    def judge_anew(self) -> None:
+        """Who may offer what has changed: what may no longer be offered leaves, what now may be joins."""
+        with self._telling:
+            with self._lock:
+                before, after = list[Record](), list[Record]()
+                for state in self._containers.values():
+                    for provider, entry in state.providers.items():
+                        made = self._make(state.address, entry.domain, provider, entry.info)
+                        if bool(made) != bool(entry.records):
+                            state.providers[provider] = entry._replace(records=made)
+                            before += entry.records
+                            after += made
+                change = self._swap(before, after)
+            self._tell(change)
+
     def _make(self, address: Address, domain: str, provider: str, info: ProviderInfo) -> list[Record]:
+        if not self._may_offer(address.identity, domain, provider, info.groups):
+            return []
         return [
             Record(
                 key=ServiceKey(address, domain, provider, service.name),
@@ -261,4 +298,8 @@ class Registry:
 
 
 def _all(state: ContainerState) -> list[Record]:
-    return [record for _, records in state.providers.values() for record in records]
+    return [record for entry in state.providers.values() for record in entry.records]
+
+
+def _records(entry: Entry | None) -> list[Record]:
+    return [] if entry is None else entry.records

@@ -27,6 +27,7 @@ _VARIABLES: Final = (
     "TRADE_BRIDGE",
     "TRADE_INSECURE_LAN",
     "TRADE_LOCK",
+    "TRADE_POLICY",
     "TRADE_RUNTIME_DIR",
     "TRADE_STATE_DIR",
 )
@@ -54,10 +55,12 @@ class Settings:
     """User and password of the whole system; none: a secret that this user's containers on this host share."""
     insecure_lan: bool = False
     """Laboratories only: listen on a network without a policy and without encryption."""
+    policy: Path | None = None
+    """File of the access policy; none: everybody in the system may do everything."""
     bridge: tuple[str, ...] = ()
     """Network interfaces such as ``eth0``: carry messages between the containers of their networks, which need no way
     to each other. It has to listen on each; one alone will do if it dials another bridge. Everything of the system
-    crosses: there are no lists of what may, and no policy, yet."""
+    crosses: there are no lists of what may, yet."""
     explicit_system: bool = False
     lock: str = ""
     """A lock that the process around this one holds for it; see `Lock.environment`."""
@@ -71,7 +74,10 @@ class Settings:
                 raise ConfigurationError(where=what, problem=problem)
         for endpoint in self.listen:
             if not Endpoint.read(endpoint).loopback and not self._open_on_purpose():
-                problem = "listening beyond loopback needs a policy, and none is loaded; listen on tcp/127.0.0.1:PORT"
+                problem = (
+                    "listening beyond loopback needs a policy, and none is loaded; set TRADE_POLICY, or listen on "
+                    "tcp/127.0.0.1:PORT"
+                )
                 raise ConfigurationError(where=f"listen {endpoint}", problem=problem)
         if self.credentials is not None and not _can_be_told(*self.credentials):
             problem = "user and password must be printable, without spaces around them, and the user without a colon"
@@ -92,10 +98,12 @@ class Settings:
             raise ConfigurationError(where=f"connect {endpoint}", problem=problem)
 
     def _open_on_purpose(self) -> bool:
-        if self.insecure_lan and not (self.explicit_system and self.credentials):
+        allowed = self.insecure_lan or self.policy is not None
+        if allowed and not (self.explicit_system and self.credentials):
             problem = "needs an explicit system id and credentials, too: set TRADE_SYSTEM and TRADE_CREDENTIALS"
-            raise ConfigurationError(where="TRADE_INSECURE_LAN", problem=problem)
-        return self.insecure_lan
+            where = "TRADE_INSECURE_LAN" if self.insecure_lan else "listening beyond loopback"
+            raise ConfigurationError(where=where, problem=problem)
+        return allowed
 
     @classmethod
     def read(
@@ -109,14 +117,16 @@ class Settings:
         credentials: tuple[str, str] | None = None,
         insecure_lan: bool | None = None,
         bridge: Sequence[str] | None = None,
+        policy: Path | None = None,
         environment: Mapping[str, str] = os.environ,
     ) -> "Settings":
         """Settings from arguments, else from the environment, else the defaults.
 
         The environment has ``TRADE_SYSTEM``, ``TRADE_IDENTITY``, ``TRADE_CONTAINER``, ``TRADE_LISTEN`` and
         ``TRADE_CONNECT`` (comma-separated), ``TRADE_CREDENTIALS`` (``user:password``), ``TRADE_INSECURE_LAN`` (``1``),
-        ``TRADE_BRIDGE`` (comma-separated), ``TRADE_LOCK`` (set by ``trade lock``), ``TRADE_RUNTIME_DIR`` and
-        ``TRADE_STATE_DIR`` (else the user's folder for state). Others that begin with ``TRADE_`` are warned of.
+        ``TRADE_BRIDGE`` (comma-separated), ``TRADE_POLICY`` (a file), ``TRADE_LOCK`` (set by ``trade lock``),
+        ``TRADE_RUNTIME_DIR`` and ``TRADE_STATE_DIR`` (else the user's folder for state). Others that begin with
+        ``TRADE_`` are warned of.
         """
         _warn_of_unknown(environment)
         named = system or environment.get("TRADE_SYSTEM") or None
@@ -129,6 +139,7 @@ class Settings:
             credentials=credentials or _credentials(environment.get("TRADE_CREDENTIALS")),
             insecure_lan=environment.get("TRADE_INSECURE_LAN") == "1" if insecure_lan is None else insecure_lan,
             bridge=tuple(_split(environment, "TRADE_BRIDGE") if bridge is None else bridge),
+            policy=policy or _path(environment.get("TRADE_POLICY")),
             explicit_system=named is not None,
             lock=environment.get("TRADE_LOCK", ""),
             state_dir=_state_dir(environment),
@@ -141,6 +152,10 @@ def _warn_of_unknown(environment: Mapping[str, str]) -> None:
             near = difflib.get_close_matches(name, _VARIABLES, n=1, cutoff=0.8)
             hint = f"did you mean {near[0]}?" if near else f"there is {', '.join(_VARIABLES)}"
             _logger.warning("the environment variable %s means nothing to TRADE; %s", name, hint)
+
+
+def _path(named: str | None) -> Path | None:
+    return Path(named) if named else None
 
 
 def _state_dir(environment: Mapping[str, str]) -> Path | None:

@@ -54,6 +54,7 @@ class _Member(Protocol):
     def withdrawn(self) -> _Withdrawn: ...
     def handle(self, key: ServiceKey) -> Handle: ...
     def containers(self) -> list[ContainerInfo]: ...
+    def load_policy(self, path: str) -> None: ...
 
 
 class System:
@@ -141,6 +142,17 @@ class System:
         """What `register` can offer again, by name."""
         return self._member().withdrawn.infos()
 
+    def load_policy(self, path: str) -> None:
+        """Go by another access policy, or by the same file as it is now; calls under way go on.
+
+        Args:
+            path: of the policy, as this container's host sees it.
+
+        Raises:
+            ConfigurationError: it is wrong, and says where; what was loaded before stays.
+        """
+        self._member().load_policy(path)
+
 
 class SystemServices:
     """What every container offers about itself."""
@@ -192,3 +204,8 @@ class SystemServices:
     def disconnect(self, endpoint: str) -> None:
         """Dial an endpoint no more; LinkStays if a link is there, which only the end of a container ends."""
         self._system.disconnect(endpoint)
+
+    @service
+    def load_policy(self, path: str) -> None:
+        """Go by another access policy, or by its file as it is now; a wrong one leaves the old one running."""
+        self._system.load_policy(path)

@@ -94,9 +94,12 @@ REGISTRY: Final = "registry/**"
 ALIVE: Final = "alive/**"
 
 
+NO_GROUP: Final = "_"  # the domain of a provider without one
+
+
 def domain_of(groups: tuple[str, ...]) -> str:
-    """The first segment of a provider's first group: the grain of export lists."""
-    return groups[0].split(".")[0] if groups else "_"
+    """A provider's first group, whole, in one chunk: the grain of access rules and export lists."""
+    return groups[0] if groups else NO_GROUP
 
 
 # --- messages
@@ -306,7 +309,6 @@ _MOST_MESSAGE_BYTES: Final = MOST_BYTES + (1 << 20)
 
 EMPTY: Final = Raw(msgspec.msgpack.encode(None))
 EMPTY_ARGUMENTS: Final = Raw(msgspec.msgpack.encode(()))
-
 
 _Message = TypeVar("_Message", Call, Reply, _ProviderMessage, Tally, EstopOrder, EstopConfirmed)
 

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 __all__ = [
+    "AccessDenied",
     "BusGone",
     "Busy",
     "CallError",
@@ -251,6 +252,25 @@ class NoSuchEstop(CallerError, LookupError):
     def describe(self) -> str:
         there = f"open {'is' if len(self.open) == 1 else 'are'} {_some(self.open)}" if self.open else "none is open"
         return f"there is no open e-stop {', '.join(self.ids)}; {there}"
+
+
+@dataclass(kw_only=True, eq=False)
+class AccessDenied(CallerError, PermissionError):
+    """The access policy does not allow it; nothing was done."""
+
+    who: str
+    """The identity that asked."""
+    verb: str
+    what: str
+    """The group, or the service."""
+    rule: str
+    """Why, in words of the policy."""
+
+    def describe(self) -> str:
+        return (
+            f"{self.who} may not {self.verb} {self.what}: {self.rule}; "
+            "`trade policy show` tells who may what, and whoever keeps the policy can change it"
+        )
 
 
 @dataclass(kw_only=True, eq=False)

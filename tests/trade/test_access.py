@@ -1,0 +1,467 @@
+"""The access policy at work: refused by who calls before anything is sent, and once more by who is called."""
+
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from trade import Container, Handle, Resource, Settings, service, where
+from trade._access import FUNCTIONS
+from trade._own_services import OwnServices
+from trade._service import marked_methods
+from trade.errors import AccessDenied, ConfigurationError, LockLost
+from trade.testing import MemorySystem, memory_system
+
+POLICY = """
+revoked = ["thief"]
+
+[roles.operator]
+includes = ["viewer"]
+call = ["rosie.neck"]
+lock = ["rosie.neck"]
+
+[roles.viewer]
+read = ["rosie"]
+
+[roles.driver]
+register = ["rosie", "lab"]
+
+[roles.chief]
+administer = ["*"]
+register = ["rosie"]
+
+[identities]
+planner = ["operator"]
+dash = ["viewer"]
+drv = ["driver"]
+chief = ["chief"]
+"""
+
+
+class Neck:
+    def __init__(self, name: str = "rosie.neck.pan") -> None:
+        self.resources = (Resource(name),)
+        self.moved: list[float] = []
+        self.stops = 0
+
+    @service
+    def move(self, angle_rad: float) -> float:
+        self.moved.append(angle_rad)
+        return angle_rad
+
+    @service(effect="read")
+    def angle(self) -> float:
+        return 0.5
+
+    @service(effect="stop")
+    def stop(self) -> None:
+        self.stops += 1
+
+
+@pytest.fixture
+def policy(tmp_path: Path) -> Path:
+    path = tmp_path / "policy.toml"
+    path.write_text(POLICY)
+    return path
+
+
+@pytest.fixture
+def memory() -> Iterator[MemorySystem]:
+    with memory_system() as system:
+        yield system
+
+
+Member = Callable[[str], Container]
+
+
+@pytest.fixture
+def member(memory: MemorySystem, policy: Path) -> Member:
+    """Starts a container under an identity, with the policy loaded."""
+
+    def start(identity: str) -> Container:
+        container = memory.container(f"of-{identity}", identity=identity)
+        if container.access.policy is None:
+            container.load_policy(policy)
+        memory.settle()
+        return container
+
+    return start
+
+
+@pytest.fixture
+def neck(member: Member, memory: MemorySystem) -> Neck:
+    """What the driver offers in group ``rosie.neck``."""
+    neck = Neck()
+    member("drv").register(neck, "rosie.neck")
+    memory.settle()
+    return neck
+
+
+def find(container: Container, name: str, group: str = "rosie.neck") -> Handle:
+    return container.find(where(name=name, group=group, container="of-drv"))
+
+
+# --- by the caller
+
+
+def test_a_permitted_identity_calls_reads_and_stops(member: Member, neck: Neck) -> None:
+    planner = member("planner")
+    assert (find(planner, "move")(0.1), find(planner, "angle")(), find(planner, "stop")()) == (0.1, 0.5, None)
+
+
+def test_a_denied_call_tells_who_what_and_why_and_nothing_runs(member: Member, neck: Neck) -> None:
+    dash = member("dash")
+    with pytest.raises(AccessDenied) as denied:
+        find(dash, "move")(0.1)
+    error = denied.value
+    assert (error.who, error.verb, error.what) == ("dash", "call", "rosie.neck.move")
+    assert error.rule == "no rule of role viewer allows call in rosie.neck"
+    assert isinstance(error, PermissionError)
+    assert find(dash, "angle")() == 0.5
+    assert neck.moved == []
+
+
+def test_S07_a_stop_needs_no_role_but_one_must_not_be_revoked(member: Member, neck: Neck) -> None:
+    find(member("nobody"), "stop")()
+    assert neck.stops == 1
+    with pytest.raises(AccessDenied, match="thief is revoked"):
+        find(member("thief"), "stop")()
+    assert neck.stops == 1
+
+
+def test_a_denied_call_sends_nothing(member: Member, neck: Neck, monkeypatch: pytest.MonkeyPatch) -> None:
+    dash = member("dash")
+    move = find(dash, "move")
+    monkeypatch.setattr(dash._caller, "ask", lambda *_: pytest.fail("it was sent"))
+    with pytest.raises(AccessDenied):
+        move(0.1)
+
+
+def test_one_calls_ones_own_services_by_the_same_rules(member: Member, neck: Neck) -> None:
+    drv = member("drv")
+    with pytest.raises(AccessDenied, match=r"drv may not call rosie.neck.move"):
+        find(drv, "move")(0.1)
+
+
+def test_registering_needs_the_right_over_every_group(member: Member) -> None:
+    drv = member("drv")
+    with pytest.raises(AccessDenied, match=r"drv may not register Neck in office"):
+        drv.register(Neck(), ("rosie.arm", "office"))
+    with pytest.raises(AccessDenied, match=r"drv may not register Neck in _"):
+        drv.register(Neck())
+    arm = Neck("rosie.arm")
+    drv.register(arm, ("rosie.arm", "lab"))
+    with pytest.raises(AccessDenied, match=r"drv may not register Neck in office"):
+        drv.add_group(arm, "office")
+
+
+def test_locking_needs_the_right_over_the_group(member: Member, neck: Neck) -> None:
+    planner, dash = member("planner"), member("dash")
+    with planner.lock(where(group="rosie.neck")):
+        assert find(planner, "move")(0.1) == 0.1
+    with pytest.raises(AccessDenied, match=r"dash may not lock rosie.neck.move"):
+        dash.lock(where(group="rosie.neck")).acquire()
+
+
+def test_breaking_a_lock_resuming_and_clearing_are_for_who_administers(
+    member: Member, memory: MemorySystem, neck: Neck
+) -> None:
+    planner, dash, chief = member("planner"), member("dash"), member("chief")
+    with planner.lock(where(group="rosie.neck")):
+        with pytest.raises(AccessDenied, match=r"dash may not administer rosie.neck.move"):
+            dash.break_lock(where(group="rosie.neck"), "mine")
+        find(dash, "stop")()
+        planner.resume(where(group="rosie.neck"))
+    assert len(planner.locks()) == 0
+    with pytest.raises(AccessDenied, match=r"planner may not administer rosie.neck.pan"):
+        planner.resume(where(group="rosie.neck"))
+    chief.resume(where(group="rosie.neck"))
+    report = dash.estop("smoke")
+    memory.settle()
+    with pytest.raises(AccessDenied, match="dash may not administer e-stop"):
+        dash.estop_clear([report.id])
+    assert chief.estop_clear([report.id]).complete
+
+
+def test_the_system_is_changed_by_who_administers_it(member: Member, policy: Path) -> None:
+    planner, chief, drv = member("planner"), member("chief"), member("drv")
+    load = where(name="load_policy", container=drv.name)
+    with pytest.raises(AccessDenied, match=r"planner may not administer trade.load_policy"):
+        planner.call(load, str(policy))
+    chief.call(load, str(policy))
+    assert planner.call(where(name="clock", container=drv.name)) > 0
+
+
+def test_every_function_of_the_middleware_is_in_the_table_of_what_they_need() -> None:
+    assert set(FUNCTIONS) == set(marked_methods(OwnServices, ()))
+
+
+# --- by the provider, whatever the caller did
+
+
+@pytest.fixture
+def careless(memory: MemorySystem, neck: Neck) -> Container:
+    """A container of ``dash`` that has no policy, and so asks nobody before it calls."""
+    container = memory.container("careless", identity="dash")
+    memory.settle()
+    return container
+
+
+def test_a_provider_refuses_who_did_not_ask_the_policy(careless: Container, neck: Neck) -> None:
+    with pytest.raises(AccessDenied) as denied:
+        find(careless, "move")(0.1)
+    assert (denied.value.who, denied.value.verb, denied.value.what) == ("dash", "call", "rosie.neck.move")
+    with pytest.raises(AccessDenied, match="dash may not call"):
+        find(careless, "move").start(0.1).result(20)
+    assert neck.moved == []
+    assert find(careless, "angle")() == 0.5
+    find(careless, "stop")()
+
+
+def test_a_provider_refuses_locks_and_switches_to_who_did_not_ask(careless: Container, policy: Path) -> None:
+    with (
+        pytest.raises(AccessDenied, match=r"dash may not lock rosie.neck.pan"),
+        careless.lock(where(group="rosie.neck")),
+    ):
+        pass
+    with pytest.raises(AccessDenied, match=r"dash may not administer rosie.neck.pan"):
+        careless.resume(where(group="rosie.neck"))
+    for name, argument in (("load_policy", str(policy)), ("connect", "tcp/127.0.0.1:1"), ("set_discovery", True)):
+        with pytest.raises(AccessDenied, match=f"dash may not administer trade.{name}"):
+            careless.call(where(name=name, container="of-drv"), argument)
+
+
+def test_a_lock_is_not_broken_by_who_did_not_ask(careless: Container, member: Member) -> None:
+    planner = member("planner")
+    with planner.lock(where(group="rosie.neck")):
+        with pytest.raises(AccessDenied, match=r"dash may not administer rosie.neck.pan"):
+            careless.break_lock(where(group="rosie.neck"), "mine")
+        assert find(planner, "move")(0.1) == 0.1
+
+
+def test_an_e_stop_is_not_cleared_by_who_may_not(careless: Container, member: Member, memory: MemorySystem) -> None:
+    report = careless.estop("smoke")
+    memory.settle()
+    assert not careless.estop_clear([report.id], limit_s=0.3).complete
+    assert [known.id for known in member("drv").estops()] == [report.id]
+
+
+def test_a_revoked_identity_stops_nobody(memory: MemorySystem, member: Member, neck: Neck) -> None:
+    thief = memory.container("careless", identity="thief")
+    memory.settle()
+    thief.estop("now", limit_s=0.3)
+    with pytest.raises(AccessDenied, match="thief is revoked"):
+        find(thief, "stop")()
+    assert (neck.stops, member("drv").estops()) == (0, [])
+
+
+def test_readers_ignore_what_somebody_may_not_offer(memory: MemorySystem, member: Member, neck: Neck) -> None:
+    planner, careless = member("planner"), memory.container("careless", identity="dash")
+    careless.register(Neck("mine"), "rosie.neck")
+    careless.register(Neck("other"), ("office", "rosie.neck"))
+    memory.settle()
+    assert [handle.container for handle in planner.services(where(group="rosie.neck", name="move"))] == ["of-drv"]
+    assert planner.services(where(group="office")) == []
+    assert planner.services(where(name="clock", container="careless"))
+
+
+def test_only_its_own_functions_are_offered_by_everybody_in_the_group_of_the_middleware(member: Member) -> None:
+    access = member("planner").access
+    assert access.may_offer("dash", "trade", "system", ("trade",))
+    assert not access.may_offer("dash", "trade", "system", ("trade", "rosie"))
+    assert not access.may_offer("dash", "trade", "another", ("trade",))
+    assert not access.may_offer("thief", "trade", "system", ("trade",))
+
+
+# --- reload
+
+
+def rewritten(policy: Path, old: str, new: str) -> Path:
+    policy.write_text(policy.read_text().replace(old, new))
+    return policy
+
+
+def test_a_reloaded_policy_counts_for_the_next_call_on_both_sides(
+    member: Member, careless: Container, policy: Path
+) -> None:
+    planner, drv = member("planner"), member("drv")
+    move, unchecked = find(planner, "move"), find(careless, "move")
+    assert move(0.1) == 0.1
+    rewritten(policy, 'dash = ["viewer"]', 'dash = ["operator"]')
+    rewritten(policy, 'planner = ["operator"]', 'planner = ["viewer"]')
+    drv.load_policy(policy)
+    with pytest.raises(AccessDenied):  # says the provider
+        move(0.1)
+    planner.load_policy(policy)
+    with pytest.raises(AccessDenied):  # says its own container
+        move(0.1)
+    assert unchecked(0.2) == 0.2
+
+
+def test_a_call_under_way_goes_on_when_its_right_goes(
+    member: Member, memory: MemorySystem, gate: Any, policy: Path
+) -> None:
+    drv, planner = member("drv"), member("planner")
+    drv.register(gate, "rosie.neck.gate")
+    memory.settle()
+    run = find(planner, "pass_through").start()
+    assert gate.entered.wait(20)
+    drv.load_policy(rewritten(policy, 'planner = ["operator"]', "planner = []"))
+    gate.open.set()
+    assert run.result(20) == "through"
+
+
+def test_an_invalid_policy_says_why_and_leaves_the_old_one(member: Member, neck: Neck, policy: Path) -> None:
+    planner, chief = member("planner"), member("chief")
+    old = policy.read_text()
+    policy.write_text("[roles]\nidentities = 1\n")
+    with pytest.raises(ConfigurationError, match=r"roles.identities: must be a table"):
+        planner.load_policy(policy)
+    with pytest.raises(ConfigurationError, match=r"roles.identities: must be a table"):
+        chief.call(where(name="load_policy", container="of-drv"), str(policy))
+    assert find(planner, "move")(0.1) == 0.1
+    policy.write_text(old)
+    chief.system.load_policy(str(policy))
+
+
+def test_what_may_no_longer_be_offered_leaves_and_returns_with_the_right(
+    member: Member, memory: MemorySystem, neck: Neck, policy: Path, eventually: Callable[[Callable[[], bool]], bool]
+) -> None:
+    planner = member("planner")
+    joined, left = list[str](), list[str]()
+    planner.joined(where(name="move"), lambda handle: joined.append(handle.label))
+    planner.left(where(name="move"), lambda handle: left.append(handle.label))
+    planner.load_policy(rewritten(policy, 'drv = ["driver"]', "drv = []"))
+    memory.settle()
+    assert planner.services(where(name="move")) == []
+    assert eventually(lambda: left == ["rosie.neck.move"])
+    planner.load_policy(rewritten(policy, "drv = []", 'drv = ["driver"]'))
+    assert eventually(lambda: joined == ["rosie.neck.move"])
+    assert find(planner, "move")(0.1) == 0.1
+
+
+def test_a_lock_that_may_no_longer_be_held_is_lost(member: Member, neck: Neck, policy: Path) -> None:
+    planner, drv = member("planner"), member("drv")
+    with planner.lock(where(group="rosie.neck")):
+        drv.load_policy(rewritten(policy, 'lock = ["rosie.neck"]', ""))
+        assert drv.locks() == []
+        with pytest.raises(LockLost, match="planner may not lock"):
+            find(planner, "move")(0.1)
+
+
+def test_who_waits_for_a_lock_gets_none_that_it_may_no_longer_hold(
+    member: Member, memory: MemorySystem, neck: Neck, policy: Path, eventually: Callable[[Callable[[], bool]], bool]
+) -> None:
+    drv, chief = member("drv"), memory.container("unchecked", identity="chief")
+    rewritten(policy, 'chief = ["chief"]', 'chief = ["chief", "operator"]')
+    drv.load_policy(policy)
+    other = memory.container("careless", identity="planner")
+    memory.settle()
+    refused = list[Exception]()
+
+    def wait() -> None:
+        try:
+            other.lock(where(group="rosie.neck"), wait_s=20).acquire()
+        except AccessDenied as denied:
+            refused.append(denied)
+
+    with chief.lock(where(group="rosie.neck")):
+        waiting = threading.Thread(target=wait)
+        waiting.start()
+        assert eventually(lambda: any(info.waiting for info in drv.locks()))
+        drv.load_policy(rewritten(policy, 'planner = ["operator"]', 'planner = ["viewer"]'))
+        assert [info.holder.identity for info in drv.locks()] == ["chief"]
+    waiting.join(20)
+    assert [str(denied).split(":")[0] for denied in refused] == ["planner may not lock rosie.neck.pan"]
+    assert drv.locks() == []
+
+
+# --- what a nested call may do
+
+
+class Waver:
+    def __init__(self, home: Container) -> None:
+        self._home = home
+
+    @service
+    def wave(self) -> float:
+        return find(self._home, "move")(0.3)
+
+
+def test_a_nested_call_is_made_and_judged_as_the_container_that_makes_it(
+    member: Member, memory: MemorySystem, neck: Neck, policy: Path
+) -> None:
+    rewritten(policy, 'drv = ["driver"]', 'drv = ["driver"]\nwaver = ["operator", "driver"]')
+    rewritten(policy, 'read = ["rosie"]', 'read = ["rosie"]\ncall = ["lab"]')
+    waver, dash = member("waver"), member("dash")
+    member("drv").load_policy(policy)
+    waver.register(Waver(waver), "lab")
+    memory.settle()
+    assert dash.call(where(name="wave")) == 0.3
+    with pytest.raises(AccessDenied):
+        find(dash, "move")(0.3)
+
+
+# --- what it costs
+
+
+def test_a_caller_and_a_service_are_decided_about_once(
+    member: Member, careless: Container, neck: Neck, policy: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drv = member("drv")
+    decided = list[str]()
+    judge = drv.access.denied_call
+
+    def counted(*asked: Any) -> AccessDenied | None:
+        decided.append(asked[3])
+        return judge(*asked)
+
+    monkeypatch.setattr(drv.access, "denied_call", counted)
+    angle = find(careless, "angle")
+    for _ in range(20):
+        angle()
+    assert decided.count("angle") == 1
+    drv.load_policy(policy)
+    angle()
+    assert decided.count("angle") == 2
+
+
+def test_a_caller_asks_its_policy_once_a_service(
+    member: Member, neck: Neck, policy: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    planner = member("planner")
+    asked = list[str]()
+    require = planner.access.require_call
+
+    def counted(*words: str) -> None:
+        asked.append(words[2])
+        require(*words)
+
+    monkeypatch.setattr(planner.access, "require_call", counted)
+    move = find(planner, "move")
+    for _ in range(20):
+        move(0.1)
+    assert asked.count("move") == 1
+
+
+# --- settings
+
+
+def test_a_policy_is_named_in_the_environment_and_read_at_the_start(policy: Path, tmp_path: Path) -> None:
+    settings = Settings.read(environment={"TRADE_POLICY": str(policy)})
+    assert settings.policy == policy
+    assert Settings.read(environment={}).policy is None
+    missing = Settings.read(environment={"TRADE_POLICY": str(tmp_path / "none.toml")})
+    with pytest.raises(ConfigurationError, match="cannot be read"):
+        Container(missing)
+
+
+def test_S21_with_a_policy_one_may_listen_on_a_network_under_a_chosen_name_and_credentials(policy: Path) -> None:
+    chosen: dict[str, Any] = {"system": "lab", "credentials": ("lab", "secret"), "listen": ["tcp/0.0.0.0:0"]}
+    assert Settings.read(**chosen, policy=policy, environment={}).listen == ("tcp/0.0.0.0:0",)
+    with pytest.raises(ConfigurationError, match="needs a policy, and none is loaded; set TRADE_POLICY"):
+        Settings.read(**chosen, environment={})
+    with pytest.raises(ConfigurationError, match="needs an explicit system id and credentials, too"):
+        Settings.read(listen=["tcp/0.0.0.0:0"], policy=policy, environment={})

@@ -1,0 +1,354 @@
+"""The transport's rules made from a policy pin every identity to its keys: bare sessions try what no container would.
+
+A star whose middle holds the rules; user names, which the end that is dialled knows, stand for certificates there.
+"""
+
+import contextlib
+import itertools
+import json
+import queue
+import shutil
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, Final
+
+import pytest
+import zenoh
+
+from trade import Container, Settings, service, where
+from trade._acl import acl
+from trade._endpoints import free_endpoint
+from trade._policies import Policy
+from trade._policy_file import read_policy
+from trade._zenoh import ZenohTransport, configuration
+
+POLICY: Final = """
+revoked = ["thief"]
+
+[roles.operator]
+call = ["rosie.neck", "lab"]
+read = ["rosie.neck"]
+
+[roles.driver]
+register = ["rosie.neck"]
+
+[roles.viewer]
+read = ["lab"]
+
+[identities]
+planner = ["operator"]
+drv = ["driver"]
+dash = ["viewer"]
+mallory = ["operator", "driver"]
+thief = ["operator", "driver"]
+"""
+SYSTEM: Final = "rules"
+STAR: Final = ("planner", "drv", "dash", "mallory")
+WAIT_S: Final = 20.0
+"""Before something that is to come is given up."""
+MANY: Final = 200
+
+
+@pytest.fixture(scope="module")
+def policy(tmp_path_factory: pytest.TempPathFactory) -> Policy:
+    path = tmp_path_factory.mktemp("policy") / "policy.toml"
+    path.write_text(POLICY)
+    return read_policy(path)
+
+
+class Star:
+    """Clients that know each other only through the session in the middle, which goes by the rules."""
+
+    def __init__(self, folder: Path, rules: dict[str, Any], stack: contextlib.ExitStack) -> None:
+        self.numbers = itertools.count(2)
+        users = folder / "users"
+        users.write_text("".join(f"{name}:secret of {name}\n" for name in STAR))
+        endpoint = free_endpoint()
+        middle = {
+            "mode": "router",
+            "listen/endpoints": [endpoint],
+            "transport/auth/usrpwd/dictionary_file": str(users),
+            **rules,
+        }
+        stack.enter_context(_opened(middle))
+        self.sessions = {
+            name: stack.enter_context(
+                _opened(
+                    {
+                        "mode": "client",
+                        "connect/endpoints": [endpoint],
+                        "namespace": SYSTEM,
+                        "transport/auth/usrpwd/user": name,
+                        "transport/auth/usrpwd/password": f"secret of {name}",
+                    }
+                )
+            )
+            for name in STAR
+        }
+        self.heard = {name: self._listen(name) for name in STAR}
+        for actor, receiver in itertools.permutations(STAR, 2):
+            self._until_linked(actor, receiver)
+
+    def _listen(self, name: str) -> queue.SimpleQueue[str]:
+        """One queue for all that a container of that name subscribes to, and for more than it may."""
+        heard: queue.SimpleQueue[str] = queue.SimpleQueue()
+        hear = zenoh.handlers.Callback(lambda sample: heard.put(str(sample.key_expr)), indirect=False)  # so in order
+        own = [f"{kind}/*/{name}/**" for kind in ("call", "stop", "reply")]
+        for pattern in (*own, "estop/**", "registry/**", "**", "call/**", "reply/**"):
+            self.sessions[name].declare_subscriber(pattern, hear, allowed_origin=zenoh.Locality.REMOTE)
+        return heard
+
+    def _until_linked(self, actor: str, receiver: str) -> None:
+        deadline = time.monotonic() + WAIT_S
+        while not self._marked(actor, receiver, 0.2):
+            assert time.monotonic() < deadline, f"{receiver} hears nothing of {actor}"
+
+    def _marked(self, actor: str, receiver: str, wait_s: float) -> list[str]:
+        """What the receiver has heard, in order, before what every identity may send: a stop."""
+        mark = f"stop/{actor}/{receiver}/c/e1/lab/mark-{time.monotonic_ns()}"
+        self.sessions[actor].put(mark, b"")
+        heard, deadline = list[str](), time.monotonic() + wait_s
+        while mark not in heard:
+            try:
+                heard.append(self.heard[receiver].get(timeout=max(0.0, deadline - time.monotonic())))
+            except queue.Empty:
+                return []
+        return heard
+
+    def put(self, actor: str, receiver: str, *keys: str) -> list[str]:
+        """Let one put on these keys; what the other one has heard of that."""
+        for key in keys:
+            self.sessions[actor].put(key, b"", congestion_control=zenoh.CongestionControl.BLOCK)
+        heard = self._marked(actor, receiver, WAIT_S)
+        assert heard
+        return [key for key in heard if key in keys]
+
+
+def _opened(settings: dict[str, Any]) -> zenoh.Session:
+    config = zenoh.Config()
+    for key, value in {"scouting/multicast/enabled": False, **settings}.items():
+        config.insert_json5(key, json.dumps(value))
+    return zenoh.open(config)
+
+
+@pytest.fixture(scope="module")
+def star(policy: Policy, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Star]:
+    rules = acl(policy, namespace=SYSTEM, subject="usernames")
+    with contextlib.ExitStack() as stack:
+        yield Star(tmp_path_factory.mktemp("star"), rules, stack)
+
+
+PUTS: Final = {
+    # what: who puts it, who hears it, on which key, whether it passes
+    "a call": ("planner", "drv", "call/planner/drv/c/e1/rosie.neck/P", True),
+    "a call beneath the group": ("planner", "drv", "call/planner/drv/c/e1/rosie.neck.pan/P", True),
+    "a call to the middleware": ("dash", "drv", "call/dash/drv/c/e1/trade/system", True),
+    "a call to read": ("dash", "drv", "call/dash/drv/c/e1/lab/P", True),
+    "a call above the group": ("planner", "drv", "call/planner/drv/c/e1/rosie/P", False),
+    "a call to a group that begins alike": ("planner", "drv", "call/planner/drv/c/e1/rosie.necklace/P", False),
+    "a call to a group of others": ("dash", "drv", "call/dash/drv/c/e1/rosie.neck/P", False),
+    "a call to what has no group": ("planner", "drv", "call/planner/drv/c/e1/_/P", False),
+    "a forged call": ("mallory", "drv", "call/planner/drv/c/e1/rosie.neck/P", False),
+    "a forged call to the middleware": ("mallory", "drv", "call/planner/drv/c/e1/trade/system", False),
+    "a call to everybody": ("mallory", "drv", "call/*/drv/c/e1/rosie.neck/P", False),
+    "a stop without a role": ("dash", "drv", "stop/dash/drv/c/e1/rosie.neck/P", True),
+    "a forged stop": ("mallory", "drv", "stop/planner/drv/c/e1/rosie.neck/P", False),
+    "an answer": ("drv", "planner", "reply/drv/planner/c/e1", True),
+    "a forged answer": ("mallory", "planner", "reply/drv/planner/c/e1", False),
+    "an answer in the callers name": ("mallory", "planner", "reply/planner/planner/c/e1", False),
+    "an entry": ("drv", "planner", "registry/rosie.neck/drv/c/e1/P", True),
+    "an entry of the middleware": ("dash", "planner", "registry/trade/dash/c/e1/system", True),
+    "an entry in a group of others": ("drv", "planner", "registry/lab/drv/c/e1/P", False),
+    "an entry of a reader": ("dash", "planner", "registry/rosie.neck/dash/c/e1/P", False),
+    "a forged entry": ("mallory", "planner", "registry/rosie.neck/drv/c/e1/P", False),
+    "a forged tally": ("mallory", "planner", "registry/trade/drv/c/e1/tally", False),
+    "an entry one may not see": ("drv", "dash", "registry/rosie.neck/drv/c/e1/P", False),
+    "an e-stop": ("dash", "drv", "estop/dash", True),
+    "a forged e-stop": ("mallory", "drv", "estop/planner", False),
+    "a confirmation": ("drv", "dash", "estop/drv/c/e1", True),
+    "a forged confirmation": ("mallory", "dash", "estop/drv/c/e1", False),
+    "an overheard call": ("planner", "mallory", "call/planner/drv/c/e1/rosie.neck/P", False),
+    "an overheard answer": ("drv", "mallory", "reply/drv/planner/c/e1", False),
+}
+
+
+@pytest.mark.parametrize(("actor", "receiver", "key", "passes"), PUTS.values(), ids=list(PUTS))
+def test_what_passes_is_what_the_policy_allows(star: Star, actor: str, receiver: str, key: str, passes: bool) -> None:
+    fresh = key.replace("/e1", f"/e{next(star.numbers)}")  # what comes twice may still wait from the test before
+    assert bool(star.put(actor, receiver, fresh)) is passes
+
+
+def test_a_sign_of_life_is_given_for_oneself_only(star: Star) -> None:
+    signs: queue.SimpleQueue[str] = queue.SimpleQueue()
+    reader, forger = star.sessions["planner"].liveliness(), star.sessions["mallory"].liveliness()
+    watch = reader.declare_subscriber("alive/**", lambda sample: signs.put(str(sample.key_expr)))
+    forged, own = forger.declare_token("alive/drv/c/e1"), forger.declare_token("alive/mallory/c/e1")
+    assert signs.get(timeout=WAIT_S) == "alive/mallory/c/e1"  # declared later
+    real = star.sessions["drv"].liveliness().declare_token("alive/drv/c/e1")
+    assert signs.get(timeout=WAIT_S) == "alive/drv/c/e1"
+    for declared in (watch, forged, own, real):
+        declared.undeclare()
+
+
+def asked(star: Star, reader: str, pattern: str) -> list[str]:
+    replies = star.sessions[reader].get(
+        pattern,
+        zenoh.handlers.FifoChannel(64),
+        target=zenoh.QueryTarget.ALL,
+        consolidation=zenoh.ConsolidationMode.NONE,
+        timeout=2.0,
+    )
+    return sorted(str(reply.ok.key_expr) for reply in replies if reply.ok is not None)
+
+
+def answering(star: Star, who: str, pattern: str, *keys: str) -> Any:
+    def answer(query: zenoh.Query) -> None:
+        for key in keys:
+            if query.key_expr.intersects(key):
+                query.reply(key, b"")
+
+    return star.sessions[who].declare_queryable(pattern, answer)
+
+
+def asked_until(star: Star, reader: str, pattern: str, expected: list[str]) -> bool:
+    deadline = time.monotonic() + WAIT_S
+    while (got := asked(star, reader, pattern)) != expected and time.monotonic() < deadline:
+        pass
+    return got == expected
+
+
+def test_only_the_container_itself_answers_for_what_it_offers(star: Star) -> None:
+    drv, mallory = "registry/*/drv/c/e1/*", "registry/*/mallory/c/e1/*"
+    forged, own = "registry/rosie.neck/drv/c/e1/P", "registry/rosie.neck/mallory/c/e1/P"
+    with contextlib.ExitStack() as stack:
+        stack.callback(answering(star, "mallory", drv, forged).undeclare)
+        stack.callback(answering(star, "mallory", mallory, own, forged).undeclare)
+        assert asked_until(star, "planner", mallory, [own])
+        assert asked(star, "planner", drv) == []
+        assert asked(star, "planner", "registry/**") == [own]
+        entries = ["registry/lab/drv/c/e1/L", "registry/rosie.neck/drv/c/e1/P", "registry/trade/drv/c/e1/system"]
+        stack.callback(answering(star, "drv", drv, *entries).undeclare)
+        assert asked_until(star, "planner", drv, entries[1:])  # it may not offer the first
+        assert asked(star, "dash", drv) == entries[2:]  # nor may that one see the second
+
+
+def test_who_has_no_role_or_a_revoked_one_has_no_rules(policy: Policy) -> None:
+    rules = acl(policy, namespace=SYSTEM, identities=[*STAR, "thief"])["access_control"]
+    assert rules["default_permission"] == "deny"
+    assert [subject["id"] for subject in rules["subjects"]] == list(STAR)
+    assert not any("thief" in json.dumps(rule) for rule in rules["rules"])
+
+
+def test_a_gateway_is_believed_and_every_key_is_of_the_system(policy: Policy) -> None:
+    rules = acl(policy, namespace=SYSTEM, gateways=["edge"])["access_control"]["rules"]
+    assert all(key.startswith(f"{SYSTEM}/") for rule in rules for key in rule["key_exprs"])
+    believed = [rule for rule in rules if rule["id"].startswith("edge ")]
+    assert {key for rule in believed for key in rule["key_exprs"]} == {f"{SYSTEM}/**"}
+
+
+def test_a_flood_of_calls_is_cut_and_stops_are_not(policy: Policy, tmp_path: Path) -> None:
+    rules = acl(policy, namespace=SYSTEM, subject="usernames", calls_hz=10)
+    with contextlib.ExitStack() as stack:
+        star = Star(tmp_path, rules, stack)
+        calls = star.put("planner", "drv", *(f"call/planner/drv/c/e1/lab/P{number}" for number in range(MANY)))
+        stops = star.put("planner", "drv", *(f"stop/planner/drv/c/e1/lab/P{number}" for number in range(MANY)))
+    assert 1 <= len(set(calls)) < MANY // 2
+    assert len(set(stops)) == MANY
+
+
+# --- whole containers, linked directly, each with rules of its own, pinned by their certificates
+
+
+class Neck:
+    @service
+    def move(self, angle_rad: float) -> float:
+        return angle_rad
+
+    @service(effect="read")
+    def angle(self) -> float:
+        return 0.5
+
+    @service(effect="stop")
+    def stop(self) -> None: ...
+
+
+@pytest.fixture(scope="module")
+def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with an authority and a certificate for each identity."""
+    if shutil.which("openssl") is None:
+        pytest.skip("needs the program openssl, to make certificates")
+    folder = tmp_path_factory.mktemp("certificates")
+    (folder / "kind").write_text("subjectAltName=IP:127.0.0.1\nextendedKeyUsage=serverAuth,clientAuth\n")
+    new = ("-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes")
+    _openssl(folder, "req", "-x509", *new, "-keyout", "ca.key", "-out", "ca.pem", "-days", "2", "-subj", "/CN=ca")
+    for name in STAR:
+        _openssl(folder, "req", *new, "-keyout", f"{name}.key", "-out", f"{name}.csr", "-subj", f"/CN={name}")
+        signed = ("-in", f"{name}.csr", "-out", f"{name}.pem", "-days", "2", "-extfile", "kind")
+        _openssl(folder, "x509", "-req", "-CA", "ca.pem", "-CAkey", "ca.key", "-CAcreateserial", *signed)
+    return folder
+
+
+def _openssl(folder: Path, *arguments: str) -> None:
+    subprocess.run(["openssl", *arguments], cwd=folder, check=True, capture_output=True)
+
+
+Join = Callable[[str], Container]
+
+
+@pytest.fixture
+def join(certificates: Path, policy: Policy, tmp_path: Path) -> Iterator[Join]:
+    """Starts the container of an identity with its certificate, linked to those before it."""
+    file = tmp_path / "policy.toml"
+    file.write_text(POLICY)
+    with contextlib.ExitStack() as stack:
+        endpoints = list[str]()
+
+        def start(name: str) -> Container:
+            endpoint = free_endpoint().replace("tcp/", "tls/")
+            settings = {
+                **configuration(
+                    namespace=SYSTEM, listen=[endpoint], connect=endpoints, credentials=("system", "secret")
+                ),
+                **acl(policy, namespace=SYSTEM),
+                "transport/link/tls/root_ca_certificate": str(certificates / "ca.pem"),
+                "transport/link/tls/enable_mtls": True,
+                **{
+                    f"transport/link/tls/{end}_{part}": str(certificates / f"{name}.{suffix}")
+                    for end in ("listen", "connect")
+                    for part, suffix in (("private_key", "key"), ("certificate", "pem"))
+                },
+            }
+            endpoints.append(endpoint)
+            return stack.enter_context(
+                Container(
+                    Settings(system=SYSTEM, identity=name, container=f"of-{name}", policy=file),
+                    transport=ZenohTransport(settings),
+                )
+            )
+
+        yield start
+
+
+def test_containers_do_all_they_may_under_the_rules(
+    join: Join, eventually: Callable[[Callable[[], bool]], bool]
+) -> None:
+    drv = join("drv")
+    neck, arm = Neck(), Neck()
+    drv.register(neck, "rosie.neck")
+    planner = join("planner")
+    call = {name: planner.find(where(name=name, group="rosie.neck"), wait_s=WAIT_S) for name in ("move", "angle")}
+    assert (call["move"](0.1), call["angle"]()) == (0.1, 0.5)
+    planner.call(where(name="stop"))
+    drv.register(arm, "rosie.neck.left")
+    assert planner.find(where(name="move", group="rosie.neck.left"), wait_s=WAIT_S)(0.2) == 0.2
+    drv.deregister(arm)
+    assert eventually(lambda: not planner.services(where(group="rosie.neck.left")))
+    assert planner.estop("smoke").complete
+    dash = join("dash")
+    assert eventually(lambda: len(dash.addresses()) == 3)
+    assert eventually(lambda: len(dash.services(where(name="clock"))) == 3)
+    assert dash.services(where(group="rosie")) == []
+    drv.close()
+    assert eventually(lambda: len(planner.addresses()) == 2)

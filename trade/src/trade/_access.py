@@ -1,0 +1,124 @@
+"""What the access policy means for one container: who may call, offer and lock here, and what it may do elsewhere.
+
+A call is judged twice, by whoever makes it and by whoever serves it, and by the same rules. It is made, and judged, as
+the identity of the container that makes it; for whom that one acts gives it no rights and takes none away.
+"""
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Final
+
+from trade._policies import Decision, Policy
+from trade._policy_file import read_policy
+from trade._system import DOMAIN, PROVIDER
+from trade._wire import domain_of
+from trade.errors import AccessDenied
+
+_ALL: Final = ""
+FUNCTIONS: Final = {
+    "clock": _ALL,
+    "containers": _ALL,
+    "withdrawn": _ALL,
+    "locks": _ALL,
+    "renew": _ALL,  # only what is one's own
+    "release": _ALL,  # only what is one's own
+    "request_release": _ALL,
+    "release_requested": _ALL,
+    "acquire": _ALL,  # asks itself for lock over the groups of the resources
+    "break_lock": _ALL,  # asks itself for administer over them
+    "resume": _ALL,  # asks itself for administer over those whose lock is not one's own
+    "deregister": "administer",
+    "register": "administer",
+    "set_discovery": "administer",
+    "set_broadcast": "administer",
+    "connect": "administer",
+    "disconnect": "administer",
+    "load_policy": "administer",
+}
+"""What the middleware's own functions need over group ``trade``; empty: open to everybody who is not revoked."""
+
+_NEEDS: Final = {"read": "read", "actuate": "call", "stop": _ALL}
+"""What other services need over their group, by effect; a stop is open to everybody (S07)."""
+
+
+def decide_call(policy: Policy, who: str, domain: str, name: str, effect: str) -> tuple[str, Decision]:
+    """Whether somebody may call a service of a group. Returns the verb that it needs, and the decision."""
+    verb = FUNCTIONS.get(name, "administer") if domain == DOMAIN else _NEEDS.get(effect, "call")
+    return (verb, policy.decide(who, verb, domain)) if verb else ("call", policy.authenticated(who))
+
+
+class Access:
+    """The policy a container goes by; without one everybody may do everything."""
+
+    def __init__(self, path: Path | None = None) -> None:
+        """Read the policy. Raises ConfigurationError: it is wrong."""
+        self.policy: Policy | None = None if path is None else read_policy(path)
+
+    def load(self, path: Path) -> None:
+        """Go by another one from now on. Raises ConfigurationError: it is wrong, and the old one stays."""
+        self.policy = read_policy(path)
+
+    # --- calls
+
+    def denied_call(
+        self, policy: Policy, who: str, domain: str, name: str, effect: str, what: str
+    ) -> AccessDenied | None:
+        """Why somebody may not call a service; None if it may."""
+        verb, decision = decide_call(policy, who, domain, name, effect)
+        return None if decision.allowed else AccessDenied(who=who, verb=verb, what=what, rule=decision.rule)
+
+    def require_call(self, who: str, domain: str, name: str, effect: str, what: str) -> None:
+        """Raises AccessDenied: it may not call the service."""
+        if self.policy is not None:
+            denied = self.denied_call(self.policy, who, domain, name, effect, what)
+            if denied is not None:
+                raise denied
+
+    # --- everything else
+
+    def require(self, who: str, verb: str, group: str, what: str) -> None:
+        """Raises AccessDenied: it may not do that in the group."""
+        self.require_any(who, verb, (group,), what)
+
+    def require_any(self, who: str, verb: str, groups: Iterable[str], what: str) -> None:
+        """Raises AccessDenied: it may do that in none of the groups."""
+        denied = self._denied_all(who, verb, groups, what)
+        if denied is not None:
+            raise denied
+
+    def _denied_all(self, who: str, verb: str, groups: Iterable[str], what: str) -> AccessDenied | None:
+        if self.policy is None:
+            return None
+        rule = f"nothing that is offered uses {what}"
+        for group in sorted(groups):
+            decision = self.policy.decide(who, verb, group)
+            if decision.allowed:
+                return None
+            rule = decision.rule
+        return AccessDenied(who=who, verb=verb, what=what, rule=rule)
+
+    def denied_lock(self, who: str, resources: Iterable[tuple[str, Iterable[str]]]) -> AccessDenied | None:
+        """Why somebody may not lock these, told with the groups of the services that use each; None if it may."""
+        denials = (self._denied_all(who, "lock", groups, name) for name, groups in resources)
+        return next((denied for denied in denials if denied is not None), None)
+
+    def denied_order(self, who: str, *, clears: bool) -> AccessDenied | None:
+        """Why an e-stop order is not heeded: everybody may stop, and who clears has to administer the system."""
+        if self.policy is None:
+            return None
+        verb = "administer" if clears else "call"
+        decision = self.policy.decide(who, verb, DOMAIN) if clears else self.policy.authenticated(who)
+        return None if decision.allowed else AccessDenied(who=who, verb=verb, what="estop", rule=decision.rule)
+
+    def may_offer(self, who: str, domain: str, provider: str, groups: Sequence[str]) -> bool:
+        """Whether an identity may have offered what a registry entry tells of: its own functions, and what it may."""
+        if self.policy is None:
+            return True
+        if domain == DOMAIN and provider == PROVIDER and tuple(groups) == (DOMAIN,):
+            return self.policy.authenticated(who).allowed
+        return all(self.policy.decide(who, "register", group).allowed for group in (domain, *groups))
+
+    def require_offer(self, who: str, groups: tuple[str, ...], what: str) -> None:
+        """Raises AccessDenied: it may not offer something in all of these groups."""
+        for group in groups or (domain_of(groups),):
+            self.require(who, "register", group, f"{what} in {group}")

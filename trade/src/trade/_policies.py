@@ -1,0 +1,152 @@
+"""The access policy: which identity may do what in which groups. Pure data, compiled once and never changed."""
+
+import fnmatch
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Final, NamedTuple
+
+from msgspec import Struct
+
+__all__ = ["EVERYTHING", "VERBS", "Decision", "Policy", "Role"]
+
+VERBS: Final = ("call", "read", "register", "lock", "instrument", "administer")
+"""What one may do: call what actuates, call what reads, offer providers, lock, attach hooks, change the system."""
+
+EVERYTHING: Final = "*"
+"""In a rule: every group, and what is in none."""
+
+_MOST_STRANGERS: Final = 4096
+"""Identities without a name of their own in the policy whose rights are kept; of more they are worked out again."""
+
+
+class Decision(NamedTuple):
+    """Whether somebody may do something, and why."""
+
+    allowed: bool
+    rule: str
+    """The rule that says so, in words."""
+
+
+class Role(Struct, frozen=True):
+    """What identities of one kind may do."""
+
+    name: str
+    rights: Mapping[str, Sequence[str]]
+    """Verb to groups."""
+    includes: Sequence[str] = ()
+    """Roles whose rights it has, too; without cycles."""
+
+
+_Rights = dict[tuple[str, str], str]
+"""From (verb, group as the rule names it) to the rule in words."""
+
+
+class Policy:
+    """Who may do what: nobody anything that no rule allows.
+
+    ``decide`` costs a few look-ups in dictionaries, however long the policy is.
+    """
+
+    def __init__(
+        self,
+        roles: Iterable[Role],
+        identities: Mapping[str, Sequence[str]],
+        revoked: Iterable[str] = (),
+        source: str = "policy",
+    ) -> None:
+        """Compile it.
+
+        Args:
+            roles: all there are.
+            identities: names, or patterns with ``*`` and ``?``, to the names of roles.
+            revoked: identities that may do nothing at all any more, stopping included.
+            source: where it was read from, for people.
+        """
+        self.source: Final = source
+        self.roles: Final = {role.name: role for role in roles}
+        self.identities: Final = {pattern: tuple(names) for pattern, names in identities.items()}
+        self.revoked: Final = frozenset(revoked)
+        self._of_role = {name: self._rights_of_role(name) for name in self.roles}
+        self._of: dict[str, _Rights] = {}
+
+    # --- asking
+
+    def decide(self, who: str, verb: str, group: str) -> Decision:
+        """Whether an identity may do something in a group.
+
+        Args:
+            who: the identity.
+            verb: one of ``VERBS``.
+            group: a whole dotted group; ``_`` for what is in none.
+        """
+        if who in self.revoked:
+            return Decision(False, f"{who} is revoked")
+        rights = self._of.get(who)
+        if rights is None:
+            rights = self._learn(who)
+        rule = rights.get((verb, EVERYTHING))
+        above = group
+        while rule is None and above:
+            rule = rights.get((verb, above))
+            above = above.rpartition(".")[0]
+        if rule is None:
+            return Decision(False, self._why_not(who, verb, group))
+        return Decision(True, rule)
+
+    def authenticated(self, who: str) -> Decision:
+        """Whether what everybody may do is open to an identity: to all but the revoked ones."""
+        return Decision(False, f"{who} is revoked") if who in self.revoked else Decision(True, "everybody may")
+
+    def roles_of(self, who: str) -> tuple[str, ...]:
+        """The roles of an identity, in the order of the policy; a revoked one has none."""
+        if who in self.revoked:
+            return ()
+        found = (names for pattern, names in self.identities.items() if fnmatch.fnmatchcase(who, pattern))
+        return tuple(dict.fromkeys(name for names in found for name in names))
+
+    def groups_of(self, who: str, verbs: Iterable[str]) -> list[str]:
+        """The groups an identity has one of these verbs over, as the rules name them, sorted; ``*`` alone if all."""
+        wanted = set(verbs)
+        groups = {group for verb, group in self._rights(who) if verb in wanted}
+        return [EVERYTHING] if EVERYTHING in groups else sorted(groups)
+
+    def names(self) -> list[str]:
+        """The identities that are named in full and not revoked."""
+        return [name for name in self.identities if not _is_pattern(name) and name not in self.revoked]
+
+    # --- compiling
+
+    def _rights(self, who: str) -> _Rights:
+        rights: _Rights = {}
+        for name in self.roles_of(who):
+            for right, rule in self._of_role[name].items():
+                rights.setdefault(right, rule)
+        return rights
+
+    def _learn(self, who: str) -> _Rights:
+        if len(self._of) >= _MOST_STRANGERS:
+            self._of.clear()
+        return self._of.setdefault(who, self._rights(who))
+
+    def _rights_of_role(self, name: str) -> _Rights:
+        rights: _Rights = {}
+        open_, done = [name], set[str]()
+        while open_:
+            role = self.roles[open_.pop(0)]
+            if role.name in done:
+                continue
+            done.add(role.name)
+            open_ += role.includes
+            for verb, groups in role.rights.items():
+                for group in groups:
+                    rights.setdefault((verb, group), f"role {role.name}: {verb} {group}")
+        return rights
+
+    def _why_not(self, who: str, verb: str, group: str) -> str:
+        roles = self.roles_of(who)
+        if not roles:
+            return f"no rule gives {who} a role"
+        return f"no rule of role{'s' if len(roles) > 1 else ''} {', '.join(roles)} allows {verb} in {group}"
+
+
+def _is_pattern(name: str) -> bool:
+    return "*" in name or "?" in name

@@ -1,0 +1,11 @@
+"""Access policies for those who look at them from outside, and for whoever opens a session of the transport itself.
+
+Containers read their own: see `trade.Settings.policy` and `trade.Container.load_policy`.
+"""
+
+from trade._access import decide_call
+from trade._acl import acl
+from trade._policies import EVERYTHING, VERBS, Decision, Policy, Role
+from trade._policy_file import read_policy
+
+__all__ = ["EVERYTHING", "VERBS", "Decision", "Policy", "Role", "acl", "decide_call", "read_policy"]
