@@ -153,10 +153,11 @@ class ZenohQuestion(Question):
 class ZenohQuestions(Questions):
     def __init__(self, queryable: Any) -> None:
         self._queryable = queryable
+        self._recv = queryable.handler.recv  # to ask for it while another thread closes is refused
 
     def receive(self) -> Question:
         try:
-            return ZenohQuestion(self._queryable.handler.recv())
+            return ZenohQuestion(self._recv())
         except zenoh.ZError:
             raise ChannelClosed from None
 
