@@ -21,5 +21,5 @@ class Papers:
         """The folder of a name, issued or renewed now."""
         return self.authority.issue(name, **options).folder  # type: ignore[arg-type]
 
-    def for_a_moment(self, name: str, seconds: float) -> Path:
-        return self.of(name, lasts=timedelta(seconds=seconds))
+    def expired(self, name: str) -> Path:
+        return self.of(name, lasts=timedelta(minutes=-1))

@@ -261,10 +261,9 @@ def test_the_commands_list_who_there_is(folder: Path) -> None:
     said("init", folder)
     assert "nobody has an identity yet" in said("list", "--ca", folder).stdout
     said("issue", "door", "--for", "gateway", "--ca", folder)
-    said("issue", "old", "--hours", "0.0003", "--ca", folder)
+    Authority(folder).issue("old", lasts=timedelta(minutes=-1))
     said("issue", "bad", "--host", "bad.example", "--ca", folder)
     said("revoke", "bad", "--ca", folder)
-    _wait_a_second()
     listed = {entry["name"]: entry for entry in json.loads(said("list", "--json", "--ca", folder).stdout)}
     assert {name: (entry["for"], entry["state"]) for name, entry in listed.items()} == {
         "bad": ("container", "revoked"),
@@ -274,13 +273,6 @@ def test_the_commands_list_who_there_is(folder: Path) -> None:
     assert listed["bad"]["hosts"] == ["bad.example"]
     lines = said("list", "--ca", folder).stdout.splitlines()
     assert [line.split()[:2] for line in lines[1:]] == [["bad", "container"], ["door", "gateway"], ["old", "container"]]
-
-
-def _wait_a_second() -> None:
-    """Certificates end on whole seconds; this one at the next."""
-    import threading
-
-    threading.Event().wait(1.2)
 
 
 def test_the_commands_say_what_is_wrong(folder: Path) -> None:

@@ -133,7 +133,7 @@ def test_S21_a_laboratory_network_is_listened_on_only_on_purpose() -> None:
     settings = Settings.read(environment={"TRADE_INSECURE_LAN": "1"}, listen=LAN, system="lab", credentials=ALICE)
     assert settings.listen == tuple(LAN)
     for environment in ({}, {"TRADE_INSECURE_LAN": "0"}, {"TRADE_INSECURE_LAN": ""}):
-        with pytest.raises(ConfigurationError, match="needs a policy, and none is loaded"):
+        with pytest.raises(ConfigurationError, match="beyond loopback takes certificates"):
             Settings.read(environment=environment, listen=LAN, system="lab", credentials=ALICE)
 
 

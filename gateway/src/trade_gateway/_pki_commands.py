@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from trade_gateway._pki import Authority, Issued
 
 _PURPOSES: Final = ("container", "gateway")
-_LONGEST_HOURS: Final = 10 * 366 * 24.0
+_LONGEST_HOURS: Final = 366 * 24.0
 _DEFAULT: Final = Path("pki")
 
 app = typer.Typer(
@@ -54,7 +54,7 @@ def issue(
     hours: Annotated[
         float | None,
         typer.Option(
-            min=1 / 3600,
+            min=0.1,
             max=_LONGEST_HOURS,
             help="How long; a week if not said. A link cannot be revoked before, so not for long.",
         ),
