@@ -250,8 +250,7 @@ def test_the_commands_make_an_identity_and_say_how_to_start_with_it(folder: Path
     assert "ca.key secret" in said("init", folder).stdout
     issued = said("issue", "arm", "--ca", folder, "--address", "10.0.0.5").stdout
     assert str(folder / "issued" / "arm") in issued
-    [start] = re.findall(r"^ +export (.*)$", issued, re.MULTILINE)
-    variables = dict(word.split("=") for word in start.split())
+    variables = dict(re.findall(r"(TRADE_\w+)=(\S+)", issued))
     assert variables["TRADE_LISTEN"] == "tls/10.0.0.5:7450"
     assert (Path(variables["TRADE_TLS"]) / "key.pem").is_file()
     assert "TRADE_LISTEN=tls/10.0.0.5:7450" in said("issue", "arm", "--ca", folder).stdout  # renewed: still

@@ -1,7 +1,11 @@
 """Certificates prove who a container is; who has none is not linked; what is wrong with one is said at once."""
 
+import json
 import logging
+import os
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from datetime import timedelta
 from pathlib import Path
@@ -15,7 +19,7 @@ from trade import Container, Settings, service, where
 from trade._endpoints import free_endpoint
 from trade._tls import Certificate
 from trade._zenoh import ZenohTransport, configuration
-from trade.errors import CannotConnect, ConfigurationError, NoSuchService
+from trade.errors import CannotConnect, ConfigurationError, ContainerLost, NoSuchService
 from waiting import wait_until
 
 
@@ -193,18 +197,22 @@ def test_the_right_name_with_a_wrong_key_is_not_linked_if_it_opens_all_the_same(
 
 
 def test_a_link_ends_when_a_certificate_expires_and_comes_back_when_it_is_renewed(
-    start_container: Any, papers: Papers
+    start_container: Any, papers: Papers, gate: Any
 ) -> None:
     planner = start_container("planner", tls=papers.of("planner"))
     tool = start_container("tool", tls=papers.of("tool"))
     arm = start_container("arm", tls=papers.of("arm", lasts=timedelta(seconds=8)))
     arm.register(Echo(), "robot")
+    arm.register(gate, "robot")
+    run = planner.find(where(name="pass_through"), wait_s=20).start()
+    assert gate.entered.wait(30)
     assert echo(planner)(3) == 3
-    wait_until(lambda: ("tls", "arm") not in links(planner), "the link with the expired certificate ends")
+    with pytest.raises(ContainerLost):
+        run.result(60)
     wait_until(lambda: not planner.services(where(name="echo")), "what it offered is gone")
-    assert ("tls", "tool") in links(planner)
-    assert {name for _, name in links(tool)} == {"planner"}
-    papers.of("arm")  # it dials the others, as the last one that came: with what stands there now
+    assert links(planner) == [("tls", "tool")]
+    assert links(tool) == [("tls", "planner")]
+    papers.of("arm")  # it dials the others, as it came last: with what stands there now
     assert echo(planner)(4) == 4
 
 
@@ -226,6 +234,18 @@ def test_with_and_without_certificates_are_not_linked_and_it_says_so(
         certified = start_container("certified", tls=papers.of("arm"))
     assert "without certificates, and this container is with certificates: they cannot be linked" in caplog.text
     assert sees_nobody(certified)
+
+
+@pytest.mark.parametrize(("of", "seen"), [("papers", True), ("strangers", False), ("", False)])
+def test_the_command_line_lists_nobody_without_a_certificate_of_the_authority(
+    start_container: Any, request: pytest.FixtureRequest, papers: Papers, of: str, seen: bool
+) -> None:
+    start_container("there", tls=papers.of("arm"))
+    visitor = {"TRADE_TLS": str(request.getfixturevalue(of).of("desk"))} if of else {}
+    command = [sys.executable, "-m", "trade_gateway", "containers", "--json"]
+    environment = {**os.environ, **visitor}
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True, env=environment)
+    assert [entry["identity"] for entry in json.loads(ended.stdout)] == (["arm"] if seen else [])
 
 
 # --- settings

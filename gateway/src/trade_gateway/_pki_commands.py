@@ -90,8 +90,8 @@ def issue(
     out.say(
         f"{given.name}, a {given.purpose}, until {_moment(given.until)}: ca.pem, cert.pem and key.pem (secret) are in\n"
         f"  {escape(str(given.folder))}\nStart it with them, wherever you take them:\n"
-        f"  export TRADE_SYSTEM=SYSTEM TRADE_TLS={escape(_quoted(given.folder))} TRADE_LISTEN={escape(listen)}\n"
-        "  trade up ROBOT.toml"
+        f"  export TRADE_SYSTEM=SYSTEM TRADE_TLS={escape(_quoted(given.folder))}\n"
+        f"  TRADE_LISTEN={escape(listen)} trade up ROBOT.toml"
     )
 
 
