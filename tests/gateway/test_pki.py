@@ -135,6 +135,12 @@ def test_what_a_name_was_given_for_outlives_its_files(authority: Authority) -> N
     assert (listed.purpose, listed.until) == ("gateway", None)
 
 
+def test_what_others_leave_in_the_folder_is_no_name(authority: Authority) -> None:
+    authority.issue("door")
+    (authority.folder / "names" / ".DS_Store").write_text("")
+    assert [one.name for one in authority.issued()] == ["door"]
+
+
 def test_a_damaged_mark_is_taken_for_a_gateways(authority: Authority) -> None:
     authority.issue("door")
     (authority.folder / "names" / "door").write_text("contai")
@@ -162,7 +168,9 @@ def test_the_list_of_revoked_names_is_one_that_programs_read(authority: Authorit
     assert 'revoked = ["arm", "leg"]' in (authority.folder / "revoked.toml").read_text().splitlines()
 
 
-@pytest.mark.parametrize("text", ["revoked = arm", "revoked = 'arm'", "revoked = [1]", "", "names = []"])
+@pytest.mark.parametrize(
+    "text", ["revoked = arm", "revoked = 'arm'", "revoked = [1]", "revoked = ['a b']", "", "names = []"]
+)
 def test_a_damaged_list_forgets_nobody(authority: Authority, text: str) -> None:
     authority.issue("arm")
     (authority.folder / "revoked.toml").write_text(text)

@@ -125,7 +125,7 @@ LAN = ["tcp/192.168.1.5:7450"]
 
 @pytest.mark.parametrize("missing", [{"system": "lab"}, {"credentials": ALICE}, {}], ids=str)
 def test_S21_a_laboratory_network_needs_a_system_and_credentials_as_well(missing: dict[str, Any]) -> None:
-    with pytest.raises(ConfigurationError, match="TRADE_INSECURE_LAN: needs an explicit system id and credentials"):
+    with pytest.raises(ConfigurationError, match="TRADE_INSECURE_LAN needs an explicit system id and credentials"):
         Settings.read(environment={"TRADE_INSECURE_LAN": "1"}, listen=LAN, **missing)
 
 

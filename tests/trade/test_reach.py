@@ -43,7 +43,7 @@ def test_S21_beyond_loopback_is_refused_without_certificates(end: str, endpoint:
 
 @pytest.mark.parametrize("missing", [{"system": "lab"}, {"credentials": ("me", "secret")}, {}], ids=str)
 def test_S21_reaching_a_laboratory_network_needs_a_system_and_credentials(missing: dict[str, Any]) -> None:
-    with pytest.raises(ConfigurationError, match="TRADE_INSECURE_LAN: needs an explicit system id and credentials"):
+    with pytest.raises(ConfigurationError, match="TRADE_INSECURE_LAN needs an explicit system id and credentials"):
         read(connect=["tcp/192.168.1.5:7450"], insecure_lan=True, **missing)
 
 

@@ -1,12 +1,13 @@
 """Certificates prove who a container is; who has none is not linked; what is wrong with one is said at once."""
 
+import contextlib
 import json
 import logging
 import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
@@ -175,25 +176,57 @@ def test_the_right_name_with_a_wrong_key_is_refused_before_anything_opens(
         Settings.read(tls=impostor(papers, strangers, tmp_path, key_of))
 
 
+OpenBare = Callable[..., ZenohTransport]
+
+
+@pytest.fixture
+def open_bare(system: str, papers: Papers) -> Iterator[OpenBare]:
+    """Opens transports with certificates that no container would start with."""
+    until = Certificate.read(papers.of("anybody")).until
+    with contextlib.ExitStack() as stack:
+
+        def start(folder: Path, **endpoints: list[str]) -> ZenohTransport:
+            certificate = Certificate(folder, "arm", frozenset(), until)
+            settings = {"listen": [tls_endpoint()], "connect": [], **endpoints}
+            transport = ZenohTransport(configuration(namespace=system, certificate=certificate, **settings))
+            stack.callback(transport.close)
+            return transport
+
+        yield start
+
+
+def is_linked(container: Container, name: str, expected: bool) -> None:
+    """Wait for the link, or for as long as one that is refused is tried."""
+    if expected:
+        wait_until(lambda: ("tls", name) in links(container), "they are linked")
+    else:
+        assert container.reach._thread is not None
+        container.reach._thread.join(20)
+        assert links(container) == []
+
+
 @pytest.mark.parametrize("honest", [True, False], ids=["the right key", "a wrong key"])
 def test_the_right_name_with_a_wrong_key_is_not_linked_if_it_opens_all_the_same(
-    start_container: Any, system: str, papers: Papers, strangers: Papers, tmp_path: Path, honest: bool
+    start_container: Any, open_bare: OpenBare, papers: Papers, strangers: Papers, tmp_path: Path, honest: bool
 ) -> None:
-    endpoint = tls_endpoint()
-    start_container("planner", tls=papers.of("planner"), listen=[endpoint])
+    endpoint, other = tls_endpoint(), tls_endpoint()
+    planner = start_container("planner", tls=papers.of("planner"), listen=[endpoint], connect=[other])
     folder = papers.of("arm") if honest else impostor(papers, strangers, tmp_path, "another")
-    certificate = Certificate(folder, "arm", frozenset(), Certificate.read(papers.of("arm")).until)
-    transport = ZenohTransport(
-        configuration(namespace=system, listen=[tls_endpoint()], connect=[endpoint], certificate=certificate)
-    )
-    try:
-        seen = transport.present("alive/**", 2.0) if not honest else []
-        if honest:
-            wait_until(lambda: transport.present("alive/**", 2.0), "it sees somebody")
-        assert seen == []
-        assert bool(transport._session.info.peers_zid()) == honest
-    finally:
-        transport.close()
+    open_bare(folder, listen=[other], connect=[endpoint])  # each dials the other
+    is_linked(planner, "arm", honest)
+
+
+@pytest.mark.parametrize("honest", [True, False], ids=["for the host", "for another host"])
+def test_who_sits_where_its_certificate_is_not_for_is_not_linked(
+    start_container: Any, open_bare: OpenBare, papers: Papers, monkeypatch: pytest.MonkeyPatch, honest: bool
+) -> None:
+    """Else any container of the system could take another one's address."""
+    own, endpoint = papers.of("planner"), tls_endpoint()
+    if not honest:
+        monkeypatch.setattr("trade_gateway._pki._HERE", ("arm.example", "10.9.9.9"))
+    open_bare(papers.of("arm"), listen=[endpoint])
+    planner = start_container("planner", tls=own, connect=[endpoint])
+    is_linked(planner, "arm", honest)
 
 
 def test_a_link_ends_when_a_certificate_expires_and_comes_back_when_it_is_renewed(
@@ -359,7 +392,9 @@ def test_S21_with_certificates_a_network_may_be_listened_on_and_reached(papers: 
         settings = read(tls=folder, system="lab", listen=[listen], connect=["tls/10.0.0.9:7450"])
         assert settings.listen == (listen,)
     for end in ("listen", "connect"):
-        with pytest.raises(ConfigurationError, match="reaching a network needs a system id: set TRADE_SYSTEM"):
+        with pytest.raises(
+            ConfigurationError, match="reaching a network needs an explicit system id: set TRADE_SYSTEM"
+        ):
             read(tls=folder, **{end: ["tls/10.0.0.5:7450"]})
 
 

@@ -182,10 +182,11 @@ class Authority:
             return frozenset()
         except (ValueError, KeyError):
             listed = None
-        if not isinstance(listed, list) or not all(isinstance(name, str) for name in cast("list[object]", listed)):
+        names = cast("list[object]", listed) if isinstance(listed, list) else [None]
+        if not all(isinstance(name, str) and is_chunk(name) for name in names):
             problem = 'must be like revoked = ["old-arm"]; put that right first: nobody may be forgotten'
             raise ConfigurationError(where=str(self._revoked_file), problem=problem)
-        return frozenset(cast("list[str]", listed))
+        return frozenset(map(str, names))
 
     @property
     def _revoked_file(self) -> Path:
@@ -209,7 +210,7 @@ class Authority:
         return certificate, key
 
     def _names(self) -> list[str]:
-        return sorted(path.name for path in (self.folder / "names").glob("*"))
+        return sorted(path.name for path in (self.folder / "names").glob("[!.]*"))
 
     def _purpose(self, name: str) -> Purpose:
         """What a name was given for; one whose mark is damaged is nobody else's than a gateway's."""
@@ -225,7 +226,7 @@ class Authority:
             return False
         given = self._purpose(name)
         if purpose not in (None, given):
-            problem = f"is the name of a {given}, and whoever has its key would be a {purpose}; choose another name"
+            problem = f"is the name of a {given} for ever, not of a {purpose}; choose another name"
             raise NameTaken(where=name, problem=problem)
         return True
 

@@ -95,26 +95,30 @@ class Settings:
         self._check_reach(f"connect {endpoint}", Endpoint.read(endpoint))
 
     def _check_reach(self, where: str, endpoint: Endpoint) -> None:
-        if (endpoint.protocol == "tls") != (self.tls is not None):
-            problem = (
-                f"goes with certificates, and TRADE_TLS names none: {_CERTIFY}"
-                if self.tls is None
-                else f"TRADE_TLS is set, so it must be tls/{endpoint.host}:{endpoint.port}"
-            )
+        problem = self._refused_plain(endpoint) if self.tls is None else self._refused_certified(endpoint)
+        if problem:
             raise ConfigurationError(where=where, problem=problem)
-        if self.tls is not None and endpoint.rest:  # it could switch off what makes a link safe
-            problem = f"takes nothing after the port; leave out {endpoint.rest}"
-            raise ConfigurationError(where=where, problem=problem)
+
+    def _refused_plain(self, endpoint: Endpoint) -> str:
+        if endpoint.protocol == "tls":
+            return f"goes with certificates, and TRADE_TLS names none: {_CERTIFY}"
         if endpoint.loopback:
-            return
-        if self.tls is None and not self.insecure_lan:
-            problem = f"beyond loopback takes certificates: {_CERTIFY}, and tls/{endpoint.host}:{endpoint.port}"
-            raise ConfigurationError(where=where, problem=problem)
-        if self.tls is not None and not self.explicit_system:
-            raise ConfigurationError(where=where, problem="reaching a network needs a system id: set TRADE_SYSTEM")
-        if self.tls is None and not (self.explicit_system and self.credentials):
-            problem = "needs an explicit system id and credentials, too: set TRADE_SYSTEM and TRADE_CREDENTIALS"
-            raise ConfigurationError(where="TRADE_INSECURE_LAN", problem=problem)
+            return ""
+        if not self.insecure_lan:
+            return f"beyond loopback takes certificates: {_CERTIFY}, and tls/{endpoint.host}:{endpoint.port}"
+        if not (self.explicit_system and self.credentials):
+            what = "TRADE_INSECURE_LAN needs an explicit system id and credentials, too"
+            return f"{what}: set TRADE_SYSTEM and TRADE_CREDENTIALS=user:password"
+        return ""
+
+    def _refused_certified(self, endpoint: Endpoint) -> str:
+        if endpoint.protocol != "tls":
+            return f"TRADE_TLS is set, so it must be tls/{endpoint.host}:{endpoint.port}"
+        if endpoint.rest:  # it could switch off what makes a link safe
+            return f"takes nothing after the port; leave out {endpoint.rest}"
+        if not (endpoint.loopback or self.explicit_system):
+            return "reaching a network needs an explicit system id: set TRADE_SYSTEM"
+        return ""
 
     def _certificate(self) -> Certificate | None:
         if self.tls is None:
