@@ -49,7 +49,8 @@ class Member:
 
     def start(self, *connect: str, turn: str = "0") -> str:
         system = f"{os.environ['TRADE_SYSTEM']}-{turn}"
-        listen = [f"tcp/{address}" for address in self.address.split(",") if address]
+        protocol = "tls" if "TRADE_TLS" in os.environ else "tcp"
+        listen = [f"{protocol}/{address}" for address in self.address.split(",") if address]
         self.container = Container(
             Settings.read(system=system, container=self.name, listen=listen, connect=connect or None)
         )

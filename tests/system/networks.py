@@ -34,18 +34,20 @@ def why_not() -> str:
 
 
 class Member:
-    """``member.py`` in one of the namespaces."""
+    """``member.py`` in one of the namespaces; with certificates if ``tls`` is its folder, else with a password."""
 
-    def __init__(self, namespace: str, name: str, address: str, runtime: Path, bridge: str = "") -> None:
+    def __init__(
+        self, namespace: str, name: str, address: str, runtime: Path, bridge: str = "", tls: Path | None = None
+    ) -> None:
         # With a host name of its own: the namespace's.
         command = ["ip", "netns", "exec", namespace, "unshare", "--uts", sys.executable, str(MEMBER)]
         # Each namespace is a host of its own: no folder in common.
+        password = {"TRADE_INSECURE_LAN": "1", "TRADE_CREDENTIALS": "lab:secret"}
         environment = {
             **os.environ,
             "TRADE_RUNTIME_DIR": str(runtime / namespace),
-            "TRADE_INSECURE_LAN": "1",
-            "TRADE_CREDENTIALS": "lab:secret",
             "TRADE_BRIDGE": bridge,
+            **(password if tls is None else {"TRADE_TLS": str(tls)}),
         }
         self._process = subprocess.Popen(
             [*command, namespace, name, address],

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from certificates import Papers
 from system.member import PROVIDERS
 from system.networks import Member, Networks
 
@@ -21,8 +22,8 @@ def member(networks: Networks, system: str, tmp_path: Path) -> Iterator[StartMem
     """Starts ``member.py`` on a host; it is told to do things, and asked, from there on."""
     started: list[Member] = []
 
-    def start(host: str, name: str, address: str = "", *, bridge: str = "") -> Member:
-        started.append(Member(networks.host(host), name, address, tmp_path, bridge))
+    def start(host: str, name: str, address: str = "", *, bridge: str = "", tls: Path | None = None) -> Member:
+        started.append(Member(networks.host(host), name, address, tmp_path, bridge, tls))
         return started[-1]
 
     yield start
@@ -67,6 +68,29 @@ def test_containers_with_no_way_to_each_other_work_together_through_a_bridge(
     right.kill()
     all_work_together([bridge, *left, late])
     assert left[0].ask("gone") == ["r1"] * PROVIDERS
+
+
+def test_containers_with_certificates_work_together_through_a_bridge_and_strangers_do_not(
+    member: StartMember, two_networks: None, tmp_path: Path
+) -> None:
+    papers, strangers = Papers(tmp_path / "pki"), Papers(tmp_path / "elsewhere")
+    left_door, right_door = (endpoint.replace("tcp/", "tls/") for endpoint in (LEFT, RIGHT))
+
+    def of(name: str, *addresses: str) -> Path:
+        return papers.of(name, addresses=addresses)
+
+    door = of("door", "10.231.1.1", "10.231.2.1")
+    bridge = up(member("between", "bridge", BRIDGE, bridge="net1,net2", tls=door))
+    left = [
+        up(member(f"left{n}", f"l{n}", f"10.231.1.{n + 1}:0", tls=of(f"l{n}", f"10.231.1.{n + 1}")), left_door)
+        for n in (1, 2)
+    ]
+    right = up(member("right1", "r1", "10.231.2.2:0", tls=of("r1", "10.231.2.2")), right_door)
+    foreign = strangers.of("r2", addresses=["10.231.2.3"])
+    stranger = up(member("right2", "r2", "10.231.2.3:0", tls=foreign), right_door)
+    all_work_together([bridge, *left, right])
+    assert left[0].ask("linked", "2") == sorted(each.ask("id") for each in (bridge, left[1]))
+    all_work_together([stranger])
 
 
 def test_when_a_bridge_dies_neighbours_work_on_and_the_far_come_back_with_the_next_one(

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from certificates import Papers
 from system.conftest import ROSIE, Bench, Program
 from system.member import PROVIDERS
 from system.networks import Member, Networks, ip
@@ -39,12 +40,13 @@ def cable(networks: Networks) -> Cable:
 
 
 @pytest.fixture
-def member(cable: Cable, system: str, tmp_path: Path) -> Iterator[Callable[[str, str], Member]]:
+def member(cable: Cable, system: str, tmp_path: Path) -> Iterator[Callable[..., Member]]:
     started: list[Member] = []
 
-    def start(side: str, name: str) -> Member:
-        namespace, address = {"left": (cable.left, "10.231.7.1:0"), "right": (cable.right, "10.231.7.2:0")}[side]
-        started.append(Member(namespace, name, address, tmp_path))
+    def start(side: str, name: str, papers: Papers | None = None) -> Member:
+        namespace, address = {"left": (cable.left, "10.231.7.1"), "right": (cable.right, "10.231.7.2")}[side]
+        tls = None if papers is None else papers.of(name, addresses=[address])
+        started.append(Member(namespace, name, f"{address}:0", tmp_path, tls=tls))
         return started[-1]
 
     yield start
@@ -52,7 +54,7 @@ def member(cable: Cable, system: str, tmp_path: Path) -> Iterator[Callable[[str,
         running.close()
 
 
-StartMember = Callable[[str, str], Member]
+StartMember = Callable[..., Member]
 
 
 def test_three_that_start_and_register_at_the_same_moment_all_see_everything(member: StartMember) -> None:
@@ -87,11 +89,13 @@ def test_discovery_links_hosts_by_multicast(member: StartMember) -> None:
     assert left.ask("call_all") == right.ask("call_all") == 2 * PROVIDERS
 
 
+@pytest.mark.parametrize("certified", [False, True], ids=["password", "certificates"])
 @pytest.mark.parametrize("linked_by", ["find_each_other", "connect", "settings"])
 def test_services_come_back_after_a_partition_without_a_restart(
-    cable: Cable, member: StartMember, linked_by: str
+    cable: Cable, member: StartMember, tmp_path: Path, linked_by: str, certified: bool
 ) -> None:
-    left, right = member("left", "a"), member("right", "b")
+    papers = Papers(tmp_path / "pki") if certified else None
+    left, right = member("left", "a", papers), member("right", "b", papers)
     endpoint = left.ask("start")
     right.ask("start", *([endpoint] if linked_by == "settings" else []))
     for each in (left, right):

@@ -456,12 +456,3 @@ def test_a_policy_is_named_in_the_environment_and_read_at_the_start(policy: Path
     missing = Settings.read(environment={"TRADE_POLICY": str(tmp_path / "none.toml")})
     with pytest.raises(ConfigurationError, match="cannot be read"):
         Container(missing)
-
-
-def test_S21_with_a_policy_one_may_listen_on_a_network_under_a_chosen_name_and_credentials(policy: Path) -> None:
-    chosen: dict[str, Any] = {"system": "lab", "credentials": ("lab", "secret"), "listen": ["tcp/0.0.0.0:0"]}
-    assert Settings.read(**chosen, policy=policy, environment={}).listen == ("tcp/0.0.0.0:0",)
-    with pytest.raises(ConfigurationError, match="needs a policy, and none is loaded; set TRADE_POLICY"):
-        Settings.read(**chosen, environment={})
-    with pytest.raises(ConfigurationError, match="needs an explicit system id and credentials, too"):
-        Settings.read(listen=["tcp/0.0.0.0:0"], policy=policy, environment={})

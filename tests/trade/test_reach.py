@@ -31,23 +31,25 @@ def test_S21_the_default_system_is_the_users_on_this_host() -> None:
     assert not read().explicit_system
 
 
-@pytest.mark.parametrize(
-    "endpoint", ["tcp/0.0.0.0:7450", "tcp/[::]:7450", "tcp/192.168.1.5:0", "tls/robot.example:7447", "udp/10.0.0.1:1"]
-)
-def test_S21_listening_beyond_loopback_is_refused(endpoint: str) -> None:
-    with pytest.raises(ConfigurationError, match="listening beyond loopback needs a policy, and none is loaded"):
-        read(system="lab", credentials=("me", "secret"), listen=[endpoint])
+BEYOND = ["tcp/0.0.0.0:7450", "tcp/[::]:7450", "tcp/192.168.1.5:0", "udp/10.0.0.1:1"]
+
+
+@pytest.mark.parametrize("end", ["listen", "connect"])
+@pytest.mark.parametrize("endpoint", BEYOND)
+def test_S21_beyond_loopback_is_refused_without_certificates(end: str, endpoint: str) -> None:
+    with pytest.raises(ConfigurationError, match=r"beyond loopback takes certificates: set TRADE_TLS .*and tls/"):
+        read(system="lab", credentials=("me", "secret"), **{end: [endpoint]})
 
 
 @pytest.mark.parametrize("missing", [{"system": "lab"}, {"credentials": ("me", "secret")}, {}], ids=str)
-def test_S21_reaching_a_network_needs_a_system_and_credentials(missing: dict[str, Any]) -> None:
-    with pytest.raises(ConfigurationError, match="reaching a network needs an explicit system id and credentials"):
-        read(connect=["tcp/192.168.1.5:7450"], **missing)
+def test_S21_reaching_a_laboratory_network_needs_a_system_and_credentials(missing: dict[str, Any]) -> None:
+    with pytest.raises(ConfigurationError, match="TRADE_INSECURE_LAN needs an explicit system id and credentials"):
+        read(connect=["tcp/192.168.1.5:7450"], insecure_lan=True, **missing)
 
 
-def test_S21_a_network_may_be_reached_on_purpose() -> None:
-    settings = read(system="lab", credentials=("me", "secret"), connect=["tls/robot.example:7447"])
-    assert settings.connect == ("tls/robot.example:7447",)
+def test_S21_a_laboratory_network_may_be_reached_on_purpose() -> None:
+    lab = {"system": "lab", "credentials": ("me", "secret"), "insecure_lan": True}
+    assert read(connect=["tcp/robot.example:7447"], **lab).connect == ("tcp/robot.example:7447",)
 
 
 def test_an_empty_system_in_the_environment_is_no_explicit_one() -> None:
@@ -56,7 +58,7 @@ def test_an_empty_system_in_the_environment_is_no_explicit_one() -> None:
 
 def test_S21_a_bridge_listens_beyond_loopback_no_more_than_others() -> None:
     lan = ["tcp/192.168.1.5:7450", "tcp/10.0.0.5:7450"]
-    with pytest.raises(ConfigurationError, match="listening beyond loopback needs a policy, and none is loaded"):
+    with pytest.raises(ConfigurationError, match="beyond loopback takes certificates"):
         read(system="lab", credentials=("me", "secret"), listen=lan, bridge=["eth0", "eth1"])
 
 
@@ -72,7 +74,7 @@ def test_a_bridge_of_an_interface_that_is_not_there_is_refused_and_leaves_nothin
         Container(Settings.read(bridge=["nosuch0", "nosuch1"]))
 
 
-LOOPBACK = ["tcp/127.0.0.1:0", "tcp/127.8.9.1:7450", "tcp/[::1]:7450", "tcp/localhost:7450", "tls/127.0.0.1:1#a=b"]
+LOOPBACK = ["tcp/127.0.0.1:0", "tcp/127.8.9.1:7450", "tcp/[::1]:7450", "tcp/localhost:7450", "tcp/127.0.0.1:1#a=b"]
 
 
 @pytest.mark.parametrize("endpoint", LOOPBACK)

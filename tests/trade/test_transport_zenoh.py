@@ -5,9 +5,10 @@ import secrets
 import socket
 import threading
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 
 from trade._rendezvous import free_endpoint
-from trade._transport import Presence
+from trade._transport import ChannelClosed, Presence, Questions
 from trade._zenoh import ZenohTransport, configuration
 from trade.testing import LossConformance, Severable, TransportConformance
 
@@ -33,6 +34,19 @@ class TestZenoh(TransportConformance):
                 return transport
 
             yield open_transport
+
+    def test_who_waits_for_questions_while_they_are_closed_hears_that_they_are(self) -> None:
+        def read(questions: Questions) -> None:
+            with contextlib.suppress(ChannelClosed):
+                questions.receive()
+
+        with self.network() as open_transport, ThreadPoolExecutor(1, "asked") as other:
+            transport = open_transport()
+            for _ in range(500):
+                questions = transport.questions("anything")
+                waiting = other.submit(read, questions)
+                questions.close()
+                waiting.result(60)
 
 
 def _wait_for_links(transport: ZenohTransport, count: int) -> None:

@@ -4,6 +4,7 @@ import contextlib
 import logging
 import socket
 from collections.abc import Sequence
+from datetime import datetime, timedelta, timezone
 from typing import Final
 
 from trade._credentials import user_secret
@@ -11,14 +12,15 @@ from trade._endpoints import Endpoint, dialled_from_here, loopback_interface, wi
 from trade._links import Links
 from trade._rendezvous import Rendezvous
 from trade._settings import Settings
+from trade._tls import Certificate
 from trade._zenoh import ZenohTransport, configuration
 from trade.errors import ConfigurationError
 
 __all__ = ["join"]
 
 _logger = logging.getLogger("trade")
-_ANYWHERE_HERE: Final = Endpoint("tcp", "127.0.0.1", 0)
 _PORTS_TRIED: Final = 4
+_SOON: Final = timedelta(days=1)
 
 
 def join(settings: Settings, leaving: contextlib.ExitStack) -> ZenohTransport:
@@ -34,7 +36,8 @@ def join(settings: Settings, leaving: contextlib.ExitStack) -> ZenohTransport:
 
 
 def _join(settings: Settings, networks: list[list[str]], leaving: contextlib.ExitStack) -> ZenohTransport:
-    wanted = [Endpoint.read(endpoint) for endpoint in settings.listen] or [_ANYWHERE_HERE]
+    anywhere_here = Endpoint("tcp" if settings.tls is None else "tls", "127.0.0.1", 0)
+    wanted = [Endpoint.read(endpoint) for endpoint in settings.listen] or [anywhere_here]
     for _ in range(0 if all(endpoint.port for endpoint in wanted) else _PORTS_TRIED):
         with contextlib.suppress(ConfigurationError):  # somebody else took the free port first
             return _join_at(settings, _chosen(wanted), networks, leaving)
@@ -48,19 +51,50 @@ def _chosen(wanted: list[Endpoint]) -> list[str]:
 def _join_at(
     settings: Settings, listen: list[str], networks: list[list[str]], leaving: contextlib.ExitStack
 ) -> ZenohTransport:
-    connect = list(settings.connect)
+    connect, certified = list(settings.connect), settings.tls is not None
     if settings.bridge or not connect:
         rendezvous = Rendezvous(settings.system)
         leaving.callback(rendezvous.leave)
-        connect += rendezvous.enter(_nearest(listen))
-    if settings.insecure_lan:
+        connect += _of_our_kind(rendezvous.enter(_nearest(listen)), certified)
+    if settings.insecure_lan and not certified:
         _logger.warning("TRADE_INSECURE_LAN: %s is open to its network, unencrypted", listen)
-    credentials = settings.credentials or user_secret()
+    certificate = Certificate.read(settings.tls) if settings.tls else None
+    if certificate is not None:
+        _tell_of_the_end(certificate)
     return ZenohTransport(
         configuration(
-            namespace=settings.system, listen=listen, connect=connect, credentials=credentials, bridge=networks
+            namespace=settings.system,
+            listen=listen,
+            connect=connect,
+            credentials=None if certified else settings.credentials or user_secret(),
+            certificate=certificate,
+            bridge=networks,
         )
     )
+
+
+def _tell_of_the_end(certificate: Certificate) -> None:
+    """The transport listens with the certificate it was opened with, renewed or not."""
+    if certificate.until - datetime.now(timezone.utc) < _SOON:
+        until = f"{certificate.until:%Y-%m-%d %H:%M} UTC"
+        who = certificate.identity
+        _logger.warning(
+            "the certificate of %s ends %s: renew it and start again, or all its links end then", who, until
+        )
+
+
+def _of_our_kind(endpoints: list[str], certified: bool) -> list[str]:
+    """Those of them that we can link to: either all of a system have certificates, or none has."""
+    ours = [endpoint for endpoint in endpoints if (Endpoint.read(endpoint).protocol == "tls") == certified]
+    if others := [endpoint for endpoint in endpoints if endpoint not in ours]:
+        kinds = ("without certificates", "with certificates")
+        _logger.warning(
+            "%s: %s, and this container is %s: they cannot be linked; set TRADE_TLS for all of the system or for none",
+            ", ".join(others),
+            kinds[not certified],
+            kinds[certified],
+        )
+    return ours
 
 
 def _nearest(listen: list[str]) -> str:

@@ -18,6 +18,7 @@ import zenoh
 
 from trade._credentials import dictionary_file
 from trade._endpoints import Endpoint, dialled_from_here, loopback_interface
+from trade._tls import authority
 from trade.errors import ConfigurationError
 
 _NOBODY: Final[dict[str, Any]] = {"router": [], "peer": []}
@@ -29,6 +30,7 @@ it, and of the port that the main session listens on. So a scout knows whom it f
 _LOOK_S: Final = 0.01
 
 _USER: Final = "transport/auth/usrpwd/user"
+_TLS: Final = "transport/link/tls"
 _PASSWORD: Final = "transport/auth/usrpwd/password"  # noqa: S105 - the name of a setting
 
 
@@ -43,7 +45,11 @@ def new_session_id(*, dials: bool = False) -> str:
 
 
 def open_session(settings: dict[str, Any]) -> zenoh.Session:
-    """Open what the settings say, as zenoh names them; it lets in who has its own credentials. Raises zenoh.ZError."""
+    """Open what the settings say, as zenoh names them; it lets in who has its own credentials, or a certificate of its
+    authority. Raises zenoh.ZError.
+    """
+    if _USER not in settings:
+        return zenoh.open(_config(settings))
     with dictionary_file((settings[_USER], settings[_PASSWORD])) as allowed:
         return zenoh.open(_config({**settings, "transport/auth/usrpwd/dictionary_file": str(allowed)}))
 
@@ -81,6 +87,7 @@ class Links:
         self._settings = settings
         self._own = str(session.zid())
         self.bridges: Final[bool] = settings["mode"] == "router"
+        self.certified: Final = _TLS in settings
         self.listen: Final = [Endpoint.read(text) for text in settings["listen/endpoints"]]
         self._tag = _tag(settings)
         self._shown = next((own for own in self.listen if not own.loopback), self.listen[0])
@@ -198,8 +205,11 @@ def _found(beacon: str, locators: Iterable[str]) -> Found:
 
 
 def _tag(settings: dict[str, Any]) -> str:
-    """What the ids of one system's beacons begin with; without its password nobody can tell which system it is."""
-    digest = hmac.digest(str(settings[_PASSWORD]).encode(), str(settings["namespace"]).encode(), hashlib.sha256).hex()
+    """What the ids of one system's beacons begin with; without its password, or its authority's certificate, nobody can
+    tell which system it is.
+    """
+    known = authority(settings[_TLS]) if _TLS in settings else str(settings[_PASSWORD]).encode()
+    digest = hmac.digest(known, str(settings["namespace"]).encode(), hashlib.sha256).hex()
     return "b" + digest[: _TAG - 1]
 
 

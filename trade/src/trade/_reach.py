@@ -79,7 +79,7 @@ class Reach:
         self._may_dial(endpoint)
         there = self._dial(endpoint)
         if not there:
-            raise CannotConnect(endpoint=endpoint, reason=_why(endpoint, self._links.bridges))
+            raise CannotConnect(endpoint=endpoint, reason=_why(endpoint, self._links))
         with self._lock:
             self._check_open()
             self._kept[endpoint] = there
@@ -151,7 +151,7 @@ class Reach:
         silent, self._unsure = self._unsure, []
         for endpoint in silent:
             if accepts(endpoint):
-                _logger.warning("%s", CannotConnect(endpoint=endpoint, reason=_REFUSED))
+                _logger.warning("%s", CannotConnect(endpoint=endpoint, reason=_REFUSED[self._links.certified]))
 
     def _ended(self) -> bool:
         return self._closed
@@ -171,13 +171,19 @@ class Reach:
             thread.join(5)
 
 
-_REFUSED: Final = "something listens there but does not let us in; do both have the same user and password?"
-
-
+_REFUSED: Final = {
+    False: "something listens there but does not let us in; do both have the same user and password?",
+    True: (
+        "something listens there but there is no link; are both certificates in date and of one authority, and is the "
+        "other one for the addresses it listens on?"
+    ),
+}
+"""By whether we have a certificate."""
 _BRIDGES: Final = " Or is it a bridge? Those link to each other by connect in their settings, when they start."
 
 
-def _why(endpoint: str, bridges: bool) -> str:
+def _why(endpoint: str, links: Links) -> str:
     if not accepts(endpoint):
         return "nothing accepts connections there; is it up, and the address right?"
-    return _REFUSED + _BRIDGES if bridges else _REFUSED
+    refused = _REFUSED[links.certified]
+    return refused + _BRIDGES if links.bridges else refused

@@ -10,7 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from trade._endpoints import Endpoint
+from trade._endpoints import Endpoint, dialled_from_here
+from trade._tls import Certificate
 from trade._wire import as_chunk, is_chunk
 from trade.errors import ConfigurationError
 
@@ -24,6 +25,7 @@ _VARIABLES: Final = (
     "TRADE_LISTEN",
     "TRADE_CONNECT",
     "TRADE_CREDENTIALS",
+    "TRADE_TLS",
     "TRADE_BRIDGE",
     "TRADE_INSECURE_LAN",
     "TRADE_LOCK",
@@ -31,6 +33,7 @@ _VARIABLES: Final = (
     "TRADE_RUNTIME_DIR",
     "TRADE_STATE_DIR",
 )
+_CERTIFY: Final = "set TRADE_TLS to the folder that trade pki issue made"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -53,8 +56,12 @@ class Settings:
     """Endpoints of others; none: the containers of this system on this host."""
     credentials: tuple[str, str] | None = None
     """User and password of the whole system; none: a secret that this user's containers on this host share."""
+    tls: Path | None = None
+    """A folder with ``ca.pem``, ``cert.pem`` and ``key.pem``, as ``trade pki issue`` makes it: the links are encrypted,
+    both ends show certificates of one authority, and the identity is the certificate's common name. Takes the place of
+    credentials; all endpoints are ``tls/HOST:PORT`` then."""
     insecure_lan: bool = False
-    """Laboratories only: listen on a network without a policy and without encryption."""
+    """Laboratories only: reach a network without certificates, without encryption, without a policy."""
     policy: Path | None = None
     """File of the access policy; none: everybody in the system may do everything."""
     bridge: tuple[str, ...] = ()
@@ -72,13 +79,12 @@ class Settings:
             if not is_chunk(text) or text.strip(".") == "":  # the system names a folder, too
                 problem = f"{text!r} is no name for a {what}; use letters, digits, . _ - (at most 80)"
                 raise ConfigurationError(where=what, problem=problem)
+        certificate = self._certificate()
         for endpoint in self.listen:
-            if not Endpoint.read(endpoint).loopback and not self._open_on_purpose():
-                problem = (
-                    "listening beyond loopback needs a policy, and none is loaded; set TRADE_POLICY, or listen on "
-                    "tcp/127.0.0.1:PORT"
-                )
-                raise ConfigurationError(where=f"listen {endpoint}", problem=problem)
+            self._check_reach(f"listen {endpoint}", Endpoint.read(endpoint))
+            self._check_governed(f"listen {endpoint}", Endpoint.read(endpoint))
+            if certificate is not None:
+                certificate.check_is_for(Endpoint.read(dialled_from_here(Endpoint.read(endpoint))).host)
         if self.credentials is not None and not _can_be_told(*self.credentials):
             problem = "user and password must be printable, without spaces around them, and the user without a colon"
             raise ConfigurationError(where="credentials", problem=problem)
@@ -90,20 +96,56 @@ class Settings:
 
     def check_may_dial(self, endpoint: str) -> None:
         """S21: raises ConfigurationError if that would reach a network by accident."""
-        if not Endpoint.read(endpoint).loopback and not (self.explicit_system and self.credentials):
-            problem = (
-                "reaching a network needs an explicit system id and credentials: set TRADE_SYSTEM and "
-                "TRADE_CREDENTIALS=user:password"
-            )
-            raise ConfigurationError(where=f"connect {endpoint}", problem=problem)
+        self._check_reach(f"connect {endpoint}", Endpoint.read(endpoint))
 
-    def _open_on_purpose(self) -> bool:
-        allowed = self.insecure_lan or self.policy is not None
-        if allowed and not (self.explicit_system and self.credentials):
-            problem = "needs an explicit system id and credentials, too: set TRADE_SYSTEM and TRADE_CREDENTIALS"
-            where = "TRADE_INSECURE_LAN" if self.insecure_lan else "listening beyond loopback"
+    def _check_reach(self, where: str, endpoint: Endpoint) -> None:
+        problem = self._refused_plain(endpoint) if self.tls is None else self._refused_certified(endpoint)
+        if problem:
             raise ConfigurationError(where=where, problem=problem)
-        return allowed
+
+    def _refused_plain(self, endpoint: Endpoint) -> str:
+        if endpoint.protocol == "tls":
+            return f"goes with certificates, and TRADE_TLS names none: {_CERTIFY}"
+        if endpoint.loopback:
+            return ""
+        if not self.insecure_lan:
+            return f"beyond loopback takes certificates: {_CERTIFY}, and tls/{endpoint.host}:{endpoint.port}"
+        if not (self.explicit_system and self.credentials):
+            what = "TRADE_INSECURE_LAN needs an explicit system id and credentials, too"
+            return f"{what}: set TRADE_SYSTEM and TRADE_CREDENTIALS=user:password"
+        return ""
+
+    def _refused_certified(self, endpoint: Endpoint) -> str:
+        if endpoint.protocol != "tls":
+            return f"TRADE_TLS is set, so it must be tls/{endpoint.host}:{endpoint.port}"
+        if endpoint.rest:  # it could switch off what makes a link safe
+            return f"takes nothing after the port; leave out {endpoint.rest}"
+        if not (endpoint.loopback or self.explicit_system):
+            return "reaching a network needs an explicit system id: set TRADE_SYSTEM"
+        return ""
+
+    def _check_governed(self, where: str, endpoint: Endpoint) -> None:
+        if not (endpoint.loopback or self.policy or self.insecure_lan):
+            problem = (
+                "listening beyond loopback needs a policy, and none is loaded; set TRADE_POLICY, or listen on "
+                f"{endpoint.protocol}/127.0.0.1:PORT"
+            )
+            raise ConfigurationError(where=where, problem=problem)
+
+    def _certificate(self) -> Certificate | None:
+        if self.tls is None:
+            return None
+        if self.credentials is not None:
+            problem = "certificates take their place; leave out TRADE_CREDENTIALS or TRADE_TLS"
+            raise ConfigurationError(where="credentials", problem=problem)
+        certificate = Certificate.read(self.tls)
+        if certificate.identity != self.identity:
+            problem = (
+                f"{self.identity!r} contradicts {self.tls / 'cert.pem'}, which is of {certificate.identity!r}; "
+                "leave out TRADE_IDENTITY, or name the folder of that one"
+            )
+            raise ConfigurationError(where="identity", problem=problem)
+        return certificate
 
     @classmethod
     def read(
@@ -115,6 +157,7 @@ class Settings:
         listen: Sequence[str] | None = None,
         connect: Sequence[str] | None = None,
         credentials: tuple[str, str] | None = None,
+        tls: str | Path | None = None,
         insecure_lan: bool | None = None,
         bridge: Sequence[str] | None = None,
         policy: Path | None = None,
@@ -123,20 +166,23 @@ class Settings:
         """Settings from arguments, else from the environment, else the defaults.
 
         The environment has ``TRADE_SYSTEM``, ``TRADE_IDENTITY``, ``TRADE_CONTAINER``, ``TRADE_LISTEN`` and
-        ``TRADE_CONNECT`` (comma-separated), ``TRADE_CREDENTIALS`` (``user:password``), ``TRADE_INSECURE_LAN`` (``1``),
-        ``TRADE_BRIDGE`` (comma-separated), ``TRADE_POLICY`` (a file), ``TRADE_LOCK`` (set by ``trade lock``),
-        ``TRADE_RUNTIME_DIR`` and ``TRADE_STATE_DIR`` (else the user's folder for state). Others that begin with
-        ``TRADE_`` are warned of.
+        ``TRADE_CONNECT`` (comma-separated), ``TRADE_CREDENTIALS`` (``user:password``), ``TRADE_TLS`` (a folder),
+        ``TRADE_POLICY`` (a file), ``TRADE_INSECURE_LAN`` (``1``), ``TRADE_BRIDGE`` (comma-separated), ``TRADE_LOCK``
+        (set by ``trade lock``), ``TRADE_RUNTIME_DIR`` and ``TRADE_STATE_DIR`` (else the user's folder for state).
+        Others that begin with ``TRADE_`` are warned of.
         """
         _warn_of_unknown(environment)
         named = system or environment.get("TRADE_SYSTEM") or None
+        folder = tls or environment.get("TRADE_TLS")
+        certified = Path(folder).absolute() if folder else None
         return cls(
             system=named or f"{_user()}@{as_chunk(socket.gethostname())}",
-            identity=identity or environment.get("TRADE_IDENTITY") or _user(),
+            identity=identity or environment.get("TRADE_IDENTITY") or _who(certified),
             container=container or environment.get("TRADE_CONTAINER") or _program(),
             listen=tuple(_split(environment, "TRADE_LISTEN") if listen is None else listen),
             connect=tuple(_split(environment, "TRADE_CONNECT") if connect is None else connect),
             credentials=credentials or _credentials(environment.get("TRADE_CREDENTIALS")),
+            tls=certified,
             insecure_lan=environment.get("TRADE_INSECURE_LAN") == "1" if insecure_lan is None else insecure_lan,
             bridge=tuple(_split(environment, "TRADE_BRIDGE") if bridge is None else bridge),
             policy=policy or _path(environment.get("TRADE_POLICY")),
@@ -186,6 +232,10 @@ def _can_be_told(user: str, password: str) -> bool:
     """Whether the transport's file of users can hold them."""
     fit = all(text and text.isprintable() and text == text.strip() for text in (user, password))
     return fit and ":" not in user
+
+
+def _who(certified: Path | None) -> str:
+    return _user() if certified is None else Certificate.read(certified).identity
 
 
 def _user() -> str:

@@ -14,6 +14,7 @@ import zenoh
 
 from trade._endpoints import Endpoint
 from trade._links import Links, new_session_id, open_session
+from trade._tls import Certificate, transport_settings
 from trade._transport import (
     Answer,
     Channel,
@@ -42,10 +43,17 @@ def configuration(
     namespace: str,
     listen: Sequence[str],
     connect: Sequence[str],
-    credentials: tuple[str, str],
+    credentials: tuple[str, str] | None = None,
+    certificate: Certificate | None = None,
     bridge: Sequence[Sequence[str]] = (),
 ) -> dict[str, Any]:
-    """The settings of one session, as zenoh names them; ``bridge`` has the interfaces of each network it joins."""
+    """The settings of one session, as zenoh names them; ``bridge`` has the interfaces of each network it joins.
+
+    Whom it lets in is decided by certificates or else by credentials.
+    """
+    entry: dict[str, Any] = {} if certificate is None else {"transport/link/tls": transport_settings(certificate)}
+    if credentials is not None:
+        entry["transport/auth/usrpwd/user"], entry["transport/auth/usrpwd/password"] = credentials
     return {
         "id": new_session_id(dials=all(Endpoint.read(own).loopback for own in listen)),
         "mode": "router" if bridge else "peer",
@@ -64,8 +72,7 @@ def configuration(
             "peer": {"to_router": "always", "to_peer": "greater-zid"},
             "router": {"to_peer": "always"},
         },
-        "transport/auth/usrpwd/user": credentials[0],
-        "transport/auth/usrpwd/password": credentials[1],
+        **entry,
         "transport/link/tx/lease": LEASE_MS,
         "transport/link/tx/keep_alive": 4,
         "transport/link/tx/queue/congestion_control/block/wait_before_close": 1_000_000,
@@ -153,10 +160,11 @@ class ZenohQuestion(Question):
 class ZenohQuestions(Questions):
     def __init__(self, queryable: Any) -> None:
         self._queryable = queryable
+        self._recv = queryable.handler.recv  # to ask for it while another thread closes is refused
 
     def receive(self) -> Question:
         try:
-            return ZenohQuestion(self._queryable.handler.recv())
+            return ZenohQuestion(self._recv())
         except zenoh.ZError:
             raise ChannelClosed from None
 
