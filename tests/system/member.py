@@ -83,6 +83,19 @@ class Member:
     def call_group(self, group: str) -> list[int]:
         return [outcome.result for outcome in self.up.call_all(where(group=group, name="echo"), 7)]
 
+    def lock(self, group: str) -> list[str]:
+        """Hold all that moves there, and move it."""
+        with self.up.lock(where(group=group)) as lock:
+            self.up.find(where(name="move", group=group))(1)
+            return list(lock.resources)
+
+    def try_move(self, of: str, deadline_s: str) -> None:
+        """Move what it has seen before, or sees now, however long that takes."""
+        handles = self.up.services(where(name="move", group=of))
+        self._kept = handles[0] if handles else self._kept
+        assert self._kept is not None
+        self._kept.with_(deadline_s=float(deadline_s))(1)
+
     def watch(self) -> None:
         """From now on note which containers' services leave."""
         self.up.left(where(name="echo"), lambda handle: self._gone.append(handle.container))

@@ -37,17 +37,27 @@ class Member:
     """``member.py`` in one of the namespaces; with certificates if ``tls`` is its folder, else with a password."""
 
     def __init__(
-        self, namespace: str, name: str, address: str, runtime: Path, bridge: str = "", tls: Path | None = None
+        self,
+        namespace: str,
+        name: str,
+        address: str,
+        runtime: Path,
+        bridge: str = "",
+        tls: Path | None = None,
+        policy: Path | None = None,
     ) -> None:
         # With a host name of its own: the namespace's.
         command = ["ip", "netns", "exec", namespace, "unshare", "--uts", sys.executable, str(MEMBER)]
         # Each namespace is a host of its own: no folder in common.
-        password = {"TRADE_INSECURE_LAN": "1", "TRADE_CREDENTIALS": "lab:secret"}
+        lax = {} if policy is not None else {"TRADE_INSECURE_LAN": "1"}
+        entry = {"TRADE_CREDENTIALS": "lab:secret"} if tls is None else {"TRADE_TLS": str(tls)}
         environment = {
             **os.environ,
             "TRADE_RUNTIME_DIR": str(runtime / namespace),
             "TRADE_BRIDGE": bridge,
-            **(password if tls is None else {"TRADE_TLS": str(tls)}),
+            **lax,
+            **entry,
+            **({} if policy is None else {"TRADE_POLICY": str(policy)}),
         }
         self._process = subprocess.Popen(
             [*command, namespace, name, address],
@@ -72,6 +82,14 @@ class Member:
     def ask(self, *words: str) -> Any:
         self.tell(*words)
         return self.heard()
+
+    def refused(self, *words: str) -> str:
+        """The error that it gets."""
+        self.tell(*words)
+        assert self._process.stdout is not None
+        said = json.loads(self._process.stdout.readline())
+        assert "error" in said, said
+        return said["error"]
 
     def kill(self) -> None:
         self._process.kill()

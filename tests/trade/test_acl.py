@@ -18,9 +18,9 @@ import pytest
 import zenoh
 
 from trade import Container, Settings, service, where
-from trade._acl import acl
+from trade._acl import acl, crossings
 from trade._endpoints import free_endpoint
-from trade._policies import Policy
+from trade._policies import Policy, Role
 from trade._policy_file import read_policy
 from trade._zenoh import ZenohTransport, configuration
 
@@ -242,10 +242,45 @@ def test_who_has_no_role_or_a_revoked_one_has_no_rules(policy: Policy) -> None:
 
 
 def test_a_gateway_is_believed_and_every_key_is_of_the_system(policy: Policy) -> None:
-    rules = acl(policy, namespace=SYSTEM, gateways=["edge"])["access_control"]["rules"]
+    trusting = Policy(policy.roles.values(), policy.identities, gateways=["edge"])
+    rules = acl(trusting, namespace=SYSTEM)["access_control"]["rules"]
     assert all(key.startswith(f"{SYSTEM}/") for rule in rules for key in rule["key_exprs"])
     believed = [rule for rule in rules if rule["id"].startswith("edge ")]
     assert {key for rule in believed for key in rule["key_exprs"]} == {f"{SYSTEM}/**"}
+
+
+def keys_of(rules: dict[str, Any], who: str, message: str, flow: str) -> set[str]:
+    """What that subject may, without the system."""
+    found = [rule for rule in rules["access_control"]["rules"] if rule["id"] == f"{who} {flow} {message}"]
+    return {key.partition("/")[2] for rule in found for key in rule["key_exprs"]}
+
+
+def test_what_a_network_does_not_export_is_neither_offered_nor_called_across_it() -> None:
+    roles = [Role("all", {"call": ["*"], "register": ["rosie", "lab"]})]
+    policy = Policy(roles, {"rosie": ["all"], "planner": ["all"]})
+    crossing = crossings({"eth0": ["rosie.head"], "eth1": []})
+    assert crossing == {"eth0": (["rosie.head"], []), "eth1": ([], ["rosie.head"])}
+    rules = acl(policy, namespace=SYSTEM, networks={("eth0", "lo"): crossing["eth0"], ("eth1",): crossing["eth1"]})
+    subjects = {subject["id"]: subject for subject in rules["access_control"]["subjects"]}
+    assert subjects["rosie eth0 lo"]["interfaces"] == ["eth0", "lo"]
+    assert subjects["planner eth1"]["cert_common_names"] == ["planner"]
+    offered = {key for key in keys_of(rules, "rosie eth0 lo", "put", "ingress") if key.startswith("registry/")}
+    assert offered == {f"registry/{group}/rosie/*/*/*" for group in ("trade", "rosie.head", "rosie.head.$*")}
+    called = {key for key in keys_of(rules, "planner eth1", "put", "ingress") if key.startswith("call/")}
+    assert called == {f"call/planner/*/*/*/{group}/*" for group in ("trade", "rosie.head", "rosie.head.$*")}
+    seen = keys_of(rules, "planner eth0 lo", "reply", "egress")
+    assert seen == {"registry/trade/*/*/*/*"}
+    assert "stop/planner/**" in keys_of(rules, "planner eth1", "put", "ingress")
+
+
+def test_without_certificates_only_what_crosses_is_looked_at() -> None:
+    crossing = crossings({"eth0": ["rosie"], "eth1": ["*"]})
+    rules = acl(None, namespace=SYSTEM, networks={(name,): what for name, what in crossing.items()})
+    assert all("cert_common_names" not in subject for subject in rules["access_control"]["subjects"])
+    assert keys_of(rules, "* eth1", "reply", "egress") == {
+        f"registry/{group}/*/*/*/*" for group in ("trade", "rosie", "rosie.$*")
+    }
+    assert keys_of(rules, "* eth0", "reply", "egress") == {"registry/*/*/*/*/*"}
 
 
 def test_a_flood_of_calls_is_cut_and_stops_are_not(policy: Policy, tmp_path: Path) -> None:

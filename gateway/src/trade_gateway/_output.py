@@ -83,6 +83,12 @@ def _cut(text: str, width: int) -> str:
     return text.ljust(width) if len(text) <= width else text[: width - 1] + "…"
 
 
+def complain(text: str) -> None:
+    """A line on standard error, for programs, too: what went wrong, and that one goes on."""
+    Console(stderr=True, highlight=False, soft_wrap=True).print(f"[bold yellow]warning[/]: {escape(text)}")
+    sys.stderr.flush()
+
+
 def say_error(error: BaseException) -> None:
     """The error's name and message on standard error."""
     console = Console(stderr=True, highlight=False, soft_wrap=True)

@@ -39,7 +39,7 @@ def up(
     out = Output(as_json=as_json)
     robot = load(robot_file)
     with ExitStack() as stack:
-        asked_to_leave = stack.enter_context(_leaving())
+        asked_to_leave = stack.enter_context(leaving())
         simulation = stack.enter_context(_simulation(robot_file, sim_log)) if sim else None
         ports: dict[str, str] | None = simulation.ports if simulation else None
         container = stack.enter_context(Container(choice_of(context).settings(name or robot.name)))
@@ -65,7 +65,7 @@ def up(
 
 
 @contextmanager
-def _leaving() -> Generator[threading.Event]:
+def leaving() -> Generator[threading.Event]:
     """An event that Ctrl-C and SIGTERM set, so that devices are always left in order."""
     event = threading.Event()
 

@@ -4,8 +4,8 @@ docs/access-control.md has the table and how it was found. One table serves a co
 what an identity may send to whoever holds the rules, and what it may be sent.
 """
 
-from collections.abc import Iterable, Sequence
-from typing import Any, Final, Literal
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Final, Literal, NamedTuple
 
 from trade._policies import EVERYTHING, VERBS, Policy
 from trade._system import DOMAIN
@@ -29,27 +29,49 @@ _ALL_MESSAGES: Final = (
 _SEEING: Final = tuple(verb for verb in VERBS if verb != "register")
 """Who may do one of these in a group may know what is offered there."""
 
+_ANYBODY: Final = "*"
+"""In place of an identity where nothing tells who is who: on links without certificates."""
+
+
+class Crossing(NamedTuple):
+    """What a gateway lets pass between one of its networks and the others."""
+
+    offered: Sequence[str]
+    """Groups whose services of this network the others see and call."""
+    seen: Sequence[str]
+    """Groups of the others that are seen and called from this network."""
+
+
+def crossings(exports: Mapping[str, Sequence[str]]) -> dict[str, Crossing]:
+    """From what each network lets out, by interface, to what crosses at each."""
+    return {
+        name: Crossing(groups, sorted({group for other in exports if other != name for group in exports[other]}))
+        for name, groups in exports.items()
+    }
+
+
+_EVERYTHING_CROSSES: Final = Crossing((EVERYTHING,), (EVERYTHING,))
+
 _Row = tuple[str, str, Sequence[str]]
 """Flow, message, keys."""
 
 
 def acl(
-    policy: Policy,
+    policy: Policy | None,
     *,
     namespace: str,
     identities: Iterable[str] | None = None,
-    gateways: Sequence[str] = (),
+    networks: Mapping[tuple[str, ...], Crossing] | None = None,
     subject: Literal["cert_common_names", "usernames"] = "cert_common_names",
     calls_hz: float | None = None,
 ) -> dict[str, Any]:
     """Settings of a zenoh session that let each identity send and hear what the policy allows, and nothing else.
 
     Args:
-        policy: who may what.
+        policy: who may what; none: everybody may everything that crosses, and nobody can be told from others.
         namespace: the system id: rules go by the keys on the wire, which begin with it.
         identities: everybody there is; by default those the policy names in full, as rules know no patterns.
-        gateways: identities that are believed whatever they pass on, as they have checked it themselves. Nobody else
-            may ever be given such a name.
+        networks: of a gateway, what crosses at the interfaces of each of its networks; none: everything.
         subject: what tells who is at the other end of a link; user names are known to the end that was dialled only.
         calls_hz: how often an identity may call at most, evenly spread: of two calls that come closer together than
             that the second is dropped. None: as often as it likes.
@@ -58,32 +80,47 @@ def acl(
         ``access_control`` and ``downsampling``, as zenoh names them. They are read when a session opens: another
         policy needs another session.
     """
-    known = [name for name in (policy.names() if identities is None else identities) if name not in policy.revoked]
-    tables = {name: _rows(policy, name) for name in dict.fromkeys(known) if name not in gateways}
-    tables.update((name, _trusted()) for name in gateways if name not in policy.revoked)
+    places = networks or {(): _EVERYTHING_CROSSES}
+    if policy is None:
+        known, gateways = [_ANYBODY], list[str]()
+    else:
+        gateways = [name for name in policy.gateways if name not in policy.revoked]
+        named = policy.names() if identities is None else identities
+        known = [name for name in dict.fromkeys(named) if name not in policy.revoked and name not in gateways]
     rules: list[dict[str, Any]] = []
+    subjects: list[dict[str, Any]] = []
     policies: list[dict[str, Any]] = []
-    for name, rows in tables.items():
-        made = [_rule(f"{name} {flow} {message}", flow, message, keys, namespace) for flow, message, keys in rows]
-        rules += made
-        policies.append({"rules": [rule["id"] for rule in made], "subjects": [name]})
+
+    def let(name: str, interfaces: Sequence[str], rows: Iterable[_Row]) -> None:
+        who = " ".join((name, *interfaces))
+        made = [_rule(who, *row, namespace) for row in rows if row[2]]
+        told: dict[str, Any] = {} if name == _ANYBODY else {subject: [name]}
+        subjects.append({"id": who, **told, **({"interfaces": list(interfaces)} if interfaces else {})})
+        rules.extend(made)
+        policies.append({"rules": [rule["id"] for rule in made], "subjects": [who]})
+
+    for interfaces, crossing in places.items():
+        for name in known:
+            let(name, interfaces, _rows(policy, name, crossing))
+    for name in gateways:
+        let(name, (), _trusted())
     return {
         "access_control": {
             "enabled": True,
             "default_permission": "deny",
             "rules": rules,
-            "subjects": [{"id": name, subject: [name]} for name in tables],
+            "subjects": subjects,
             "policies": policies,
         },
-        "downsampling": [] if calls_hz is None else _limits(tables.keys() - set(gateways), namespace, calls_hz),
+        "downsampling": [] if calls_hz is None else _limits(known, namespace, calls_hz),
     }
 
 
-def _rows(policy: Policy, me: str) -> list[_Row]:
+def _rows(policy: Policy | None, me: str, crossing: Crossing) -> list[_Row]:
     """What one identity may send to us, and what we may send to it."""
-    calls = _over(policy, me, ("call", "read"), f"call/{me}/*/*/*/{{}}/*")
-    offers = _over(policy, me, ("register",), f"registry/{{}}/{me}/*/*/*")
-    sees = _over(policy, me, _SEEING, "registry/{}/*/*/*/*")
+    calls = _over(policy, me, ("call", "read"), crossing.seen, f"call/{me}/*/*/*/{{}}/*")
+    offers = _over(policy, me, ("register",), crossing.offered, f"registry/{{}}/{me}/*/*/*")
+    sees = _over(policy, me, _SEEING, crossing.seen, "registry/{}/*/*/*/*")
     own = f"registry/*/{me}/*/*/*"
     to_it = [f"call/*/{me}/**", f"stop/*/{me}/**", f"reply/*/{me}/**", ESTOPS]
     return [
@@ -104,9 +141,9 @@ def _rows(policy: Policy, me: str) -> list[_Row]:
     ]
 
 
-def _over(policy: Policy, who: str, verbs: Iterable[str], pattern: str) -> list[str]:
-    """Keys of the groups an identity has one of the verbs over, and of the middleware's own."""
-    groups = policy.groups_of(who, verbs)
+def _over(policy: Policy | None, who: str, verbs: Iterable[str], among: Sequence[str], pattern: str) -> list[str]:
+    """Keys of the groups among some that an identity has one of the verbs over, and of the middleware's own."""
+    groups = _both([EVERYTHING] if policy is None else policy.groups_of(who, verbs), among)
     if groups == [EVERYTHING]:
         return [pattern.format("*")]
     own = [DOMAIN] if DOMAIN not in groups else []
@@ -114,13 +151,24 @@ def _over(policy: Policy, who: str, verbs: Iterable[str], pattern: str) -> list[
     return [pattern.format(chunk) for chunk in (*own, *beneath)]
 
 
+def _both(some: Sequence[str], others: Sequence[str]) -> list[str]:
+    """The groups that both name, where each stands for all beneath it."""
+    return sorted({narrow for one in some for other in others if (narrow := _narrower(one, other))})
+
+
+def _narrower(one: str, other: str) -> str:
+    if other in (EVERYTHING, one) or one.startswith(f"{other}."):
+        return one
+    return other if one == EVERYTHING or other.startswith(f"{one}.") else ""
+
+
 def _trusted() -> list[_Row]:
     return [(flow, message, ["**"]) for flow in (_IN, _OUT) for message in _ALL_MESSAGES]
 
 
-def _rule(name: str, flow: str, message: str, keys: Sequence[str], namespace: str) -> dict[str, Any]:
+def _rule(who: str, flow: str, message: str, keys: Sequence[str], namespace: str) -> dict[str, Any]:
     return {
-        "id": name,
+        "id": f"{who} {flow} {message}",
         "permission": "allow",
         "flows": [flow],
         "messages": [message],

@@ -5,11 +5,13 @@ import logging
 import socket
 from collections.abc import Sequence
 from datetime import datetime, timedelta, timezone
-from typing import Final
+from typing import Any, Final
 
+from trade._acl import acl, crossings
 from trade._credentials import user_secret
 from trade._endpoints import Endpoint, dialled_from_here, loopback_interface, with_free_port
 from trade._links import Links
+from trade._policy_file import read_policy
 from trade._rendezvous import Rendezvous
 from trade._settings import Settings
 from trade._tls import Certificate
@@ -69,8 +71,21 @@ def _join_at(
             credentials=None if certified else settings.credentials or user_secret(),
             certificate=certificate,
             bridge=networks,
+            rules=_rules(settings, networks),
         )
     )
+
+
+def _rules(settings: Settings, networks: list[list[str]]) -> dict[str, Any]:
+    """The transport's access rules: who may what, if certificates tell who is who, and what crosses a gateway."""
+    policy = read_policy(settings.policy) if settings.policy and settings.tls else None
+    if policy is None and settings.exports is None:
+        return {}
+    crossing = None
+    if settings.exports is not None:
+        known = crossings(settings.exports)
+        crossing = {tuple(interfaces): known[interfaces[0]] for interfaces in networks}
+    return acl(policy, namespace=settings.system, networks=crossing)
 
 
 def _tell_of_the_end(certificate: Certificate) -> None:

@@ -52,6 +52,7 @@ class Policy:
         identities: Mapping[str, Sequence[str]],
         revoked: Iterable[str] = (),
         source: str = "policy",
+        gateways: Iterable[str] = (),
     ) -> None:
         """Compile it.
 
@@ -60,11 +61,13 @@ class Policy:
             identities: names, or patterns with ``*`` and ``?``, to the names of roles.
             revoked: identities that may do nothing at all any more, stopping included.
             source: where it was read from, for people.
+            gateways: identities that the transport believes whatever they pass on, as they have checked it.
         """
         self.source: Final = source
         self.roles: Final = {role.name: role for role in roles}
         self.identities: Final = {pattern: tuple(names) for pattern, names in identities.items()}
         self.revoked: Final = frozenset(revoked)
+        self.gateways: Final = tuple(gateways)
         self._of_role = {name: self._rights_of_role(name) for name in self.roles}
         self._of: dict[str, _Rights] = {}
 

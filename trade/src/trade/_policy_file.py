@@ -20,7 +20,7 @@ else:
 __all__ = ["read_policy"]
 
 _PATTERN: Final = re.compile(r"[A-Za-z0-9_.@:*?-]{1,80}")
-_KEYS: Final = ("roles", "identities", "revoked", "revoked_file")
+_KEYS: Final = ("roles", "identities", "gateways", "revoked", "revoked_file")
 _ROLE_KEYS: Final = (*VERBS, "includes")
 _EXAMPLES: Final = {
     "roles": '[roles.operator] and call = ["rosie"]',
@@ -43,13 +43,13 @@ def read_policy(path: Path) -> Policy:
         _checked_identity(name, f"{where}: identities"): _role_names(names, roles, f'{where}: identities."{name}"')
         for name, names in _table(raw, "identities", where).items()
     }
-    revoked = _revoked(raw, where)
+    revoked = _names(raw, "revoked", where)
     beside = raw.get("revoked_file")
     if beside is not None:
         if not isinstance(beside, str) or not beside:
             raise _wrong(f"{where}: revoked_file", 'must be a path, such as revoked_file = "revoked.toml"')
         revoked = (*revoked, *_revoked_elsewhere(path.parent / beside, where))
-    return Policy(roles.values(), identities, revoked, where)
+    return Policy(roles.values(), identities, revoked, where, _names(raw, "gateways", where))
 
 
 def _load(path: Path) -> _Table:
@@ -125,11 +125,11 @@ def _checked_identity(name: str, at: str) -> str:
     return name
 
 
-def _revoked(raw: _Table, where: str) -> tuple[str, ...]:
-    names = _texts(raw.get("revoked", []), f"{where}: revoked", '["name"]')
+def _names(raw: _Table, key: str, where: str) -> tuple[str, ...]:
+    names = _texts(raw.get(key, []), f"{where}: {key}", '["name"]')
     for name in names:
         if not is_chunk(name):
-            raise _wrong(f"{where}: revoked", f"{name!r} is no identity; name each in full, without patterns")
+            raise _wrong(f"{where}: {key}", f"{name!r} is no identity; name each in full, without patterns")
     return names
 
 
@@ -139,7 +139,7 @@ def _revoked_elsewhere(path: Path, named_in: str) -> tuple[str, ...]:
         raise _wrong(f"{named_in}: revoked_file", problem)
     raw = _load(path)
     _only_known(raw, ("revoked",), str(path))
-    return _revoked(raw, str(path))
+    return _names(raw, "revoked", str(path))
 
 
 def _table(raw: _Table, key: str, where: str) -> _Table:

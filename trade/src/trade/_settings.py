@@ -67,7 +67,9 @@ class Settings:
     bridge: tuple[str, ...] = ()
     """Network interfaces such as ``eth0``: carry messages between the containers of their networks, which need no way
     to each other. It has to listen on each; one alone will do if it dials another bridge. Everything of the system
-    crosses: there are no lists of what may, yet."""
+    crosses unless ``exports`` says what."""
+    exports: Mapping[str, tuple[str, ...]] | None = None
+    """By interface of the bridge, the groups whose services on that network others see and call; none: everything."""
     explicit_system: bool = False
     lock: str = ""
     """A lock that the process around this one holds for it; see `Lock.environment`."""
@@ -93,6 +95,10 @@ class Settings:
         if len(set(self.bridge)) == 1 and not self.connect:
             problem = "joins networks, and this is only one; name a second interface, or connect to another bridge"
             raise ConfigurationError(where=f"bridge {self.bridge[0]}", problem=problem)
+
+        if self.exports is not None and set(self.exports) != set(self.bridge):
+            problem = f"must name the interfaces of the bridge, {', '.join(self.bridge) or 'none'}, each once"
+            raise ConfigurationError(where=f"exports of {', '.join(self.exports)}", problem=problem)
 
     def check_may_dial(self, endpoint: str) -> None:
         """S21: raises ConfigurationError if that would reach a network by accident."""
@@ -160,6 +166,7 @@ class Settings:
         tls: str | Path | None = None,
         insecure_lan: bool | None = None,
         bridge: Sequence[str] | None = None,
+        exports: Mapping[str, Sequence[str]] | None = None,
         policy: Path | None = None,
         environment: Mapping[str, str] = os.environ,
     ) -> "Settings":
@@ -185,6 +192,7 @@ class Settings:
             tls=certified,
             insecure_lan=environment.get("TRADE_INSECURE_LAN") == "1" if insecure_lan is None else insecure_lan,
             bridge=tuple(_split(environment, "TRADE_BRIDGE") if bridge is None else bridge),
+            exports=None if exports is None else {name: tuple(groups) for name, groups in exports.items()},
             policy=policy or _path(environment.get("TRADE_POLICY")),
             explicit_system=named is not None,
             lock=environment.get("TRADE_LOCK", ""),

@@ -7,7 +7,8 @@ receiver instead of dropping (zenoh's default), and go out at once. All sessions
 """
 
 import contextlib
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, Final
 
 import zenoh
@@ -46,10 +47,11 @@ def configuration(
     credentials: tuple[str, str] | None = None,
     certificate: Certificate | None = None,
     bridge: Sequence[Sequence[str]] = (),
+    rules: Mapping[str, Any] = MappingProxyType({}),
 ) -> dict[str, Any]:
     """The settings of one session, as zenoh names them; ``bridge`` has the interfaces of each network it joins.
 
-    Whom it lets in is decided by certificates or else by credentials.
+    Whom it lets in is decided by certificates or else by credentials, and what they may send by the rules (see `_acl`).
     """
     entry: dict[str, Any] = {} if certificate is None else {"transport/link/tls": transport_settings(certificate)}
     if credentials is not None:
@@ -73,6 +75,7 @@ def configuration(
             "router": {"to_peer": "always"},
         },
         **entry,
+        **rules,
         "transport/link/tx/lease": LEASE_MS,
         "transport/link/tx/keep_alive": 4,
         "transport/link/tx/queue/congestion_control/block/wait_before_close": 1_000_000,

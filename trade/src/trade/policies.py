@@ -4,8 +4,19 @@ Containers read their own: see `trade.Settings.policy` and `trade.Container.load
 """
 
 from trade._access import decide_call
-from trade._acl import acl
+from trade._acl import Crossing, acl, crossings
 from trade._policies import EVERYTHING, VERBS, Decision, Policy, Role
 from trade._policy_file import read_policy
 
-__all__ = ["EVERYTHING", "VERBS", "Decision", "Policy", "Role", "acl", "decide_call", "read_policy"]
+__all__ = [
+    "EVERYTHING",
+    "VERBS",
+    "Crossing",
+    "Decision",
+    "Policy",
+    "Role",
+    "acl",
+    "crossings",
+    "decide_call",
+    "read_policy",
+]

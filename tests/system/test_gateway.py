@@ -1,0 +1,229 @@
+"""``trade gateway`` between networks: what crosses, what does not, and what becomes of it on bad days."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from certificates import Papers
+from system.networks import Member, Networks
+from waiting import PATIENCE_S, wait_until
+
+pytestmark = pytest.mark.timeout(300)
+
+SYSTEM = "lab-0"
+POLICY = """
+gateways = ["door"]
+
+[roles.driver]
+register = ["rosie", "cellar"]
+
+[roles.operator]
+read = ["*"]
+call = ["rosie"]
+lock = ["rosie"]
+register = ["lobby"]
+
+[roles.viewer]
+read = ["*"]
+
+[identities]
+arm = ["driver"]
+planner = ["operator"]
+dash = ["viewer"]
+"""
+GATEWAY = f"""
+system = "{SYSTEM}"
+tls = "pki/issued/door"
+policy = "policy.toml"
+
+[network.private]
+interface = "net1"
+listen = ["tls/10.231.1.1:7450"]
+export = ["rosie.arm"]
+
+[network.public]
+interface = "net2"
+listen = ["tls/10.231.2.1:7450"]
+export = []
+"""
+
+
+class Site:
+    """A robot's private network and a public one, with a gateway between them."""
+
+    def __init__(self, networks: Networks, folder: Path) -> None:
+        self.networks = networks
+        self.folder = folder
+        self.papers = Papers(folder / "pki")
+        self.policy, self.file = folder / "policy.toml", folder / "gateway.toml"
+        self.policy.write_text(POLICY)
+        self.file.write_text(GATEWAY)
+        self.members: list[Member] = []
+        networks.lay("net1", between="10.231.1.1", left="10.231.1.2")
+        networks.lay("net2", between="10.231.2.1", right="10.231.2.2", right2="10.231.2.3")
+        self.papers.of("door", addresses=["10.231.1.1", "10.231.2.1"], gateway=True)
+        self.begin()
+
+    def begin(self) -> None:
+        command = ["ip", "netns", "exec", self.networks.host("between")]
+        command += [sys.executable, "-m", "trade_gateway", "gateway", str(self.file), "--json"]
+        complaints = (self.folder / "complaints").open("ab")
+        with complaints:
+            self.gateway = subprocess.Popen(
+                command,
+                stdout=subprocess.PIPE,
+                stderr=complaints,
+                text=True,
+                env={**os.environ, "TRADE_RUNTIME_DIR": str(self.folder / "runtime"), "TRADE_SYSTEM": "elsewhere"},
+            )
+        assert self.gateway.stdout is not None
+        self.ready = json.loads(self.gateway.stdout.readline())
+
+    def complaints(self) -> str:
+        return (self.folder / "complaints").read_text()
+
+    def member(self, host: str, name: str, network: int, policy: Path | None = None) -> Member:
+        own = self.folder / f"{name}.toml"
+        own.write_text(POLICY)
+        tls = self.papers.of(name)
+        runtime = self.folder / "runtime"
+        made = Member(self.networks.host(host), name, "127.0.0.1:0", runtime, tls=tls, policy=policy or own)
+        self.members.append(made)
+        made.ask("start", f"tls/10.231.{network}.1:7450")
+        return made
+
+    def change(self, path: Path, before: str, after: str) -> None:
+        text = path.read_text()
+        assert before in text
+        path.write_text(text.replace(before, after))
+
+    def close(self) -> None:
+        for each in self.members:
+            each.close()
+        self.gateway.send_signal(signal.SIGTERM)
+        try:
+            self.gateway.wait(20)
+        finally:
+            self.gateway.kill()
+            self.gateway.wait()
+            assert self.gateway.stdout is not None
+            self.gateway.stdout.close()
+
+
+@pytest.fixture
+def site(networks: Networks, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Site]:
+    monkeypatch.setenv("TRADE_SYSTEM", "lab")  # member.py appends its turn
+    made = Site(networks, tmp_path)
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def arm(site: Site) -> Member:
+    """On the private network: two groups, one of which is let out."""
+    made = site.member("left", "arm", 1)
+    made.ask("register_one", "rosie.arm")
+    made.ask("register_one", "cellar")
+    return made
+
+
+@pytest.fixture
+def planner(site: Site, arm: Member) -> Member:
+    made = site.member("right", "planner", 2)
+    made.ask("group", "rosie.arm", "arm")
+    return made
+
+
+def moves(member: Member, times: int) -> Callable[[], bool]:
+    return lambda: len(member.ask("moved", "rosie.arm")) == times
+
+
+def test_what_is_exported_is_found_called_locked_and_missed_on_the_other_side(
+    site: Site, arm: Member, planner: Member
+) -> None:
+    assert site.ready["networks"] == {"net1": ["rosie.arm"], "net2": []}
+    assert planner.ask("call_group", "rosie.arm") == [7]
+    planner.ask("move", "rosie.arm", "3")
+    assert arm.ask("moved", "rosie.arm") == [0, 1, 2]
+    assert len(planner.ask("lock", "rosie.arm")) == 1
+    assert planner.ask("sees", "1") == ["rosie.arm.echo"]  # nothing of the cellar
+    planner.ask("watch")
+    arm.kill()
+    wait_until(lambda: planner.ask("gone") == ["arm"], "its end crosses, too")
+
+
+def test_what_is_not_exported_is_neither_seen_nor_called_and_comes_with_the_export(
+    site: Site, arm: Member, planner: Member
+) -> None:
+    planner.ask("register_one", "lobby")
+    assert planner.ask("sees", "2") == ["lobby.echo", "rosie.arm.echo"]
+    planner.ask("move", "rosie.arm", "1")  # what was said before it has arrived
+    assert arm.ask("sees", "2") == ["cellar.echo", "rosie.arm.echo"]
+    site.change(site.file, "export = []", 'export = ["lobby"]')
+    assert arm.ask("group", "lobby", "planner") == [["trade", "lobby.echo"]] or arm.ask("group", "lobby", "planner")
+    assert planner.ask("sees", "2") == ["lobby.echo", "rosie.arm.echo"]
+
+
+def test_who_may_not_call_is_refused_by_himself_by_the_callee_and_by_the_gateway(
+    site: Site, arm: Member, planner: Member
+) -> None:
+    planner.ask("move", "rosie.arm", "1")
+    dash = site.member("right2", "dash", 2)
+    dash.ask("group", "rosie.arm", "arm")
+    assert dash.ask("call_group", "rosie.arm") == [7]
+    assert dash.refused("move", "rosie.arm", "1").startswith("AccessDenied")
+    lenient = site.folder / "lenient.toml"
+    lenient.write_text(POLICY.replace('dash = ["viewer"]', 'dash = ["operator"]'))
+    dash.close()
+    liar = site.member("right2", "dash", 2, policy=lenient)  # goes by a policy of its own
+    liar.ask("group", "rosie.arm", "arm")
+    assert liar.refused("move", "rosie.arm", "1").startswith("AccessDenied")  # the callee's word
+    stranger = site.member("right2", "mallory", 2, policy=lenient)  # has a certificate, and no role anywhere
+    stranger.ask("sees", "0")
+    assert stranger.ask("call_all") == 0
+    assert arm.ask("moved", "rosie.arm") == [0]
+
+
+def test_a_policy_is_changed_while_calls_run(site: Site, arm: Member, planner: Member) -> None:
+    planner.ask("try_move", "rosie.arm", "20")
+    site.change(site.policy, 'planner = ["operator"]', "planner = []")
+    site.gateway.send_signal(signal.SIGHUP)
+    wait_until(lambda: "move" not in str(_tried(planner)), "the gateway lets it through no more")
+    site.change(site.policy, "planner = []", 'planner = ["operator"]')
+    planner.ask("group", "rosie.arm", "arm")
+    wait_until(lambda: _tried(planner) == "moved", "and again")
+
+
+def _tried(member: Member) -> str:
+    member.tell("try_move", "rosie.arm", "1")
+    assert member._process.stdout is not None
+    said = json.loads(member._process.stdout.readline())
+    return "moved" if "answer" in said else said["error"].partition(":")[0]
+
+
+def test_a_wrong_file_changes_nothing_and_says_why(site: Site, planner: Member) -> None:
+    site.change(site.file, 'policy = "policy.toml"', 'polcy = "policy.toml"')
+    wait_until(lambda: "polcy: unknown key" in site.complaints(), "it is said")
+    assert "going on as before" in site.complaints()
+    planner.ask("move", "rosie.arm", "2")
+    site.change(site.file, 'polcy = "policy.toml"', 'policy = "policy.toml"\nconnect = ["tcp/10.231.2.9:1"]')
+    wait_until(lambda: "must be tls/10.231.2.9:1" in site.complaints(), "so is this")
+    planner.ask("move", "rosie.arm", "1")
+
+
+def test_a_gateway_that_is_killed_and_comes_back_is_used_again(site: Site, arm: Member, planner: Member) -> None:
+    planner.ask("watch")
+    planner.ask("move", "rosie.arm", "1")
+    site.gateway.kill()
+    site.gateway.wait(PATIENCE_S)
+    wait_until(lambda: planner.ask("gone") == ["arm"], "out of sight")
+    site.begin()
+    planner.ask("group", "rosie.arm", "arm")
+    planner.ask("move", "rosie.arm", "1")
+    assert arm.ask("moved", "rosie.arm") == [0, 0]
