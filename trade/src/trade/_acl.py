@@ -29,6 +29,13 @@ _ALL_MESSAGES: Final = (
 _SEEING: Final = tuple(verb for verb in VERBS if verb != "register")
 """Who may do one of these in a group may know what is offered there."""
 
+_BEHIND: Final = {
+    "id": "calls behind",
+    "flows": [_IN],
+    "messages": ["put"],
+    "overwrite": {"priority": "data_low", "express": False},
+}
+
 _Row = tuple[str, str, Sequence[str]]
 """Flow, message, keys."""
 
@@ -55,8 +62,9 @@ def acl(
             that the second is dropped. None: as often as it likes.
 
     Returns:
-        ``access_control`` and ``downsampling``, as zenoh names them. They are read when a session opens: another
-        policy needs another session.
+        ``access_control``, ``downsampling`` and ``qos/network``, as zenoh names them. They are read when a session
+        opens: another policy needs another session. The last one sends calls on behind everything else, so that who
+        floods with them holds up nobody's stops and answers.
     """
     known = [name for name in (policy.names() if identities is None else identities) if name not in policy.revoked]
     tables = {name: _rows(policy, name) for name in dict.fromkeys(known) if name not in gateways}
@@ -75,6 +83,7 @@ def acl(
             "subjects": [{"id": name, subject: [name]} for name in tables],
             "policies": policies,
         },
+        "qos/network": [_BEHIND | {"key_exprs": [f"{namespace}/call/**"]}],
         "downsampling": [] if calls_hz is None else _limits(tables.keys() - set(gateways), namespace, calls_hz),
     }
 
