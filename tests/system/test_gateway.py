@@ -67,7 +67,7 @@ class Site:
         self.members: list[Member] = []
         networks.lay("net1", between="10.231.1.1", left="10.231.1.2")
         networks.lay("net2", between="10.231.2.1", right="10.231.2.2", right2="10.231.2.3")
-        self.papers.of("door", addresses=["10.231.1.1", "10.231.2.1"], gateway=True)
+        self.papers.of("door", addresses=["10.231.1.1", "10.231.2.1"], purpose="gateway")
         self.begin()
 
     def begin(self) -> None:

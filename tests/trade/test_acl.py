@@ -89,7 +89,7 @@ class Star:
         }
         self.heard = {name: self._listen(name) for name in STAR}
         for actor, receiver in itertools.permutations(STAR, 2):
-            self._until_linked(actor, receiver)
+            self.put(actor, receiver)
 
     def _listen(self, name: str) -> queue.SimpleQueue[str]:
         """One queue for all that a container of that name subscribes to, and for more than it may."""
@@ -100,30 +100,34 @@ class Star:
             self.sessions[name].declare_subscriber(pattern, hear, allowed_origin=zenoh.Locality.REMOTE)
         return heard
 
-    def _until_linked(self, actor: str, receiver: str) -> None:
-        deadline = time.monotonic() + WAIT_S
-        while not self._marked(actor, receiver, 0.2):
-            assert time.monotonic() < deadline, f"{receiver} hears nothing of {actor}"
+    def put(self, actor: str, receiver: str, *keys: str) -> list[str]:
+        """Let one put on these keys; what the other one has heard of that.
 
-    def _marked(self, actor: str, receiver: str, wait_s: float) -> list[str]:
-        """What the receiver has heard, in order, before what every identity may send: a stop."""
-        mark = f"stop/{actor}/{receiver}/c/e1/lab/mark-{time.monotonic_ns()}"
-        self.sessions[actor].put(mark, b"")
-        heard, deadline = list[str](), time.monotonic() + wait_s
+        Behind them goes what every identity may send, of the same kind, as kinds overtake each other.
+        """
+        kind, heard, deadline = "call" if keys and keys[0].startswith("call/") else "stop", list[str](), _soon(WAIT_S)
+        for key in keys:
+            self.sessions[actor].put(key, b"", congestion_control=zenoh.CongestionControl.BLOCK)
+        while time.monotonic() < deadline:
+            mark = f"{kind}/{actor}/{receiver}/c/e1/trade/mark-{time.monotonic_ns()}"
+            self.sessions[actor].put(mark, b"")
+            heard += self._heard_until(receiver, mark, _soon(0.2))
+            if mark in heard:
+                return [key for key in heard if key in keys]
+        pytest.fail(f"{receiver} hears nothing of {actor}")
+
+    def _heard_until(self, receiver: str, mark: str, deadline: float) -> list[str]:
+        heard = list[str]()
         while mark not in heard:
             try:
                 heard.append(self.heard[receiver].get(timeout=max(0.0, deadline - time.monotonic())))
             except queue.Empty:
-                return []
+                break
         return heard
 
-    def put(self, actor: str, receiver: str, *keys: str) -> list[str]:
-        """Let one put on these keys; what the other one has heard of that."""
-        for key in keys:
-            self.sessions[actor].put(key, b"", congestion_control=zenoh.CongestionControl.BLOCK)
-        heard = self._marked(actor, receiver, WAIT_S)
-        assert heard
-        return [key for key in heard if key in keys]
+
+def _soon(wait_s: float) -> float:
+    return time.monotonic() + wait_s
 
 
 def _opened(settings: dict[str, Any]) -> zenoh.Session:
@@ -183,12 +187,14 @@ def test_what_passes_is_what_the_policy_allows(star: Star, actor: str, receiver:
 def test_a_sign_of_life_is_given_for_oneself_only(star: Star) -> None:
     signs: queue.SimpleQueue[str] = queue.SimpleQueue()
     reader, forger = star.sessions["planner"].liveliness(), star.sessions["mallory"].liveliness()
-    watch = reader.declare_subscriber("alive/**", lambda sample: signs.put(str(sample.key_expr)))
+    watch = reader.declare_subscriber("alive/**", lambda sample: signs.put(str(sample.key_expr)), history=True)
+    before = forger.declare_token("alive/mallory/c/e0")
+    assert signs.get(timeout=WAIT_S) == "alive/mallory/c/e0"  # from here on signs come in the order they are given in
     forged, own = forger.declare_token("alive/drv/c/e1"), forger.declare_token("alive/mallory/c/e1")
-    assert signs.get(timeout=WAIT_S) == "alive/mallory/c/e1"  # declared later
+    assert signs.get(timeout=WAIT_S) == "alive/mallory/c/e1"
     real = star.sessions["drv"].liveliness().declare_token("alive/drv/c/e1")
     assert signs.get(timeout=WAIT_S) == "alive/drv/c/e1"
-    for declared in (watch, forged, own, real):
+    for declared in (watch, before, forged, own, real):
         declared.undeclare()
 
 
@@ -281,6 +287,24 @@ def test_without_certificates_only_what_crosses_is_looked_at() -> None:
         f"registry/{group}/*/*/*/*" for group in ("trade", "rosie", "rosie.$*")
     }
     assert keys_of(rules, "* eth0", "reply", "egress") == {"registry/*/*/*/*/*"}
+
+
+def test_calls_at_once_all_pass_and_go_on_behind_stops(star: Star) -> None:
+    heard: queue.SimpleQueue[tuple[str, str]] = queue.SimpleQueue()
+    hear = zenoh.handlers.Callback(
+        lambda sample: heard.put((str(sample.key_expr), str(sample.priority))), indirect=False
+    )
+    subscribed = [star.sessions["drv"].declare_subscriber(f"{kind}/*/drv/b/**", hear) for kind in ("call", "stop")]
+    urgent = {"congestion_control": zenoh.CongestionControl.BLOCK, "priority": zenoh.Priority.REAL_TIME}
+    star.put("planner", "drv")  # what is subscribed to is known to all by the time that this is heard
+    for number in range(MANY):
+        star.sessions["planner"].put(f"call/planner/drv/b/e1/lab/P{number}", b"", **urgent)
+    star.sessions["planner"].put("stop/planner/drv/b/e1/lab/P", b"", **urgent)
+    got = [heard.get(timeout=WAIT_S) for _ in range(MANY + 1)]
+    assert {priority for key, priority in got if key.startswith("call/")} == {str(zenoh.Priority.DATA_LOW)}
+    assert {priority for key, priority in got if key.startswith("stop/")} == {str(zenoh.Priority.REAL_TIME)}
+    for one in subscribed:
+        one.undeclare()
 
 
 def test_a_flood_of_calls_is_cut_and_stops_are_not(policy: Policy, tmp_path: Path) -> None:

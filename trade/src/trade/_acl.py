@@ -29,6 +29,13 @@ _ALL_MESSAGES: Final = (
 _SEEING: Final = tuple(verb for verb in VERBS if verb != "register")
 """Who may do one of these in a group may know what is offered there."""
 
+_BEHIND: Final = {
+    "id": "calls behind",
+    "flows": [_IN],
+    "messages": ["put"],
+    "overwrite": {"priority": "data_low", "express": False},
+}
+
 _ANYBODY: Final = "*"
 """In place of an identity where nothing tells who is who: on links without certificates."""
 
@@ -77,8 +84,9 @@ def acl(
             that the second is dropped. None: as often as it likes.
 
     Returns:
-        ``access_control`` and ``downsampling``, as zenoh names them. They are read when a session opens: another
-        policy needs another session.
+        ``access_control``, ``downsampling`` and ``qos/network``, as zenoh names them. They are read when a session
+        opens: another policy needs another session. The last one sends calls on behind everything else, so that who
+        floods with them holds up nobody's stops and answers.
     """
     places = networks or {(): _EVERYTHING_CROSSES}
     if policy is None:
@@ -112,6 +120,7 @@ def acl(
             "subjects": subjects,
             "policies": policies,
         },
+        "qos/network": [_BEHIND | {"key_exprs": [f"{namespace}/call/**"]}],
         "downsampling": [] if calls_hz is None else _limits(known, namespace, calls_hz),
     }
 
