@@ -114,6 +114,8 @@ class Settings:
     def _refused_certified(self, endpoint: Endpoint) -> str:
         if endpoint.protocol != "tls":
             return f"TRADE_TLS is set, so it must be tls/{endpoint.host}:{endpoint.port}"
+        if endpoint.host.startswith("["):
+            return "the transport does not link with certificates at IPv6 addresses; use an IPv4 address or a name"
         if endpoint.rest:  # it could switch off what makes a link safe
             return f"takes nothing after the port; leave out {endpoint.rest}"
         if not (endpoint.loopback or self.explicit_system):
