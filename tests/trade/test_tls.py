@@ -10,10 +10,13 @@ import sys
 from collections.abc import Callable, Iterator
 from datetime import timedelta
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from cryptography import x509
 from cryptography.hazmat.primitives import serialization
+from cryptography.x509.oid import ExtendedKeyUsageOID
 
 from certificates import Papers
 from trade import Container, Settings, service, where
@@ -353,6 +356,34 @@ def test_an_expired_certificate_is_refused_before_anything_opens(papers: Papers)
     with pytest.raises(ConfigurationError, match=r"cert\.pem: has expired, .*renew it: trade pki issue"):
         read(tls=papers.expired("arm"))
     assert read(tls=papers.of("arm")).identity == "arm"
+
+
+SERVER, CLIENT, CODE = (getattr(ExtendedKeyUsageOID, name) for name in ("SERVER_AUTH", "CLIENT_AUTH", "CODE_SIGNING"))
+
+
+@pytest.mark.parametrize(
+    ("made_with", "said"),
+    [
+        ({"_CLOCKS_DIFFER": -timedelta(hours=1)}, r"cert\.pem: is not valid yet; is the clock of this host right"),
+        (
+            {"ExtendedKeyUsageOID": SimpleNamespace(SERVER_AUTH=SERVER, CLIENT_AUTH=CODE)},
+            r"cert\.pem: may not be used for both ends of a link",
+        ),
+        (
+            {"ExtendedKeyUsageOID": SimpleNamespace(SERVER_AUTH=CODE, CLIENT_AUTH=CLIENT)},
+            r"cert\.pem: may not be used for both ends of a link",
+        ),
+        ({"_named": lambda _: x509.Name([])}, r"cert\.pem: has the common name of nobody, which is no identity"),
+        ({"_HERE": ("arm.example", "10.9.9.9")}, r"is for 10\.9\.9\.9, arm\.example, not for 127\.0\.0\.1"),
+    ],
+)
+def test_certificates_that_are_of_no_use_are_refused(
+    papers: Papers, monkeypatch: pytest.MonkeyPatch, made_with: dict[str, Any], said: str
+) -> None:
+    for name, value in made_with.items():
+        monkeypatch.setattr(f"trade_gateway._pki.{name}", value)
+    with pytest.raises(ConfigurationError, match=said):
+        read(tls=papers.of("arm"))
 
 
 def test_a_certificate_that_expired_since_the_settings_were_read_is_refused(system: str, papers: Papers) -> None:

@@ -79,7 +79,8 @@ class Settings:
         certificate = self._certificate()
         for endpoint in self.listen:
             self._check_reach(f"listen {endpoint}", Endpoint.read(endpoint))
-            if certificate is not None:
+        if certificate is not None:
+            for endpoint in self.listen or ("tls/127.0.0.1:0",):
                 certificate.check_is_for(Endpoint.read(dialled_from_here(Endpoint.read(endpoint))).host)
         if self.credentials is not None and not _can_be_told(*self.credentials):
             problem = "user and password must be printable, without spaces around them, and the user without a colon"
