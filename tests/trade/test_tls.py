@@ -386,10 +386,13 @@ def test_certificates_that_are_of_no_use_are_refused(
         read(tls=papers.of("arm"))
 
 
-def test_a_certificate_that_expired_since_the_settings_were_read_is_refused(system: str, papers: Papers) -> None:
+def test_what_happened_to_the_folder_since_the_settings_were_read_is_said(system: str, papers: Papers) -> None:
     settings = Settings.read(tls=papers.of("arm"))
     papers.expired("arm")
     with pytest.raises(ConfigurationError, match="has expired"):
+        Container(settings)
+    shutil.copytree(papers.of("leg"), papers.of("arm"), dirs_exist_ok=True)
+    with pytest.raises(ConfigurationError, match=r"'arm' contradicts .* which is of 'leg'"):
         Container(settings)
 
 

@@ -76,7 +76,7 @@ class Settings:
             if not is_chunk(text) or text.strip(".") == "":  # the system names a folder, too
                 problem = f"{text!r} is no name for a {what}; use letters, digits, . _ - (at most 80)"
                 raise ConfigurationError(where=what, problem=problem)
-        certificate = self._certificate()
+        certificate = self.certificate()
         for endpoint in self.listen:
             self._check_reach(f"listen {endpoint}", Endpoint.read(endpoint))
         if certificate is not None:
@@ -123,7 +123,8 @@ class Settings:
             return "reaching a network needs an explicit system id: set TRADE_SYSTEM"
         return ""
 
-    def _certificate(self) -> Certificate | None:
+    def certificate(self) -> Certificate | None:
+        """What the folder has now; raises ConfigurationError if that is of no use, or another one's."""
         if self.tls is None:
             return None
         if self.credentials is not None:
