@@ -256,7 +256,7 @@ def refused(*words: object) -> TradeError:
 
 def test_the_commands_make_an_identity_and_say_how_to_start_with_it(folder: Path) -> None:
     assert "ca.key secret" in said("init", folder).stdout
-    issued = said("issue", "arm", "--ca", folder, "--address", "10.0.0.5").stdout
+    issued = said("issue", "arm", "--ca", folder, "--address", "fe80::1", "--address", "10.0.0.5").stdout
     assert str(folder / "issued" / "arm") in issued
     variables = dict(re.findall(r"(TRADE_\w+)=(\S+)", issued))
     assert variables["TRADE_LISTEN"] == "tls/10.0.0.5:7450"

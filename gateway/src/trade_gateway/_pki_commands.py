@@ -86,7 +86,8 @@ def issue(
     if as_json:
         out.data(_plain(given))
         return
-    listen = f"tls/{_bracketed((*given.hosts, '127.0.0.1')[0])}:7450"
+    dialled = next((host for host in given.hosts if ":" not in host), "127.0.0.1")  # IPv6 does not go with certificates
+    listen = f"tls/{dialled}:7450"
     out.say(
         f"{given.name}, a {given.purpose}, until {_moment(given.until)}: ca.pem, cert.pem and key.pem (secret) are in\n"
         f"  {escape(str(given.folder))}\nStart it with them, wherever you take them:\n"
@@ -155,7 +156,3 @@ def _moment(when: datetime | None) -> str:
 
 def _quoted(folder: Path) -> str:
     return shlex.quote(str(folder))
-
-
-def _bracketed(host: str) -> str:
-    return f"[{host}]" if ":" in host else host

@@ -27,8 +27,10 @@ _SOON: Final = timedelta(days=1)
 
 def join(settings: Settings, leaving: contextlib.ExitStack) -> ZenohTransport:
     """Open the main session; what has to be undone when the container leaves goes onto the stack."""
-    networks = _networks(settings.bridge)
-    transport = _join(settings, networks, leaving)
+    networks, certificate = _networks(settings.bridge), settings.certificate()
+    if certificate is not None:
+        _tell_of_the_end(certificate)
+    transport = _join(settings, certificate, networks, leaving)
     try:
         _check_bridged(settings.bridge, transport.links)
     except ConfigurationError:
@@ -37,13 +39,15 @@ def join(settings: Settings, leaving: contextlib.ExitStack) -> ZenohTransport:
     return transport
 
 
-def _join(settings: Settings, networks: list[list[str]], leaving: contextlib.ExitStack) -> ZenohTransport:
-    anywhere_here = Endpoint("tcp" if settings.tls is None else "tls", "127.0.0.1", 0)
+def _join(
+    settings: Settings, certificate: Certificate | None, networks: list[list[str]], leaving: contextlib.ExitStack
+) -> ZenohTransport:
+    anywhere_here = Endpoint("tcp" if certificate is None else "tls", "127.0.0.1", 0)
     wanted = [Endpoint.read(endpoint) for endpoint in settings.listen] or [anywhere_here]
     for _ in range(0 if all(endpoint.port for endpoint in wanted) else _PORTS_TRIED):
         with contextlib.suppress(ConfigurationError):  # somebody else took the free port first
-            return _join_at(settings, _chosen(wanted), networks, leaving)
-    return _join_at(settings, _chosen(wanted), networks, leaving)
+            return _join_at(settings, certificate, _chosen(wanted), networks, leaving)
+    return _join_at(settings, certificate, _chosen(wanted), networks, leaving)
 
 
 def _chosen(wanted: list[Endpoint]) -> list[str]:
@@ -51,18 +55,19 @@ def _chosen(wanted: list[Endpoint]) -> list[str]:
 
 
 def _join_at(
-    settings: Settings, listen: list[str], networks: list[list[str]], leaving: contextlib.ExitStack
+    settings: Settings,
+    certificate: Certificate | None,
+    listen: list[str],
+    networks: list[list[str]],
+    leaving: contextlib.ExitStack,
 ) -> ZenohTransport:
-    connect, certified = list(settings.connect), settings.tls is not None
+    connect, certified = list(settings.connect), certificate is not None
     if settings.bridge or not connect:
         rendezvous = Rendezvous(settings.system)
         leaving.callback(rendezvous.leave)
         connect += _of_our_kind(rendezvous.enter(_nearest(listen)), certified)
     if settings.insecure_lan and not certified:
         _logger.warning("TRADE_INSECURE_LAN: %s is open to its network, unencrypted", listen)
-    certificate = Certificate.read(settings.tls) if settings.tls else None
-    if certificate is not None:
-        _tell_of_the_end(certificate)
     return ZenohTransport(
         configuration(
             namespace=settings.system,

@@ -81,11 +81,12 @@ class Settings:
             if not is_chunk(text) or text.strip(".") == "":  # the system names a folder, too
                 problem = f"{text!r} is no name for a {what}; use letters, digits, . _ - (at most 80)"
                 raise ConfigurationError(where=what, problem=problem)
-        certificate = self._certificate()
+        certificate = self.certificate()
         for endpoint in self.listen:
             self._check_reach(f"listen {endpoint}", Endpoint.read(endpoint))
             self._check_governed(f"listen {endpoint}", Endpoint.read(endpoint))
-            if certificate is not None:
+        if certificate is not None:
+            for endpoint in self.listen or ("tls/127.0.0.1:0",):
                 certificate.check_is_for(Endpoint.read(dialled_from_here(Endpoint.read(endpoint))).host)
         if self.credentials is not None and not _can_be_told(*self.credentials):
             problem = "user and password must be printable, without spaces around them, and the user without a colon"
@@ -124,6 +125,8 @@ class Settings:
     def _refused_certified(self, endpoint: Endpoint) -> str:
         if endpoint.protocol != "tls":
             return f"TRADE_TLS is set, so it must be tls/{endpoint.host}:{endpoint.port}"
+        if endpoint.host.startswith("["):
+            return "the transport does not link with certificates at IPv6 addresses; use an IPv4 address or a name"
         if endpoint.rest:  # it could switch off what makes a link safe
             return f"takes nothing after the port; leave out {endpoint.rest}"
         if not (endpoint.loopback or self.explicit_system):
@@ -138,7 +141,8 @@ class Settings:
             )
             raise ConfigurationError(where=where, problem=problem)
 
-    def _certificate(self) -> Certificate | None:
+    def certificate(self) -> Certificate | None:
+        """What the folder has now; raises ConfigurationError if that is of no use, or another one's."""
         if self.tls is None:
             return None
         if self.credentials is not None:
