@@ -183,13 +183,13 @@ class BusGroup(_Joints, JointGroup):
 class AttachedJoints(AttachedBus):
     """A bus with its joints, and the thread that owns it."""
 
-    def __init__(self, thread: BusThread) -> None:
-        self._thread = thread
+    def __init__(self, thread: BusThread, motor: type[BusMotor] = BusMotor) -> None:
+        self._thread, self._motor = thread, motor
         self._axes = {axis.joint.name: axis for axis in thread.exchange.axes}
 
     def motor(self, joint: str) -> Motor:
         axis = self._axes[joint]
-        return BusMotor(axis.name, self._thread, [axis])
+        return self._motor(axis.name, self._thread, [axis])
 
     def group(self, name: str, joints: Sequence[str]) -> JointGroup:
         return BusGroup(name, self._thread, [self._axes[joint] for joint in joints])
