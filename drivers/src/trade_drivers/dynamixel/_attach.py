@@ -10,7 +10,7 @@ from trade_drivers.dynamixel._wire import BadAnswer, NoAnswer, Refused
 
 if TYPE_CHECKING:
     from trade_drivers.dynamixel._sdk import Wire
-    from trade_drivers.robotfile import Bus
+    from trade_drivers.robotfile import SerialBus
 
 __all__ = ["check_bus", "look_over"]
 
@@ -24,7 +24,7 @@ _ALL_ANSWER: Final = 2
 _Result = TypeVar("_Result")
 
 
-def check_bus(bus: "Bus", axes: Sequence[Axis], where: str) -> None:
+def check_bus(bus: "SerialBus", axes: Sequence[Axis], where: str) -> None:
     """What the file alone can tell: models, speeds, and whether the bytes of a cycle fit into it.
 
     Raises:
@@ -56,7 +56,7 @@ def check_bus(bus: "Bus", axes: Sequence[Axis], where: str) -> None:
         raise ConfigurationError(where=f"{where}: bus.{bus.name}.rate_hz", problem=problem)
 
 
-def look_over(wire: "Wire", bus: "Bus", axis: Axis, clock_ns: Callable[[], int], where: str) -> float:
+def look_over(wire: "Wire", bus: "SerialBus", axis: Axis, clock_ns: Callable[[], int], where: str) -> float:
     """Check one joint's device and take its first measurements.
 
     Returns:
@@ -81,7 +81,7 @@ def look_over(wire: "Wire", bus: "Bus", axis: Axis, clock_ns: Callable[[], int],
     return table.RETURN_DELAY.decode(settings) * table.RETURN_DELAY.si_per_count
 
 
-def _ping(wire: "Wire", bus: "Bus", axis: Axis, key: str) -> int:
+def _ping(wire: "Wire", bus: "SerialBus", axis: Axis, key: str) -> int:
     problem = (
         f"no device answers to id {axis.id} on bus {bus.name!r} ({wire.path}, {bus.baud} baud); check its power and "
         "cable, its id (register 7) and its baud rate (register 8)"

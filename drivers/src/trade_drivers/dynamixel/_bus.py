@@ -15,7 +15,7 @@ from trade_drivers.dynamixel._wire import PortLost
 
 if TYPE_CHECKING:
     from trade_drivers.dynamixel._sdk import Wire
-    from trade_drivers.robotfile import Bus
+    from trade_drivers.robotfile import SerialBus
 
 __all__ = ["BusThread"]
 
@@ -27,7 +27,9 @@ _REOPEN_MOST_S: Final = 1.0
 class BusThread:
     """One owner thread of one bus. Services hand it work and read what it measured; nobody else touches the port."""
 
-    def __init__(self, exchange: Exchange, wire: "Wire", bus: "Bus", healthy: Callable[[], bool], name: str) -> None:
+    def __init__(
+        self, exchange: Exchange, wire: "Wire", bus: "SerialBus", healthy: Callable[[], bool], name: str
+    ) -> None:
         self.exchange = exchange
         self._wire = wire
         self._bus = bus

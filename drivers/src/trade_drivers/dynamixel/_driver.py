@@ -15,7 +15,7 @@ from trade_drivers.dynamixel._bus import BusThread
 from trade_drivers.dynamixel._exchange import Exchange
 from trade_drivers.dynamixel._motor import DynamixelGroup, DynamixelMotor
 from trade_drivers.dynamixel._wire import PortLost, WireError
-from trade_drivers.robotfile import Bus, Joint, Robot
+from trade_drivers.robotfile import Bus, Joint, Robot, SerialBus
 
 if TYPE_CHECKING:
     from trade_drivers.dynamixel._sdk import Wire
@@ -48,6 +48,9 @@ class DynamixelDriver(Driver):
     """X-series servos in position control on a serial bus, through dynamixel-sdk."""
 
     def attach(self, robot: Robot, bus: Bus, port: str, healthy: Callable[[], bool]) -> AttachedBus:
+        if not isinstance(bus, SerialBus):
+            problem = "driver dynamixel needs a serial bus: port instead of interface and channel"
+            raise ConfigurationError(where=f"{robot.where}: bus.{bus.name}", problem=problem)
         with ExitStack() as undo:
             exchange = open_exchange(robot, bus, port)
             undo.callback(exchange.wire.close)
@@ -57,7 +60,7 @@ class DynamixelDriver(Driver):
         return DynamixelBus(thread, exchange.axes)
 
 
-def open_exchange(robot: Robot, bus: Bus, port: str) -> Exchange:
+def open_exchange(robot: Robot, bus: SerialBus, port: str) -> Exchange:
     """Open the port and look every joint over, without a thread: ``cycle()`` is the caller's to call.
 
     Raises:
@@ -95,12 +98,15 @@ def open_exchange(robot: Robot, bus: Bus, port: str) -> Exchange:
     return exchange
 
 
-def _known(robot: Robot, bus: Bus) -> list[Joint]:
+def _known(robot: Robot, bus: SerialBus) -> list[Joint]:
     joints = robot.joints_on(bus.name)
     for joint in joints:
         if joint.model not in table.BY_MODEL_NAME:
             problem = f"{joint.model!r} is unknown to the driver dynamixel; it knows {', '.join(table.BY_MODEL_NAME)}"
             raise ConfigurationError(where=f'{robot.where}: joint."{joint.name}".model', problem=problem)
+        if joint.counts_per_rev is not None or joint.gear != 1:
+            problem = "counts_per_rev and gear are for other devices: a servo's angle is that of its joint"
+            raise ConfigurationError(where=f'{robot.where}: joint."{joint.name}"', problem=problem)
     return joints
 
 

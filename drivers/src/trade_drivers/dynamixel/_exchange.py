@@ -16,7 +16,7 @@ from trade_drivers.dynamixel._wire import NoAnswer, Refused
 
 if TYPE_CHECKING:
     from trade_drivers.dynamixel._sdk import Wire
-    from trade_drivers.robotfile import Bus
+    from trade_drivers.robotfile import SerialBus
 
 __all__ = ["Exchange"]
 
@@ -39,7 +39,7 @@ class Exchange:
     """What happens on one bus. Everything but ``submit`` and ``stop`` belongs to the thread that calls ``cycle()``."""
 
     def __init__(
-        self, wire: "Wire", bus: "Bus", axes: Sequence[Axis], clock: Callable[[], int] = time.monotonic_ns
+        self, wire: "Wire", bus: "SerialBus", axes: Sequence[Axis], clock: Callable[[], int] = time.monotonic_ns
     ) -> None:
         self.wire = wire
         self.axes = tuple(axes)
