@@ -22,6 +22,7 @@ __all__ = [
     "Dribble",
     "Duplicate",
     "Echo",
+    "Emergency",
     "Freeze",
     "Garbage",
     "HardwareFault",
@@ -219,6 +220,13 @@ class HardwareFault(_Devices, frozen=True, kw_only=True, tag="hardware_fault"):
     bits: Byte = 0x20
 
 
+class Emergency(_Devices, frozen=True, kw_only=True, tag="emergency"):
+    """CAN drives fail with an error code, such as 4310h: too hot. With ``lasting`` it cannot be reset until healed."""
+
+    code: Annotated[int, Meta(ge=0x1000, le=0xFFFF)]
+    lasting: bool = False
+
+
 class Supply(_Devices, frozen=True, kw_only=True, tag="supply"):
     """Set what devices measure of their supply and housing; outside their limits they shut down."""
 
@@ -240,6 +248,7 @@ Command = (
     | Dribble
     | Duplicate
     | Echo
+    | Emergency
     | Freeze
     | Garbage
     | HardwareFault

@@ -11,7 +11,9 @@ from ._log import Direction, Entry
 
 __all__ = ["events", "frames", "instructions", "motion_writes", "read_log", "received", "sent", "writes"]
 
-WRITING: Final = frozenset({"write", "reg_write", "action", "sync_write", "bulk_write"})
+WRITING: Final = frozenset(
+    {"write", "reg_write", "action", "sync_write", "bulk_write", "sdo_write", "rpdo1", "rpdo2", "rpdo3", "rpdo4"}
+)
 EVERYBODY: Final = 254
 
 
@@ -106,7 +108,10 @@ def writes(
     until: float = inf,
     bus: str | None = None,
 ) -> list[Entry]:
-    """Every instruction that writes: write, reg write, action, sync write, bulk write; arguments as `instructions`.
+    """Every instruction that writes; arguments as `instructions`.
+
+    On a Dynamixel bus: write, reg write, action, sync write, bulk write. On a CAN bus: SDO writes, and receive PDOs at
+    the moment they take effect; one that only repeats what the device has is a frame, but no instruction.
 
     Args:
         entries: where to look.
@@ -129,6 +134,8 @@ def motion_writes(
     bus: str | None = None,
 ) -> list[Entry]:
     """The writes that could move something: those that touch torque or goal registers; arguments as `writes`.
+
+    Of CAN drives: those that change controlword, mode or a target.
 
     A registered write counts, and so does the action that lets it loose. Switching torque off counts, too.
     """

@@ -1,6 +1,7 @@
 """A simulated CAN bus: a wire with arbitration and bit rate, and an adapter for several clients of socketcand."""
 
-from ._bus import CanBus, Device, Label
+from ._bus import CanBus
+from ._device import Device, Label
 from ._frame import Frame
 from ._text import Reader, error_text, frame_text, parse_send
 from ._wire import Referee, Station, Wire

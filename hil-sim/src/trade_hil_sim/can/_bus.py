@@ -9,21 +9,22 @@ from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import replace
 from math import inf
-from typing import Final, Protocol, TypeVar
+from typing import Final, TypeVar
 
 import msgspec
 
 from trade_hil_sim import _faults as faults
 from trade_hil_sim._errors import SimulationError
 from trade_hil_sim._log import ByteLog, Entry
-from trade_hil_sim._state import BusState, DeviceState
+from trade_hil_sim._state import BusState
 
+from ._device import Device, Label, plain
 from ._frame import Frame
 from ._hub import LOOPBACK, Client, Hub
 from ._text import error_text, frame_text
 from ._wire import Station, Wire
 
-__all__ = ["CanBus", "Device", "Label"]
+__all__ = ["CanBus"]
 
 ANSWER_S: Final = 5.0
 """How long the bus's thread may take over an order."""
@@ -34,46 +35,6 @@ BUS_OFF: Final = 0x40
 RESTARTED: Final = 0x100
 
 _T = TypeVar("_T")
-Label = Callable[[Frame], "tuple[str, int | None]"]
-"""Says what a frame is, for the log and for faults: its name, and the id of the device it comes from or goes to."""
-
-
-class Device(Protocol):
-    """What sits on the bus. Everything is called from the bus's thread, with the time in seconds (monotonic)."""
-
-    device_id: int
-    joint: str
-    due: float
-    """When `advance` should be called next; infinity if only frames matter."""
-    send: Callable[[Frame, float], None]
-    """Set by the bus: sends a frame from the time given on."""
-    emit: Callable[[Entry], None]
-    """Set by the bus: puts a line into the log, with the bus's name filled in."""
-
-    def hear(self, frame: Frame, t: float) -> None:
-        """A frame has come; not called while it is off the bus."""
-        ...
-
-    def advance(self, t: float) -> None:
-        """Do what is due by itself by time `t`; `due` is later afterwards."""
-        ...
-
-    def do(self, command: faults.Command, t: float) -> None:
-        """Carry out a fault or an order; raises `SimulationError` for what it has not got."""
-        ...
-
-    def heal(self, t: float) -> None:
-        """End every fault of sensors and shafts."""
-        ...
-
-    def state(self, t: float) -> DeviceState:
-        """The truth about it."""
-        ...
-
-
-def plain(frame: Frame) -> tuple[str, int | None]:  # noqa: ARG001 - a label is asked about a frame
-    """The label of a bus without a protocol: no frame has a name or a device."""
-    return "", None
 
 
 class CanBus:
