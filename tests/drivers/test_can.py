@@ -1,7 +1,11 @@
 """What is pure about a CAN bus and a drive on it: load, error frames, ports as text, states, frames. And the port."""
 
 import itertools
+import socket
 import struct
+import threading
+from collections.abc import Iterator
+from contextlib import suppress
 
 import can
 import pytest
@@ -12,6 +16,7 @@ from trade_drivers.cia402 import _machine as machine
 from trade_drivers.cia402 import _table as table
 from trade_drivers.cia402._machine import State, command_towards_enabled, state_of
 from trade_drivers.joints import PortLost
+from trade_hil_sim import BusOff, CanBus, Replug, Unplug, frames
 
 _numbers = itertools.count()
 
@@ -113,6 +118,70 @@ def test_a_bus_off_is_a_loss_and_what_comes_before_it_is_only_noted(channel: str
     port.open()
     assert port.state is ErrorState.ACTIVE
     port.close()
+
+
+# --- a bus behind socketcand
+
+
+@pytest.fixture
+def bus() -> Iterator[CanBus]:
+    with CanBus(paced=False) as simulated:
+        yield simulated
+
+
+def test_frames_pass_the_simulated_adapter_both_ways(bus: CanBus) -> None:
+    here, there = CanPort(bus.port, 1_000_000), CanPort(bus.port, 1_000_000)
+    here.open()
+    there.open()
+    here.send(0x080, b"")
+    here.send(0x201, bytes(range(8)))
+    assert [there.receive(5), there.receive(5)] == [(0x080, b""), (0x201, bytes(range(8)))]
+    assert [entry.can_id for entry in frames(bus.log.entries)] == [0x080, 0x201]
+    here.close()
+    there.close()
+
+
+def test_an_unplugged_adapter_is_a_loss_after_few_frames_and_opens_again(bus: CanBus) -> None:
+    port = CanPort(bus.port, 1_000_000)
+    port.open()
+    bus.do(Unplug())
+    with pytest.raises(PortLost):
+        for _ in range(1000):
+            port.send(0x080, b"")
+            port.receive(0.001)
+    with pytest.raises(PortLost):
+        port.open()
+    bus.do(Replug())
+    port.open()
+    port.send(0x080, b"")
+    port.close()
+
+
+def test_a_bus_off_of_the_adapter_is_a_loss(bus: CanBus) -> None:
+    port = CanPort(bus.port, 1_000_000)
+    port.open()
+    bus.do(BusOff())
+    with pytest.raises(PortLost, match="bus-off"):
+        port.receive(5)
+    port.close()
+
+
+@pytest.mark.parametrize("greeting", [b"", b"220 mail\r\n"], ids=["silence", "another server"])
+def test_a_server_that_does_not_greet_is_a_loss_and_not_a_hang(greeting: bytes) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = CanPort(f"socketcand:127.0.0.1:{server.getsockname()[1]}/can0", 1_000_000)
+
+        def greet() -> None:
+            peer, _ = server.accept()
+            with peer, suppress(OSError):
+                peer.sendall(greeting)
+                peer.recv(1)
+
+        host = threading.Thread(target=greet)
+        host.start()
+        with pytest.raises(PortLost):
+            port.open()
+        host.join()
 
 
 # --- the drive
