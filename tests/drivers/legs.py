@@ -81,7 +81,8 @@ class Leg:
 
     def attach(self, **options: Any) -> AttachedRobot:
         """Attach the driver; it is closed with the test, whatever that says."""
-        options.setdefault("ports", {"legs": self.sim.port})
+        if "ports" not in options:
+            options["ports"] = {"legs": self.sim.port}
         robot = attach(
             self.robot, register=lambda _, groups: self.announced.append(groups), deregister=lambda _: None, **options
         )

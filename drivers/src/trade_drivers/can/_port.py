@@ -16,6 +16,7 @@ from trade_drivers.joints import PortLost
 __all__ = ["CanPort", "Frame", "split_port"]
 
 _log = logging.getLogger(__name__)
+logging.getLogger("can.interfaces.socketcand").setLevel(logging.ERROR)  # else it warns of every frame in two pieces
 _HELLO_S: Final = 1.0
 _SOCKETCAND_PORT: Final = 29536
 _HELLO: Final = b"< hi >"

@@ -108,7 +108,7 @@ def set_up(net: Net, axis: DriveAxis, bus: "CanBus") -> None:
 
 
 def _check_identity(net: Net, axis: DriveAxis) -> None:
-    kind = net.read(axis.id, table.DEVICE_TYPE) & 0xFFFF
+    kind = net.read(axis.id, table.DEVICE_TYPE, attempts=1) & 0xFFFF  # who is away costs the others no more time
     if kind != table.DRIVE_PROFILE:
         raise Unfit(f"node {axis.id} is no CiA 402 drive: its device type (1000h) names profile {kind}")
     identity = tuple(_read(net, axis.id, entry) for entry in table.IDENTITY)

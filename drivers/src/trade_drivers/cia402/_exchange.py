@@ -163,7 +163,7 @@ class DriveExchange(Exchange):
         except NoAnswer:
             return
         except (Unfit, Refused) as unfit:
-            axis.latch(str(unfit))
+            axis.fault = str(unfit)  # whatever was wrong before, this has to be mended first
             return
         _log.info("%s answers again", axis.name)
 
@@ -179,3 +179,4 @@ class DriveExchange(Exchange):
         if was_ready:
             axis.latch("it was away")
         axis.silent, axis.silent_since_ns, axis.beat_ns, axis.sample = False, now_ns, now_ns, None
+        axis.controlword = axis.asked_ns = axis.awaited_ns = 0

@@ -130,7 +130,7 @@ def write(bus: "DriveExchange", job: Job, axis: DriveAxis, entry: Entry, value: 
     began_ns = bus.clock()
     for _ in range(_ATTEMPTS):
         try:
-            bus.net.write(axis.id, entry, value, job.gate)
+            bus.net.write(axis.id, entry, value, job.gate, attempts=1)
         except NoAnswer:
             yield
         except Refused as refused:

@@ -18,6 +18,7 @@ from trade_drivers.joints import Gate
 
 __all__ = ["Net", "NoAnswer", "Refused", "emergency_text"]
 
+ATTEMPTS: Final = 3
 _ANSWER_S: Final = 0.040
 """Patience for one answer, so that a stop is never more than 50 ms from the wire."""
 _DRAIN_S: Final = 0.030
@@ -128,24 +129,24 @@ class Net(Network):
         """Network management: start a node, and so on. Nobody confirms it."""
         self.port.send(table.NMT, bytes((word, node)))
 
-    def read(self, node: int, entry: Entry) -> int:
+    def read(self, node: int, entry: Entry, attempts: int = ATTEMPTS) -> int:
         """A number out of a drive's dictionary.
 
         Raises:
             NoAnswer, Refused: what became of it.
         """
-        data = self._transfer(node, entry, lambda client: client.upload(entry.index, entry.sub))
+        data = self._transfer(node, entry, lambda client: client.upload(entry.index, entry.sub), attempts)
         if len(data) < entry.size:
             raise NoAnswer(f"{entry} came with {len(data)} bytes")
         return entry.decode(data)
 
     def read_text(self, node: int, index: int) -> str:
         """A text out of a drive's dictionary."""
-        data = self._transfer(node, f"{index:04X}h", lambda client: client.upload(index, 0))
+        data = self._transfer(node, f"{index:04X}h", lambda client: client.upload(index, 0), ATTEMPTS)
         return data.rstrip(b"\0 ").decode("ascii", "replace")
 
-    def write(self, node: int, entry: Entry, value: int, gate: Gate | None = None) -> None:
-        """A number into a drive's dictionary; the gate is asked right before."""
+    def write(self, node: int, entry: Entry, value: int, gate: Gate | None = None, attempts: int = ATTEMPTS) -> None:
+        """A number into a drive's dictionary; the gate is asked right before each attempt."""
 
         def download(client: _Client) -> bytes:
             if gate is not None:
@@ -153,14 +154,17 @@ class Net(Network):
             client.download(entry.index, entry.sub, entry.encode(value))
             return b""
 
-        self._transfer(node, entry, download)
+        self._transfer(node, entry, download, attempts)
 
-    def _transfer(self, node: int, entry: object, act: Callable[[_Client], bytes]) -> bytes:
+    def _transfer(self, node: int, entry: object, act: Callable[[_Client], bytes], attempts: int) -> bytes:
         client = self._clients.get(node) or self._clients.setdefault(node, _Client(node, self))
-        try:
-            return bytes(act(client))
-        except SdoAbortedError as refused:
-            raise Refused(entry, refused.code, str(refused)) from None
-        except (SdoCommunicationError, struct.error) as silent:
-            self.take_in(_DRAIN_S)
-            raise NoAnswer(f"{entry}: {silent}") from None
+        problem: Exception | None = None
+        for _ in range(attempts):
+            try:
+                return bytes(act(client))
+            except SdoAbortedError as refused:
+                raise Refused(entry, refused.code, str(refused)) from None
+            except (SdoCommunicationError, struct.error) as silent:
+                problem = silent
+                self.take_in(_DRAIN_S)
+        raise NoAnswer(f"{entry}: {problem}")
