@@ -173,10 +173,9 @@ class DriveExchange(Exchange):
         Raises:
             NoAnswer, Refused, Unfit: it cannot be used, or not yet.
         """
-        was_ready, axis.ready = axis.ready, False
         set_up(self.net, axis, self._bus)
         now_ns = self.clock()
-        if was_ready:
+        if axis.ready:
             axis.latch("it was away")
         axis.silent, axis.silent_since_ns, axis.beat_ns, axis.sample = False, now_ns, now_ns, None
         axis.controlword = axis.asked_ns = axis.awaited_ns = 0
