@@ -11,10 +11,12 @@ from ._faults import (
     AnswerFault,
     BadCrc,
     BrownOut,
+    BusOff,
     Command,
     Dribble,
     Duplicate,
     Echo,
+    Emergency,
     Freeze,
     Garbage,
     HardwareFault,
@@ -30,11 +32,12 @@ from ._faults import (
     Unplug,
     WrongModel,
 )
-from ._judge import events, instructions, motion_writes, read_log, received, sent, writes
+from ._judge import events, frames, instructions, motion_writes, read_log, received, sent, writes
 from ._line import Peer, SerialLine
 from ._log import ByteLog, Entry
 from ._process import SimProcess, remove_leftovers
 from ._state import BusState, DeviceState
+from .can import CanBus, Frame
 from .dynamixel import MODELS, XL430_W250, XM430_W350, DynamixelBus, Servo
 
 __all__ = [
@@ -45,15 +48,19 @@ __all__ = [
     "AnswerFault",
     "BadCrc",
     "BrownOut",
+    "BusOff",
     "BusState",
     "ByteLog",
+    "CanBus",
     "Command",
     "DeviceState",
     "Dribble",
     "Duplicate",
     "DynamixelBus",
     "Echo",
+    "Emergency",
     "Entry",
+    "Frame",
     "Freeze",
     "Garbage",
     "HardwareFault",
@@ -75,6 +82,7 @@ __all__ = [
     "Unplug",
     "WrongModel",
     "events",
+    "frames",
     "instructions",
     "motion_writes",
     "read_log",

@@ -1,5 +1,8 @@
 """Scripted faults as plain values, so that they can be made in Python or sent over the control socket.
 
+On a CAN bus every frame of a device is an answer, and its name (``heartbeat``, ``tpdo1``, ``sdo_reply``, ...) the
+instruction; a fault that names a frame of clients (``sync``, ``rpdo1``, ...) strikes that.
+
 Two kinds: faults of answers, which change the bytes of some answers on their way out, and orders, which do something to
 a device or to the line once.
 """
@@ -14,10 +17,12 @@ __all__ = [
     "AnswerFault",
     "BadCrc",
     "BrownOut",
+    "BusOff",
     "Command",
     "Dribble",
     "Duplicate",
     "Echo",
+    "Emergency",
     "Freeze",
     "Garbage",
     "HardwareFault",
@@ -98,7 +103,7 @@ class Late(AnswerFault, frozen=True, kw_only=True, tag="late"):
 
 
 class BadCrc(AnswerFault, frozen=True, tag="bad_crc"):
-    """The last byte of the answer is wrong."""
+    """The last byte of the answer is wrong. On a CAN bus: the frame is destroyed, and sent again."""
 
     def shape(self, pieces: list[Piece]) -> list[Piece]:
         """The same with its last byte inverted."""
@@ -174,6 +179,12 @@ class Replug(_Order, frozen=True, tag="replug"):
     """Plug the serial adapter in again."""
 
 
+class BusOff(_Devices, frozen=True, kw_only=True, tag="bus_off"):
+    """CAN controllers go bus-off: devices', or without `ids` the adapter's. With ``on`` false they start again."""
+
+    on: bool = True
+
+
 class Absent(_Devices, frozen=True, kw_only=True, tag="absent"):
     """Devices are off the bus: they neither hear nor answer. With ``on`` false they are back."""
 
@@ -209,6 +220,13 @@ class HardwareFault(_Devices, frozen=True, kw_only=True, tag="hardware_fault"):
     bits: Byte = 0x20
 
 
+class Emergency(_Devices, frozen=True, kw_only=True, tag="emergency"):
+    """CAN drives fail with an error code, such as 4310h: too hot. With ``lasting`` it cannot be reset until healed."""
+
+    code: Annotated[int, Meta(ge=0x1000, le=0xFFFF)]
+    lasting: bool = False
+
+
 class Supply(_Devices, frozen=True, kw_only=True, tag="supply"):
     """Set what devices measure of their supply and housing; outside their limits they shut down."""
 
@@ -226,9 +244,11 @@ Command = (
     Absent
     | BadCrc
     | BrownOut
+    | BusOff
     | Dribble
     | Duplicate
     | Echo
+    | Emergency
     | Freeze
     | Garbage
     | HardwareFault
@@ -290,13 +310,23 @@ class Script:
 
     def silences(self, device_id: int, instruction: str) -> bool:
         """Whether this answer is not given at all; counts as one matched."""
-        return any(a.hits((device_id,), instruction) for a in self._active if isinstance(a.fault, Mute))
+        return self.strikes(Mute, (device_id,), instruction)
 
-    def shape(self, answer: bytes, ids: tuple[int, ...], instruction: str) -> list[Piece]:
-        """The answer as the faults in force leave it."""
+    def strikes(self, kind: type[AnswerFault], ids: tuple[int, ...], instruction: str) -> bool:
+        """Whether a fault of this kind hits this answer; counts as one matched."""
+        return any(a.hits(ids, instruction) for a in self._active if isinstance(a.fault, kind))
+
+    def names(self, instruction: str) -> bool:
+        """Whether a fault is about answers to this instruction only."""
+        return any(a.fault.instruction == instruction for a in self._active if not a.spent)
+
+    def shape(
+        self, answer: bytes, ids: tuple[int, ...], instruction: str, *, but: tuple[type[AnswerFault], ...] = (Mute,)
+    ) -> list[Piece]:
+        """The answer as the faults in force leave it, but for those of some kinds."""
         pieces = [Piece(answer)]
         for active in self._active:
-            if not isinstance(active.fault, Mute) and active.hits(ids, instruction):
+            if not isinstance(active.fault, but) and active.hits(ids, instruction):
                 pieces = active.fault.shape(pieces)
         self._active = [active for active in self._active if not active.spent]
         return pieces

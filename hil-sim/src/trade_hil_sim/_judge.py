@@ -7,11 +7,13 @@ from typing import Final
 
 import msgspec
 
-from ._log import Entry
+from ._log import Direction, Entry
 
-__all__ = ["events", "instructions", "motion_writes", "read_log", "received", "sent", "writes"]
+__all__ = ["events", "frames", "instructions", "motion_writes", "read_log", "received", "sent", "writes"]
 
-WRITING: Final = frozenset({"write", "reg_write", "action", "sync_write", "bulk_write"})
+WRITING: Final = frozenset(
+    {"write", "reg_write", "action", "sync_write", "bulk_write", "sdo_write", "rpdo1", "rpdo2", "rpdo3", "rpdo4"}
+)
 EVERYBODY: Final = 254
 
 
@@ -32,6 +34,40 @@ def received(entries: Iterable[Entry], *, since: float = -inf, until: float = in
 def sent(entries: Iterable[Entry], *, since: float = -inf, until: float = inf, bus: str | None = None) -> bytes:
     """The bytes that went out, joined."""
     return b"".join(e.data for e in entries if e.kind == "sent" and _within(e, since, until, bus))
+
+
+def frames(
+    entries: Iterable[Entry],
+    name: str | None = None,
+    *,
+    can_id: int | None = None,
+    device_id: int | None = None,
+    source: str | None = None,
+    direction: Direction | None = None,
+    since: float = -inf,
+    until: float = inf,
+    bus: str | None = None,
+) -> list[Entry]:
+    """Frames that got through on CAN buses, in the order they did.
+
+    Args:
+        entries: where to look.
+        name: ``sync``, ``rpdo1``, ``heartbeat``, ...; default: any.
+        can_id: only this id.
+        device_id: only those that come from this device or are addressed to it.
+        source: only those sent by this joint or client.
+        direction: ``in`` for those of clients, ``out`` for those of devices.
+        since: earliest time in seconds on CLOCK_MONOTONIC.
+        until: latest time in seconds on CLOCK_MONOTONIC.
+        bus: only this bus.
+    """
+    wanted = {"name": name, "can_id": can_id, "device_id": device_id, "source": source, "direction": direction}
+    asked = [(field, value) for field, value in wanted.items() if value is not None]
+    return [
+        e
+        for e in entries
+        if e.kind == "frame" and _within(e, since, until, bus) and all(getattr(e, f) == v for f, v in asked)
+    ]
 
 
 def instructions(
@@ -72,7 +108,10 @@ def writes(
     until: float = inf,
     bus: str | None = None,
 ) -> list[Entry]:
-    """Every instruction that writes: write, reg write, action, sync write, bulk write; arguments as `instructions`.
+    """Every instruction that writes; arguments as `instructions`.
+
+    On a Dynamixel bus: write, reg write, action, sync write, bulk write. On a CAN bus: SDO writes, and receive PDOs at
+    the moment they take effect; one that only repeats what the device has is a frame, but no instruction.
 
     Args:
         entries: where to look.
@@ -95,6 +134,8 @@ def motion_writes(
     bus: str | None = None,
 ) -> list[Entry]:
     """The writes that could move something: those that touch torque or goal registers; arguments as `writes`.
+
+    Of CAN drives: those that change controlword, mode or a target.
 
     A registered write counts, and so does the action that lets it loose. Switching torque off counts, too.
     """

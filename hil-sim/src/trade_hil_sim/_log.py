@@ -1,4 +1,4 @@
-"""The byte log: every chunk on the wire, every decoded instruction and every device event, with its time.
+"""The byte log: every chunk or frame on the wire, every decoded instruction and every device event, with its time.
 
 It is the judge in tests of safety: what a device received and did, not what anybody believes to have sent. Times are
 ``time.monotonic()`` (CLOCK_MONOTONIC), which on Linux is one clock for all processes of a machine.
@@ -10,9 +10,10 @@ from typing import Literal
 
 import msgspec
 
-__all__ = ["ByteLog", "Entry", "Kind"]
+__all__ = ["ByteLog", "Direction", "Entry", "Kind"]
 
-Kind = Literal["received", "sent", "instruction", "event"]
+Kind = Literal["received", "sent", "frame", "instruction", "event"]
+Direction = Literal["in", "out"]
 
 
 class Entry(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -20,6 +21,8 @@ class Entry(msgspec.Struct, frozen=True, omit_defaults=True):
 
     - ``received`` and ``sent``: raw bytes, as the simulator read and wrote them. A client that has an answer finds it,
       and what led to it, in the log.
+    - ``frame``: one frame that got through on a CAN bus, at the end of its last bit, logged before anybody hears it;
+      ``name`` is what it is (``sync``, ``rpdo1``, ...), ``device_id`` the device it comes from or goes to.
     - ``instruction``: one decoded instruction, one entry for each device that a group write addresses.
     - ``event``: something a device did by itself or in answer: ``motion_started``, ``at_rest``, ``torque_on``,
       ``torque_off``, ``watchdog_expired``, ``watchdog_cleared``, ``rebooted``, ``refused``, ``shutdown``, ...
@@ -38,6 +41,11 @@ class Entry(msgspec.Struct, frozen=True, omit_defaults=True):
     joint: str = ""
     hex: str = ""
     """The bytes: on the wire, or the data an instruction carries."""
+    can_id: int | None = None
+    source: str = ""
+    """Of a frame: who sent it, a joint's name or ``client1`` and so on in the order they came."""
+    direction: Direction | None = None
+    """Of a frame: ``in`` from a client, ``out`` from a device."""
     address: int | None = None
     registers: tuple[str, ...] = ()
     """Names of the registers an instruction writes, looked up through indirect addresses."""

@@ -27,8 +27,8 @@ class SimulatedBus(Protocol):
         ...
 
     @property
-    def port(self) -> Path:
-        """What a client opens."""
+    def port(self) -> Path | str:
+        """What a client opens: a path, or such as ``socketcand:127.0.0.1:29536/can0``; final from `open` on."""
         ...
 
     def open(self) -> object:

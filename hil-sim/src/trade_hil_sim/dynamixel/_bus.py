@@ -21,7 +21,7 @@ from ._servo import Servo
 from ._table import BAUDS, CENTRE, MODELS, RAD_PER_COUNT
 
 if TYPE_CHECKING:
-    from trade_drivers.robotfile import Bus, Joint
+    from trade_drivers.robotfile import Joint, SerialBus
 
 __all__ = ["DynamixelBus"]
 
@@ -69,7 +69,7 @@ class DynamixelBus:
 
     @classmethod
     def from_robot(
-        cls, bus: "Bus", joints: "Sequence[Joint]", port: Path, *, log: ByteLog | None = None, paced: bool = True
+        cls, bus: "SerialBus", joints: "Sequence[Joint]", port: Path, *, log: ByteLog | None = None, paced: bool = True
     ) -> "DynamixelBus":
         """The bus a robot file describes, each joint at its zero (or as near as its limits allow).
 
@@ -223,7 +223,7 @@ class DynamixelBus:
                 delay_s = 0.0
 
 
-def _servo_for(bus: "Bus", joint: "Joint", t: float) -> Servo:
+def _servo_for(bus: "SerialBus", joint: "Joint", t: float) -> Servo:
     model = MODELS.get(joint.model)
     if model is None:
         known = ", ".join(sorted(MODELS))

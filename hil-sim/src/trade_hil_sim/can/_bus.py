@@ -1,0 +1,366 @@
+"""A simulated CAN bus: devices on a wire that several clients reach through one adapter, with a log and faults."""
+
+import os
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import Future
+from contextlib import suppress
+from dataclasses import replace
+from math import inf
+from typing import Final, TypeVar
+
+import msgspec
+
+from trade_hil_sim import _faults as faults
+from trade_hil_sim._errors import SimulationError
+from trade_hil_sim._log import ByteLog, Entry
+from trade_hil_sim._state import BusState
+
+from ._device import Device, Label, plain
+from ._frame import Frame
+from ._hub import LOOPBACK, Client, Hub
+from ._text import error_text, frame_text
+from ._wire import Station, Wire
+
+__all__ = ["CanBus"]
+
+ANSWER_S: Final = 5.0
+"""How long the bus's thread may take over an order."""
+MOST_DATA: Final = 8
+BUS_ERROR: Final = 0x88
+"""A protocol violation and a bus error (linux/can/error.h)."""
+BUS_OFF: Final = 0x40
+RESTARTED: Final = 0x100
+
+_T = TypeVar("_T")
+
+
+class CanBus:
+    """Devices on one CAN bus; clients reach it by the socketcand protocol, at `port`.
+
+    Args:
+        devices: on the bus.
+        name: of the bus, in the log.
+        channel: the interface clients open.
+        bitrate: bits a second, if paced.
+        log: where to record; default: a log in memory, at `log`.
+        paced: let frames take as long as on a real wire; else none takes time.
+        label: says what frames are.
+    """
+
+    def __init__(
+        self,
+        devices: Iterable[Device] = (),
+        *,
+        name: str = "bus",
+        channel: str = "can0",
+        bitrate: int = 1_000_000,
+        log: ByteLog | None = None,
+        paced: bool = True,
+        label: Label = plain,
+    ) -> None:
+        self.name = name
+        self.log = ByteLog() if log is None else log
+        self._label = label
+        self._devices = list(devices)
+        self._script = faults.Script()
+        self._echo = False
+        self._adapter_off = False
+        self._wire = Wire(bitrate if paced else None, self)
+        self._hub = Hub(channel, self)
+        self._wall_offset_s = time.time() - time.monotonic()
+        self._clients: dict[Client, Station] = {}
+        self._stations = {device.device_id: self._attach(device) for device in self._devices}
+        self._asked: deque[Callable[[], None]] = deque()
+        self._closing = False
+        self._thread: threading.Thread | None = None
+
+    def _attach(self, device: Device) -> Station:
+        station = Station(device.joint or f"node {device.device_id}", device.hear, device.device_id)
+        device.send = lambda frame, t: self._post(station, frame, t)
+        device.emit = lambda entry: self.log.add(msgspec.structs.replace(entry, bus=self.name))
+        self._wire.attach(station)
+        return station
+
+    # what anybody uses
+
+    @property
+    def port(self) -> str:
+        """What a client is given: ``socketcand:127.0.0.1:29536/can0``; known from `open` on."""
+        return f"socketcand:{LOOPBACK}:{self._hub.tcp_port}/{self._hub.channel}"
+
+    @property
+    def tcp_port(self) -> int:
+        """The TCP port of the adapter; known from `open` on."""
+        return self._hub.tcp_port
+
+    @property
+    def channel(self) -> str:
+        """The interface clients open."""
+        return self._hub.channel
+
+    @property
+    def devices(self) -> Sequence[Device]:
+        """The devices; take care, the bus's own thread uses them, too."""
+        return tuple(self._devices)
+
+    def open(self) -> "CanBus":
+        """Plug the adapter in and power the devices."""
+        if self._thread is not None:
+            raise SimulationError(f"bus {self.name} is open, or was; make a new one")
+        self._hub.open()
+        self._bell, self._rope = os.pipe()
+        os.set_blocking(self._rope, False)
+        self._thread = threading.Thread(target=self._run, name=f"sim-{self.name}", daemon=True)
+        self._thread.start()
+        return self
+
+    def close(self) -> None:
+        """Hang up and end the thread. Idempotent; a log passed in stays open."""
+        thread = self._thread
+        if thread is None or self._closing:
+            return
+        self._closing = True
+        self._ring()
+        thread.join(ANSWER_S)
+
+    def __enter__(self) -> "CanBus":
+        return self.open()
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    def state(self) -> BusState:
+        """The truth about the bus and its devices, now."""
+        return self._in_thread(self._state)
+
+    def do(self, command: faults.Command) -> None:
+        """Carry out one fault or order; raises `SimulationError` for what is not here."""
+        self._in_thread(lambda: self._do(command))
+
+    def load(self) -> tuple[float, float]:
+        """How long frames have held the wire, in all, and the time, both in seconds: two of these make a load."""
+        return self._in_thread(lambda: (self._wire.busy_s, time.monotonic()))
+
+    # the thread
+
+    def _in_thread(self, act: Callable[[], _T]) -> _T:
+        if self._closing:
+            raise SimulationError(f"bus {self.name} is closed")
+        if self._thread is None or threading.current_thread() is self._thread:
+            return act()
+        done: Future[_T] = Future()
+
+        def obey() -> None:
+            try:
+                done.set_result(act())
+            except Exception as problem:  # noqa: BLE001  # handed to the thread that asked
+                done.set_exception(problem)
+
+        self._asked.append(obey)
+        self._ring()
+        return done.result(ANSWER_S)
+
+    def _ring(self) -> None:
+        with suppress(OSError):
+            os.write(self._rope, b"!")
+
+    def _run(self) -> None:
+        try:
+            while not self._closing:
+                if self._hub.serve(self._bell, self._patience_s(), self._pass_time):
+                    os.read(self._bell, 4096)
+                    while self._asked:
+                        self._asked.popleft()()
+                self._pass_time(time.monotonic())
+                self._hub.flush()
+        finally:
+            self._closing = True
+            self._hub.close()
+            os.close(self._bell)
+            os.close(self._rope)
+
+    def _patience_s(self) -> float:
+        due = min((device.due for device in self._devices), default=inf)
+        return min(60.0, max(0.0, min(due, self._wire.next_due()) - time.monotonic()))
+
+    def _pass_time(self, now: float) -> None:
+        """Let happen what is due on the wire and in devices, in order and at its own time."""
+        while True:
+            device = min(self._devices, key=lambda d: d.due, default=None)
+            own, wire = inf if device is None else device.due, self._wire.next_due()
+            if min(own, wire) > now:
+                return
+            if device is not None and own <= wire:
+                device.advance(own)
+            else:
+                self._wire.advance(wire)
+
+    # faults and orders
+
+    def _state(self) -> BusState:
+        t = time.monotonic()
+        self._pass_time(t)
+        devices = [
+            msgspec.structs.replace(d.state(t), bus=self.name, absent=not self._stations[d.device_id].connected)
+            for d in self._devices
+        ]
+        return BusState(name=self.name, port=self.port, plugged=self._hub.plugged, devices=devices)
+
+    def _do(self, command: faults.Command) -> None:
+        t = time.monotonic()
+        self._pass_time(t)
+        match command:
+            case faults.Unplug():
+                self._hub.unplug()
+                self._note("unplugged", t)
+            case faults.Replug():
+                self._hub.plug_in()
+                self._note("plugged", t)
+            case faults.Echo():
+                self._echo = command.on
+            case faults.Heal():
+                self._heal(t)
+            case faults.Dribble():
+                raise SimulationError("a frame comes whole; late, truncate or garbage suit a CAN bus")
+            case faults.AnswerFault():
+                self._named(command.ids)
+                self._script.add(command)
+            case faults.Unmute():
+                self._named(command.ids)
+                self._script.unmute(command.ids)
+            case faults.BusOff(ids=None):
+                self._adapter(command.on, t)
+            case _:
+                self._do_to_devices(command, t)
+
+    def _do_to_devices(self, command: faults.Command, t: float) -> None:
+        for device in self._named(getattr(command, "ids", None)):
+            station = self._stations[device.device_id]
+            if isinstance(command, faults.Absent):
+                station.connected = not command.on
+                station.fall_silent()
+                continue
+            if isinstance(command, faults.BusOff):
+                station.off, station.errors = command.on, 0
+                station.fall_silent()
+            device.do(command, t)
+
+    def _adapter(self, off: bool, t: float) -> None:
+        """The adapter's controller goes bus-off, or is started again."""
+        self._adapter_off = off
+        for client, station in self._clients.items():
+            station.off, station.errors = off, 0
+            station.fall_silent()
+            client.tell(error_text(BUS_OFF if off else RESTARTED, t + self._wall_offset_s))
+        self._note("bus_off" if off else "restarted", t, source="adapter")
+
+    def _heal(self, t: float) -> None:
+        self._script.heal()
+        self._echo = False
+        if self._adapter_off:
+            self._adapter(False, t)
+        for device in self._devices:
+            station = self._stations[device.device_id]
+            station.connected, station.off, station.errors = True, False, 0
+            device.heal(t)
+
+    def _named(self, ids: tuple[int, ...] | None) -> list[Device]:
+        here = {device.device_id for device in self._devices}
+        if unknown := set(ids or ()) - here:
+            raise SimulationError(f"bus {self.name} has no device {sorted(unknown)}; it has {sorted(here)}")
+        return [device for device in self._devices if ids is None or device.device_id in ids]
+
+    def _post(self, station: Station, frame: Frame, t: float) -> None:
+        """Send a frame as the faults in force leave it."""
+        name, ids = self._struck(station, frame)
+        if ids is None:
+            self._wire.send(station, frame, t)
+        elif not self._script.strikes(faults.Mute, ids, name):
+            for data, late_s in self._script.shape(frame.data, ids, name, but=(faults.Mute, faults.BadCrc)):
+                self._wire.send(station, replace(frame, data=data[:MOST_DATA]), t + late_s)
+
+    def _struck(self, station: Station, frame: Frame) -> tuple[str, tuple[int, ...] | None]:
+        """A frame's name, and whose faults concern it; a client's frame only suffers from those that name it."""
+        name, node = self._label(frame)
+        if station.device_id is not None:
+            return name, (station.device_id,)
+        if not self._script.names(name):
+            return name, None
+        return name, () if node is None else (node,)
+
+    # the wire's referee
+
+    def corrupts(self, sender: Station, frame: Frame) -> bool:
+        """Whether a fault says so."""
+        name, ids = self._struck(sender, frame)
+        return ids is not None and self._script.strikes(faults.BadCrc, ids, name)
+
+    def passed(self, sender: Station, frame: Frame, t: float) -> None:
+        """Log it; and echo it if the adapter does."""
+        self._frame("", sender, frame, t)
+        if self._echo and sender.device_id is None:
+            sender.deliver(frame, t)
+
+    def destroyed(self, sender: Station, frame: Frame, t: float) -> None:
+        """Log it and tell all clients."""
+        self._frame("destroyed", sender, frame, t)
+        for client in self._clients:
+            client.tell(error_text(BUS_ERROR, t + self._wall_offset_s))
+        if sender.off and sender.device_id is None:
+            self._adapter(True, t)
+        elif sender.off:
+            self._note("bus_off", t, source=sender.name, device_id=sender.device_id)
+
+    def lost(self, sender: Station, frame: Frame, t: float) -> None:
+        """Log it."""
+        self._frame("lost", sender, frame, t)
+
+    # the hub's tenant
+
+    def joined(self, client: Client) -> None:
+        """It is a station of its own."""
+        station = Station(client.name, lambda frame, t: self._tell(client, frame, t))
+        station.off = self._adapter_off
+        self._clients[client] = station
+        self._wire.attach(station)
+        self._note("joined", time.monotonic(), source=client.name)
+
+    def left(self, client: Client) -> None:
+        """It takes what it had not sent with it."""
+        self._wire.detach(self._clients.pop(client))
+        self._note("left", time.monotonic(), source=client.name)
+
+    def said(self, client: Client, frame: Frame, t: float) -> None:
+        """It sends a frame."""
+        self._post(self._clients[client], frame, t)
+
+    def misunderstood(self, client: Client, text: str) -> None:
+        """Log it."""
+        self._note("misunderstood", time.monotonic(), source=client.name, detail=text)
+
+    def _tell(self, client: Client, frame: Frame, t: float) -> None:
+        if not client.tell(frame_text(frame, t + self._wall_offset_s)) and client.overrun == 1:
+            self._note("overrun", t, source=client.name, detail="the client does not read; frames for it are lost")
+
+    def _note(self, name: str, t: float, *, source: str = "", device_id: int | None = None, detail: str = "") -> None:
+        self.log.add(Entry(t, self.name, "event", name, device_id, source=source, detail=detail))
+
+    def _frame(self, name: str, sender: Station, frame: Frame, t: float) -> None:
+        """A frame that got through has its own name; one that did not is an event."""
+        label, node = self._label(frame)
+        entry = Entry(
+            t,
+            self.name,
+            "event" if name else "frame",
+            name or label,
+            node if sender.device_id is None else sender.device_id,
+            hex=frame.data.hex(),
+            can_id=frame.can_id,
+            source=sender.name,
+            direction="in" if sender.device_id is None else "out",
+            detail=str(frame) if name or frame.remote or frame.extended else "",
+        )
+        self.log.add(entry)

@@ -1,0 +1,174 @@
+"""The wire of a CAN bus: one frame at a time, the lowest id first, as long as its bits last. Pure: time is an argument.
+
+Wire time follows real time but is not lengthened by it: a simulator that comes late lets pass, in order and with their
+own times, the frames that a real wire would have carried meanwhile.
+"""
+
+import heapq
+from collections.abc import Callable, Iterable
+from math import inf
+from typing import Final, NamedTuple, Protocol
+
+from ._frame import Frame
+
+__all__ = ["Referee", "Station", "Wire"]
+
+ERROR_BITS: Final = 20
+"""Bit times of an error frame and the pause after it."""
+PER_ERROR: Final = 8
+"""What a destroyed frame adds to its sender's error counter; one that gets through takes 1 off (ISO 11898-1)."""
+BUS_OFF: Final = 256
+UNHEARD: Final = 10
+"""How many frames a sender keeps while nobody acknowledges them: the usual length of a transmit queue on Linux."""
+
+
+class _Waiting(NamedTuple):
+    ready: float
+    order: int
+    frame: Frame
+
+
+class Station:
+    """A controller on the bus: a client's or a device's. Frames of one station leave in the order they were sent.
+
+    Args:
+        name: who it is, for the log.
+        device_id: of a device.
+        deliver: gets every frame of the others, with its time in seconds.
+    """
+
+    def __init__(self, name: str, deliver: Callable[[Frame, float], None], device_id: int | None = None) -> None:
+        self.name, self.device_id, self.deliver = name, device_id, deliver
+        self.connected = True
+        self.off = False
+        """Bus-off: it has made too many errors, and neither sends nor hears."""
+        self.errors = 0
+        """Transmit error counter."""
+        self.queue: list[_Waiting] = []
+
+    @property
+    def hears(self) -> bool:
+        """Whether it takes part."""
+        return self.connected and not self.off
+
+    def fall_silent(self) -> None:
+        """Forget what was to be sent."""
+        self.queue.clear()
+
+
+class Referee(Protocol):
+    """Who decides what happens to frames, and hears what did."""
+
+    def corrupts(self, sender: Station, frame: Frame) -> bool:
+        """Whether this frame is destroyed on its way."""
+        ...
+
+    def passed(self, sender: Station, frame: Frame, t: float) -> None:
+        """A frame got through; called before anybody hears it."""
+        ...
+
+    def destroyed(self, sender: Station, frame: Frame, t: float) -> None:
+        """A frame was destroyed; its sender's error counter has been raised."""
+        ...
+
+    def lost(self, sender: Station, frame: Frame, t: float) -> None:
+        """A frame was not taken: nobody acknowledges, and the sender's queue is full."""
+        ...
+
+
+class Wire:
+    """What stations send, in the order and at the times a wire allows.
+
+    Args:
+        bitrate: bits a second; None: frames take no time.
+        referee: decides and hears.
+    """
+
+    def __init__(self, bitrate: int | None, referee: Referee) -> None:
+        self._bit_s = 0.0 if bitrate is None else 1.0 / bitrate
+        self._referee = referee
+        self._stations: list[Station] = []
+        self._order = 0
+        self._free_at = 0.0
+        self._under_way: tuple[Station, _Waiting, float] | None = None
+        self.busy_s = 0.0
+        """How long frames have held the wire, in all."""
+
+    @property
+    def stations(self) -> Iterable[Station]:
+        """Who is attached."""
+        return tuple(self._stations)
+
+    def attach(self, station: Station) -> None:
+        """Let a station take part."""
+        self._stations.append(station)
+
+    def detach(self, station: Station) -> None:
+        """Take a station off; what it had not sent is lost, a frame that is under way is cut off."""
+        self._stations.remove(station)
+        station.fall_silent()
+        if self._under_way is not None and self._under_way[0] is station:
+            self._under_way = None
+
+    def send(self, station: Station, frame: Frame, ready: float) -> None:
+        """Queue a frame that may begin at `ready` seconds."""
+        if not station.hears:
+            return
+        if len(station.queue) >= UNHEARD and not self._acknowledged(station):
+            self._referee.lost(station, frame, ready)
+            return
+        self._order += 1
+        heapq.heappush(station.queue, _Waiting(ready, self._order, frame))
+
+    def next_due(self) -> float:
+        """When `advance` should be called next; infinity while nothing is to be sent."""
+        if self._under_way is not None:
+            return self._under_way[2]
+        ready = min((station.queue[0].ready for station in self._competing()), default=inf)
+        return max(ready, self._free_at)
+
+    def advance(self, t: float) -> None:
+        """Begin or end the frame that is due at `t`."""
+        if self._under_way is None:
+            self._begin(t)
+        else:
+            self._end(*self._under_way)
+
+    def _competing(self) -> list[Station]:
+        return [s for s in self._stations if s.queue and s.hears and self._acknowledged(s)]
+
+    def _acknowledged(self, station: Station) -> bool:
+        return any(other is not station and other.hears for other in self._stations)
+
+    def _begin(self, t: float) -> None:
+        ready = [s for s in self._competing() if s.queue[0].ready <= t]
+        winner = min(ready, key=lambda s: s.queue[0].frame.rank, default=None)
+        if winner is None:
+            return
+        waiting = heapq.heappop(winner.queue)
+        lasts_s = waiting.frame.bits * self._bit_s
+        self.busy_s += lasts_s
+        self._under_way = winner, waiting, t + lasts_s
+
+    def _end(self, sender: Station, waiting: _Waiting, t: float) -> None:
+        self._under_way, self._free_at = None, t
+        if not sender.hears:
+            return
+        if self._referee.corrupts(sender, waiting.frame):
+            self._destroy(sender, waiting, t)
+            return
+        sender.errors = max(0, sender.errors - 1)
+        self._referee.passed(sender, waiting.frame, t)
+        for station in tuple(self._stations):
+            if station is not sender and station.hears:
+                station.deliver(waiting.frame, t)
+
+    def _destroy(self, sender: Station, waiting: _Waiting, t: float) -> None:
+        """The sender tries again, until it has made too many errors."""
+        self._free_at = t + ERROR_BITS * self._bit_s
+        sender.errors += PER_ERROR
+        heapq.heappush(sender.queue, waiting)
+        if sender.errors >= BUS_OFF:
+            sender.off = True
+            sender.fall_silent()
+        self._referee.destroyed(sender, waiting.frame, t)

@@ -1,0 +1,30 @@
+"""Simulated servo drives on CANopen: CiA 301 and CiA 402, written by hand from the standards."""
+
+from ._bus import Cia402Bus
+from ._drive import Drive
+from ._modes import Mode
+from ._names import canopen_label
+from ._node import NodeState
+from ._objects import OBJECTS, Object, pdo_objects
+from ._sdo import SdoServer
+from ._states import Command, State, command, next_state
+from ._store import Abort, AbortCode, Store
+
+__all__ = [
+    "OBJECTS",
+    "Abort",
+    "AbortCode",
+    "Cia402Bus",
+    "Command",
+    "Drive",
+    "Mode",
+    "NodeState",
+    "Object",
+    "SdoServer",
+    "State",
+    "Store",
+    "canopen_label",
+    "command",
+    "next_state",
+    "pdo_objects",
+]

@@ -1,0 +1,368 @@
+"""A servo drive (CiA 402): state machine, modes, faults and sensors, behind a CANopen node. Time is an argument."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from math import inf, tau
+from typing import Final
+
+from trade_hil_sim import _faults as faults
+from trade_hil_sim._errors import SimulationError
+from trade_hil_sim._log import Entry
+from trade_hil_sim._state import DeviceState
+from trade_hil_sim.can import Frame
+
+from ._machine import Machine
+from ._modes import MOTION, Mode, Modes
+from ._node import Node
+from ._objects import OBJECTS, SUPPORTED_MODES, Object, pdo_objects
+from ._shaft import Shaft
+from ._states import Command, State
+from ._store import Abort, AbortCode, Store
+
+__all__ = ["Drive"]
+
+VOLTAGE_ON: Final = 1 << 4
+NO_QUICK_STOP: Final = 1 << 5
+REMOTE: Final = 1 << 9
+MODE_LAG_S: Final = 0.004
+"""From a mode's being asked for to its being shown: a drive changes in its own time."""
+LOOK_S: Final = 0.005
+"""How often a drive compares where it is with where it should be."""
+FOLLOWING_ERROR: Final = 0x8611
+LINK_FAULT: Final = 0x8130
+OVER_VOLTAGE: Final = 0x3210
+UNDER_VOLTAGE: Final = 0x3220
+TOO_HOT: Final = 0x4310
+VOLTS: Final = (18.0, 60.0)
+HOTTEST_C: Final = 85
+FULL: Final = 1000
+
+
+def _named(model: str) -> list[Object]:
+    """The objects of a drive that says it is of this model."""
+    return [replace(o, default=model.encode()) if o.name == "device_name" else o for o in OBJECTS]
+
+
+class Drive:
+    """One drive; it boots when made.
+
+    Args:
+        device_id: its node id, 1 to 127.
+        joint: name of the joint, for the log.
+        model: what it is called.
+        counts_per_rev: counts of the encoder for one turn of the motor.
+        gear: turns of the motor for one turn of the joint.
+        position_counts: where the shaft is at first.
+        reversed_: whether the joint turns against the counts.
+        offset_rad: the joint's angle at 0 counts.
+        t: now, in seconds.
+    """
+
+    def __init__(
+        self,
+        device_id: int,
+        *,
+        joint: str = "",
+        model: str = "CiA402",
+        counts_per_rev: float = 4096.0,
+        gear: float = 1.0,
+        position_counts: float = 0.0,
+        reversed_: bool = False,
+        offset_rad: float = 0.0,
+        t: float = 0.0,
+    ) -> None:
+        self.device_id, self.joint, self.model = device_id, joint, model
+        self._rad_per_count = (-1 if reversed_ else 1) * tau / (counts_per_rev * gear)
+        self._offset_rad = offset_rad
+        self.send: Callable[[Frame, float], None] = lambda frame, t: None  # noqa: ARG005 - the bus sets it
+        self.emit: Callable[[Entry], None] = lambda entry: None  # noqa: ARG005 - the bus sets it
+        self.due = t
+        self.store = Store([*_named(model), *pdo_objects(device_id)])
+        self._shaft = Shaft(position_counts, t)
+        self.modes = Modes(self.store, self._shaft, counts_per_rev, self.note)
+        self._machine = Machine(self.store, self._shaft, self.modes, self.note)
+        self._mode_due = self._look_due = inf
+        self._behind_since: float | None = None
+        self._frozen: tuple[float, float] | None = None
+        self._volts, self._celsius = 48.0, 35
+        self._underway = False
+        self.node = Node(device_id, self.store, self, t)
+        self._plan(t)
+
+    @property
+    def state_now(self) -> State:
+        """The state of its state machine."""
+        return self._machine.state
+
+    # the bus
+
+    def hear(self, frame: Frame, t: float) -> None:
+        """A frame has come."""
+        self.advance(t)
+        self.node.hear(frame, t)
+        self._plan(t)
+
+    def advance(self, t: float) -> None:
+        """Do what is due by itself."""
+        if self._mode_due <= t:
+            self._change_mode(t)
+        self.modes.advance(t)
+        self._machine.advance(t)
+        if self._look_due <= t:
+            self._look(t)
+        self.node.advance(t)
+        self._plan(t)
+
+    def _plan(self, t: float) -> None:
+        """Show what is new, and say when to come again."""
+        self._note_motion(t)
+        self._show(t)
+        self.node.changed(t)
+        if not (self.state_now is State.OPERATION_ENABLED and self._shaft.parted):
+            self._look_due = inf
+            self._behind_since = None
+        elif self._look_due == inf:
+            self._look_due = t + LOOK_S
+        rests = self._machine.due(t)
+        self.due = min(rests, self._mode_due, self._look_due, self.modes.due, self.node.due, self.modes.next_show(t))
+
+    # what the node asks
+
+    def refresh(self, t: float) -> None:
+        """Bring measured values up to date."""
+        position, speed = (self._shaft.position(t), self._shaft.speed(t)) if self._frozen is None else self._frozen
+        wanted, wanted_speed, acceleration = self._shaft.demand.at(t)
+        torque = self._torque(acceleration)
+        self.store.set("position_actual", round(position - self.modes.zero))
+        self.store.set("velocity_actual", round(speed))
+        self.store.set("position_demand", round(wanted - self.modes.zero))
+        self.store.set("velocity_demand", round(wanted_speed))
+        self.store.set("following_error", round(wanted - position))
+        self.store.set("torque_actual", torque)
+        self.store.set("current_actual", torque)
+        self.store.set("dc_link_mv", round(self._volts * 1e3))
+
+    def _torque(self, acceleration: float) -> int:
+        most = self.store.get("max_torque")
+        if not self._machine.powered:
+            return 0
+        if self.modes.mode in {Mode.PROFILE_TORQUE, Mode.CYCLIC_TORQUE}:
+            return max(-most, min(most, self.store.get("target_torque")))
+        if self._shaft.jammed and self._shaft.parted:
+            return most
+        return round(acceleration / self.store.get("max_acceleration") * FULL)
+
+    def check(self, entry: Object, value: int) -> None:
+        """Refuse modes and methods there are not; raises `Abort`."""
+        if entry.name == "mode" and value not in SUPPORTED_MODES | {0}:
+            raise Abort(AbortCode.VALUE)
+        if entry.name in {"position_limit_min", "position_limit_max"}:
+            low, high = self.store.get("position_limit_min"), self.store.get("position_limit_max")
+            if value > high if entry.name == "position_limit_min" else value < low:
+                raise Abort(AbortCode.VALUE)
+
+    def written(self, name: str, values: Sequence[tuple[Object, int]], t: float) -> None:
+        """Take what a client has written, all at once."""
+        changes = [entry.name for entry, value in values if self.store.get(entry.name) != value]
+        if changes or name == "sdo_write":
+            self._journal(name, values, bool(MOTION.intersection(changes)), t)
+        before = self.store.get("controlword")
+        for entry, value in values:
+            self.store.set(entry.name, value)
+        names = {entry.name for entry, _ in values}
+        if "mode" in names and self.store.get("mode") != self.modes.mode:
+            self._mode_due = t + MODE_LAG_S
+        if "controlword" in names:
+            self._machine.obey(before, t, self.node)
+        self.modes.written(names, before, t)
+
+    def link_lost(self, reason: str, t: float) -> None:
+        """Nobody is in charge any more: object 6007h says what a drive with power does."""
+        match self.store.get("abort_connection_option") if self._machine.powered else 0:
+            case 1:
+                self._machine.fail(LINK_FAULT, t, None)
+            case 2:
+                self._machine.lead(Command.DISABLE_VOLTAGE, t)
+            case 3:
+                self._machine.lead(Command.QUICK_STOP, t)
+            case _:
+                self.note("unattended", t, reason)
+
+    def link_back(self, t: float) -> None:
+        """The master is back; a fault stays, whatever caused it."""
+        if self.state_now not in {State.FAULT, State.FAULT_REACTION_ACTIVE}:
+            self.node.emergency_over(t)
+
+    def power_on(self, t: float) -> None:
+        """Everything is as it was made, but the shaft stays where it is."""
+        self._mode_due = inf
+        self._machine.enter(State.SWITCH_ON_DISABLED, t)
+        self.modes.select(Mode.NONE, t)
+
+    def put(self, frame: Frame, t: float) -> None:
+        """Send a frame."""
+        self.send(frame, t)
+
+    def note(self, name: str, t: float, detail: str = "") -> None:
+        """Put an event into the log."""
+        counts = round(self._shaft.position(t) - self.modes.zero)
+        self.emit(
+            Entry(
+                t,
+                "",
+                "event",
+                name,
+                self.device_id,
+                joint=self.joint,
+                position_counts=counts,
+                position_rad=self._rad(t),
+                detail=detail,
+            )
+        )
+
+    def _change_mode(self, t: float) -> None:
+        self._mode_due = inf
+        wanted = self.store.get("mode")
+        if wanted in SUPPORTED_MODES | {0}:
+            self.modes.select(Mode(wanted), t)
+            self.store.set("mode_display", wanted)
+
+    def _show(self, t: float) -> None:
+        """The statusword as it is now."""
+        word = int(self.state_now) | VOLTAGE_ON | REMOTE | self.modes.bits(t)
+        if self.state_now not in {State.QUICK_STOP_ACTIVE, State.FAULT_REACTION_ACTIVE, State.FAULT}:
+            word |= NO_QUICK_STOP
+        self.store.set("statusword", word)
+
+    # sensors and faults
+
+    def _look(self, t: float) -> None:
+        """Compare where it is with where it should be."""
+        self._look_due = t + LOOK_S
+        self._shaft.rejoin(t)
+        if abs(self._shaft.behind(t)) <= self.store.get("following_error_window"):
+            self._behind_since = None
+            return
+        self._behind_since = t if self._behind_since is None else self._behind_since
+        if t - self._behind_since >= self.store.get("following_error_timeout_ms") / 1e3:
+            self._machine.fail(FOLLOWING_ERROR, t, self.node)
+
+    def do(self, command: faults.Command, t: float) -> None:
+        """Carry out a fault or an order; raises `SimulationError` for what it has not got."""
+        self.advance(t)
+        match command:
+            case faults.Freeze():
+                self._frozen = (self._shaft.position(t), self._shaft.speed(t)) if command.on else None
+            case faults.Jam():
+                self._jam(command.on, t)
+            case faults.Place():
+                self._place(command.counts, t)
+            case faults.WrongModel():
+                self.store.set("product_code", command.number)
+            case faults.BrownOut():
+                self.note("brown_out", t)
+                self.node.reset(t)
+            case faults.Emergency():
+                if command.lasting:
+                    self._machine.causes.add(command.code)
+                self._machine.fail(command.code, t, self.node)
+            case faults.Supply():
+                self._supply(command, t)
+            case faults.BusOff():
+                self._bus_off(command.on, t)
+            case _:
+                raise SimulationError(f"{type(command).__name__} is nothing a CiA 402 drive can have")
+        self._plan(t)
+
+    def _bus_off(self, on: bool, t: float) -> None:
+        self.note("bus_off" if on else "restarted", t)
+        if on:
+            self.link_lost("bus-off", t)
+
+    def _jam(self, on: bool, t: float) -> None:
+        self._shaft.jam(on, t)
+        if not on and self.state_now is State.OPERATION_ENABLED:
+            self.modes.enable(t)
+
+    def _place(self, counts: int, t: float) -> None:
+        """By hand; an enabled drive goes back to where it should be, or fails if that is too far."""
+        demand = self._shaft.demand.at(t)[0]
+        self._shaft.place(counts + self.modes.zero, t)
+        self.note("placed", t)
+        if self.state_now is not State.OPERATION_ENABLED:
+            self._shaft.forget(t)
+        elif abs(self._shaft.behind(t)) > self.store.get("following_error_window"):
+            self._machine.fail(FOLLOWING_ERROR, t, self.node)
+        else:
+            self._shaft.go(t, demand, self.store.get("max_profile_velocity"), self.store.get("max_acceleration"))
+
+    def _supply(self, command: faults.Supply, t: float) -> None:
+        self._volts = self._volts if command.voltage_v is None else command.voltage_v
+        self._celsius = self._celsius if command.temperature_c is None else command.temperature_c
+        now = {
+            OVER_VOLTAGE: self._volts > VOLTS[1],
+            UNDER_VOLTAGE: self._volts < VOLTS[0],
+            TOO_HOT: self._celsius > HOTTEST_C,
+        }
+        for code, wrong in now.items():
+            if wrong and code not in self._machine.causes:
+                self._machine.causes.add(code)
+                self._machine.fail(code, t, self.node)
+            elif not wrong:
+                self._machine.causes.discard(code)
+
+    def heal(self, t: float) -> None:
+        """End every fault of sensors and shaft; errors stay until they are reset."""
+        self.advance(t)
+        self._frozen, self._volts, self._celsius = None, 48.0, 35
+        self._machine.causes.clear()
+        self.store.set("product_code", 402)
+        if self._shaft.jammed:
+            self._jam(False, t)
+        self._plan(t)
+
+    # the truth
+
+    def _rad(self, t: float) -> float:
+        return self._offset_rad + self._shaft.position(t) * self._rad_per_count
+
+    def _note_motion(self, t: float) -> None:
+        moving = self._shaft.moving(t)
+        if moving != self._underway:
+            self._underway = moving
+            self.note("motion_started" if moving else "at_rest", t)
+
+    def _journal(self, name: str, values: Sequence[tuple[Object, int]], moves: bool, t: float) -> None:
+        self.emit(
+            Entry(
+                t,
+                "",
+                "instruction",
+                name,
+                self.device_id,
+                joint=self.joint,
+                hex=b"".join(entry.encode(value) for entry, value in values).hex(),
+                address=values[0][0].index if name == "sdo_write" else None,
+                registers=tuple(entry.name for entry, _ in values),
+                moves=moves,
+            )
+        )
+
+    def state(self, t: float) -> DeviceState:
+        """The truth about it."""
+        self.advance(t)
+        return DeviceState(
+            device_id=self.device_id,
+            joint=self.joint,
+            model=self.model,
+            position_counts=round(self._shaft.position(t) - self.modes.zero),
+            position_rad=self._rad(t),
+            velocity_rad_s=self._shaft.speed(t) * self._rad_per_count,
+            goal_counts=self.store.get("target_position"),
+            torque=self._machine.powered,
+            moving=self._shaft.moving(t),
+            operating_mode=int(self.modes.mode),
+            hardware_error=self.store.get("error_code"),
+            watchdog=self.store.get("consumer_heartbeat_1") & 0xFFFF,
+            absent=False,
+        )

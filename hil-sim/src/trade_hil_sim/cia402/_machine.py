@@ -1,0 +1,156 @@
+"""The power side of a drive: its state, what commands and faults make of it, and how motion ends on the way."""
+
+from collections.abc import Callable
+from math import inf
+from typing import Final
+
+from ._modes import Modes
+from ._shaft import Shaft
+from ._states import Command, State, command, next_state
+from ._store import Store
+
+__all__ = ["POWERED", "Emergencies", "Machine"]
+
+from typing import Protocol
+
+FAULT_RESET: Final = 1 << 7
+COAST: Final = 1_000_000.0
+"""Counts/s^2 at which a shaft without power comes to rest."""
+STAYING: Final = 5
+"""Quick stop options from here on stay in quick stop active."""
+POWERED: Final = frozenset({State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE, State.FAULT_REACTION_ACTIVE})
+
+
+class Emergencies(Protocol):
+    """Who tells others of errors."""
+
+    def emergency(self, code: int, t: float) -> None:
+        """There is an error."""
+        ...
+
+    def emergency_over(self, t: float) -> None:
+        """There is none any more."""
+        ...
+
+
+class Machine:
+    """The state machine at work.
+
+    Args:
+        store: objects of the drive.
+        shaft: what moves.
+        modes: what moves it while operation is enabled.
+        note: puts an event into the log.
+    """
+
+    def __init__(self, store: Store, shaft: Shaft, modes: Modes, note: Callable[[str, float, str], None]) -> None:
+        self._store, self._shaft, self._modes, self._note = store, shaft, modes, note
+        self.state = State.SWITCH_ON_DISABLED
+        self.causes = set[int]()
+        """Errors that cannot be reset because they last."""
+        self._then: State | None = None
+        """The state that follows when the shaft has come to rest."""
+
+    @property
+    def powered(self) -> bool:
+        """Whether the shaft is driven or held."""
+        return self.state in POWERED
+
+    def due(self, t: float) -> float:
+        """When `advance` should be called, as of now; the ends of motions are for others to watch."""
+        return t if self._then is not None and not self._shaft.moving(t) else inf
+
+    def advance(self, t: float) -> None:
+        """Go on when the shaft has come to rest."""
+        if self._then is not None and not self._shaft.moving(t):
+            self.enter(self._then, t)
+
+    def obey(self, before: int, t: float, emergencies: Emergencies) -> None:
+        """Heed the controlword; `before` is as it was."""
+        now = self._store.get("controlword")
+        if self.state is State.FAULT:
+            if now & FAULT_RESET and not before & FAULT_RESET:
+                self._reset_fault(t, emergencies)
+        elif self.state is not State.FAULT_REACTION_ACTIVE:
+            self.lead(command(now), t)
+
+    def _reset_fault(self, t: float, emergencies: Emergencies) -> None:
+        if self.causes:
+            self._note("refused", t, f"error {min(self.causes):04X}h lasts")
+            return
+        self._store.set("error_code", 0)
+        self.enter(State.SWITCH_ON_DISABLED, t)
+        emergencies.emergency_over(t)
+
+    def lead(self, wanted: Command, t: float) -> None:
+        """Carry out a command of the state machine."""
+        state = next_state(self.state, wanted)
+        if state is self.state:
+            if self._then is not None and state is State.OPERATION_ENABLED:  # it was about to be left
+                self._then = None
+                self._modes.enable(t)
+            return
+        stays = self._store.get("quick_stop_option") >= STAYING
+        if self.state is State.QUICK_STOP_ACTIVE and state is State.OPERATION_ENABLED and not stays:
+            return
+        if self.state is State.OPERATION_ENABLED and wanted is not Command.DISABLE_VOLTAGE:
+            self._leave_operation(wanted, state, t)
+        else:
+            self.enter(state, t)
+
+    def _leave_operation(self, wanted: Command, state: State, t: float) -> None:
+        """Operation is left after slowing down, if the option for it says so."""
+        if wanted is Command.QUICK_STOP:
+            self._quick_stop(t)
+            return
+        option = "shutdown_option" if wanted is Command.SHUTDOWN else "disable_operation_option"
+        if self._store.get(option) and self._shaft.moving(t):
+            self._then = state
+            self._modes.stop(t, self._store.get("profile_deceleration"))
+        else:
+            self.enter(state, t)
+
+    def _quick_stop(self, t: float) -> None:
+        option = self._store.get("quick_stop_option")
+        if option == 0:
+            self.enter(State.SWITCH_ON_DISABLED, t)
+            return
+        self.enter(State.QUICK_STOP_ACTIVE, t)
+        slow = option in {1, STAYING}
+        self._modes.stop(t, self._store.get("profile_deceleration" if slow else "quick_stop_deceleration"))
+        if option < STAYING:
+            self._then = State.SWITCH_ON_DISABLED
+
+    def enter(self, state: State, t: float) -> None:
+        """Be in a state."""
+        had_power, has_power = self.state in POWERED, state in POWERED
+        changed, self.state = state is not self.state, state
+        self._then = None
+        if state is State.OPERATION_ENABLED:
+            self._modes.enable(t)
+        else:
+            self._modes.disable()
+        if changed:
+            self._note("state", t, state.name.lower())
+        if had_power != has_power:
+            self._note("torque_on" if has_power else "torque_off", t, "")
+        if not has_power:
+            self._shaft.forget(t)
+            self._modes.stop(t, COAST)
+
+    def fail(self, code: int, t: float, emergencies: Emergencies | None) -> None:
+        """Fail: react as object 605Eh says, then stay in fault until reset. Without `emergencies` nobody is told."""
+        self._store.set("error_code", code)
+        self._note("shutdown", t, f"error {code:04X}h")
+        if emergencies is not None:
+            emergencies.emergency(code, t)
+        if self.state is State.FAULT:
+            return
+        option = self._store.get("fault_reaction_option")
+        if self.state in POWERED and option:
+            self.enter(State.FAULT_REACTION_ACTIVE, t)
+            slow = option == 1
+            self._modes.stop(t, self._store.get("profile_deceleration" if slow else "quick_stop_deceleration"))
+            self._then = State.FAULT
+        else:
+            self.enter(State.FAULT, t)

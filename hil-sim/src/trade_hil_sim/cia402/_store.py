@@ -1,0 +1,93 @@
+"""The values behind the object dictionary, and what an SDO client is told when it asks for the impossible."""
+
+from collections.abc import Iterable
+from enum import IntEnum
+
+from ._objects import Object
+
+__all__ = ["Abort", "AbortCode", "Store"]
+
+
+class AbortCode(IntEnum):
+    """Why an SDO transfer was refused (CiA 301, table 22)."""
+
+    TOGGLE = 0x0503_0000
+    UNKNOWN_COMMAND = 0x0504_0001
+    WRITE_ONLY = 0x0601_0001
+    READ_ONLY = 0x0601_0002
+    NO_OBJECT = 0x0602_0000
+    NOT_MAPPABLE = 0x0604_0041
+    PDO_TOO_LONG = 0x0604_0042
+    LENGTH = 0x0607_0010
+    TOO_LONG = 0x0607_0012
+    TOO_SHORT = 0x0607_0013
+    NO_SUBINDEX = 0x0609_0011
+    VALUE = 0x0609_0030
+    CANNOT_STORE = 0x0800_0020
+    DEVICE_STATE = 0x0800_0022
+
+
+class Abort(Exception):
+    """An SDO transfer is refused."""
+
+    def __init__(self, code: AbortCode) -> None:
+        super().__init__(f"{code.name} ({code:#010x})")
+        self.code = code
+
+
+class Store:
+    """Values of objects, by address and by name.
+
+    Args:
+        objects: which there are.
+    """
+
+    def __init__(self, objects: Iterable[Object]) -> None:
+        self._objects = {(entry.index, entry.sub): entry for entry in objects}
+        self._indexes = {index for index, _ in self._objects}
+        self._by_name = {entry.name: entry for entry in self._objects.values()}
+        self._values: dict[str, int] = {}
+        self.reset()
+
+    @property
+    def numbers(self) -> list[Object]:
+        """All objects that hold a number."""
+        return [entry for entry in self._objects.values() if entry.name in self._values]
+
+    def reset(self) -> None:
+        """Forget everything that was written."""
+        self._values = {o.name: o.default for o in self._objects.values() if isinstance(o.default, int)}
+
+    def find(self, index: int, sub: int) -> Object:
+        """The object at an address; raises `Abort`."""
+        if index not in self._indexes:
+            raise Abort(AbortCode.NO_OBJECT)
+        if (index, sub) not in self._objects:
+            raise Abort(AbortCode.NO_SUBINDEX)
+        return self._objects[index, sub]
+
+    def get(self, name: str) -> int:
+        """The value of a number."""
+        return self._values[name]
+
+    def set(self, name: str, value: int) -> None:
+        """Change the value of a number, whatever its access; what does not fit is cut to the nearest that does."""
+        entry = self._by_name[name]
+        bits = 8 * entry.size
+        low, high = (-(1 << bits - 1), (1 << bits - 1) - 1) if entry.signed else (0, (1 << bits) - 1)
+        self._values[name] = min(high, max(low, value))
+
+    def read(self, entry: Object) -> bytes:
+        """The bytes of an object."""
+        return entry.default if isinstance(entry.default, bytes) else entry.encode(self._values[entry.name])
+
+    def check(self, entry: Object, data: bytes) -> int:
+        """The value a client wants written; raises `Abort` if it must not be."""
+        if entry.access == "ro":
+            raise Abort(AbortCode.READ_ONLY)
+        if len(data) != entry.size:
+            raise Abort(AbortCode.TOO_LONG if len(data) > entry.size else AbortCode.TOO_SHORT)
+        value = entry.decode(data)
+        if (entry.low is not None and value < entry.low) or (entry.high is not None and value > entry.high):
+            raise Abort(AbortCode.VALUE)
+        return value
