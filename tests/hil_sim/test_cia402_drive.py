@@ -1,5 +1,6 @@
 """The drive side of the simulated drive: states, modes, stops and faults of CiA 402-2, judged by shaft and log."""
 
+from itertools import pairwise
 from typing import Any
 
 import pytest
@@ -127,7 +128,7 @@ def test_a_move_ends_at_its_target_within_speed_and_acceleration() -> None:
         assert len(speeds) < 200
     assert bench.position == 8000
     assert max(speeds) == 10_000
-    assert max(b - a for a, b in zip(speeds, speeds[1:], strict=False)) <= 500 + 1
+    assert max(b - a for a, b in pairwise(speeds)) <= 500 + 1
     assert bench.names()[-2:] == ["motion_started", "at_rest"]
 
 
@@ -499,7 +500,7 @@ def test_power_lost_is_everything_forgotten_but_the_shaft_stays() -> None:
     bench.run(0.1)
     assert (bench.state, bench.get(0x6061), bench.position, bench.get(0x607A)) == (SOD, 0, 3000, 0)
     assert bench.frames(0x705) == ["00", "00"]
-    assert bench.names()[-3:] == ["torque_off", "booted", "nmt"] or "booted" in bench.names()[-3:]
+    assert {"brown_out", "torque_off", "booted"} <= set(bench.names()[-6:])
 
 
 def test_a_swap_shows_in_its_identity_and_what_it_has_not_got_is_refused(bench: Bench) -> None:
