@@ -4,6 +4,7 @@ from itertools import pairwise
 from typing import Any
 
 import pytest
+from canopen.profiles.p402 import OperationMode, State402
 
 from drive_bench import STATUS, Bench
 from trade_hil_sim import (
@@ -528,3 +529,25 @@ def test_a_shaft_turned_by_hand_goes_back_if_it_is_driven_and_not_else(bench: Be
     bench.drive.do(Place(counts=700), bench.t)
     bench.run(1.0)
     assert bench.position == 500
+
+
+# the same facts, written by others
+
+
+def test_states_commands_and_modes_are_those_of_the_library_canopen() -> None:
+    for state in State:
+        mask, bits = State402.SW_MASK[state.name.replace("_", " ")]
+        assert state & mask == bits
+    assert {name: command(word).name for name, word in State402.CW_COMMANDS_CODE.items()} == {
+        "SWITCH ON DISABLED": "DISABLE_VOLTAGE",  # they mean the fault reset
+        "DISABLE VOLTAGE": "DISABLE_VOLTAGE",
+        "READY TO SWITCH ON": "SHUTDOWN",
+        "SWITCHED ON": "SWITCH_ON",
+        "OPERATION ENABLED": "ENABLE_OPERATION",
+        "QUICK STOP ACTIVE": "QUICK_STOP",
+    }
+    ours = {mode.name.replace("PROFILE_", "PROFILED_").replace("CYCLIC", "CYCLIC SYNCHRONOUS") for mode in Mode if mode}
+    theirs = {name.replace("_", " "): OperationMode.NAME2CODE[name.replace("_", " ")] for name in ours}
+    assert sorted(theirs.values()) == sorted(mode for mode in Mode if mode)
+    supported = sum(OperationMode.SUPPORTED[name] for name in theirs)
+    assert Bench().get(0x6502) == supported
