@@ -1,4 +1,4 @@
-"""A driver in a process of its own that moves the head slowly and reports: ``driver_process.py ROBOT PORT``."""
+"""A driver in a process of its own that moves a joint slowly: ``driver_process.py ROBOT PORT [BUS JOINT]``."""
 
 import sys
 from pathlib import Path
@@ -6,16 +6,18 @@ from pathlib import Path
 import trade_drivers
 
 ROBOT, PORT = sys.argv[1:3]
+BUS, JOINT = sys.argv[3:5] or ("neck", "neck.pan")
 
 
 def main() -> None:
     robot = trade_drivers.parse(Path(ROBOT).read_text(encoding="utf-8"), ROBOT)
     with trade_drivers.attach(
-        robot, register=lambda provider, groups: None, deregister=lambda provider: None, ports={"neck": PORT}
+        robot, register=lambda provider, groups: None, deregister=lambda provider: None, ports={BUS: PORT}
     ) as head:
         print("attached", flush=True)
         try:
-            head.motor("neck.pan").move_to(1.3, 0.1)
+            motor = head.motor(JOINT)
+            motor.move_to(0.93 * motor.limits().max_rad, 0.1)
         except Exception as error:  # noqa: BLE001 - the parent reads which
             print(type(error).__name__, error, flush=True)
         for line in sys.stdin:

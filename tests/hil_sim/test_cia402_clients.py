@@ -72,7 +72,8 @@ def make_drives() -> Iterator[Callable[..., Cia402Bus]]:
     opened: list[Cia402Bus] = []
 
     def make(*ids: int, paced: bool = False) -> Cia402Bus:
-        bus = Cia402Bus([Drive(i, joint=f"leg.{i}", t=time.monotonic()) for i in ids], name="leg", paced=paced)
+        drives = [Drive(i, joint=f"leg.{i}", model="Knee drive, long name", t=time.monotonic()) for i in ids]
+        bus = Cia402Bus(drives, name="leg", paced=paced)
         bus.open()
         opened.append(bus)
         wait_until(lambda: len(events(bus.log.entries, "booted")) == len(ids), "the drives are up")
@@ -166,7 +167,7 @@ def configure(node: Any) -> None:
 def test_canopen_reads_names_numbers_and_refusals(make_drives: Any, connect: Any, open_master: Any) -> None:
     master = open_master(connect(make_drives(5).port), 5)
     [node] = master.nodes
-    assert node.sdo["device_name"].raw == "Simulated CiA 402 servo drive"
+    assert node.sdo["device_name"].raw == "Knee drive, long name"
     assert node.sdo["device_type"].raw == 0x20192
     assert node.sdo["identity_count"]["product_code"].raw == 402
     node.sdo["target_position"].raw = -123456

@@ -1,6 +1,7 @@
 """A servo drive (CiA 402): state machine, modes, faults and sensors, behind a CANopen node. Time is an argument."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from math import inf, tau
 from typing import Final
 
@@ -37,6 +38,11 @@ HOTTEST_C: Final = 85
 FULL: Final = 1000
 
 
+def _named(model: str) -> list[Object]:
+    """The objects of a drive that says it is of this model."""
+    return [replace(o, default=model.encode()) if o.name == "device_name" else o for o in OBJECTS]
+
+
 class Drive:
     """One drive; it boots when made.
 
@@ -71,7 +77,7 @@ class Drive:
         self.send: Callable[[Frame, float], None] = lambda frame, t: None  # noqa: ARG005 - the bus sets it
         self.emit: Callable[[Entry], None] = lambda entry: None  # noqa: ARG005 - the bus sets it
         self.due = t
-        self.store = Store([*OBJECTS, *pdo_objects(device_id)])
+        self.store = Store([*_named(model), *pdo_objects(device_id)])
         self._shaft = Shaft(position_counts, t)
         self.modes = Modes(self.store, self._shaft, counts_per_rev, self.note)
         self._machine = Machine(self.store, self._shaft, self.modes, self.note)

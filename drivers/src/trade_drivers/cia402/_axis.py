@@ -1,0 +1,156 @@
+"""One drive as the bus thread knows it: what its frames said last, and what speaks against moving on."""
+
+from collections.abc import Sequence
+from math import tau
+from struct import error as BadLength  # noqa: N812 - what unpacking raises for another number of bytes
+from typing import Final
+
+from trade_drivers._interfaces import MotorState
+from trade_drivers.cia402 import _machine as machine
+from trade_drivers.cia402 import _table as table
+from trade_drivers.cia402._machine import State, state_of
+from trade_drivers.cia402._net import emergency_text
+from trade_drivers.joints import Axis, Grain, Sample
+from trade_drivers.robotfile import Joint
+
+__all__ = ["DriveAxis"]
+
+_STILL_RAD_S: Final = 0.01
+_ARRIVED_RAD: Final = 0.004
+_NEAR_RAD: Final = 0.03
+_SOME_FAULT: Final = "it reports a fault"
+_ACKNOWLEDGE_NS: Final = 250_000_000
+"""How long a drive may take to take a set-point."""
+
+
+def grain_of(joint: Joint, rate_hz: float) -> Grain:
+    """What counts of this joint's drive mean: positions in counts, speeds in counts a second, and so on."""
+    rad = tau / ((joint.counts_per_rev or 1.0) * joint.gear)
+    return Grain(
+        rad=rad,
+        rad_s=rad,
+        rad_s2=rad,
+        centre=0,
+        still_velocity=max(1, round(_STILL_RAD_S / rad)),
+        still_counts=max(1, round(_STILL_RAD_S / rate_hz / rad)),
+        arrived=max(2, round(_ARRIVED_RAD / rad)),
+        near=max(4, round(_NEAR_RAD / rad)),
+    )
+
+
+class DriveAxis(Axis):
+    """One drive."""
+
+    def __init__(self, name: str, bus: str, joint: Joint, rate_hz: float, coupled: Sequence[str] = ()) -> None:
+        super().__init__(name, bus, joint, grain_of(joint, rate_hz), coupled)
+        self.identity: tuple[int, ...] = ()
+        """What it said of itself when it was attached."""
+        self.state_now: State | None = None
+        self.statusword = 0
+        self.mode = 0
+        self.velocity = 0
+        self.controlword = 0
+        """What was commanded last."""
+        self.target = 0
+        self.asked_ns = 0
+        """When its set-point was raised; 0 once it was taken."""
+        self.beat_ns = 0
+        """When its heartbeat came last."""
+        self.awaited_ns = 0
+        """When it was last asked for a measurement; 0 once that has come."""
+
+    # --- what it says
+
+    def take_status(self, data: bytes) -> None:
+        """Its first TPDO. Only the first after a SYNC counts: what comes later is too late to be believed."""
+        asked_ns, self.awaited_ns = self.awaited_ns, 0
+        if not asked_ns:
+            return
+        try:
+            self.statusword, position, torque = table.STATUS.layout.unpack(data)
+        except BadLength:
+            return
+        self.state_now = state_of(self.statusword)
+        self.note(Sample(position, self.velocity, torque, asked_ns))
+        self._judge(asked_ns)
+
+    def take_motion(self, data: bytes) -> None:
+        """Its second TPDO."""
+        try:
+            self.velocity, self.mode, error = table.MOTION.layout.unpack(data)
+        except BadLength:
+            return
+        if error and self.state_now in {State.FAULT, State.FAULT_REACTION}:
+            self.latch(emergency_text(error))
+
+    def take_emergency(self, data: bytes) -> None:
+        """An EMCY, however short; code 00xx says that an error has gone, which does not undo that it was there."""
+        code = int.from_bytes(data[:2], "little")
+        if code & 0xFF00:
+            self.latch(emergency_text(code))
+
+    def take_heartbeat(self, data: bytes, now_ns: int) -> None:
+        """Its heartbeat, or that it has started anew: then what it was told before is gone."""
+        state = data[0] & 0x7F if data else table.BOOT_UP
+        if state == table.BOOT_UP:
+            self._lose("it has restarted; is its supply sound?", now_ns)
+        elif state != table.OPERATIONAL and not self.silent:
+            self._lose(f"somebody has made it {table.NMT_STATES.get(state, hex(state))}", now_ns)
+        self.beat_ns = now_ns
+
+    def _lose(self, why: str, now_ns: int) -> None:
+        if self.ready:
+            self.latch(why)
+        self.forget(now_ns)
+
+    def forget(self, now_ns: int) -> None:
+        """Leave it out until it was looked over again."""
+        if not self.silent:
+            self.silent, self.silent_since_ns, self.probe_at_ns = True, now_ns, now_ns
+        self.controlword = self.asked_ns = self.awaited_ns = 0
+
+    def latch(self, fault: str) -> None:
+        """Note what speaks against moving on, until it is enabled again; the first that says something is kept."""
+        if self.fault in {"", _SOME_FAULT}:
+            self.fault = fault
+        self.ready = False
+
+    def _judge(self, now_ns: int) -> None:
+        state = self.state_now
+        if state in {State.FAULT, State.FAULT_REACTION}:
+            self.latch(_SOME_FAULT)
+        elif self.ready and state is State.QUICK_STOP:
+            self.latch("it has made a quick stop by itself: it heard nothing for too long, or a switch told it to")
+        elif self.ready and state is not State.ENABLED:
+            self.latch("its torque went off: it lost power, or its protection switched it off")
+        elif self.ready and self.asked_ns and now_ns - self.asked_ns > _ACKNOWLEDGE_NS and not self.acknowledged:
+            self.latch("it does not take its goal (statusword bit 12)")
+        if self.ready and not self.statusword & machine.REMOTE:
+            self.latch("it does not obey the bus (statusword bit 9); is it operated from its panel?")
+
+    # --- what it is
+
+    @property
+    def acknowledged(self) -> bool:
+        """It shows that it has taken a set-point."""
+        return bool(self.statusword & machine.ACKNOWLEDGED)
+
+    @property
+    def can_take_goal(self) -> bool:
+        """The handshake of the last set-point is over."""
+        return not self.controlword & machine.NEW_SET_POINT and not self.acknowledged
+
+    @property
+    def may_hold_torque(self) -> bool:
+        return self.state_now is None or self.state_now.torque
+
+    def state(self, now_ns: int, stale_after_ns: int) -> MotorState:
+        sample = self.fresh(now_ns, stale_after_ns)
+        return self.measured(
+            sample,
+            now_ns,
+            load=self.scale.load(sample.effort, table.FULL_TORQUE),
+            enabled=self.state_now in {State.ENABLED, State.QUICK_STOP},
+            temperature_c=None,
+            voltage_v=None,
+        )

@@ -1,0 +1,182 @@
+"""The cyclic exchange with all drives of one CAN bus: heartbeat, SYNC, measurements, handshakes, work."""
+
+import logging
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Final, cast
+
+from trade_drivers.cia402 import _jobs as jobs
+from trade_drivers.cia402 import _machine as machine
+from trade_drivers.cia402 import _table as table
+from trade_drivers.cia402._attach import Unfit, heartbeat_ms, set_up
+from trade_drivers.cia402._axis import DriveAxis
+from trade_drivers.cia402._machine import State
+from trade_drivers.cia402._net import Net, NoAnswer, Refused
+from trade_drivers.joints import Axis, Exchange, Gate, Goal, Job, Steps
+
+if TYPE_CHECKING:
+    from trade_drivers.can import CanPort
+    from trade_drivers.robotfile import CanBus
+
+__all__ = ["DriveExchange"]
+
+_log = logging.getLogger(__name__)
+_PROBE_NS: Final = 500_000_000
+_BEATS_MISSED: Final = 3
+
+
+class DriveExchange(Exchange):
+    """What happens on one bus of drives."""
+
+    def __init__(
+        self, port: "CanPort", bus: "CanBus", axes: Sequence[DriveAxis], clock: Callable[[], int] = time.monotonic_ns
+    ) -> None:
+        super().__init__(bus, axes, clock)
+        self.port = port
+        self.drives = tuple(axes)
+        self.net = Net(port, self.serve_stops)
+        self._bus = bus
+        self._beat_ns = int(bus.watchdog_s * 1e9 / 5)
+        self._beaten_ns = 0
+        self._deaf_ns = _BEATS_MISSED * heartbeat_ms(bus) * 1_000_000
+        self.rival = False
+        """Somebody else sends heartbeats as this driver does."""
+        self.net.hear(table.HEARTBEAT + table.OUR_NODE, self._hear_rival)
+        for axis in axes:
+            self._listen_to(axis)
+
+    def _hear_rival(self, _: bytes) -> None:
+        if not self.rival:
+            _log.error("%s: another driver commands the drives of this bus, too", self.port.path)
+        self.rival = True
+
+    def _listen_to(self, axis: DriveAxis) -> None:
+        self.net.hear(table.STATUS.base + axis.id, axis.take_status)
+        self.net.hear(table.MOTION.base + axis.id, axis.take_motion)
+        self.net.hear(table.EMERGENCY + axis.id, axis.take_emergency)
+        self.net.hear(table.HEARTBEAT + axis.id, lambda data: axis.take_heartbeat(data, self.clock()))
+
+    # --- what a drive is told
+
+    def command(self, axis: DriveAxis, controlword: int, target: int | None = None) -> None:
+        """A controlword, and where to go with it."""
+        axis.controlword = controlword
+        axis.target = axis.target if target is None else target
+        self.port.send(table.COMMAND.base + axis.id, table.COMMAND.layout.pack(controlword, axis.target))
+
+    def write_goals(self, goals: Mapping[Axis, Goal], gate: Gate) -> None:
+        """Ramps first, which move nothing; then the gate, and all joints start in one go."""
+        for axis, goal in goals.items():
+            self.port.send(table.PROFILE.base + axis.id, table.PROFILE.layout.pack(goal.speed, goal.accel))
+            self.port.send(table.BRAKING.base + axis.id, table.BRAKING.layout.pack(goal.accel))
+        gate()
+        for axis, goal in goals.items():
+            drive = cast("DriveAxis", axis)
+            drive.asked_ns = self.clock()
+            self.command(drive, machine.GO, goal.position)
+
+    def write_holds(self, positions: Mapping[Axis, int]) -> None:
+        """Halt, on the joint's own ramp; what is not known to be enabled is not told, lest that enable it."""
+        for axis, position in positions.items():
+            drive = cast("DriveAxis", axis)
+            drive.asked_ns = 0
+            if drive.state_now is State.ENABLED:
+                self.port.send(table.BRAKING.base + axis.id, table.BRAKING.layout.pack(axis.accel_counts))
+                self.command(drive, machine.HOLD, position)
+
+    def enabling(self, job: Job, axis: Axis) -> Steps:
+        return jobs.enabling(self, job, cast("DriveAxis", axis))
+
+    def relaxing(self, job: Job, axis: Axis) -> Steps:
+        return jobs.relaxing(self, job, cast("DriveAxis", axis))
+
+    def looking(self, axis: Axis) -> Steps:
+        return jobs.looking(self, cast("DriveAxis", axis))
+
+    def making_way(self, axes: Sequence[Axis]) -> Steps:
+        for axis in axes:
+            drive = cast("DriveAxis", axis)
+            yield from jobs.until(self, drive, lambda: drive.can_take_goal, "it does not end its last handshake")  # noqa: B023 - over before the next
+
+    def leaving(self, job: Job, axis: Axis, *, relax: bool) -> Steps:
+        return jobs.leaving(self, job, cast("DriveAxis", axis), relax=relax)
+
+    # --- from the bus thread
+
+    def idle(self, seconds: float) -> None:
+        self.net.take_in(seconds)
+
+    def cycle(self) -> None:
+        """One round: stops, heartbeat, measurements, handshakes, work, motions."""
+        began_ns = self.clock()
+        self.net.take_in(0.0)  # what came late is no answer to the next SYNC
+        self._beat(began_ns)
+        self._measure(began_ns)
+        self._listen(began_ns)
+        self._shake_hands()
+        self._recover()
+        self.work(began_ns + self.period_ns // 2)
+        self.watch()
+
+    def _beat(self, now_ns: int) -> None:
+        """The heartbeat that the drives' own watchdogs live on."""
+        if now_ns - self._beaten_ns >= self._beat_ns:
+            self._beaten_ns = now_ns
+            self.port.send(table.HEARTBEAT + table.OUR_NODE, bytes((table.OPERATIONAL,)))
+
+    def _measure(self, began_ns: int) -> None:
+        asked = [axis for axis in self.drives if not axis.silent]
+        for axis in asked:
+            axis.awaited_ns = began_ns  # not when it came: a frozen process would take old values for new
+        self.port.send(table.SYNC, b"")
+        self.net.take_in(self.period_ns / 2e9, lambda: not any(axis.awaited_ns for axis in asked))
+
+    def _listen(self, now_ns: int) -> None:
+        """Who has not been heard for too long is left out, and asked now and then whether it is back."""
+        for axis in self.drives:
+            if axis.silent:
+                continue
+            if axis.age_ns(now_ns) > self.stale_after_ns or now_ns - axis.beat_ns > self._deaf_ns:
+                _log.warning("%s is not heard on %s", axis.name, axis.bus)
+                axis.forget(now_ns)
+                axis.probe_at_ns = now_ns + _PROBE_NS
+
+    def _shake_hands(self) -> None:
+        """A set-point that was taken is taken back, so that the next one has an edge."""
+        for axis in self.drives:
+            if axis.asked_ns and axis.acknowledged and axis.state_now is State.ENABLED:
+                axis.asked_ns = 0
+                self.command(axis, axis.controlword & ~machine.NEW_SET_POINT)
+
+    def _recover(self) -> None:
+        """Look one of those over that are away, when it is its turn; enables nothing, moves nothing."""
+        now_ns = self.clock()
+        for axis in self.drives:
+            if axis.silent and now_ns >= axis.probe_at_ns:
+                axis.probe_at_ns = now_ns + _PROBE_NS
+                self._readmit(axis)
+                return
+
+    def _readmit(self, axis: DriveAxis) -> None:
+        try:
+            self.admit(axis)
+        except NoAnswer:
+            return
+        except (Unfit, Refused) as unfit:
+            axis.fault = str(unfit)  # whatever was wrong before, this has to be mended first
+            return
+        _log.info("%s answers again", axis.name)
+
+    def admit(self, axis: DriveAxis) -> None:
+        """Take a drive on that answers.
+
+        Raises:
+            NoAnswer, Refused, Unfit: it cannot be used, or not yet.
+        """
+        was_ready, axis.ready = axis.ready, False
+        set_up(self.net, axis, self._bus)
+        now_ns = self.clock()
+        if was_ready:
+            axis.latch("it was away")
+        axis.silent, axis.silent_since_ns, axis.beat_ns, axis.sample = False, now_ns, now_ns, None
+        axis.controlword = axis.asked_ns = axis.awaited_ns = 0

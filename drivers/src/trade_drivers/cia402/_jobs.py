@@ -1,0 +1,141 @@
+"""What enabling, relaxing, homing and leaving a drive are made of: one exchange on the wire after the other."""
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Final
+
+from trade.errors import DeviceSilent
+from trade_drivers.cia402 import _machine as machine
+from trade_drivers.cia402 import _table as table
+from trade_drivers.cia402._axis import DriveAxis
+from trade_drivers.cia402._machine import State
+from trade_drivers.cia402._net import NoAnswer, Refused
+from trade_drivers.cia402._table import Entry
+from trade_drivers.joints import Job, Steps
+
+if TYPE_CHECKING:
+    from trade_drivers.cia402._exchange import DriveExchange
+
+__all__ = ["enabling", "leaving", "looking", "relaxing", "set_mode", "until", "write"]
+
+_ATTEMPTS: Final = 3
+_CHANGE_NS: Final = 600_000_000
+"""How long a drive may take to go from one state to the next."""
+_WAIT_S: Final = 0.001
+
+
+def enabling(bus: "DriveExchange", job: Job, axis: DriveAxis) -> Steps:
+    """Torque on where it was measured to be, halted, in profile position with its own ramps; all of it confirmed."""
+    yield from looking(bus, axis)
+    if not axis.statusword & machine.REMOTE:
+        raise axis.faulty("it does not obey the bus (statusword bit 9); is it operated from its panel?")
+    if axis.state_now is State.FAULT:
+        yield from _reset(bus, job, axis)
+    yield from set_mode(bus, job, axis, table.PROFILE_POSITION)
+    for entry, value in (
+        (table.PROFILE_VELOCITY, axis.speed_counts),
+        (table.ACCELERATION, axis.accel_counts),
+        (table.DECELERATION, axis.accel_counts),
+    ):
+        yield from write(bus, job, axis, entry, value)
+    yield from _climb(bus, job, axis)
+    axis.fault, axis.ready = "", True
+
+
+def _climb(bus: "DriveExchange", job: Job, axis: DriveAxis) -> Steps:
+    """Up to where it is enabled, a state at a time; the goal is where it is."""
+    while True:
+        yield from until(bus, axis, lambda: machine.command_towards_enabled(axis.state_now) is not None, _stays(axis))
+        word = machine.command_towards_enabled(axis.state_now)
+        sample = axis.fresh(bus.clock(), bus.stale_after_ns)
+        before = axis.state_now
+        job.gate()
+        bus.command(axis, word or 0, sample.position)
+        if before is State.ENABLED:
+            return
+        yield from until(bus, axis, lambda: axis.state_now is not before, _stays(axis))  # noqa: B023 - over before the next round
+
+
+def _stays(axis: DriveAxis) -> str:
+    if axis.fault and axis.state_now is State.FAULT:
+        return axis.fault
+    state = axis.state_now.name.lower().replace("_", " ") if axis.state_now else f"{axis.statusword:04X}h"
+    return f"it cannot be enabled: it stays at {state}; is its power stage supplied, and its safe torque off released?"
+
+
+def _reset(bus: "DriveExchange", job: Job, axis: DriveAxis) -> Steps:
+    """Clear the drive's own fault. Nothing else happens: that it can be enabled again is another matter."""
+    for word in (machine.DISABLE_VOLTAGE, machine.RESET_FAULT):
+        job.gate()
+        bus.command(axis, word)
+        yield from _next_measurement(bus, axis)
+    yield from until(
+        bus, axis, lambda: axis.state_now is not State.FAULT, f"its fault cannot be cleared: {axis.fault or 'it stays'}"
+    )
+
+
+def set_mode(bus: "DriveExchange", job: Job, axis: DriveAxis, mode: int) -> Steps:
+    """Another mode of operation; in it only when the drive says so itself."""
+    yield from write(bus, job, axis, table.MODE, mode)
+    yield from until(bus, axis, lambda: axis.mode == mode, f"it does not go into mode {mode} (6061h)")
+
+
+def relaxing(bus: "DriveExchange", job: Job, axis: DriveAxis) -> Steps:
+    """Torque off; its watchdog lives on."""
+    axis.ready = False
+    if axis.may_hold_torque:
+        job.gate()
+        bus.command(axis, machine.DISABLE_VOLTAGE)
+    yield from until(bus, axis, lambda: not axis.may_hold_torque, "told to relax, but its torque is still on")
+
+
+def leaving(bus: "DriveExchange", job: Job, axis: DriveAxis, *, relax: bool) -> Steps:
+    """Torque off, or left on where it was seen at rest; only then its watchdog is disarmed."""
+    if relax:
+        yield from relaxing(bus, job, axis)
+    elif axis.still == 0 and axis.may_hold_torque:
+        return
+    yield from write(bus, job, axis, table.CONSUMER_HEARTBEAT, 0)
+    axis.ready = False
+
+
+def looking(bus: "DriveExchange", axis: DriveAxis) -> Steps:
+    """How it is now: what the SYNC after this one says."""
+    bus.require_answering(axis)
+    yield from _next_measurement(bus, axis)
+
+
+def _next_measurement(bus: "DriveExchange", axis: DriveAxis) -> Steps:
+    since_ns = bus.clock()
+    yield from until(bus, axis, lambda: axis.sample is not None and axis.sample.at_ns > since_ns, "it says nothing")
+
+
+def until(bus: "DriveExchange", axis: DriveAxis, condition: Callable[[], bool], otherwise: str) -> Steps:
+    """Wait for what the drive's frames are to say.
+
+    Raises:
+        DeviceFault: it did not come; ``otherwise`` says what is wrong then.
+        DeviceSilent: the drive fell silent.
+    """
+    give_up_ns = bus.clock() + _CHANGE_NS
+    while not condition():
+        bus.require_answering(axis)
+        if bus.clock() > give_up_ns:
+            raise axis.faulty(otherwise)
+        bus.net.take_in(_WAIT_S)
+        yield
+
+
+def write(bus: "DriveExchange", job: Job, axis: DriveAxis, entry: Entry, value: int) -> Steps:
+    """Change its dictionary, and hear that it did, within the retry budget. A repeated write does no harm."""
+    began_ns = bus.clock()
+    for _ in range(_ATTEMPTS):
+        try:
+            bus.net.write(axis.id, entry, value, job.gate, attempts=1)
+        except NoAnswer:
+            yield
+        except Refused as refused:
+            raise axis.faulty(f"it refused a command: {refused}") from None
+        else:
+            yield
+            return
+    raise DeviceSilent(device=axis.name, bus=axis.bus, waited_s=(bus.clock() - began_ns) / 1e9)

@@ -1,0 +1,53 @@
+"""A motor with what only a drive can: finding its zero."""
+
+from typing import Annotated, cast
+
+from trade import Meta, permit, service
+from trade.errors import LimitExceeded
+from trade_drivers.cia402._axis import DriveAxis
+from trade_drivers.cia402._exchange import DriveExchange
+from trade_drivers.cia402._homing import Homing
+from trade_drivers.joints import BusMotor
+
+__all__ = ["Drive"]
+
+Method = Annotated[int, Meta(ge=-128, le=37, description="homing method of CiA 402-2; 37: where it is now is its zero")]
+Slow = Annotated[float, Meta(gt=0, description="speed of the search in rad/s; by default a tenth of the joint's limit")]
+
+
+class Drive(BusMotor):
+    """One CiA 402 drive as a motor."""
+
+    @service(effect="actuate", cancel="stop")
+    def home(self, method: Method = 37, speed_rad_s: Slow | None = None) -> float:
+        """Find the zero of the joint, and return the angle measured there.
+
+        With most methods the joint moves until it meets a switch or an index, limits() or not: nobody else knows where
+        it is. Never done by itself. The next move or enable() puts the drive back into its usual mode.
+
+        Raises:
+            DeviceFault: it was not found, or the drive does not know the method.
+            LimitExceeded: faster than limits().
+            MotionStopped, DeviceSilent, DeadlineExceeded: as with move_to().
+        """
+        axis = cast("DriveAxis", self._axes[0])
+        fastest = axis.joint.max_speed_rad_s
+        speed = fastest / 10 if speed_rad_s is None else speed_rad_s
+        if not axis.grain.rad_s <= speed <= fastest:
+            raise LimitExceeded(
+                what=f"{axis.name} speed", value=speed, lower=axis.grain.rad_s, upper=fastest, unit="rad/s"
+            )
+        expires_ns, ends = self._expiry()
+        with permit(self.resources) as permitted:
+            homing = Homing(
+                cast("DriveExchange", self._exchange),
+                axis,
+                method=method,
+                speed_counts=int(speed / axis.grain.rad_s),
+                service=f"{self._name}.home",
+                expires_ns=expires_ns,
+                until_ns=expires_ns if ends else None,
+                permit=permitted,
+            )
+            self._finish(homing)
+        return axis.scale.angle_rad(axis.fresh(self._exchange.clock(), self._exchange.stale_after_ns).position)
