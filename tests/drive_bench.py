@@ -6,6 +6,7 @@ from trade_hil_sim import Entry, Frame
 from trade_hil_sim.cia402 import Drive, Mode, State
 
 NODE = 5
+MODEL = "Simulated CiA 402 servo drive"
 STATUS = 0x6F
 
 
@@ -16,7 +17,7 @@ class Bench:
         self.t = 100.0
         self.sent: list[tuple[float, Frame]] = []
         self.log: list[Entry] = []
-        self.drive = Drive(NODE, joint="leg.knee", position_counts=position_counts, t=self.t)
+        self.drive = Drive(NODE, joint="leg.knee", model=MODEL, position_counts=position_counts, t=self.t)
         self.drive.send = lambda frame, t: self.sent.append((t, frame))
         self.drive.emit = self.log.append
         self.run(0.1)

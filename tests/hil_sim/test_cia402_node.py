@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import pytest
 
-from drive_bench import NODE, Bench
+from drive_bench import MODEL, NODE, Bench
 from trade_hil_sim import Frame
 from trade_hil_sim.cia402 import canopen_label
 
@@ -129,7 +129,7 @@ def test_a_name_is_read_in_segments(bench: Bench) -> None:
         toggle ^= 0x10
         if answer[0] & 1:
             break
-    assert text == b"Simulated CiA 402 servo drive"
+    assert text == MODEL.encode()
     assert bench.sdo("6000000000000000")[:2] == "80"
 
 
