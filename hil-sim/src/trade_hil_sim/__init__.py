@@ -23,6 +23,7 @@ from ._faults import (
     Late,
     Mute,
     Place,
+    Put,
     Replug,
     Supply,
     Truncate,
@@ -34,8 +35,9 @@ from ._judge import events, instructions, motion_writes, read_log, received, sen
 from ._line import Peer, SerialLine
 from ._log import ByteLog, Entry
 from ._process import SimProcess, remove_leftovers
-from ._state import BusState, DeviceState
+from ._state import BusState, DeviceState, GripperTruth
 from .dynamixel import MODELS, XL430_W250, XM430_W350, DynamixelBus, Servo
+from .robotiq import Gripper, RobotiqBus
 
 __all__ = [
     "MODELS",
@@ -56,6 +58,8 @@ __all__ = [
     "Entry",
     "Freeze",
     "Garbage",
+    "Gripper",
+    "GripperTruth",
     "HardwareFault",
     "Heal",
     "Jam",
@@ -63,7 +67,9 @@ __all__ = [
     "Mute",
     "Peer",
     "Place",
+    "Put",
     "Replug",
+    "RobotiqBus",
     "SerialLine",
     "Servo",
     "SimControl",

@@ -11,7 +11,7 @@ from ._log import Entry
 
 __all__ = ["events", "instructions", "motion_writes", "read_log", "received", "sent", "writes"]
 
-WRITING: Final = frozenset({"write", "reg_write", "action", "sync_write", "bulk_write"})
+WRITING: Final = frozenset({"write", "write_one", "read_write", "reg_write", "action", "sync_write", "bulk_write"})
 EVERYBODY: Final = 254
 
 
