@@ -139,6 +139,16 @@ def test_a_hardware_error_does_not_keep_the_others_from_being_attached(rig: Rig)
 # --- what the file alone tells
 
 
+def test_a_servo_on_a_can_bus_is_refused(head: Rig) -> None:
+    head.configure(('port = "/dev/ttyNOWHERE"', 'interface = "virtual"\nchannel = "neck"'))
+    assert "bus.neck: driver dynamixel needs a serial bus" in refused(head)
+
+
+def test_a_gear_is_refused_where_it_would_not_be_heeded(head: Rig) -> None:
+    head.configure(("reversed = true", "gear = 2"))
+    assert 'joint."neck.tilt": counts_per_rev and gear are for other devices' in refused(head)
+
+
 @pytest.mark.parametrize(
     ("change", "complaint"),
     [

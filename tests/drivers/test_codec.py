@@ -13,9 +13,10 @@ from hypothesis import strategies as st
 
 import trade_drivers
 from trade_drivers.dynamixel import _table as table
-from trade_drivers.dynamixel._axis import CYCLIC, SLOW, Axis, Scale
+from trade_drivers.dynamixel._axis import CYCLIC, GRAIN, SLOW, ServoAxis
 from trade_drivers.dynamixel._frames import Corrupt, crc16, take_status, unstuffed
-from trade_drivers.dynamixel._profile import Leg, together
+from trade_drivers.joints._axis import Scale
+from trade_drivers.joints._profile import Leg, together
 from trade_drivers.robotfile import Joint
 from trade_hil_sim.dynamixel import status
 
@@ -139,13 +140,13 @@ def test_counts_are_twos_complement_where_the_table_says_so() -> None:
 
 @given(st.integers(0, 4095), st.booleans(), st.floats(-3, 3))
 def test_counts_and_angles_convert_back_and_forth(counts: int, reversed_: bool, offset_rad: float) -> None:
-    scale = Scale(joint(reversed=reversed_, offset_rad=offset_rad))
+    scale = Scale(joint(reversed=reversed_, offset_rad=offset_rad), GRAIN)
     assert scale.counts(scale.angle_rad(counts)) == pytest.approx(counts, abs=1e-6)
 
 
 def test_the_range_of_a_joint_in_counts_holds_every_allowed_angle() -> None:
     for reversed_ in (False, True):
-        axis = Axis("rosie.neck.pan", "/dev/x", joint(reversed=reversed_, offset_rad=0.1))
+        axis = ServoAxis("rosie.neck.pan", "/dev/x", joint(reversed=reversed_, offset_rad=0.1))
         ends = sorted(round(axis.scale.counts(angle)) for angle in (-1.0, 1.0))
         assert axis.low <= ends[0] < ends[1] <= axis.high
         assert axis.high - axis.low <= ends[1] - ends[0] + 2
@@ -154,7 +155,8 @@ def test_the_range_of_a_joint_in_counts_holds_every_allowed_angle() -> None:
 # --- profiles
 
 
-LEGS = st.builds(Leg, st.integers(0, 4000), st.integers(1, 300), st.integers(1, 200))
+SAME = st.builds(Leg, st.integers(300, 2000), st.just(104), st.just(53), st.just(GRAIN))
+LEGS = st.builds(Leg, st.integers(0, 4000), st.integers(1, 300), st.integers(1, 200), st.just(GRAIN))
 
 
 @given(st.lists(LEGS, min_size=1, max_size=6))
@@ -164,14 +166,16 @@ def test_no_profile_exceeds_the_limits_of_its_joint_nor_means_no_limit(legs: lis
         assert 1 <= profile.accel_counts <= leg.accel_counts
 
 
-@given(st.lists(st.builds(Leg, st.integers(300, 2000), st.just(104), st.just(53)), min_size=2, max_size=6))
+@given(
+    st.lists(st.builds(Leg, st.integers(300, 2000), st.just(104), st.just(53), st.just(GRAIN)), min_size=2, max_size=6)
+)
 def test_joints_arrive_together(legs: list[Leg]) -> None:
     durations = [profile.duration_s for profile in together(legs)]
     assert max(durations) < 1.1 * min(durations)
 
 
 def test_a_joint_alone_uses_its_limits() -> None:
-    (profile,) = together([Leg(2000, 104, 53)])
+    (profile,) = together([Leg(2000, 104, 53, GRAIN)])
     assert profile[:2] == (53, 104)
 
 

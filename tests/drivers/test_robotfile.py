@@ -6,7 +6,7 @@ import pytest
 
 from robots import HAND, HEAD
 from trade.errors import ConfigurationError
-from trade_drivers import Robot, load, parse
+from trade_drivers import CanBus, Robot, SerialBus, load, parse
 
 
 def test_a_robot_file_becomes_records() -> None:
@@ -34,6 +34,62 @@ def test_coupled_joints_name_each_other() -> None:
     assert robot.coupled_to("neck.pan") == ["rosie.neck.tilt"]
     assert robot.coupled_to("neck.tilt") == ["rosie.neck.pan"]
     assert parse(HEAD, "head.toml").coupled_to("neck.pan") == []
+
+
+LEGS = """
+[robot]
+name = "rosie"
+
+[bus.legs]
+driver = "cia402"
+interface = "socketcan"
+channel = "can0"
+
+[joint."legs.hip"]
+bus = "legs"
+id = 1
+model = "drive"
+counts_per_rev = 4096
+gear = 50
+min_rad = -1.0
+max_rad = 1.0
+max_speed_rad_s = 2.0
+max_accel_rad_s2 = 20.0
+"""
+
+
+def test_a_bus_with_the_words_of_python_can_is_a_can_bus() -> None:
+    robot = parse(LEGS, "legs.toml")
+    [bus], [joint] = robot.buses, robot.joints
+    assert isinstance(bus, CanBus)
+    assert (bus.interface, bus.channel, bus.bitrate, bus.port) == ("socketcan", "can0", 1_000_000, "socketcan:can0")
+    assert (joint.counts_per_rev, joint.gear) == (4096.0, 50.0)
+
+
+def test_a_bus_with_a_port_is_a_serial_bus_and_its_joints_need_no_counts() -> None:
+    robot = parse(HEAD, "head.toml")
+    assert isinstance(robot.buses[0], SerialBus)
+    assert (robot.joints[0].counts_per_rev, robot.joints[0].gear) == (None, 1.0)
+
+
+CAN_MISTAKES = [
+    ('channel = "can0"', 'port = "/dev/tty"', "bus.legs: 'port' is a key of a serial bus and 'interface' one of a CAN"),
+    ('channel = "can0"\n', "", "bus.legs: missing required key 'channel'; write channel = \"can0\""),
+    ('interface = "socketcan"\n', "", "bus.legs: missing required key 'interface'; write interface = \"socketcan\""),
+    ('"socketcan"', '"udp_multicast"', "bus.legs.interface: 'udp_multicast' loses frames and hands everyone their own"),
+    ('"socketcan"', '"socketcan:can0"', "bus.legs.interface: Expected `str` matching"),
+    ('"can0"', '"can0"\nbitrate = 2000000', "bus.legs.bitrate: Expected `int` <= 1000000, but it is 2000000"),
+    ("gear = 50", "gear = 0", 'joint."legs.hip".gear: Expected `float` > 0'),
+    ("counts_per_rev = 4096", "counts_per_rev = -1", 'joint."legs.hip".counts_per_rev: Expected `float` > 0'),
+]
+
+
+@pytest.mark.parametrize(("before", "after", "complaint"), CAN_MISTAKES, ids=[m[2][:40] for m in CAN_MISTAKES])
+def test_a_mistake_on_a_can_bus_is_answered_so_too(before: str, after: str, complaint: str) -> None:
+    assert before in LEGS
+    with pytest.raises(ConfigurationError) as error:
+        parse(LEGS.replace(before, after, 1), "legs.toml")
+    assert complaint in str(error.value)
 
 
 MISTAKES = [

@@ -507,7 +507,7 @@ def test_S22_the_ends_of_the_range_belong_to_it(head: Rig) -> None:
 
 
 def test_S22_the_bus_thread_looks_at_the_limits_itself(head: Rig) -> None:
-    from trade_drivers.dynamixel._motion import Move
+    from trade_drivers.joints._motion import Move
 
     pan = head.attach().motor("neck.pan")
     pan.enable()

@@ -4,12 +4,13 @@ from trade_drivers._attach import AttachedRobot, attach
 from trade_drivers._driver import AttachedBus, Driver, drivers
 from trade_drivers._interfaces import JointGroup, JointLimits, Motor, MotorState
 from trade_drivers._load import load
-from trade_drivers.robotfile import Bus, Coupled, Group, Joint, Robot, parse
+from trade_drivers.robotfile import Bus, CanBus, Coupled, Group, Joint, Robot, SerialBus, parse
 
 __all__ = [
     "AttachedBus",
     "AttachedRobot",
     "Bus",
+    "CanBus",
     "Coupled",
     "Driver",
     "Group",
@@ -19,6 +20,7 @@ __all__ = [
     "Motor",
     "MotorState",
     "Robot",
+    "SerialBus",
     "attach",
     "drivers",
     "load",

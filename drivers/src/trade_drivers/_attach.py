@@ -84,7 +84,8 @@ def attach(
         robot: what ``load`` read.
         register: what announces a provider in its groups; ``trade.register`` by default.
         deregister: its opposite; ``trade.deregister`` by default.
-        ports: bus name -> serial device, instead of the file's: for simulated devices.
+        ports: bus name -> serial device, or ``INTERFACE:CHANNEL`` of a CAN bus, instead of the file's: for simulated
+            devices.
         healthy: asked by every bus thread in every cycle; while it says no, devices are told to hold once and the bus
             falls silent, so that their own watchdogs stop them.
 

@@ -21,8 +21,10 @@ class MotorState(Struct, frozen=True, kw_only=True):
     velocity_rad_s: float
     load: float
     """Effort as a fraction of the most the motor can give, -1 to 1; negative in the negative direction of the joint."""
-    temperature_c: float
-    voltage_v: float
+    temperature_c: float | None
+    """None: the device does not tell."""
+    voltage_v: float | None
+    """None: the device does not tell."""
     enabled: bool
     """Torque is on: the joint holds or moves; False: it can be turned by hand."""
     moving: bool

@@ -16,7 +16,7 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib  # pyright: ignore[reportMissingImports]
 
-__all__ = ["Bus", "Coupled", "Gripper", "Group", "Joint", "Robot", "parse"]
+__all__ = ["Bus", "CanBus", "Coupled", "Gripper", "Group", "Joint", "Robot", "SerialBus", "parse"]
 
 _SEGMENTS = re.compile(r"[a-z][a-z0-9_]*(\.[a-z][a-z0-9_]*)*")
 _AT = re.compile(r" - at `\$\.?([^`]*)`$")
@@ -24,30 +24,60 @@ _MISSING = re.compile(r"missing required field `([^`]*)`")
 _UNKNOWN = re.compile(r"contains unknown field `([^`]*)`")
 _CHOICES = {"leave": '"hold" or "relax"'}
 
-_EXAMPLES = {"port": '"/dev/serial/by-id/..." (`ls /dev/serial/by-id` shows those there are)', "driver": '"dynamixel"'}
+_EXAMPLES = {
+    "port": '"/dev/serial/by-id/..." (`ls /dev/serial/by-id` shows those there are); on CAN, interface and channel',
+    "driver": '"dynamixel"',
+    "interface": '"socketcan"',
+    "channel": '"can0"',
+}
+_SERIAL_KEYS = ("port", "baud", "fast_sync")
+_CAN_KEYS = ("interface", "channel", "bitrate")
+_LOSSY = "udp_multicast"
 
 Positive = Annotated[float, Meta(gt=0)]
+Text = Annotated[str, Meta(min_length=1)]
 
 
 class Bus(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """One wire and the thread that owns it."""
+    """One wire and the thread that owns it: what every kind of wire has."""
 
     name: str
     driver: str
     """Entry point of the group ``trade.drivers``: ``dynamixel``."""
-    port: Annotated[str, Meta(min_length=1)]
-    """Serial device; prefer the stable name under /dev/serial/by-id."""
-    baud: Annotated[int, Meta(ge=9600, le=4_500_000)] = 1_000_000
     rate_hz: Annotated[float, Meta(gt=0, le=1000)] = 100.0
     """Cycles of reading and writing per second."""
-    fast_sync: bool = False
-    """Read all devices with one joined answer (needs firmware that knows it)."""
     stale_after_s: Annotated[float, Meta(gt=0, le=2)] = 0.25
     """A measured value older than this is an error, not a number."""
     watchdog_s: Annotated[float, Meta(ge=0.1, le=2)] = 0.3
     """The device's own watchdog: silent this long, it stops by itself."""
     leave: Literal["hold", "relax"] = "hold"
     """What to do with enabled devices when the driver leaves: hold the position, or switch torque off."""
+
+
+class SerialBus(Bus, frozen=True, kw_only=True):
+    """A serial line."""
+
+    port: Text
+    """Serial device; prefer the stable name under /dev/serial/by-id."""
+    baud: Annotated[int, Meta(ge=9600, le=4_500_000)] = 1_000_000
+    fast_sync: bool = False
+    """Read all devices with one joined answer (needs firmware that knows it)."""
+
+
+class CanBus(Bus, frozen=True, kw_only=True):
+    """A CAN bus, named by the words of python-can."""
+
+    interface: Annotated[str, Meta(pattern="^[a-z0-9_]+$")]
+    """``socketcan``, ``socketcand``, ``slcan``, ``virtual`` or another of python-can's, but ``udp_multicast``."""
+    channel: Text
+    """``can0`` for socketcan, ``HOST:PORT/can0`` for socketcand, the serial device for slcan."""
+    bitrate: Annotated[int, Meta(ge=10_000, le=1_000_000)] = 1_000_000
+    """Bits per second. An interface of the operating system is set up by the system, and must agree."""
+
+    @property
+    def port(self) -> str:
+        """Interface and channel as one text, such as ``socketcan:can0``."""
+        return f"{self.interface}:{self.channel}"
 
 
 class Joint(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -60,7 +90,11 @@ class Joint(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Model as printed on the device: ``XL430-W250``."""
     reversed: bool = False
     offset_rad: float = 0.0
-    """Joint angle when the device reads its centre."""
+    """Joint angle when the device reads its centre, or 0 where counts have no centre."""
+    counts_per_rev: Positive | None = None
+    """Counts of the encoder for one turn of its motor, for devices that cannot tell it by their model."""
+    gear: Positive = 1.0
+    """Turns of the motor for one turn of the joint."""
     min_rad: float
     max_rad: float
     max_speed_rad_s: Positive
@@ -99,7 +133,7 @@ class Robot(Struct, frozen=True, kw_only=True):
     """A robot file, read and checked."""
 
     name: str
-    buses: list[Bus]
+    buses: list[SerialBus | CanBus]
     joints: list[Joint]
     groups: list[Group]
     coupled: list[Coupled]
@@ -137,7 +171,7 @@ class Robot(Struct, frozen=True, kw_only=True):
         return {group: list(joints) for group, joints in found.items()}
 
 
-_Record = TypeVar("_Record", Bus, Joint, Gripper, Group)
+_Record = TypeVar("_Record", SerialBus, CanBus, Joint, Gripper, Group)
 
 
 def parse(text: str, where: str) -> Robot:
@@ -157,10 +191,10 @@ def parse(text: str, where: str) -> Robot:
     _only_known(raw, where)
     robot = Robot(
         name=_robot_name(raw.get("robot"), where),
-        buses=_records(raw, "bus", Bus, where),
-        joints=_records(raw, "joint", Joint, where),
-        grippers=_records(raw, "gripper", Gripper, where),
-        groups=_records(raw, "group", Group, where),
+        buses=[_bus(*entry, where) for entry in _tables(raw, "bus", where)],
+        joints=[_record(*entry, Joint, where) for entry in _tables(raw, "joint", where)],
+        grippers=[_record(*entry, Gripper, where) for entry in _tables(raw, "gripper", where)],
+        groups=[_record(*entry, Group, where) for entry in _tables(raw, "group", where)],
         coupled=_coupled(raw.get("coupled", []), where),
         where=where,
     )
@@ -196,26 +230,47 @@ def _check_name(name: str, where: str) -> None:
         raise ConfigurationError(where=where, problem=problem)
 
 
-def _records(raw: Mapping[str, object], section: str, record: type[_Record], where: str) -> list[_Record]:
+def _tables(raw: Mapping[str, object], section: str, where: str) -> list[tuple[str, str, Mapping[str, object]]]:
+    """The tables of a section: its key for messages, its name and its contents."""
     tables = raw.get(section, {})
     if not isinstance(tables, dict):
         raise _wrong(where, section, f"must be tables: [{section}.NAME]")
     if not tables and section == "bus":
         raise _wrong(where, f"[{section}.NAME]", "missing; a robot needs at least one")
-    return [_record(table, section, str(name), record, where) for name, table in tables.items()]  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]
+    return [_table(section, str(name), table, where) for name, table in tables.items()]  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]
 
 
-def _record(table: object, section: str, name: str, record: type[_Record], where: str) -> _Record:
+def _table(section: str, name: str, table: object, where: str) -> tuple[str, str, Mapping[str, object]]:
     key = f'{section}."{name}"' if "." in name else f"{section}.{name}"
     _check_name(name, f"{where}: {key}")
     if not isinstance(table, dict):
         raise _wrong(where, key, f"must be a table: [{key}]")
     if any(isinstance(value, dict) for value in table.values()):  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]
         raise _wrong(where, key, f'a dotted name needs quotes: [{section}."{name}.{next(iter(table))}"]')  # pyright: ignore[reportUnknownArgumentType]
+    return key, name, cast("dict[str, object]", table)
+
+
+def _bus(key: str, name: str, table: Mapping[str, object], where: str) -> SerialBus | CanBus:
+    """A bus of the kind its keys tell."""
+    can = [word for word in _CAN_KEYS if word in table]
+    serial = [word for word in _SERIAL_KEYS if word in table]
+    if can and serial:
+        problem = f"{serial[0]!r} is a key of a serial bus and {can[0]!r} one of a CAN bus; a bus is one of them"
+        raise _wrong(where, key, problem)
+    if not can:
+        return _record(key, name, table, SerialBus, where)
+    bus = _record(key, name, table, CanBus, where)
+    if bus.interface == _LOSSY:
+        problem = f"{_LOSSY!r} loses frames and hands everyone their own, which drives cannot be told from; use another"
+        raise _wrong(where, f"{key}.interface", problem)
+    return bus
+
+
+def _record(key: str, name: str, table: Mapping[str, object], record: type[_Record], where: str) -> _Record:
     try:
         made = msgspec.convert({**table, "name": name}, record)
     except msgspec.ValidationError as bad:
-        raise _explain(bad, table, key, record, where) from None  # pyright: ignore[reportUnknownArgumentType]
+        raise _explain(bad, table, key, record, where) from None
     _check_finite(made, key, where)
     return made
 

@@ -5,12 +5,12 @@ from typing import TYPE_CHECKING, Final, NoReturn, TypeVar
 
 from trade.errors import ConfigurationError
 from trade_drivers.dynamixel import _table as table
-from trade_drivers.dynamixel._axis import CYCLIC, SLOW, Axis, Health
+from trade_drivers.dynamixel._axis import CYCLIC, SLOW, Health, ServoAxis
 from trade_drivers.dynamixel._wire import BadAnswer, NoAnswer, Refused
 
 if TYPE_CHECKING:
     from trade_drivers.dynamixel._sdk import Wire
-    from trade_drivers.robotfile import Bus
+    from trade_drivers.robotfile import SerialBus
 
 __all__ = ["check_bus", "look_over"]
 
@@ -24,7 +24,7 @@ _ALL_ANSWER: Final = 2
 _Result = TypeVar("_Result")
 
 
-def check_bus(bus: "Bus", axes: Sequence[Axis], where: str) -> None:
+def check_bus(bus: "SerialBus", axes: Sequence[ServoAxis], where: str) -> None:
     """What the file alone can tell: models, speeds, and whether the bytes of a cycle fit into it.
 
     Raises:
@@ -56,7 +56,7 @@ def check_bus(bus: "Bus", axes: Sequence[Axis], where: str) -> None:
         raise ConfigurationError(where=f"{where}: bus.{bus.name}.rate_hz", problem=problem)
 
 
-def look_over(wire: "Wire", bus: "Bus", axis: Axis, clock_ns: Callable[[], int], where: str) -> float:
+def look_over(wire: "Wire", bus: "SerialBus", axis: ServoAxis, clock_ns: Callable[[], int], where: str) -> float:
     """Check one joint's device and take its first measurements.
 
     Returns:
@@ -81,7 +81,7 @@ def look_over(wire: "Wire", bus: "Bus", axis: Axis, clock_ns: Callable[[], int],
     return table.RETURN_DELAY.decode(settings) * table.RETURN_DELAY.si_per_count
 
 
-def _ping(wire: "Wire", bus: "Bus", axis: Axis, key: str) -> int:
+def _ping(wire: "Wire", bus: "SerialBus", axis: ServoAxis, key: str) -> int:
     problem = (
         f"no device answers to id {axis.id} on bus {bus.name!r} ({wire.path}, {bus.baud} baud); check its power and "
         "cable, its id (register 7) and its baud rate (register 8)"
@@ -103,7 +103,7 @@ def _ping(wire: "Wire", bus: "Bus", axis: Axis, key: str) -> int:
     return _wrong(key, problem)
 
 
-def _check_model(axis: Axis, number: int, key: str) -> None:
+def _check_model(axis: ServoAxis, number: int, key: str) -> None:
     if number == axis.model.number:
         return
     found = table.BY_MODEL_NUMBER.get(number)
@@ -111,7 +111,7 @@ def _check_model(axis: Axis, number: int, key: str) -> None:
     _wrong(f"{key}.model", f"is {axis.model.name!r}, but id {axis.id} is {name} (model number {number})")
 
 
-def _check_settings(axis: Axis, settings: bytes, key: str) -> None:
+def _check_settings(axis: ServoAxis, settings: bytes, key: str) -> None:
     joint, health = axis.joint, axis.health
     mode, drive = table.OPERATING_MODE.decode(settings), table.DRIVE_MODE.decode(settings)
     if health is not None and health.status_level != _ALL_ANSWER:
@@ -142,7 +142,7 @@ def _check_settings(axis: Axis, settings: bytes, key: str) -> None:
         )
 
 
-def _again(wire: "Wire", axis: Axis, act: Callable[[], _Result]) -> _Result:
+def _again(wire: "Wire", axis: ServoAxis, act: Callable[[], _Result]) -> _Result:
     for _ in range(_ATTEMPTS - 1):
         try:
             return act()

@@ -1,22 +1,18 @@
-"""What services ask of the bus thread: work of several exchanges, done one exchange at a time between the cycles."""
+"""What enabling, relaxing and leaving a servo are made of: one exchange on the wire after the other."""
 
-import threading
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator
 from typing import TYPE_CHECKING, Final, TypeVar
 
-from trade import Permit
-from trade.errors import DeadlineExceeded, DeviceSilent, OutcomeUnknown, TradeError
+from trade.errors import DeadlineExceeded, DeviceSilent, OutcomeUnknown
 from trade_drivers.dynamixel import _table as table
-from trade_drivers.dynamixel._axis import SLOW, Axis, Health
+from trade_drivers.dynamixel._axis import SLOW, Health, ServoAxis
 from trade_drivers.dynamixel._wire import NoAnswer, Refused
+from trade_drivers.joints import Goal, Job, Steps
 
 if TYPE_CHECKING:
-    from trade_drivers.dynamixel._exchange import Exchange
+    from trade_drivers.dynamixel._exchange import ServoExchange
 
-__all__ = ["Command", "Enable", "Halt", "Job", "Leave", "Relax", "Steps", "StopTicket", "enabling"]
-
-Steps = Generator[None, None, None]
-"""Yields after each exchange on the wire, so that stops and cycles come in between."""
+__all__ = ["enabling", "goal_block", "leaving", "read_health", "relaxing"]
 
 _Result = TypeVar("_Result")
 _ATTEMPTS: Final = 3
@@ -26,221 +22,91 @@ _GOAL_BLOCK: Final = (
 )
 
 
-class Job:
-    """Something that is waited for. As it stands it needs no leave: it ends motion."""
-
-    def __init__(self, exchange: "Exchange", axes: Sequence[Axis]) -> None:
-        self.exchange = exchange
-        self.axes = tuple(axes)
-        self._ended = threading.Event()
-        self._error: TradeError | None = None
-        self._steps: Steps | None = None
-
-    @property
-    def ended(self) -> bool:
-        """Its outcome is known."""
-        return self._ended.is_set()
-
-    def gate(self) -> None:
-        """The last look before its bytes go out; what it raises keeps them in."""
-
-    def steps(self) -> Steps:
-        """The work."""
-        raise NotImplementedError
-
-    def step(self) -> bool:
-        """Do one exchange of it; False when nothing is left to do."""
-        if self._steps is None:
-            self._steps = self.steps()
-        try:
-            next(self._steps)
-        except StopIteration:
-            return False
-        except TradeError as problem:
-            self.finish(problem)
-            return False
-        return True
-
-    def done_stepping(self) -> None:
-        """All its exchanges have been made."""
-        self.finish()
-
-    def finish(self, error: TradeError | None = None) -> None:
-        """Let the waiting service have the outcome; only the first counts."""
-        if not self._ended.is_set():
-            self._error = error
-            self._ended.set()
-
-    def wait(self, alive: Callable[[], bool]) -> None:
-        """Block until it has ended.
-
-        Raises:
-            TradeError: what became of it.
-        """
-        while not self._ended.wait(1.0):
-            if not alive():
-                self.finish(self.axes[0].faulty("the thread of its bus has ended"))
-        if self._error is not None:
-            raise self._error
+def goal_block(goal: Goal) -> bytes:
+    """What goes from profile acceleration to goal position."""
+    return b"".join(
+        (
+            table.PROFILE_ACCELERATION.encode(goal.accel),
+            table.PROFILE_VELOCITY.encode(goal.speed),
+            table.GOAL_POSITION.encode(goal.position),
+        )
+    )
 
 
-class Command(Job):
-    """What may set something moving: it carries an expiry, and the permit under which its call was admitted."""
-
-    def __init__(
-        self, exchange: "Exchange", axes: Sequence[Axis], *, service: str, expires_ns: int, permit: Permit
-    ) -> None:
-        super().__init__(exchange, axes)
-        self.service = service
-        self.expires_ns = expires_ns
-        self.permit = permit
-        self._admitted_ns = exchange.clock()
-
-    def gate(self) -> None:
-        """The last look before its bytes go out.
-
-        Raises:
-            DeadlineExceeded: it is late, and late is never.
-            MotionStopped, LockLost, LockedByOther: a stop, or another owner, came after it was admitted.
-        """
-        if self.exchange.clock() >= self.expires_ns:
-            patience_s = (self.expires_ns - self._admitted_ns) / 1e9
-            raise DeadlineExceeded(service=self.service, deadline_s=max(0.0, patience_s))
-        self.permit.gate()
+def relaxing(bus: "ServoExchange", job: Job, axis: ServoAxis) -> Steps:
+    """Torque off, and its watchdog disarmed."""
+    yield from _write(bus, job, axis, table.TORQUE_ENABLE, 0)
+    axis.ready = False
+    yield from _write(bus, job, axis, table.BUS_WATCHDOG, 0)
+    health = yield from read_health(bus, axis)
+    if health.torque:
+        raise axis.faulty("told to relax, but its torque is still on")
 
 
-class StopTicket(Job):
-    """A stop: it has no expiry and needs no permit, and ends when all its joints are at rest."""
-
-    def __init__(self, exchange: "Exchange", axes: Sequence[Axis], reason: str) -> None:
-        super().__init__(exchange, axes)
-        self.reason = reason
-
-
-class Enable(Command):
-    """Torque on, holding where the joints are. A joint that is enabled already is only looked at, not disturbed."""
-
-    def steps(self) -> Steps:
-        for axis in self.axes:
-            if axis.ready:
-                yield from _read_health(self, axis)
-            if not axis.ready:
-                yield from enabling(self, axis)
+def leaving(bus: "ServoExchange", job: Job, axis: ServoAxis, *, relax: bool) -> Steps:
+    """Torque off or left on, and its watchdog disarmed where it may be."""
+    health = yield from read_health(bus, axis)
+    if relax and health.torque:
+        yield from _write(bus, job, axis, table.TORQUE_ENABLE, 0)
+    elif health.watchdog == table.WATCHDOG_EXPIRED or axis.still == 0:
+        return
+    if health.watchdog:
+        yield from _write(bus, job, axis, table.BUS_WATCHDOG, 0)
+    axis.ready = False
 
 
-class Halt(Command):
-    """Whatever moves the joints ends, and they hold; unlike a stop it needs leave and makes nothing void."""
-
-    def steps(self) -> Steps:
-        self.gate()
-        self.exchange.halt(self.axes, f"{self.service} said so")
-        yield
-        for axis in self.axes:
-            _require_answering(self, axis)
-
-
-class Relax(Command):
-    """Torque off."""
-
-    def steps(self) -> Steps:
-        for axis in self.axes:
-            _require_answering(self, axis)
-            self.gate()
-            self.exchange.end_motion(axis, f"{axis.name} was relaxed")
-            yield from _write(self, axis, table.TORQUE_ENABLE, 0)
-            axis.ready = False
-            yield from _write(self, axis, table.BUS_WATCHDOG, 0)
-            health = yield from _read_health(self, axis)
-            if health.torque:
-                raise axis.faulty("told to relax, but its torque is still on")
-
-
-class Leave(Job):
-    """The driver goes, after it has stopped everything: hold or relax, as the robot file says.
-
-    A joint that holds is disarmed once it was seen at rest: silence on the bus is then what is wanted, and an expired
-    watchdog would only lock its goal for whoever comes next. Not seen at rest, or silent: its watchdog stays armed.
-    """
-
-    def __init__(self, exchange: "Exchange", axes: Sequence[Axis], *, relax: bool) -> None:
-        super().__init__(exchange, axes)
-        self._relax = relax
-
-    def steps(self) -> Steps:
-        for axis in self.axes:
-            if axis.silent:
-                continue
-            try:
-                yield from self._leave(axis)
-            except TradeError as problem:
-                self.finish(problem)
-
-    def _leave(self, axis: Axis) -> Steps:
-        health = yield from _read_health(self, axis)
-        if self._relax and health.torque:
-            yield from _write(self, axis, table.TORQUE_ENABLE, 0)
-        elif health.watchdog == table.WATCHDOG_EXPIRED or axis.still == 0:
-            return
-        if health.watchdog:
-            yield from _write(self, axis, table.BUS_WATCHDOG, 0)
-        axis.ready = False
-
-
-def enabling(job: Job, axis: Axis) -> Steps:
+def enabling(bus: "ServoExchange", job: Job, axis: ServoAxis) -> Steps:
     """Torque on at the measured position, with the joint's own profile and its watchdog armed; all of it read back."""
-    _require_answering(job, axis)
-    health = yield from _read_health(job, axis)
+    bus.require_answering(axis)
+    health = yield from read_health(bus, axis)
     if health.error:
         raise axis.faulty()
     if health.watchdog:
-        yield from _write(job, axis, table.BUS_WATCHDOG, 0)
-    position = yield from _read_position(job, axis)
-    block = axis.goal_block(position)
-    yield from _write(job, axis, table.PROFILE_ACCELERATION, block)
-    armed = job.exchange.watchdog_counts
-    yield from _write(job, axis, table.BUS_WATCHDOG, armed)
-    yield from _write(job, axis, table.TORQUE_ENABLE, 1)
+        yield from _write(bus, job, axis, table.BUS_WATCHDOG, 0)
+    position = yield from _read_position(bus, axis)
+    block = goal_block(Goal(position, axis.accel_counts, axis.speed_counts))
+    yield from _write(bus, job, axis, table.PROFILE_ACCELERATION, block)
+    armed = bus.watchdog_counts
+    yield from _write(bus, job, axis, table.BUS_WATCHDOG, armed)
+    yield from _write(bus, job, axis, table.TORQUE_ENABLE, 1)
     axis.ready = False
-    health = yield from _read_health(job, axis)
-    kept = yield from _try(job, axis, lambda: job.exchange.wire.read(axis.id, *_GOAL_BLOCK).data)
+    health = yield from read_health(bus, axis)
+    kept = yield from _try(bus, axis, lambda: bus.wire.read(axis.id, *_GOAL_BLOCK).data)
     if not health.torque or health.watchdog != armed or kept != block:
         raise axis.faulty("it did not keep what enabling it wrote")
     axis.fault, axis.ready = "", True
 
 
-def _require_answering(job: Job, axis: Axis) -> None:
-    if axis.silent:
-        raise axis.deaf(job.exchange.clock())
-
-
-def _write(job: Job, axis: Axis, register: table.Register, value: int | bytes) -> Steps:
+def _write(bus: "ServoExchange", job: Job, axis: ServoAxis, register: table.Register, value: int | bytes) -> Steps:
     data = value if isinstance(value, bytes) else register.encode(value)
-    yield from _try(job, axis, lambda: job.exchange.wire.write(axis.id, register.address, data, job.gate))
+    yield from _try(bus, axis, lambda: bus.wire.write(axis.id, register.address, data, job.gate))
 
 
-def _read_health(job: Job, axis: Axis) -> Generator[None, None, Health]:
+def read_health(bus: "ServoExchange", axis: ServoAxis) -> Generator[None, None, Health]:
+    """How it is, asked now."""
+
     def read() -> Health:
-        asked_ns = job.exchange.clock()
-        return Health.decode(job.exchange.wire.read(axis.id, *SLOW).data, asked_ns)
+        asked_ns = bus.clock()
+        return Health.decode(bus.wire.read(axis.id, *SLOW).data, asked_ns)
 
-    health = yield from _try(job, axis, read)
+    health = yield from _try(bus, axis, read)
     axis.take_health(health)
     return health
 
 
-def _read_position(job: Job, axis: Axis) -> Generator[None, None, int]:
+def _read_position(bus: "ServoExchange", axis: ServoAxis) -> Generator[None, None, int]:
     register = table.PRESENT_POSITION
-    answer = yield from _try(job, axis, lambda: job.exchange.wire.read(axis.id, register.address, register.size))
+    answer = yield from _try(bus, axis, lambda: bus.wire.read(axis.id, register.address, register.size))
     return register.decode(answer.data, register.address)
 
 
-def _try(job: Job, axis: Axis, act: Callable[[], _Result]) -> Generator[None, None, _Result]:
+def _try(bus: "ServoExchange", axis: ServoAxis, act: Callable[[], _Result]) -> Generator[None, None, _Result]:
     """One exchange within the retry budget; a ping before each retry keeps late answers from being taken for new."""
     asked = False
     for _ in range(_ATTEMPTS):
         try:
             if asked:
-                job.exchange.wire.ping(axis.id)
+                bus.wire.ping(axis.id)
                 yield
             result = act()
         except DeadlineExceeded as late:

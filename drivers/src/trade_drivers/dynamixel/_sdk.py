@@ -27,11 +27,10 @@ from trade_drivers.dynamixel._wire import (
     LONGEST_WAIT_S,
     Answer,
     BadAnswer,
-    Gate,
     NoAnswer,
-    PortLost,
     Refused,
 )
+from trade_drivers.joints import Gate, PortLost
 
 __all__ = ["Wire"]
 

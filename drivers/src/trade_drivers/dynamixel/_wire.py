@@ -1,9 +1,8 @@
 """What an answer is and what can go wrong on the wire: all that the rest of this folder knows of the vendor library."""
 
-from collections.abc import Callable
 from typing import Final, NamedTuple
 
-__all__ = ["DRAIN_S", "LONGEST_WAIT_S", "Answer", "BadAnswer", "Gate", "NoAnswer", "PortLost", "Refused", "WireError"]
+__all__ = ["DRAIN_S", "LONGEST_WAIT_S", "Answer", "BadAnswer", "NoAnswer", "Refused", "WireError"]
 
 ANSWER_MARGIN_S: Final = 0.034
 """Patience beyond the time the bytes take: twice the default 16 ms latency of an FTDI adapter, and 2 ms."""
@@ -11,9 +10,6 @@ LONGEST_WAIT_S: Final = 0.048
 """No exchange waits longer than this, so that a stop is never more than 50 ms from the wire."""
 DRAIN_S: Final = 0.030
 """Silence kept after a failed exchange: an answer that is late arrives now and is thrown away, not believed later."""
-
-Gate = Callable[[], None]
-"""Called right before the bytes go out; what it raises keeps them in."""
 
 _NUMBERS: Final = {
     1: "could not carry it out",
@@ -58,7 +54,3 @@ class Refused(WireError):
         super().__init__(_NUMBERS.get(number, f"error number {number}"))
         self.device_id = device_id
         self.number = number
-
-
-class PortLost(WireError):
-    """The port itself is gone: unplugged, or never opened."""

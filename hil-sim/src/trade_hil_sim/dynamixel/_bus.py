@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Final
 import msgspec
 
 from trade_hil_sim import _faults as faults
+from trade_hil_sim._device_line import DeviceLine
 from trade_hil_sim._errors import SimulationError
 from trade_hil_sim._log import ByteLog
-from trade_hil_sim._serial_bus import SerialBus
 from trade_hil_sim._state import BusState
 
 from ._dispatch import Dispatch
@@ -20,7 +20,7 @@ from ._servo import Servo
 from ._table import BAUDS, CENTRE, MODELS, RAD_PER_COUNT
 
 if TYPE_CHECKING:
-    from trade_drivers.robotfile import Bus, Joint
+    from trade_drivers.robotfile import Joint, SerialBus
 
 __all__ = ["DynamixelBus"]
 
@@ -28,7 +28,7 @@ PAUSE_S: Final = 0.1
 """A packet whose next byte has not come after this long is given up."""
 
 
-class DynamixelBus(SerialBus[Servo]):
+class DynamixelBus(DeviceLine[Servo]):
     """Servos on one serial line; a client opens `port` as it would a real adapter.
 
     Args:
@@ -60,7 +60,7 @@ class DynamixelBus(SerialBus[Servo]):
 
     @classmethod
     def from_robot(
-        cls, bus: "Bus", joints: "Sequence[Joint]", port: Path, *, log: ByteLog | None = None, paced: bool = True
+        cls, bus: "SerialBus", joints: "Sequence[Joint]", port: Path, *, log: ByteLog | None = None, paced: bool = True
     ) -> "DynamixelBus":
         """The bus a robot file describes, each joint at its zero (or as near as its limits allow).
 
@@ -131,7 +131,7 @@ class DynamixelBus(SerialBus[Servo]):
             self._answer(answer.data, answer.ids, packet.name, after_s=answer.delay_s, device_id=device_id)
 
 
-def _servo_for(bus: "Bus", joint: "Joint", t: float) -> Servo:
+def _servo_for(bus: "SerialBus", joint: "Joint", t: float) -> Servo:
     model = MODELS.get(joint.model)
     if model is None:
         known = ", ".join(sorted(MODELS))

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Final
 import msgspec
 
 from trade_hil_sim import _faults as faults
+from trade_hil_sim._device_line import DeviceLine
 from trade_hil_sim._errors import SimulationError
 from trade_hil_sim._log import ByteLog, Entry
-from trade_hil_sim._serial_bus import SerialBus
 from trade_hil_sim._state import BusState
 
 from . import _table as table
@@ -28,8 +28,8 @@ from ._protocol import (
 )
 
 if TYPE_CHECKING:
-    from trade_drivers.robotfile import Bus, Joint
     from trade_drivers.robotfile import Gripper as GripperRecord
+    from trade_drivers.robotfile import Joint, SerialBus
 
 __all__ = ["RobotiqBus"]
 
@@ -41,7 +41,7 @@ _WRITING: Final = frozenset({Function.WRITE_ONE, Function.WRITE, Function.READ_W
 _NAMES: Final = ("action_request", "position_request", "speed_and_force")
 
 
-class RobotiqBus(SerialBus[Gripper]):
+class RobotiqBus(DeviceLine[Gripper]):
     """Grippers on one serial line; a client opens `port` as it would a real adapter.
 
     Args:
@@ -71,7 +71,7 @@ class RobotiqBus(SerialBus[Gripper]):
     @classmethod
     def from_robot(
         cls,
-        bus: "Bus",
+        bus: "SerialBus",
         devices: "Sequence[Joint | GripperRecord]",
         port: Path,
         *,

@@ -1,29 +1,25 @@
-"""Motor and JointGroup on a Dynamixel bus: they check, hand over to the bus thread, wait, and never touch the port."""
+"""Motor and JointGroup on a bus: they check, hand over to the bus thread, wait, and never touch the port."""
 
-import time
 from collections.abc import Sequence
 from math import isfinite
 from typing import Final
 
 from trade import Resource, current_call, permit
 from trade.errors import DeviceError, DeviceSilent, InvalidArgument, LimitExceeded
+from trade_drivers._driver import AttachedBus
 from trade_drivers._interfaces import LONGEST_VALID_S, JointGroup, JointLimits, Motor, MotorState
-from trade_drivers.dynamixel import _table as table
-from trade_drivers.dynamixel._axis import Axis, Health, Sample
-from trade_drivers.dynamixel._bus import BusThread
-from trade_drivers.dynamixel._jobs import Command, Enable, Halt, Relax
-from trade_drivers.dynamixel._motion import Move
-from trade_drivers.dynamixel._setpoint import SetPoint
+from trade_drivers.joints._axis import Axis
+from trade_drivers.joints._bus import BusThread
+from trade_drivers.joints._jobs import Command, Enable, Halt, Relax
+from trade_drivers.joints._motion import Move
+from trade_drivers.joints._setpoint import SetPoint
 
-__all__ = ["DynamixelGroup", "DynamixelMotor"]
+__all__ = ["AttachedJoints", "BusGroup", "BusMotor"]
 
 _DEFAULT_EXPIRY_NS: Final = 1_000_000_000
 """How long a plain Python call may wait for its turn on the bus."""
 _ANSWER_NS: Final = 100_000_000
 """For one exchange (48 ms at most), the hold, and the way back to the caller."""
-_BEYOND_COUNTS: Final = 4
-"""Farther than this outside of its range, a joint is not told to go on outwards."""
-_HEALTH_STALE_NS: Final = 2_000_000_000
 
 
 class _Joints:
@@ -120,18 +116,13 @@ class _Joints:
         return [self._state(axis) for axis in self._axes]
 
     def _state(self, axis: Axis) -> MotorState:
-        now_ns = self._exchange.clock()
-        health = axis.health
         try:
-            sample = axis.fresh(now_ns, self._exchange.stale_after_ns)
-            if health is None or now_ns - health.at_ns > _HEALTH_STALE_NS:
-                raise axis.deaf(now_ns)
+            return axis.state(self._exchange.clock(), self._exchange.stale_after_ns)
         except DeviceSilent:
             reason = self._exchange.refusing(axis) if self._exchange.refusing is not None else None
             if isinstance(reason, DeviceError):
                 raise reason from None
             raise
-        return _motor_state(axis, sample, health, now_ns)
 
     def _limits(self) -> list[JointLimits]:
         return [
@@ -146,8 +137,8 @@ class _Joints:
         ]
 
 
-class DynamixelMotor(_Joints, Motor):
-    """One servo as a motor."""
+class BusMotor(_Joints, Motor):
+    """One joint as a motor."""
 
     def state(self) -> MotorState:
         return self._states()[0]
@@ -168,8 +159,8 @@ class DynamixelMotor(_Joints, Motor):
         self._set([_end_counts(axis, velocity)], [_speed_counts(axis, abs(velocity))], service, valid_s)
 
 
-class DynamixelGroup(_Joints, JointGroup):
-    """Servos of one bus as a group."""
+class BusGroup(_Joints, JointGroup):
+    """Joints of one bus as a group."""
 
     def joints(self) -> list[str]:
         return [axis.name for axis in self._axes]
@@ -187,6 +178,24 @@ class DynamixelGroup(_Joints, JointGroup):
         service = f"{self._name}.servo"
         goals = self._goals(positions_rad, service, "positions_rad")
         self._set(goals, [axis.speed_counts for axis in self._axes], service, _valid(valid_s, service))
+
+
+class AttachedJoints(AttachedBus):
+    """A bus with its joints, and the thread that owns it."""
+
+    def __init__(self, thread: BusThread) -> None:
+        self._thread = thread
+        self._axes = {axis.joint.name: axis for axis in thread.exchange.axes}
+
+    def motor(self, joint: str) -> Motor:
+        axis = self._axes[joint]
+        return BusMotor(axis.name, self._thread, [axis])
+
+    def group(self, name: str, joints: Sequence[str]) -> JointGroup:
+        return BusGroup(name, self._thread, [self._axes[joint] for joint in joints])
+
+    def close(self) -> None:
+        self._thread.close()
 
 
 def _time_to_answer_ns(left_ns: int) -> int:
@@ -211,11 +220,12 @@ def _valid(valid_s: float, service: str) -> float:
 
 
 def _end_counts(axis: Axis, velocity_rad_s: float) -> int:
-    """Where a motion in this direction ends at the latest: the servo brakes by itself before it gets there."""
+    """Where a motion in this direction ends at the latest: the device brakes by itself before it gets there."""
     joint, sample = axis.joint, axis.sample
+    # farther outside of its range than its grain, a joint is not told to go on outwards
     end = joint.max_rad if velocity_rad_s > 0 else joint.min_rad
     angle_rad = end if sample is None else axis.scale.angle_rad(sample.position)
-    if (angle_rad - end) * velocity_rad_s > abs(velocity_rad_s) * _BEYOND_COUNTS * table.RAD_PER_COUNT:
+    if (angle_rad - end) * velocity_rad_s > abs(velocity_rad_s) * axis.grain.arrived * axis.grain.rad:
         raise LimitExceeded(what=axis.name, value=angle_rad, lower=joint.min_rad, upper=joint.max_rad, unit="rad")
     return round(axis.scale.counts(end))
 
@@ -230,24 +240,7 @@ def _goal_counts(axis: Axis, position_rad: float) -> int:
 def _speed_counts(axis: Axis, speed_rad_s: float | None) -> int:
     if speed_rad_s is None:
         return axis.speed_counts
-    slowest, fastest = table.RAD_S_PER_COUNT, axis.joint.max_speed_rad_s
+    slowest, fastest = axis.grain.rad_s, axis.joint.max_speed_rad_s
     if not slowest <= speed_rad_s <= fastest:
         raise LimitExceeded(what=f"{axis.name} speed", value=speed_rad_s, lower=slowest, upper=fastest, unit="rad/s")
-    return max(1, int(speed_rad_s / table.RAD_S_PER_COUNT))
-
-
-def _motor_state(axis: Axis, sample: Sample, health: Health, now_ns: int) -> MotorState:
-    measured_at = time.monotonic() - (now_ns - sample.at_ns) / 1e9
-    return MotorState(
-        name=axis.name,
-        position_rad=axis.scale.angle_rad(sample.position),
-        velocity_rad_s=axis.scale.speed_rad_s(sample.velocity),
-        load=axis.scale.load(sample.effort, axis.model.full_effort_counts),
-        temperature_c=health.temperature * table.TEMPERATURE.si_per_count,
-        voltage_v=health.voltage * table.INPUT_VOLTAGE.si_per_count,
-        enabled=health.torque,
-        moving=axis.motion is not None or axis.still == 0,
-        fault=axis.fault,
-        measured_at=measured_at,
-        age_s=(now_ns - sample.at_ns) / 1e9,
-    )
+    return max(1, int(speed_rad_s / axis.grain.rad_s))

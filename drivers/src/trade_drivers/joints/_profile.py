@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from math import sqrt
 from typing import NamedTuple
 
-from trade_drivers.dynamixel._table import RAD_PER_COUNT, RAD_S2_PER_COUNT, RAD_S_PER_COUNT
+from trade_drivers.joints._axis import Grain
 
 __all__ = ["Leg", "Profile", "together"]
 
@@ -15,6 +15,7 @@ class Leg(NamedTuple):
     distance_counts: int
     speed_counts: int
     accel_counts: int
+    grain: Grain
 
 
 class Profile(NamedTuple):
@@ -30,26 +31,26 @@ def together(legs: Sequence[Leg]) -> list[Profile]:
 
     Each is the leg's own fastest trapezoid stretched in time. 0 is never used: a device takes it for "no limit".
     """
-    duration_s = max(_duration_s(*leg) for leg in legs)
+    duration_s = max(_duration_s(leg, leg.speed_counts, leg.accel_counts) for leg in legs)
     return [_stretched(leg, duration_s) for leg in legs]
 
 
-def _duration_s(distance_counts: int, speed_counts: float, accel_counts: float) -> float:
-    distance, speed = abs(distance_counts) * RAD_PER_COUNT, speed_counts * RAD_S_PER_COUNT
-    accel = accel_counts * RAD_S2_PER_COUNT
+def _duration_s(leg: Leg, speed_counts: int, accel_counts: int) -> float:
+    distance, speed = abs(leg.distance_counts) * leg.grain.rad, speed_counts * leg.grain.rad_s
+    accel = accel_counts * leg.grain.rad_s2
     if distance < speed * speed / accel:
         return 2 * sqrt(distance / accel)
     return distance / speed + speed / accel
 
 
 def _stretched(leg: Leg, duration_s: float) -> Profile:
-    fastest_s = _duration_s(*leg)
+    fastest_s = _duration_s(leg, leg.speed_counts, leg.accel_counts)
     ratio = fastest_s / duration_s if duration_s > 0 else 1.0
     best: Profile | None = None
     ideal = leg.speed_counts * ratio
     for speed in {max(1, int(ideal)), min(leg.speed_counts, int(ideal) + 1)}:
         accel = _accel_for(leg, speed, duration_s, leg.accel_counts * ratio * ratio)
-        profile = Profile(accel, speed, _duration_s(leg.distance_counts, speed, accel))
+        profile = Profile(accel, speed, _duration_s(leg, speed, accel))
         if best is None or abs(profile.duration_s - duration_s) < abs(best.duration_s - duration_s):
             best = profile
     assert best is not None  # noqa: S101 - the set above has one or two members
@@ -58,9 +59,9 @@ def _stretched(leg: Leg, duration_s: float) -> Profile:
 
 def _accel_for(leg: Leg, speed: int, duration_s: float, ideal: float) -> int:
     """The acceleration that makes up for the rounding of the speed, within the limit."""
-    cruise_s = abs(leg.distance_counts) * RAD_PER_COUNT / (speed * RAD_S_PER_COUNT)
+    cruise_s = abs(leg.distance_counts) * leg.grain.rad / (speed * leg.grain.rad_s)
     if 0 < cruise_s < duration_s:
-        exact = speed * RAD_S_PER_COUNT / (duration_s - cruise_s) / RAD_S2_PER_COUNT
+        exact = speed * leg.grain.rad_s / (duration_s - cruise_s) / leg.grain.rad_s2
         # a trapezoid only while it reaches its speed; else the triangle's own acceleration is the right one
         ideal = exact if cruise_s >= duration_s / 2 else ideal
     return max(1, min(leg.accel_counts, round(ideal)))

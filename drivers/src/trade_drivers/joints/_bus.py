@@ -5,29 +5,43 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from typing import TYPE_CHECKING, Final
+from functools import partial
+from typing import TYPE_CHECKING, Final, Protocol
 
 from trade.errors import BusGone, TradeError
-from trade_drivers.dynamixel._axis import Axis
-from trade_drivers.dynamixel._exchange import Exchange
-from trade_drivers.dynamixel._jobs import Leave
-from trade_drivers.dynamixel._wire import PortLost
+from trade_drivers.joints._axis import Axis
+from trade_drivers.joints._exchange import Exchange, PortLost
+from trade_drivers.joints._jobs import Leave
 
 if TYPE_CHECKING:
-    from trade_drivers.dynamixel._sdk import Wire
     from trade_drivers.robotfile import Bus
 
-__all__ = ["BusThread"]
+__all__ = ["BusThread", "Port"]
 
 _log = logging.getLogger(__name__)
 _REOPEN_FIRST_S: Final = 0.1
 _REOPEN_MOST_S: Final = 1.0
 
 
+class Port(Protocol):
+    """What the wire is reached through."""
+
+    path: str
+    """For messages."""
+
+    def open(self) -> None:
+        """Begin to use it; raises ``PortLost`` while it is not there."""
+        ...
+
+    def close(self) -> None:
+        """Let go of it; more than once is fine."""
+        ...
+
+
 class BusThread:
     """One owner thread of one bus. Services hand it work and read what it measured; nobody else touches the port."""
 
-    def __init__(self, exchange: Exchange, wire: "Wire", bus: "Bus", healthy: Callable[[], bool], name: str) -> None:
+    def __init__(self, exchange: Exchange, wire: Port, bus: "Bus", healthy: Callable[[], bool], name: str) -> None:
         self.exchange = exchange
         self._wire = wire
         self._bus = bus
@@ -93,12 +107,13 @@ class BusThread:
         """Wait for the next cycle; stops do not wait."""
         exchange = self.exchange
         while (left_s := next_at - time.monotonic()) > 0:
-            if exchange.wake.wait(left_s):
+            if self._lost_at:
+                exchange.wake.wait(left_s)
                 exchange.wake.clear()
-                if self._leaving:
-                    break
-                if not self._lost_at:
-                    self._guarded(exchange.serve_stops)
+            else:
+                self._guarded(partial(exchange.idle, left_s))
+            if self._leaving:
+                break
         return max(next_at, time.monotonic())
 
     def _beat(self) -> None:

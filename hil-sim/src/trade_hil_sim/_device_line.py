@@ -13,7 +13,7 @@ from ._line import SerialLine
 from ._log import ByteLog
 from ._state import BusState
 
-__all__ = ["SerialBus"]
+__all__ = ["DeviceLine"]
 
 
 class Device(Protocol):
@@ -34,10 +34,10 @@ class Device(Protocol):
 
 
 _Device = TypeVar("_Device", bound=Device)
-_Bus = TypeVar("_Bus", bound="SerialBus[Any]")
+_Bus = TypeVar("_Bus", bound="DeviceLine[Any]")
 
 
-class SerialBus(ABC, Generic[_Device]):
+class DeviceLine(ABC, Generic[_Device]):
     """Devices on one serial line; a client opens `port` as it would a real adapter.
 
     Args:

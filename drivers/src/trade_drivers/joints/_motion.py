@@ -7,20 +7,15 @@ from msgspec import Struct
 
 from trade import Permit
 from trade.errors import MotionStopped, TradeError
-from trade_drivers.dynamixel import _table as table
-from trade_drivers.dynamixel._axis import Axis
-from trade_drivers.dynamixel._jobs import Command, Steps, enabling
-from trade_drivers.dynamixel._profile import Leg, together
+from trade_drivers.joints._axis import Axis, Goal
+from trade_drivers.joints._jobs import Command, Steps
+from trade_drivers.joints._profile import Leg, together
 
 if TYPE_CHECKING:
-    from trade_drivers.dynamixel._exchange import Exchange
+    from trade_drivers.joints._exchange import Exchange
 
 __all__ = ["Motion", "Move"]
 
-_ARRIVED_COUNTS: Final = 4
-"""Closer than this (0.35 degrees) and at rest: arrived."""
-_NEAR_COUNTS: Final = 20
-"""Closer than this (1.8 degrees) and no longer coming closer: arrived too, as far as the position loop goes."""
 _SETTLING_S: Final = 0.15
 _STUCK_S: Final = 0.5
 _MOST_PER_CYCLE_S: Final = 0.1
@@ -45,7 +40,8 @@ class Motion(Command):
             axis.check_usable(exchange.clock(), exchange.stale_after_ns)
         for axis in self.axes:
             if not axis.ready:
-                yield from enabling(self, axis)
+                yield from exchange.enabling(self, axis)
+        yield from exchange.making_way(self.axes)
         self.launch()
 
     def launch(self) -> None:
@@ -96,15 +92,15 @@ class Move(Motion):
         samples = [axis.check_usable(now_ns, exchange.stale_after_ns) for axis in self.axes]
         distances = [abs(self._goals[axis] - sample.position) for axis, sample in zip(self.axes, samples, strict=True)]
         legs = [
-            Leg(distance, speed, axis.accel_counts)
+            Leg(distance, speed, axis.accel_counts, axis.grain)
             for axis, distance, speed in zip(self.axes, distances, self._speeds, strict=True)
         ]
         profiles = together(legs)
-        data: dict[int, bytes] = {}
+        goals: dict[Axis, Goal] = {}
         for axis, profile in zip(self.axes, profiles, strict=True):
             axis.check_goal(self._goals[axis])
-            data[axis.id] = axis.goal_block(self._goals[axis], profile.accel_counts, profile.speed_counts)
-        exchange.wire.sync_write(table.PROFILE_ACCELERATION.address, data, self.gate)
+            goals[axis] = Goal(self._goals[axis], profile.accel_counts, profile.speed_counts)
+        exchange.write_goals(goals, self.gate)
         exchange.take_over(self)
         self._progress = {
             axis: _Progress(self._goals[axis], distance) for axis, distance in zip(self.axes, distances, strict=True)
@@ -145,14 +141,14 @@ class Move(Motion):
             progress.waiting_s += elapsed_s
         if axis.still < 2:
             return False
-        return distance <= _ARRIVED_COUNTS or (distance <= _NEAR_COUNTS and progress.waiting_s > _SETTLING_S)
+        return distance <= axis.grain.arrived or (distance <= axis.grain.near and progress.waiting_s > _SETTLING_S)
 
     def _stuck(self, now_ns: int) -> TradeError | None:
         late = (now_ns - self._began_ns) / 1e9 > self._patience_s
         for axis, progress in self._progress.items():
-            blocked = progress.closest > _NEAR_COUNTS and progress.waiting_s > _STUCK_S
+            blocked = progress.closest > axis.grain.near and progress.waiting_s > _STUCK_S
             if late or blocked:
-                short_rad = progress.closest * table.RAD_PER_COUNT
+                short_rad = progress.closest * axis.grain.rad
                 fault = f"it makes no progress, {short_rad:.3g} rad short of its goal; is it blocked?"
                 if blocked:  # it stands: nothing moves it until somebody has looked
                     axis.fault, axis.ready = fault, False

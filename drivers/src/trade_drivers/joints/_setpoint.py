@@ -5,12 +5,11 @@ from typing import TYPE_CHECKING
 
 from trade import Permit
 from trade.errors import TradeError
-from trade_drivers.dynamixel import _table as table
-from trade_drivers.dynamixel._axis import Axis
-from trade_drivers.dynamixel._motion import Motion
+from trade_drivers.joints._axis import Axis, Goal
+from trade_drivers.joints._motion import Motion
 
 if TYPE_CHECKING:
-    from trade_drivers.dynamixel._exchange import Exchange
+    from trade_drivers.joints._exchange import Exchange
 
 __all__ = ["SetPoint"]
 
@@ -42,11 +41,11 @@ class SetPoint(Motion):
         return self._goals[axis]
 
     def launch(self) -> None:
-        data: dict[int, bytes] = {}
+        goals: dict[Axis, Goal] = {}
         for axis in self.axes:
             axis.check_goal(self._goals[axis])
-            data[axis.id] = axis.goal_block(self._goals[axis], speed=self._speeds[axis])
-        self.exchange.wire.sync_write(table.PROFILE_ACCELERATION.address, data, self.gate)
+            goals[axis] = Goal(self._goals[axis], axis.accel_counts, self._speeds[axis])
+        self.exchange.write_goals(goals, self.gate)
         self.exchange.take_over(self)
         self.expires_ns = self._until_ns  # on its way, it lasts as long as it was said to
         self.finish()

@@ -1,0 +1,33 @@
+"""How full a bus is: bits of frames against bits per second. Pure, but for the clock it is given."""
+
+from typing import Final
+
+__all__ = ["LoadMeter", "frame_bits"]
+
+_WINDOW_NS: Final = 1_000_000_000
+
+
+def frame_bits(size: int) -> int:
+    """The most bits a standard data frame of that many bytes takes on the wire, the pause behind it included.
+
+    Source: ISO 11898-1; 47 bits and the data, and one stuffed bit for every four of the 34 + 8 n that can be stuffed.
+    """
+    return 47 + 8 * size + (33 + 8 * size) // 4
+
+
+class LoadMeter:
+    """The load of the last whole second, as a fraction of the bit rate."""
+
+    def __init__(self, bitrate: int, now_ns: int) -> None:
+        self._bitrate = bitrate
+        self._since_ns = now_ns
+        self._bits = 0
+        self.load = 0.0
+
+    def add(self, size: int, now_ns: int) -> None:
+        """A frame of that many bytes went over the bus."""
+        self._bits += frame_bits(size)
+        elapsed_ns = now_ns - self._since_ns
+        if elapsed_ns >= _WINDOW_NS:
+            self.load = self._bits * 1e9 / elapsed_ns / self._bitrate
+            self._since_ns, self._bits = now_ns, 0

@@ -1,0 +1,176 @@
+"""One end of a CAN bus, through python-can: frames out and in, and everything that can go wrong as ``PortLost``."""
+
+import logging
+import socket
+import time
+from contextlib import suppress
+from typing import Any, Final, NamedTuple
+
+import can
+
+from trade.errors import ConfigurationError
+from trade_drivers.can._errors import ErrorState, error_state
+from trade_drivers.can._load import LoadMeter
+from trade_drivers.joints import PortLost
+
+__all__ = ["CanPort", "Frame", "split_port"]
+
+_log = logging.getLogger(__name__)
+_HELLO_S: Final = 1.0
+_SOCKETCAND_PORT: Final = 29536
+_HELLO: Final = b"< hi >"
+_TROUBLE: Final = (can.CanError, OSError, ValueError, IndexError)
+"""What python-can's interfaces raise: not only its own errors."""
+_FULL: Final = 0.9
+
+
+class Frame(NamedTuple):
+    """What was received."""
+
+    id: int
+    data: bytes
+
+
+def split_port(port: str, where: str) -> tuple[str, str]:
+    """Interface and channel of a text such as ``socketcan:can0``.
+
+    Raises:
+        ConfigurationError: it is no such text.
+    """
+    interface, colon, channel = port.partition(":")
+    if not (interface and colon and channel):
+        problem = f"{port!r} is no CAN bus; write INTERFACE:CHANNEL, such as socketcan:can0"
+        raise ConfigurationError(where=where, problem=problem)
+    return interface, channel
+
+
+class CanPort:
+    """A CAN bus as one thread uses it."""
+
+    def __init__(self, path: str, bitrate: int, where: str = "bus") -> None:
+        self.path = path
+        self.state = ErrorState.ACTIVE
+        self.errors = 0
+        """Error frames received since it was opened."""
+        self._where = where
+        self._interface, self._channel = split_port(path, where)
+        self._bitrate = bitrate
+        self._bus: can.BusABC | None = None
+        self.meter = LoadMeter(bitrate, time.monotonic_ns())
+        self._told_full = False
+
+    def open(self) -> None:
+        """Begin to use it.
+
+        Raises:
+            PortLost: it is not there, at present.
+            ConfigurationError: python-can knows no such interface, or it needs another package.
+        """
+        self.close()
+        options = self._options()
+        try:
+            self._bus = can.Bus(interface=self._interface, **options)
+        except (can.CanInterfaceNotImplementedError, ImportError) as unknown:
+            raise ConfigurationError(where=f"{self._where}.interface", problem=f"{self.path}: {unknown}") from None
+        except _TROUBLE as bad:
+            raise PortLost(str(bad)) from None
+        self.state, self.errors = ErrorState.ACTIVE, 0
+        self.meter = LoadMeter(self._bitrate, time.monotonic_ns())
+
+    def _options(self) -> dict[str, Any]:
+        match self._interface:
+            case "socketcand":
+                host, port, channel = self._server()
+                _greet(host, port)
+                # without tcp_tune several small frames in a row wait 40 ms for an acknowledgement
+                return {"host": host, "port": port, "channel": channel, "tcp_tune": True}
+            case "slcan":
+                return {"channel": self._channel, "bitrate": self._bitrate, "sleep_after_open": 0}
+            case "socketcan" | "virtual":  # the system sets the one's bit rate, the other has none
+                return {"channel": self._channel}
+            case _:
+                return {"channel": self._channel, "bitrate": self._bitrate}
+
+    def _server(self) -> tuple[str, int, str]:
+        server, slash, channel = self._channel.partition("/")
+        host, _, port = server.partition(":")
+        if not (host and slash and channel) or (port and not port.isdecimal()):
+            problem = f"{self._channel!r}: write HOST:PORT/CHANNEL, such as 127.0.0.1:29536/can0"
+            raise ConfigurationError(where=f"{self._where}.channel", problem=problem)
+        return host, int(port or _SOCKETCAND_PORT), channel
+
+    def close(self) -> None:
+        """Let go of it; more than once is fine."""
+        bus, self._bus = self._bus, None
+        if bus is not None:
+            with suppress(*_TROUBLE):
+                bus.shutdown()
+
+    def send(self, frame_id: int, data: bytes) -> None:
+        """One frame out; never waits.
+
+        Raises:
+            PortLost: it could not be sent.
+        """
+        message = can.Message(arbitration_id=frame_id, data=data, is_extended_id=False)
+        try:
+            self._open_bus().send(message, timeout=0)
+        except _TROUBLE as bad:
+            raise PortLost(str(bad)) from None
+        self._count(len(data))
+
+    def receive(self, timeout_s: float) -> Frame | None:
+        """One data frame, or None when none has come in that time (or an error frame has).
+
+        Raises:
+            PortLost: the bus is gone, or this end has switched itself off it.
+        """
+        try:
+            message = self._open_bus().recv(timeout_s)
+        except _TROUBLE as bad:
+            raise PortLost(str(bad)) from None
+        if message is None:
+            return None
+        if message.is_error_frame:
+            self._take_error(message.arbitration_id, bytes(message.data))
+            return None
+        self._count(len(message.data))
+        if message.is_extended_id or message.is_remote_frame:
+            return None
+        return Frame(message.arbitration_id, bytes(message.data))
+
+    def _open_bus(self) -> can.BusABC:
+        if self._bus is None:
+            raise PortLost("it is not open")
+        return self._bus
+
+    def _count(self, size: int) -> None:
+        self.meter.add(size, time.monotonic_ns())
+        full = self.meter.load > _FULL
+        if full and not self._told_full:
+            _log.warning(
+                "%s: the bus is %.0f %% full; lower rate_hz or raise the bit rate", self.path, self.meter.load * 100
+            )
+        self._told_full = full
+
+    def _take_error(self, frame_id: int, data: bytes) -> None:
+        self.errors += 1
+        state = error_state(frame_id, data)
+        if state is None or state == self.state:
+            return
+        _log.log(
+            logging.INFO if state < self.state else logging.WARNING, "%s: the bus is now %s", self.path, state.name
+        )
+        self.state = state
+        if state is ErrorState.BUS_OFF:
+            raise PortLost("bus-off: too many errors on the bus; check bit rate, termination and cable")
+
+
+def _greet(host: str, port: int) -> None:
+    """Find out with a deadline whether a server answers: python-can's own client has none."""
+    try:
+        with socket.create_connection((host, port), _HELLO_S) as probe:
+            if not probe.recv(len(_HELLO)).startswith(b"<"):
+                raise PortLost(f"{host}:{port} is no socketcand")
+    except OSError as bad:
+        raise PortLost(f"{host}:{port}: {bad}") from None

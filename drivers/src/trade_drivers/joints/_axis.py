@@ -1,0 +1,243 @@
+"""One joint as its bus thread knows it: what was measured last, how it is, and how counts become radians."""
+
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from math import ceil, floor
+from typing import TYPE_CHECKING, Final
+
+from msgspec import Struct
+
+from trade import Resource
+from trade.errors import DeviceFault, DeviceSilent, LimitExceeded
+from trade_drivers._interfaces import MotorState
+from trade_drivers.robotfile import Joint
+
+if TYPE_CHECKING:
+    from trade_drivers.joints._motion import Motion
+
+__all__ = ["Axis", "Goal", "Grain", "Sample", "Scale"]
+
+_AT_REST: Final = 2
+
+
+class Grain(Struct, frozen=True):
+    """What one count of a device means, and how much of it is noise."""
+
+    rad: float
+    """Of a position."""
+    rad_s: float
+    """Of a velocity."""
+    rad_s2: float
+    """Of an acceleration."""
+    centre: float
+    """The position that is the joint's offset."""
+    still_velocity: int
+    """Measured slower than this, or as slow, it may be at rest."""
+    still_counts: int
+    """So it may if its position has not changed by more."""
+    arrived: int
+    """Closer than this to its goal and at rest: arrived."""
+    near: int
+    """Closer than this and no longer coming closer: arrived too, as far as the position loop goes."""
+
+
+class Sample(Struct, frozen=True, gc=False):
+    """One cyclic measurement, in counts."""
+
+    position: int
+    velocity: int
+    effort: int
+    at_ns: int
+
+
+class Goal(Struct, frozen=True, gc=False):
+    """Where to, and how fast at most, in counts."""
+
+    position: int
+    accel: int
+    speed: int
+
+
+class Scale:
+    """Counts of the device to radians of the joint and back."""
+
+    def __init__(self, joint: Joint, grain: Grain) -> None:
+        self._sign = -1 if joint.reversed else 1
+        self._offset_rad = joint.offset_rad
+        self._grain = grain
+
+    def counts(self, angle_rad: float) -> float:
+        """Where an angle lies, in counts; not rounded."""
+        return self._grain.centre + (angle_rad - self._offset_rad) * self._sign / self._grain.rad
+
+    def angle_rad(self, counts: int) -> float:
+        """The joint angle of a position."""
+        return self._offset_rad + (counts - self._grain.centre) * self._sign * self._grain.rad
+
+    def speed_rad_s(self, counts: int) -> float:
+        """The joint's speed, with its sign."""
+        return counts * self._sign * self._grain.rad_s
+
+    def load(self, counts: int, full: int) -> float:
+        """Effort as a fraction of full, with the joint's sign, at most 1."""
+        return max(-1.0, min(1.0, counts * self._sign / full))
+
+
+class Axis(ABC):
+    """The state of one joint. The bus thread writes it; other threads read whole values."""
+
+    def __init__(self, name: str, bus: str, joint: Joint, grain: Grain, coupled: Sequence[str] = ()) -> None:
+        self.name = name
+        self.resource = Resource(name, coupled=coupled)
+        """What locks and stops attach to."""
+        self.bus = bus
+        """The port, for messages."""
+        self.joint = joint
+        self.id = joint.id
+        self.grain = grain
+        self.scale = Scale(joint, grain)
+        ends = sorted((self.scale.counts(joint.min_rad), self.scale.counts(joint.max_rad)))
+        self.low, self.high = floor(ends[0]), ceil(ends[1])
+        self.speed_counts = max(1, floor(joint.max_speed_rad_s / grain.rad_s))
+        self.accel_counts = max(1, floor(joint.max_accel_rad_s2 / grain.rad_s2))
+
+        self.sample: Sample | None = None
+        self.fault = ""
+        self.remedy = ""
+        """What helps against a fault the device itself has latched."""
+        self.ready = False
+        """Enabled by this driver, which has checked and armed it since."""
+        self.motion: Motion | None = None
+        self.halting_since_ns = 0
+        """When it was told to hold; 0 once it was seen at rest."""
+        self.held_ns = 0
+        """When it was last told to."""
+        self.still = 0
+        """Measurements in a row in which it did not move."""
+
+        self.misses = 0
+        self.doubted = False
+        """It missed an exchange and has not been heard properly since."""
+        self.silent = False
+        """It used up its retries: it is left out and asked now and then whether it is back."""
+        self.probe_at_ns = 0
+        self.silent_since_ns = 0
+
+    def note(self, sample: Sample) -> None:
+        """Keep a cyclic measurement."""
+        before, self.sample = self.sample, sample
+        resting = abs(sample.velocity) <= self.grain.still_velocity and (
+            before is not None and abs(sample.position - before.position) <= self.grain.still_counts
+        )
+        self.still = self.still + 1 if resting else 0
+        self.misses = 0
+
+    @property
+    @abstractmethod
+    def may_hold_torque(self) -> bool:
+        """Torque is on, or nobody knows."""
+
+    @abstractmethod
+    def state(self, now_ns: int, stale_after_ns: int) -> MotorState:
+        """What was last measured.
+
+        Raises:
+            DeviceSilent: it is too old.
+        """
+
+    def tell_moving(self) -> None:
+        """Let the resource know whether it moves: as last measured or commanded, turned by hand does not count."""
+        under_way = self.motion is not None or self.halting_since_ns > 0
+        if under_way or not (self.silent or self.doubted):
+            self.resource.moving = under_way or (self.still < _AT_REST and self.may_hold_torque)
+
+    @property
+    def moved_since_held(self) -> bool:
+        """Whether it was measured, since it was last told to hold, and found moving."""
+        return not self.silent and not self.still and self.sample is not None and self.sample.at_ns > self.held_ns
+
+    def age_ns(self, now_ns: int) -> int:
+        """Age of the newest measurement, or the time it has been silent if there is none."""
+        return now_ns - (self.sample.at_ns if self.sample else self.silent_since_ns)
+
+    def hold_counts(self, now_ns: int) -> int | None:
+        """Where to hold: where it was measured, or, if that is old, where it must have got to since on its way."""
+        sample = self.sample
+        if sample is None:
+            return None
+        age_s = (now_ns - sample.at_ns) / 1e9
+        if self.motion is None or age_s < 0.05:
+            return sample.position
+        goal = self.motion.goal_of(self)
+        travelled = sample.velocity * self.grain.rad_s / self.grain.rad * age_s
+        low, high = sorted((sample.position, goal))
+        return round(max(low, min(high, sample.position + travelled)))
+
+    def check_goal(self, counts: int) -> None:
+        """The last look before the wire.
+
+        Raises:
+            LimitExceeded: outside the joint's range.
+        """
+        if not self.low <= counts <= self.high:
+            joint, value = self.joint, self.scale.angle_rad(counts)
+            raise LimitExceeded(what=self.name, value=value, lower=joint.min_rad, upper=joint.max_rad, unit="rad")
+
+    def check_usable(self, now_ns: int, stale_after_ns: int) -> Sample:
+        """The newest measurement, if the joint may be commanded.
+
+        Raises:
+            DeviceSilent: it does not answer.
+            DeviceFault: a fault is latched.
+        """
+        if self.fault:
+            raise self.faulty()
+        return self.fresh(now_ns, stale_after_ns)
+
+    def fresh(self, now_ns: int, stale_after_ns: int) -> Sample:
+        """The newest measurement.
+
+        Raises:
+            DeviceSilent: it is too old, or there is none.
+        """
+        if self.sample is None or self.age_ns(now_ns) > stale_after_ns:
+            raise self.deaf(now_ns)
+        return self.sample
+
+    def deaf(self, now_ns: int) -> DeviceSilent:
+        """The error of a joint that does not answer."""
+        return DeviceSilent(device=self.name, bus=self.bus, waited_s=self.age_ns(now_ns) / 1e9)
+
+    def faulty(self, fault: str = "") -> DeviceFault:
+        """The error of a joint with a fault; by default the latched one."""
+        remedy = "remove the cause, then call enable()"
+        if not fault and self.remedy:
+            remedy = self.remedy
+        return DeviceFault(device=self.name, bus=self.bus, fault=fault or self.fault, remedy=remedy)
+
+    def measured(
+        self,
+        sample: Sample,
+        now_ns: int,
+        *,
+        load: float,
+        enabled: bool,
+        temperature_c: float | None,
+        voltage_v: float | None,
+    ) -> MotorState:
+        """A state with this measurement in it."""
+        age_s = (now_ns - sample.at_ns) / 1e9
+        return MotorState(
+            name=self.name,
+            position_rad=self.scale.angle_rad(sample.position),
+            velocity_rad_s=self.scale.speed_rad_s(sample.velocity),
+            load=load,
+            temperature_c=temperature_c,
+            voltage_v=voltage_v,
+            enabled=enabled,
+            moving=self.motion is not None or self.still == 0,
+            fault=self.fault,
+            measured_at=time.monotonic() - age_s,
+            age_s=age_s,
+        )

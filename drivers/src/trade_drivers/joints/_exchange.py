@@ -1,0 +1,260 @@
+"""The cyclic exchange with the joints of one bus, whoever built them: stops, work, motions, holding."""
+
+import threading
+import time
+from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Final
+
+from trade.errors import MotionStopped, TradeError
+from trade_drivers.joints._axis import Axis, Goal
+from trade_drivers.joints._jobs import Job, Steps, StopTicket
+from trade_drivers.joints._motion import Motion
+
+if TYPE_CHECKING:
+    from trade_drivers.robotfile import Bus
+
+__all__ = ["Exchange", "Gate", "PortLost"]
+
+Gate = Callable[[], None]
+"""Called right before the bytes go out; what it raises keeps them in."""
+_HALT_NS: Final = 2_000_000_000
+
+
+class PortLost(Exception):
+    """The port itself is gone: unplugged, down, or never opened."""
+
+
+class Exchange(ABC):
+    """What happens on one bus. Everything but ``submit`` and ``stop`` belongs to the thread that calls ``cycle()``."""
+
+    def __init__(self, bus: "Bus", axes: Sequence[Axis], clock: Callable[[], int] = time.monotonic_ns) -> None:
+        self.axes = tuple(axes)
+        self.clock = clock
+        self.wake = threading.Event()
+        """Set when something should not wait for the next cycle."""
+        self.stale_after_ns = int(bus.stale_after_s * 1e9)
+        self.refusing: Callable[[Axis], TradeError] | None = None
+        """Why nothing is taken on at present."""
+        self.period_ns = int(1e9 / bus.rate_hz)
+        self._inbox: deque[Job] = deque()
+        self._stops: deque[StopTicket] = deque()
+        self._working: list[Job] = []
+        self._stopping: list[StopTicket] = []
+
+    # --- what a device of this kind is told, and how
+
+    @abstractmethod
+    def cycle(self) -> None:
+        """One round: stops, measurements, work, motions.
+
+        Raises:
+            PortLost: the wire is gone.
+        """
+
+    @abstractmethod
+    def write_goals(self, goals: Mapping[Axis, Goal], gate: Gate) -> None:
+        """Send joints on their way, all of them or none; the gate is asked right before the bytes go out."""
+
+    @abstractmethod
+    def write_holds(self, positions: Mapping[Axis, int]) -> None:
+        """Have joints brake as hard as they may and hold, near these positions. Never waits."""
+
+    @abstractmethod
+    def enabling(self, job: Job, axis: Axis) -> Steps:
+        """Torque on where the joint is measured to be, watchdog armed, all of it read back; then it is ``ready``."""
+
+    @abstractmethod
+    def relaxing(self, job: Job, axis: Axis) -> Steps:
+        """Torque off, watchdog disarmed."""
+
+    @abstractmethod
+    def looking(self, axis: Axis) -> Steps:
+        """How the joint is, asked now."""
+
+    def making_way(self, axes: Sequence[Axis]) -> Steps:  # noqa: ARG002 - most devices take a goal at any time
+        """Wait until these joints can take new goals."""
+        yield from ()
+
+    @abstractmethod
+    def leaving(self, job: Job, axis: Axis, *, relax: bool) -> Steps:
+        """Torque off or left on, watchdog disarmed where it may be."""
+
+    # --- from any thread
+
+    def submit(self, job: Job) -> None:
+        """Take work on; the job's ``wait`` tells what became of it."""
+        if self.refusing is not None:
+            job.finish(self.refusing(job.axes[0]))
+        else:
+            self._inbox.append(job)
+
+    def stop(self, axes: Sequence[Axis], reason: str = "stop() was called") -> StopTicket:
+        """Void what was admitted for these joints, and have them hold before anything else happens on the bus."""
+        for axis in axes:
+            axis.resource.stop("its driver", reason=reason)
+        ticket = StopTicket(self, axes, reason)
+        if self.refusing is not None:
+            ticket.finish(self.refusing(axes[0]))
+        self._stops.append(ticket)
+        self.wake.set()
+        return ticket
+
+    # --- from the bus thread
+
+    def idle(self, seconds: float) -> None:
+        """Between two cycles; ends early when something came up. Stops do not wait."""
+        if self.wake.wait(seconds):
+            self.wake.clear()
+            self.serve_stops()
+
+    def serve_stops(self) -> None:
+        """Write the hold of every stop that has come."""
+        while self._stops:
+            ticket = self._stops.popleft()
+            if not ticket.ended:
+                self._stopping.append(ticket)
+            self.halt(ticket.axes, ticket.reason)
+
+    def halt(self, axes: Iterable[Axis], reason: str) -> None:
+        """End the motions of these joints, whole groups, and have all of them hold where they are."""
+        held = dict.fromkeys(axes)
+        for axis in tuple(held):
+            if (motion := axis.motion) is not None:
+                held.update(dict.fromkeys(motion.axes))
+        now_ns = self.clock()
+        try:
+            self.hold([axis for axis in held if not self._at_rest(axis, now_ns)], now_ns)
+        finally:
+            for axis in held:
+                if axis.motion is not None:
+                    self._forget(axis.motion, MotionStopped(device=axis.name, reason=reason))
+
+    def _at_rest(self, axis: Axis, now_ns: int) -> bool:
+        """Nothing to stop: no torque, or no motion of ours and seen not to move."""
+        idle = axis.motion is None and axis.still >= 2 and axis.age_ns(now_ns) <= self.stale_after_ns
+        return idle or not axis.may_hold_torque
+
+    def end_motion(self, axis: Axis, reason: str) -> None:
+        """End the motion of a joint that is being relaxed; the other members of its group hold."""
+        if (motion := axis.motion) is not None:
+            self.halt(motion.axes, reason)
+
+    def release(self, motion: Motion, error: TradeError | None) -> None:
+        """A watched motion has ended: well, or with an error and all its joints held."""
+        try:
+            if error is not None:
+                self.hold([axis for axis in motion.axes if axis.may_hold_torque], self.clock())
+        finally:
+            self._forget(motion, error)
+
+    def take_over(self, motion: Motion) -> None:
+        """A motion's goals are out: those it replaces have ended, and what they left behind holds."""
+        replaced = dict.fromkeys(axis.motion for axis in motion.axes if axis.motion is not None)
+        for axis in motion.axes:
+            axis.motion, axis.still, axis.halting_since_ns = motion, 0, 0
+            axis.tell_moving()
+        for old in replaced:
+            left = [axis for axis in old.axes if axis.motion is old]
+            self._forget(old, MotionStopped(device=motion.axes[0].name, reason="another move took over"))
+            self.hold(left, self.clock())
+
+    def fail_all(self, error_of: Callable[[Axis], TradeError]) -> None:
+        """End everything anyone waits for."""
+        for axis in self.axes:
+            if axis.motion is not None:
+                self._forget(axis.motion, error_of(axis))
+        for job in (*self._working, *self._drain(self._inbox), *self._stopping, *self._drain(self._stops)):
+            job.finish(error_of(job.axes[0]))
+        self._working.clear()
+        self._stopping.clear()
+
+    def forget_measurements(self) -> None:
+        """The port is gone: nothing is known any more but how long ago it was."""
+        now_ns = self.clock()
+        for axis in self.axes:
+            if not axis.silent:
+                axis.silent, axis.silent_since_ns, axis.probe_at_ns = True, now_ns, now_ns
+
+    def require_answering(self, axis: Axis) -> None:
+        """Raises ``DeviceSilent`` for a joint that is left out because it does not answer."""
+        if axis.silent:
+            raise axis.deaf(self.clock())
+
+    # --- parts of a cycle
+
+    def work(self, until_ns: int) -> None:
+        """Go on with the jobs, an exchange of each in turn; a stop or the time ends the round."""
+        while self._inbox:
+            self._working.append(self._inbox.popleft())
+        while self._working and not self._stops:
+            taken: set[Axis] = set()
+            for job in tuple(self._working):
+                if not job.ended and not taken.isdisjoint(job.axes):
+                    continue  # one at a time touches a joint
+                taken.update(job.axes)
+                if job.ended or not job.step():
+                    self._working.remove(job)
+                    job.done_stepping()
+                if self._stops:
+                    break
+            if self.clock() >= until_ns:
+                return
+
+    def watch(self) -> None:
+        """Look at motions and stops with what was measured, and end what is over."""
+        now_ns = self.clock()
+        for motion in dict.fromkeys(axis.motion for axis in self.axes if axis.motion is not None):
+            motion.watch(now_ns)
+        again: list[Axis] = []
+        for axis in self.axes:
+            if axis.halting_since_ns:
+                self._watch_halt(axis, now_ns, again)
+        self.hold(again, now_ns)
+        for axis in self.axes:
+            axis.tell_moving()
+        for ticket in tuple(self._stopping):
+            self._answer(ticket, now_ns)
+
+    def _watch_halt(self, axis: Axis, now_ns: int, again: list[Axis]) -> None:
+        if axis.still >= 2 or not axis.may_hold_torque or axis.fault:
+            axis.halting_since_ns = 0
+        elif now_ns - axis.halting_since_ns <= _HALT_NS and axis.moved_since_held:
+            again.append(axis)  # it was still on its way: so it need not come back as far
+
+    def _answer(self, ticket: StopTicket, now_ns: int) -> None:
+        error: TradeError | None = None
+        for axis in ticket.axes:
+            if axis.silent or axis.age_ns(now_ns) > self.stale_after_ns:
+                error = axis.deaf(now_ns)
+            elif axis.halting_since_ns and now_ns - axis.halting_since_ns > _HALT_NS:
+                error = axis.faulty("told to hold, but it is still moving")
+            elif axis.halting_since_ns:
+                return
+        self._stopping.remove(ticket)
+        ticket.finish(error)
+
+    def hold(self, axes: Sequence[Axis], now_ns: int) -> None:
+        """Have joints hold, and watch them until they are at rest."""
+        positions: dict[Axis, int] = {}
+        for axis in axes:
+            if (position := axis.hold_counts(now_ns)) is not None:
+                positions[axis] = position
+            axis.still, axis.held_ns = 0, now_ns
+            axis.halting_since_ns = axis.halting_since_ns or now_ns
+        if positions:
+            self.write_holds(positions)
+
+    def _forget(self, motion: Motion, error: TradeError | None) -> None:
+        for axis in motion.axes:
+            if axis.motion is motion:
+                axis.motion = None
+                axis.tell_moving()
+        motion.finish(error)
+
+    @staticmethod
+    def _drain(queue: "deque[Job] | deque[StopTicket]") -> list[Job]:
+        jobs: list[Job] = list(queue)
+        queue.clear()
+        return jobs

@@ -1,0 +1,162 @@
+"""What services ask of the bus thread: work of several exchanges, done one exchange at a time between the cycles."""
+
+import threading
+from collections.abc import Callable, Generator, Sequence
+from typing import TYPE_CHECKING
+
+from trade import Permit
+from trade.errors import DeadlineExceeded, TradeError
+from trade_drivers.joints._axis import Axis
+
+if TYPE_CHECKING:
+    from trade_drivers.joints._exchange import Exchange
+
+__all__ = ["Command", "Enable", "Halt", "Job", "Leave", "Relax", "Steps", "StopTicket"]
+
+Steps = Generator[None, None, None]
+"""Yields after each exchange on the wire, so that stops and cycles come in between."""
+
+
+class Job:
+    """Something that is waited for. As it stands it needs no leave: it ends motion."""
+
+    def __init__(self, exchange: "Exchange", axes: Sequence[Axis]) -> None:
+        self.exchange = exchange
+        self.axes = tuple(axes)
+        self._ended = threading.Event()
+        self._error: TradeError | None = None
+        self._steps: Steps | None = None
+
+    @property
+    def ended(self) -> bool:
+        """Its outcome is known."""
+        return self._ended.is_set()
+
+    def gate(self) -> None:
+        """The last look before its bytes go out; what it raises keeps them in."""
+
+    def steps(self) -> Steps:
+        """The work."""
+        raise NotImplementedError
+
+    def step(self) -> bool:
+        """Do one exchange of it; False when nothing is left to do."""
+        if self._steps is None:
+            self._steps = self.steps()
+        try:
+            next(self._steps)
+        except StopIteration:
+            return False
+        except TradeError as problem:
+            self.finish(problem)
+            return False
+        return True
+
+    def done_stepping(self) -> None:
+        """All its exchanges have been made."""
+        self.finish()
+
+    def finish(self, error: TradeError | None = None) -> None:
+        """Let the waiting service have the outcome; only the first counts."""
+        if not self._ended.is_set():
+            self._error = error
+            self._ended.set()
+
+    def wait(self, alive: Callable[[], bool]) -> None:
+        """Block until it has ended.
+
+        Raises:
+            TradeError: what became of it.
+        """
+        while not self._ended.wait(1.0):
+            if not alive():
+                self.finish(self.axes[0].faulty("the thread of its bus has ended"))
+        if self._error is not None:
+            raise self._error
+
+
+class Command(Job):
+    """What may set something moving: it carries an expiry, and the permit under which its call was admitted."""
+
+    def __init__(
+        self, exchange: "Exchange", axes: Sequence[Axis], *, service: str, expires_ns: int, permit: Permit
+    ) -> None:
+        super().__init__(exchange, axes)
+        self.service = service
+        self.expires_ns = expires_ns
+        self.permit = permit
+        self._admitted_ns = exchange.clock()
+
+    def gate(self) -> None:
+        """The last look before its bytes go out.
+
+        Raises:
+            DeadlineExceeded: it is late, and late is never.
+            MotionStopped, LockLost, LockedByOther: a stop, or another owner, came after it was admitted.
+        """
+        if self.exchange.clock() >= self.expires_ns:
+            patience_s = (self.expires_ns - self._admitted_ns) / 1e9
+            raise DeadlineExceeded(service=self.service, deadline_s=max(0.0, patience_s))
+        self.permit.gate()
+
+
+class StopTicket(Job):
+    """A stop: it has no expiry and needs no permit, and ends when all its joints are at rest."""
+
+    def __init__(self, exchange: "Exchange", axes: Sequence[Axis], reason: str) -> None:
+        super().__init__(exchange, axes)
+        self.reason = reason
+
+
+class Enable(Command):
+    """Torque on, holding where the joints are. A joint that is enabled already is only looked at, not disturbed."""
+
+    def steps(self) -> Steps:
+        for axis in self.axes:
+            if axis.ready:
+                yield from self.exchange.looking(axis)
+            if not axis.ready:
+                yield from self.exchange.enabling(self, axis)
+
+
+class Halt(Command):
+    """Whatever moves the joints ends, and they hold; unlike a stop it needs leave and makes nothing void."""
+
+    def steps(self) -> Steps:
+        self.gate()
+        self.exchange.halt(self.axes, f"{self.service} said so")
+        yield
+        for axis in self.axes:
+            self.exchange.require_answering(axis)
+
+
+class Relax(Command):
+    """Torque off."""
+
+    def steps(self) -> Steps:
+        for axis in self.axes:
+            self.exchange.require_answering(axis)
+            self.gate()
+            self.exchange.end_motion(axis, f"{axis.name} was relaxed")
+            yield from self.exchange.relaxing(self, axis)
+
+
+class Leave(Job):
+    """The driver goes, after it has stopped everything: hold or relax, as the robot file says.
+
+    A joint that holds is disarmed once it was seen at rest: silence on the bus is then what is wanted, and an expired
+    watchdog would only hinder whoever comes next. Not seen at rest, or silent: its watchdog stays armed.
+    """
+
+    def __init__(self, exchange: "Exchange", axes: Sequence[Axis], *, relax: bool) -> None:
+        super().__init__(exchange, axes)
+        self._relax = relax
+
+    def steps(self) -> Steps:
+        for axis in self.axes:
+            if axis.silent:
+                continue
+            try:
+                yield from self.exchange.leaving(self, axis, relax=self._relax)
+            except TradeError as problem:
+                self.finish(problem)
