@@ -10,9 +10,9 @@ from drivers.gripper_contract import GripperContract
 from drivers.gripper_rig import HandRig, made_rig
 from robots import HAND, HEAD
 from trade.errors import ConfigurationError, DeviceFault, MotionStopped
-from trade_drivers import Gripper, attach, parse
+from trade_drivers import Gripper, SerialBus, attach, parse
 from trade_drivers.robotiq import _table as table
-from trade_hil_sim import Absent, Put
+from trade_hil_sim import Absent, DynamixelBus, Put
 from trade_hil_sim.robotiq import _table as simulated
 from waiting import wait_until
 
@@ -175,7 +175,19 @@ def test_a_port_that_is_not_there_is_named(hand: HandRig, tmp_path: Path) -> Non
         hand.attach(ports={"hand": str(tmp_path / "nowhere")})
 
 
-def test_a_gripper_on_a_bus_of_servos_and_a_joint_on_one_of_grippers_are_refused(hand: HandRig) -> None:
+def test_a_gripper_on_a_bus_of_servos_is_refused(tmp_path: Path) -> None:
+    text = HEAD + HAND[HAND.index("[gripper") :].replace('"hand"', '"neck"')
+    robot = parse(text, "head.toml")
+    neck = robot.buses[0]
+    assert isinstance(neck, SerialBus)
+    with (
+        DynamixelBus.from_robot(neck, robot.joints_on("neck"), tmp_path / "neck", paced=False) as bus,
+        pytest.raises(ConfigurationError, match=r'gripper."left.hand": the driver of its bus has no grippers'),
+    ):
+        attach(robot, ports={"neck": str(bus.port)})
+
+
+def test_a_joint_on_a_bus_of_grippers_is_refused(hand: HandRig) -> None:
     joint = HEAD[HEAD.index("[joint") : HEAD.index('[joint."neck.tilt"]')].replace('"neck"', '"hand"')
     with pytest.raises(ConfigurationError, match="driver robotiq has no joints, only grippers"):
         attach(parse(HAND + joint, "hand.toml"), ports={"hand": str(hand.sim.port)})

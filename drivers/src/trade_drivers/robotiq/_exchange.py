@@ -206,7 +206,7 @@ class Exchange:
                     self.probe(hand)
                 self.read(hand)
             except Refused as refused:
-                hand.latched = f"it is no 2F-85: {refused}"
+                hand.fault = f"it is no 2F-85: {refused}"
                 return
             if hand.silent:
                 _log.info("%s answers again", hand.name)

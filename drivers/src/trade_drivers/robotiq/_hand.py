@@ -36,8 +36,8 @@ class Hand:
         self.sample: Status | None = None
         self.force_counts = 0
         """The force it was last told."""
-        self.latched = ""
-        """A fault that this driver found."""
+        self.fault = ""
+        """Why it refuses to move, reported by the gripper or found by this driver: kept until somebody clears it."""
         self.motion: Motion | None = None
         self.halting_since_ns = 0
         """When it was told to stop; 0 once it was seen at rest."""
@@ -66,6 +66,7 @@ class Hand:
             self._speed_m_s = -counts_s * self.model.m_per_count
         self._note_contact(now)
         self.sample = now
+        self.fault = table.fault_text(now.fault) or self.fault
         self.misses = 0
         return now
 
@@ -75,12 +76,6 @@ class Hand:
             self._held_at = now.position
         elif not now.activated or abs(now.position - self._held_at) > _HELD_COUNTS:
             self._holding = ""
-
-    @property
-    def fault(self) -> str:
-        """Why it refuses to move; empty if it does not."""
-        reported = table.fault_text(self.sample.fault) if self.sample is not None else ""
-        return reported or self.latched
 
     def at_rest(self, now_ns: int, stale_after_ns: int) -> bool:
         """Seen at rest, now, with nothing of ours under way; it may be pressing on something."""

@@ -92,7 +92,7 @@ class Command(Work):
         while not (status := (yield from self.look())).reset or table.fault_text(status.fault):
             if exchange.clock() > until_ns:
                 raise hand.faulty(hand.fault or "it was reset, but keeps its activation")
-        hand.latched = ""
+        hand.fault = ""
 
 
 class ClearFault(Command):
@@ -163,7 +163,7 @@ class Motion(Command):
         self._patience_s -= elapsed_s
         if self._patience_s > 0 and self._waiting_s <= _STUCK_S:
             return None
-        self.hand.latched = "it says that it moves, but its fingers stand; is its position sensor sound?"
+        self.hand.fault = "it says that it moves, but its fingers stand; is its position sensor sound?"
         return self.hand.faulty()
 
     def _trouble(self, now_ns: int) -> TradeError | None:
@@ -197,7 +197,7 @@ class Activate(Motion):
             return self.hand.inactive("it did not begin its activation, or lost its power in the middle of it")
         problem = super().stuck(sample, now_ns)
         if problem is not None:
-            self.hand.latched = "its activation does not end; is something in the way of its fingers?"
+            self.hand.fault = "its activation does not end; is something in the way of its fingers?"
             return self.hand.faulty()
         return None
 

@@ -41,6 +41,7 @@ _OVERHEAD: Final = 5
 """Bytes of an answer beyond its registers."""
 _EXCEPTION_SIZE: Final = 5
 _CLEAN_S: Final = 1.0
+_OFTEN: Final = 2
 _PROBES: Final = ((3, 1), (4, 1), (3, 2), (4, 2))
 """Function and number of registers: a late answer to one of them is no answer to the next."""
 
@@ -131,7 +132,7 @@ class Wire:
         self.settled_at = 0.0
         self.pause: Callable[[float], None] = time.sleep
         self._client = _QuietClient(path, baud)
-        self._drain_s = DRAIN_S
+        self._in_a_row = 0
         self._failed_at = -_CLEAN_S
         self._failures = 0
 
@@ -221,7 +222,7 @@ class Wire:
                 raise NoAnswer(device_id, time.monotonic() - began) from None
         if answer.isError():
             raise Refused(device_id, answer.exception_code)
-        self._drain_s = DRAIN_S
+        self._in_a_row = 0
         return list(answer.registers)
 
     @contextmanager
@@ -249,8 +250,8 @@ class Wire:
     def _unsettle(self) -> None:
         self._failed_at = time.monotonic()
         self._failures += 1
-        self.settled_at = self._failed_at + self._drain_s
-        self._drain_s = min(LONGEST_DRAIN_S, 2 * self._drain_s)
+        self.settled_at = self._failed_at + (DRAIN_S if self._in_a_row < _OFTEN else LONGEST_DRAIN_S)
+        self._in_a_row += 1
 
 
 def _error_number(bad: BaseException | None) -> int | None:

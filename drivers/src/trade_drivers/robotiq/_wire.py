@@ -11,7 +11,7 @@ LONGEST_WAIT_S: Final = 0.048
 DRAIN_S: Final = 0.030
 """Silence kept after a failed exchange: an answer that is late arrives now and is thrown away, not believed later."""
 LONGEST_DRAIN_S: Final = 0.120
-"""It doubles up to this while exchanges go on failing."""
+"""From the third failure in a row on."""
 
 
 class WireError(Exception):
