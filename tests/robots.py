@@ -49,3 +49,21 @@ max_speed_rad_s = 2.5
 max_accel_rad_s2 = 20.0
 """
 )
+
+HAND = """
+[robot]
+name = "rosie"
+
+[bus.hand]
+driver = "robotiq"
+port = "/dev/ttyNOHAND"
+baud = 115200
+
+[gripper."left.hand"]
+bus = "hand"
+id = 9
+model = "2F-85"
+max_width_m = 0.085
+max_speed_m_s = 0.15
+max_force_n = 200.0
+"""

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from robots import HEAD
+from robots import HAND, HEAD
 from trade.errors import ConfigurationError
 from trade_drivers import CanBus, Robot, SerialBus, load, parse
 
@@ -96,7 +96,7 @@ MISTAKES = [
     (
         "[robot]\nname",
         "name",
-        "head.toml: [name]: unknown table; a robot file has [robot], [bus], [joint], [group], [[coupled]]",
+        "head.toml: [name]: unknown table; a robot file has [robot], [bus], [joint], [gripper], [group], [[coupled]]",
     ),
     ('name = "rosie"', "", 'head.toml: [robot]: missing; write [robot] and name = "rosie"'),
     ('name = "rosie"', 'name = "Rosie"', "robot.name: 'Rosie' is no name"),
@@ -136,7 +136,7 @@ MISTAKES = [
     ("max_speed_rad_s = 2.5", "max_speed_rad_s = -1", "max_speed_rad_s: Expected `float` > 0"),
     ("max_accel_rad_s2 = 20.0", "max_accel_rad_s2 = true", "max_accel_rad_s2: Expected `float`, got `bool`"),
     ("reversed = true", "offset_rad = inf", "offset_rad: must be a finite number"),
-    ("[group.head]", '[group."neck.pan"]', "a joint has this name already"),
+    ("[group.head]", '[group."neck.pan"]', "a joint or gripper has this name already"),
     (
         '"neck.pan", "neck.tilt"]',
         '"neck.pan", "neck.nod"]',
@@ -201,3 +201,40 @@ def test_load_says_what_is_wrong_with_the_file_itself(tmp_path: Path) -> None:
         with pytest.raises(ConfigurationError, match=complaint) as error:
             load(path)
         assert str(path) in str(error.value)
+
+
+def test_grippers_are_records_and_members_like_joints() -> None:
+    robot = parse(HAND, "hand.toml")
+    assert [gripper.name for gripper in robot.grippers_on("hand")] == ["left.hand"]
+    assert (robot.joints, robot.grippers[0].min_width_m) == ([], 0.0)
+    assert robot.members() == {"rosie": ["rosie.left.hand"], "rosie.left": ["rosie.left.hand"]}
+
+
+GRIPPER_MISTAKES = [
+    ("max_force_n = 200.0\n", "", "gripper.\"left.hand\": missing required key 'max_force_n'"),
+    ("max_width_m = 0.085", "max_width_m = nan", 'gripper."left.hand".max_width_m'),
+    ("max_width_m = 0.085", "max_width_m = 0.085\nmin_width_m = 0.1", "must be greater than min_width_m"),
+    ("id = 9", "id = 0", "Expected `int` >= 1, but it is 0"),
+    ('bus = "hand"', 'bus = "foot"', "gripper.\"left.hand\".bus: there is no bus 'foot'; there is hand"),
+    ('[gripper."left.hand"]', "[gripper.left.hand]", 'a dotted name needs quotes: [gripper."left.hand"]'),
+]
+
+
+@pytest.mark.parametrize(("before", "after", "complaint"), GRIPPER_MISTAKES, ids=[m[2][:40] for m in GRIPPER_MISTAKES])
+def test_a_mistake_about_a_gripper_is_answered_with_the_key(before: str, after: str, complaint: str) -> None:
+    assert before in HAND
+    with pytest.raises(ConfigurationError) as error:
+        parse(HAND.replace(before, after, 1), "hand.toml")
+    assert complaint in str(error.value)
+
+
+def test_a_gripper_and_a_joint_share_neither_id_nor_name_and_a_robot_has_one_of_them() -> None:
+    second = HAND[HAND.index("[gripper") :]
+    for text, complaint in (
+        (HAND + second.replace("left", "right"), "9 is taken on bus 'hand' by gripper 'left.hand'"),
+        (HEAD + second.replace("left.hand", "neck.pan").replace('"hand"', '"neck"'), "a joint has this name already"),
+        (HAND.replace(second, ""), "a robot needs at least one joint or gripper"),
+    ):
+        with pytest.raises(ConfigurationError) as error:
+            parse(text, "hand.toml")
+        assert complaint in str(error.value)

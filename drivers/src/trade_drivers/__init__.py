@@ -2,7 +2,7 @@
 
 from trade_drivers._attach import AttachedRobot, attach
 from trade_drivers._driver import AttachedBus, Driver, drivers
-from trade_drivers._interfaces import JointGroup, JointLimits, Motor, MotorState
+from trade_drivers._interfaces import Gripper, GripperLimits, GripperState, JointGroup, JointLimits, Motor, MotorState
 from trade_drivers._load import load
 from trade_drivers.robotfile import Bus, CanBus, Coupled, Group, Joint, Robot, SerialBus, parse
 
@@ -13,6 +13,9 @@ __all__ = [
     "CanBus",
     "Coupled",
     "Driver",
+    "Gripper",
+    "GripperLimits",
+    "GripperState",
     "Group",
     "Joint",
     "JointGroup",

@@ -9,13 +9,14 @@ from contextlib import ExitStack
 import trade
 from trade.errors import ConfigurationError, TradeError
 from trade_drivers._driver import AttachedBus, load_driver
-from trade_drivers._interfaces import JointGroup, Motor
+from trade_drivers._interfaces import Gripper, JointGroup, Motor
 from trade_drivers.robotfile import Group, Robot
 
 __all__ = ["AttachedRobot", "attach"]
 
 _log = logging.getLogger(__name__)
 
+Provider = Motor | JointGroup | Gripper
 Register = Callable[[object, Sequence[str]], object]
 Deregister = Callable[[object], object]
 
@@ -23,10 +24,10 @@ Deregister = Callable[[object], object]
 class AttachedRobot:
     """A robot whose devices are attached and whose services are announced, until it is closed."""
 
-    def __init__(self, robot: Robot, providers: Mapping[str, Motor | JointGroup], undo: ExitStack) -> None:
+    def __init__(self, robot: Robot, providers: Mapping[str, Provider], undo: ExitStack) -> None:
         self.robot = robot
         self.providers = dict(providers)
-        """By group: ``rosie.neck.pan`` -> its Motor, ``rosie.head`` -> its JointGroup."""
+        """By group: ``rosie.neck.pan`` -> a Motor, ``rosie.head`` -> a JointGroup, ``rosie.left.hand`` -> a Gripper."""
         self._undo = undo
         self._lock = threading.Lock()
         atexit.register(self.close)
@@ -42,6 +43,13 @@ class AttachedRobot:
         """The provider of a group, named as in the robot file; KeyError if there is none."""
         provider = self.providers[f"{self.robot.name}.{name}"]
         if not isinstance(provider, JointGroup):
+            raise KeyError(name)
+        return provider
+
+    def gripper(self, name: str) -> Gripper:
+        """The provider of a gripper, named as in the robot file; KeyError if there is none."""
+        provider = self.providers[f"{self.robot.name}.{name}"]
+        if not isinstance(provider, Gripper):
             raise KeyError(name)
         return provider
 
@@ -77,8 +85,8 @@ def attach(
     """Attach all devices of a robot, then announce their services. Nothing is moved or enabled; what moves is stopped.
 
     Joint ``neck.pan`` of robot ``rosie`` becomes a Motor in group ``rosie.neck.pan``, group ``head`` a JointGroup in
-    ``rosie.head``. Of a group whose joints share no bus, the motors themselves are in its group. If anything is wrong,
-    nothing is announced and every port is let go of.
+    ``rosie.head``, gripper ``left.hand`` a Gripper in ``rosie.left.hand``. Of a group whose joints share no bus, the
+    motors themselves are in its group. If anything is wrong, nothing is announced and every port is let go of.
 
     Args:
         robot: what ``load`` read.
@@ -108,7 +116,7 @@ def _attach_buses(
     if unknown := sorted(set(ports) - set(names)):
         problem = f"there is no bus {unknown[0]!r} to give a port to; there is {', '.join(names)}"
         raise ConfigurationError(where=robot.where, problem=problem)
-    used = {joint.bus for joint in robot.joints}
+    used = {device.bus for device in (*robot.joints, *robot.grippers)}
     buses: dict[str, AttachedBus] = {}
     for bus in robot.buses:
         driver = load_driver(bus.driver, f"{robot.where}: bus.{bus.name}.driver")
@@ -118,10 +126,12 @@ def _attach_buses(
     return buses
 
 
-def _providers(robot: Robot, buses: Mapping[str, AttachedBus]) -> dict[str, Motor | JointGroup]:
-    providers: dict[str, Motor | JointGroup] = {
+def _providers(robot: Robot, buses: Mapping[str, AttachedBus]) -> dict[str, Provider]:
+    providers: dict[str, Provider] = {
         f"{robot.name}.{joint.name}": buses[joint.bus].motor(joint.name) for joint in robot.joints
     }
+    for gripper in robot.grippers:
+        providers[f"{robot.name}.{gripper.name}"] = buses[gripper.bus].gripper(gripper.name)
     for group in robot.groups:
         name = f"{robot.name}.{group.name}"
         on = _buses_of(robot, group)

@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 from importlib.metadata import EntryPoint, entry_points
 
 from trade.errors import ConfigurationError
-from trade_drivers._interfaces import JointGroup, Motor
+from trade_drivers._interfaces import Gripper, JointGroup, Motor
 from trade_drivers.robotfile import Bus, Robot
 
 __all__ = ["AttachedBus", "Driver", "drivers", "load_driver"]
@@ -23,6 +23,15 @@ class AttachedBus(ABC):
     @abstractmethod
     def group(self, name: str, joints: Sequence[str]) -> JointGroup:
         """A provider of several joints of this bus; ``name`` is the group with the robot's name before it."""
+
+    def gripper(self, name: str) -> Gripper:
+        """The provider of one gripper of this bus, named as in the robot file.
+
+        Raises:
+            ConfigurationError: the driver of this bus has no grippers.
+        """
+        problem = "the driver of its bus has no grippers; one that has is robotiq"
+        raise ConfigurationError(where=f'gripper."{name}"', problem=problem)
 
     @abstractmethod
     def close(self) -> None:

@@ -1,15 +1,15 @@
-"""What a motor and a group of joints can do, in SI units, whoever built them."""
+"""What a motor, a group of joints and a gripper can do, in SI units, whoever built them."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import Annotated, Final
+from typing import Annotated, Final, Literal
 
 from msgspec import Struct
 
 from trade import Meta, Resource, service
 
-__all__ = ["JointGroup", "JointLimits", "Motor", "MotorState"]
+__all__ = ["Gripper", "GripperLimits", "GripperState", "JointGroup", "JointLimits", "Motor", "MotorState"]
 
 
 class MotorState(Struct, frozen=True, kw_only=True):
@@ -44,6 +44,44 @@ class JointLimits(Struct, frozen=True, kw_only=True):
     max_rad: float
     max_speed_rad_s: float
     max_accel_rad_s2: float
+
+
+class GripperState(Struct, frozen=True, kw_only=True):
+    """What was last measured at one gripper."""
+
+    name: str
+    """The gripper, such as ``rosie.left.hand``."""
+    width_m: float
+    """Between the fingers."""
+    speed_m_s: float
+    """How fast the width changes; negative when it closes."""
+    force_n: float
+    """The force it was last told to grip with; no gripper known here measures it."""
+    current_a: float
+    """Of its motor."""
+    holding: Literal["", "outside", "inside"]
+    """An object was met: between the fingers, which close on it, or around them. Empty: none, or it was lost."""
+    activated: bool
+    """Its fingers have found their stops; without that it cannot be moved."""
+    moving: bool
+    fault: str = ""
+    """Why it refuses to move; empty if it does not."""
+    measured_at: float
+    """When all this was read: ``time.monotonic()`` of the driver's process."""
+    age_s: float
+    """How long ago that was."""
+
+
+class GripperLimits(Struct, frozen=True, kw_only=True):
+    """What a gripper may be told, from the robot file and the device."""
+
+    name: str
+    min_width_m: float
+    max_width_m: float
+    min_speed_m_s: float
+    max_speed_m_s: float
+    min_force_n: float
+    max_force_n: float
 
 
 Position = Annotated[float, Meta(description="joint angle in rad, within limits()")]
@@ -199,3 +237,105 @@ class JointGroup(ABC):
     @abstractmethod
     def relax(self) -> None:
         """Switch the torque of every joint off."""
+
+
+Width = Annotated[float, Meta(description="between the fingers in m, within limits()")]
+FingerSpeed = Annotated[
+    float, Meta(gt=0, description="of the fingers in m/s, within limits(); by default the greatest")
+]
+Force = Annotated[float, Meta(gt=0, description="to grip with in N, within limits(); by default the greatest")]
+
+
+class Gripper(ABC):
+    """One gripper with two fingers that move together.
+
+    Everything raises ``DeviceSilent`` when the device has not answered for too long: an old value is no value.
+    """
+
+    members: Members = MappingProxyType({})
+    """As of a ``Motor``."""
+
+    @property
+    @abstractmethod
+    def resources(self) -> tuple[Resource, ...]:
+        """The gripper, as what locks, fences and stops attach to: one, named ``rosie.left.hand``."""
+
+    @service(effect="read")
+    @abstractmethod
+    def state(self) -> GripperState:
+        """Width, what is held, health and the time of their measurement.
+
+        Raises:
+            DeviceSilent: the newest measurement is older than the bus allows.
+        """
+
+    @service(effect="read")
+    @abstractmethod
+    def limits(self) -> GripperLimits:
+        """The range, speeds and forces this gripper may be commanded."""
+
+    @service(effect="actuate", cancel="stop")
+    @abstractmethod
+    def activate(self) -> GripperState:
+        """Have the fingers find their stops, by moving all the way: what they hold falls. Never done by itself.
+
+        Clears the fault of the device. A gripper that is activated and has no fault is left as it is.
+
+        Raises:
+            MotionStopped: stop(), or the call's deadline came first; it is not activated.
+            DeviceFault: it did not succeed; the fault says why.
+            DeviceSilent: the device does not answer.
+            DeadlineExceeded: the deadline passed before anything was sent; nothing will be.
+        """
+
+    @service(effect="actuate", cancel="stop")
+    @abstractmethod
+    def move_to(
+        self, width_m: Width, speed_m_s: FingerSpeed | None = None, force_n: Force | None = None
+    ) -> GripperState:
+        """Move the fingers until they are at rest there, or hold something; whether they do is in the answer.
+
+        The gripper goes on pressing on what it holds, and follows it, until it is moved or stopped.
+
+        Raises:
+            LimitExceeded: outside of limits(); nothing was sent.
+            InvalidArgument: not a finite number.
+            MotionStopped: stop(), another move, or the call's deadline came first; the fingers were stopped. For its
+                deadline a move ends up to 0.1 s early, so that this answer is still in time.
+            DeviceFault: not activated, a fault, or the fingers do not move; they were told to stop.
+            DeviceSilent: the device does not answer.
+            DeadlineExceeded: the deadline passed before anything was sent; nothing will be.
+        """
+
+    @service(effect="actuate", cancel="stop")
+    @abstractmethod
+    def open(self, speed_m_s: FingerSpeed | None = None) -> GripperState:
+        """``move_to`` the greatest width; what is held is let go of."""
+
+    @service(effect="actuate", cancel="stop")
+    @abstractmethod
+    def close(self, speed_m_s: FingerSpeed | None = None, force_n: Force | None = None) -> GripperState:
+        """``move_to`` the least width: grip what is between the fingers."""
+
+    @service(effect="stop")
+    @abstractmethod
+    def stop(self) -> None:
+        """End any motion, activation too; returns once the fingers are at rest. Commands admitted earlier are dropped.
+
+        From here on the fingers stand: they do not follow what they hold any more.
+
+        Raises:
+            DeviceSilent: told to stop, but nobody heard whether it did.
+            DeviceFault: told to stop, but it is still moving.
+        """
+
+    @service(effect="actuate", cancel="stop")
+    @abstractmethod
+    def clear_fault(self) -> None:
+        """Reset the device: its faults are cleared, nothing moves, and it has to be activated again.
+
+        Raises:
+            DeviceFault: the fault is still there.
+            DeviceSilent: the device does not answer.
+            DeadlineExceeded: the deadline passed before it was sent.
+        """

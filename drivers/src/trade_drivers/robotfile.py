@@ -16,7 +16,7 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib  # pyright: ignore[reportMissingImports]
 
-__all__ = ["Bus", "CanBus", "Coupled", "Group", "Joint", "Robot", "SerialBus", "parse"]
+__all__ = ["Bus", "CanBus", "Coupled", "Gripper", "Group", "Joint", "Robot", "SerialBus", "parse"]
 
 _SEGMENTS = re.compile(r"[a-z][a-z0-9_]*(\.[a-z][a-z0-9_]*)*")
 _AT = re.compile(r" - at `\$\.?([^`]*)`$")
@@ -101,6 +101,21 @@ class Joint(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     max_accel_rad_s2: Positive
 
 
+class Gripper(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """One gripper: its device on a bus, and its limits."""
+
+    name: str
+    bus: str
+    id: Annotated[int, Meta(ge=1, le=247)]
+    """Modbus slave id; a 2F-85 leaves the factory with 9."""
+    model: str
+    """Model as printed on the device: ``2F-85``."""
+    min_width_m: Annotated[float, Meta(ge=0)] = 0.0
+    max_width_m: Positive
+    max_speed_m_s: Positive
+    max_force_n: Positive
+
+
 class Group(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Joints that move together, in the order their values are given."""
 
@@ -124,10 +139,15 @@ class Robot(Struct, frozen=True, kw_only=True):
     coupled: list[Coupled]
     where: str
     """The file the robot was read from."""
+    grippers: list[Gripper] = []
 
     def joints_on(self, bus: str) -> list[Joint]:
         """The joints on one bus, in file order."""
         return [joint for joint in self.joints if joint.bus == bus]
+
+    def grippers_on(self, bus: str) -> list[Gripper]:
+        """The grippers on one bus, in file order."""
+        return [gripper for gripper in self.grippers if gripper.bus == bus]
 
     def coupled_to(self, joint: str) -> list[str]:
         """The joints that are only locked together with this one, with the robot's name before them."""
@@ -135,13 +155,13 @@ class Robot(Struct, frozen=True, kw_only=True):
         return [f"{self.name}.{name}" for name in names if name != joint]
 
     def members(self) -> dict[str, list[str]]:
-        """The joints of the robot, of its groups and of every part its joints are named after, all with full names.
+        """The joints and grippers of the robot, of its groups and of every part they are named after, with full names.
 
         A lock over one of these is a lock over all of its members, or over none.
         """
         found: dict[str, dict[str, None]] = {}
-        for joint in self.joints:
-            full = f"{self.name}.{joint.name}"
+        for device in (*self.joints, *self.grippers):
+            full = f"{self.name}.{device.name}"
             for end, letter in enumerate(full):
                 if letter == ".":
                     found.setdefault(full[:end], {})[full] = None
@@ -151,7 +171,7 @@ class Robot(Struct, frozen=True, kw_only=True):
         return {group: list(joints) for group, joints in found.items()}
 
 
-_Record = TypeVar("_Record", SerialBus, CanBus, Joint, Group)
+_Record = TypeVar("_Record", SerialBus, CanBus, Joint, Gripper, Group)
 
 
 def parse(text: str, where: str) -> Robot:
@@ -173,6 +193,7 @@ def parse(text: str, where: str) -> Robot:
         name=_robot_name(raw.get("robot"), where),
         buses=[_bus(*entry, where) for entry in _tables(raw, "bus", where)],
         joints=[_record(*entry, Joint, where) for entry in _tables(raw, "joint", where)],
+        grippers=[_record(*entry, Gripper, where) for entry in _tables(raw, "gripper", where)],
         groups=[_record(*entry, Group, where) for entry in _tables(raw, "group", where)],
         coupled=_coupled(raw.get("coupled", []), where),
         where=where,
@@ -186,7 +207,7 @@ def _wrong(where: str, key: str, problem: str) -> ConfigurationError:
 
 
 def _only_known(raw: Mapping[str, object], where: str) -> None:
-    known = {"robot": "[robot]", "bus": "[bus]", "joint": "[joint]", "group": "[group]", "coupled": "[[coupled]]"}
+    known = {key: f"[{key}]" for key in ("robot", "bus", "joint", "gripper", "group")} | {"coupled": "[[coupled]]"}
     for key in raw:
         if key not in known:
             raise _wrong(where, f"[{key}]", f"unknown table; a robot file has {', '.join(known.values())}")
@@ -214,7 +235,7 @@ def _tables(raw: Mapping[str, object], section: str, where: str) -> list[tuple[s
     tables = raw.get(section, {})
     if not isinstance(tables, dict):
         raise _wrong(where, section, f"must be tables: [{section}.NAME]")
-    if not tables and section != "group":
+    if not tables and section == "bus":
         raise _wrong(where, f"[{section}.NAME]", "missing; a robot needs at least one")
     return [_table(section, str(name), table, where) for name, table in tables.items()]  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]
 
@@ -296,19 +317,36 @@ def _check_finite(record: Struct, key: str, where: str) -> None:
 
 
 def _check_links(robot: Robot) -> None:
-    where, buses, seen = robot.where, {bus.name for bus in robot.buses}, dict[tuple[str, int], str]()
     _check_ports(robot)
+    _check_devices(robot)
     for joint in robot.joints:
-        key = f'joint."{joint.name}"'
-        if joint.bus not in buses:
-            raise _wrong(where, f"{key}.bus", f"there is no bus {joint.bus!r}; there is {', '.join(sorted(buses))}")
         if not joint.min_rad < joint.max_rad:
             problem = f"must be greater than min_rad, but {joint.max_rad} <= {joint.min_rad}"
-            raise _wrong(where, f"{key}.max_rad", problem)
-        if other := seen.get((joint.bus, joint.id)):
-            raise _wrong(where, f"{key}.id", f"{joint.id} is taken on bus {joint.bus!r} by joint {other!r}")
-        seen[joint.bus, joint.id] = joint.name
+            raise _wrong(robot.where, f'joint."{joint.name}".max_rad', problem)
+    for gripper in robot.grippers:
+        if not gripper.min_width_m < gripper.max_width_m:
+            problem = f"must be greater than min_width_m, but {gripper.max_width_m} <= {gripper.min_width_m}"
+            raise _wrong(robot.where, f'gripper."{gripper.name}".max_width_m', problem)
     _check_groups(robot)
+
+
+def _check_devices(robot: Robot) -> None:
+    """There is a device, and each is on a bus there is, under an id and a name of its own."""
+    if not robot.joints and not robot.grippers:
+        raise _wrong(robot.where, "[joint.NAME]", "missing; a robot needs at least one joint or gripper")
+    buses, names, seen = {bus.name for bus in robot.buses}, set[str](), dict[tuple[str, int], str]()
+    for device in (*robot.joints, *robot.grippers):
+        kind = type(device).__name__.lower()
+        key = f'{kind}."{device.name}"'
+        if device.bus not in buses:
+            problem = f"there is no bus {device.bus!r}; there is {', '.join(sorted(buses))}"
+            raise _wrong(robot.where, f"{key}.bus", problem)
+        if other := seen.get((device.bus, device.id)):
+            raise _wrong(robot.where, f"{key}.id", f"{device.id} is taken on bus {device.bus!r} by {other}")
+        if device.name in names:
+            raise _wrong(robot.where, key, "a joint has this name already")
+        names.add(device.name)
+        seen[device.bus, device.id] = f"{kind} {device.name!r}"
 
 
 def _check_ports(robot: Robot) -> None:
@@ -323,8 +361,8 @@ def _check_groups(robot: Robot) -> None:
     names = {joint.name for joint in robot.joints}
     for group in robot.groups:
         _check_joints(robot, group.joints, f"group.{group.name}.joints", names)
-        if group.name in names:
-            raise _wrong(robot.where, f"group.{group.name}", "a joint has this name already")
+        if group.name in names or group.name in {gripper.name for gripper in robot.grippers}:
+            raise _wrong(robot.where, f"group.{group.name}", "a joint or gripper has this name already")
     for number, coupled in enumerate(robot.coupled, 1):
         _check_joints(robot, coupled.joints, f"coupled {number}.joints", names)
 

@@ -1,4 +1,4 @@
-"""What ``trade up`` tells of its joints: a line when something is wrong with one, and when it is well again."""
+"""What ``trade up`` tells of its devices: a line when something is wrong with one, and when it is well again."""
 
 from collections.abc import Iterator, Mapping
 from datetime import datetime
@@ -8,18 +8,18 @@ from msgspec import Struct
 from rich.markup import escape
 
 from trade.errors import DeviceError
-from trade_drivers import Motor
+from trade_drivers import Gripper, Motor
 from trade_gateway._output import Output
 
 __all__ = ["FaultWatch"]
 
 
 class FaultWatch:
-    """Compares what joints say of themselves with what they said before. Looking asks no device anything."""
+    """Compares what devices say of themselves with what they said before. Looking asks no device anything."""
 
     def __init__(self, providers: Mapping[str, Any]) -> None:
-        self._motors = {name: motor for name, motor in providers.items() if isinstance(motor, Motor)}
-        self._known: dict[str, _Trouble] = dict.fromkeys(self._motors, _WELL)
+        self._devices = {name: device for name, device in providers.items() if isinstance(device, Motor | Gripper)}
+        self._known: dict[str, _Trouble] = dict.fromkeys(self._devices, _WELL)
 
     def begin(self, out: Output) -> None:
         """Say what is wrong, or that nothing is."""
@@ -39,8 +39,8 @@ class FaultWatch:
         return bool(changes)
 
     def _changes(self) -> Iterator[tuple[str, "_Trouble"]]:
-        for joint, motor in self._motors.items():
-            trouble = _trouble(joint, motor)
+        for joint, device in self._devices.items():
+            trouble = _trouble(joint, device)
             if trouble.kind != self._known[joint].kind:
                 self._known[joint] = trouble
                 yield joint, trouble
@@ -61,9 +61,9 @@ def _now() -> datetime:
     return datetime.now().astimezone()
 
 
-def _trouble(joint: str, motor: Motor) -> _Trouble:
+def _trouble(joint: str, device: Motor | Gripper) -> _Trouble:
     try:
-        fault = motor.state().fault
+        fault = device.state().fault
     except DeviceError as silent:
         return _Trouble(type(silent).__name__, str(silent))
     except Exception as defect:  # noqa: BLE001 - a mistake of the driver's is told, and ends nothing
@@ -71,4 +71,5 @@ def _trouble(joint: str, motor: Motor) -> _Trouble:
     if not fault:
         return _WELL
     sentence = fault if fault.endswith("?") else f"{fault}."
-    return _Trouble(fault, f"{joint}: {sentence} When you have looked: trade call {joint}.enable")
+    remedy = "enable" if isinstance(device, Motor) else "clear_fault"
+    return _Trouble(fault, f"{joint}: {sentence} When you have looked: trade call {joint}.{remedy}")

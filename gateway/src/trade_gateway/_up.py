@@ -102,8 +102,9 @@ def _refuse_twice(container: Container) -> None:
 
 def _say_attaching(out: Output, robot: Robot, ports: dict[str, str] | None) -> None:
     for bus in robot.buses:
-        joints = ", ".join(f"{joint.name} ({joint.model}, id {joint.id})" for joint in robot.joints_on(bus.name))
-        out.say(f"[bold]{robot.name}[/]: attaching bus {bus.name} on {(ports or {}).get(bus.name, bus.port)}: {joints}")
+        devices = (*robot.joints_on(bus.name), *robot.grippers_on(bus.name))
+        named = ", ".join(f"{device.name} ({device.model}, id {device.id})" for device in devices)
+        out.say(f"[bold]{robot.name}[/]: attaching bus {bus.name} on {(ports or {}).get(bus.name, bus.port)}: {named}")
 
 
 def _say_ready(out: Output, robot: Robot, container: Container, simulation: Any) -> None:

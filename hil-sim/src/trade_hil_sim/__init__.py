@@ -25,6 +25,7 @@ from ._faults import (
     Late,
     Mute,
     Place,
+    Put,
     Replug,
     Supply,
     Truncate,
@@ -36,9 +37,10 @@ from ._judge import events, frames, instructions, motion_writes, read_log, recei
 from ._line import Peer, SerialLine
 from ._log import ByteLog, Entry
 from ._process import SimProcess, remove_leftovers
-from ._state import BusState, DeviceState
+from ._state import BusState, DeviceState, GripperTruth
 from .can import CanBus, Frame
 from .dynamixel import MODELS, XL430_W250, XM430_W350, DynamixelBus, Servo
+from .robotiq import Gripper, RobotiqBus
 
 __all__ = [
     "MODELS",
@@ -63,6 +65,8 @@ __all__ = [
     "Frame",
     "Freeze",
     "Garbage",
+    "Gripper",
+    "GripperTruth",
     "HardwareFault",
     "Heal",
     "Jam",
@@ -70,7 +74,9 @@ __all__ = [
     "Mute",
     "Peer",
     "Place",
+    "Put",
     "Replug",
+    "RobotiqBus",
     "SerialLine",
     "Servo",
     "SimControl",

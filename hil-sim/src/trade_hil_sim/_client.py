@@ -11,7 +11,7 @@ import msgspec
 from . import _faults as faults
 from ._control import Answer, State
 from ._errors import SimulationError
-from ._state import BusState, DeviceState
+from ._state import BusState, DeviceState, GripperTruth
 
 __all__ = ["SimControl"]
 
@@ -70,6 +70,19 @@ class SimControl:
         if len(found) != 1:
             known = ", ".join(f"{device.joint} ({device.bus} {device.device_id})" for device in devices)
             raise SimulationError(f"{len(found)} devices are called {which!r}; there is {known}")
+        return found[0]
+
+    def gripper(self, which: str | int) -> GripperTruth:
+        """The truth about one gripper, by its name or its id.
+
+        Raises:
+            SimulationError: no such gripper; names those there are. The same if an id is on two buses.
+        """
+        grippers = [gripper for bus in self.state() for gripper in bus.grippers]
+        found = [gripper for gripper in grippers if which in {gripper.gripper, gripper.device_id}]
+        if len(found) != 1:
+            known = ", ".join(f"{gripper.gripper} ({gripper.bus} {gripper.device_id})" for gripper in grippers)
+            raise SimulationError(f"{len(found)} grippers are called {which!r}; there is {known or 'none'}")
         return found[0]
 
     # faults of answers
@@ -140,6 +153,12 @@ class SimControl:
     def place(self, counts: int, ids: Iterable[int] | None = None, *, bus: str | None = None) -> None:
         """Turn shafts by hand, to a position in counts."""
         self.do(faults.Place(counts=counts, ids=_ids(ids), bus=bus))
+
+    def put(
+        self, width_m: float | None, ids: Iterable[int] | None = None, *, inside: bool = False, bus: str | None = None
+    ) -> None:
+        """Put an object between the fingers of grippers, or with None take it away."""
+        self.do(faults.Put(width_m=width_m, inside=inside, ids=_ids(ids), bus=bus))
 
     def do(self, command: faults.Command) -> None:
         """Send any command of the simulator."""

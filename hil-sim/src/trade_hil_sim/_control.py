@@ -127,7 +127,8 @@ class ControlServer:
         return self._by_bus(command, ids)
 
     def _by_bus(self, command: Command, ids: tuple[int, ...]) -> list[tuple[Steered, Command]]:
-        here = {name: {device.device_id for device in bus.state().devices} for name, bus in self._buses.items()}
+        states = {name: bus.state() for name, bus in self._buses.items()}
+        here = {name: {device.device_id for device in (*s.devices, *s.grippers)} for name, s in states.items()}
         if unknown := set(ids).difference(*here.values()):
             raise SimulationError(f"no bus has a device {sorted(unknown)}; there is {here}")
         mine = {name: tuple(i for i in ids if i in there) for name, there in here.items()}

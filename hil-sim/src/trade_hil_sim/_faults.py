@@ -32,6 +32,7 @@ __all__ = [
     "Mute",
     "Piece",
     "Place",
+    "Put",
     "Replug",
     "Script",
     "Supply",
@@ -215,7 +216,7 @@ class BrownOut(_Devices, frozen=True, tag="brown_out"):
 
 
 class HardwareFault(_Devices, frozen=True, kw_only=True, tag="hardware_fault"):
-    """Latch bits of the hardware error register: 4 overheating, 32 overload, ..."""
+    """Latch bits of the hardware error register: 4 overheating, 32 overload, ...; of a gripper, its fault number."""
 
     bits: Byte = 0x20
 
@@ -240,6 +241,16 @@ class Place(_Devices, frozen=True, kw_only=True, tag="place"):
     counts: Annotated[int, Meta(ge=-1_048_575, le=1_048_575)]
 
 
+class Put(_Devices, frozen=True, kw_only=True, tag="put"):
+    """Put an object between a gripper's fingers; without a width, take it away."""
+
+    width_m: Annotated[float, Meta(ge=0, le=1)] | None = None
+    stiffness_n_m: Annotated[float, Meta(gt=0)] = 50_000.0
+    """How many newtons press it in by a metre."""
+    inside: bool = False
+    """It is hollow, and the fingers meet it when they open."""
+
+
 Command = (
     Absent
     | BadCrc
@@ -257,6 +268,7 @@ Command = (
     | Late
     | Mute
     | Place
+    | Put
     | Replug
     | Supply
     | Truncate

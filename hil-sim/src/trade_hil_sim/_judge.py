@@ -12,7 +12,10 @@ from ._log import Direction, Entry
 __all__ = ["events", "frames", "instructions", "motion_writes", "read_log", "received", "sent", "writes"]
 
 WRITING: Final = frozenset(
-    {"write", "reg_write", "action", "sync_write", "bulk_write", "sdo_write", "rpdo1", "rpdo2", "rpdo3", "rpdo4"}
+    {
+        *("write", "write_one", "read_write", "reg_write", "action", "sync_write", "bulk_write"),
+        *("sdo_write", "rpdo1", "rpdo2", "rpdo3", "rpdo4"),
+    }
 )
 EVERYBODY: Final = 254
 

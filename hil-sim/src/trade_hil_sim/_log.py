@@ -54,6 +54,8 @@ class Entry(msgspec.Struct, frozen=True, omit_defaults=True):
     position_counts: int | None = None
     position_rad: float | None = None
     """The joint's angle in the robot file's sense; without a robot file, the device's angle from its centre."""
+    width_m: float | None = None
+    """How far a gripper is open."""
     detail: str = ""
 
     @property

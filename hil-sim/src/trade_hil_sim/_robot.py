@@ -5,7 +5,7 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Final, Protocol, cast
 
-from trade_drivers.robotfile import Bus, Joint, Robot, parse
+from trade_drivers.robotfile import Bus, Gripper, Joint, Robot, parse
 
 from ._errors import SimulationError
 from ._faults import Command
@@ -52,7 +52,13 @@ class SimulatedBusClass(Protocol):
     """What an entry point of the group ``trade.sims`` names."""
 
     def from_robot(
-        self, bus: Bus, joints: Sequence[Joint], port: Path, *, log: ByteLog | None = None, paced: bool = True
+        self,
+        bus: Bus,
+        devices: Sequence[Joint | Gripper],
+        port: Path,
+        *,
+        log: ByteLog | None = None,
+        paced: bool = True,
     ) -> SimulatedBus:
         """Make the bus a robot file describes, not yet open; raises `SimulationError` naming what it cannot do."""
         ...
@@ -81,7 +87,11 @@ def buses_of(
             raise SimulationError(f"{robot.where} has no bus {name!r}; it has {', '.join(sorted(known))}")
     return [
         find_simulator(bus.driver).from_robot(
-            bus, robot.joints_on(bus.name), directory / bus.name, log=log, paced=paced
+            bus,
+            [*robot.joints_on(bus.name), *robot.grippers_on(bus.name)],
+            directory / bus.name,
+            log=log,
+            paced=paced,
         )
         for bus in robot.buses
         if not names or bus.name in names

@@ -2,7 +2,7 @@
 
 import msgspec
 
-__all__ = ["BusState", "DeviceState"]
+__all__ = ["BusState", "DeviceState", "GripperTruth"]
 
 
 class DeviceState(msgspec.Struct, frozen=True, kw_only=True):
@@ -27,6 +27,26 @@ class DeviceState(msgspec.Struct, frozen=True, kw_only=True):
     absent: bool
 
 
+class GripperTruth(msgspec.Struct, frozen=True, kw_only=True):
+    """One simulated gripper."""
+
+    bus: str = ""
+    device_id: int
+    gripper: str
+    width_m: float
+    position_counts: int
+    goal_counts: int
+    activated: bool
+    moving: bool
+    holding: bool
+    """It presses on something on its way to the goal."""
+    force_n: float
+    """The force it was told to press with."""
+    fault: int
+    """What its fault register reads."""
+    absent: bool
+
+
 class BusState(msgspec.Struct, frozen=True, kw_only=True):
     """One simulated bus."""
 
@@ -34,4 +54,5 @@ class BusState(msgspec.Struct, frozen=True, kw_only=True):
     port: str
     """The name clients open."""
     plugged: bool
-    devices: list[DeviceState]
+    devices: list[DeviceState] = []
+    grippers: list[GripperTruth] = []

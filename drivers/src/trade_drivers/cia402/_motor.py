@@ -4,6 +4,7 @@ from typing import Annotated, cast
 
 from trade import Meta, permit, service
 from trade.errors import LimitExceeded
+from trade_drivers._asked import expiry
 from trade_drivers.cia402._axis import DriveAxis
 from trade_drivers.cia402._exchange import DriveExchange
 from trade_drivers.cia402._homing import Homing
@@ -37,7 +38,7 @@ class Drive(BusMotor):
             raise LimitExceeded(
                 what=f"{axis.name} speed", value=speed, lower=axis.grain.rad_s, upper=fastest, unit="rad/s"
             )
-        expires_ns, ends = self._expiry()
+        expires_ns, ends = expiry(self._exchange.clock)
         with permit(self.resources) as permitted:
             homing = Homing(
                 cast("DriveExchange", self._exchange),

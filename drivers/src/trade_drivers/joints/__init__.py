@@ -1,9 +1,10 @@
 """Joints with a position drive on a bus: what drivers of every vendor have in common, one owner thread a bus."""
 
+from trade_drivers._bus_thread import BusThread, Port
+from trade_drivers._work import Gate, PortLost, Steps
 from trade_drivers.joints._axis import Axis, Goal, Grain, Sample
-from trade_drivers.joints._bus import BusThread, Port
-from trade_drivers.joints._exchange import Exchange, Gate, PortLost
-from trade_drivers.joints._jobs import Job, Steps
+from trade_drivers.joints._exchange import Exchange
+from trade_drivers.joints._jobs import Job
 from trade_drivers.joints._motion import Motion
 from trade_drivers.joints._motor import AttachedJoints, BusMotor
 

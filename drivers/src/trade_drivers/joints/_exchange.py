@@ -5,25 +5,21 @@ import time
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from typing import TYPE_CHECKING, Final
 
 from trade.errors import MotionStopped, TradeError
+from trade_drivers._work import Device, Gate, Steps
 from trade_drivers.joints._axis import Axis, Goal
-from trade_drivers.joints._jobs import Job, Steps, StopTicket
+from trade_drivers.joints._jobs import Job, Leave, StopTicket
 from trade_drivers.joints._motion import Motion
 
 if TYPE_CHECKING:
     from trade_drivers.robotfile import Bus
 
-__all__ = ["Exchange", "Gate", "PortLost"]
+__all__ = ["Exchange"]
 
-Gate = Callable[[], None]
-"""Called right before the bytes go out; what it raises keeps them in."""
 _HALT_NS: Final = 2_000_000_000
-
-
-class PortLost(Exception):
-    """The port itself is gone: unplugged, down, or never opened."""
 
 
 class Exchange(ABC):
@@ -35,7 +31,7 @@ class Exchange(ABC):
         self.wake = threading.Event()
         """Set when something should not wait for the next cycle."""
         self.stale_after_ns = int(bus.stale_after_s * 1e9)
-        self.refusing: Callable[[Axis], TradeError] | None = None
+        self.refusing: Callable[[Device], TradeError] | None = None
         """Why nothing is taken on at present."""
         self.period_ns = int(1e9 / bus.rate_hz)
         self._inbox: deque[Job] = deque()
@@ -101,6 +97,20 @@ class Exchange(ABC):
         self.wake.set()
         return ticket
 
+    def leave(self, alive: Callable[[], bool], *, relax: bool) -> None:
+        """Stop everything, then hold or relax; waits until that is done, or the bus thread has ended.
+
+        Raises:
+            TradeError: not everything could be left so.
+        """
+        if not self.axes:
+            return
+        with suppress(TradeError):  # a joint that cannot be heard keeps its watchdog; the others are left properly
+            self.stop(self.axes, "its driver is leaving").wait(alive)
+        leave = Leave(self, self.axes, relax=relax)
+        self.submit(leave)
+        leave.wait(alive)
+
     # --- from the bus thread
 
     def idle(self, seconds: float) -> None:
@@ -131,6 +141,10 @@ class Exchange(ABC):
                 if axis.motion is not None:
                     self._forget(axis.motion, MotionStopped(device=axis.name, reason=reason))
 
+    def halt_all(self, reason: str) -> None:
+        """The same for all joints."""
+        self.halt(self.axes, reason)
+
     def _at_rest(self, axis: Axis, now_ns: int) -> bool:
         """Nothing to stop: no torque, or no motion of ours and seen not to move."""
         idle = axis.motion is None and axis.still >= 2 and axis.age_ns(now_ns) <= self.stale_after_ns
@@ -160,7 +174,7 @@ class Exchange(ABC):
             self._forget(old, MotionStopped(device=motion.axes[0].name, reason="another move took over"))
             self.hold(left, self.clock())
 
-    def fail_all(self, error_of: Callable[[Axis], TradeError]) -> None:
+    def fail_all(self, error_of: Callable[[Device], TradeError]) -> None:
         """End everything anyone waits for."""
         for axis in self.axes:
             if axis.motion is not None:

@@ -1,11 +1,11 @@
 """What services ask of the bus thread: work of several exchanges, done one exchange at a time between the cycles."""
 
-import threading
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from trade import Permit
-from trade.errors import DeadlineExceeded, TradeError
+from trade.errors import TradeError
+from trade_drivers._work import Steps, Work, check_admitted
 from trade_drivers.joints._axis import Axis
 
 if TYPE_CHECKING:
@@ -13,66 +13,14 @@ if TYPE_CHECKING:
 
 __all__ = ["Command", "Enable", "Halt", "Job", "Leave", "Relax", "Steps", "StopTicket"]
 
-Steps = Generator[None, None, None]
-"""Yields after each exchange on the wire, so that stops and cycles come in between."""
 
-
-class Job:
+class Job(Work):
     """Something that is waited for. As it stands it needs no leave: it ends motion."""
 
     def __init__(self, exchange: "Exchange", axes: Sequence[Axis]) -> None:
+        super().__init__(axes[0])
         self.exchange = exchange
         self.axes = tuple(axes)
-        self._ended = threading.Event()
-        self._error: TradeError | None = None
-        self._steps: Steps | None = None
-
-    @property
-    def ended(self) -> bool:
-        """Its outcome is known."""
-        return self._ended.is_set()
-
-    def gate(self) -> None:
-        """The last look before its bytes go out; what it raises keeps them in."""
-
-    def steps(self) -> Steps:
-        """The work."""
-        raise NotImplementedError
-
-    def step(self) -> bool:
-        """Do one exchange of it; False when nothing is left to do."""
-        if self._steps is None:
-            self._steps = self.steps()
-        try:
-            next(self._steps)
-        except StopIteration:
-            return False
-        except TradeError as problem:
-            self.finish(problem)
-            return False
-        return True
-
-    def done_stepping(self) -> None:
-        """All its exchanges have been made."""
-        self.finish()
-
-    def finish(self, error: TradeError | None = None) -> None:
-        """Let the waiting service have the outcome; only the first counts."""
-        if not self._ended.is_set():
-            self._error = error
-            self._ended.set()
-
-    def wait(self, alive: Callable[[], bool]) -> None:
-        """Block until it has ended.
-
-        Raises:
-            TradeError: what became of it.
-        """
-        while not self._ended.wait(1.0):
-            if not alive():
-                self.finish(self.axes[0].faulty("the thread of its bus has ended"))
-        if self._error is not None:
-            raise self._error
 
 
 class Command(Job):
@@ -94,10 +42,10 @@ class Command(Job):
             DeadlineExceeded: it is late, and late is never.
             MotionStopped, LockLost, LockedByOther: a stop, or another owner, came after it was admitted.
         """
-        if self.exchange.clock() >= self.expires_ns:
-            patience_s = (self.expires_ns - self._admitted_ns) / 1e9
-            raise DeadlineExceeded(service=self.service, deadline_s=max(0.0, patience_s))
-        self.permit.gate()
+        now_ns = self.exchange.clock()
+        check_admitted(
+            self.service, self.permit, admitted_ns=self._admitted_ns, expires_ns=self.expires_ns, now_ns=now_ns
+        )
 
 
 class StopTicket(Job):

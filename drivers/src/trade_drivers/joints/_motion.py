@@ -7,8 +7,9 @@ from msgspec import Struct
 
 from trade import Permit
 from trade.errors import MotionStopped, TradeError
+from trade_drivers._work import Steps
 from trade_drivers.joints._axis import Axis, Goal
-from trade_drivers.joints._jobs import Command, Steps
+from trade_drivers.joints._jobs import Command
 from trade_drivers.joints._profile import Leg, together
 
 if TYPE_CHECKING:

@@ -1,31 +1,26 @@
 """Motor and JointGroup on a bus: they check, hand over to the bus thread, wait, and never touch the port."""
 
 from collections.abc import Sequence
-from math import isfinite
-from typing import Final
 
-from trade import Resource, current_call, permit
+from trade import Resource, permit
 from trade.errors import DeviceError, DeviceSilent, InvalidArgument, LimitExceeded
+from trade_drivers._asked import expiry, finite, time_to_answer_ns
+from trade_drivers._bus_thread import BusThread
 from trade_drivers._driver import AttachedBus
 from trade_drivers._interfaces import LONGEST_VALID_S, JointGroup, JointLimits, Motor, MotorState
 from trade_drivers.joints._axis import Axis
-from trade_drivers.joints._bus import BusThread
+from trade_drivers.joints._exchange import Exchange
 from trade_drivers.joints._jobs import Command, Enable, Halt, Relax
 from trade_drivers.joints._motion import Move
 from trade_drivers.joints._setpoint import SetPoint
 
 __all__ = ["AttachedJoints", "BusGroup", "BusMotor"]
 
-_DEFAULT_EXPIRY_NS: Final = 1_000_000_000
-"""How long a plain Python call may wait for its turn on the bus."""
-_ANSWER_NS: Final = 100_000_000
-"""For one exchange (48 ms at most), the hold, and the way back to the caller."""
-
 
 class _Joints:
     """What one motor and a group have in common: a bus and some of its joints."""
 
-    def __init__(self, name: str, thread: BusThread, axes: Sequence[Axis]) -> None:
+    def __init__(self, name: str, thread: BusThread[Exchange], axes: Sequence[Axis]) -> None:
         self._name = name
         self._thread = thread
         self._exchange = thread.exchange
@@ -45,7 +40,7 @@ class _Joints:
         self._do(Relax, "relax")
 
     def _do(self, kind: type[Enable | Relax | Halt], name: str) -> None:
-        expires_ns, _ = self._expiry()
+        expires_ns, _ = expiry(self._exchange.clock)
         service = f"{self._name}.{name}"
         with permit(self.resources) as permitted:
             self._finish(kind(self._exchange, self._axes, service=service, expires_ns=expires_ns, permit=permitted))
@@ -54,21 +49,14 @@ class _Joints:
         self._exchange.submit(job)
         job.wait(self._thread.alive)
 
-    def _expiry(self) -> tuple[int, bool]:
-        """When it may begin at the latest, and whether it must be over then: a plain Python call ends when it ends."""
-        call = current_call()
-        if call is None or call.expires_ns is None:
-            return self._exchange.clock() + _DEFAULT_EXPIRY_NS, False
-        return call.expires_ns, True
-
     def _move(self, positions_rad: Sequence[float], speed_rad_s: float | None, argument: str) -> list[float]:
         service = f"{self._name}.move_to"
         goals = self._goals(positions_rad, service, argument)
-        speed = None if speed_rad_s is None else _finite(speed_rad_s, service, "speed_rad_s")
+        speed = None if speed_rad_s is None else finite(speed_rad_s, service, "speed_rad_s")
         speeds = [_speed_counts(axis, speed) for axis in self._axes]
-        expires_ns, ends = self._expiry()
+        expires_ns, ends = expiry(self._exchange.clock)
         if ends:
-            expires_ns -= _time_to_answer_ns(expires_ns - self._exchange.clock())
+            expires_ns -= time_to_answer_ns(expires_ns - self._exchange.clock())
         until_ns = expires_ns if ends else None
         with permit(self.resources) as permitted:
             move = Move(
@@ -87,7 +75,7 @@ class _Joints:
     def _set(self, goals: Sequence[int], speeds: Sequence[int], service: str, valid_s: float) -> None:
         """Begin a set-point, or take over from the one before; returns once it is on the wire."""
         until_ns = self._exchange.clock() + int(valid_s * 1e9)
-        expires_ns, _ = self._expiry()
+        expires_ns, _ = expiry(self._exchange.clock)
         with permit(self.resources) as permitted:
             self._finish(
                 SetPoint(
@@ -108,7 +96,7 @@ class _Joints:
             problem = f"has {len(positions_rad)} values; it takes {len(self._axes)}, for {names}"
             raise InvalidArgument(service=service, argument=argument, problem=problem)
         return [
-            _goal_counts(axis, _finite(value, service, argument))
+            _goal_counts(axis, finite(value, service, argument))
             for axis, value in zip(self._axes, positions_rad, strict=True)
         ]
 
@@ -151,7 +139,7 @@ class BusMotor(_Joints, Motor):
 
     def set_velocity(self, velocity_rad_s: float, valid_s: float = 0.2) -> None:
         service = f"{self._name}.set_velocity"
-        velocity, valid_s = _finite(velocity_rad_s, service, "velocity_rad_s"), _valid(valid_s, service)
+        velocity, valid_s = finite(velocity_rad_s, service, "velocity_rad_s"), _valid(valid_s, service)
         if velocity == 0:
             self._do(Halt, "set_velocity")
             return
@@ -183,7 +171,7 @@ class BusGroup(_Joints, JointGroup):
 class AttachedJoints(AttachedBus):
     """A bus with its joints, and the thread that owns it."""
 
-    def __init__(self, thread: BusThread, motor: type[BusMotor] = BusMotor) -> None:
+    def __init__(self, thread: BusThread[Exchange], motor: type[BusMotor] = BusMotor) -> None:
         self._thread, self._motor = thread, motor
         self._axes = {axis.joint.name: axis for axis in thread.exchange.axes}
 
@@ -198,22 +186,8 @@ class AttachedJoints(AttachedBus):
         self._thread.close()
 
 
-def _time_to_answer_ns(left_ns: int) -> int:
-    """How long before its call's deadline a move ends, so that the caller is told that the joint was stopped.
-
-    Stopped at the deadline itself, the answer would come when nobody waits for it any more.
-    """
-    return min(_ANSWER_NS, max(0, left_ns) // 5)
-
-
-def _finite(value: float, service: str, argument: str) -> float:
-    if not isinstance(value, int | float) or isinstance(value, bool) or not isfinite(value):  # pyright: ignore[reportUnnecessaryIsInstance]
-        raise InvalidArgument(service=service, argument=argument, problem=f"{value!r} is not a finite number")
-    return float(value)
-
-
 def _valid(valid_s: float, service: str) -> float:
-    if not 0 < _finite(valid_s, service, "valid_s") <= LONGEST_VALID_S:
+    if not 0 < finite(valid_s, service, "valid_s") <= LONGEST_VALID_S:
         problem = f"{valid_s!r} is not above 0 and at most {LONGEST_VALID_S:g}"
         raise InvalidArgument(service=service, argument="valid_s", problem=problem)
     return valid_s

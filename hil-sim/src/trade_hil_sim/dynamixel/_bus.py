@@ -1,6 +1,5 @@
 """A simulated Dynamixel bus: servos behind one serial line, with a log and scripted faults."""
 
-import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -9,8 +8,8 @@ from typing import TYPE_CHECKING, Final
 import msgspec
 
 from trade_hil_sim import _faults as faults
+from trade_hil_sim._device_line import DeviceLine
 from trade_hil_sim._errors import SimulationError
-from trade_hil_sim._line import SerialLine
 from trade_hil_sim._log import ByteLog
 from trade_hil_sim._state import BusState
 
@@ -29,7 +28,7 @@ PAUSE_S: Final = 0.1
 """A packet whose next byte has not come after this long is given up."""
 
 
-class DynamixelBus:
+class DynamixelBus(DeviceLine[Servo]):
     """Servos on one serial line; a client opens `port` as it would a real adapter.
 
     Args:
@@ -51,21 +50,13 @@ class DynamixelBus:
         paced: bool = True,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self.name, self.port = name, port
-        self.log = ByteLog() if log is None else log
-        self._clock = clock
-        self._servos = list(servos)
-        self._lock = threading.RLock()
-        self._script = faults.Script()
-        self._journal = Journal(self.log, name, self._servos)
+        super().__init__(servos, port, name=name, log=log, paced=paced, clock=clock)
+        self._journal = Journal(self.log, name, self._devices)
         self._dispatch = Dispatch(self._script.silences, self._journal.refused)
         self._reader = PacketReader()
-        self._last_byte_at = 0.0
-        self._echo = False
         self._deaf_to: int | None = None
-        for servo in self._servos:
+        for servo in self._devices:
             servo.emit = self._journal.event
-        self._line = SerialLine(port, self, name=name, log=self.log, paced=paced)
 
     @classmethod
     def from_robot(
@@ -87,120 +78,40 @@ class DynamixelBus:
         servos = [_servo_for(bus, joint, clock()) for joint in joints]
         return cls(servos, port, name=bus.name, log=log, paced=paced, clock=clock)
 
-    def open(self) -> "DynamixelBus":
-        """Plug in: from now on the port can be opened."""
-        self._line.open()
-        return self
-
-    def close(self) -> None:
-        """Hang up and remove the port. Idempotent; a log passed in stays open."""
-        self._line.close()
-
-    def __enter__(self) -> "DynamixelBus":
-        return self.open()
-
-    def __exit__(self, *exc: object) -> None:
-        self.close()
-
     @property
     def servos(self) -> Sequence[Servo]:
         """The servos; take care, the bus's own thread uses them, too."""
-        return tuple(self._servos)
+        return tuple(self._devices)
 
     def state(self) -> BusState:
         """The truth about the bus and its servos, now."""
         with self._lock:
             t = self._clock()
-            devices = [msgspec.structs.replace(servo.state(t), bus=self.name) for servo in self._servos]
+            devices = [msgspec.structs.replace(servo.state(t), bus=self.name) for servo in self._devices]
         return BusState(name=self.name, port=str(self.port), plugged=self._line.plugged, devices=devices)
 
-    # faults and orders
+    def _do_to(self, device: Servo, command: faults.Command, t: float) -> None:
+        _do_to(device, command, t)
 
-    def do(self, command: faults.Command) -> None:
-        """Carry out one fault or order; raises `SimulationError` for a device that is not here."""
-        match command:
-            case faults.Unplug():
-                self._line.unplug()
-            case faults.Replug():
-                self._line.replug()
-            case _:
-                with self._lock:
-                    self._do_here(command)
-                self._line.nudge()
+    def _heal(self, device: Servo, t: float) -> None:
+        device.absent = False
+        device.freeze_sensor(False, t)
+        device.jam(False, t)
+        device.table.set("model_number", device.model.number)
 
-    def _do_here(self, command: faults.Command) -> None:
-        match command:
-            case faults.AnswerFault():
-                self._named(command.ids)
-                self._script.add(command)
-            case faults.Unmute():
-                self._named(command.ids)
-                self._script.unmute(command.ids)
-            case faults.Heal():
-                self._heal()
-            case faults.Echo():
-                self._echo = command.on
-            case _:
-                self._do_to_devices(command)
-
-    def _do_to_devices(self, command: faults.Command) -> None:
-        if isinstance(
-            command, (faults.AnswerFault, faults.Unmute, faults.Heal, faults.Echo, faults.Unplug, faults.Replug)
-        ):
-            return
-        t = self._clock()
-        for servo in self._named(command.ids):
-            servo.advance(t)
-            _do_to(servo, command, t)
-
-    def _heal(self) -> None:
-        t = self._clock()
-        self._script.heal()
-        self._echo = False
-        for servo in self._servos:
-            servo.advance(t)
-            servo.absent = False
-            servo.freeze_sensor(False, t)
-            servo.jam(False, t)
-            servo.table.set("model_number", servo.model.number)
-
-    def _named(self, ids: tuple[int, ...] | None) -> list[Servo]:
-        here = {servo.device_id for servo in self._servos}
-        if unknown := set(ids or ()) - here:
-            raise SimulationError(f"bus {self.name} has no device {sorted(unknown)}; it has {sorted(here)}")
-        return [servo for servo in self._servos if ids is None or servo.device_id in ids]
-
-    # the far end of the line; called from its thread
-
-    def wake_in_s(self) -> float | None:
-        """Seconds until a servo does something by itself."""
-        with self._lock:
-            due = min((due for servo in self._servos if (due := servo.next_due()) is not None), default=None)
-            return None if due is None else due - self._clock()
-
-    def wake(self) -> None:
-        """Let the servos do what is due."""
-        with self._lock:
-            t = self._clock()
-            for servo in self._servos:
-                servo.advance(t)
-
-    def received(self, data: bytes, t: float) -> None:
-        """Bytes from the client."""
-        if self._echo:
-            self._line.send(data, name="echo")
-        if t - self._last_byte_at > PAUSE_S:
+    def _silent_for(self, s: float) -> None:
+        if s > PAUSE_S:
             self._reader.reset()
-        self._last_byte_at = t
-        with self._lock:
-            hearing = self._hearing(t)
-            for packet in self._reader.feed(data) if hearing else ():
-                self._carry_out([servo for servo in hearing if servo.hears], packet, t)
+
+    def _take(self, data: bytes, t: float) -> None:
+        hearing = self._hearing(t)
+        for packet in self._reader.feed(data) if hearing else ():
+            self._carry_out([servo for servo in hearing if servo.hears], packet, t)
 
     def _hearing(self, t: float) -> list[Servo]:
         """Servos set to the baud rate the client speaks at; to others it is noise."""
         baud = self._line.client_baud
-        hearing = [servo for servo in self._servos if baud is None or servo.baud == baud]
+        hearing = [servo for servo in self._devices if baud is None or servo.baud == baud]
         if hearing:
             self._deaf_to = None
         elif baud != self._deaf_to:
@@ -216,11 +127,8 @@ class DynamixelBus:
             for servo in servos:
                 servo.heard(now)
         for answer in self._dispatch.answers(servos, packet, now):
-            delay_s = answer.delay_s
-            for data, late_s in self._script.shape(answer.data, answer.ids, packet.name):
-                device_id = answer.ids[0] if len(answer.ids) == 1 else BROADCAST
-                self._line.send(data, after_s=delay_s, late_s=late_s, name=packet.name, device_id=device_id)
-                delay_s = 0.0
+            device_id = answer.ids[0] if len(answer.ids) == 1 else BROADCAST
+            self._answer(answer.data, answer.ids, packet.name, after_s=answer.delay_s, device_id=device_id)
 
 
 def _servo_for(bus: "SerialBus", joint: "Joint", t: float) -> Servo:

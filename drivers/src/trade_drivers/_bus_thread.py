@@ -4,17 +4,12 @@ import logging
 import threading
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from functools import partial
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import Final, Generic, Protocol, TypeVar
 
 from trade.errors import BusGone, TradeError
-from trade_drivers.joints._axis import Axis
-from trade_drivers.joints._exchange import Exchange, PortLost
-from trade_drivers.joints._jobs import Leave
-
-if TYPE_CHECKING:
-    from trade_drivers.robotfile import Bus
+from trade_drivers._work import Device, PortLost
+from trade_drivers.robotfile import Bus
 
 __all__ = ["BusThread", "Port"]
 
@@ -38,11 +33,50 @@ class Port(Protocol):
         ...
 
 
-class BusThread:
+class Exchange(Protocol):
+    """What happens on the bus. ``leave`` is called from any thread, the rest from the bus thread."""
+
+    refusing: Callable[[Device], TradeError] | None
+    """Why nothing is taken on at present."""
+
+    @property
+    def wake(self) -> threading.Event:
+        """Set when something should not wait for the next cycle."""
+        ...
+
+    def cycle(self) -> None:
+        """One round: stops, measurements, work, motions."""
+        ...
+
+    def idle(self, seconds: float) -> None:
+        """Between two cycles; ends early when something came up."""
+        ...
+
+    def halt_all(self, reason: str) -> None:
+        """End every motion."""
+        ...
+
+    def forget_measurements(self) -> None:
+        """The port is gone."""
+        ...
+
+    def fail_all(self, error_of: Callable[[Device], TradeError]) -> None:
+        """End everything anyone waits for."""
+        ...
+
+    def leave(self, alive: Callable[[], bool], *, relax: bool) -> None:
+        """Stop everything, then hold or relax; waits until that is done, or the bus thread has ended."""
+        ...
+
+
+_Exchange_co = TypeVar("_Exchange_co", bound=Exchange, covariant=True)
+
+
+class BusThread(Generic[_Exchange_co]):
     """One owner thread of one bus. Services hand it work and read what it measured; nobody else touches the port."""
 
-    def __init__(self, exchange: Exchange, wire: Port, bus: "Bus", healthy: Callable[[], bool], name: str) -> None:
-        self.exchange = exchange
+    def __init__(self, exchange: _Exchange_co, wire: Port, bus: Bus, healthy: Callable[[], bool], name: str) -> None:
+        self._exchange = exchange
         self._wire = wire
         self._bus = bus
         self._healthy = healthy
@@ -52,6 +86,11 @@ class BusThread:
         self._reopen_s = _REOPEN_FIRST_S
         self._leaving = False
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+
+    @property
+    def exchange(self) -> _Exchange_co:
+        """What it does on the wire."""
+        return self._exchange
 
     def start(self) -> None:
         """Begin to cycle; the port must be open."""
@@ -71,20 +110,11 @@ class BusThread:
             return
         try:
             if self.alive():
-                self._leave()
+                self.exchange.leave(self.alive, relax=self._bus.leave == "relax")
         finally:
             self._leaving = True
             self.exchange.wake.set()
             self._thread.join()
-
-    def _leave(self) -> None:
-        exchange = self.exchange
-        with suppress(TradeError):  # a joint that cannot be heard keeps its watchdog; the others are left properly
-            exchange.stop(exchange.axes, "its driver is leaving").wait(self.alive)
-        relax = self._bus.leave == "relax"
-        leave = Leave(exchange, exchange.axes, relax=relax)
-        exchange.submit(leave)
-        leave.wait(self.alive)
 
     # --- the thread
 
@@ -99,7 +129,7 @@ class BusThread:
             problem = f"the thread of its bus failed: {defect!r}"
             _log.exception("bus %s: its thread failed; its devices stop by their watchdogs", self._bus.name)
         finally:
-            self.exchange.refusing = lambda axis: axis.faulty(problem)
+            self.exchange.refusing = lambda device: device.faulty(problem)
             self._wire.close()
             self.exchange.fail_all(self.exchange.refusing)
 
@@ -135,8 +165,8 @@ class BusThread:
             self.exchange.forget_measurements()
             self.exchange.fail_all(self._gone)
 
-    def _gone(self, axis: Axis) -> TradeError:
-        return BusGone(device=axis.name, bus=self._wire.path, waited_s=time.monotonic() - self._lost_at)
+    def _gone(self, device: Device) -> TradeError:
+        return BusGone(device=device.name, bus=self._wire.path, waited_s=time.monotonic() - self._lost_at)
 
     def _reopen(self) -> None:
         self.exchange.fail_all(self._gone)
@@ -165,12 +195,12 @@ class BusThread:
         self._sick = not healthy
         if self._sick:
             _log.error("bus %s: this process is not healthy; holding, then silent", self._bus.name)
-            self._guarded(lambda: self.exchange.halt(self.exchange.axes, "its driver's process is not healthy"))
+            self._guarded(lambda: self.exchange.halt_all("its driver's process is not healthy"))
             self.exchange.refusing = self._unhealthy
             self.exchange.fail_all(self._unhealthy)
         else:
             self.exchange.refusing = None
         return healthy
 
-    def _unhealthy(self, axis: Axis) -> TradeError:
-        return axis.faulty("its driver's process is not healthy")
+    def _unhealthy(self, device: Device) -> TradeError:
+        return device.faulty("its driver's process is not healthy")

@@ -1,0 +1,103 @@
+"""What services ask of the thread that owns a bus: work that is waited for, and what lets a command pass."""
+
+import threading
+from collections.abc import Callable, Generator
+from typing import Protocol
+
+from trade import Permit
+from trade.errors import DeadlineExceeded, DeviceFault, TradeError
+
+__all__ = ["Device", "Gate", "PortLost", "Steps", "Work", "check_admitted"]
+
+Steps = Generator[None, None, None]
+"""Yields after each exchange on the wire, so that stops and cycles come in between."""
+
+Gate = Callable[[], None]
+"""Called right before the bytes go out; what it raises keeps them in."""
+
+
+class PortLost(Exception):
+    """The port itself is gone: unplugged, down, or never opened."""
+
+
+class Device(Protocol):
+    """Something on a bus, as errors tell of it."""
+
+    @property
+    def name(self) -> str:
+        """Such as ``rosie.neck.pan``."""
+        ...
+
+    def faulty(self, fault: str = "") -> DeviceFault:
+        """The error of a device with a fault; by default the latched one."""
+        ...
+
+
+class Work:
+    """Something that is waited for. As it stands it needs no leave: it ends motion."""
+
+    def __init__(self, device: Device) -> None:
+        self._device = device
+        self._ended = threading.Event()
+        self._error: TradeError | None = None
+        self._steps: Steps | None = None
+
+    @property
+    def ended(self) -> bool:
+        """Its outcome is known."""
+        return self._ended.is_set()
+
+    def gate(self) -> None:
+        """The last look before its bytes go out; what it raises keeps them in."""
+
+    def steps(self) -> Steps:
+        """The work."""
+        raise NotImplementedError
+
+    def step(self) -> bool:
+        """Do one exchange of it; False when nothing is left to do."""
+        if self._steps is None:
+            self._steps = self.steps()
+        try:
+            next(self._steps)
+        except StopIteration:
+            return False
+        except TradeError as problem:
+            self.finish(problem)
+            return False
+        return True
+
+    def done_stepping(self) -> None:
+        """All its exchanges have been made."""
+        self.finish()
+
+    def finish(self, error: TradeError | None = None) -> None:
+        """Let the waiting service have the outcome; only the first counts."""
+        if not self._ended.is_set():
+            self._error = error
+            self._ended.set()
+
+    def wait(self, alive: Callable[[], bool]) -> None:
+        """Block until it has ended.
+
+        Raises:
+            TradeError: what became of it.
+        """
+        while not self._ended.wait(1.0):
+            if not alive():
+                self.finish(self._device.faulty("the thread of its bus has ended"))
+        if self._error is not None:
+            raise self._error
+
+
+def check_admitted(service: str, permit: Permit, *, admitted_ns: int, expires_ns: int, now_ns: int) -> None:
+    """The last look at a command before its bytes go out.
+
+    Raises:
+        DeadlineExceeded: it is late, and late is never.
+        MotionStopped, LockLost, LockedByOther: a stop, or another owner, came after it was admitted.
+    """
+    if now_ns >= expires_ns:
+        patience_s = (expires_ns - admitted_ns) / 1e9
+        raise DeadlineExceeded(service=service, deadline_s=max(0.0, patience_s))
+    permit.gate()

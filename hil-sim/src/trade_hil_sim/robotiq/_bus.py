@@ -1,0 +1,231 @@
+"""A simulated Modbus line with 2F-85 grippers, with a log and scripted faults."""
+
+import time
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import msgspec
+
+from trade_hil_sim import _faults as faults
+from trade_hil_sim._device_line import DeviceLine
+from trade_hil_sim._errors import SimulationError
+from trade_hil_sim._log import ByteLog, Entry
+from trade_hil_sim._state import BusState
+
+from . import _table as table
+from ._gripper import Gripper, Object
+from ._protocol import (
+    BROADCAST,
+    MOST_REGISTERS,
+    ExceptionCode,
+    Function,
+    Request,
+    RequestReader,
+    exception,
+    read_answer,
+    write_answer,
+)
+
+if TYPE_CHECKING:
+    from trade_drivers.robotfile import Gripper as GripperRecord
+    from trade_drivers.robotfile import Joint, SerialBus
+
+__all__ = ["RobotiqBus"]
+
+MODEL: Final = "2F-85"
+_BAUDS: Final = (9600, 19_200, 38_400, 57_600, 115_200)
+_GAP_CHARACTERS: Final = 3.5
+_BITS: Final = 10
+_WRITING: Final = frozenset({Function.WRITE_ONE, Function.WRITE, Function.READ_WRITE})
+_NAMES: Final = ("action_request", "position_request", "speed_and_force")
+
+
+class RobotiqBus(DeviceLine[Gripper]):
+    """Grippers on one serial line; a client opens `port` as it would a real adapter.
+
+    Args:
+        grippers: on the bus, each with an id of its own.
+        port: stable path the client opens; made here, gone after `close`.
+        name: of the bus, in the log.
+        log: where to record; default: a log in memory, at `log`.
+        paced: take as long as the real wire, the gap before an answer included; else answer as fast as possible.
+        clock: the grippers' clock, in seconds. The line itself keeps real time.
+    """
+
+    def __init__(
+        self,
+        grippers: Iterable[Gripper],
+        port: Path,
+        *,
+        name: str = "bus",
+        log: ByteLog | None = None,
+        paced: bool = True,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        super().__init__(grippers, port, name=name, log=log, paced=paced, clock=clock)
+        self._reader = RequestReader()
+        for gripper in self._devices:
+            gripper.emit = self._event
+
+    @classmethod
+    def from_robot(
+        cls,
+        bus: "SerialBus",
+        devices: "Sequence[Joint | GripperRecord]",
+        port: Path,
+        *,
+        log: ByteLog | None = None,
+        paced: bool = True,
+    ) -> "RobotiqBus":
+        """The bus a robot file describes, each gripper open and not activated.
+
+        Args:
+            bus: the bus's record.
+            devices: the grippers on it.
+            port: path the client will open instead of the record's.
+            log: where to record.
+            paced: take as long as the real wire.
+
+        Raises:
+            SimulationError: a model or baud rate that is not simulated.
+        """
+        if bus.baud not in _BAUDS:
+            known = ", ".join(map(str, _BAUDS))
+            raise SimulationError(f"bus.{bus.name}.baud: {bus.baud} is no rate of a {MODEL}; there is {known}")
+        for device in devices:
+            if device.model != MODEL:
+                raise SimulationError(f'"{device.name}".model: {device.model!r} is not simulated; there is {MODEL}')
+        clock = time.monotonic
+        grippers = [Gripper(device.id, name=device.name, t=clock(), baud=bus.baud) for device in devices]
+        return cls(grippers, port, name=bus.name, log=log, paced=paced, clock=clock)
+
+    @property
+    def grippers(self) -> Sequence[Gripper]:
+        """The grippers; take care, the bus's own thread uses them, too."""
+        return tuple(self._devices)
+
+    def state(self) -> BusState:
+        """The truth about the bus and its grippers, now."""
+        with self._lock:
+            t = self._clock()
+            grippers = [msgspec.structs.replace(gripper.truth(t), bus=self.name) for gripper in self._devices]
+        return BusState(name=self.name, port=str(self.port), plugged=self._line.plugged, grippers=grippers)
+
+    def _do_to(self, device: Gripper, command: faults.Command, t: float) -> None:
+        match command:
+            case faults.Absent():
+                device.absent = command.on
+            case faults.Freeze():
+                device.freeze(command.on, t)
+            case faults.Jam():
+                device.jam(command.on, t)
+            case faults.BrownOut():
+                device.lose_power(t)
+            case faults.HardwareFault():
+                device.fail(command.bits, t)
+            case faults.Put(width_m=None):
+                device.put(None, t)
+            case faults.Put(width_m=float(width_m)):
+                device.put(Object(width_m, command.stiffness_n_m, command.inside), t)
+            case _:
+                raise SimulationError(f"{type(command).__name__} is nothing that happens to a {MODEL}")
+
+    def _heal(self, device: Gripper, t: float) -> None:
+        device.heal(t)
+
+    # --- requests
+
+    def _silent_for(self, s: float) -> None:
+        self._reader.silence(s)
+
+    def _take(self, data: bytes, t: float) -> None:
+        baud = self._line.client_baud
+        hearing = [gripper for gripper in self._devices if baud in {None, gripper.baud} and not gripper.absent]
+        for request in self._reader.feed(data) if hearing else ():
+            if request is None:
+                self.log.add(Entry(t, self.name, "instruction", "damaged"))
+            else:
+                self._carry_out(request, hearing, t)
+
+    def _carry_out(self, request: Request, hearing: list[Gripper], t: float) -> None:
+        now = self._clock()
+        meant = [one for one in hearing if request.device_id in {BROADCAST, one.device_id}]
+        self._note(request, meant, t)
+        for gripper in meant:
+            gripper.heard(now)
+            answer = _obey(gripper, request, now)
+            if isinstance(answer, ExceptionCode):
+                self._event(gripper, "refused", now, answer.name.lower())
+                answer = exception(request, answer) if gripper.exceptions else None
+            silenced = self._script.silences(gripper.device_id, request.name)
+            if answer is not None and request.device_id != BROADCAST and not silenced:
+                gap_s = _GAP_CHARACTERS * _BITS / gripper.baud
+                self._answer(answer, (gripper.device_id,), request.name, after_s=gap_s, device_id=gripper.device_id)
+
+    # --- the log
+
+    def _note(self, request: Request, meant: list[Gripper], t: float) -> None:
+        writes = request.function in _WRITING
+        first = request.write_at - table.COMMAND
+        touched = range(first, first + len(request.values)) if writes else range(0)
+        names = tuple(_NAMES[at] for at in touched if 0 <= at < len(_NAMES))
+        values = b"".join(value.to_bytes(2, "big") for value in request.values)
+        address = request.write_at if writes else request.read_at
+        moves = any(_moves(one, request) for one in meant) if names else False
+        self.log.add(
+            Entry(
+                t,
+                self.name,
+                "instruction",
+                request.name,
+                request.device_id,
+                joint=meant[0].name if len(meant) == 1 else "",
+                hex=values.hex(),
+                address=address,
+                registers=names,
+                moves=moves,
+            )
+        )
+
+    def _event(self, gripper: Gripper, name: str, t: float, detail: str) -> None:
+        counts = gripper.position(t)
+        self.log.add(
+            Entry(
+                t,
+                self.name,
+                "event",
+                name,
+                gripper.device_id,
+                joint=gripper.name,
+                position_counts=round(counts),
+                width_m=table.width_of(counts),
+                detail=detail,
+            )
+        )
+
+
+def _moves(gripper: Gripper, request: Request) -> bool:
+    """Whether a write leaves the gripper told to move: to go, to activate, or to let go by itself."""
+    before, now = gripper.command, list(gripper.command)
+    for at, value in enumerate(request.values, request.write_at - table.COMMAND):
+        if 0 <= at < len(now):
+            now[at] = value
+    action = now[0] >> 8
+    rising = action & table.ACTIVATE and not before[0] >> 8 & table.ACTIVATE
+    return bool(rising or action & (table.GO | table.AUTO_RELEASE))
+
+
+def _obey(gripper: Gripper, request: Request, t: float) -> bytes | ExceptionCode | None:
+    """Carry a request out; what is answered, or why not."""
+    if request.function not in set(Function):
+        return ExceptionCode.FUNCTION
+    if not request.whole or request.read_count > MOST_REGISTERS:
+        return ExceptionCode.VALUE
+    reads = request.function not in {Function.WRITE_ONE, Function.WRITE}
+    if reads and gripper.read(request.read_at, request.read_count, t) is None:
+        return ExceptionCode.ADDRESS
+    if request.function in _WRITING and not gripper.write(request.write_at, request.values, t):
+        return ExceptionCode.ADDRESS
+    values = gripper.read(request.read_at, request.read_count, t) if reads else None
+    return write_answer(request) if values is None else read_answer(request, values)

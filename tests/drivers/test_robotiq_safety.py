@@ -1,0 +1,458 @@
+"""The motion rules on a gripper, by their numbers; the judge is what the simulated gripper received and did."""
+
+import math
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from drivers.conftest import Outcome, call, sleep_past, written_now
+from drivers.gripper_rig import HandRig, made_rig
+from robots import HAND
+from trade import Container, Handle, where
+from trade.errors import (
+    DeadlineExceeded,
+    DeviceError,
+    DeviceFault,
+    DeviceSilent,
+    InvalidArgument,
+    LimitExceeded,
+    LockedByOther,
+    LockLost,
+    MotionStopped,
+    OutcomeUnknown,
+    Stopped,
+)
+from trade_drivers import Gripper
+from trade_hil_sim import BrownOut, Heal, Mute, Put, Replug, RobotiqBus, Unplug, events, received
+from waiting import wait_until
+
+SLOW_M_S = 0.02
+
+
+class Gate:
+    """A health check that can hold the bus thread up, or say no."""
+
+    def __init__(self) -> None:
+        self._open, self._reached = threading.Event(), threading.Event()
+        self._open.set()
+        self.says = True
+
+    def __call__(self) -> bool:
+        if not self._open.is_set():
+            self._reached.set()
+            self._open.wait(20)
+        return self.says
+
+    def hold_up(self) -> None:
+        self._reached.clear()
+        self._open.clear()
+        assert self._reached.wait(20)
+
+    def let_go(self) -> None:
+        self._open.set()
+
+
+@pytest.fixture
+def gate() -> Iterator[Gate]:
+    made = Gate()
+    yield made
+    made.let_go()
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> Iterator[HandRig]:
+    with made_rig(tmp_path) as made:
+        yield made
+
+
+@pytest.fixture
+def hand(rig: HandRig) -> HandRig:
+    rig.plug()
+    return rig
+
+
+def under_way(hand: HandRig) -> None:
+    wait_until(lambda: hand.truth.moving and hand.truth.width_m < 0.083, "it is under way")
+
+
+# --- S01
+
+
+@pytest.mark.parametrize("command", ["move_to", "close", "open", "activate", "clear_fault"])
+def test_S01_a_command_that_expires_while_the_bus_is_held_up_is_never_written(
+    hand: HandRig, gate: Gate, command: str
+) -> None:
+    gripper = hand.active(healthy=gate) if command in {"move_to", "close", "open"} else hand.gripper(healthy=gate)
+    gate.hold_up()
+    mark = written_now()
+    late = Outcome((lambda: gripper.move_to(0.02)) if command == "move_to" else getattr(gripper, command), 0.05)
+    with call(0.05) as expires_ns:
+        sleep_past(expires_ns)
+    gate.let_go()
+    assert isinstance(late.wait().error, DeadlineExceeded)
+    assert not hand.writes(mark)
+
+
+def test_S01_a_command_is_not_repeated_after_its_deadline_and_its_fingers_are_stopped(hand: HandRig) -> None:
+    gripper = hand.active()
+    hand.sim.do(Mute(instruction="read_write"))
+    mark = written_now()
+    late = Outcome(lambda: gripper.close(SLOW_M_S), deadline_s=0.1).wait()
+    assert isinstance(late.error, OutcomeUnknown | DeviceSilent | MotionStopped)
+    moves = hand.moves(mark)
+    assert moves
+    assert max(entry.t for entry in moves) - min(entry.t for entry in moves) < 0.1
+    hand.sim.do(Heal())
+    wait_until(lambda: not hand.truth.moving, "it stands")
+    assert hand.truth.width_m > 0.03
+    assert len(hand.moves(mark)) == len(moves)
+
+
+# --- S06: the device has no watchdog
+
+
+class Child:
+    """A driver in a process of its own that closes the hand slowly."""
+
+    def __init__(self, rig: HandRig, tmp_path: Path) -> None:
+        file = tmp_path / "hand.toml"
+        file.write_text(HAND)
+        program = Path(__file__).with_name("gripper_process.py")
+        self.process = subprocess.Popen([sys.executable, str(program), str(file), str(rig.sim.port)])
+
+    def close(self) -> None:
+        self.process.kill()
+        self.process.wait()
+
+
+@pytest.fixture
+def child(hand: HandRig, tmp_path: Path) -> Iterator[Child]:
+    made = Child(hand, tmp_path)
+    yield made
+    made.close()
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP], ids=["kill -9", "SIGSTOP"])
+def test_S06_without_its_driver_a_gripper_ends_the_move_it_was_told_and_no_other(
+    hand: HandRig, child: Child, number: int
+) -> None:
+    began = hand.wait_for("motion_started", hand.wait_for("activated").t)
+    os.kill(child.process.pid, number)
+    mark = written_now() + 0.1
+    hand.wait_for("at_rest", began.t)
+    assert hand.truth.width_m == pytest.approx(0.05, abs=0.001)
+    assert not hand.moves(mark)
+
+
+def test_S06_that_a_2F85_has_no_watchdog_is_in_the_documentation() -> None:
+    page = Path(__file__).parents[2].joinpath("docs", "drivers.md").read_text(encoding="utf-8")
+    assert "no watchdog" in page[page.index("## Robotiq") :]
+
+
+def test_S06_an_unhealthy_process_stops_the_fingers_once_and_falls_silent(hand: HandRig, gate: Gate) -> None:
+    gripper = hand.active(healthy=gate)
+    moving = Outcome(lambda: gripper.close(SLOW_M_S))
+    under_way(hand)
+    mark = written_now()
+    gate.says = False
+    assert moving.wait().error is not None
+    wait_until(lambda: not hand.truth.moving, "it stands")
+    [stop] = [entry for entry in hand.writes(mark) if not entry.moves]
+    assert hand.truth.width_m > 0.03
+    wait_until(lambda: _silent(gripper), "what was measured is too old")
+    assert not received(hand.log, since=stop.t + 0.1)
+    for act in (gripper.close, gripper.activate, gripper.state):
+        with pytest.raises(DeviceError, match="not healthy"):
+            act()
+
+
+def test_S06_a_defect_in_the_bus_thread_is_silence_and_an_error_for_everybody(
+    hand: HandRig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gripper = hand.active()
+    moving = Outcome(lambda: gripper.close(SLOW_M_S))
+    under_way(hand)
+
+    def defect(_: object) -> None:
+        raise RuntimeError("a defect")
+
+    monkeypatch.setattr(gripper._exchange, "_measure", defect)  # type: ignore[attr-defined]
+    assert "a defect" in str(moving.wait().error)
+    for act in (gripper.activate, gripper.stop, gripper.close):
+        with pytest.raises(DeviceError):
+            act()
+
+
+# --- S08
+
+
+def test_S08_a_stop_drops_what_waits_on_the_bus(hand: HandRig, gate: Gate) -> None:
+    gripper = hand.active(healthy=gate)
+    gate.hold_up()
+    mark = written_now()
+    waiting = Outcome(gripper.close)
+    wait_until(lambda: gripper._exchange._inbox, "it is admitted")  # type: ignore[attr-defined]
+    stop = Outcome(gripper.stop)
+    wait_until(lambda: gripper._exchange._stops, "the stop is there")  # type: ignore[attr-defined]
+    gate.let_go()
+    stop.wait()
+    assert isinstance(waiting.wait().error, MotionStopped)
+    assert not hand.moves(mark)
+
+
+def test_S08_a_stop_ends_activation_and_leaves_it_not_activated(hand: HandRig) -> None:
+    gripper = hand.gripper()
+    activating = Outcome(gripper.activate)
+    wait_until(lambda: hand.truth.moving, "its fingers move")
+    mark = written_now()
+    gripper.stop()
+    assert isinstance(activating.wait().error, MotionStopped)
+    assert not hand.truth.moving
+    assert not gripper.state().activated
+    assert not hand.moves(mark)
+
+
+def test_S08_a_stop_that_is_not_answered_is_written_again_until_it_is_heard(hand: HandRig) -> None:
+    gripper = hand.active()
+    moving = Outcome(lambda: gripper.close(SLOW_M_S))
+    under_way(hand)
+    hand.sim.do(Mute(instruction="read_write", count=1))
+    gripper.stop()
+    assert isinstance(moving.wait().error, MotionStopped)
+    assert not hand.truth.moving
+    assert hand.truth.width_m > 0.03
+
+
+def test_S08_a_stop_of_a_silent_gripper_is_sent_blind_and_cannot_activate_it(hand: HandRig) -> None:
+    gripper = hand.active()
+    moving = Outcome(lambda: gripper.close(SLOW_M_S))
+    under_way(hand)
+    hand.sim.do(Mute())
+    assert isinstance(moving.wait().error, DeviceSilent)
+    wait_until(lambda: not hand.truth.moving, "it stands")
+    mark = written_now()
+    with pytest.raises(DeviceSilent):
+        gripper.stop()
+    assert {entry.hex for entry in hand.writes(mark)} == {"00" * 6}
+    assert hand.truth.width_m > 0.03
+
+
+# --- S11 and S08 through the middleware
+
+
+HAND_SERVICES = where(group="rosie.left.hand")
+
+
+@pytest.fixture
+def driver(start_container: Callable[..., Container]) -> Container:
+    return start_container("driver")
+
+
+@pytest.fixture
+def gripper(hand: HandRig, gate: Gate, driver: Container) -> Gripper:
+    return hand.active(register=driver.register, deregister=driver.deregister, healthy=gate)
+
+
+@pytest.fixture
+def planner(start_container: Callable[..., Container], gripper: Gripper) -> Container:
+    return start_container("planner")
+
+
+@pytest.fixture
+def operator(start_container: Callable[..., Container], gripper: Gripper) -> Container:
+    return start_container("operator")
+
+
+def service(container: Container, name: str) -> Handle:
+    return container.find(where(name=name, group="rosie.left.hand"), wait_s=20).with_(deadline_s=60)
+
+
+def test_S11_a_command_admitted_under_a_lock_that_is_lost_never_reaches_the_wire(
+    hand: HandRig, gate: Gate, gripper: Gripper, planner: Container, operator: Container
+) -> None:
+    close = service(planner, "close")
+    lock = planner.lock(HAND_SERVICES).acquire()
+    with lock.use():
+        gate.hold_up()
+        mark = written_now()
+        run = close.start()
+        wait_until(lambda: gripper._exchange._inbox, "it is admitted")  # type: ignore[attr-defined]
+        assert operator.locking.break_lock(HAND_SERVICES, "it is mine")
+        gate.let_go()
+        with pytest.raises((LockLost, MotionStopped)):
+            run.result()
+    lock.release()
+    assert not hand.moves(mark)
+
+
+def test_S11_who_has_no_lock_writes_nothing(
+    hand: HandRig, gripper: Gripper, planner: Container, operator: Container
+) -> None:
+    with planner.lock(HAND_SERVICES):
+        mark = written_now()
+        for act in (
+            service(operator, "close"),
+            service(operator, "open"),
+            lambda: service(operator, "move_to")(0.05),
+            service(operator, "activate"),
+            service(operator, "clear_fault"),
+            gripper.close,  # a plain call of the method, without the middleware (S15)
+        ):
+            with pytest.raises(LockedByOther):
+                act()
+        assert service(operator, "state")().name == "rosie.left.hand"
+    assert not hand.writes(mark)
+
+
+def test_S08_a_foreign_stop_holds_until_somebody_resumes(
+    hand: HandRig, gripper: Gripper, planner: Container, operator: Container
+) -> None:
+    run = service(planner, "close").start(SLOW_M_S)
+    under_way(hand)
+    service(operator, "stop")()
+    with pytest.raises(MotionStopped):
+        run.result()
+    mark = written_now()
+    for act in (service(planner, "close"), service(operator, "activate"), gripper.open):
+        with pytest.raises(Stopped):
+            act()
+    assert not hand.moves(mark)
+    assert operator.locking.resume(HAND_SERVICES) == ["rosie.left.hand"]
+    assert service(planner, "open")().width_m == pytest.approx(0.085, abs=0.001)
+
+
+def test_S05_a_move_ends_with_its_session_and_what_is_held_stays_held(
+    hand: HandRig, gripper: Gripper, planner: Container, operator: Container
+) -> None:
+    service(planner, "close").start(SLOW_M_S)
+    under_way(hand)
+    planner.close()
+    wait_until(lambda: not hand.truth.moving, "it stands")
+    assert hand.truth.width_m > 0.03
+    hand.sim.do(Put(width_m=0.02))
+    service(operator, "close")()
+    mark = written_now()
+    operator.close()
+    first = gripper.state()
+    wait_until(lambda: gripper.state().measured_at > first.measured_at + 0.3, "it had time")
+    assert not hand.writes(mark)
+    assert hand.truth.holding
+
+
+# --- S18, S19
+
+
+def tell(bus: RobotiqBus, *values: int) -> None:
+    """What somebody else wrote before."""
+    bus.grippers[0].write(0x03E8, values, time.monotonic())
+    bus._line.nudge()
+
+
+def test_S18_attaching_to_a_gripper_at_rest_writes_nothing(hand: HandRig) -> None:
+    gripper = hand.gripper()
+    assert not gripper.state().activated
+    assert not hand.writes()
+
+
+def test_S18_attaching_to_a_gripper_that_holds_something_leaves_it_so(hand: HandRig) -> None:
+    hand.sim.do(Put(width_m=0.04))
+    tell(hand.sim, 0x0100, 0, 0)
+    hand.wait_for("activated")
+    tell(hand.sim, 0x0900, 255, 0xFFFF)
+    wait_until(lambda: hand.truth.holding, "it holds")
+    assert hand.gripper().state().holding == "outside"
+    assert not hand.writes()
+
+
+def test_S18_a_gripper_found_moving_is_stopped(hand: HandRig) -> None:
+    tell(hand.sim, 0x0100, 0, 0)
+    hand.wait_for("activated")
+    tell(hand.sim, 0x0900, 255, 0x00FF)
+    under_way(hand)
+    hand.gripper()
+    wait_until(lambda: not hand.truth.moving, "it stands")
+    assert not hand.moves()
+    assert hand.truth.activated
+    assert hand.truth.width_m > 0.02
+
+
+def test_S18_a_gripper_found_activating_is_stopped(hand: HandRig) -> None:
+    tell(hand.sim, 0x0100, 0, 0)
+    wait_until(lambda: hand.truth.moving, "its fingers move")
+    hand.gripper()
+    wait_until(lambda: not hand.truth.moving, "it stands")
+    assert not hand.moves()
+    assert not hand.truth.activated
+
+
+@pytest.mark.parametrize("what", ["attach", "brown-out", "replug", "silence"])
+def test_S19_nothing_but_activate_ever_activates(hand: HandRig, what: str) -> None:
+    gripper = hand.gripper() if what == "attach" else hand.active()
+    mark = written_now()
+    match what:
+        case "brown-out":
+            hand.sim.do(BrownOut())
+        case "replug":
+            hand.sim.do(Unplug())
+            hand.sim.do(BrownOut())
+            hand.sim.do(Replug())
+        case "silence":
+            hand.sim.do(Mute())
+            hand.sim.do(BrownOut())
+            wait_until(lambda: _silent(gripper), "it is silent")
+            hand.sim.do(Heal())
+        case _:
+            pass
+    wait_until(lambda: not _silent(gripper) and not gripper.state().activated, "it is back")
+    gripper.stop()
+    for act in (gripper.close, gripper.open, lambda: gripper.move_to(0.04)):
+        with pytest.raises(DeviceFault, match=r"call activate\(\): it moves the fingers"):
+            act()
+    assert not hand.moves(mark)
+    assert gripper.activate().activated
+    assert events(hand.log, "activating", since=mark)
+
+
+def _silent(gripper: Gripper) -> bool:
+    try:
+        gripper.state()
+    except DeviceError:
+        return True
+    return False
+
+
+def test_S19_a_brown_out_in_the_middle_of_a_move_ends_it_and_its_stop_does_not_activate(hand: HandRig) -> None:
+    gripper = hand.active()
+    moving = Outcome(lambda: gripper.close(SLOW_M_S))
+    under_way(hand)
+    mark = written_now()
+    hand.sim.do(BrownOut())
+    assert isinstance(moving.wait().error, DeviceFault)
+    assert "lost its activation" in str(moving.error)
+    first = gripper.state()
+    wait_until(lambda: gripper.state().measured_at > first.measured_at + 0.2, "it had time")
+    assert not hand.moves(mark)
+    assert not events(hand.log, "activating", since=mark)
+
+
+# --- S22
+
+
+def test_S22_what_is_refused_is_not_written(hand: HandRig) -> None:
+    gripper = hand.active()
+    mark = written_now()
+    for width, speed, force in (
+        *((value, None, None) for value in (-0.001, 0.0851, math.nan, math.inf)),
+        *((0.04, value, None) for value in (0.019, 0.151, 0.0, math.nan)),
+        *((0.04, None, value) for value in (19.9, 200.1, 0.0, math.inf)),
+    ):
+        with pytest.raises((LimitExceeded, InvalidArgument)):
+            gripper.move_to(width, speed, force)
+    assert not hand.writes(mark)
