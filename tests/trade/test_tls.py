@@ -23,7 +23,7 @@ from trade import Container, Settings, service, where
 from trade._endpoints import free_endpoint
 from trade._tls import Certificate
 from trade._zenoh import ZenohTransport, configuration
-from trade.errors import CannotConnect, ConfigurationError, ContainerLost, NoSuchService
+from trade.errors import AccessDenied, CannotConnect, ConfigurationError, ContainerLost, NoSuchService
 from waiting import wait_until
 
 
@@ -447,3 +447,45 @@ def test_a_container_does_not_listen_where_its_certificate_is_not_for(papers: Pa
         read(tls=folder, system="lab", listen=[listen], policy=Path("policy.toml"))
     added = papers.of("arm", addresses=["10.0.0.6"], hosts=["LEG.example"])
     assert read(tls=added, system="lab", listen=[listen], policy=Path("policy.toml")).listen == (listen,)
+
+
+RULES = """
+[roles.driver]
+register = ["robot"]
+
+[roles.viewer]
+read = ["robot"]
+
+[identities]
+arm = ["driver"]
+planner = ["viewer"]
+"""
+
+
+def test_with_a_policy_a_container_is_sent_nothing_by_who_is_not_in_it(
+    start_container: Any, papers: Papers, tmp_path: Path
+) -> None:
+    """Directly linked, and whatever the other one's own policy says."""
+    policy, lenient = tmp_path / "policy.toml", tmp_path / "lenient.toml"
+    policy.write_text(RULES)
+    lenient.write_text(RULES.replace("[identities]", '[identities]\nmallory = ["viewer"]'))
+    arm = start_container("c-arm", tls=papers.of("arm"), policy=policy)
+    arm.register(Echo(), "robot")
+    planner = start_container("c-planner", tls=papers.of("planner"), policy=policy)
+    mallory = start_container("c-mallory", tls=papers.of("mallory"), policy=lenient)
+    assert echo(planner)(3) == 3
+    assert ("tls", "mallory") in links(arm)
+    with pytest.raises(NoSuchService):
+        mallory.find(where(name="echo", local=False), wait_s=1.2)
+    stand_in = Echo()
+    with pytest.raises(AccessDenied, match="register"):
+        mallory.register(stand_in, "robot")
+
+
+def test_who_is_in_the_policy_by_a_pattern_only_is_warned_of(
+    start_container: Any, papers: Papers, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    policy = tmp_path / "policy.toml"
+    policy.write_text(RULES + '"dash-*" = ["viewer"]\n')
+    start_container("c-arm", tls=papers.of("arm"), policy=policy)
+    assert "dash-*: the transport knows names in full only" in caplog.text

@@ -86,6 +86,12 @@ def _rules(settings: Settings, networks: list[list[str]]) -> dict[str, Any]:
     policy = read_policy(settings.policy) if settings.policy and settings.tls else None
     if policy is None and settings.exports is None:
         return {}
+    if policy is not None and (patterns := policy.patterns()):
+        _logger.warning(
+            "%s: %s: the transport knows names in full only; whoever such a pattern stands for can send nothing",
+            policy.source,
+            ", ".join(patterns),
+        )
     crossing = None
     if settings.exports is not None:
         known = crossings(settings.exports)

@@ -116,6 +116,10 @@ class Policy:
         """The identities that are named in full and not revoked."""
         return [name for name in self.identities if not _is_pattern(name) and name not in self.revoked]
 
+    def patterns(self) -> list[str]:
+        """What stands for several identities."""
+        return [name for name in self.identities if _is_pattern(name)]
+
     # --- compiling
 
     def _rights(self, who: str) -> _Rights:

@@ -1,0 +1,115 @@
+"""Gateway files: what is right is taken as it stands, what is wrong is named with its remedy before anything starts."""
+
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from certificates import Papers
+from trade.errors import ConfigurationError
+from trade_gateway._gateway_file import digest, read_gateway_file
+from trade_gateway.cli import app
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "gateway.toml"
+POLICY = """
+revoked_file = "revoked.toml"
+gateways = ["door"]
+[roles.viewer]
+read = ["*"]
+[identities]
+planner = ["viewer"]
+"""
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    """The example, with what it names beside it."""
+    made = tmp_path / "gateway.toml"
+    made.write_text(EXAMPLE.read_text())
+    (tmp_path / "policy.toml").write_text(POLICY)
+    (tmp_path / "revoked.toml").write_text("revoked = []")
+    Papers(tmp_path / "pki").of("door", purpose="gateway", addresses=["192.168.7.1", "10.0.0.7"])
+    return made
+
+
+def change(path: Path, before: str, after: str) -> None:
+    text = path.read_text()
+    assert before in text
+    path.write_text(text.replace(before, after))
+
+
+def test_the_example_is_right_and_says_what_crosses(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TRADE_SYSTEM", "another")  # the file says it all
+    monkeypatch.setenv("TRADE_CONNECT", "tcp/127.0.0.1:1")
+    _, settings = read_gateway_file(file)
+    assert (settings.system, settings.container, settings.identity) == ("lab", "gateway", "door")
+    assert settings.listen == ("tls/192.168.7.1:7450", "tls/10.0.0.7:7450")
+    assert settings.bridge == ("eth0", "eth1")
+    assert settings.exports == {"eth0": ("rosie",), "eth1": ()}
+    assert settings.connect == ()
+
+
+def test_without_any_list_everything_crosses_and_with_one_the_rest_does(file: Path) -> None:
+    change(file, 'export = ["rosie"]', "")
+    assert read_gateway_file(file)[1].exports == {"eth0": ("*",), "eth1": ()}
+    change(file, "export = []", "")
+    assert read_gateway_file(file)[1].exports is None
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "said"),
+    [
+        ('system = "lab"', "", r"system: missing; write system = "),
+        ('interface = "eth1"', "", r"interface: missing; write interface = "),
+        (
+            'interface = "eth1"',
+            'interface = "eth0"',
+            r"network.lab.interface: eth0 is the interface of network 'robot'",
+        ),
+        ('policy = "policy.toml"', 'polcy = "policy.toml"', r"polcy: unknown key; there is system, name, tls, policy"),
+        ("export = []", 'exports = ["rosie"]', r"exports: unknown key; there is interface, listen, export"),
+        ("export = []", 'export = ["rosie.*"]', r"network.lab.export: 'rosie.\*' is no group"),
+        ("export = []", 'export = "rosie"', r"network.export: Expected `array"),
+        ('tls = "pki/issued/door"', "", r"tls: missing; name the folder with its certificate: trade pki issue"),
+        ('tls = "pki/issued/door"', 'tls = "pki/issued/dor"', r"dor/ca.pem: cannot be read"),
+        ('policy = "policy.toml"', 'policy = "none.toml"', r"none.toml: the policy cannot be read"),
+        ('policy = "policy.toml"', "", r"listening beyond loopback needs a policy"),
+        ('"tls/10.0.0.7:7450"', '"tcp/10.0.0.7:7450"', r"must be tls/10.0.0.7:7450"),
+        ('"tls/10.0.0.7:7450"', '"tls/10.0.0.8:7450"', r"not for 10.0.0.8"),
+        ('tls = "pki/issued/door"', 'credentials = "lab:secret"', r"credentials: is for laboratories"),
+        ("[network.lab]", "[network", r"not valid TOML"),
+    ],
+)
+def test_what_is_wrong_is_named(file: Path, before: str, after: str, said: str) -> None:
+    change(file, before, after)
+    with pytest.raises(ConfigurationError, match=said):
+        read_gateway_file(file)
+
+
+def test_a_laboratory_may_do_without_certificates_on_purpose(file: Path) -> None:
+    text = file.read_text().replace('tls = "pki/issued/door"', 'credentials = "lab:secret"\ninsecure_lan = true')
+    file.write_text(text.replace("tls/", "tcp/").replace('policy = "policy.toml"', ""))
+    _, settings = read_gateway_file(file)
+    assert settings.credentials == ("lab", "secret")
+    assert settings.insecure_lan
+
+
+def test_a_change_is_seen_in_the_file_the_policy_the_revoked_names_and_the_certificate(file: Path) -> None:
+    seen = [digest(file)]
+    for path in ("gateway.toml", "policy.toml", "revoked.toml", "pki/issued/door/cert.pem"):
+        beside = file.parent / path
+        beside.write_text(beside.read_text() + "\n")
+        assert digest(file) not in seen
+        seen.append(digest(file))
+        assert digest(file) == seen[-1]
+    file.write_text("not TOML [")
+    assert digest(file) not in seen  # and no error
+
+
+def test_check_starts_nothing(file: Path) -> None:
+    told = CliRunner().invoke(app, ["gateway", str(file), "--check"])
+    assert told.exit_code == 0
+    assert "is right" in told.stdout
+    change(file, 'interface = "eth1"', 'interface = "eth0"')
+    with pytest.raises(ConfigurationError):
+        CliRunner().invoke(app, ["gateway", str(file), "--check"], catch_exceptions=False)
