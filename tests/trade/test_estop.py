@@ -109,6 +109,26 @@ def test_S09_everybody_stops_latches_and_confirms(system: MemorySystem) -> None:
     assert [estop.reason for estop in system.container("one").estops()] == ["smoke"]
 
 
+def test_S09_estops_are_services_of_every_container(system: MemorySystem) -> None:
+    """So that whoever only speaks the wire, or is no program of ours, can give one."""
+    [axis] = drivers(system, "one")
+    caller = system.container("caller")
+
+    def own(name: str, *arguments: object) -> object:
+        found = caller.find(where(name=name, group="trade", container="one"), wait_s=20)
+        return found.with_(deadline_s=GENEROUS_S)(*arguments)
+
+    report = own("estop", "smoke")
+    assert report.complete  # type: ignore[attr-defined]
+    assert axis.stopped == 1
+    [open_] = own("estops")  # type: ignore[misc]
+    assert open_.reason == "smoke (asked by tester)"
+    with pytest.raises(NoSuchEstop):
+        own("estop_clear", ["nonsense"])
+    assert own("estop_clear", [open_.id]).complete  # type: ignore[attr-defined]
+    assert call(caller, "move_to", "one", 0.5) == 0.5
+
+
 def test_S09_a_motion_under_way_is_stopped_and_what_was_admitted_is_void(system: MemorySystem) -> None:
     [axis] = drivers(system, "one")
     caller = system.container("caller")

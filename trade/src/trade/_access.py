@@ -24,6 +24,8 @@ FUNCTIONS: Final = {
     "release": _ALL,  # only what is one's own
     "request_release": _ALL,
     "release_requested": _ALL,
+    "estop": _ALL,
+    "estops": _ALL,
     "acquire": _ALL,  # asks itself for lock over the groups of the resources
     "break_lock": _ALL,  # asks itself for administer over them
     "resume": _ALL,  # asks itself for administer over those whose lock is not one's own
@@ -34,6 +36,7 @@ FUNCTIONS: Final = {
     "connect": "administer",
     "disconnect": "administer",
     "load_policy": "administer",
+    "estop_clear": "administer",
 }
 """What the middleware's own functions need over group ``trade``; empty: open to everybody who is not revoked."""
 

@@ -137,7 +137,7 @@ class Container(Hosting, Looking, Guarding):
                 self.address,
                 self._ask_for_release,
                 self.locking.keeper.asked,
-                self._estopping.open_here,
+                self._estopping,
                 self.access,
                 self._providers.groups_of,
             )

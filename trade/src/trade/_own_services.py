@@ -1,14 +1,14 @@
 """The one provider of the middleware's own functions: what is in group ``trade`` of every container."""
 
-from collections.abc import Callable
-
 from trade._access import Access
+from trade._context import current_call
+from trade._estop_line import EstopReport
+from trade._estopping import LIMIT_S, Estopping
 from trade._lock_services import Ask, Asked, GroupsOf, LockServices
 from trade._locks import LockTable
+from trade._service import service
 from trade._system import System, SystemServices
 from trade._wire import Address, Estop
-
-Open = Callable[[], tuple[Estop, ...]]
 
 
 class OwnServices(SystemServices, LockServices):
@@ -21,15 +21,32 @@ class OwnServices(SystemServices, LockServices):
         own: Address,
         ask: Ask,
         asked: Asked,
-        open_estops: Open,
+        estopping: Estopping,
         access: Access,
         groups: GroupsOf,
     ) -> None:
         SystemServices.__init__(self, system)
         LockServices.__init__(self, locks, own, ask, asked, access, groups)
-        self._open_estops = open_estops
+        self._estopping = estopping
 
     @property
     def open_estops(self) -> tuple[Estop, ...]:
         """What its registry entry tells of e-stops."""
-        return self._open_estops()
+        return self._estopping.open_here()
+
+    @service(effect="stop")
+    def estop(self, reason: str = "") -> EstopReport:
+        """Stop everything in the whole system, and let nothing move until that is cleared; who did, who is missing."""
+        call = current_call()
+        asked = f"asked by {call.caller}" if call is not None else ""
+        return self._estopping.estop(f"{reason} ({asked})" if reason else asked, LIMIT_S)
+
+    @service(effect="read")
+    def estops(self) -> list[Estop]:
+        """The e-stops that are open anywhere in the system, oldest first."""
+        return self._estopping.open()
+
+    @service
+    def estop_clear(self, ids: list[str]) -> EstopReport:
+        """Clear e-stops by their ids; nothing moves by itself."""
+        return self._estopping.clear(ids, LIMIT_S)
