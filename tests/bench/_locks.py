@@ -28,10 +28,11 @@ def run(n: int, rounds: int) -> None:
         n: calls, or locks, of each kind in a round.
         rounds: how often each kind has its turn.
     """
-    with own_folder(), child(_serve) as server:
-        hear(server)
+    with own_folder(), child(_serve, _HOSTS[0]) as one, child(_serve, _HOSTS[1]) as other:
+        for server in (one, other):
+            hear(server)
         results = alone(_measure, n, rounds)
-    print(f"\nfour services on two containers, uncontended: medians over {rounds} rounds of {n}")
+    print(f"\nfour services on two containers in processes of their own: medians over {rounds} rounds of {n}")
     for name, us in results.items():
         print(f"{name:16}{median(us):8.1f} us")
     pairs = list(zip(results[_LOCK], results[_CALL], results[_UNCHECKED], strict=True))
@@ -41,9 +42,7 @@ def run(n: int, rounds: int) -> None:
     print_target("checked / unchecked call", checks, f"at most {_MOST_CHECKS:g}", lambda share: share <= _MOST_CHECKS)
 
 
-def _serve(pipe: Connection) -> None:
-    from contextlib import ExitStack
-
+def _serve(pipe: Connection, host: str) -> None:
     from trade import Container, Settings, service
 
     class Joint:
@@ -62,14 +61,12 @@ def _serve(pipe: Connection) -> None:
         def stop(self) -> None:
             """Nothing moves here."""
 
-    with ExitStack() as stack:
-        for host in _HOSTS:
-            container = stack.enter_context(Container(Settings.read(container=host, system=_SYSTEM)))
-            for name in ("pan", "tilt"):
-                for handle in container.register(Joint(f"{host}.{name}"), f"{_GROUP}.{host}.{name}"):
-                    local = container._providers.lookup(f"{_GROUP}/{handle.key.provider}", handle.name)
-                    if handle.name == "move_unchecked" and local is not None:
-                        local.resources = ()
+    with Container(Settings.read(container=host, system=_SYSTEM)) as container:
+        for name in ("pan", "tilt"):
+            for handle in container.register(Joint(f"{host}.{name}"), f"{_GROUP}.{host}.{name}"):
+                local = container._providers.lookup(f"{handle.key.domain}/{handle.key.provider}", handle.name)
+                if handle.name == "move_unchecked" and local is not None:
+                    local.resources = ()
         pipe.send("ready")
         try:
             pipe.recv()
