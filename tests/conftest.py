@@ -3,6 +3,7 @@
 import asyncio
 import gc
 import os
+import resource
 import secrets
 import threading
 import time
@@ -15,13 +16,19 @@ import pytest
 import trade
 from trade import Container, Settings, where
 
+_FILES = 8192
 _SETTLE_S = 5.0
 """How long what a test has ended may take to be gone; far above what it takes."""
 
 
 @pytest.fixture(scope="session", autouse=True)
 def _warm_up(tmp_path_factory: pytest.TempPathFactory) -> None:
-    """The transport's runtime and the event loop's selector open files once a process; that is no leak."""
+    """The transport's runtime and the event loop's selector open files once a process; that is no leak.
+
+    Of every session the transport keeps two or three files of shared memory open until the process ends.
+    """
+    allowed, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (max(allowed, min(most, _FILES)), most))
     os.environ["TRADE_RUNTIME_DIR"] = str(tmp_path_factory.mktemp("runtime"))
     os.environ["TRADE_STATE_DIR"] = str(tmp_path_factory.mktemp("state"))
     for _ in range(2):

@@ -2,7 +2,6 @@
 
 import argparse
 import os
-import select
 import shutil
 import signal
 import sys
@@ -18,6 +17,7 @@ from ._control import ControlServer
 from ._errors import SimulationError
 from ._log import ByteLog
 from ._process import Ready
+from ._ready import ready
 from ._robot import buses_of, read_robot
 
 EPILOG = """\
@@ -70,13 +70,13 @@ def _run(options: argparse.Namespace, stack: ExitStack, stop: "_Stop") -> None:
         stack.callback(bus.close)
         bus.open()
     control = stack.enter_context(ControlServer(options.control or directory / "_control", buses))
-    ready = Ready(
+    told = Ready(
         ready=True,
         ports={bus.name: str(bus.port) for bus in buses},
         log=None if options.log is None else str(options.log.absolute()),
         control=str(control.path),
     )
-    sys.stdout.write(msgspec.json.encode(ready).decode() + "\n")
+    sys.stdout.write(msgspec.json.encode(told).decode() + "\n")
     sys.stdout.flush()
     stop.wait(options.parent, sys.stdin.fileno() if options.stdin else None)
 
@@ -117,10 +117,10 @@ class _Stop:
             if stdin is not None:
                 watched.append(stdin)
             while True:
-                readable, _, _ = select.select(watched, [], [])
-                if stdin in readable and os.read(stdin or 0, 4096):
-                    readable.remove(stdin or 0)
-                if readable:
+                told = ready(watched)
+                if stdin in told and os.read(stdin or 0, 4096):
+                    told.remove(stdin or 0)
+                if told:
                     return
 
     def close(self) -> None:

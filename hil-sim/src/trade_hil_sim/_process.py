@@ -3,7 +3,6 @@
 import contextlib
 import fcntl
 import os
-import select
 import shutil
 import subprocess
 import sys
@@ -19,6 +18,7 @@ from ._client import SimControl
 from ._errors import SimulationError
 from ._judge import read_log
 from ._log import Entry
+from ._ready import ready
 
 __all__ = ["Ready", "SimProcess", "remove_leftovers"]
 
@@ -199,8 +199,7 @@ class SimProcess:
             return b""
         fd, line = self._process.stdout.fileno(), b""
         while b"\n" not in line:
-            readable, _, _ = select.select([fd], [], [], max(0.0, deadline - time.monotonic()))
-            data = os.read(fd, 4096) if readable else b""
+            data = os.read(fd, 4096) if ready([fd], timeout_s=deadline - time.monotonic()) else b""
             if not data:
                 return line
             line += data

@@ -1,6 +1,5 @@
 """The adapter: a TCP port that talks to clients as socketcand does. It knows text and sockets, but no wire."""
 
-import select
 import socket
 import time
 from collections.abc import Callable, Iterable
@@ -8,6 +7,7 @@ from contextlib import suppress
 from typing import Final, Protocol
 
 from trade_hil_sim._errors import SimulationError
+from trade_hil_sim._ready import ready
 
 from ._frame import Frame
 from ._text import GREETING, OK, Reader, parse_send, refusal
@@ -157,7 +157,7 @@ class Hub:
         now = time.monotonic()
         held_s = min((c.quiet_until - now for c in writing if c.quiet_until > now), default=wait_s)
         writing = [client for client in writing if client.quiet_until <= now]
-        readable, _, _ = select.select(watched, writing, [], max(0.0, min(wait_s, held_s)))
+        readable = ready(watched, writing, max(0.0, min(wait_s, held_s)))
         t = time.monotonic()
         awake(t)
         for thing in readable:
