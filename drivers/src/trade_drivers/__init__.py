@@ -2,8 +2,10 @@
 
 from trade_drivers._attach import AttachedRobot, attach
 from trade_drivers._driver import AttachedBus, Driver, drivers
-from trade_drivers._interfaces import JointGroup, JointLimits, Motor, MotorState
+from trade_drivers._interfaces import JointGroup, Motor, MotorState
 from trade_drivers._load import load
+from trade_drivers._plan import FollowProgress, JointLimits, Plan, Tolerances
+from trade_drivers._trajectory import Trajectory, TrajectoryPoint
 from trade_drivers.robotfile import Bus, Coupled, Group, Joint, Robot, parse
 
 __all__ = [
@@ -12,13 +14,18 @@ __all__ = [
     "Bus",
     "Coupled",
     "Driver",
+    "FollowProgress",
     "Group",
     "Joint",
     "JointGroup",
     "JointLimits",
     "Motor",
     "MotorState",
+    "Plan",
     "Robot",
+    "Tolerances",
+    "Trajectory",
+    "TrajectoryPoint",
     "attach",
     "drivers",
     "load",

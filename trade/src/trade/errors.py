@@ -39,6 +39,7 @@ __all__ = [
     "ServiceGone",
     "SetupError",
     "Stopped",
+    "ToleranceExceeded",
     "TooLarge",
     "TooManyServices",
     "TradeError",
@@ -411,6 +412,25 @@ class BusGone(DeviceSilent, ConnectionError):
             f"{self.device} cannot be reached: port {self.bus} is gone (for {self.waited_s:.1f} s); plug its adapter "
             "in again. The driver reconnects by itself and moves nothing"
         )
+
+
+@dataclass(kw_only=True, eq=False)
+class ToleranceExceeded(DeviceError, RuntimeError):
+    """A joint is farther from its trajectory than it may be: where it begins, on the way, or where it ends."""
+
+    what: str
+    """``start``, ``path`` or ``goal``."""
+    error_rad: float
+    tolerance_rad: float
+
+    def describe(self) -> str:
+        off = f"{self.device} is {abs(self.error_rad):.3g} rad off the {self.what} of its trajectory"
+        remedy = {
+            "start": "nothing was sent; begin where it is",
+            "path": "it holds; look whether it is blocked or overloaded, or give it more time",
+            "goal": "it holds; look whether it is blocked or overloaded, or allow more goal_rad or goal_time_s",
+        }[self.what]
+        return f"{off}, {self.tolerance_rad:.3g} is allowed: {remedy}"
 
 
 # --- the set-up

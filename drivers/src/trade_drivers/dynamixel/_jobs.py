@@ -20,6 +20,7 @@ Steps = Generator[None, None, None]
 
 _Result = TypeVar("_Result")
 _ATTEMPTS: Final = 3
+_TELL_S: Final = 0.1
 _GOAL_BLOCK: Final = (
     table.PROFILE_ACCELERATION.address,
     table.GOAL_POSITION.end - table.PROFILE_ACCELERATION.address,
@@ -71,13 +72,15 @@ class Job:
             self._error = error
             self._ended.set()
 
-    def wait(self, alive: Callable[[], bool]) -> None:
-        """Block until it has ended.
+    def wait(self, alive: Callable[[], bool], tell: Callable[[], None] | None = None) -> None:
+        """Block until it has ended; call ``tell`` ten times a second meanwhile.
 
         Raises:
             TradeError: what became of it.
         """
-        while not self._ended.wait(1.0):
+        while not self._ended.wait(1.0 if tell is None else _TELL_S):
+            if tell is not None:
+                tell()
             if not alive():
                 self.finish(self.axes[0].faulty("the thread of its bus has ended"))
         if self._error is not None:

@@ -2,15 +2,17 @@
 
 import time
 from collections.abc import Sequence
-from math import isfinite
 from typing import Final
 
 from trade import Resource, current_call, permit
-from trade.errors import DeviceError, DeviceSilent, InvalidArgument, LimitExceeded
-from trade_drivers._interfaces import LONGEST_VALID_S, JointGroup, JointLimits, Motor, MotorState
+from trade.errors import DeviceError, DeviceSilent, LimitExceeded
+from trade_drivers._checks import finite, one_each, valid, within
+from trade_drivers._interfaces import JointGroup, JointLimits, Motor, MotorState
+from trade_drivers._plan import Plan
 from trade_drivers.dynamixel import _table as table
 from trade_drivers.dynamixel._axis import Axis, Health, Sample
 from trade_drivers.dynamixel._bus import BusThread
+from trade_drivers.dynamixel._follow import Follow
 from trade_drivers.dynamixel._jobs import Command, Enable, Halt, Relax
 from trade_drivers.dynamixel._motion import Move
 from trade_drivers.dynamixel._setpoint import SetPoint
@@ -65,15 +67,19 @@ class _Joints:
             return self._exchange.clock() + _DEFAULT_EXPIRY_NS, False
         return call.expires_ns, True
 
-    def _move(self, positions_rad: Sequence[float], speed_rad_s: float | None, argument: str) -> list[float]:
-        service = f"{self._name}.move_to"
-        goals = self._goals(positions_rad, service, argument)
-        speed = None if speed_rad_s is None else _finite(speed_rad_s, service, "speed_rad_s")
-        speeds = [_speed_counts(axis, speed) for axis in self._axes]
+    def _span(self) -> tuple[int, int | None]:
+        """When a motion with an end may begin at the latest, and when it is ended if it is not over."""
         expires_ns, ends = self._expiry()
         if ends:
             expires_ns -= _time_to_answer_ns(expires_ns - self._exchange.clock())
-        until_ns = expires_ns if ends else None
+        return expires_ns, expires_ns if ends else None
+
+    def _move(self, positions_rad: Sequence[float], speed_rad_s: float | None, argument: str) -> list[float]:
+        service = f"{self._name}.move_to"
+        goals = self._goals(positions_rad, service, argument)
+        speed = None if speed_rad_s is None else finite(speed_rad_s, service, "speed_rad_s")
+        speeds = [_speed_counts(axis, speed) for axis in self._axes]
+        expires_ns, until_ns = self._span()
         with permit(self.resources) as permitted:
             move = Move(
                 self._exchange,
@@ -107,14 +113,8 @@ class _Joints:
             )
 
     def _goals(self, positions_rad: Sequence[float], service: str, argument: str) -> list[int]:
-        if len(positions_rad) != len(self._axes):
-            names = ", ".join(axis.name for axis in self._axes)
-            problem = f"has {len(positions_rad)} values; it takes {len(self._axes)}, for {names}"
-            raise InvalidArgument(service=service, argument=argument, problem=problem)
-        return [
-            _goal_counts(axis, _finite(value, service, argument))
-            for axis, value in zip(self._axes, positions_rad, strict=True)
-        ]
+        values = one_each(positions_rad, [axis.name for axis in self._axes], service, argument)
+        return [_goal_counts(axis, value) for axis, value in zip(self._axes, values, strict=True)]
 
     def _states(self) -> list[MotorState]:
         return [self._state(axis) for axis in self._axes]
@@ -160,7 +160,7 @@ class DynamixelMotor(_Joints, Motor):
 
     def set_velocity(self, velocity_rad_s: float, valid_s: float = 0.2) -> None:
         service = f"{self._name}.set_velocity"
-        velocity, valid_s = _finite(velocity_rad_s, service, "velocity_rad_s"), _valid(valid_s, service)
+        velocity, valid_s = finite(velocity_rad_s, service, "velocity_rad_s"), valid(valid_s, service)
         if velocity == 0:
             self._do(Halt, "set_velocity")
             return
@@ -186,7 +186,18 @@ class DynamixelGroup(_Joints, JointGroup):
     def servo(self, positions_rad: list[float], valid_s: float = 0.2) -> None:
         service = f"{self._name}.servo"
         goals = self._goals(positions_rad, service, "positions_rad")
-        self._set(goals, [axis.speed_counts for axis in self._axes], service, _valid(valid_s, service))
+        self._set(goals, [axis.speed_counts for axis in self._axes], service, valid(valid_s, service))
+
+    def stream(self, plan: Plan) -> list[float]:
+        exchange, service = self._exchange, f"{self._name}.follow"
+        expires_ns, until_ns = self._span()
+        with permit(self.resources) as permitted:
+            job = Follow(
+                exchange, self._axes, plan, service=service, expires_ns=expires_ns, until_ns=until_ns, permit=permitted
+            )
+            exchange.submit(job)
+            job.wait(self._thread.alive, lambda: plan.course.report(exchange.clock()))
+        return job.final_rad
 
 
 def _time_to_answer_ns(left_ns: int) -> int:
@@ -195,19 +206,6 @@ def _time_to_answer_ns(left_ns: int) -> int:
     Stopped at the deadline itself, the answer would come when nobody waits for it any more.
     """
     return min(_ANSWER_NS, max(0, left_ns) // 5)
-
-
-def _finite(value: float, service: str, argument: str) -> float:
-    if not isinstance(value, int | float) or isinstance(value, bool) or not isfinite(value):  # pyright: ignore[reportUnnecessaryIsInstance]
-        raise InvalidArgument(service=service, argument=argument, problem=f"{value!r} is not a finite number")
-    return float(value)
-
-
-def _valid(valid_s: float, service: str) -> float:
-    if not 0 < _finite(valid_s, service, "valid_s") <= LONGEST_VALID_S:
-        problem = f"{valid_s!r} is not above 0 and at most {LONGEST_VALID_S:g}"
-        raise InvalidArgument(service=service, argument="valid_s", problem=problem)
-    return valid_s
 
 
 def _end_counts(axis: Axis, velocity_rad_s: float) -> int:
@@ -222,17 +220,13 @@ def _end_counts(axis: Axis, velocity_rad_s: float) -> int:
 
 def _goal_counts(axis: Axis, position_rad: float) -> int:
     joint = axis.joint
-    if not joint.min_rad <= position_rad <= joint.max_rad:
-        raise LimitExceeded(what=axis.name, value=position_rad, lower=joint.min_rad, upper=joint.max_rad, unit="rad")
-    return round(axis.scale.counts(position_rad))
+    return round(axis.scale.counts(within(position_rad, joint.min_rad, joint.max_rad, axis.name, "rad")))
 
 
 def _speed_counts(axis: Axis, speed_rad_s: float | None) -> int:
     if speed_rad_s is None:
         return axis.speed_counts
-    slowest, fastest = table.RAD_S_PER_COUNT, axis.joint.max_speed_rad_s
-    if not slowest <= speed_rad_s <= fastest:
-        raise LimitExceeded(what=f"{axis.name} speed", value=speed_rad_s, lower=slowest, upper=fastest, unit="rad/s")
+    within(speed_rad_s, table.RAD_S_PER_COUNT, axis.joint.max_speed_rad_s, f"{axis.name} speed", "rad/s")
     return max(1, int(speed_rad_s / table.RAD_S_PER_COUNT))
 
 
