@@ -425,11 +425,9 @@ class ToleranceExceeded(DeviceError, RuntimeError):
 
     def describe(self) -> str:
         off = f"{self.device} is {abs(self.error_rad):.3g} rad off the {self.what} of its trajectory"
-        remedy = {
-            "start": "nothing was sent; begin where it is",
-            "path": "it holds; look whether it is blocked or overloaded, or give it more time",
-            "goal": "it holds; look whether it is blocked or overloaded, or allow more goal_rad or goal_time_s",
-        }[self.what]
+        remedy = "it holds; look whether it is blocked or overloaded, give it more time, or allow more"
+        if self.what == "start":
+            remedy = "nothing was sent; begin where it is"
         return f"{off}, {self.tolerance_rad:.3g} is allowed: {remedy}"
 
 
