@@ -150,8 +150,8 @@ class Relax(Command):
             _require_answering(self, axis)
             self.gate()
             self.exchange.end_motion(axis, f"{axis.name} was relaxed")
+            axis.ready = False  # before: its health may be read in between, and torque that is off would be a fault
             yield from _write(self, axis, table.TORQUE_ENABLE, 0)
-            axis.ready = False
             yield from _write(self, axis, table.BUS_WATCHDOG, 0)
             health = yield from _read_health(self, axis)
             if health.torque:
@@ -181,6 +181,7 @@ class Leave(Job):
     def _leave(self, axis: Axis) -> Steps:
         health = yield from _read_health(self, axis)
         if self._relax and health.torque:
+            axis.ready = False
             yield from _write(self, axis, table.TORQUE_ENABLE, 0)
         elif health.watchdog == table.WATCHDOG_EXPIRED or axis.still == 0:
             return
