@@ -12,30 +12,35 @@ import pytest
 from drivers.test_across import LEGS
 from robots import HEAD
 from trade import where
-from trade_drivers import AttachedRobot, JointGroup, Motor, attach, load
+from trade_drivers import AttachedRobot, JointGroup, Motor, attach, parse
 from trade_drivers.testing import JointGroupContract, MotorContract
-from trade_hil_sim import SimProcess, events
+from trade_hil_sim import ByteLog, SimProcess, events
+from trade_hil_sim._robot import buses_of
 
 FILES = {
     "head": HEAD,
-    "legs": LEGS.replace("[bus.right]", "[bus.right]\nfast_sync = true"),
+    "fast": HEAD.replace('driver = "dynamixel"', 'driver = "dynamixel"\nfast_sync = true'),
+    "legs": LEGS,
 }
 """Robot files by name."""
-MOTORS = [("head", "neck.pan"), ("head", "neck.tilt"), ("legs", "right.hip")]
+MOTORS = [("head", "neck.pan"), ("head", "neck.tilt"), ("fast", "neck.pan")]
 GROUPS = [("head", "head"), ("legs", "legs")]
 
 
 @pytest.fixture(scope="module", autouse=True)
 def robots(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, AttachedRobot]]:
-    """The robots of the files, their devices simulated in processes of their own."""
+    """The robots of the files, on simulated buses in this process: a starved one of its own looks like silence."""
     with ExitStack() as undo:
         made: dict[str, AttachedRobot] = {}
         for name, text in FILES.items():
-            file = tmp_path_factory.mktemp("robot") / f"{name}.toml"
-            file.write_text(text)
-            sim = undo.enter_context(SimProcess(file, logged=False, paced=False))
+            robot = parse(text, f"{name}.toml")
+            buses = buses_of(robot, tmp_path_factory.mktemp(name), log=ByteLog(keep=False), paced=False)
+            for bus in buses:
+                undo.callback(bus.close)
+                bus.open()
+            ports = {bus.name: str(bus.port) for bus in buses}
             made[name] = undo.enter_context(
-                attach(load(file), register=lambda *_: None, deregister=lambda _: None, ports=sim.ports)
+                attach(robot, register=lambda *_: None, deregister=lambda _: None, ports=ports)
             )
         yield made
 

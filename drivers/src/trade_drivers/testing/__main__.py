@@ -2,6 +2,9 @@
 
 import sys
 
-from trade_drivers.testing._hil import main
+try:
+    from trade_drivers.testing._hil import main
+except ImportError as missing:
+    sys.exit(f"the contracts are run by pytest ({missing}); pip install pytest")
 
 sys.exit(main())
