@@ -51,7 +51,7 @@ class Piece(NamedTuple):
 
 
 class Curve:
-    """One joint's way through its points; it stands at the first before it begins and at the last when it is over."""
+    """One joint's way through its points: what it begins with holds before, and the last is where it stands after."""
 
     __slots__ = ("_begins", "pieces")
 
@@ -81,8 +81,7 @@ class Curve:
 
     def at(self, time_s: float) -> tuple[float, float]:
         """Angle in rad and speed in rad/s."""
-        if time_s < 0:
-            return self.pieces[0].position_rad, 0.0
+        time_s = max(0.0, time_s)
         if time_s >= self.duration_s:
             return self.pieces[-1].at(self.pieces[-1].duration_s)[0], 0.0
         piece = self.pieces[bisect_right(self._begins, time_s) - 1]

@@ -76,7 +76,7 @@ def checked(tracks: Sequence[Track], tolerances: Tolerances) -> Plan:
     """
     for limits, curve in tracks:
         ends = (limits.min_rad, limits.max_rad)
-        start, goal = curve.at(-1)[0], curve.at(inf)[0]
+        start, goal = curve.at(0)[0], curve.at(inf)[0]
         _keep(limits.name, "angle", "rad", [(curve.duration_s, goal)], *ends)
         _keep(limits.name, "angle", "rad", _each(curve, "angles"), min(start, ends[0]), max(start, ends[1]))
         speed, accel = limits.max_speed_rad_s, limits.max_accel_rad_s2

@@ -98,7 +98,7 @@ class Follow(Motion):
         for axis, curve in self._curves.items():
             position, velocity = curve.at(elapsed_s)
             braking = velocity * abs(velocity) / (2 * axis.joint.max_accel_rad_s2)
-            start = round(axis.scale.counts(curve.at(-1)[0]))
+            start = round(axis.scale.counts(curve.at(0)[0]))
             goal = round(axis.scale.counts(position + braking))
             goals[axis] = max(min(axis.low, start), min(max(axis.high, start), goal))
         return goals
