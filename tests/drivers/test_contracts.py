@@ -103,6 +103,19 @@ def test_the_contracts_run_on_every_joint_and_group_of_a_robot_file(system: str,
         assert len(events(sim.entries(), "torque_on")) == len(events(sim.entries(), "torque_off")) > 0
 
 
+def test_grippers_are_opened_and_closed_only_after_a_word_of_their_own(system: str, tmp_path: Path) -> None:
+    file = tmp_path / "hand.toml"
+    file.write_text(HAND)
+    with SimProcess(file, paced=False) as sim:
+        refused = hil(file, sim, says="no\n")
+        assert refused.returncode == 2
+        assert "CLOSED" in refused.stderr
+        assert "RELAXED" not in refused.stderr
+        ended = hil(file, sim, "-k", "go_to_the_ends or no_number", says="yes\n")
+        assert ended.returncode == 0, ended.stdout + ended.stderr
+        assert ended.stdout.count("[rosie.left.hand] PASSED") == 2
+
+
 def test_a_contract_that_is_broken_is_told_of(system: str, head_file: Path) -> None:
     head_file.write_text(HEAD.replace("min_rad = -1.4", "min_rad = 0.2"))  # it is found outside of its range
     with SimProcess(head_file, paced=False) as sim:

@@ -13,7 +13,7 @@ import trade
 from trade import where
 from trade.errors import ConfigurationError, TradeError
 from trade_drivers._attach import AttachedRobot, attach
-from trade_drivers._interfaces import JointGroup, Motor
+from trade_drivers._interfaces import Gripper, JointGroup, Motor
 from trade_drivers._load import load
 from trade_drivers.robotfile import Robot
 from trade_drivers.testing._asking import REACH_RAD, SPEED_RAD_S
@@ -21,7 +21,7 @@ from trade_drivers.testing._asking import REACH_RAD, SPEED_RAD_S
 __all__ = ["main"]
 
 _SUITE: Final = Path(__file__).with_name("_suite.py")
-_KINDS: Final[Mapping[str, type[object]]] = {"motor": Motor, "group": JointGroup}
+_KINDS: Final[Mapping[str, type[object]]] = {"motor": Motor, "group": JointGroup, "gripper": Gripper}
 """Fixtures of the contracts, and what of the robot each of them goes through."""
 _REFUSED: Final = 2
 
@@ -76,12 +76,12 @@ def _refuse_if_in_use(robot: Robot) -> None:
     if not offered:
         return
     places = sorted({f"{handle.container} on {handle.host}" for handle in offered})
-    joints = {f"{robot.name}.{joint.name}" for joint in robot.joints}
+    devices = {f"{robot.name}.{device.name}" for device in (*robot.joints, *robot.grippers)}
     owners = sorted(
         {
             f"{lock.holder.identity}/{lock.holder.container} ({lock.holder.purpose or 'no purpose given'})"
             for lock in trade.locks()
-            if joints & set(lock.resources)
+            if devices & set(lock.resources)
         }
     )
     locked = f" and locked by {', '.join(owners)}" if owners else ""
@@ -90,10 +90,18 @@ def _refuse_if_in_use(robot: Robot) -> None:
 
 
 def _agreed(robot: Robot) -> bool:
-    sys.stderr.write(
-        f"{len(robot.joints)} joints of {robot.name} will be enabled, moved by up to {REACH_RAD} rad at "
-        f"{SPEED_RAD_S} rad/s, and RELAXED again and again:\nwhat is not supported falls. Type yes to go on: "
-    )
+    if robot.joints:
+        sys.stderr.write(
+            f"{len(robot.joints)} joints of {robot.name} will be enabled, moved by up to {REACH_RAD} rad at "
+            f"{SPEED_RAD_S} rad/s, and RELAXED again and again:\nwhat is not supported falls.\n"
+        )
+    if robot.grippers:
+        sys.stderr.write(
+            f"{len(robot.grippers)} grippers of {robot.name} will be activated, OPENED and CLOSED all the way again "
+            "and again, as fast and as hard as the file allows:\nwhat they hold falls; nothing may be between their "
+            "fingers.\n"
+        )
+    sys.stderr.write("Type yes to go on: ")
     sys.stderr.flush()
     return sys.stdin.readline().strip() == "yes"
 
@@ -117,6 +125,15 @@ class _Devices:
     @pytest.fixture
     def group(self, request: pytest.FixtureRequest) -> Iterator[object]:
         yield from self._device(request.param)
+
+    @pytest.fixture
+    def gripper(self, request: pytest.FixtureRequest) -> Iterator[object]:
+        gripper = self._providers[request.param]
+        assert isinstance(gripper, Gripper)  # noqa: S101 - pytest_generate_tests gave no other name
+        gripper.activate()
+        gripper.open()
+        yield gripper
+        gripper.stop()
 
     def _device(self, name: str) -> Iterator[object]:
         device = self._providers[name]
