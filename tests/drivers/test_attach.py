@@ -178,7 +178,7 @@ def test_a_file_that_cannot_work_is_refused_before_a_byte_is_sent(
     assert not sim.received(rig.log)
 
 
-def test_the_motors_of_a_group_over_two_buses_stand_in_it_themselves(rig: Rig) -> None:
+def test_a_group_over_two_buses_is_a_provider_like_any_other(rig: Rig) -> None:
     rig.configure(
         (
             '[joint."neck.pan"]\nbus = "neck"',
@@ -189,7 +189,8 @@ def test_the_motors_of_a_group_over_two_buses_stand_in_it_themselves(rig: Rig) -
     other = DynamixelBus([Servo(1)], rig.sim.port.with_name("arm"), paced=False)
     with other:
         robot = rig.attach(ports={"neck": str(rig.sim.port), "arm": str(other.port)})
-        assert rig.announced == [("rosie.neck.pan", "rosie.head"), ("rosie.neck.tilt", "rosie.head")]
+        assert rig.announced == [("rosie.neck.pan",), ("rosie.neck.tilt",), ("rosie.head",)]
+        assert robot.group("head").joints() == ["rosie.neck.pan", "rosie.neck.tilt"]
         assert robot.motor("neck.pan").members["rosie.head"] == ["rosie.neck.pan", "rosie.neck.tilt"]
         robot.close()
 

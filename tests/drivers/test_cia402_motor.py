@@ -1,30 +1,18 @@
-"""A drive is a motor like any other, and two of them a group; what its frames say is what was meant."""
+"""What a drive and a group of them do on the bus, beyond their contracts: its frames say what was meant."""
 
+import functools
 import itertools
 
 import pytest
 
-from drivers.conftest import written_now
+from drivers.conftest import Outcome, written_now
 from drivers.legs import COUNTS_PER_RAD, GO, HALT, HIP, KNEE, Leg, leg, rig
-from drivers.motor_contract import MotorContract
-from trade.errors import DeviceFault, InvalidArgument, LimitExceeded
-from trade_drivers import Motor
+from trade.errors import ConfigurationError, DeviceFault, InvalidArgument, LimitExceeded, MotionStopped
+from trade_drivers import JointGroup, Tolerances, Trajectory, TrajectoryPoint
 from trade_drivers.cia402._motor import Drive
 from waiting import wait_until
 
 __all__ = ["leg", "rig"]
-
-
-class TestDriveIsAMotor(MotorContract):
-    @pytest.fixture
-    def motor(self, leg: Leg) -> Motor:
-        return leg.attach().motor("leg.hip")
-
-
-class TestReversedDriveIsAMotor(MotorContract):
-    @pytest.fixture
-    def motor(self, leg: Leg) -> Motor:
-        return leg.attach().motor("leg.knee")
 
 
 def test_the_way_to_enabled_is_one_state_after_the_other_and_ends_halted_where_it_is(leg: Leg) -> None:
@@ -68,6 +56,75 @@ def test_servo_follows_newer_and_newer_goals(leg: Leg) -> None:
         group.servo([0.01 * step, 0.0], valid_s=0.5)
     wait_until(lambda: leg.goals(HIP)[-1] == round(0.19 * COUNTS_PER_RAD), "the last goal is on the wire")
     assert leg.goals(HIP) == sorted(leg.goals(HIP))
+
+
+ACKNOWLEDGED = 1 << 12
+
+
+def through(group: JointGroup, *rows: tuple[float, list[float]]) -> Trajectory:
+    points = [TrajectoryPoint(time_from_start_s=time_s, positions_rad=angles) for time_s, angles in rows]
+    return Trajectory(joints=group.joints(), points=points)
+
+
+def shaken(leg: Leg, joint: int, since: float) -> bool:
+    """Whether no set-point was raised before the drive had ended the handshake of the one before."""
+    word, free = 0, True
+    for entry in leg.frames(device_id=joint, since=since):
+        if entry.name == "rpdo1":
+            word = int.from_bytes(entry.data[:2], "little")
+            if word & GO and not free:
+                return False
+            free = free and not word & GO
+        elif entry.name == "tpdo1" and not word & GO and not int.from_bytes(entry.data[:2], "little") & ACKNOWLEDGED:
+            free = True
+    return True
+
+
+def test_a_trajectory_is_streamed_at_the_rate_at_which_drives_take_goals(leg: Leg) -> None:
+    group = leg.attach().group("leg")
+    group.enable()
+    mark = written_now()
+    trajectory = through(group, (0.0, [0.0, 0.0]), (0.7, [0.5, 0.2]), (1.4, [-0.2, -0.2]), (2.0, [0.0, 0.0]))
+    assert group.follow(trajectory, Tolerances(path_rad=0.5)) == pytest.approx([0.0, 0.0], abs=0.03)
+    assert shaken(leg, HIP, mark)
+    assert shaken(leg, KNEE, mark)
+    goals, cycles = leg.goals(HIP, mark), len(leg.frames("sync", since=mark))
+    assert cycles / 5 < len(goals) <= cycles / 2 + 1
+    assert max(goals) == pytest.approx(0.5 * COUNTS_PER_RAD, rel=0.1)
+    assert len(leg.frames("rpdo2", HIP, mark)) == 1  # its ramps do not change on the way
+
+
+def test_a_move_takes_over_from_trajectories_whose_handshakes_alternate(rig: Leg) -> None:
+    single = "".join(f'[group.{joint}]\njoints = ["leg.{joint}"]\n' for joint in ("hip", "knee"))
+    rig.configure(("[group.leg]", f"{single}[group.leg]"))
+    rig.plug()
+    robot = rig.attach()
+    hip, knee, both = (robot.group(name) for name in ("hip", "knee", "leg"))
+    both.enable()
+    mark = written_now()
+    for _ in range(5):
+        streams = []
+        for group, joint in ((hip, HIP), (knee, KNEE)):
+            [state] = group.state()
+            there = [state.position_rad + 0.3]
+            trajectory = through(group, (0.0, [state.position_rad]), (1.5, there))
+            since, follow = written_now(), functools.partial(group.follow, trajectory, Tolerances(path_rad=0.5))
+            streams.append(Outcome(follow))
+            wait_until(lambda: len(rig.goals(joint, since)) > 3, "goals follow each other")  # noqa: B023 - over before the next
+        assert both.move_to([0.0, 0.0]) == pytest.approx([0.0, 0.0], abs=0.01)
+        assert all(isinstance(stream.wait().error, MotionStopped) for stream in streams)
+    assert shaken(rig, HIP, mark)
+    assert shaken(rig, KNEE, mark)
+
+
+def test_a_bus_too_slow_for_set_points_refuses_trajectories(rig: Leg) -> None:
+    rig.configure(('channel = "can0"', 'channel = "can0"\nrate_hz = 12'))
+    rig.plug()
+    group = rig.attach().group("leg")
+    mark = written_now()
+    with pytest.raises(ConfigurationError, match="rate_hz of 15"):
+        group.follow(through(group, (0.0, [0.0, 0.0]), (2.0, [0.1, 0.2])))
+    assert not rig.controlwords(HIP, mark)
 
 
 def test_S04_a_set_point_that_is_not_renewed_ends_in_a_halt(leg: Leg) -> None:

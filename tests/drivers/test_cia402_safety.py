@@ -134,7 +134,7 @@ def test_S06_a_process_that_is_not_healthy_holds_then_falls_silent(leg: Leg) -> 
     started = leg.wait_for("motion_started", HIP)
     healthy = False
     assert moving.wait().error is not None
-    wait_until(lambda: leg.controlwords(HIP, started.t)[-1] & HALT, "it was told to halt")
+    wait_until(lambda: leg.controlwords(HIP, started.t)[-1] & HALT, "it was halted")
     wait_until(lambda: "quick_stop_active" in states(leg, HIP, started.t), "the drive's own watchdog has its say")
 
 

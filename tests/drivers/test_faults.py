@@ -4,8 +4,11 @@ import pytest
 
 import trade_hil_sim as sim
 from drivers.conftest import Outcome, Rig, written_now
+from trade import permit
 from trade.errors import BusGone, DeviceFault, DeviceSilent
 from trade_drivers import AttachedRobot, MotorState
+from trade_drivers.dynamixel import open_exchange
+from trade_drivers.joints._jobs import Enable, Relax
 from waiting import wait_until
 
 COUNT_RAD = 6.283185 / 4096
@@ -316,3 +319,22 @@ def test_a_clock_that_stands_still_is_a_fault(head: Rig, robot: AttachedRobot) -
     robot.motor("neck.pan").enable()
     head.sim.do(sim.Freeze(ids=(1,), tick=True))
     wait_until(lambda: (s := state(robot, "neck.pan")) is not None and s.fault, "the fault is latched")
+
+
+def test_health_that_is_read_while_a_joint_is_being_relaxed_is_no_fault(head: Rig) -> None:
+    exchange = open_exchange(head.robot, head.robot.buses[0], str(head.sim.port))
+    exchange.period_ns = 0  # one step of its work in each cycle
+    try:
+        for kind in (Enable, Relax):
+            with permit([axis.resource for axis in exchange.axes]) as permitted:
+                job = kind(exchange, exchange.axes, service="test", expires_ns=2**63, permit=permitted)
+                exchange.submit(job)
+                while not job.ended:
+                    for axis in exchange.servos:
+                        axis.health_due_ns = 2**63
+                    exchange.servos[0].health_due_ns = 0  # it is looked at in every cycle
+                    exchange.cycle()
+            job.wait(lambda: True)
+        assert not any(axis.fault for axis in exchange.axes)
+    finally:
+        exchange.wire.close()

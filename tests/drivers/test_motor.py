@@ -1,32 +1,11 @@
-"""The contract of motors on Dynamixel servos, and what a motor and a group do on the bus."""
+"""What a motor and a group do on the bus, beyond their contracts."""
 
 import pytest
 
 from drivers.conftest import Outcome, Rig, goal_counts, written_now
-from drivers.motor_contract import MotorContract
 from trade.errors import InvalidArgument, MotionStopped
-from trade_drivers import AttachedRobot, Motor
+from trade_drivers import AttachedRobot
 from waiting import wait_until
-
-
-class TestDynamixelMotor(MotorContract):
-    @pytest.fixture
-    def motor(self, head: Rig) -> Motor:
-        return head.attach().motor("neck.pan")
-
-
-class TestReversedDynamixelMotor(MotorContract):
-    @pytest.fixture
-    def motor(self, head: Rig) -> Motor:
-        return head.attach().motor("neck.tilt")
-
-
-class TestFastSyncDynamixelMotor(MotorContract):
-    @pytest.fixture
-    def motor(self, rig: Rig) -> Motor:
-        rig.configure(('driver = "dynamixel"', 'driver = "dynamixel"\nfast_sync = true'))
-        rig.plug()
-        return rig.attach().motor("neck.pan")
 
 
 @pytest.fixture

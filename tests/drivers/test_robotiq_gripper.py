@@ -6,12 +6,12 @@ from pathlib import Path
 import pytest
 
 from drivers.conftest import Outcome, written_now
-from drivers.gripper_contract import GripperContract
 from drivers.gripper_rig import HandRig, made_rig
 from robots import HAND, HEAD
 from trade.errors import ConfigurationError, DeviceFault, MotionStopped
 from trade_drivers import Gripper, SerialBus, attach, parse
 from trade_drivers.robotiq import _table as table
+from trade_drivers.testing import GripperContract
 from trade_hil_sim import Absent, DynamixelBus, Put
 from trade_hil_sim.robotiq import _table as simulated
 from waiting import wait_until

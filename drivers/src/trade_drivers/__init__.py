@@ -2,8 +2,10 @@
 
 from trade_drivers._attach import AttachedRobot, attach
 from trade_drivers._driver import AttachedBus, Driver, drivers
-from trade_drivers._interfaces import Gripper, GripperLimits, GripperState, JointGroup, JointLimits, Motor, MotorState
+from trade_drivers._interfaces import Gripper, GripperLimits, GripperState, JointGroup, Motor, MotorState
 from trade_drivers._load import load
+from trade_drivers._plan import FollowProgress, JointLimits, Plan, Tolerances
+from trade_drivers._trajectory import Trajectory, TrajectoryPoint
 from trade_drivers.robotfile import Bus, CanBus, Coupled, Group, Joint, Robot, SerialBus, parse
 
 __all__ = [
@@ -13,6 +15,7 @@ __all__ = [
     "CanBus",
     "Coupled",
     "Driver",
+    "FollowProgress",
     "Gripper",
     "GripperLimits",
     "GripperState",
@@ -22,8 +25,12 @@ __all__ = [
     "JointLimits",
     "Motor",
     "MotorState",
+    "Plan",
     "Robot",
     "SerialBus",
+    "Tolerances",
+    "Trajectory",
+    "TrajectoryPoint",
     "attach",
     "drivers",
     "load",

@@ -1,13 +1,11 @@
-"""What a service makes of the call that asks for it: until when it may begin, and whether its numbers are numbers."""
+"""What a service makes of the call that asks for it: until when it may begin, and until when it may last."""
 
 from collections.abc import Callable
-from math import isfinite
 from typing import Final
 
 from trade import current_call
-from trade.errors import InvalidArgument
 
-__all__ = ["expiry", "finite", "time_to_answer_ns"]
+__all__ = ["expiry", "span"]
 
 _DEFAULT_EXPIRY_NS: Final = 1_000_000_000
 """How long a plain Python call may wait for its turn on the bus."""
@@ -23,20 +21,14 @@ def expiry(clock: Callable[[], int]) -> tuple[int, bool]:
     return call.expires_ns, True
 
 
-def time_to_answer_ns(left_ns: int) -> int:
-    """How long before its call's deadline a move ends, so that the caller is told that the joint was stopped.
+def span(clock: Callable[[], int]) -> tuple[int, int | None]:
+    """When a motion with an end may begin at the latest, and when it is ended if it is not over.
 
-    Stopped at the deadline itself, the answer would come when nobody waits for it any more.
+    That is somewhat before the deadline of its call, so that the caller is told that it was stopped: stopped at the
+    deadline itself, the answer would come when nobody waits for it any more.
     """
-    return min(_ANSWER_NS, max(0, left_ns) // 5)
-
-
-def finite(value: float, service: str, argument: str) -> float:
-    """The number.
-
-    Raises:
-        InvalidArgument: it is none.
-    """
-    if not isinstance(value, int | float) or isinstance(value, bool) or not isfinite(value):  # pyright: ignore[reportUnnecessaryIsInstance]
-        raise InvalidArgument(service=service, argument=argument, problem=f"{value!r} is not a finite number")
-    return float(value)
+    expires_ns, ends = expiry(clock)
+    if not ends:
+        return expires_ns, None
+    expires_ns -= min(_ANSWER_NS, max(0, expires_ns - clock()) // 5)
+    return expires_ns, expires_ns

@@ -8,6 +8,7 @@ from contextlib import ExitStack
 
 import trade
 from trade.errors import ConfigurationError, TradeError
+from trade_drivers._across import AcrossGroup
 from trade_drivers._driver import AttachedBus, load_driver
 from trade_drivers._interfaces import Gripper, JointGroup, Motor
 from trade_drivers.robotfile import Group, Robot
@@ -85,8 +86,8 @@ def attach(
     """Attach all devices of a robot, then announce their services. Nothing is moved or enabled; what moves is stopped.
 
     Joint ``neck.pan`` of robot ``rosie`` becomes a Motor in group ``rosie.neck.pan``, group ``head`` a JointGroup in
-    ``rosie.head``, gripper ``left.hand`` a Gripper in ``rosie.left.hand``. Of a group whose joints share no bus, the
-    motors themselves are in its group. If anything is wrong, nothing is announced and every port is let go of.
+    ``rosie.head``, whether its joints share a bus or not, gripper ``left.hand`` a Gripper in ``rosie.left.hand``. If
+    anything is wrong, nothing is announced and every port is let go of.
 
     Args:
         robot: what ``load`` read.
@@ -104,7 +105,7 @@ def attach(
         buses = _attach_buses(robot, ports or {}, healthy, undo)
         providers = _providers(robot, buses)
         for name, provider in providers.items():
-            (register or trade.register)(provider, (name, *_scattered(robot, name)))
+            (register or trade.register)(provider, (name,))
             undo.callback(_withdraw, deregister or trade.deregister, provider)
         return AttachedRobot(robot, providers, undo.pop_all())
 
@@ -133,27 +134,20 @@ def _providers(robot: Robot, buses: Mapping[str, AttachedBus]) -> dict[str, Prov
     for gripper in robot.grippers:
         providers[f"{robot.name}.{gripper.name}"] = buses[gripper.bus].gripper(gripper.name)
     for group in robot.groups:
-        name = f"{robot.name}.{group.name}"
-        on = _buses_of(robot, group)
-        if len(on) == 1:
-            providers[name] = buses[on[0]].group(name, group.joints)
+        providers[f"{robot.name}.{group.name}"] = _group(robot, group, buses)
     members = robot.members()
     for provider in providers.values():
         provider.members = members
     return providers
 
 
-def _buses_of(robot: Robot, group: Group) -> list[str]:
-    return sorted({joint.bus for joint in robot.joints if joint.name in group.joints})
-
-
-def _scattered(robot: Robot, motor: str) -> list[str]:
-    """The groups a motor stands in itself, because their joints share no bus and have no provider of their own."""
-    return [
-        f"{robot.name}.{group.name}"
-        for group in robot.groups
-        if len(_buses_of(robot, group)) > 1 and motor.removeprefix(f"{robot.name}.") in group.joints
-    ]
+def _group(robot: Robot, group: Group, buses: Mapping[str, AttachedBus]) -> JointGroup:
+    on = {joint.name: joint.bus for joint in robot.joints}
+    parts: dict[str, list[str]] = {}
+    for joint in group.joints:
+        parts.setdefault(on[joint], []).append(joint)
+    made = [buses[bus].group(f"{robot.name}.{group.name}", joints) for bus, joints in parts.items()]
+    return made[0] if len(made) == 1 else AcrossGroup([f"{robot.name}.{joint}" for joint in group.joints], made)
 
 
 def _withdraw(deregister: Deregister, provider: object) -> None:

@@ -3,11 +3,14 @@
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import Annotated, Final, Literal
+from typing import Annotated, Literal
 
 from msgspec import Struct
 
 from trade import Meta, Resource, service
+from trade_drivers._checks import LONGEST_VALID_S
+from trade_drivers._plan import JointLimits, Plan, Tolerances
+from trade_drivers._trajectory import Trajectory, planned
 
 __all__ = ["Gripper", "GripperLimits", "GripperState", "JointGroup", "JointLimits", "Motor", "MotorState"]
 
@@ -34,16 +37,6 @@ class MotorState(Struct, frozen=True, kw_only=True):
     """When position, velocity and load were read: ``time.monotonic()`` of the driver's process."""
     age_s: float
     """How long ago that was."""
-
-
-class JointLimits(Struct, frozen=True, kw_only=True):
-    """What a joint may be told, from the robot file."""
-
-    name: str
-    min_rad: float
-    max_rad: float
-    max_speed_rad_s: float
-    max_accel_rad_s2: float
 
 
 class GripperState(Struct, frozen=True, kw_only=True):
@@ -85,7 +78,6 @@ class GripperLimits(Struct, frozen=True, kw_only=True):
 
 
 Position = Annotated[float, Meta(description="joint angle in rad, within limits()")]
-LONGEST_VALID_S: Final = 1.0
 Members = Mapping[str, Sequence[str]]
 Velocity = Annotated[float, Meta(description="speed in rad/s with the joint's sign, within limits(); 0 stands still")]
 Valid = Annotated[float, Meta(gt=0, le=LONGEST_VALID_S, description="seconds after which it ends unless it is renewed")]
@@ -221,6 +213,47 @@ class JointGroup(ABC):
         """Follow positions that are given again and again: each holds for ``valid_s`` seconds, then all joints stop.
 
         Every joint goes for its own at its limits of speed and acceleration; returns once the devices were told.
+        """
+
+    @service(effect="actuate", cancel="stop")
+    def follow(self, trajectory: Trajectory, tolerances: Tolerances | None = None) -> list[float]:
+        """Go through angles at given times and return, once at rest at the last, the angles measured.
+
+        All of it is checked before anything is sent; relaxed joints are enabled first. The driver's own thread sends
+        what is due in each of its cycles: nothing is asked of the caller meanwhile, but it must live. Cancelled, it
+        stops. Another move of a joint takes over at once: this call ends with ``MotionStopped``, and the joints that
+        are left hold. A trajectory that is to take over from another one smoothly begins with the angles and
+        velocities of that moment. Its progress is a ``FollowProgress``.
+
+        Args:
+            trajectory: angles in rad and, if given, speeds in rad/s over time in seconds.
+            tolerances: how far from it the joints may be; by default those of ``Tolerances``.
+
+        Raises:
+            LimitExceeded: an angle, speed or acceleration is beyond limits(), also between the points; nothing was
+                sent. It may begin outside of the range of a joint that stands there, and come back in.
+            InvalidArgument: other joints, times that do not rise, no end at rest, numbers that are not finite, or more
+                time than its call has; nothing was sent.
+            ToleranceExceeded: a joint is not where the trajectory begins; or it left it on the way, or did not come to
+                rest at its end: then all hold.
+            ConfigurationError: its bus is too slow for that kind of device; nothing was sent.
+            MotionStopped, DeviceFault, DeviceSilent, DeadlineExceeded: as with a motor's move_to().
+        """
+        return self.stream(planned(trajectory, tolerances or Tolerances(), self.limits()))
+
+    @abstractmethod
+    def stream(self, plan: Plan) -> list[float]:
+        """Carry out what follow() has checked; no service. For drivers:
+
+        - enable what is relaxed, see that each joint is within ``start_rad`` of ``curve.at(0)``, and take over from
+          whatever moves them, holding there; then call ``plan.course.ready(now_ns)``;
+        - in every cycle, after the permit's gate, send what is due at ``plan.course.elapsed_s(now_ns)``, which stays
+          below zero until all buses are ready;
+        - in every cycle, look whether ``plan.course.failed`` is set, a joint is farther off than ``path_rad``, or more
+          than 0.2 s have passed since the cycle before: then hold, and raise;
+        - tell ``plan.course.note(joint, error_rad)``, and call ``plan.course.report(now_ns)`` several times a second on
+          the thread of the service;
+        - return the angles at rest, or raise as follow() says.
         """
 
     @service(effect="stop")

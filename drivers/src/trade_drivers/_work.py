@@ -2,7 +2,7 @@
 
 import threading
 from collections.abc import Callable, Generator
-from typing import Protocol
+from typing import Final, Protocol
 
 from trade import Permit
 from trade.errors import DeadlineExceeded, DeviceFault, TradeError
@@ -14,6 +14,9 @@ Steps = Generator[None, None, None]
 
 Gate = Callable[[], None]
 """Called right before the bytes go out; what it raises keeps them in."""
+
+
+_TELL_S: Final = 0.1
 
 
 class PortLost(Exception):
@@ -77,13 +80,15 @@ class Work:
             self._error = error
             self._ended.set()
 
-    def wait(self, alive: Callable[[], bool]) -> None:
-        """Block until it has ended.
+    def wait(self, alive: Callable[[], bool], tell: Callable[[], None] | None = None) -> None:
+        """Block until it has ended; call ``tell`` ten times a second meanwhile.
 
         Raises:
             TradeError: what became of it.
         """
-        while not self._ended.wait(1.0):
+        while not self._ended.wait(1.0 if tell is None else _TELL_S):
+            if tell is not None:
+                tell()
             if not alive():
                 self.finish(self._device.faulty("the thread of its bus has ended"))
         if self._error is not None:

@@ -41,6 +41,7 @@ __all__ = [
     "SessionEnded",
     "SetupError",
     "Stopped",
+    "ToleranceExceeded",
     "TooLarge",
     "TooManyServices",
     "TradeError",
@@ -443,6 +444,23 @@ class BusGone(DeviceSilent, ConnectionError):
             f"{self.device} cannot be reached: port {self.bus} is gone (for {self.waited_s:.1f} s); plug its adapter "
             "in again. The driver reconnects by itself and moves nothing"
         )
+
+
+@dataclass(kw_only=True, eq=False)
+class ToleranceExceeded(DeviceError, RuntimeError):
+    """A joint is farther from its trajectory than it may be: where it begins, on the way, or where it ends."""
+
+    what: str
+    """``start``, ``path`` or ``goal``."""
+    error_rad: float
+    tolerance_rad: float
+
+    def describe(self) -> str:
+        off = f"{self.device} is {abs(self.error_rad):.3g} rad off the {self.what} of its trajectory"
+        remedy = "it holds; look whether it is blocked or overloaded, give it more time, or allow more"
+        if self.what == "start":
+            remedy = "nothing was sent; begin where it is"
+        return f"{off}, {self.tolerance_rad:.3g} is allowed: {remedy}"
 
 
 # --- the set-up

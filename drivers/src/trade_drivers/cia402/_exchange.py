@@ -28,6 +28,9 @@ _BEATS_MISSED: Final = 3
 class DriveExchange(Exchange):
     """What happens on one bus of drives."""
 
+    cycles_a_goal = 3
+    """Raised, acknowledged, taken back."""
+
     def __init__(
         self, port: "CanPort", bus: "CanBus", axes: Sequence[DriveAxis], clock: Callable[[], int] = time.monotonic_ns
     ) -> None:
@@ -69,11 +72,17 @@ class DriveExchange(Exchange):
         for axis, goal in goals.items():
             self.port.send(table.PROFILE.base + axis.id, table.PROFILE.layout.pack(goal.speed, goal.accel))
             self.port.send(table.BRAKING.base + axis.id, table.BRAKING.layout.pack(goal.accel))
+        self.write_positions({axis: goal.position for axis, goal in goals.items()}, gate)
+
+    def write_positions(self, positions: Mapping[Axis, int], gate: Gate) -> None:
         gate()
-        for axis, goal in goals.items():
+        for axis, position in positions.items():
             drive = cast("DriveAxis", axis)
             drive.asked_ns = self.clock()
-            self.command(drive, machine.GO, goal.position)
+            self.command(drive, machine.GO, position)
+
+    def can_take_goals(self, axes: Sequence[Axis]) -> bool:
+        return all(cast("DriveAxis", axis).can_take_goal and not self.worked_on(axis) for axis in axes)
 
     def write_holds(self, positions: Mapping[Axis, int]) -> None:
         """Halt, on the joint's own ramp; what is not known to be enabled is not told, lest that enable it."""

@@ -3,8 +3,8 @@
 from typing import Annotated, cast
 
 from trade import Meta, permit, service
-from trade.errors import LimitExceeded
 from trade_drivers._asked import expiry
+from trade_drivers._checks import within
 from trade_drivers.cia402._axis import DriveAxis
 from trade_drivers.cia402._exchange import DriveExchange
 from trade_drivers.cia402._homing import Homing
@@ -34,10 +34,7 @@ class Drive(BusMotor):
         axis = cast("DriveAxis", self._axes[0])
         fastest = axis.joint.max_speed_rad_s
         speed = fastest / 10 if speed_rad_s is None else speed_rad_s
-        if not axis.grain.rad_s <= speed <= fastest:
-            raise LimitExceeded(
-                what=f"{axis.name} speed", value=speed, lower=axis.grain.rad_s, upper=fastest, unit="rad/s"
-            )
+        within(speed, axis.grain.rad_s, fastest, f"{axis.name} speed", "rad/s")
         expires_ns, ends = expiry(self._exchange.clock)
         with permit(self.resources) as permitted:
             homing = Homing(

@@ -111,16 +111,6 @@ class ServoAxis(Axis):
         """Torque is on, or nobody knows."""
         return self.health is None or self.health.torque
 
-    def goal_block(self, goal: int, accel: int = 0, speed: int = 0) -> bytes:
-        """What goes from profile acceleration to goal position; by default at the joint's limits."""
-        return b"".join(
-            (
-                table.PROFILE_ACCELERATION.encode(accel or self.accel_counts),
-                table.PROFILE_VELOCITY.encode(speed or self.speed_counts),
-                table.GOAL_POSITION.encode(goal),
-            )
-        )
-
     def state(self, now_ns: int, stale_after_ns: int) -> MotorState:
         sample, health = self.fresh(now_ns, stale_after_ns), self.health
         if health is None or now_ns - health.at_ns > _HEALTH_STALE_NS:

@@ -55,6 +55,10 @@ class ServoExchange(Exchange):
         data = {axis.id: jobs.goal_block(goal) for axis, goal in goals.items()}
         self.wire.sync_write(table.PROFILE_ACCELERATION.address, data, gate)
 
+    def write_positions(self, positions: Mapping[Axis, int], gate: Gate) -> None:
+        data = {axis.id: table.GOAL_POSITION.encode(position) for axis, position in positions.items()}
+        self.wire.sync_write(table.GOAL_POSITION.address, data, gate)
+
     def write_holds(self, positions: Mapping[Axis, int]) -> None:
         ours: dict[int, bytes] = {}
         others: dict[int, bytes] = {}

@@ -35,8 +35,8 @@ def goal_block(goal: Goal) -> bytes:
 
 def relaxing(bus: "ServoExchange", job: Job, axis: ServoAxis) -> Steps:
     """Torque off, and its watchdog disarmed."""
+    axis.ready = False  # before: its health may be read in between, and torque that is off would be a fault
     yield from _write(bus, job, axis, table.TORQUE_ENABLE, 0)
-    axis.ready = False
     yield from _write(bus, job, axis, table.BUS_WATCHDOG, 0)
     health = yield from read_health(bus, axis)
     if health.torque:
@@ -47,6 +47,7 @@ def leaving(bus: "ServoExchange", job: Job, axis: ServoAxis, *, relax: bool) -> 
     """Torque off or left on, and its watchdog disarmed where it may be."""
     health = yield from read_health(bus, axis)
     if relax and health.torque:
+        axis.ready = False
         yield from _write(bus, job, axis, table.TORQUE_ENABLE, 0)
     elif health.watchdog == table.WATCHDOG_EXPIRED or axis.still == 0:
         return

@@ -25,6 +25,9 @@ _HALT_NS: Final = 2_000_000_000
 class Exchange(ABC):
     """What happens on one bus. Everything but ``submit`` and ``stop`` belongs to the thread that calls ``cycle()``."""
 
+    cycles_a_goal = 1
+    """How many cycles it takes at most until a joint can take the next goal."""
+
     def __init__(self, bus: "Bus", axes: Sequence[Axis], clock: Callable[[], int] = time.monotonic_ns) -> None:
         self.axes = tuple(axes)
         self.clock = clock
@@ -54,6 +57,14 @@ class Exchange(ABC):
         """Send joints on their way, all of them or none; the gate is asked right before the bytes go out."""
 
     @abstractmethod
+    def write_positions(self, positions: Mapping[Axis, int], gate: Gate) -> None:
+        """The same for joints on their way, as fast as they are already; only if they ``can_take_goals``."""
+
+    def can_take_goals(self, axes: Sequence[Axis]) -> bool:  # noqa: ARG002 - most devices take a goal at any time
+        """Whether these joints can take new goals now, and nothing else is about to give them some."""
+        return True
+
+    @abstractmethod
     def write_holds(self, positions: Mapping[Axis, int]) -> None:
         """Have joints brake as hard as they may and hold, near these positions. Never waits."""
 
@@ -69,7 +80,7 @@ class Exchange(ABC):
     def looking(self, axis: Axis) -> Steps:
         """How the joint is, asked now."""
 
-    def making_way(self, axes: Sequence[Axis]) -> Steps:  # noqa: ARG002 - most devices take a goal at any time
+    def making_way(self, axes: Sequence[Axis]) -> Steps:  # noqa: ARG002 - as above
         """Wait until these joints can take new goals."""
         yield from ()
 
@@ -197,6 +208,10 @@ class Exchange(ABC):
             raise axis.deaf(self.clock())
 
     # --- parts of a cycle
+
+    def worked_on(self, axis: Axis) -> bool:
+        """Whether a job is in the middle of its exchanges with this joint."""
+        return any(axis in job.axes for job in self._working)
 
     def work(self, until_ns: int) -> None:
         """Go on with the jobs, an exchange of each in turn; a stop or the time ends the round."""

@@ -57,6 +57,17 @@ class Motion(Command):
         """Look at the newest measurements; end it if it is over or must not go on."""
         raise NotImplementedError
 
+    def trouble(self, now_ns: int, until_ns: int | None) -> TradeError | None:
+        """Why none of its joints may go on: a fault, silence, or the end of its call."""
+        for axis in self.axes:
+            if axis.fault:
+                return axis.faulty()
+            if axis.silent or axis.age_ns(now_ns) > self.exchange.stale_after_ns:
+                return axis.deaf(now_ns)
+        if until_ns is not None and now_ns >= until_ns:
+            return MotionStopped(device=self.axes[0].name, reason="the deadline of its call came; give it a longer one")
+        return None
+
     def done_stepping(self) -> None:
         """Launched; now it is watched. (It has ended already if anything was refused.)"""
 
@@ -110,7 +121,7 @@ class Move(Motion):
         self._patience_s = 1.0 + 2 * max(profile.duration_s for profile in profiles)
 
     def watch(self, now_ns: int) -> None:
-        ending = self._trouble(now_ns)
+        ending = self.trouble(now_ns, self._until_ns)
         if ending is None:
             elapsed_s = min((now_ns - self._watched_ns) / 1e9, _MOST_PER_CYCLE_S)
             self._watched_ns = now_ns
@@ -122,16 +133,6 @@ class Move(Motion):
             ending = self._stuck(now_ns)
         if ending is not None:
             self.exchange.release(self, ending)
-
-    def _trouble(self, now_ns: int) -> TradeError | None:
-        for axis in self.axes:
-            if axis.fault:
-                return axis.faulty()
-            if axis.silent or axis.age_ns(now_ns) > self.exchange.stale_after_ns:
-                return axis.deaf(now_ns)
-        if self._until_ns is not None and now_ns >= self._until_ns:
-            return MotionStopped(device=self.axes[0].name, reason="the deadline of its call came; give it a longer one")
-        return None
 
     def _arrived(self, axis: Axis, elapsed_s: float) -> bool:
         progress, sample = self._progress[axis], axis.sample

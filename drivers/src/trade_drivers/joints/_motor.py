@@ -3,13 +3,16 @@
 from collections.abc import Sequence
 
 from trade import Resource, permit
-from trade.errors import DeviceError, DeviceSilent, InvalidArgument, LimitExceeded
-from trade_drivers._asked import expiry, finite, time_to_answer_ns
+from trade.errors import DeviceError, DeviceSilent, LimitExceeded
+from trade_drivers._asked import expiry, span
 from trade_drivers._bus_thread import BusThread
+from trade_drivers._checks import finite, one_each, valid, within
 from trade_drivers._driver import AttachedBus
-from trade_drivers._interfaces import LONGEST_VALID_S, JointGroup, JointLimits, Motor, MotorState
+from trade_drivers._interfaces import JointGroup, JointLimits, Motor, MotorState
+from trade_drivers._plan import Plan
 from trade_drivers.joints._axis import Axis
 from trade_drivers.joints._exchange import Exchange
+from trade_drivers.joints._follow import Follow
 from trade_drivers.joints._jobs import Command, Enable, Halt, Relax
 from trade_drivers.joints._motion import Move
 from trade_drivers.joints._setpoint import SetPoint
@@ -54,10 +57,7 @@ class _Joints:
         goals = self._goals(positions_rad, service, argument)
         speed = None if speed_rad_s is None else finite(speed_rad_s, service, "speed_rad_s")
         speeds = [_speed_counts(axis, speed) for axis in self._axes]
-        expires_ns, ends = expiry(self._exchange.clock)
-        if ends:
-            expires_ns -= time_to_answer_ns(expires_ns - self._exchange.clock())
-        until_ns = expires_ns if ends else None
+        expires_ns, until_ns = span(self._exchange.clock)
         with permit(self.resources) as permitted:
             move = Move(
                 self._exchange,
@@ -91,14 +91,8 @@ class _Joints:
             )
 
     def _goals(self, positions_rad: Sequence[float], service: str, argument: str) -> list[int]:
-        if len(positions_rad) != len(self._axes):
-            names = ", ".join(axis.name for axis in self._axes)
-            problem = f"has {len(positions_rad)} values; it takes {len(self._axes)}, for {names}"
-            raise InvalidArgument(service=service, argument=argument, problem=problem)
-        return [
-            _goal_counts(axis, finite(value, service, argument))
-            for axis, value in zip(self._axes, positions_rad, strict=True)
-        ]
+        values = one_each(positions_rad, [axis.name for axis in self._axes], service, argument)
+        return [_goal_counts(axis, value) for axis, value in zip(self._axes, values, strict=True)]
 
     def _states(self) -> list[MotorState]:
         return [self._state(axis) for axis in self._axes]
@@ -139,7 +133,7 @@ class BusMotor(_Joints, Motor):
 
     def set_velocity(self, velocity_rad_s: float, valid_s: float = 0.2) -> None:
         service = f"{self._name}.set_velocity"
-        velocity, valid_s = finite(velocity_rad_s, service, "velocity_rad_s"), _valid(valid_s, service)
+        velocity, valid_s = finite(velocity_rad_s, service, "velocity_rad_s"), valid(valid_s, service)
         if velocity == 0:
             self._do(Halt, "set_velocity")
             return
@@ -165,7 +159,18 @@ class BusGroup(_Joints, JointGroup):
     def servo(self, positions_rad: list[float], valid_s: float = 0.2) -> None:
         service = f"{self._name}.servo"
         goals = self._goals(positions_rad, service, "positions_rad")
-        self._set(goals, [axis.speed_counts for axis in self._axes], service, _valid(valid_s, service))
+        self._set(goals, [axis.speed_counts for axis in self._axes], service, valid(valid_s, service))
+
+    def stream(self, plan: Plan) -> list[float]:
+        exchange, service = self._exchange, f"{self._name}.follow"
+        expires_ns, until_ns = span(exchange.clock)
+        with permit(self.resources) as permitted:
+            job = Follow(
+                exchange, self._axes, plan, service=service, expires_ns=expires_ns, until_ns=until_ns, permit=permitted
+            )
+            exchange.submit(job)
+            job.wait(self._thread.alive, lambda: plan.course.report(exchange.clock()))
+        return job.final_rad
 
 
 class AttachedJoints(AttachedBus):
@@ -186,13 +191,6 @@ class AttachedJoints(AttachedBus):
         self._thread.close()
 
 
-def _valid(valid_s: float, service: str) -> float:
-    if not 0 < finite(valid_s, service, "valid_s") <= LONGEST_VALID_S:
-        problem = f"{valid_s!r} is not above 0 and at most {LONGEST_VALID_S:g}"
-        raise InvalidArgument(service=service, argument="valid_s", problem=problem)
-    return valid_s
-
-
 def _end_counts(axis: Axis, velocity_rad_s: float) -> int:
     """Where a motion in this direction ends at the latest: the device brakes by itself before it gets there."""
     joint, sample = axis.joint, axis.sample
@@ -206,15 +204,11 @@ def _end_counts(axis: Axis, velocity_rad_s: float) -> int:
 
 def _goal_counts(axis: Axis, position_rad: float) -> int:
     joint = axis.joint
-    if not joint.min_rad <= position_rad <= joint.max_rad:
-        raise LimitExceeded(what=axis.name, value=position_rad, lower=joint.min_rad, upper=joint.max_rad, unit="rad")
-    return round(axis.scale.counts(position_rad))
+    return round(axis.scale.counts(within(position_rad, joint.min_rad, joint.max_rad, axis.name, "rad")))
 
 
 def _speed_counts(axis: Axis, speed_rad_s: float | None) -> int:
     if speed_rad_s is None:
         return axis.speed_counts
-    slowest, fastest = axis.grain.rad_s, axis.joint.max_speed_rad_s
-    if not slowest <= speed_rad_s <= fastest:
-        raise LimitExceeded(what=f"{axis.name} speed", value=speed_rad_s, lower=slowest, upper=fastest, unit="rad/s")
+    within(speed_rad_s, axis.grain.rad_s, axis.joint.max_speed_rad_s, f"{axis.name} speed", "rad/s")
     return max(1, int(speed_rad_s / axis.grain.rad_s))

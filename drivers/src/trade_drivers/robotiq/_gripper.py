@@ -1,9 +1,10 @@
 """A 2F-85 as a Gripper: it checks, hands over to the bus thread, waits, and never touches the port."""
 
 from trade import Resource, permit
-from trade.errors import DeviceError, DeviceSilent, LimitExceeded
-from trade_drivers._asked import expiry, finite, time_to_answer_ns
+from trade.errors import DeviceError, DeviceSilent
+from trade_drivers._asked import expiry, span
 from trade_drivers._bus_thread import BusThread
+from trade_drivers._checks import finite, within
 from trade_drivers._interfaces import Gripper, GripperLimits, GripperState
 from trade_drivers.robotiq import _table as table
 from trade_drivers.robotiq._exchange import Exchange
@@ -49,7 +50,7 @@ class RobotiqGripper(Gripper):
         )
 
     def activate(self) -> GripperState:
-        expires_ns, until_ns = self._deadline()
+        expires_ns, until_ns = span(self._exchange.clock)
         with permit(self.resources) as permitted:
             self._finish(
                 Activate(
@@ -85,13 +86,14 @@ class RobotiqGripper(Gripper):
 
     def _move(self, name: str, width_m: float, speed_m_s: float | None, force_n: float | None) -> GripperState:
         service, limits, model = f"{self._name}.{name}", self.limits(), self._hand.model
-        width = self._within(finite(width_m, service, "width_m"), "width", limits.min_width_m, limits.max_width_m, "m")
+        width = finite(width_m, service, "width_m")
+        within(width, limits.min_width_m, limits.max_width_m, f"{self._name} width", "m")
         speed = limits.max_speed_m_s if speed_m_s is None else finite(speed_m_s, service, "speed_m_s")
-        self._within(speed, "speed", limits.min_speed_m_s, limits.max_speed_m_s, "m/s")
+        within(speed, limits.min_speed_m_s, limits.max_speed_m_s, f"{self._name} speed", "m/s")
         force = limits.max_force_n if force_n is None else finite(force_n, service, "force_n")
-        self._within(force, "force", limits.min_force_n, limits.max_force_n, "N")
+        within(force, limits.min_force_n, limits.max_force_n, f"{self._name} force", "N")
         registers = table.command(model.counts(width), model.speed_counts(speed), model.force_counts(force))
-        expires_ns, until_ns = self._deadline()
+        expires_ns, until_ns = span(self._exchange.clock)
         with permit(self.resources) as permitted:
             self._finish(
                 Move(
@@ -105,19 +107,6 @@ class RobotiqGripper(Gripper):
                 )
             )
         return self.state()
-
-    def _within(self, value: float, what: str, lower: float, upper: float, unit: str) -> float:
-        if not lower <= value <= upper:
-            raise LimitExceeded(what=f"{self._name} {what}", value=value, lower=lower, upper=upper, unit=unit)
-        return value
-
-    def _deadline(self) -> tuple[int, int | None]:
-        """Until when it may begin, and when it must be over."""
-        clock = self._exchange.clock
-        expires_ns, ends = expiry(clock)
-        if ends:
-            expires_ns -= time_to_answer_ns(expires_ns - clock())
-        return expires_ns, expires_ns if ends else None
 
     def _finish(self, job: Command) -> None:
         self._exchange.submit(job)

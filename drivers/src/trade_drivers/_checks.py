@@ -1,0 +1,42 @@
+"""What every driver asks of the numbers it is given, before anything is sent."""
+
+from collections.abc import Sequence
+from math import isfinite
+from typing import Final
+
+from trade.errors import InvalidArgument, LimitExceeded
+
+__all__ = ["LONGEST_VALID_S", "finite", "one_each", "valid", "within"]
+
+LONGEST_VALID_S: Final = 1.0
+"""No set-point holds longer without being renewed."""
+
+
+def finite(value: float, service: str, argument: str) -> float:
+    """The number, or InvalidArgument."""
+    if not isinstance(value, int | float) or isinstance(value, bool) or not isfinite(value):  # pyright: ignore[reportUnnecessaryIsInstance]
+        raise InvalidArgument(service=service, argument=argument, problem=f"{value!r} is not a finite number")
+    return float(value)
+
+
+def valid(valid_s: float, service: str) -> float:
+    """How long a set-point may hold, in seconds, or InvalidArgument."""
+    if not 0 < finite(valid_s, service, "valid_s") <= LONGEST_VALID_S:
+        problem = f"{valid_s!r} is not above 0 and at most {LONGEST_VALID_S:g}"
+        raise InvalidArgument(service=service, argument="valid_s", problem=problem)
+    return valid_s
+
+
+def one_each(values: Sequence[float], joints: Sequence[str], service: str, argument: str) -> list[float]:
+    """One finite number for each joint, or InvalidArgument."""
+    if len(values) != len(joints):
+        problem = f"has {len(values)} values; it takes {len(joints)}, for {', '.join(joints)}"
+        raise InvalidArgument(service=service, argument=argument, problem=problem)
+    return [finite(value, service, argument) for value in values]
+
+
+def within(value: float, lower: float, upper: float, what: str, unit: str) -> float:
+    """The value if it lies in the range, or LimitExceeded."""
+    if not lower <= value <= upper:
+        raise LimitExceeded(what=what, value=value, lower=lower, upper=upper, unit=unit)
+    return value

@@ -1,0 +1,11 @@
+"""What every driver must do: a contract for each kind of device, run by pytest on its simulation and on hardware.
+
+The contracts are plain classes with ``test_`` methods, run in a subclass that says by a fixture what is tested.
+``python -m trade_drivers.testing --hil ROBOT.toml`` runs them on the devices of a robot file.
+"""
+
+from trade_drivers.testing._grippers import GripperContract
+from trade_drivers.testing._groups import JointGroupContract
+from trade_drivers.testing._motors import MotorContract
+
+__all__ = ["GripperContract", "JointGroupContract", "MotorContract"]

@@ -1,0 +1,75 @@
+"""How the contracts ask: refusals, waits with a deadline, calls in threads of their own, short and slow ways."""
+
+# ruff: noqa: S101 - these are tests
+
+import threading
+import time
+from collections.abc import Callable, Generator, Sequence
+from contextlib import contextmanager
+from typing import Final, Generic, TypeVar
+
+from trade.errors import TradeError
+from trade_drivers._interfaces import MotorState
+from trade_drivers._plan import JointLimits
+
+__all__ = ["NEAR_RAD", "REACH_RAD", "SPEED_RAD_S", "Caller", "ahead", "refused", "until"]
+
+REACH_RAD: Final = 0.12
+"""No joint is sent farther from where it is found."""
+SPEED_RAD_S: Final = 0.2
+"""Nor faster."""
+NEAR_RAD: Final = 0.03
+"""As close as a joint has to come to its goal."""
+_PATIENCE_S: Final = 20.0
+
+_Result = TypeVar("_Result")
+
+
+@contextmanager
+def refused(error: type[TradeError]) -> Generator[None, None, None]:
+    """What runs within must be refused with this error."""
+    try:
+        yield
+    except error:
+        return
+    raise AssertionError(f"it was not refused with {error.__name__}")
+
+
+def until(true: Callable[[], object], what: str) -> None:
+    """Wait for something that must come about."""
+    deadline = time.monotonic() + _PATIENCE_S
+    while not true():
+        assert time.monotonic() < deadline, f"waited {_PATIENCE_S:g} s in vain until {what}"
+        threading.Event().wait(0.005)
+
+
+class Caller(Generic[_Result]):
+    """A call that takes its time, in a thread of its own."""
+
+    def __init__(self, act: Callable[[], _Result]) -> None:
+        self._act = act
+        self._error: TradeError | None = None
+        self._thread = threading.Thread(target=self._run, name="caller", daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        try:
+            self._act()
+        except TradeError as error:
+            self._error = error
+
+    def error(self) -> TradeError | None:
+        """What it raised, once it has ended."""
+        self._thread.join(_PATIENCE_S)
+        assert not self._thread.is_alive(), "the call does not end"
+        return self._error
+
+
+def ahead(states: Sequence[MotorState], limits: Sequence[JointLimits], part: float = 1.0) -> list[float]:
+    """A short way from where the joints are, to the side where there is more room."""
+    goals: list[float] = []
+    for state, limit in zip(states, limits, strict=True):
+        up, down = limit.max_rad - state.position_rad, state.position_rad - limit.min_rad
+        way = min(REACH_RAD, max(up, down)) * part
+        goals.append(state.position_rad + (way if up >= down else -way))
+    return goals

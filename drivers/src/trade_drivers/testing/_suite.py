@@ -1,0 +1,17 @@
+"""What `_hil` has pytest collect: the contracts, for all devices of the robot file."""
+
+from trade_drivers.testing._grippers import GripperContract
+from trade_drivers.testing._groups import JointGroupContract
+from trade_drivers.testing._motors import MotorContract
+
+
+class TestMotor(MotorContract):
+    """Each joint."""
+
+
+class TestJointGroup(JointGroupContract):
+    """Each group."""
+
+
+class TestGripper(GripperContract):
+    """Each gripper."""
