@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from trade import Container, Handle, Run, Settings, service, where
+from trade import Container, Handle, Lock, Run, Settings, service, where
 from trade._links import _others
 
 PROVIDERS = 5
@@ -40,6 +40,7 @@ class Member:
         self._gone: list[str] = []
         self._kept: Handle | None = None
         self._run: Run | None = None
+        self._lock: Lock | None = None
         self._providers: dict[str, Echo] = {}
 
     @property
@@ -88,6 +89,17 @@ class Member:
         with self.up.lock(where(group=group)) as lock:
             self.up.find(where(name="move", group=group))(1)
             return list(lock.resources)
+
+    def hold(self, group: str) -> None:
+        """Take a lock and keep it."""
+        self._lock = self.up.lock(where(group=group)).acquire()
+
+    def held(self) -> bool:
+        """Whether it still holds, for those who granted it, too."""
+        assert self._lock is not None
+        with self._lock.use():
+            self.up.find(where(name="move", group="rosie.arm.p0"))(1)
+        return self._lock.held
 
     def try_move(self, of: str, deadline_s: str) -> None:
         """Move what it has seen before, or sees now, however long that takes."""

@@ -221,6 +221,25 @@ def test_a_wrong_file_changes_nothing_and_says_why(site: Site, planner: Member) 
     planner.ask("move", "rosie.arm", "1")
 
 
+def test_S12_a_gateway_that_opens_anew_loses_nobody_no_call_and_no_lock(
+    site: Site, arm: Member, planner: Member
+) -> None:
+    arm.ask("register_one", "rosie.arm.p0")
+    planner.ask("group", "rosie.arm.p0", "arm")
+    planner.ask("watch")
+    planner.ask("hold", "rosie.arm.p0")
+    planner.ask("nap", "rosie.arm")
+    for exported in ('["lobby"]', "[]", '["lobby"]'):
+        site.change(site.file, site.file.read_text().rpartition("export = ")[2], f"{exported}\n")
+        heard = site.gateway.stdout
+        assert heard is not None
+        assert json.loads(heard.readline())["reloaded"]
+    planner.ask("woken")
+    assert planner.ask("held")
+    assert planner.ask("gone") == []
+    assert planner.ask("sees", "2") == ["rosie.arm.echo", "rosie.arm.p0.echo"]
+
+
 def test_a_gateway_that_is_killed_and_comes_back_is_used_again(site: Site, arm: Member, planner: Member) -> None:
     planner.ask("watch")
     planner.ask("move", "rosie.arm", "1")

@@ -83,6 +83,8 @@ class Gateway:
             complain(f"{file} was changed and cannot be used; going on as before: {refused}")
             return False
         out.say(f"read {file} again")
+        if out.as_json:
+            out.data({"reloaded": str(file)})
         return True
 
     def close(self) -> None:

@@ -9,6 +9,7 @@ when it closes.
 import hashlib
 import hmac
 import json
+import math
 import secrets
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -28,6 +29,7 @@ _NAME: Final = 12
 """Hexadecimal digits: the id of a beacon is made of its system's tag, of so much of the id of the main session as names
 it, and of the port that the main session listens on. So a scout knows whom it found, and dials the main session."""
 _LOOK_S: Final = 0.01
+_MOMENT_S: Final = 1.0
 
 _USER: Final = "transport/auth/usrpwd/user"
 _TLS: Final = "transport/link/tls"
@@ -91,7 +93,24 @@ class Links:
         self.listen: Final = [Endpoint.read(text) for text in settings["listen/endpoints"]]
         self._tag = _tag(settings)
         self._shown = next((own for own in self.listen if not own.loopback), self.listen[0])
+        self._routers: set[str] = set()
+        self._router_lost_s = -math.inf
         self._beacon_id = f"{self._tag}{self._own[:_NAME]}{self._shown.port:04x}"
+
+    def bridge_lost(self) -> bool:
+        """Whether the main session's link to a bridge went within the last second, as far as was looked."""
+        try:
+            there = {str(router) for router in self._session.info.routers_zid()}
+        except zenoh.ZError:  # closed
+            return False
+        if self._routers - there:
+            self._router_lost_s = time.monotonic()
+        self._routers = there
+        return time.monotonic() - self._router_lost_s < _MOMENT_S
+
+    def bridged(self) -> bool:
+        """Whether the main session is linked to a bridge, or was within the last second."""
+        return self.bridge_lost() or bool(self._routers)
 
     def linked(self, session: str) -> bool:
         """Whether the main session is linked to one whose id begins so."""

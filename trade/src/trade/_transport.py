@@ -149,6 +149,14 @@ class Transport(ABC):
     def present(self, pattern: str, timeout_s: float) -> list[str]:
         """The signs of life that stand now, one's own included."""
 
+    def bridged(self) -> bool:
+        """Whether it is linked to a bridge, or was a moment ago: others may be seen through that only."""
+        return False
+
+    def bridge_lost(self) -> bool:
+        """Whether a bridge to others went a moment ago: who is out of sight now may be behind it, and come back."""
+        return False
+
     @abstractmethod
     def wake(self, key: str, payload: bytes) -> None:
         """Put for the readers of this very transport only; nothing leaves the process."""

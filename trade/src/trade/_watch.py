@@ -5,6 +5,7 @@ import threading
 from collections.abc import Callable
 from typing import Final
 
+from trade._absence import Absences
 from trade._asking import Asker
 from trade._registry import ContainerState, Registry
 from trade._system import DOMAIN
@@ -44,6 +45,8 @@ class Watch:
         self._ended = ended
         self.malformed = 0
         self._asker = Asker(transport, registry, self._answer, beat)
+        self._transport = transport
+        self._absences = Absences(self._gone, transport.bridge_lost)
         entries, signs = transport.announcements(REGISTRY), transport.presences(ALIVE)
         for key in transport.present(ALIVE, _SYNC_S):
             self._sign(Message(key, b""))
@@ -94,16 +97,29 @@ class Watch:
         address = Address(identity, container, epoch)
         if address == self._own:
             return
+        session = "/".join((str(address), *client))
+        bridged = self._transport.bridged()
+        if message.payload is None:
+            if bridged:
+                self._absences.begin(session)
+            else:
+                self._gone(session)
+            return
+        was_away = self._absences.end(session)
+        if not client:
+            self._lost(address, back=True)
+            if self._registry.appear(address) or was_away:
+                self._asker.request(address, anew=True)
+
+    def _gone(self, session: str) -> None:
+        """A container, or a client of one, has ended or cannot be reached."""
+        identity, container, epoch, *client = session.split("/")
         if client:
-            if message.payload is None:
-                self._ended(f"{address}/{client[0]}")
-        elif message.payload is None:
+            self._ended(session)
+        else:
+            address = Address(identity, container, epoch)
             self._lost(address)
             self._registry.vanish(address)
-        else:
-            self._lost(address, back=True)
-            if self._registry.appear(address):
-                self._asker.request(address, anew=True)
 
     def _answer(self, answer: Answer, meant: dict[Address, ContainerState]) -> None:
         """Take what a container says that it offers. Who speaks for anybody else is not listened to at all."""
@@ -132,6 +148,7 @@ class Watch:
     def close(self) -> None:
         """End the threads. Idempotent."""
         self._asker.close()
+        self._absences.close()
         for channel in self._channels:
             channel.close()
         for thread in self._threads:

@@ -254,6 +254,12 @@ class ZenohTransport(Transport):
             replies = self._session.liveliness().get(pattern, _fifo(), timeout=timeout_s)
         return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
 
+    def bridged(self) -> bool:
+        return self.links.bridged()
+
+    def bridge_lost(self) -> bool:
+        return self.links.bridge_lost()
+
     def wake(self, key: str, payload: bytes) -> None:
         _quietly(lambda: self._session.put(key, payload, allowed_destination=zenoh.Locality.SESSION_LOCAL))
 

@@ -1,0 +1,55 @@
+"""S12: who is out of sight with a bridge is gone after a moment, unless he is back before."""
+
+import queue
+import threading
+from collections.abc import Iterator
+
+import pytest
+
+from trade._absence import Absences
+
+
+@pytest.fixture
+def told() -> "queue.SimpleQueue[str]":
+    return queue.SimpleQueue()
+
+
+@pytest.fixture
+def absences(told: "queue.SimpleQueue[str]") -> Iterator[Absences]:
+    made = Absences(told.put, lambda: True, grace_s=0.2)
+    yield made
+    made.close()
+
+
+def test_S12_who_does_not_come_back_is_gone_once(absences: Absences, told: "queue.SimpleQueue[str]") -> None:
+    absences.begin("me/arm/1")
+    absences.begin("me/arm/1")
+    absences.begin("me/leg/1")
+    assert [told.get(timeout=60), told.get(timeout=60)] == ["me/arm/1", "me/leg/1"]
+    assert not absences.end("me/arm/1")  # too late
+    assert told.empty()
+
+
+def test_S12_who_is_back_in_time_was_never_gone(told: "queue.SimpleQueue[str]") -> None:
+    patient = Absences(told.put, lambda: True, grace_s=3600.0)
+    patient.begin("me/arm/1")
+    assert patient.end("me/arm/1")
+    assert not patient.end("me/arm/1")
+    patient.close()
+    assert told.empty()
+
+
+def test_who_went_without_any_bridge_is_gone_as_soon_as_that_is_sure(told: "queue.SimpleQueue[str]") -> None:
+    absences = Absences(told.put, lambda: False, grace_s=3600.0)
+    absences.begin("me/arm/1")
+    assert told.get(timeout=60) == "me/arm/1"
+    absences.close()
+
+
+def test_nobody_is_told_of_anybody_after_the_end(told: "queue.SimpleQueue[str]") -> None:
+    absences = Absences(told.put, lambda: True, grace_s=3600.0)
+    absences.begin("me/arm/1")
+    absences.close()
+    absences.begin("me/leg/1")
+    assert told.empty()
+    assert not [thread for thread in threading.enumerate() if thread.name == "trade-absence"]

@@ -1,0 +1,85 @@
+"""Who is out of sight because a bridge went: believed to be there for a moment more, as bridges come back (S12).
+
+A sign of life may fall a moment before the link is seen to have gone that it came by, so one looks twice.
+"""
+
+import threading
+import time
+from collections.abc import Callable
+from typing import Final
+
+GRACE_S: Final = 1.0
+_LOOK_S: Final = 0.05
+
+
+class Absences:
+    """Sessions whose sign of life fell, perhaps with a bridge; then who is not back within a second is gone."""
+
+    def __init__(
+        self,
+        gone: Callable[[str], None],
+        bridge_lost: Callable[[], bool],
+        grace_s: float = GRACE_S,
+        look_s: float = _LOOK_S,
+    ) -> None:
+        """Tell of nobody yet.
+
+        Args:
+            gone: told of each session that is gone for good, on a thread of this.
+            bridge_lost: whether a bridge went a moment ago.
+            grace_s: how long who is behind a bridge may be away, in seconds.
+            look_s: how long after a sign of life has fallen the loss of a bridge is known, in seconds.
+        """
+        self._gone = gone
+        self._bridge_lost = bridge_lost
+        self._grace_s = grace_s
+        self._look_s = look_s
+        self._due: dict[str, tuple[float, bool]] = {}
+        """When to look at a session, and whether it is gone then."""
+        self._changed = threading.Condition()
+        self._thread: threading.Thread | None = None
+        self._closed = False
+
+    def begin(self, session: str) -> None:
+        """Its sign of life fell; does not wait."""
+        with self._changed:
+            self._due.setdefault(session, (time.monotonic() + self._look_s, False))
+            if self._thread is None and not self._closed:
+                self._thread = threading.Thread(target=self._run, name="trade-absence", daemon=True)
+                self._thread.start()
+            self._changed.notify_all()
+
+    def end(self, session: str) -> bool:
+        """Its sign of life rose; returns whether it was away, and is not gone yet."""
+        with self._changed:
+            return self._due.pop(session, None) is not None
+
+    def _run(self) -> None:
+        while (session := self._next()) is not None:
+            self._gone(session)
+
+    def _next(self) -> str | None:
+        """The next one that is gone for good; none once this is closed."""
+        with self._changed:
+            while not self._closed:
+                first = min(self._due, key=self._due.__getitem__, default=None)
+                if first is None:
+                    self._changed.wait()
+                    continue
+                at, last = self._due[first]
+                if (left_s := at - time.monotonic()) > 0:
+                    self._changed.wait(left_s)
+                elif last or not self._bridge_lost():
+                    del self._due[first]
+                    return first
+                else:
+                    self._due[first] = (at + self._grace_s - self._look_s, True)
+            return None
+
+    def close(self) -> None:
+        """Tell of nobody any more. Idempotent."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+        if self._thread is not None and self._thread is not threading.current_thread():
+            self._thread.join(2)
