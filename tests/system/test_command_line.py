@@ -99,7 +99,7 @@ def test_tables_in_a_pipe_are_whole_lines(rosie_up, trade_command: Command) -> N
     rosie_up()
     lines = trade_command("services", "--group", "rosie.head").stdout.splitlines()
     moves = [line for line in lines if line.startswith("rosie.head.move_to")]
-    assert len(lines) == 9  # the head line, and a line a service
+    assert len(lines) == 10  # the head line, and a line a service
     assert "move_to(positions_rad: list[float], speed_rad_s: float (> 0) | None = None) -> list[float]  act" in moves[0]
 
 

@@ -178,8 +178,8 @@ class Estops:
             self._answers[request] = problem
         if problem:
             _logger.error("e-stop %s: %s", request, problem)
+        self._changed()  # first: who has heard of everybody may look at once
         self._confirm(request, problem)
-        self._changed()
 
     def _apart(self, work: Callable[[], None]) -> None:
         thread = threading.Thread(target=work, name="trade-estop-work", daemon=True)

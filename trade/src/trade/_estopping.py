@@ -23,6 +23,8 @@ from trade.errors import ConfigurationError, NoSuchEstop
 
 LIMIT_S: Final = 3.0
 _LONGEST_LIMIT_S: Final = 60.0
+_TOLD_S: Final = 1.0
+"""How long the entries of others may lag behind their confirmations."""
 _LONGEST_REASON: Final = 500
 
 
@@ -109,7 +111,18 @@ class Estopping:
             knowing = (r.key.address for r in self._own_records() if any(estop.id in ids for estop in r.estops))
             return {*self._with_stops(), *knowing}
 
-        return self._line.ask(order, expected, limit_s, lambda: False)
+        report = self._line.ask(order, expected, limit_s, lambda: False)
+        self._registry.wait_for(lambda: not self._still_told(ids, report.confirmed), _TOLD_S)
+        return report
+
+    def _still_told(self, ids: Sequence[str], by: Sequence[str]) -> bool:
+        """Whether the entries of those who confirmed still have them: what they say now may not have arrived."""
+        return any(
+            estop.id in ids
+            for record in self._own_records()
+            if f"{record.key.address.identity}/{record.key.address.container}" in by
+            for estop in record.estops
+        )
 
     def _with_stops(self) -> set[Address]:
         return {state.address for state in self._registry.containers() if _has_stop(state)}
