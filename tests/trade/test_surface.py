@@ -36,7 +36,7 @@ def test_public_names_are_sorted_and_complete() -> None:
         for name, value in vars(trade).items()
         if not name.startswith("_") and (inspect.isclass(value) or inspect.isfunction(value))
     }
-    assert public - {"Any", "Callback", "Iterable", "Mapping", "Sequence"} <= set(trade.__all__)
+    assert public - {"Any", "datetime", "Iterable", "Mapping", "Sequence"} <= set(trade.__all__)
 
 
 def test_importing_trade_needs_nothing_of_one_operating_system_and_no_hardware(start_program: Any) -> None:

@@ -6,6 +6,7 @@ functions here use the process's default container, which starts itself on first
 
 import threading
 from collections.abc import Iterable, Mapping, Sequence
+from datetime import datetime
 from typing import Any
 
 from msgspec import Meta
@@ -20,7 +21,9 @@ from trade._handle import Bound, Handle, Run
 from trade._lock import Lock, OnLost, OnRequest
 from trade._locking import LEASE_S
 from trade._many import Outcome
-from trade._notifications import Callback, Notification
+from trade._notifications import Notification, NotificationInfo
+from trade._notifying import POLL_S
+from trade._occasions import What
 from trade._resources import Permit, Resource, permit
 from trade._secret import Secret
 from trade._service import service
@@ -43,6 +46,7 @@ __all__ = [
     "LockInfo",
     "Meta",
     "Notification",
+    "NotificationInfo",
     "Outcome",
     "Permit",
     "Resource",
@@ -55,11 +59,14 @@ __all__ = [
     "acall_all",
     "acall_sequence",
     "add_group",
+    "after",
     "alter",
+    "at",
     "break_lock",
     "call",
     "call_all",
     "call_sequence",
+    "cancel_notification",
     "changed",
     "close",
     "container",
@@ -70,11 +77,14 @@ __all__ = [
     "estop",
     "estop_clear",
     "estops",
+    "every",
     "find",
     "joined",
     "left",
     "lock",
     "locks",
+    "notifications",
+    "once",
     "open_session",
     "permit",
     "progress",
@@ -220,19 +230,78 @@ def containers() -> list[ContainerInfo]:
     return container().containers()
 
 
-def joined(constraint: Constraint, call: Callback, *, existing: bool = False) -> Notification:
+def joined(
+    constraint: Constraint, call: What, *, existing: bool = False, if_: What | None = None, host: str = ""
+) -> Notification:
     """Call with the handle of every service that comes and matches; see `Container.joined`."""
-    return container().joined(constraint, call, existing=existing)
+    return container().joined(constraint, call, existing=existing, if_=if_, host=host)
 
 
-def left(constraint: Constraint, call: Callback) -> Notification:
+def left(constraint: Constraint, call: What, *, if_: What | None = None, host: str = "") -> Notification:
     """Call with the handle of every service that goes and matched; see `Container.left`."""
-    return container().left(constraint, call)
+    return container().left(constraint, call, if_=if_, host=host)
 
 
-def changed(constraint: Constraint, call: Callback) -> Notification:
+def changed(constraint: Constraint, call: What, *, if_: What | None = None, host: str = "") -> Notification:
     """Call with the handle of every service that matches and is altered; see `Container.changed`."""
-    return container().changed(constraint, call)
+    return container().changed(constraint, call, if_=if_, host=host)
+
+
+def once(
+    call: What, *, if_: What | None = None, when: What | None = None, poll_s: float = POLL_S, host: str = ""
+) -> Notification:
+    """Make that call once, without waiting for it; see `Container.once`."""
+    return container().once(call, if_=if_, when=when, poll_s=poll_s, host=host)
+
+
+def after(
+    s: float,
+    call: What,
+    *,
+    if_: What | None = None,
+    when: What | None = None,
+    poll_s: float = POLL_S,
+    host: str = "",
+) -> Notification:
+    """Make that call after so many seconds; see `Container.after`."""
+    return container().after(s, call, if_=if_, when=when, poll_s=poll_s, host=host)
+
+
+def at(
+    moment: datetime,
+    call: What,
+    *,
+    if_: What | None = None,
+    when: What | None = None,
+    poll_s: float = POLL_S,
+    host: str = "",
+) -> Notification:
+    """Make that call at a moment; see `Container.at`."""
+    return container().at(moment, call, if_=if_, when=when, poll_s=poll_s, host=host)
+
+
+def every(
+    s: float,
+    call: What,
+    *,
+    if_: What | None = None,
+    when: What | None = None,
+    edge: bool = False,
+    poll_s: float = POLL_S,
+    host: str = "",
+) -> Notification:
+    """Make that call every so many seconds; see `Container.every`."""
+    return container().every(s, call, if_=if_, when=when, edge=edge, poll_s=poll_s, host=host)
+
+
+def notifications() -> list[NotificationInfo]:
+    """Every notification that stands anywhere in the system."""
+    return container().notifications()
+
+
+def cancel_notification(notification: str) -> None:
+    """End a notification, wherever it lives; see `Container.cancel_notification`."""
+    container().cancel_notification(notification)
 
 
 def lock(

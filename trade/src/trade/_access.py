@@ -26,6 +26,11 @@ FUNCTIONS: Final = {
     "release_requested": _ALL,
     "estop": _ALL,
     "estops": _ALL,
+    "notify": "instrument",  # and the right to make the call, looked at whenever it is made
+    "notifications": _ALL,
+    "cancel_notification": _ALL,  # asks itself for administer if it is another's
+    "detach_notification": _ALL,  # likewise
+    "notification_failed": _ALL,
     "acquire": _ALL,  # asks itself for lock over the groups of the resources
     "break_lock": _ALL,  # asks itself for administer over them
     "resume": _ALL,  # asks itself for administer over those whose lock is not one's own

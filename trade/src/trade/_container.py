@@ -13,6 +13,7 @@ from trade import _process
 from trade._access import Access
 from trade._announcing import Announcer
 from trade._calls import Caller
+from trade._clockwork import Clockwork
 from trade._codec import Codec
 from trade._context import handed_down
 from trade._coroutines import AsyncLoop
@@ -26,8 +27,8 @@ from trade._invoke import LocalTarget, RemoteTarget, container_closed, new_reque
 from trade._joining import join
 from trade._locking import Locking
 from trade._locks import LockTable
-from trade._looking import Looking
 from trade._notifications import Notifier
+from trade._notifying import Notifying
 from trade._own_services import OwnServices
 from trade._providers import Providers
 from trade._reach import Reach
@@ -57,7 +58,7 @@ _PATIENCE_S: Final = 1.0
 """How long a call waits for the registry to hear of a handle that came by message before its registry entry did."""
 
 
-class Container(Hosting, Looking, Guarding):
+class Container(Hosting, Notifying, Guarding):
     """A participant of a system; most programs use the default one through the functions of ``trade``.
 
     Joins on construction. A context manager; ``close()`` leaves and is idempotent.
@@ -72,7 +73,7 @@ class Container(Hosting, Looking, Guarding):
         _process.note_start()
         self._settings = settings or Settings.read()
         self.address = Address(self._settings.identity, self._settings.container, secrets.token_hex(6))
-        self.session: Final = str(self.address)
+        self.session = str(self.address)
         self._clients = itertools.count(1)
         self._closing = threading.RLock()
         self._closed = False
@@ -93,7 +94,10 @@ class Container(Hosting, Looking, Guarding):
                 leaving.callback(self._reach.close)
             self._caller = Caller(self._transport, self.address, self.session)
             leaving.callback(self._caller.close)
-            self._notifier = Notifier(lambda record: Handle(self, record.key, record))
+            clockwork = Clockwork("trade-clock")
+            leaving.callback(clockwork.close)
+            epoch = self.address.epoch
+            self._notifier = Notifier(self, clockwork, epoch, lambda record: Handle(self, record.key, record))
             leaving.callback(self._notifier.close)
             self._inherited = InheritedLock(self._settings.lock, self.address) if self._settings.lock else None
             if self._inherited is not None:
@@ -140,6 +144,9 @@ class Container(Hosting, Looking, Guarding):
                 self._estopping,
                 self.access,
                 self._providers.groups_of,
+                self._notifier,
+                self._registry,
+                self,
             )
             self._providers.add(own, (DOMAIN,), name=PROVIDER)
             self._estopping.begin(own)
@@ -236,6 +243,7 @@ class Container(Hosting, Looking, Guarding):
         """Nobody of it is there any more: nothing more is let in for it, its locks fall, what it moves stops."""
         self._table.session_ended(session, reason)
         self._deadman.session_ended(session)
+        self._notifier.session_ended(session)
 
     def _ask_for_release(self, holder: Holder, token: Token, who: str, reason: str) -> None:
         """Told by the lock services: somebody would like to have what another one holds."""
@@ -342,6 +350,11 @@ class Container(Hosting, Looking, Guarding):
     def name(self) -> str:
         """The container's name."""
         return self.address.container
+
+    def require_call(self, who: str, handle: Handle) -> None:
+        """Raises AccessDenied: somebody for whom this container acts may not call that service."""
+        key, record = handle.key, handle.record
+        self.access.require_call(who, key.domain, key.name, record.info.effect, record.label)
 
     @property
     def settings(self) -> Settings:

@@ -9,16 +9,13 @@ from trade._constraints import Constraint, where
 from trade._handle import Bound, Handle
 from trade._hints import no_such_service, too_many_services
 from trade._member import Member
-from trade._notifications import Callback, Notification, Notifier
 from trade._registry import Record, Registry
-from trade.errors import ConfigurationError
 
 
 class Looking(Member):
     """Finds services here and elsewhere."""
 
     _registry: Registry
-    _notifier: Notifier
 
     # --- looking up
 
@@ -47,42 +44,6 @@ class Looking(Member):
         if len(matches) > 1:
             raise too_many_services(constraint, matches)
         return Handle(self, matches[0].key, matches[0])
-
-    # --- being told
-
-    def joined(self, constraint: Constraint, call: Callback, *, existing: bool = False) -> Notification:
-        """Call with the handle of every service that comes and matches.
-
-        Args:
-            constraint: which services.
-            call: a handle, or a function of this process.
-            existing: also once for each that is there already.
-        """
-        return self._notify("joined", constraint, call, existing=existing)
-
-    def left(self, constraint: Constraint, call: Callback) -> Notification:
-        """Call with the (dead) handle of every service that goes and matched."""
-        return self._notify("left", constraint, call, existing=False)
-
-    def changed(self, constraint: Constraint, call: Callback) -> Notification:
-        """Call with the handle of every service whose groups, metadata, health or description become others.
-
-        It fires for what matches, and once more for what has just ceased to. Who is quick may find several changes in
-        one.
-        """
-        return self._notify("changed", constraint, call, existing=False)
-
-    def _notify(self, occasion: str, constraint: Constraint, call: Callback, *, existing: bool) -> Notification:
-        self._check_open()
-        if not callable(call):
-            raise ConfigurationError(
-                where=f"trade.{occasion}", problem=f"call must be a handle or a function, not {call!r}"
-            )
-        notification = Notification(occasion, constraint, call)
-        self._registry.between_changes(
-            lambda: self._notifier.add(notification, self._registry.select(constraint) if existing else [])
-        )
-        return notification
 
     # --- calling
 

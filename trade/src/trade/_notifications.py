@@ -1,97 +1,416 @@
-"""Standing requests: on this occasion, make that call. Here: ``joined``, ``left`` and ``changed``."""
+"""Standing requests: on this occasion, if this holds, make that call."""
 
+import contextlib
 import logging
-import queue
 import threading
+import time
+from abc import ABC, abstractmethod
+from collections import deque
 from collections.abc import Callable
-from typing import Any
+from enum import Enum
+from typing import Any, Final, Protocol
 
+from msgspec import Struct
+
+from trade._clockwork import Clockwork
 from trade._constraints import Constraint
 from trade._handle import Handle
+from trade._occasions import OF_SERVICES, Deed, Target, Terms, text_of
 from trade._registry import Change, Record
+from trade._session import Session
+from trade.errors import ConfigurationError
 
 _logger = logging.getLogger("trade")
 
-Callback = Callable[[Handle], Any]
-"""A handle of a service, or a function of this process; it is given the handle of what came, went or changed."""
+_LOOK_NS: Final = 1_000_000_000
+"""How often the clock on the wall is looked at: it may be set."""
+_MOST: Final = 10_000
+"""So many may stand in a container for others at once."""
 
 
-class Notification:
-    """A standing request; it ends when it is cancelled or its container closes."""
+class State(str, Enum):
+    """Of a standing request."""
 
-    def __init__(self, occasion: str, constraint: Constraint, call: Callback) -> None:
-        self.occasion = occasion
-        self.constraint = constraint
-        self.call = call
-        self._live = True
+    WAITING = "waiting"
+    """For ``when`` to hold."""
+    STANDING = "standing"
+    ENDED = "ended"
+    """It has fired, or its moment has passed."""
+    CANCELLED = "cancelled"
+
+
+class NotificationInfo(Struct, frozen=True, kw_only=True):
+    """One standing request, as everybody may know it."""
+
+    id: str
+    occasion: str
+    """Such as ``every 10 s``."""
+    call: str
+    """What is called, as text."""
+    condition: str
+    owner: str
+    """The session of who asked for it."""
+    container: str
+    """Where it lives."""
+    state: str
+    """``waiting`` for its ``when``, ``standing``, ``ended`` or ``cancelled``."""
+    fired: int
+    failures: int
+    merged: int
+    """Ticks left out because the call of an earlier one still ran."""
+    last_error: str
+    detached: bool
+    """Whether it outlives its owner."""
+
+
+class Notification(ABC):
+    """A standing request; it ends when it has fired for the last time, is cancelled, or its owner ends."""
+
+    def __init__(self, name: str, text: str) -> None:
+        self.id: Final = name
+        """Names it in the whole system."""
+        self._text = text
+
+    @abstractmethod
+    def info(self) -> NotificationInfo:
+        """How it stands."""
 
     @property
     def active(self) -> bool:
         """Whether it can still fire."""
-        return self._live
+        return self.info().state in (State.WAITING, State.STANDING)
 
+    @abstractmethod
     def cancel(self) -> None:
         """End it; a call under way finishes. Idempotent."""
-        self._live = False
 
-    detach = cancel
+    @abstractmethod
+    def detach(self) -> None:
+        """Let it outlive whoever asked for it; it then stands until it is cancelled.
+
+        Raises:
+            ConfigurationError: it lives in the container that asked for it, and ends with that.
+        """
 
     def __repr__(self) -> str:
-        return f"<Notification {self.occasion} {self.constraint}>"
+        return f"<Notification {self._text}>"
+
+
+class Home(Protocol):
+    """What a standing request needs of its container."""
+
+    @property
+    def name(self) -> str: ...
+    def find(self, constraint: Constraint, *, wait_s: float = ...) -> Handle: ...
+    def require_call(self, who: str, handle: Handle) -> None: ...
+
+
+class Owner(Struct, frozen=True):
+    """Who asked for it."""
+
+    session: str
+    identity: str = ""
+    """If it asked from another container: checked again whenever a call is made for it."""
+    acts_as: Session | None = None
+    """Calls are made in this session."""
+
+
+class Standing(Notification):
+    """One that lives in this container. Done by the clockwork: never twice at once."""
+
+    def __init__(
+        self,
+        name: str,
+        terms: Terms,
+        call: Target,
+        if_: Target | None,
+        when: Target | None,
+        owner: Owner,
+        home: Home,
+        ended: Callable[["Standing"], None],
+        failed: Callable[["Standing", str], None],
+    ) -> None:
+        super().__init__(name, str(terms))
+        self.owner: Final = owner
+        self.terms: Final = terms
+        self._call = call
+        self._if = if_
+        self._when = when
+        self._home = home
+        self._tell_ended = ended
+        self._tell_failed = failed
+        self.detached = False
+        self._state = State.STANDING if when is None else State.WAITING
+        self._due_ns: int | None = None
+        """Of after and every."""
+        self._held = False
+        """Whether the condition held at the last tick."""
+        self._concerned: deque[Handle] = deque()
+        """Services that came, went or changed and were not told of yet."""
+        self._fired = self._failures = self._merged = 0
+        self._last_error = ""
+        self._cancel_due: Callable[[], None] = lambda: None
+
+    # --- being
+
+    def begin(self, clockwork: Clockwork) -> Callable[[int], None]:
+        """Have it done; returns what has it done once more."""
+        due = clockwork.begin(self._act, time.monotonic_ns())
+        self._cancel_due = due.cancel
+        return due.at
+
+    @property
+    def active(self) -> bool:
+        return self._state in (State.WAITING, State.STANDING)
+
+    def info(self) -> NotificationInfo:
+        conditions = [("if", self._if), ("when", self._when)]
+        return NotificationInfo(
+            id=self.id,
+            occasion=str(self.terms),
+            call=text_of(self._call),
+            condition=", ".join(f"{word} {text_of(what)}" for word, what in conditions if what is not None),
+            owner=self.owner.session,
+            container=self._home.name,
+            state=self._state.value,
+            fired=self._fired,
+            failures=self._failures,
+            merged=self._merged,
+            last_error=self._last_error,
+            detached=self.detached,
+        )
+
+    def cancel(self) -> None:
+        self._end(State.CANCELLED)
+
+    def detach(self) -> None:
+        if not self.owner.identity:
+            problem = (
+                f"it lives in container {self._home.name}, which asked for it, and ends with that; "
+                "ask for it with host= another container"
+            )
+            raise ConfigurationError(where=repr(self), problem=problem)
+        self.detached = True
+
+    def _end(self, state: State) -> None:
+        if self.active:
+            self._state = state
+            self._cancel_due()
+            self._tell_ended(self)
+
+    # --- firing
+
+    def concerns(self, record: Record) -> bool:
+        """Whether it is about that service."""
+        assert self.terms.constraint is not None  # noqa: S101
+        return self.terms.constraint.matches(record)
+
+    def add(self, handle: Handle) -> None:
+        """Tell of that service, too, when it is done next."""
+        self._concerned.append(handle)
+
+    def _act(self) -> int | None:
+        now = time.monotonic_ns()
+        if self._state is State.WAITING:
+            if not self._asked(self._when):
+                return now + int(self.terms.poll_s * 1e9)
+            if not self.active:  # cancelled meanwhile
+                return None
+            self._state = State.STANDING
+        if self._state is not State.STANDING:
+            return None
+        match self.terms.occasion:
+            case "joined" | "left" | "changed":
+                return self._tell()
+            case "every":
+                return self._tick(now)
+            case "at":
+                left_ns = int((self.terms.at - time.time()) * 1e9)
+                return now + min(left_ns, _LOOK_NS) if left_ns > 0 else self._once()
+            case "after":
+                self._due_ns = self._due_ns or now + int(self.terms.s * 1e9)
+                return self._due_ns if self._due_ns > now else self._once()
+            case "once":
+                return self._once()
+
+    def _once(self) -> None:
+        self._fire()
+        self._end(State.ENDED)
+
+    def _tick(self, now: int) -> int:
+        period = int(self.terms.s * 1e9)
+        if self._due_ns is None:
+            self._due_ns = now + period
+            return self._due_ns
+        if self._due_ns <= now:
+            self._fire()
+            self._due_ns += period
+            missed = max(0, (time.monotonic_ns() - self._due_ns) // period)
+            self._merged += missed
+            self._due_ns += missed * period
+        return self._due_ns
+
+    def _tell(self) -> None:
+        while self._concerned and self._state is State.STANDING:
+            self._fire(self._concerned.popleft())
+
+    def _fire(self, *given: Handle) -> None:
+        if self._if is not None:
+            held, before = self._asked(self._if), self._held
+            self._held = held
+            if not held or (self.terms.edge and before):
+                return
+        if not self.active:
+            return
+        try:
+            self._do(self._call, *given)
+            self._fired += 1
+        except BaseException as error:  # noqa: BLE001 - whatever a callback raises kills nothing
+            self._failed(error)
+
+    def _asked(self, condition: Target | None) -> bool:
+        """Whether a condition holds; one that fails does not."""
+        assert condition is not None  # noqa: S101
+        try:
+            held = self._do(condition)
+            if not isinstance(held, bool):
+                problem = f"a condition answers with True or False, not {held!r}"
+                raise ConfigurationError(where=text_of(condition), problem=problem)
+        except BaseException as error:  # noqa: BLE001
+            self._failed(error)
+            return False
+        return held
+
+    def _do(self, target: Target, *given: Handle) -> Any:
+        acts_as = self.owner.acts_as
+        with contextlib.nullcontext() if acts_as is None else acts_as.use():
+            if not isinstance(target, Deed):
+                return target(*given)
+            handle = target.handle
+            if handle is None:
+                assert target.constraint is not None  # noqa: S101
+                handle = self._home.find(target.constraint, wait_s=0)
+            if self.owner.identity:
+                self._home.require_call(self.owner.identity, handle)
+            return handle(*given, *target.args, **target.kwargs)
+
+    def _failed(self, error: BaseException) -> None:
+        self._failures += 1
+        text = f"{type(error).__name__}: {error}"
+        if text != self._last_error:  # the same again says nothing new
+            self._last_error = text
+            _logger.warning("the call of %r failed; it stays attached: %s", self, text)
+            self._tell_failed(self, text)
 
 
 class Notifier:
-    """Fires the notifications of one container, one after the other, on a thread of its own."""
+    """Owns what stands in one container, for itself and for others."""
 
-    def __init__(self, handle: Callable[[Record], Handle]) -> None:
+    def __init__(self, home: Home, clockwork: Clockwork, epoch: str, handle: Callable[[Record], Handle]) -> None:
+        self._home = home
+        self._clockwork = clockwork
+        self._epoch = epoch
         self._handle = handle
-        self._standing: list[Notification] = []
-        self._queue: queue.SimpleQueue[tuple[Notification, Handle] | None] = queue.SimpleQueue()
-        self._thread: threading.Thread | None = None
         self._lock = threading.Lock()
+        self._standing: dict[str, Standing] = {}
+        self._of_services: dict[str, tuple[Standing, Callable[[int], None]]] = {}
+        self._count = 0
+        self.failed: Callable[[Standing, str], None] = lambda _standing, _error: None
+        """Told of failures of what stands for others."""
+        self.ended: Callable[[str], None] = lambda _session: None
+        """Told when nothing stands any more for a session of another container."""
 
-    def add(self, notification: Notification, existing: list[Record]) -> None:
-        """Begin; those already there fire first."""
+    def add(
+        self,
+        terms: Terms,
+        call: Target,
+        if_: Target | None,
+        when: Target | None,
+        owner: Owner,
+        existing: list[Record],
+    ) -> Standing:
+        """Begin one; services that are there already are told of first.
+
+        Raises:
+            ConfigurationError: a time that is none, or too many stand here for others.
+        """
+        terms.check()
         with self._lock:
-            if self._thread is None:
-                self._thread = threading.Thread(target=self._fire, name="trade-notify", daemon=True)
-                self._thread.start()
+            if owner.identity and len(self._standing) >= _MOST:
+                problem = f"{len(self._standing)} notifications stand here already"
+                raise ConfigurationError(where=self._home.name, problem=problem)
+            self._count += 1
+            name = f"{self._epoch}.{self._count}"
+            standing = Standing(name, terms, call, if_, when, owner, self._home, self._forget, self._failed)
+            self._standing[name] = standing
             for record in existing:
-                self._queue.put((notification, self._handle(record)))
-            self._standing.append(notification)
+                standing.add(self._handle(record))
+            again = standing.begin(self._clockwork)
+            if terms.occasion in OF_SERVICES:
+                self._of_services[name] = (standing, again)
+        return standing
+
+    def _failed(self, standing: Standing, error: str) -> None:
+        if standing.owner.identity:
+            self.failed(standing, error)
+
+    def _forget(self, standing: Standing) -> None:
+        with self._lock:
+            self._standing.pop(standing.id, None)
+            self._of_services.pop(standing.id, None)
+        if standing.owner.identity:
+            self.tidy(standing.owner.session)
+
+    def tidy(self, session: str) -> None:
+        """See whether anything stands for that session."""
+        with self._lock:
+            left = any(one.owner.session == session for one in self._standing.values())
+        if not left:
+            self.ended(session)
 
     def changed(self, change: Change) -> None:
         """Told by the registry."""
         with self._lock:
-            self._standing = [standing for standing in self._standing if standing.active]
-            for notification in self._standing:
-                for record in _concerned(notification, change):
-                    self._queue.put((notification, self._handle(record)))
+            told = list(self._of_services.values())
+        now = time.monotonic_ns()
+        for standing, again in told:
+            concerned = _concerned(standing, change)
+            for record in concerned:
+                standing.add(self._handle(record))
+            if concerned:
+                again(now)
 
-    def _fire(self) -> None:
-        while (item := self._queue.get()) is not None:
-            notification, handle = item
-            if not notification.active:
-                continue
-            try:
-                notification.call(handle)
-            except BaseException:
-                _logger.exception("the call of %r failed; it stays attached", notification)
+    def session_ended(self, session: str) -> None:
+        """Nobody of it is there any more: what it asked for ends, unless it was detached."""
+        with self._lock:
+            orphans = [one for one in self._standing.values() if one.owner.session == session and not one.detached]
+        for standing in orphans:
+            standing.cancel()
+        self.tidy(session)
+
+    def get(self, name: str) -> Standing | None:
+        return self._standing.get(name)
+
+    def infos(self) -> list[NotificationInfo]:
+        """What stands here, oldest first."""
+        with self._lock:
+            standing = list(self._standing.values())
+        return [one.info() for one in standing]
 
     def close(self) -> None:
-        """End the thread; what has not fired will not. Idempotent."""
-        for standing in self._standing:
-            standing.cancel()
-        self._queue.put(None)
-        if self._thread is not None and self._thread is not threading.current_thread():
-            self._thread.join(2)
+        """End all. Idempotent."""
+        with self._lock:
+            standing = list(self._standing.values())
+        for one in standing:
+            one.cancel()
 
 
-def _concerned(notification: Notification, change: Change) -> list[Record]:
-    matches = notification.constraint.matches
-    if notification.occasion == "joined":
-        return [record for record in change.joined if matches(record)]
-    if notification.occasion == "left":
-        return [record for record in change.left if matches(record)]
-    altered = [(old, new) for old, new in zip(change.before, change.replaced, strict=True) if old != new]
-    return [new for old, new in altered if matches(old) or matches(new)]
+def _concerned(standing: Standing, change: Change) -> list[Record]:
+    match standing.terms.occasion:
+        case "joined":
+            return [record for record in change.joined if standing.concerns(record)]
+        case "left":
+            return [record for record in change.left if standing.concerns(record)]
+        case _:
+            altered = [(old, new) for old, new in zip(change.before, change.replaced, strict=True) if old != new]
+            return [new for old, new in altered if standing.concerns(old) or standing.concerns(new)]

@@ -6,12 +6,15 @@ from trade._estop_line import EstopReport
 from trade._estopping import LIMIT_S, Estopping
 from trade._lock_services import Ask, Asked, GroupsOf, LockServices
 from trade._locks import LockTable
+from trade._notification_services import Home, NotificationServices
+from trade._notifications import Notifier
+from trade._registry import Registry
 from trade._service import service
 from trade._system import System, SystemServices
 from trade._wire import Address, Estop
 
 
-class OwnServices(SystemServices, LockServices):
+class OwnServices(SystemServices, LockServices, NotificationServices):
     """One provider, so that one registry entry tells of all its container's own functions."""
 
     def __init__(
@@ -24,9 +27,13 @@ class OwnServices(SystemServices, LockServices):
         estopping: Estopping,
         access: Access,
         groups: GroupsOf,
+        notifier: Notifier,
+        registry: Registry,
+        home: Home,
     ) -> None:
         SystemServices.__init__(self, system)
         LockServices.__init__(self, locks, own, ask, asked, access, groups)
+        NotificationServices.__init__(self, notifier, registry, home, access)
         self._estopping = estopping
 
     @property

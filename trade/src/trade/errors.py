@@ -256,6 +256,16 @@ class NoSuchEstop(CallerError, LookupError):
 
 
 @dataclass(kw_only=True, eq=False)
+class NoSuchNotification(CallerError, LookupError):
+    """No notification of that id stands anywhere that is known here."""
+
+    id: str
+
+    def describe(self) -> str:
+        return f"there is no notification {self.id}: it has ended, or was cancelled; `trade notifications` lists them"
+
+
+@dataclass(kw_only=True, eq=False)
 class AccessDenied(CallerError, PermissionError):
     """The access policy does not allow it; nothing was done."""
 
