@@ -217,7 +217,11 @@ def test_the_way_up_ends_halted_and_a_fault_is_no_part_of_it() -> None:
     assert machine.GO & machine.HALT == 0
 
 
-@pytest.mark.parametrize("pdo", [table.STATUS, table.MOTION, table.COMMAND, table.PROFILE, table.BRAKING], ids=str)
+@pytest.mark.parametrize(
+    "pdo",
+    [table.STATUS, table.MOTION, table.COMMAND, table.PROFILE, table.BRAKING],
+    ids=lambda pdo: f"{pdo.communication:04X}h",
+)
 def test_a_frame_is_laid_out_as_it_is_mapped_and_fits(pdo: table.Pdo) -> None:
     assert pdo.layout.size == sum(entry.size for entry in pdo.entries) <= 8
     kinds = {"u1": "B", "u2": "H", "u4": "I", "i1": "b", "i2": "h", "i4": "i"}
