@@ -18,6 +18,8 @@ from trade._context import CallContext, current_call, progress
 from trade._estop_line import EstopReport
 from trade._estopping import LIMIT_S
 from trade._handle import Bound, Handle, Run
+from trade._hooking import Hook
+from trade._hooks import Called, HookInfo
 from trade._lock import Lock, OnLost, OnRequest
 from trade._locking import LEASE_S
 from trade._many import Outcome
@@ -36,12 +38,15 @@ from trade._wire import HEALTHY, Estop, Scalar
 __all__ = [
     "Bound",
     "CallContext",
+    "Called",
     "Constraint",
     "Container",
     "ContainerInfo",
     "Estop",
     "EstopReport",
     "Handle",
+    "Hook",
+    "HookInfo",
     "Lock",
     "LockInfo",
     "Meta",
@@ -60,8 +65,10 @@ __all__ = [
     "acall_sequence",
     "add_group",
     "after",
+    "after_service",
     "alter",
     "at",
+    "before_service",
     "break_lock",
     "call",
     "call_all",
@@ -73,12 +80,14 @@ __all__ = [
     "containers",
     "current_call",
     "deregister",
+    "detach_hook",
     "errors",
     "estop",
     "estop_clear",
     "estops",
     "every",
     "find",
+    "hooks",
     "joined",
     "left",
     "lock",
@@ -302,6 +311,26 @@ def notifications() -> list[NotificationInfo]:
 def cancel_notification(notification: str) -> None:
     """End a notification, wherever it lives; see `Container.cancel_notification`."""
     container().cancel_notification(notification)
+
+
+def before_service(target: Handle | Constraint, call: Handle) -> Hook:
+    """Have a service called before each call of another one; see `Container.before_service`."""
+    return container().before_service(target, call)
+
+
+def after_service(target: Handle | Constraint, call: Handle) -> Hook:
+    """Have a service called after each call of another one; see `Container.after_service`."""
+    return container().after_service(target, call)
+
+
+def hooks() -> list[HookInfo]:
+    """Every hook in the system, once for each container it is attached in."""
+    return container().hooks()
+
+
+def detach_hook(hook: str) -> None:
+    """End a hook by its id, wherever it is attached; see `Container.detach_hook`."""
+    container().detach_hook(hook)
 
 
 def lock(

@@ -31,6 +31,10 @@ FUNCTIONS: Final = {
     "cancel_notification": _ALL,  # asks itself for administer if it is another's
     "detach_notification": _ALL,  # likewise
     "notification_failed": _ALL,
+    "attach_hook": _ALL,  # asks itself for instrument over each service
+    "detach_hook": _ALL,  # asks itself for administer if it is another's
+    "hooks": _ALL,
+    "hook_suspended": _ALL,
     "acquire": _ALL,  # asks itself for lock over the groups of the resources
     "break_lock": _ALL,  # asks itself for administer over them
     "resume": _ALL,  # asks itself for administer over those whose lock is not one's own
@@ -87,6 +91,10 @@ class Access:
     def require(self, who: str, verb: str, group: str, what: str) -> None:
         """Raises AccessDenied: it may not do that in the group."""
         self.require_any(who, verb, (group,), what)
+
+    def denied(self, who: str, verb: str, group: str, what: str) -> AccessDenied | None:
+        """Why it may not do that in the group; None if it may."""
+        return self._denied_all(who, verb, (group,), what)
 
     def require_any(self, who: str, verb: str, groups: Iterable[str], what: str) -> None:
         """Raises AccessDenied: it may do that in none of the groups."""

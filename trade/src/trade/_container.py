@@ -15,12 +15,15 @@ from trade._announcing import Announcer
 from trade._calls import Caller
 from trade._clockwork import Clockwork
 from trade._codec import Codec
+from trade._constraints import where
 from trade._context import handed_down
 from trade._coroutines import AsyncLoop
 from trade._dispatch import Dispatcher
 from trade._estopping import Estopping
 from trade._guarding import Guarding
 from trade._handle import Handle, Run
+from trade._hooking import Hooking
+from trade._hooks import Hooks
 from trade._hosting import Hosting
 from trade._inherited import InheritedLock
 from trade._invoke import LocalTarget, RemoteTarget, container_closed, new_request
@@ -28,7 +31,6 @@ from trade._joining import join
 from trade._locking import Locking
 from trade._locks import LockTable
 from trade._notifications import Notifier
-from trade._notifying import Notifying
 from trade._own_services import OwnServices
 from trade._providers import Providers
 from trade._reach import Reach
@@ -49,7 +51,7 @@ from trade._wire import (
 )
 from trade._withdrawn import Withdrawn
 from trade._zenoh import ZenohTransport
-from trade.errors import ConfigurationError, ServiceGone
+from trade.errors import AccessDenied, ConfigurationError, ServiceGone
 
 __all__ = ["Container"]
 
@@ -58,7 +60,7 @@ _PATIENCE_S: Final = 1.0
 """How long a call waits for the registry to hear of a handle that came by message before its registry entry did."""
 
 
-class Container(Hosting, Notifying, Guarding):
+class Container(Hosting, Hooking, Guarding):
     """A participant of a system; most programs use the default one through the functions of ``trade``.
 
     Joins on construction. A context manager; ``close()`` leaves and is idempotent.
@@ -116,6 +118,16 @@ class Container(Hosting, Notifying, Guarding):
             self._providers = Providers(
                 announcer, self._registry, self.address, self._codec, coroutines, self._table, self.access
             )
+            self._hooks = Hooks(
+                self,
+                self._codec,
+                clockwork,
+                self._providers.service,
+                lambda: self._registry.select(where.local),
+                self._denied_hook,
+            )
+            self._registry.listen(self._hooks.changed)
+            self._hook_numbers = itertools.count(1)
             state = self._settings.state_dir
             self._estopping = Estopping(
                 self._transport,
@@ -146,6 +158,7 @@ class Container(Hosting, Notifying, Guarding):
                 self._providers.groups_of,
                 self._notifier,
                 self._registry,
+                self._hooks,
                 self,
             )
             self._providers.add(own, (DOMAIN,), name=PROVIDER)
@@ -171,6 +184,7 @@ class Container(Hosting, Notifying, Guarding):
         self.access.load(Path(path))
         self._targets.clear()
         self._registry.judge_anew()
+        self._hooks.judge_anew()
         for info in self._table.infos():
             held = [(name, self._providers.groups_of(name)) for name in info.resources]
             denied = self.access.denied_lock(info.holder.identity, held)
@@ -244,6 +258,7 @@ class Container(Hosting, Notifying, Guarding):
         self._table.session_ended(session, reason)
         self._deadman.session_ended(session)
         self._notifier.session_ended(session)
+        self._hooks.session_ended(session)
 
     def _ask_for_release(self, holder: Holder, token: Token, who: str, reason: str) -> None:
         """Told by the lock services: somebody would like to have what another one holds."""
@@ -355,6 +370,9 @@ class Container(Hosting, Notifying, Guarding):
         """Raises AccessDenied: somebody for whom this container acts may not call that service."""
         key, record = handle.key, handle.record
         self.access.require_call(who, key.domain, key.name, record.info.effect, record.label)
+
+    def _denied_hook(self, who: str, record: Record) -> AccessDenied | None:
+        return self.access.denied(who, "instrument", record.key.domain, record.label)
 
     @property
     def settings(self) -> Settings:

@@ -10,7 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from types import CoroutineType
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 import msgspec
 from msgspec import Raw, structs
@@ -63,10 +63,30 @@ _DEFECTS: Final = (InvalidResult, NotSerialisable, RemoteError)
 _decode_cancel: Final = msgspec.msgpack.Decoder(CancelArguments).decode
 
 
+class Around(Protocol):
+    """What is called before and after a service."""
+
+    def run(
+        self, service: "LocalService", args: Sequence[Any], kwargs: dict[str, Any], context: CallContext
+    ) -> Any: ...
+
+
 class LocalService:
     """A method of a registered provider, ready to be called."""
 
-    __slots__ = ("_loop", "admitted", "effect", "info", "label", "method", "resources", "serial", "signature", "strict")
+    __slots__ = (
+        "_loop",
+        "admitted",
+        "around",
+        "effect",
+        "info",
+        "label",
+        "method",
+        "resources",
+        "serial",
+        "signature",
+        "strict",
+    )
 
     def __init__(
         self,
@@ -88,6 +108,8 @@ class LocalService:
         self.serial = serial
         self.resources = resources
         """What it needs for itself, or stops."""
+        self.around: Around | None = None
+        """What is called before and after it."""
         self.admitted: dict[str, Policy] = {}
         """Who may call it, and by which policy that was decided."""
         self._loop = loop
@@ -99,6 +121,11 @@ class LocalService:
 
     def call(self, args: Sequence[Any], kwargs: dict[str, Any], context: CallContext) -> Any:
         """Call with the arguments as they are."""
+        around = self.around
+        return self.call_bare(args, kwargs, context) if around is None else around.run(self, args, kwargs, context)
+
+    def call_bare(self, args: Sequence[Any], kwargs: dict[str, Any], context: CallContext) -> Any:
+        """The same without what is called before and after it."""
         if not self.resources:
             return self.run_admitted(args, kwargs, context)
         if self.effect == "read":  # open to all, unless it was locked by its own handle

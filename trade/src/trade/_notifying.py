@@ -1,19 +1,17 @@
 """The part of a container that asks to be told: on this occasion, if this holds, make that call."""
 
-import contextlib
 import time
 from datetime import datetime
 from typing import Final
 
 from trade._constraints import Constraint, where
-from trade._handle import Handle, Run
 from trade._looking import Looking
 from trade._notification_services import Hosted, placed
 from trade._notifications import Notification, NotificationInfo, Notifier, Owner
 from trade._occasions import Terms, What, deed_of, epoch_s, target_of
 from trade._session import speaking
 from trade._system import DOMAIN
-from trade.errors import NoSuchNotification, TradeError
+from trade.errors import NoSuchNotification
 
 POLL_S: Final = 1.0
 
@@ -150,14 +148,7 @@ class Notifying(Looking):
     def notifications(self) -> list[NotificationInfo]:
         """Every notification that stands anywhere in the system."""
         self._check_open()
-        runs: list[Run] = []
-        found: list[NotificationInfo] = []
-        for handle in self.services(where(name="notifications", group=DOMAIN)):
-            with contextlib.suppress(TradeError):  # it left meanwhile
-                runs.append(handle.start())
-        for run in runs:
-            with contextlib.suppress(TradeError):
-                found.extend(run.result())
+        found = [info for infos in self._ask_all("notifications") for info in infos]
         return sorted(found, key=lambda info: (info.container, info.id))
 
     def cancel_notification(self, notification: str) -> None:
@@ -168,12 +159,7 @@ class Notifying(Looking):
             AccessDenied: it is another's, and the policy does not let this container administer the system.
         """
         self._check_open()
-        homes = [
-            one
-            for one in self.services(where(name="cancel_notification", group=DOMAIN))
-            if _lives_in(notification, one)
-        ]
-        if not any(handle(notification) for handle in homes):
+        if not any(self._ask_all("cancel_notification", notification)):
             raise NoSuchNotification(id=notification)
 
     def _notify(self, terms: Terms, call: What, if_: What | None, when: What | None, host: str) -> Notification:
@@ -191,7 +177,3 @@ class Notifying(Looking):
         deeds = [None if one is None else deed_of(one, host, named) for one in conditions]
         name = notify(terms, deed_of(target, host, named), *deeds)
         return Hosted(name, terms, notify.key.address, self.handle)
-
-
-def _lives_in(notification: str, handle: Handle) -> bool:
-    return notification.startswith(f"{handle.key.address.epoch}.")

@@ -4,6 +4,8 @@ from trade._access import Access
 from trade._context import current_call
 from trade._estop_line import EstopReport
 from trade._estopping import LIMIT_S, Estopping
+from trade._hook_services import HookServices
+from trade._hooks import Hooks
 from trade._lock_services import Ask, Asked, GroupsOf, LockServices
 from trade._locks import LockTable
 from trade._notification_services import Home, NotificationServices
@@ -14,7 +16,7 @@ from trade._system import System, SystemServices
 from trade._wire import Address, Estop
 
 
-class OwnServices(SystemServices, LockServices, NotificationServices):
+class OwnServices(SystemServices, LockServices, NotificationServices, HookServices):
     """One provider, so that one registry entry tells of all its container's own functions."""
 
     def __init__(
@@ -29,11 +31,13 @@ class OwnServices(SystemServices, LockServices, NotificationServices):
         groups: GroupsOf,
         notifier: Notifier,
         registry: Registry,
+        hooks: Hooks,
         home: Home,
     ) -> None:
         SystemServices.__init__(self, system)
         LockServices.__init__(self, locks, own, ask, asked, access, groups)
         NotificationServices.__init__(self, notifier, registry, home, access)
+        HookServices.__init__(self, hooks, home, access)
         self._estopping = estopping
 
     @property

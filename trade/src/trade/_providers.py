@@ -262,6 +262,10 @@ class Providers:
         registered = self._hosted.get(place)
         return None if registered is None else registered.services.get(service)
 
+    def service(self, key: ServiceKey) -> LocalService | None:
+        """A service of this container by its key."""
+        return self.lookup(f"{key.domain}/{key.provider}", key.name)
+
     def _services_of(
         self, provider: object, groups: tuple[str, ...], implements: Sequence[type], place: str
     ) -> dict[str, LocalService]:

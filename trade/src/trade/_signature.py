@@ -17,7 +17,7 @@ from trade._arguments import too_many
 from trade._codec import Codec
 from trade._description import describe, described, field_of
 from trade._limits import NOT_FINITE, problem_text, value_at
-from trade._secret import is_secret, mask
+from trade._secret import MASK, is_secret, mask
 from trade._service import ServiceMark
 from trade._wire import MOST_BYTES, ErrorInfo
 from trade.errors import ConfigurationError, InvalidArgument, InvalidResult, NotSerialisable, TooLarge
@@ -145,6 +145,11 @@ class Signature:
     def has_secrets(self) -> bool:
         """Whether an argument is secret."""
         return bool(self._secrets)
+
+    def named(self, args: Sequence[Any], kwargs: Mapping[str, Any]) -> dict[str, Any]:
+        """Arguments by name, for everybody's eyes."""
+        given = {**dict(zip(self._positional, args, strict=False)), **kwargs}
+        return {name: MASK if name in self._secrets else value for name, value in given.items()}
 
     def without_secrets(self, error: ErrorInfo, raw: Raw | bytes) -> ErrorInfo:
         """An error of a call with these arguments, fit for everybody's eyes."""

@@ -266,6 +266,16 @@ class NoSuchNotification(CallerError, LookupError):
 
 
 @dataclass(kw_only=True, eq=False)
+class NoSuchHook(CallerError, LookupError):
+    """No hook of that id is attached anywhere that is known here."""
+
+    id: str
+
+    def describe(self) -> str:
+        return f"there is no hook {self.id}: it was detached, or who attached it has ended; `trade hooks` lists them"
+
+
+@dataclass(kw_only=True, eq=False)
 class AccessDenied(CallerError, PermissionError):
     """The access policy does not allow it; nothing was done."""
 
