@@ -39,6 +39,10 @@ _CLOSED: Final = (zenoh.ZError, RuntimeError)
 _PUT: Final = zenoh.SampleKind.PUT
 
 
+_SHARED_FROM_BYTES: Final = 32 << 10
+"""Larger messages go through shared memory on one host; what containers tell of their services is smaller."""
+
+
 def configuration(
     *,
     namespace: str,
@@ -76,6 +80,8 @@ def configuration(
         },
         **entry,
         **rules,
+        # The first message above it takes a pool of 16 MiB of locked memory that lives as long as the process.
+        "transport/shared_memory/transport_optimization/message_size_threshold": _SHARED_FROM_BYTES,
         "transport/link/tx/lease": LEASE_MS,
         "transport/link/tx/keep_alive": 4,
         "transport/link/tx/queue/congestion_control/block/wait_before_close": 1_000_000,

@@ -1,0 +1,35 @@
+"""Shared memory of the transport is for what is large: a pool is 16 MiB of locked memory that the process keeps."""
+
+from typing import Any
+
+from trade import Container, where
+
+OFFERS = """
+    class Lamp:
+        @service(effect="read")
+        def brightness(self, room: str = "hall", at_s: float = 0.0, unit: str = "candela") -> float:
+            "How bright it is."
+            return 0.5
+        @service(effect="read")
+        def picture(self) -> bytes:
+            return bytes(1 << 20)
+    for number in range(40):
+        trade.register(Lamp(), f"house.room{number}")
+    def locked_kib():
+        return next(int(line.split()[1]) for line in open("/proc/self/status") if line.startswith("VmLck"))
+    hear()
+    say(locked_kib())
+    hear()
+    say(locked_kib())
+"""
+
+
+def test_telling_of_many_services_takes_no_pool_and_what_is_large_does(here: Container, start_program: Any) -> None:
+    program = start_program(OFFERS)
+    handle = here.find(where(name="picture", group="house.room39"), wait_s=30)
+    program.tell()
+    told = int(program.heard())
+    assert told < 4096
+    handle()
+    program.tell()
+    assert int(program.heard()) > told + 4096  # it would be seen
