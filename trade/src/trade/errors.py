@@ -33,6 +33,8 @@ __all__ = [
     "LockedByOther",
     "MotionStopped",
     "NoSuchEstop",
+    "NoSuchHook",
+    "NoSuchNotification",
     "NoSuchService",
     "NotSerialisable",
     "OutcomeUnknown",
