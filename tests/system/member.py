@@ -136,6 +136,11 @@ class Member:
         """Take a lock and keep it."""
         self._lock = self.up.lock(where(group=group)).acquire()
 
+    def hold_when_there(self, group: str) -> None:
+        """The same once something that moves is there."""
+        self.up.find(where(name="move_to", group=group), wait_s=30)
+        self.hold(group)
+
     def held(self) -> bool:
         """Whether it still holds, for those who granted it, too."""
         assert self._lock is not None

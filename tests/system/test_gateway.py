@@ -153,12 +153,17 @@ def test_S12_a_gateway_that_opens_anew_loses_nobody_no_call_and_no_lock(
     assert planner.ask("sees", "2") == ["rosie.arm.echo", "rosie.arm.p0.echo"]
 
 
-def test_a_gateway_that_is_killed_and_comes_back_is_used_again(site: Site, arm: Member, planner: Member) -> None:
+def test_a_gateway_that_is_killed_ends_the_calls_under_way_and_the_next_one_serves(
+    site: Site, arm: Member, planner: Member
+) -> None:
     planner.ask("watch")
-    planner.ask("move", "rosie.arm", "1")
+    planner.ask("started", "nap", "rosie.arm", "60.0")
+    planner.ask("call", "move", "rosie.arm", "arm", "1")
     site.end(signal.SIGKILL)
+    assert planner.refused("ended").startswith("ContainerLost")
     wait_until(lambda: planner.ask("gone") == ["arm"], "out of sight")
+    planner.refused("call", "move", "rosie.arm", "arm", "2")
     site.begin()
     planner.ask("group", "rosie.arm", "arm")
-    planner.ask("move", "rosie.arm", "1")
-    assert arm.ask("moved", "rosie.arm") == [0, 0]
+    planner.ask("call", "move", "rosie.arm", "arm", "3")
+    assert arm.ask("moved", "rosie.arm") == [1, 3]
