@@ -74,13 +74,24 @@ class Attack:
         """What the arm has done so far."""
         return self.arm.ask("moved", ARM)
 
+    def revoke(self, who: str) -> None:
+        """Once it is heeded."""
+        if who not in self.site.papers.authority.revoked():
+            self.folder(who)
+            self.site.papers.authority.revoke(who)
+            assert self.site.said()["reloaded"]
+
+    def folder(self, who: str) -> Path:
+        """With its certificate; a revoked one keeps what it had."""
+        issued = self.site.papers.authority.folder / "issued" / who
+        return issued if issued.exists() else self.site.papers.of(who)
+
     # --- bare sessions
 
-    def open(self, identity: str, mode: str = "peer", folder: Path | None = None) -> str:
+    def open(self, identity: str, mode: str = "peer") -> str:
         """A session with that certificate, linked to the gateway, and as a peer to its neighbour; its name."""
         name = f"{identity}{next(numbers)}"
-        path = folder or self.site.papers.of(identity)
-        self.intruder.ask("open", name, str(path), DOOR["public"], mode)
+        self.intruder.ask("open", name, str(self.folder(identity)), DOOR["public"], mode)
         assert self.intruder.ask("linked", name, *([self.planner.ask("id")] if mode == "peer" else []))
         self.intruder.ask("listen", name, f"reply/*/{identity}/{name}/*")
         return name
@@ -123,3 +134,12 @@ class Attack:
         answer = f"reply/{self.place[0]}/{who}/{name}/clock"
         self.say(name, self.key(who, system=True), self.call(name, who, "clock", channel=f"{name}/clock"))
         assert any(key == answer for key, _ in self.intruder.ask("heard", name, answer)), "its clock is told to anybody"
+
+    def slipped(self, name: str, *keys: str) -> list[str]:
+        """Which of these keys the arm hears of a session that may say nothing at all, not even that it has spoken."""
+        self.arm.ask("tapped")
+        for _ in range(5):
+            for key in keys:
+                self.say(name, key, "")
+            self.planner.ask("call_group", ARM)
+        return sorted(set(keys) & set(self.arm.ask("tapped")))

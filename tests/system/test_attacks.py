@@ -6,6 +6,7 @@ an intruder: bare sessions with whatever certificate.
 """
 
 import json
+import os
 import shutil
 import time
 from collections.abc import Iterator
@@ -14,8 +15,9 @@ from pathlib import Path
 import pytest
 
 from certificates import Papers
+from system import rights
 from system.attack import ARM, POLICY, Attack, numbers
-from system.conftest import networks_of_ones_own
+from system.conftest import ROOT, networks_of_ones_own
 from system.sites import DOOR, Site
 from trade._access import FUNCTIONS
 from trade._wire import (
@@ -350,12 +352,7 @@ def test_a_certificate_that_is_no_good_opens_no_door(
 def silent(attack: Attack, name: str, who: str) -> bool:
     """Whether nothing at all of it passes, neither a call nor a stop."""
     keys = [attack.key(who), attack.key(who, system=True), attack.key(who, kind="stop"), f"estop/{who}"]
-    attack.arm.ask("tapped")
-    for _ in range(5):
-        for key in keys:
-            attack.say(name, key, "")
-        attack.planner.ask("call_group", ARM)
-    return not set(keys) & set(attack.arm.ask("tapped"))
+    return not attack.slipped(name, *keys)
 
 
 @pytest.mark.parametrize("who", ["mallory", "idle"])
@@ -378,8 +375,7 @@ def test_who_is_revoked_while_it_is_linked_says_nothing_more_and_calls_of_others
     wait_until(lambda: attack.moved() == [*before, 1], "so far it may")
     attack.planner.ask("started", "nap", ARM, "4.0")
     attack.planner.ask("hold", ARM)
-    attack.site.papers.authority.revoke("thief")
-    assert attack.site.said()["reloaded"]
+    attack.revoke("thief")
     wait_until(lambda: attack.intruder.ask("linked", thief), "its certificate is still good for a link")
     assert silent(attack, thief, "thief")
     attack.say(thief, attack.key("thief"), attack.call(thief, "thief", "move", 2))
@@ -388,3 +384,13 @@ def test_who_is_revoked_while_it_is_linked_says_nothing_more_and_calls_of_others
     attack.planner.ask("let_go")
     attack.planner.ask("move", ARM, "1")
     assert attack.moved() == [*before, 1, 0]
+
+
+def test_the_table_of_rights_is_what_happens(attack: Attack) -> None:
+    """With WRITE_TABLES=1 in the environment it is written anew."""
+    attack.revoke("thief")
+    page = ROOT / "docs" / "access-control.md"
+    table = rights.found_out(attack)
+    if os.environ.get("WRITE_TABLES"):
+        page.write_text(rights.written_into(page.read_text(encoding="utf-8"), table), encoding="utf-8")
+    assert rights.in_the_page(page.read_text(encoding="utf-8")) == table
