@@ -14,6 +14,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from typer.testing import CliRunner, Result
 
 from trade.errors import ConfigurationError, TradeError
+from trade.policies import read_policy
 from trade_gateway import _pki
 from trade_gateway._pki import Authority, Issued, NameRevoked, NameTaken, NoAuthority
 from trade_gateway._pki_commands import app
@@ -166,6 +167,45 @@ def test_the_list_of_revoked_names_is_one_that_programs_read(authority: Authorit
         authority.revoke(name)
     assert authority.revoked() == {"arm", "leg"}
     assert 'revoked = ["arm", "leg"]' in (authority.folder / "revoked.toml").read_text().splitlines()
+
+
+def test_of_two_that_revoke_at_the_same_time_neither_is_forgotten(
+    authority: Authority, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("arm", "leg"):
+        authority.issue(name)
+    replace, others = _pki._replace, iter([lambda: Authority(authority.folder).revoke("leg")])
+
+    def late(path: Path, text: bytes, mode: int) -> None:
+        for other in others:  # comes in between, and is done before the first one writes
+            other()
+        replace(path, text, mode)
+
+    monkeypatch.setattr(_pki, "_replace", late)
+    authority.revoke("arm")
+    assert read_policy(a_policy_with(authority.folder / "revoked.toml")).revoked == {"arm", "leg"}
+    assert authority.revoked() == {"arm", "leg"}
+
+
+def test_who_was_revoked_is_not_issued_again_though_the_list_be_lost(authority: Authority) -> None:
+    for name in ("arm", "leg"):
+        authority.issue(name)
+    authority.revoke("arm")
+    (authority.folder / "revoked.toml").unlink()
+    with pytest.raises(NameRevoked):
+        authority.issue("arm")
+    authority.revoke("leg")
+    assert 'revoked = ["arm", "leg"]' in (authority.folder / "revoked.toml").read_text()
+
+
+def a_policy_with(revoked_file: Path) -> Path:
+    path = revoked_file.with_name("policy.toml")
+    path.write_text('revoked_file = "revoked.toml"\n[roles]\n[identities]\n')
+    return path
+
+
+def test_a_new_authority_has_a_list_of_revoked_names_that_a_policy_can_name(authority: Authority) -> None:
+    assert read_policy(a_policy_with(authority.folder / "revoked.toml")).revoked == set()
 
 
 @pytest.mark.parametrize(

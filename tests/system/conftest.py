@@ -8,8 +8,8 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, suppress
+from collections.abc import Callable, Generator, Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -153,17 +153,26 @@ def rosie_up(run: Callable[..., Program], tmp_path: Path) -> Callable[[], Rosie]
     return up
 
 
-@pytest.fixture
-def networks() -> Iterator[Networks]:
-    """Hosts and networks of the test's own; skips where there can be none, and fails there in CI."""
+@contextmanager
+def networks_of_ones_own() -> Generator[Networks]:
+    """Hosts and networks; skips where there can be none, and fails there in CI."""
     reason = why_not()
     if reason and os.environ.get("CI") == "true":
         pytest.fail(f"{reason}; in CI this is part of what must hold")
     if reason:
         pytest.skip(reason)
     made = Networks()
-    yield made
-    made.close()
+    try:
+        yield made
+    finally:
+        made.close()
+
+
+@pytest.fixture
+def networks() -> Iterator[Networks]:
+    """Hosts and networks of the test's own; see above."""
+    with networks_of_ones_own() as made:
+        yield made
 
 
 class Bench:

@@ -1,5 +1,6 @@
 """A container on a network of its own: does what it is told on standard input, answers with a line each."""
 
+import contextlib
 import json
 import os
 import socket
@@ -9,7 +10,9 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from trade import Container, Handle, Lock, Run, Settings, service, where
+import zenoh
+
+from trade import Container, Handle, Lock, Resource, Run, Settings, current_call, service, where
 from trade._links import _others
 
 PROVIDERS = 5
@@ -32,6 +35,37 @@ class Echo:
         threading.Event().wait(seconds)
 
 
+class Joint(Echo):
+    """Something that is locked, stopped and resumed."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.resources = (Resource("joint"),)
+        self.greeted: list[str] = []
+
+    @service(effect="stop")
+    def halt(self) -> None: ...
+
+    @service
+    def greet(self, newcomer: Handle) -> None:
+        """Noted with who calls."""
+        call = current_call()
+        assert call is not None
+        self.greeted.append(f"{call.caller} {newcomer.label}")
+
+
+class Relay:
+    """Moves something of others for whoever calls."""
+
+    def __init__(self, container: Container, of: str) -> None:
+        self._container = container
+        self._of = of
+
+    @service
+    def relay(self, number: int) -> None:
+        self._container.find(where(name="move", group=self._of))(number)
+
+
 class Member:
     def __init__(self, name: str, address: str) -> None:
         self.name = name
@@ -42,6 +76,7 @@ class Member:
         self._run: Run | None = None
         self._lock: Lock | None = None
         self._providers: dict[str, Echo] = {}
+        self._tapped: list[Any] = []
 
     @property
     def up(self) -> Container:
@@ -68,6 +103,13 @@ class Member:
     def deregister_one(self, group: str) -> None:
         self.up.deregister(self._providers.pop(group))
 
+    def register_joint(self, group: str) -> None:
+        self._providers[group] = Joint()
+        self.up.register(self._providers[group], group)
+
+    def register_relay(self, group: str, of: str) -> None:
+        self.up.register(Relay(self.up, of), group)
+
     def add_group(self, of: str, group: str) -> None:
         self.up.add_group(self._providers[of], group)
 
@@ -93,6 +135,11 @@ class Member:
     def hold(self, group: str) -> None:
         """Take a lock and keep it."""
         self._lock = self.up.lock(where(group=group)).acquire()
+
+    def hold_when_there(self, group: str) -> None:
+        """The same once something that moves is there."""
+        self.up.find(where(name="move_to", group=group), wait_s=30)
+        self.hold(group)
 
     def held(self) -> bool:
         """Whether it still holds, for those who granted it, too."""
@@ -174,6 +221,97 @@ class Member:
 
     def moved(self, of: str) -> list[int]:
         return self._providers[of].moves
+
+    def greeted(self, of: str) -> list[str]:
+        joint = self._providers[of]
+        assert isinstance(joint, Joint)
+        return joint.greeted
+
+    def greet_joining(self, group: str, of: str) -> None:
+        """From now on a joint greets, in our name, whatever of the group joins."""
+        self.up.joined(where(name="echo", group=group), self.up.find(where(name="greet", group=of)))
+
+    def call(self, name: str, group: str, container: str, *arguments: str) -> Any:
+        """Call a service of that container; the arguments are JSON."""
+        wanted = where(name=name, group=group, container=container)
+        return self.up.call(wanted, *map(json.loads, arguments))
+
+    def started(self, name: str, group: str, *arguments: str) -> None:
+        """Begin a call, under the lock if there is one."""
+        with self._lock.use() if self._lock is not None else contextlib.nullcontext():
+            found = self.up.find(where(name=name, group=group)).with_(deadline_s=120)
+            self._run = found.start(*map(json.loads, arguments))
+
+    def ended(self) -> Any:
+        """What came of the call that was begun."""
+        assert self._run is not None
+        return self._run.result(60)
+
+    def still_held(self) -> bool:
+        assert self._lock is not None
+        return self._lock.held
+
+    def let_go(self) -> None:
+        assert self._lock is not None
+        self._lock.release()
+        self._lock = None
+
+    def grants(self) -> list[list[Any]]:
+        """What shows the lock to those that granted it."""
+        assert self._lock is not None
+        return [[token.epoch, token.number] for token in self._lock.tokens()]
+
+    def break_lock(self, group: str) -> None:
+        self.up.break_lock(where(group=group), "it is needed")
+
+    def resume(self, group: str) -> None:
+        self.up.resume(where(group=group))
+
+    def estop(self) -> str:
+        return self.up.estop("a test").id
+
+    def estop_clear(self, estop: str) -> bool:
+        return self.up.estop_clear([estop], limit_s=1.0).complete
+
+    def estops(self) -> list[str]:
+        return [known.id for known in self.up.estops()]
+
+    def load_policy(self, path: str) -> None:
+        self.up.load_policy(path)
+
+    def session(self) -> str:
+        return self.up.session
+
+    def place(self, name: str, group: str) -> list[str]:
+        """Identity, container, epoch, domain and provider of a service."""
+        key = self.up.find(where(name=name, group=group)).key
+        return [*str(key.address).split("/"), key.domain, key.provider]
+
+    def waits(self) -> list[Any]:
+        """Of the call that was begun: the reply channel, and its number."""
+        caller = self.up._caller
+        [number] = caller._pending
+        assert caller._shared is not None
+        return [caller._shared.name, number]
+
+    def seen(self, group: str) -> list[str]:
+        """Who offers something there, as far as is known now."""
+        return sorted(str(handle.key.address) for handle in self.up.services(where(name="echo", group=group)))
+
+    def addresses(self) -> list[str]:
+        return [str(address) for address in self.up.addresses()]
+
+    def tap(self) -> None:
+        """From now on note all that the transport hands to this container."""
+        fifo = zenoh.handlers.FifoChannel(8192)
+        who = self.up.address.identity
+        patterns = [f"call/*/{who}/**", f"stop/*/{who}/**", f"reply/*/{who}/**", "registry/**", "estop/**"]
+        self._tapped = [self._session.declare_subscriber(pattern, fifo) for pattern in patterns]
+
+    def tapped(self) -> list[str]:
+        """The keys of what was heard since it was asked last."""
+        heard = [iter(tap.handler.try_recv, None) for tap in self._tapped]
+        return [str(sample.key_expr) for samples in heard for sample in samples]
 
     def state(self) -> dict[str, Any]:
         """For the message of a test that failed."""

@@ -34,7 +34,10 @@ def why_not() -> str:
 
 
 class Member:
-    """``member.py`` in one of the namespaces; with certificates if ``tls`` is its folder, else with a password."""
+    """``member.py``, or another script that is told by lines, in one of the namespaces.
+
+    With certificates if ``tls`` is its folder, else with a password; ``system`` if it is not the test's own.
+    """
 
     def __init__(
         self,
@@ -45,19 +48,23 @@ class Member:
         bridge: str = "",
         tls: Path | None = None,
         policy: Path | None = None,
+        script: Path = MEMBER,
+        system: str = "",
     ) -> None:
         # With a host name of its own: the namespace's.
-        command = ["ip", "netns", "exec", namespace, "unshare", "--uts", sys.executable, str(MEMBER)]
+        command = ["ip", "netns", "exec", namespace, "unshare", "--uts", sys.executable, str(script)]
         # Each namespace is a host of its own: no folder in common.
         lax = {} if policy is not None else {"TRADE_INSECURE_LAN": "1"}
         entry = {"TRADE_CREDENTIALS": "lab:secret"} if tls is None else {"TRADE_TLS": str(tls)}
         environment = {
             **os.environ,
             "TRADE_RUNTIME_DIR": str(runtime / namespace),
+            "TRADE_STATE_DIR": str(runtime / namespace / "state"),
             "TRADE_BRIDGE": bridge,
             **lax,
             **entry,
             **({} if policy is None else {"TRADE_POLICY": str(policy)}),
+            **({"TRADE_SYSTEM": system} if system else {}),
         }
         self._process = subprocess.Popen(
             [*command, namespace, name, address],

@@ -1,22 +1,18 @@
 """``trade gateway`` between networks: what crosses, what does not, and what becomes of it on bad days."""
 
 import json
-import os
 import signal
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
-from certificates import Papers
 from system.networks import Member, Networks
+from system.sites import Site
 from waiting import wait_until
 
 pytestmark = pytest.mark.timeout(300)
 
-SYSTEM = "lab-0"
 POLICY = """
 gateways = ["door"]
 
@@ -38,92 +34,11 @@ arm = ["driver"]
 planner = ["operator"]
 dash = ["viewer"]
 """
-GATEWAY = f"""
-system = "{SYSTEM}"
-tls = "pki/issued/door"
-policy = "policy.toml"
-
-[network.private]
-interface = "net1"
-listen = ["tls/10.231.1.1:7450"]
-export = ["rosie.arm"]
-
-[network.public]
-interface = "net2"
-listen = ["tls/10.231.2.1:7450"]
-export = []
-"""
-
-
-class Site:
-    """A robot's private network and a public one, with a gateway between them."""
-
-    def __init__(self, networks: Networks, folder: Path) -> None:
-        self.networks = networks
-        self.folder = folder
-        self.papers = Papers(folder / "pki")
-        self.policy, self.file = folder / "policy.toml", folder / "gateway.toml"
-        self.policy.write_text(POLICY)
-        self.file.write_text(GATEWAY)
-        self.members: list[Member] = []
-        networks.lay("net1", between="10.231.1.1", left="10.231.1.2")
-        networks.lay("net2", between="10.231.2.1", right="10.231.2.2", right2="10.231.2.3")
-        self.papers.of("door", addresses=["10.231.1.1", "10.231.2.1"], purpose="gateway")
-        self.begin()
-
-    def begin(self) -> None:
-        command = ["ip", "netns", "exec", self.networks.host("between")]
-        command += [sys.executable, "-m", "trade_gateway", "gateway", str(self.file), "--json"]
-        complaints = (self.folder / "complaints").open("ab")
-        with complaints:
-            self.gateway = subprocess.Popen(
-                command,
-                stdout=subprocess.PIPE,
-                stderr=complaints,
-                text=True,
-                env={**os.environ, "TRADE_RUNTIME_DIR": str(self.folder / "runtime"), "TRADE_SYSTEM": "elsewhere"},
-            )
-        assert self.gateway.stdout is not None
-        self.ready = json.loads(self.gateway.stdout.readline())
-
-    def end(self, how: signal.Signals) -> None:
-        self.gateway.send_signal(how)
-        try:
-            self.gateway.wait(20)
-        finally:
-            self.gateway.kill()
-            self.gateway.wait()
-            assert self.gateway.stdout is not None
-            self.gateway.stdout.close()
-
-    def complaints(self) -> str:
-        return (self.folder / "complaints").read_text()
-
-    def member(self, host: str, name: str, network: int, policy: Path | None = None) -> Member:
-        own = self.folder / f"{name}.toml"
-        own.write_text(POLICY)
-        tls = self.papers.of(name)
-        runtime = self.folder / "runtime"
-        made = Member(self.networks.host(host), name, "127.0.0.1:0", runtime, tls=tls, policy=policy or own)
-        self.members.append(made)
-        made.ask("start", f"tls/10.231.{network}.1:7450")
-        return made
-
-    def change(self, path: Path, before: str, after: str) -> None:
-        text = path.read_text()
-        assert before in text
-        path.write_text(text.replace(before, after))
-
-    def close(self) -> None:
-        for each in self.members:
-            each.close()
-        self.end(signal.SIGTERM)
 
 
 @pytest.fixture
-def site(networks: Networks, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Site]:
-    monkeypatch.setenv("TRADE_SYSTEM", "lab")  # member.py appends its turn
-    made = Site(networks, tmp_path)
+def site(networks: Networks, tmp_path: Path) -> Iterator[Site]:
+    made = Site(networks, tmp_path, POLICY)
     yield made
     made.close()
 
@@ -131,7 +46,7 @@ def site(networks: Networks, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
 @pytest.fixture
 def arm(site: Site) -> Member:
     """On the private network: two groups, one of which is let out."""
-    made = site.member("left", "arm", 1)
+    made = site.member("left", "arm")
     made.ask("register_one", "rosie.arm")
     made.ask("register_one", "cellar")
     return made
@@ -139,7 +54,7 @@ def arm(site: Site) -> Member:
 
 @pytest.fixture
 def planner(site: Site, arm: Member) -> Member:
-    made = site.member("right", "planner", 2)
+    made = site.member("right", "planner")
     made.ask("group", "rosie.arm", "arm")
     return made
 
@@ -178,17 +93,17 @@ def test_who_may_not_call_is_refused_by_himself_by_the_callee_and_by_the_gateway
     site: Site, arm: Member, planner: Member
 ) -> None:
     planner.ask("move", "rosie.arm", "1")
-    dash = site.member("right2", "dash", 2)
+    dash = site.member("right2", "dash")
     dash.ask("group", "rosie.arm", "arm")
     assert dash.ask("call_group", "rosie.arm") == [7]
     assert dash.refused("move", "rosie.arm", "1").startswith("AccessDenied")
     lenient = site.folder / "lenient.toml"
     lenient.write_text(POLICY.replace('dash = ["viewer"]', 'dash = ["operator"]'))
     dash.close()
-    liar = site.member("right2", "dash", 2, policy=lenient)  # goes by a policy of its own
+    liar = site.member("right2", "dash", policy=lenient)  # goes by a policy of its own
     liar.ask("group", "rosie.arm", "arm")
     assert liar.refused("move", "rosie.arm", "1").startswith("AccessDenied")  # the callee's word
-    stranger = site.member("right2", "mallory", 2, policy=lenient)  # has a certificate, and no role anywhere
+    stranger = site.member("right2", "mallory", policy=lenient)  # has a certificate, and no role anywhere
     stranger.ask("sees", "0")
     assert stranger.ask("call_all") == 0
     assert arm.ask("moved", "rosie.arm") == [0]
@@ -231,21 +146,24 @@ def test_S12_a_gateway_that_opens_anew_loses_nobody_no_call_and_no_lock(
     planner.ask("nap", "rosie.arm")
     for exported in ('["lobby"]', "[]", '["lobby"]'):
         site.change(site.file, site.file.read_text().rpartition("export = ")[2], f"{exported}\n")
-        heard = site.gateway.stdout
-        assert heard is not None
-        assert json.loads(heard.readline())["reloaded"]
+        assert site.said()["reloaded"]
     planner.ask("woken")
     assert planner.ask("held")
     assert planner.ask("gone") == []
     assert planner.ask("sees", "2") == ["rosie.arm.echo", "rosie.arm.p0.echo"]
 
 
-def test_a_gateway_that_is_killed_and_comes_back_is_used_again(site: Site, arm: Member, planner: Member) -> None:
+def test_a_gateway_that_is_killed_ends_the_calls_under_way_and_the_next_one_serves(
+    site: Site, arm: Member, planner: Member
+) -> None:
     planner.ask("watch")
-    planner.ask("move", "rosie.arm", "1")
+    planner.ask("started", "nap", "rosie.arm", "60.0")
+    planner.ask("call", "move", "rosie.arm", "arm", "1")
     site.end(signal.SIGKILL)
+    assert planner.refused("ended").startswith("ContainerLost")
     wait_until(lambda: planner.ask("gone") == ["arm"], "out of sight")
+    planner.refused("call", "move", "rosie.arm", "arm", "2")
     site.begin()
     planner.ask("group", "rosie.arm", "arm")
-    planner.ask("move", "rosie.arm", "1")
-    assert arm.ask("moved", "rosie.arm") == [0, 0]
+    planner.ask("call", "move", "rosie.arm", "arm", "3")
+    assert arm.ask("moved", "rosie.arm") == [1, 3]

@@ -9,9 +9,11 @@ import pytest
 
 from trade import Container, Handle, Resource, Settings, service, where
 from trade._access import FUNCTIONS
+from trade._context import CallContext, running
 from trade._own_services import OwnServices
 from trade._service import marked_methods
-from trade.errors import AccessDenied, ConfigurationError, LockLost
+from trade._wire import Behalf
+from trade.errors import AccessDenied, ConfigurationError, LockedByOther, LockLost, Stopped
 from trade.testing import MemorySystem, memory_system
 
 POLICY = """
@@ -239,6 +241,32 @@ def test_a_lock_is_not_broken_by_who_did_not_ask(careless: Container, member: Me
         with pytest.raises(AccessDenied, match=r"dash may not administer rosie.neck.pan"):
             careless.break_lock(where(group="rosie.neck"), "mine")
         assert find(planner, "move")(0.1) == 0.1
+
+
+def test_who_only_says_that_it_acts_for_the_owner_of_a_lock_resumes_nothing(
+    careless: Container, member: Member, neck: Neck
+) -> None:
+    """Whom a call is made for is what its caller says; who makes it, the transport pins."""
+    planner, chief = member("planner"), member("chief")
+    with planner.lock(where(group="rosie.neck")):
+        find(chief, "stop")()
+        for claimed in (planner.session, f"{planner.session}/page.1"):
+            with pytest.raises(LockedByOther):
+                call_for(careless, claimed, find(careless, "resume", "trade"), ["rosie.neck.pan"])
+            with pytest.raises(Stopped):
+                find(planner, "move")(0.1)
+        call_for(planner, "planner/another/e1", find(planner, "resume", "trade"), ["rosie.neck.pan"])
+        assert find(planner, "move")(0.1) == 0.1
+
+
+def call_for(container: Container, session: str, handle: Handle, *args: object) -> Any:
+    """Call, and say that it is done for that session."""
+    outer = CallContext(1, "rosie.plan", "planner", container.session, None, behalf=Behalf((session,)))
+    token = running.set(outer)
+    try:
+        return handle(*args)
+    finally:
+        running.reset(token)
 
 
 def test_an_e_stop_is_not_cleared_by_who_may_not(careless: Container, member: Member, memory: MemorySystem) -> None:

@@ -8,7 +8,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from datetime import timedelta
+from datetime import datetime, timedelta, timezone
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -19,7 +19,7 @@ from cryptography.hazmat.primitives import serialization
 from cryptography.x509.oid import ExtendedKeyUsageOID
 
 from certificates import Papers
-from trade import Container, Settings, service, where
+from trade import Container, Settings, _ending, service, where
 from trade._endpoints import free_endpoint
 from trade._tls import Certificate
 from trade._zenoh import ZenohTransport, configuration
@@ -260,6 +260,36 @@ def test_who_cannot_be_dialled_any_more_soon_is_told(
         with caplog.at_level(logging.WARNING, "trade"):
             start_container(f"arm-{hours}", tls=papers.of("arm", lasts=timedelta(hours=hours)))
         assert ("the certificate of arm ends" in caplog.text) == told
+
+
+def test_a_container_that_runs_is_told_in_time_to_start_again_before_its_certificate_ends(
+    start_container: Any, papers: Papers, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As it listens with the one it was started with, a renewed one in its folder does not help."""
+    monkeypatch.setattr(_ending, "_TOLD", (timedelta(hours=22), timedelta(hours=21)))
+    with caplog.at_level(logging.WARNING, "trade"):
+        for name, hours in (("arm", 22), ("leg", 23)):
+            start_container(name, tls=papers.of(name, lasts=timedelta(hours=hours, seconds=2)))
+        papers.of("arm")
+        wait_until(lambda: said_of_the_end(caplog, "arm") == 1, "it is told")
+    assert said_of_the_end(caplog, "leg") == 0
+    assert "start this container again before" in caplog.text
+
+
+def test_the_end_of_a_certificate_is_told_twice(
+    papers: Papers, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(_ending, "_TOLD", (timedelta(hours=22), timedelta(hours=21)))
+    until = datetime.now(timezone.utc) + timedelta(hours=21, seconds=1)
+    with caplog.at_level(logging.WARNING, "trade"):
+        ending = _ending.Ending(Certificate(papers.of("arm"), "arm", frozenset(), until))
+        assert said_of_the_end(caplog, "arm") == 1
+        wait_until(lambda: said_of_the_end(caplog, "arm") == 2, "once more")
+        ending.close()
+
+
+def said_of_the_end(caplog: pytest.LogCaptureFixture, name: str) -> int:
+    return caplog.text.count(f"the certificate of {name} ends")
 
 
 def test_with_and_without_certificates_are_not_linked_and_it_says_so(

@@ -4,7 +4,8 @@
 ``ca.pem``, ``ca.key``    the authority; whoever has the key can be anybody
 ``names/NAME``            what a name was given for, for ever: ``container`` or ``gateway``
 ``issued/NAME/``          ``ca.pem``, ``cert.pem`` and ``key.pem``: what a container is started with (``TRADE_TLS``)
-``revoked.toml``          ``revoked``, the names that a policy has to refuse
+``revoked/NAME``          marks a name that was taken back, for ever
+``revoked.toml``          ``revoked``, all of them: the names that a policy has to refuse
 ========================  ==========================================================================================
 """
 
@@ -107,7 +108,9 @@ class Authority:
             problem = "there is an authority already; use it, or name another folder"
             raise NoAuthority(where=str(folder), problem=problem) from None
         _replace(folder / "ca.pem", certificate.public_bytes(serialization.Encoding.PEM), 0o644)
-        return cls(folder)
+        made = cls(folder)
+        made._list_revoked()  # a policy that names the list must find one
+        return made
 
     def issue(
         self,
@@ -165,10 +168,20 @@ class Authority:
         if name not in self._names():
             problem = f"was never issued; there is {', '.join(self._names()) or 'nobody'}"
             raise ConfigurationError(where=name, problem=problem)
-        listed = ", ".join(f'"{one}"' for one in sorted({*self.revoked(), name}))
-        text = f"# Written by trade pki revoke: identities that policies refuse.\nrevoked = [{listed}]\n"
-        _replace(self._revoked_file, text.encode(), 0o644)
+        self._listed()  # damaged, it is to be put right first
+        marks = self.folder / "revoked"
+        marks.mkdir(mode=0o700, exist_ok=True)
+        with contextlib.suppress(FileExistsError):
+            _claim(marks / name, b"")
+        self._list_revoked()
         return self._known(name)
+
+    def _list_revoked(self) -> None:
+        """Write the list until it has all: who revokes at the same time has marked it before writing an older one."""
+        while (names := self.revoked()) != self._listed():
+            listed = ", ".join(f'"{name}"' for name in sorted(names))
+            text = f"# Written by trade pki: identities that policies refuse.\nrevoked = [{listed}]\n"
+            _replace(self._revoked_file, text.encode(), 0o644)
 
     def issued(self) -> list[Issued]:
         """All names that were ever issued, in their order."""
@@ -176,10 +189,15 @@ class Authority:
 
     def revoked(self) -> frozenset[str]:
         """The names that were taken back. Raises ConfigurationError: the list is damaged."""
+        marked = frozenset(path.name for path in (self.folder / "revoked").glob("[!.]*"))
+        return marked | (self._listed() or frozenset())
+
+    def _listed(self) -> frozenset[str] | None:
+        """Those in the list for policies; None: there is no list."""
         try:
             listed = tomllib.loads(self._revoked_file.read_text(encoding="utf-8"))["revoked"]  # pyright: ignore[reportUnknownMemberType, reportUnknownVariableType]
         except FileNotFoundError:
-            return frozenset()
+            return None
         except (ValueError, KeyError):
             listed = None
         names = cast("list[object]", listed) if isinstance(listed, list) else [None]

@@ -4,11 +4,11 @@ import contextlib
 import logging
 import socket
 from collections.abc import Sequence
-from datetime import datetime, timedelta, timezone
 from typing import Any, Final
 
 from trade._acl import acl, crossings
 from trade._credentials import user_secret
+from trade._ending import Ending
 from trade._endpoints import Endpoint, dialled_from_here, loopback_interface, with_free_port
 from trade._links import Links
 from trade._policy_file import read_policy
@@ -22,20 +22,19 @@ __all__ = ["join"]
 
 _logger = logging.getLogger("trade")
 _PORTS_TRIED: Final = 4
-_SOON: Final = timedelta(days=1)
 
 
 def join(settings: Settings, leaving: contextlib.ExitStack) -> ZenohTransport:
     """Open the main session; what has to be undone when the container leaves goes onto the stack."""
     networks, certificate = _networks(settings.bridge), settings.certificate()
-    if certificate is not None:
-        _tell_of_the_end(certificate)
     transport = _join(settings, certificate, networks, leaving)
     try:
         _check_bridged(settings.bridge, transport.links)
     except ConfigurationError:
         transport.close()
         raise
+    if certificate is not None:
+        leaving.callback(Ending(certificate).close)
     return transport
 
 
@@ -97,16 +96,6 @@ def _rules(settings: Settings, networks: list[list[str]]) -> dict[str, Any]:
         known = crossings(settings.exports)
         crossing = {tuple(interfaces): known[interfaces[0]] for interfaces in networks}
     return acl(policy, namespace=settings.system, networks=crossing)
-
-
-def _tell_of_the_end(certificate: Certificate) -> None:
-    """The transport listens with the certificate it was opened with, renewed or not."""
-    if certificate.until - datetime.now(timezone.utc) < _SOON:
-        until = f"{certificate.until:%Y-%m-%d %H:%M} UTC"
-        who = certificate.identity
-        _logger.warning(
-            "the certificate of %s ends %s: renew it and start again, or all its links end then", who, until
-        )
 
 
 def _of_our_kind(endpoints: list[str], certified: bool) -> list[str]:

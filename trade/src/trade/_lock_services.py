@@ -118,7 +118,7 @@ class LockServices:
         call = _call()
         found = self._table.named(resources)
         for resource in found:
-            if resource.holder is not None and resource.holder.session not in call.sessions:
+            if resource.holder is not None and not _is_for(resource.holder, call):
                 owner = f"{resource.holder.identity}/{resource.holder.container}"
                 raise LockedByOther(
                     resources=(resource.name,),
@@ -137,6 +137,11 @@ class LockServices:
         """
         for name in resources if self._access.policy is not None else ():
             self._access.require_any(call.caller, verb, self._groups(name), name)
+
+
+def _is_for(holder: Holder, call: CallContext) -> bool:
+    """Whether a call is made for whoever holds a lock; for whom else than itself is what its caller says."""
+    return holder.session in call.sessions and (call.caller == holder.identity or call.caller in holder.delegates)
 
 
 def _resumed(resource: Resource) -> bool:
