@@ -1,6 +1,7 @@
 """The one provider of the middleware's own functions: what is in group ``trade`` of every container."""
 
 from trade._access import Access
+from trade._borrowed import Borrowed
 from trade._context import current_call
 from trade._estop_line import EstopReport
 from trade._estopping import LIMIT_S, Estopping
@@ -24,9 +25,10 @@ class OwnServices(SystemServices, LockServices):
         estopping: Estopping,
         access: Access,
         groups: GroupsOf,
+        borrowed: Borrowed,
     ) -> None:
         SystemServices.__init__(self, system)
-        LockServices.__init__(self, locks, own, ask, asked, access, groups)
+        LockServices.__init__(self, locks, own, ask, asked, access, groups, borrowed)
         self._estopping = estopping
 
     @property
