@@ -41,7 +41,7 @@ def change(path: Path, before: str, after: str) -> None:
 def test_the_example_is_right_and_says_what_crosses(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TRADE_SYSTEM", "another")  # the file says it all
     monkeypatch.setenv("TRADE_CONNECT", "tcp/127.0.0.1:1")
-    _, settings = read_gateway_file(file)
+    settings = read_gateway_file(file).settings
     assert (settings.system, settings.container, settings.identity) == ("lab", "gateway", "door")
     assert settings.listen == ("tls/192.168.7.1:7450", "tls/10.0.0.7:7450")
     assert settings.bridge == ("eth0", "eth1")
@@ -51,9 +51,9 @@ def test_the_example_is_right_and_says_what_crosses(file: Path, monkeypatch: pyt
 
 def test_without_any_list_everything_crosses_and_with_one_the_rest_does(file: Path) -> None:
     change(file, 'export = ["rosie"]', "")
-    assert read_gateway_file(file)[1].exports == {"eth0": ("*",), "eth1": ()}
+    assert read_gateway_file(file).settings.exports == {"eth0": ("*",), "eth1": ()}
     change(file, "export = []", "")
-    assert read_gateway_file(file)[1].exports is None
+    assert read_gateway_file(file).settings.exports is None
 
 
 @pytest.mark.parametrize(
@@ -89,7 +89,7 @@ def test_what_is_wrong_is_named(file: Path, before: str, after: str, said: str) 
 def test_a_laboratory_may_do_without_certificates_on_purpose(file: Path) -> None:
     text = file.read_text().replace('tls = "pki/issued/door"', 'credentials = "lab:secret"\ninsecure_lan = true')
     file.write_text(text.replace("tls/", "tcp/").replace('policy = "policy.toml"', ""))
-    _, settings = read_gateway_file(file)
+    settings = read_gateway_file(file).settings
     assert settings.credentials == ("lab", "secret")
     assert settings.insecure_lan
 
@@ -113,3 +113,83 @@ def test_check_starts_nothing(file: Path) -> None:
     change(file, 'interface = "eth1"', 'interface = "eth0"')
     with pytest.raises(ConfigurationError):
         CliRunner().invoke(app, ["gateway", str(file), "--check"], catch_exceptions=False)
+
+
+# --- other systems
+
+
+@pytest.fixture
+def sharing(file: Path) -> Path:
+    """The example, with the share that it has as a comment."""
+    head, _, share = file.read_text().partition("# [share.clinic]")
+    lines = [line.removeprefix("# ") for line in f"[share.clinic]{share}".splitlines()]
+    file.write_text(head + "\n".join(lines))
+    (file.parent / "clinic").mkdir()
+    (file.parent / "clinic" / "policy.toml").write_text(POLICY)
+    issued = Papers(file.parent / "clinic" / "pki").of("guest", addresses=["172.16.0.7"])
+    issued.rename(file.parent / "clinic" / "door")
+    (file.parent / "clinic" / "revoked.toml").write_text("revoked = []")
+    return file
+
+
+def test_the_share_of_the_example_is_right_and_told(sharing: Path) -> None:
+    plan = read_gateway_file(sharing)
+    guest = plan.shares["clinic"]
+    assert (guest.system, guest.identity, guest.bridge) == ("clinic", "guest", ())
+    assert guest.listen == ("tls/172.16.0.7:7450",)
+    assert (plan.file.share["clinic"].export, plan.file.share["clinic"].import_) == (["rosie.head"], ["clinic.map"])
+    told = CliRunner().invoke(app, ["gateway", str(sharing), "--check"]).stdout
+    assert "system clinic, as guest: it sees rosie.head of lab" in told
+    assert "lab sees clinic.map of clinic" in told
+
+
+def test_what_is_not_listed_is_not_shared(sharing: Path) -> None:
+    change(sharing, 'export = ["rosie.head"]', "")
+    change(sharing, 'import = ["clinic.map"]', "")
+    share = read_gateway_file(sharing).file.share["clinic"]
+    assert (share.export, share.import_) == ([], [])
+
+
+def test_who_only_shares_joins_no_networks(sharing: Path) -> None:
+    text = sharing.read_text()
+    sharing.write_text(text[: text.index("[network.lab]")] + text[text.index("[share.clinic]") :])
+    with pytest.raises(ConfigurationError, match=r"network.robot.export: there is no other network"):
+        read_gateway_file(sharing)
+    change(sharing, 'export = ["rosie"] ', "")
+    settings = read_gateway_file(sharing).settings
+    assert (settings.bridge, settings.exports, settings.listen) == ((), None, ("tls/192.168.7.1:7450",))
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "said"),
+    [
+        ('system = "clinic"', "", r"share.clinic.system: missing"),
+        ('system = "clinic"', 'system = "lab"', r"share.clinic.system: 'lab' is this system"),
+        ('tls = "clinic/door"', "", r"share.clinic.tls: missing; .* by the authority of clinic"),
+        ('tls = "clinic/door"', 'tls = "clinic/dor"', r"dor/ca.pem: cannot be read"),
+        ('policy = "clinic/policy.toml"', "", r"share.clinic.policy: missing; name the policy of clinic"),
+        ('policy = "clinic/policy.toml"', 'policy = "clinic/none.toml"', r"none.toml: the policy cannot be read"),
+        ('export = ["rosie.head"]', 'export = ["rosie.*"]', r"share.clinic.export: 'rosie.\*' is no group"),
+        ('import = ["clinic.map"]', 'import = ["a b"]', r"share.clinic.import: 'a b' is no group"),
+        (
+            'import = ["clinic.map"]',
+            "imports = []",
+            r"share.clinic.imports: unknown key; there is .*export, import,",
+        ),
+        ('"tls/172.16.0.7:7450"', '"tls/172.16.0.8:7450"', r"not for 172.16.0.8"),
+        ('tls = "clinic/door"', 'credentials = "a:b"', r"share.clinic.credentials: is for laboratories"),
+    ],
+)
+def test_what_is_wrong_with_a_share_is_named(sharing: Path, before: str, after: str, said: str) -> None:
+    change(sharing, before, after)
+    with pytest.raises(ConfigurationError, match=said):
+        read_gateway_file(sharing)
+
+
+def test_a_change_of_what_a_share_names_is_seen(sharing: Path) -> None:
+    seen = [digest(sharing)]
+    for path in ("clinic/policy.toml", "clinic/revoked.toml", "clinic/door/cert.pem"):
+        beside = sharing.parent / path
+        beside.write_text(beside.read_text() + "\n")
+        assert digest(sharing) not in seen
+        seen.append(digest(sharing))

@@ -2,7 +2,7 @@
 
 import signal
 import threading
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
@@ -12,13 +12,14 @@ import typer
 
 from trade import Container, Settings
 from trade.errors import TradeError
-from trade_gateway._gateway_file import digest, read_gateway_file
+from trade.policies import EVERYTHING
+from trade_gateway._gateway_file import Plan, digest, named_digest, read_gateway_file
+from trade_gateway._guests import Guests, opened
 from trade_gateway._list import Json
 from trade_gateway._output import Output, complain
 from trade_gateway._up import leaving
 
 _LOOK_EVERY_S: Final = 1.0
-_TRIES: Final = 5
 
 
 def gateway(
@@ -28,78 +29,95 @@ def gateway(
 ) -> None:
     """Carry calls between networks that have no way to each other, as far as the file and its policy allow.
 
+    It may be a guest in other systems, too, and share some groups with them.
+
     The file is read again when it changes, when its policy, its revoked names or its certificate do, and on SIGHUP.
     What is wrong with it is said, and the gateway goes on as before.
 
     For example: trade gateway /etc/trade/gateway.toml --check
     """
     out = Output(as_json=as_json)
-    _, settings = read_gateway_file(file)
+    plan = read_gateway_file(file)
     if check:
         out.say(f"{file} is right")
+        _say_what_crosses(out, plan)
         return
     with leaving() as asked_to_leave, _hangups() as hangup:
-        running = Gateway(settings)
+        seen = digest(file)
+        running = Gateway(plan, named_digest(file))
         try:
-            seen = digest(file)
-            _say_ready(out, running, settings)
+            _say_ready(out, running, plan)
             while not asked_to_leave.wait(_LOOK_EVERY_S):
                 now = digest(file)
                 if now != seen or hangup.is_set():
+                    seen, anew = now, hangup.is_set()
                     hangup.clear()
-                    seen = now
-                    running.reload(file, out)
+                    running.reload(file, out, anew=anew)
         finally:
             running.close()
         out.say("leaving")
 
 
 class Gateway:
-    """The container that joins the networks; another one takes its place when the file changes."""
+    """The container that joins the networks, and its guests in other systems, as the file says now."""
 
-    def __init__(self, settings: Settings) -> None:
-        self._settings = settings
-        self._container = Container(settings)
+    def __init__(self, plan: Plan, named: str = "") -> None:
+        self._plan = plan
+        self._named = named
+        """What the files said that it names."""
+        self._guests = Guests()
+        self._container = Container(plan.settings)
+        self._running: Settings | None = plan.settings
+        """What the container that is open was started with."""
+        try:
+            self._guests.apply(self._container, plan)
+        except BaseException:
+            self.close()
+            raise
 
     @property
     def container(self) -> Container:
         """The one that runs now."""
         return self._container
 
-    def reload(self, file: Path, out: Output) -> bool:
-        """Go by the file as it is now; returns whether that could be done. If not, all stays as it was."""
+    def reload(self, file: Path, out: Output, *, anew: bool = True) -> bool:
+        """Go by the file as it is now; returns whether that could be done. If not, all stays as it was.
+
+        Args:
+            file: the gateway file.
+            out: where to tell of it.
+            anew: open everything anew, even where the file says nothing else.
+        """
         try:
-            _, settings = read_gateway_file(file)
+            plan, named = read_gateway_file(file), named_digest(file)
         except TradeError as wrong:
             complain(f"{file} was changed and is wrong; going on as before: {wrong}")
             return False
-        before, self._settings = self._settings, settings
-        self._container.close()
+        anew = anew or named != self._named
         try:
-            self._container = _opened(settings)
+            self._go_by(plan, anew=anew)
         except TradeError as refused:
-            self._settings = before
-            self._container = _opened(before)
+            self._go_by(self._plan, anew=False)
             complain(f"{file} was changed and cannot be used; going on as before: {refused}")
             return False
+        self._plan, self._named = plan, named
         out.say(f"read {file} again")
         if out.as_json:
             out.data({"reloaded": str(file)})
         return True
 
+    def _go_by(self, plan: Plan, *, anew: bool) -> None:
+        if anew or plan.settings != self._running:
+            self._running = None
+            self.close()
+            self._container = opened(plan.settings)
+            self._running = plan.settings
+        self._guests.apply(self._container, plan)
+
     def close(self) -> None:
-        """Leave all networks. Idempotent."""
+        """Leave all networks and systems. Idempotent."""
+        self._guests.close()
         self._container.close()
-
-
-def _opened(settings: Settings) -> Container:
-    """The one before may need a moment to let go of its addresses."""
-    for _ in range(_TRIES - 1):
-        try:
-            return Container(settings)
-        except TradeError:
-            threading.Event().wait(0.2)
-    return Container(settings)
 
 
 @contextmanager
@@ -119,7 +137,8 @@ def _hangups() -> Generator[threading.Event]:
             signal.signal(number, before)
 
 
-def _say_ready(out: Output, running: Gateway, settings: Settings) -> None:
+def _say_ready(out: Output, running: Gateway, plan: Plan) -> None:
+    settings = plan.settings
     if out.as_json:
         networks = {name: None if settings.exports is None else settings.exports[name] for name in settings.bridge}
         out.data(
@@ -130,11 +149,36 @@ def _say_ready(out: Output, running: Gateway, settings: Settings) -> None:
                 "identity": settings.identity,
                 "listen": settings.listen,
                 "networks": networks,
+                "shares": {name: _share(plan, name) for name in plan.shares},
             }
         )
         return
     out.say(f"[bold green]{running.container.name} is up[/] in system {settings.system}, as {settings.identity}")
-    for name in settings.bridge:
-        groups = "everything" if settings.exports is None else ", ".join(settings.exports[name]) or "nothing"
-        out.say(f"  {name}: others see {groups.replace('*', 'everything')} of it")
+    _say_what_crosses(out, plan)
     out.say("Ctrl-C leaves; the file is read again when it changes")
+
+
+def _share(plan: Plan, name: str) -> dict[str, object]:
+    share, settings = plan.file.share[name], plan.shares[name]
+    return {
+        "system": settings.system,
+        "identity": settings.identity,
+        "listen": settings.listen,
+        "export": share.export,
+        "import": share.import_,
+    }
+
+
+def _say_what_crosses(out: Output, plan: Plan) -> None:
+    settings = plan.settings
+    for name in settings.bridge:
+        groups = (EVERYTHING,) if settings.exports is None else settings.exports[name]
+        out.say(f"  {name}: others see {_listed(groups)} of it")
+    for name, share in plan.file.share.items():
+        guest = plan.shares[name]
+        out.say(f"  system {guest.system}, as {guest.identity}: it sees {_listed(share.export)} of {settings.system}")
+        out.say(f"  and {settings.system} sees {_listed(share.import_)} of {guest.system}")
+
+
+def _listed(groups: Sequence[str]) -> str:
+    return ", ".join(groups).replace(EVERYTHING, "everything") or "nothing"

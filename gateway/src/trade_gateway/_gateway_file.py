@@ -6,7 +6,7 @@ import re
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Final, cast
+from typing import Annotated, Any, Final, NamedTuple, cast
 
 import msgspec
 from msgspec import Meta, Struct
@@ -20,7 +20,7 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib  # pyright: ignore[reportMissingImports]
 
-__all__ = ["GatewayFile", "Network", "digest", "read_gateway_file"]
+__all__ = ["GatewayFile", "Network", "Plan", "Share", "digest", "named_digest", "read_gateway_file"]
 
 _GROUP: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_-]*(\.[A-Za-z0-9_-]+)*")
 _AT: Final = re.compile(r" - at `\$\.?([^`]*)`$")
@@ -47,6 +47,44 @@ class Network(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Groups whose services on this network the others see and call; an empty list: none; left out: all."""
 
 
+class Share(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, rename={"import_": "import"}):
+    """Another system, in which the gateway is a guest: what of ours it offers there, and the other way round."""
+
+    system: _Text
+    """Its system id."""
+    tls: str = ""
+    """The folder with the guest's certificate, of that system's authority."""
+    policy: str = ""
+    """That system's policy: who of it may see and call what is offered there."""
+    connect: list[_Text] = []
+    """Endpoints in it to dial."""
+    listen: list[_Text] = []
+    """Endpoints where its containers may dial the guest."""
+    export: list[str] = []
+    """Groups of ours that they see and call."""
+    import_: list[str] = []
+    """Groups of theirs that ours see and call."""
+    credentials: str = ""
+    """Laboratories only, instead of ``tls``: ``user:password``."""
+
+    def settings(self, where: Path, name: str, *, insecure_lan: bool) -> Settings:
+        """What the guest is started with. Raises ConfigurationError."""
+        if self.policy:
+            read_policy(where.parent / self.policy)
+        return Settings.read(
+            system=self.system,
+            container=name,
+            listen=self.listen,
+            connect=self.connect,
+            credentials=_pair(self.credentials),
+            tls=where.parent / self.tls if self.tls else None,
+            insecure_lan=insecure_lan,
+            bridge=[],
+            policy=where.parent / self.policy if self.policy else None,
+            environment=_without_system(),
+        )
+
+
 class GatewayFile(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """A gateway file, read; paths in it are beside it."""
 
@@ -60,12 +98,19 @@ class GatewayFile(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
     """The access policy."""
     connect: list[_Text] = []
     """Other gateways that it dials."""
-    network: dict[str, Network]
-    """By a name for people."""
+    network: dict[str, Network] = {}
+    """By a name for people; at least one, unless the gateway only shares."""
+    share: dict[str, Share] = {}
+    """Other systems, by a name for people."""
     credentials: str = ""
     """Laboratories only, instead of ``tls``: ``user:password``."""
     insecure_lan: bool = False
     """Laboratories only: neither certificates nor encryption nor a policy."""
+
+    @property
+    def alone(self) -> bool:
+        """Whether it joins no networks of its system: it only shares."""
+        return bool(self.share) and len(self.network) < 2 and not self.connect
 
     def settings(self, where: Path) -> Settings:
         """What its container is started with.
@@ -76,22 +121,27 @@ class GatewayFile(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
         beside = where.parent
         if self.policy:
             read_policy(beside / self.policy)  # wrong is wrong before anything is closed for it
-        limited = any(network.export is not None for network in self.network.values())
-        exports = {network.interface: tuple(_or_all(network.export)) for network in self.network.values()}
-        user, _, password = self.credentials.partition(":")
+        networks = [] if self.alone else list(self.network.values())
+        limited = any(network.export is not None for network in networks)
+        exports = {network.interface: tuple(_or_all(network.export)) for network in networks}
         return Settings.read(
             system=self.system,
             container=self.name,
             listen=[endpoint for network in self.network.values() for endpoint in network.listen],
             connect=self.connect,
-            credentials=(user, password) if self.credentials else None,
+            credentials=_pair(self.credentials),
             tls=beside / self.tls if self.tls else None,
             insecure_lan=self.insecure_lan,
-            bridge=[network.interface for network in self.network.values()],
+            bridge=[network.interface for network in networks],
             exports=exports if limited else None,
             policy=beside / self.policy if self.policy else None,
             environment=_without_system(),
         )
+
+
+def _pair(credentials: str) -> tuple[str, str] | None:
+    user, _, password = credentials.partition(":")
+    return (user, password) if credentials else None
 
 
 def _or_all(groups: Sequence[str] | None) -> Sequence[str]:
@@ -103,7 +153,19 @@ def _without_system() -> dict[str, str]:
     return {name: value for name, value in os.environ.items() if not name.startswith("TRADE_") or name.endswith("_DIR")}
 
 
-def read_gateway_file(path: Path) -> tuple[GatewayFile, Settings]:
+_KINDS: Final[Mapping[str, type[Struct]]] = {"network": Network, "share": Share}
+
+
+class Plan(NamedTuple):
+    """A gateway file with all that it names, checked."""
+
+    file: GatewayFile
+    settings: Settings
+    shares: Mapping[str, Settings]
+    """What the guests in other systems are started with, by the name of the share."""
+
+
+def read_gateway_file(path: Path) -> Plan:
     """Read and check a gateway file, the policy and the certificate that it names.
 
     Raises:
@@ -111,7 +173,7 @@ def read_gateway_file(path: Path) -> tuple[GatewayFile, Settings]:
     """
     where = str(path)
     try:
-        raw = cast("dict[str, Any]", tomllib.loads(path.read_text(encoding="utf-8")))  # pyright: ignore[reportUnknownMemberType]
+        raw = _read(path)
     except FileNotFoundError:
         raise ConfigurationError(where=where, problem="there is no such file") from None
     except OSError as bad:
@@ -123,26 +185,53 @@ def read_gateway_file(path: Path) -> tuple[GatewayFile, Settings]:
     except msgspec.ValidationError as bad:
         raise _explained(str(bad), raw, where) from None
     _check(file, where)
-    return file, file.settings(path)
+    shares = {
+        name: share.settings(path, file.name, insecure_lan=file.insecure_lan) for name, share in file.share.items()
+    }
+    return Plan(file, file.settings(path), shares)
 
 
 def _check(file: GatewayFile, where: str) -> None:
     owners: dict[str, str] = {}
+    if not file.network and not file.share:
+        raise ConfigurationError(where=f"{where}: network", problem=f"missing; write {_EXAMPLES['network']}")
     for name, network in file.network.items():
         if other := owners.get(network.interface):
             problem = f"{network.interface} is the interface of network {other!r} already"
             raise ConfigurationError(where=f"{where}: network.{name}.interface", problem=problem)
         owners[network.interface] = name
-        for group in network.export or ():
-            if group != EVERYTHING and not _GROUP.fullmatch(group):
-                problem = f'{group!r} is no group; write "rosie.head" (it and all beneath it), or "*" for all'
-                raise ConfigurationError(where=f"{where}: network.{name}.export", problem=problem)
-    if file.credentials and not (file.insecure_lan and all(file.credentials.partition(":"))):
+        _check_groups(network.export or (), f"{where}: network.{name}.export")
+        if file.alone and network.export is not None:
+            problem = "there is no other network of this system; leave it out: what other systems see is in [share...]"
+            raise ConfigurationError(where=f"{where}: network.{name}.export", problem=problem)
+    _check_proof(file, file, f"{where}: ", "NAME --for gateway")
+    for name, share in file.share.items():
+        at = f"{where}: share.{name}."
+        if share.system in (file.system, *(one.system for known, one in file.share.items() if known != name)):
+            problem = f"{share.system!r} is this system or that of another share; name another one, once"
+            raise ConfigurationError(where=f"{at}system", problem=problem)
+        _check_groups(share.export, f"{at}export")
+        _check_groups(share.import_, f"{at}import")
+        _check_proof(file, share, at, f"NAME, by the authority of {share.system}")
+        if not share.policy and not file.insecure_lan:
+            problem = f"missing; name the policy of {share.system}: without one all of it might call what is shared"
+            raise ConfigurationError(where=f"{at}policy", problem=problem)
+
+
+def _check_groups(groups: Sequence[str], where: str) -> None:
+    for group in groups:
+        if group != EVERYTHING and not _GROUP.fullmatch(group):
+            problem = f'{group!r} is no group; write "rosie.head" (it and all beneath it), or "*" for all'
+            raise ConfigurationError(where=where, problem=problem)
+
+
+def _check_proof(file: GatewayFile, part: GatewayFile | Share, where: str, words: str) -> None:
+    if part.credentials and not (file.insecure_lan and all(part.credentials.partition(":"))):
         problem = 'is for laboratories: "user:password", and insecure_lan = true; else use tls'
-        raise ConfigurationError(where=f"{where}: credentials", problem=problem)
-    if not file.tls and not file.credentials:
-        problem = "missing; name the folder with its certificate: trade pki issue NAME --for gateway"
-        raise ConfigurationError(where=f"{where}: tls", problem=problem)
+        raise ConfigurationError(where=f"{where}credentials", problem=problem)
+    if not part.tls and not part.credentials:
+        problem = f"missing; name the folder with its certificate: trade pki issue {words}"
+        raise ConfigurationError(where=f"{where}tls", problem=problem)
 
 
 def _explained(said: str, raw: Mapping[str, Any], where: str) -> ConfigurationError:
@@ -153,24 +242,33 @@ def _explained(said: str, raw: Mapping[str, Any], where: str) -> ConfigurationEr
         key = missing.group(1)
         return ConfigurationError(where=f"{where}: {prefix}{key}", problem=f"missing; write {_EXAMPLES.get(key, key)}")
     if unknown := _UNKNOWN.search(said):
-        kind = Network if prefix.startswith("network.") else GatewayFile
-        problem = f"unknown key; there is {', '.join(kind.__struct_fields__)}"
+        kind = _KINDS.get(prefix.partition(".")[0], GatewayFile)
+        problem = f"unknown key; there is {', '.join(kind.__struct_encode_fields__)}"
         return ConfigurationError(where=f"{where}: {prefix}{unknown.group(1)}", problem=problem)
     return ConfigurationError(where=f"{where}: {prefix.rstrip('.')}", problem=said[: at.start()] if at else said)
 
 
 def _named(path: str, raw: Mapping[str, Any]) -> str:
-    """The place of a value, with the network's own name where the check only says that it is one of them."""
+    """The place of a value, with its network's or share's own name where the check only says that it is one of them."""
     if "[...]" in path:
-        networks = cast("Mapping[str, object]", raw.get("network", {}))
-        path = path.replace("[...]", f".{next(iter(networks))}" if len(networks) == 1 else "", 1)
+        named = cast("Mapping[str, object]", raw.get(path.partition("[")[0], {}))
+        path = path.replace("[...]", f".{next(iter(named))}" if len(named) == 1 else "", 1)
     return f"{path}." if path else ""
 
 
 def digest(path: Path) -> str:
-    """Changes when the file does, or the policy, its list of revoked names, or the certificate that it names."""
+    """Changes when the file does, or anything that it names."""
+    return f"{_digest([path])}{named_digest(path)}"
+
+
+def named_digest(path: Path) -> str:
+    """Changes when a policy does, its list of revoked names, or a certificate that the file names."""
+    return _digest(_beside(path))
+
+
+def _digest(files: Sequence[Path]) -> str:
     seen = hashlib.sha256()
-    for file in (path, *_beside(path)):
+    for file in files:
         try:
             seen.update(file.read_bytes())
         except OSError as gone:
@@ -179,17 +277,30 @@ def digest(path: Path) -> str:
 
 
 def _beside(path: Path) -> list[Path]:
-    found: list[Path] = []
     try:
-        raw = cast("dict[str, Any]", tomllib.loads(path.read_text(encoding="utf-8")))  # pyright: ignore[reportUnknownMemberType]
-        if raw.get("tls"):
-            found.append(path.parent / str(raw["tls"]) / "cert.pem")
-        if raw.get("policy"):
-            policy = path.parent / str(raw["policy"])
-            found.append(policy)
-            rules = cast("dict[str, Any]", tomllib.loads(policy.read_text(encoding="utf-8")))  # pyright: ignore[reportUnknownMemberType]
-            named = rules.get("revoked_file")
-            found += [policy.parent / named] if isinstance(named, str) else []
+        raw = _read(path)
     except (OSError, ValueError):  # what is wrong with it is said by who reads it
-        return found
+        return []
+    shares = raw.get("share")
+    parts = [raw, *(cast("Mapping[str, Any]", shares).values() if isinstance(shares, dict) else ())]
+    tables = [cast("Mapping[str, Any]", part) for part in parts if isinstance(part, dict)]
+    return [file for table in tables for file in _named_by(table, path)]
+
+
+def _named_by(part: Mapping[str, Any], path: Path) -> list[Path]:
+    found: list[Path] = []
+    if part.get("tls"):
+        found.append(path.parent / str(part["tls"]) / "cert.pem")
+    if part.get("policy"):
+        policy = path.parent / str(part["policy"])
+        found.append(policy)
+        try:
+            named = _read(policy).get("revoked_file")
+        except (OSError, ValueError):
+            return found
+        found += [policy.parent / named] if isinstance(named, str) else []
     return found
+
+
+def _read(path: Path) -> dict[str, Any]:
+    return cast("dict[str, Any]", tomllib.loads(path.read_text(encoding="utf-8")))  # pyright: ignore[reportUnknownMemberType]

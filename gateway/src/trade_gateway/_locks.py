@@ -32,7 +32,7 @@ def locks(context: typer.Context, as_json: Json = False) -> None:
 
 
 def _owner(info: LockInfo) -> str:
-    return f"{info.holder.identity}/{info.holder.container}"
+    return info.holder.owner
 
 
 def _plain(info: LockInfo) -> dict[str, object]:

@@ -4,6 +4,7 @@ import contextlib
 import itertools
 import secrets
 import threading
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
@@ -12,6 +13,8 @@ import msgspec
 from trade import _process
 from trade._access import Access
 from trade._announcing import Announcer
+from trade._bordering import Bordering
+from trade._borrowed import Borrowed
 from trade._calls import Caller
 from trade._clockwork import Clockwork
 from trade._codec import Codec
@@ -41,26 +44,19 @@ from trade._settings import Settings
 from trade._system import DOMAIN, PROVIDER, ContainerInfo, System
 from trade._transport import ChannelClosed, Transport
 from trade._watch import Watch
-from trade._wire import (
-    Address,
-    ServiceKey,
-    Token,
-    alive_key,
-    as_chunk,
-    encode_message,
-)
+from trade._wire import Address, ServiceKey, Token, alive_key, as_chunk, encode_message
 from trade._withdrawn import Withdrawn
 from trade._zenoh import ZenohTransport
 from trade.errors import AccessDenied, ConfigurationError, ServiceGone
 
 __all__ = ["Container"]
 
-_HANDLE_EXT: Final = 1
+HANDLE_EXT: Final = 1
 _PATIENCE_S: Final = 1.0
 """How long a call waits for the registry to hear of a handle that came by message before its registry entry did."""
 
 
-class Container(Hosting, Hooking, Guarding):
+class Container(Hosting, Hooking, Guarding, Bordering):
     """A participant of a system; most programs use the default one through the functions of ``trade``.
 
     Joins on construction. A context manager; ``close()`` leaves and is idempotent.
@@ -77,6 +73,8 @@ class Container(Hosting, Hooking, Guarding):
         self.address = Address(self._settings.identity, self._settings.container, secrets.token_hex(6))
         self.session = str(self.address)
         self._clients = itertools.count(1)
+        self._told_of_ends: list[Callable[[str], None]] = []
+        """Told of every session that ends."""
         self._closing = threading.RLock()
         self._closed = False
         self.system: Final = System(lambda: self)
@@ -107,12 +105,15 @@ class Container(Hosting, Hooking, Guarding):
                 leaving.callback(handed_down.pop, self.address)
             self._registry.listen(self._changed)
             self._registry.listen(self._notifier.changed)
-            coroutines = AsyncLoop()
+            self._told_of_ends.append(self._notifier.session_ended)
+            coroutines = self._coroutines = AsyncLoop()
             leaving.callback(coroutines.close)
             self.locking = Locking(self)
             """Its locks on what others offer, and on what it offers itself."""
             self._table = LockTable(self.address.epoch, self.name)
             leaving.callback(self._table.close)
+            self.borrowed = Borrowed(self._table, self.address.epoch)
+            """What is locked in other systems behind its grants."""
             announcer = Announcer(self._transport, self.address)
             leaving.callback(announcer.close)
             self._providers = Providers(
@@ -127,6 +128,7 @@ class Container(Hosting, Hooking, Guarding):
                 self._denied_hook,
             )
             self._registry.listen(self._hooks.changed)
+            self._told_of_ends.append(self._hooks.session_ended)
             self._hook_numbers = itertools.count(1)
             state = self._settings.state_dir
             self._estopping = Estopping(
@@ -156,6 +158,7 @@ class Container(Hosting, Hooking, Guarding):
                 self._estopping,
                 self.access,
                 self._providers.groups_of,
+                self.borrowed,
                 self._notifier,
                 self._registry,
                 self._hooks,
@@ -257,8 +260,8 @@ class Container(Hosting, Hooking, Guarding):
         """Nobody of it is there any more: nothing more is let in for it, its locks fall, what it moves stops."""
         self._table.session_ended(session, reason)
         self._deadman.session_ended(session)
-        self._notifier.session_ended(session)
-        self._hooks.session_ended(session)
+        for tell in list(self._told_of_ends):
+            tell(session)
 
     def _ask_for_release(self, holder: Holder, token: Token, who: str, reason: str) -> None:
         """Told by the lock services: somebody would like to have what another one holds."""
@@ -331,17 +334,17 @@ class Container(Hosting, Hooking, Guarding):
 
     def _handle_to_data(self, value: Any) -> Any:
         if isinstance(value, Handle):
-            return msgspec.msgpack.Ext(_HANDLE_EXT, encode_message(value.key))
+            return msgspec.msgpack.Ext(HANDLE_EXT, encode_message(value.key))
         raise TypeError(f"a {type(value).__qualname__} is no plain data")
 
     def _data_to_handle(self, code: int, data: memoryview) -> Any:
-        if code != _HANDLE_EXT:
+        if code != HANDLE_EXT:
             raise msgspec.ValidationError(f"Unknown extension {code}")
         return self.handle(msgspec.msgpack.decode(data, type=ServiceKey))
 
     # --- being
 
-    def open_session(self, client: str) -> Session:
+    def open_session(self, client: str, *, system: str = "") -> Session:
         """A presence for one client of a program that acts for many: a page, a connection (S03).
 
         Inside ``with container.open_session("page"):`` calls and locks are the client's: when it is closed, what the
@@ -349,12 +352,14 @@ class Container(Hosting, Hooking, Guarding):
 
         Args:
             client: a word for it; others see ``identity/container/epoch/client.number``.
+            system: the other system that it is of, if any; others are told ``system/client via identity``.
 
         Raises:
             ConfigurationError: the container is closed.
         """
         self._check_open()
-        name = f"{self.address}/{as_chunk(client)[:60]}.{next(self._clients)}"
+        whose = f"{as_chunk(system)[:20]}:" if system else ""
+        name = f"{self.address}/{whose}{as_chunk(client)[:40]}.{next(self._clients)}"
         try:
             presence = self._transport.appear(alive_key(name))
         except ChannelClosed:  # closed by another thread meanwhile

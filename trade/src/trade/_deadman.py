@@ -12,6 +12,8 @@ from trade._resources import Resource
 
 _logger = logging.getLogger("trade")
 
+NOBODYS: Final = "trade/"
+"""The session of stops that no client asked for."""
 _STOP_S: Final = 2.0
 """How long a joint may take to come to rest (S05)."""
 
@@ -106,7 +108,7 @@ class Deadman:
         timer.daemon = True
         timer.start()
         try:
-            service.run_admitted((), {}, CallContext(0, service.label, "trade", "trade/", None))
+            service.run_admitted((), {}, CallContext(0, service.label, "trade", NOBODYS, None))
             problem = ""
         except Exception as error:  # noqa: BLE001 - whatever it is, the resource is not safe to give on
             problem = f"{service.label} failed: {error}"

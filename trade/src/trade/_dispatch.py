@@ -25,6 +25,7 @@ from trade._policies import Policy
 from trade._resources import Resource, admitted
 from trade._serial import Serial
 from trade._service import ServiceMark
+from trade._session import foreign
 from trade._signature import Signature
 from trade._system import DOMAIN, PROVIDER
 from trade._transport import ChannelClosed, Message, Publisher, Transport
@@ -134,7 +135,7 @@ class LocalService:
             return self.run_admitted(args, kwargs, context)
         if self.effect == "stop":
             for resource in self.resources:
-                resource.stop(context.caller, context.sessions)
+                resource.stop(foreign(context.session) or context.caller, context.sessions)
             return self.run_admitted(args, kwargs, context)
         permit = admitted(self.resources, context)
         structs.force_setattr(context, "permit", permit)
@@ -381,5 +382,6 @@ def _run(caller: str, call: Call, service: LocalService, ongoing: Ongoing | None
     except BaseException as error:  # noqa: BLE001 - whatever a provider raises belongs to the caller
         info = service.failure(error, call.args)
         if not isinstance(error, TradeError) or isinstance(error, _DEFECTS):
-            _logger.warning("%s failed in a call of %s:\n%s", service.label, caller, info.traceback or info.message)
+            who = foreign(call.session) or caller
+            _logger.warning("%s failed in a call of %s:\n%s", service.label, who, info.traceback or info.message)
         return Status.ERROR, Raw(encode_message(info))

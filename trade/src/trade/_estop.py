@@ -7,6 +7,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from typing import Final
 
 from trade._deadman import Deadman
@@ -58,6 +59,8 @@ class Estops:
         self._answers: dict[str, str | None] = dict.fromkeys(self._open, "")
         """What was asked already, with what failed of it; None: not done yet. What is here is not begun again."""
         self._threads: list[threading.Thread] = []
+        self.heard: list[Callable[[Estop], None]] = []
+        """Called, each on a thread of its own, with every e-stop that is opened."""
         self._latch()
 
     def open(self) -> tuple[Estop, ...]:
@@ -127,6 +130,13 @@ class Estops:
             self._done(estop.id, "; ".join(failed))
 
         self._apart(finish)
+        for tell in self.heard:
+            self._apart(partial(tell, estop))
+
+    def knows(self, estop_id: str) -> bool:
+        """Whether an e-stop of that id was opened or cleared here."""
+        with self._guard:
+            return estop_id in self._answers
 
     def _written(self, estop: Estop) -> str:
         """Write it down unless it is cleared meanwhile; what went wrong."""

@@ -1,8 +1,9 @@
 """E-stops of one container, tied together: hearing and giving orders, telling of what is open, taking the union."""
 
+import logging
 import secrets
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -18,8 +19,10 @@ from trade._providers import Providers
 from trade._registry import Change, ContainerState, Record, Registry
 from trade._system import DOMAIN
 from trade._transport import ChannelClosed, Transport
-from trade._wire import PROTOCOL, Address, Estop, EstopOrder, ProviderInfo
+from trade._wire import PROTOCOL, Address, Estop, EstopOrder, ProviderInfo, is_chunk
 from trade.errors import ConfigurationError, NoSuchEstop
+
+_logger = logging.getLogger("trade")
 
 LIMIT_S: Final = 3.0
 _LONGEST_LIMIT_S: Final = 60.0
@@ -84,10 +87,31 @@ class Estopping:
         estop = Estop(secrets.token_hex(4), str(self._own), reason[:_LONGEST_REASON], time.time())
         order = EstopOrder(PROTOCOL, estop.id, estop)
 
-        def cleared() -> bool:
-            return all(known.id != estop.id for known in self._estops.open())
+        return self._line.ask(order, self._with_stops, limit_s, lambda: self._is_cleared(estop.id))
 
-        return self._line.ask(order, self._with_stops, limit_s, cleared)
+    def hear(self, tell: Callable[[Estop], None]) -> None:
+        """Have this called, on a thread of its own, with every e-stop: those that are open, and those to come."""
+        self._estops.heard.append(tell)
+        for estop in self._estops.open():
+            tell(estop)
+
+    def deafen(self, tell: Callable[[Estop], None]) -> None:
+        """Have it called no more."""
+        self._estops.heard.remove(tell)
+
+    def carry(self, estop: Estop, system: str) -> None:
+        """Open an e-stop of another system here, under its id; once: it is cleared here by itself."""
+        if self._estops.knows(estop.id) or not is_chunk(estop.id):
+            return
+        reason = f"{estop.reason} (in system {system}, by {estop.by})"[:_LONGEST_REASON]
+        mine = Estop(estop.id, str(self._own), reason, estop.at)
+        order = EstopOrder(PROTOCOL, estop.id, mine)
+        report = self._line.ask(order, self._with_stops, LIMIT_S, lambda: self._is_cleared(estop.id))
+        if report.missing or report.failed:
+            _logger.error("e-stop %s of system %s: missing %s, %s", estop.id, system, report.missing, report.failed)
+
+    def _is_cleared(self, estop_id: str) -> bool:
+        return all(known.id != estop_id for known in self._estops.open())
 
     def open(self) -> list[Estop]:
         """See `Container.estops`."""

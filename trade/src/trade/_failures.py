@@ -6,18 +6,24 @@ from dataclasses import fields
 from typing import Any, Final
 
 import msgspec
+from msgspec import structs
 
 from trade._records import imported
 from trade._wire import ErrorInfo
 from trade.errors import RemoteError, TradeError
 
-__all__ = ["pack_error", "unpack_error"]
+__all__ = ["pack_error", "passed_on", "unpack_error"]
 
 _MOST_TRACEBACK: Final = 16_000
 
 
 class RemoteTraceback(Exception):
     """Carries the text of the traceback on the far side, as the cause of the error raised here."""
+
+    def __init__(self, info: ErrorInfo) -> None:
+        super().__init__(info.traceback)
+        self.info: Final = info
+        """The error as it came."""
 
     def __str__(self) -> str:
         return f"\n{self.args[0]}"
@@ -32,6 +38,13 @@ def pack_error(error: BaseException) -> ErrorInfo:
         fields={name: _sendable(value) for name, value in _data(error).items()},
         traceback=_traceback(error)[-_MOST_TRACEBACK:],
     )
+
+
+def passed_on(error: BaseException) -> ErrorInfo:
+    """An error that came from elsewhere, for the next one: as it came, whoever knows its type; no traceback."""
+    cause = error.__cause__
+    info = cause.info if isinstance(cause, RemoteTraceback) else pack_error(error)
+    return structs.replace(info, traceback="")
 
 
 def _data(error: BaseException) -> dict[str, Any]:
@@ -62,8 +75,8 @@ def unpack_error(info: ErrorInfo, service: str) -> BaseException:
     error = _rebuilt(info)
     if error is None:
         error = RemoteError(service=service, type_name=info.type, message=info.message, traceback=info.traceback)
-    if info.traceback:
-        error.__cause__ = RemoteTraceback(info.traceback)
+    if info.traceback or isinstance(error, RemoteError):
+        error.__cause__ = RemoteTraceback(info)
     return error
 
 

@@ -48,6 +48,7 @@ class Run:
         self._ended = Bell()
         self._future.add_done_callback(lambda _: self._ended.ring())
         self._progress: Any = None
+        self._on_progress: Callable[[Any], object] | None = None
         self._cancelling = False
         self._cancel_call: Callable[[], None] | None = None
 
@@ -83,12 +84,16 @@ class Run:
         """
         if self._future.done():
             return
+        self.ask_to_end()
+        if self._handle.record.info.cancel is not None:
+            self._handle.cancel_service()()
+
+    def ask_to_end(self) -> None:
+        """What `cancel` does first: ask the call alone to end. Does not wait."""
         self._cancelling = True
         tell = self._cancel_call
         if tell is not None:
             tell()
-        if self._handle.record.info.cancel is not None:
-            self._handle.cancel_service()()
 
     def progress(self) -> Any:
         """What the service said last of how far it is, or None."""
@@ -108,6 +113,14 @@ class Run:
     def note_progress(self, value: Any) -> None:
         """Told by the container: the service said this of how far it is."""
         self._progress = value
+        if self._on_progress is not None:
+            self._on_progress(value)
+
+    def on_progress(self, tell: Callable[[Any], object]) -> None:
+        """Have this called with each that comes, on the thread that hears of it; with the last one at once."""
+        self._on_progress = tell
+        if self._progress is not None:
+            tell(self._progress)
 
     def fail(self, error: BaseException) -> None:
         """Told by the container: it could not begin."""

@@ -5,14 +5,18 @@ import time
 from collections.abc import Callable, Iterable
 from typing import Final
 
+from msgspec import structs
+
 from trade._access import Access
+from trade._borrowed import Borrowed
 from trade._context import CallContext, current_call
 from trade._locks import LockTable
 from trade._resources import Holder, Resource
 from trade._service import service
+from trade._session import foreign
 from trade._terms import Granted, LockInfo, Terms
 from trade._wire import Address, Token
-from trade.errors import AccessDenied, Busy, LockedByOther
+from trade.errors import Busy, LockedByOther, TradeError
 
 _MOST_WAITING: Final = 24
 """So many may stand in the queues of a container at once; who comes then asks again."""
@@ -29,9 +33,17 @@ class LockServices:
     """The wire's side of a `LockTable`."""
 
     def __init__(
-        self, table: LockTable, own: Address, ask: Ask, asked: Asked, access: Access, groups: GroupsOf
+        self,
+        table: LockTable,
+        own: Address,
+        ask: Ask,
+        asked: Asked,
+        access: Access,
+        groups: GroupsOf,
+        borrowed: Borrowed,
     ) -> None:
         self._table = table
+        self._borrowed = borrowed
         self._access = access
         self._groups = groups
         self._own = own
@@ -43,7 +55,8 @@ class LockServices:
     def acquire(self, resources: list[str], terms: Terms) -> Granted:
         """Take all of these and what is coupled to them for the calling session."""
         call = _call()
-        self._require(call, "lock", [resource.name for resource in self._table.named(resources)])
+        named = self._table.named(resources)
+        self._require(call, "lock", [resource.name for resource in named])
         calls = () if call.behalf is None else call.behalf.calls
         holder = Holder(
             identity=call.caller,
@@ -56,16 +69,25 @@ class LockServices:
         if not self._places.acquire(blocking=False):
             raise Busy(service="trade.acquire", container=self._own.container)
         try:
-            granted = self._table.acquire(resources, holder, terms, call.tokens, (call.id, *calls))
+            with self._borrowed.behind(call, named, terms, self._pass_wish) as loan:  # elsewhere first: judged there
+                wait = structs.replace(terms, wait_s=max(0.0, terms.wait_s - loan.waited_s))
+                granted = self._table.acquire(resources, holder, wait, call.tokens, (call.id, *calls))
+                try:
+                    self._require(call, "lock", granted.resources)  # once more: it may have waited for long
+                    loan.stand_for(granted)
+                except TradeError:
+                    if granted.token is not None:
+                        self._table.release(granted.token.number, call.caller)
+                    raise
         finally:
             self._places.release()
-        try:
-            self._require(call, "lock", granted.resources)  # once more: it may have waited for long
-        except AccessDenied:
-            if granted.token is not None:
-                self._table.release(granted.token.number, call.caller)
-            raise
-        return granted
+        return structs.replace(granted, waited_s=granted.waited_s + loan.waited_s)
+
+    def _pass_wish(self, number: int, who: str, reason: str) -> None:
+        """Somebody in another system would like to have what stands behind a grant."""
+        holders = [info.holder for info in self._table.infos() if info.token.number == number]
+        if holders:
+            self._ask(holders[0], Token(self._own.epoch, number), who, reason)
 
     @service(effect="stop")
     def renew(self, grants: list[int]) -> dict[int, str]:
@@ -79,7 +101,10 @@ class LockServices:
         identity = _call().caller
         if lost and self._table.renew([grant], identity):
             return self._table.lose(grant, lost)
-        return self._table.release(grant, identity)
+        held = self._table.release(grant, identity)
+        if held:
+            self._borrowed.give_back(grant)
+        return held
 
     @service(effect="read")
     def locks(self) -> list[LockInfo]:
@@ -98,14 +123,15 @@ class LockServices:
     def request_release(self, resources: list[str], reason: str) -> list[str]:
         """Ask the owners of these to give them back; who was asked."""
         call = _call()
-        who = f"{call.caller}/{_container_of(call.session)}"
+        who = foreign(call.session) or f"{call.caller}/{_container_of(call.session)}"
         holders: dict[Token, Holder] = {}
         for resource in self._table.named(resources):
             if (holder := resource.holder) is not None:
                 holders[Token(self._own.epoch, resource.live)] = holder
         for token, holder in holders.items():
             self._ask(holder, token, who, reason)
-        return [f"{holder.identity}/{holder.container}" for holder in holders.values()]
+        free = [resource for resource in self._table.named(resources) if resource.holder is None]
+        return [holder.owner for holder in holders.values()] + self._borrowed.request_release(call, free, reason)
 
     @service
     def release_requested(self, token: Token, who: str, reason: str) -> bool:
@@ -119,15 +145,15 @@ class LockServices:
         found = self._table.named(resources)
         for resource in found:
             if resource.holder is not None and not _is_for(resource.holder, call):
-                owner = f"{resource.holder.identity}/{resource.holder.container}"
                 raise LockedByOther(
                     resources=(resource.name,),
-                    owner=owner,
+                    owner=resource.holder.owner,
                     purpose=resource.holder.purpose,
                     since=resource.holder.since,
                 )
         self._require(call, "administer", [resource.name for resource in found if resource.holder is None])
-        return [resource.name for resource in found if _resumed(resource)]
+        there = self._borrowed.resume(call, found)
+        return [resource.name for resource in found if _resumed(resource) or resource.name in there]
 
     def _require(self, call: CallContext, verb: str, resources: Iterable[str]) -> None:
         """Of each resource one service that uses it is enough for the caller to have the right over.

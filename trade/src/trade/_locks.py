@@ -53,6 +53,7 @@ class LockTable:
         self._epoch = epoch
         self._container = container
         self._stop: Stop = _leave_it
+        self._told: Callable[[int, str], None] = lambda _number, _reason: None
         self._clock = clock
         self._resources: dict[str, tuple[Resource, int]] = {}
         """By name, with the number of services that use it."""
@@ -77,6 +78,10 @@ class LockTable:
     def stop_with(self, stop: Stop) -> None:
         """How to stop what moves under a lock that is lost."""
         self._stop = stop
+
+    def tell_of_losses(self, told: Callable[[int, str], None]) -> None:
+        """Have this called, and not kept waiting, with each grant that is taken away, and why."""
+        self._told = told
 
     # --- resources
 
@@ -276,6 +281,11 @@ class LockTable:
             return self._ended.get(number, "it ended long ago")
         return "" if grant.until > self._clock() else _LEASE_ENDED
 
+    def may_use(self, number: int, identity: str) -> bool:
+        """Whether a grant holds and somebody of that identity may show it."""
+        grant = self._grants.get(number)
+        return grant is not None and (identity == grant.holder.identity or identity in grant.holder.delegates)
+
     def release(self, number: int, identity: str) -> bool:
         """Give it back; what its owner left moving goes on, and the next one waits for it. Returns whether it held."""
         with self._changed:
@@ -295,6 +305,7 @@ class LockTable:
             self._end(grant, reason)
             for resource in busy:
                 resource.pending = _STOPPING
+        self._told(number, reason)
         try:
             self._stop(busy, reason, self._stopped)
         except Exception as error:  # noqa: BLE001 - other locks depend on this very thread
@@ -348,7 +359,7 @@ class LockTable:
             left_s=max(0.0, grant.until - now),
             uses=sum(resource.uses for resource in grant.resources),
             last_use=max(resource.used_at for resource in grant.resources),
-            waiting=tuple(f"{one.identity}/{one.container}" for one in waiting),
+            waiting=tuple(one.owner for one in waiting),
         )
 
     # --- its end

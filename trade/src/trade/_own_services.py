@@ -1,6 +1,7 @@
 """The one provider of the middleware's own functions: what is in group ``trade`` of every container."""
 
 from trade._access import Access
+from trade._borrowed import Borrowed
 from trade._context import current_call
 from trade._estop_line import EstopReport
 from trade._estopping import LIMIT_S, Estopping
@@ -29,13 +30,14 @@ class OwnServices(SystemServices, LockServices, NotificationServices, HookServic
         estopping: Estopping,
         access: Access,
         groups: GroupsOf,
+        borrowed: Borrowed,
         notifier: Notifier,
         registry: Registry,
         hooks: Hooks,
         home: Home,
     ) -> None:
         SystemServices.__init__(self, system)
-        LockServices.__init__(self, locks, own, ask, asked, access, groups)
+        LockServices.__init__(self, locks, own, ask, asked, access, groups, borrowed)
         NotificationServices.__init__(self, notifier, registry, home, access)
         HookServices.__init__(self, hooks, home, access)
         self._estopping = estopping

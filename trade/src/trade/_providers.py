@@ -109,14 +109,10 @@ class Providers:
         Raises:
             ConfigurationError, AccessDenied: see `Container.register`.
         """
-        kind = type(provider).__qualname__
-        domain = domain_of(groups)
+        kind, domain = type(provider).__qualname__, domain_of(groups)
         if name != PROVIDER:
             self._access.require_offer(self._own.identity, groups, kind)
-        with self._lock:
-            self._require_new(provider)
-            self._counter += 1
-            chunk = name or f"{as_chunk(type(provider).__name__)[:60]}-{self._counter}"
+        chunk = name or self._new_chunk(provider, type(provider).__name__)
         place = f"{domain}/{chunk}"
         services = self._services_of(provider, groups, implements, place)
         info = ProviderInfo(
@@ -131,13 +127,42 @@ class Providers:
             members={group: tuple(names) for group, names in getattr(provider, "members", {}).items()},
             estops=getattr(provider, "open_estops", ()) if domain == DOMAIN else (),
         )
+        self._host(place, _Registered(provider, services, tuple(implements), info))
+        return [ServiceKey(self._own, domain, chunk, service) for service in services]
+
+    def pass_on(
+        self, provider: object, info: ProviderInfo, make: Callable[[str], dict[str, LocalService]]
+    ) -> tuple[str, str]:
+        """Host what stands for a provider of another system, described by its own words. Returns domain and name.
+
+        Args:
+            provider: stands for it; kept until it is removed.
+            info: what is told of it.
+            make: its services, for the place (``domain/provider``) that it gets.
+
+        Raises:
+            ConfigurationError: what it uses is another one's here.
+            AccessDenied: this container may not offer it in these groups.
+        """
+        self._access.require_offer(self._own.identity, info.groups, info.kind)
+        domain, chunk = domain_of(info.groups), self._new_chunk(provider, info.kind)
+        place = f"{domain}/{chunk}"
+        self._host(place, _Registered(provider, make(place), (), info))
+        return domain, chunk
+
+    def _new_chunk(self, provider: object, kind: str) -> str:
+        with self._lock:
+            self._require_new(provider)
+            self._counter += 1
+            return f"{as_chunk(kind)[:60]}-{self._counter}"
+
+    def _host(self, place: str, registered: _Registered) -> None:
         with self._announcing:
             with self._lock:
-                self._require_new(provider)
-                self._names[id(provider)] = place
-                self._hosted[place] = _Registered(provider, services, tuple(implements), info)
-            self._announce(place, info)
-        return [ServiceKey(self._own, domain, chunk, service) for service in services]
+                self._require_new(registered.provider)
+                self._names[id(registered.provider)] = place
+                self._hosted[place] = registered
+            self._announce(place, registered.info)
 
     def _require_new(self, provider: object) -> None:
         if id(provider) in self._names:

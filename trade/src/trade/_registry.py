@@ -114,6 +114,10 @@ class Registry:
     def listen(self, listener: Callable[[Change], None]) -> None:
         self._listeners.append(listener)
 
+    def ignore(self, listener: Callable[[Change], None]) -> None:
+        """Tell it no more."""
+        self._listeners.remove(listener)
+
     def between_changes(self, action: Callable[[], None]) -> None:
         """Do something that no change may come between; listeners are told before or after it."""
         with self._telling:

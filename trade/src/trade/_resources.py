@@ -13,6 +13,7 @@ from typing import Any, Final, NamedTuple
 from msgspec import Struct
 
 from trade._context import CallContext, running
+from trade._session import foreign
 from trade._wire import Token
 from trade.errors import LockedByOther, LockLost, MotionStopped, SessionEnded, Stopped
 
@@ -33,6 +34,11 @@ class Holder(Struct, frozen=True):
     since: float
     """``time.time()`` when it was granted."""
     delegates: tuple[str, ...] = ()
+
+    @property
+    def owner(self) -> str:
+        """``identity/container``, or ``clinic/anna via door`` for a client of another system."""
+        return foreign(self.session) or f"{self.identity}/{self.container}"
 
 
 class Latch(NamedTuple):
@@ -190,7 +196,7 @@ def locked(resource: Resource, holder: Holder | None, session: str = "") -> Lock
         return LockedByOther(resources=(resource.name,), owner="somebody")
     return LockedByOther(
         resources=(resource.name,),
-        owner=f"{holder.identity}/{holder.container}",
+        owner=holder.owner,
         purpose=holder.purpose,
         since=holder.since,
         own=holder.session == session,

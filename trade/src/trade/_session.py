@@ -9,8 +9,20 @@ from trade._transport import Presence
 from trade._wire import Address
 from trade.errors import SessionEnded
 
+__all__ = ["Session", "foreign", "speaking"]
+
 speaking: ContextVar["Session | None"] = ContextVar("trade_session", default=None)
 """The session that calls are made in now; none: the container's own."""
+
+
+def foreign(session: str) -> str:
+    """``clinic/anna via door``, if that session is one of another system's client; else nothing.
+
+    ``door`` says so, and answers for it: nobody here can see who is behind.
+    """
+    identity, *chunks = session.split("/")
+    system, crossed, client = chunks[2].partition(":") if len(chunks) == 3 else ("", "", "")
+    return f"{system}/{client.rpartition('.')[0]} via {identity}" if crossed else ""
 
 
 class Session:
