@@ -339,6 +339,18 @@ def test_S08_a_stop_voids_what_was_admitted_before_it_however_the_lock_stands(ta
         table.call("a", [token], call_id=2)
 
 
+def test_S08_what_is_let_in_while_a_strangers_stop_is_under_way_is_void(table: Table) -> None:
+    let_in: list[Permit] = []
+
+    def asking() -> Iterator[str]:
+        let_in.append(table.call("a", session="mover"))
+        yield "stranger"
+
+    table.resources["a"].stop("stranger", asking())
+    with pytest.raises(MotionStopped):
+        let_in[0].gate()
+
+
 def test_admitting_and_emptying_at_the_same_moment_never_both_succeed(table: Table) -> None:
     """A call that passes while a lock is granted is either waited for or refused."""
     rounds, both = 300, 0

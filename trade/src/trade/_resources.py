@@ -107,11 +107,11 @@ class Resource:
             sessions: of who stops; none: whoever drives the resource, which never latches.
             reason: why.
         """
-        self.stops = _stop_numbers()  # not += 1: of two at once one would be lost
         asking = set(sessions)
         used = self.holder is not None or self.busy or self.movers
         if asking and used and not self._is_of(asking):
-            self.latch = Latch(by, reason)
+            self.latch = Latch(by, reason)  # first: who is let in under the new number has seen it
+        self.stops = _stop_numbers()  # not += 1: of two at once one would be lost
 
     def _is_of(self, asking: set[str]) -> bool:
         """Whether all that moves it belongs to these, or its lock does."""
