@@ -2,6 +2,7 @@
 
 import contextlib
 import gc
+import sys
 import tracemalloc
 import weakref
 from collections import Counter
@@ -258,6 +259,19 @@ def test_a_local_call_allocates_little_and_keeps_nothing(here: Container) -> Non
         assert blocks() - before <= MOST_BLOCKS_KEPT
 
 
+@pytest.mark.parametrize(("name", "most"), [("straight", 12), ("move", 20), ("where_is", 20)])
+def test_a_local_call_that_inherits_nothing_runs_few_functions(here: Container, name: str, most: int) -> None:
+    class Direct(Arm):
+        @service(strict=False)
+        def straight(self, a: float, b: float, c: float) -> float:
+            return a
+
+    handles = {handle.name: handle for handle in here.register(Direct(), "robot")}
+    call = CALL["move" if name == "straight" else name]
+    call(handles[name])
+    assert functions_run(lambda: call(handles[name])) <= most
+
+
 def test_large_arguments_are_copied_once_into_their_message() -> None:
     data = bytes(MANY_BYTES)
     info = ServiceInfo(name="keep", signature="keep(data: bytes)")
@@ -336,6 +350,17 @@ def peak_bytes(action: Callable[[], object]) -> int:
     before, _ = tracemalloc.get_traced_memory()
     action()
     return tracemalloc.get_traced_memory()[1] - before
+
+
+def functions_run(action: Callable[[], object]) -> int:
+    """How many functions of Python it runs, on this thread, itself left out."""
+    run: list[str] = []
+    sys.setprofile(lambda frame, event, _: run.append(frame.f_code.co_name) if event == "call" else None)
+    try:
+        action()
+    finally:
+        sys.setprofile(None)
+    return len(run) - 2  # the action and what it calls here
 
 
 def blocks() -> int:

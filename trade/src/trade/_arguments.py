@@ -21,12 +21,13 @@ def encode_arguments(
 
     Raises InvalidArgument, NotSerialisable, TooLarge.
     """
-    values = given(info, service, args, kwargs)
+    values: Any = args if not kwargs else _by_name(info, service, args, kwargs)
     try:
         data = codec.encode(values)
     except (TypeError, ValueError, OverflowError, RecursionError) as bad:
         raise _unsendable(codec, info, service, values, bad) from None
-    _check_size(service, len(data))
+    if len(data) > MOST_BYTES:
+        raise _too_large(service, len(data))
     return data
 
 
@@ -47,13 +48,13 @@ def encode_call(codec: Codec, info: ServiceInfo, service: str, call: Call) -> by
         raise _unsendable(codec, info, service, values, bad) from None
     if len(data) > MOST_BYTES:
         frame = len(encode_message(structs.replace(call, args=EMPTY))) - len(memoryview(EMPTY))
-        _check_size(service, len(data) - frame)
+        if len(data) - frame > MOST_BYTES:
+            raise _too_large(service, len(data) - frame)
     return data
 
 
-def _check_size(service: str, size: int) -> None:
-    if size > MOST_BYTES:
-        raise TooLarge(service=service, what="arguments", size_bytes=size, limit_bytes=MOST_BYTES)
+def _too_large(service: str, size: int) -> TooLarge:
+    return TooLarge(service=service, what="arguments", size_bytes=size, limit_bytes=MOST_BYTES)
 
 
 def _by_name(info: ServiceInfo, service: str, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> dict[str, Any]:

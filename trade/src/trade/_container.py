@@ -29,7 +29,7 @@ from trade._hooking import Hooking
 from trade._hooks import Hooks
 from trade._hosting import Hosting
 from trade._inherited import InheritedLock
-from trade._invoke import LocalTarget, RemoteTarget, container_closed, new_request
+from trade._invoke import LocalTarget, RemoteTarget, container_closed
 from trade._joining import join
 from trade._locking import Locking
 from trade._locks import LockTable
@@ -38,6 +38,7 @@ from trade._own_services import OwnServices
 from trade._providers import Providers
 from trade._reach import Reach
 from trade._registry import Change, Record, Registry
+from trade._request import new_request
 from trade._resources import Holder
 from trade._session import Session
 from trade._settings import Settings
@@ -281,9 +282,11 @@ class Container(Hosting, Hooking, Guarding, Bordering):
 
     def invoke(self, handle: Handle, args: tuple[Any, ...], kwargs: dict[str, Any], deadline_s: float | None) -> Any:
         """Call a service and wait; what ``handle(...)`` does."""
-        request = new_request(deadline_s)
         target = self._targets.get(handle.key)
-        return (target or self._new_target(handle)).invoke(args, kwargs, request)
+        if target is not None:
+            return target.call(args, kwargs, deadline_s)
+        request = new_request(deadline_s)
+        return self._new_target(handle).invoke(args, kwargs, request)
 
     def begin(self, handle: Handle, args: tuple[Any, ...], kwargs: dict[str, Any], deadline_s: float | None) -> Run:
         """Call a service without waiting; what ``handle.start(...)`` does."""

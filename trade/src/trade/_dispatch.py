@@ -127,29 +127,29 @@ class LocalService:
 
     def call_bare(self, args: Sequence[Any], kwargs: dict[str, Any], context: CallContext) -> Any:
         """The same without what is called before and after it."""
-        if not self.resources:
-            return self.run_admitted(args, kwargs, context)
-        if self.effect == "read":  # open to all, unless it was locked by its own handle
-            for resource in self.resources:
-                resource.check_lock(context.tokens, context.caller, context.session)
-            return self.run_admitted(args, kwargs, context)
-        if self.effect == "stop":
-            for resource in self.resources:
-                resource.stop(foreign(context.session) or context.caller, context.sessions)
+        if not self.resources or self.effect != "actuate":
+            self._look(context)
             return self.run_admitted(args, kwargs, context)
         permit = admitted(self.resources, context)
-        structs.force_setattr(context, "permit", permit)
         try:
             return self.run_admitted(args, kwargs, context)
         finally:
             permit.close()
             structs.force_setattr(context, "permit", None)
 
+    def _look(self, context: CallContext) -> None:
+        """What reads is open to all, unless it was locked by its own handle; what stops does so first."""
+        for resource in self.resources:
+            if self.effect == "stop":
+                resource.stop(foreign(context.session) or context.caller, context.sessions)
+            elif resource.guarded or context.behalf is not None:
+                resource.check_lock(context.tokens, context.caller, context.session)
+
     def run_admitted(self, args: Sequence[Any], kwargs: dict[str, Any], context: CallContext) -> Any:
         """Call with the arguments as they are and nothing more asked: its resources are its own, or it stops them."""
         token = running.set(context)
         try:
-            result = self.method(*args, **kwargs)
+            result = self.method(*args, **kwargs) if kwargs else self.method(*args)
             return self._loop.complete(result, context) if type(result) is _COROUTINE else result
         except (SystemExit, GeneratorExit, asyncio.CancelledError) as error:  # the provider's, not this thread's
             raise unpack_error(pack_error(error), self.label) from error

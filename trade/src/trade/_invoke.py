@@ -8,12 +8,12 @@ from time import monotonic_ns
 from typing import Any, Final
 
 import msgspec
-from msgspec import Raw, Struct
+from msgspec import Raw
 
 from trade._arguments import encode_arguments, encode_call, given
 from trade._calls import Caller
 from trade._codec import Codec
-from trade._context import CallContext, Held, handed_down, holding, running
+from trade._context import CallContext, handed_down, holding, running
 from trade._dispatch import LocalService
 from trade._failures import unpack_error
 from trade._handle import Run
@@ -21,11 +21,12 @@ from trade._ongoing import Ongoing
 from trade._peer import Peer
 from trade._records import type_from_schema
 from trade._registry import Record
+from trade._request import DEFAULT_DEADLINE_S, Request, in_ns, new_request
 from trade._schemas import read_schema
 from trade._serial import Serial, Turn
-from trade._session import Session, speaking
+from trade._session import speaking
 from trade._system import CLOCK, DOMAIN, PROVIDER
-from trade._wire import EMPTY_ARGUMENTS, Address, Behalf, Call, ErrorInfo, Reply, ServiceInfo, Status, Token
+from trade._wire import EMPTY_ARGUMENTS, Address, Call, ErrorInfo, Reply, ServiceInfo, Status
 from trade.errors import (
     Busy,
     Cancelled,
@@ -40,84 +41,11 @@ from trade.errors import (
 
 _logger = logging.getLogger("trade")
 
-DEFAULT_DEADLINE_S: Final = 10.0
-_DEFAULT_DEADLINE_NS: Final = int(DEFAULT_DEADLINE_S * 1e9)
-
-_NOBODY: Final = Behalf()
 _decode_error: Final = msgspec.msgpack.Decoder(ErrorInfo).decode
 
 
 _Taken = bytes | tuple[tuple[Any, ...], dict[str, Any]]
 """The arguments of a strict call, and those of one that goes straight through."""
-
-
-class Request(Struct, gc=False):
-    """One call on its way out: deadline and chain, inherited from the call that makes it."""
-
-    deadline_s: float
-    deadline_ns: int
-    chain: tuple[str, ...]
-    asked_s: float
-    """Without the outer call's deadline, which a stop does not heed: it is sent and waited for however late that is."""
-    asked_ns: int
-    outer: CallContext | None
-    """The call that makes it."""
-    around: tuple[Held, ...]
-    """The locks it is made under."""
-    client: Session | None
-    """For whom it is made; none: the container itself."""
-
-    def session(self, own: Address) -> str:
-        """The client's session, if that container acts for one; else nothing.
-
-        Raises:
-            SessionEnded: the client is gone.
-        """
-        if self.client is None or self.client.owner != own:
-            return ""
-        self.client.check()
-        return self.client.name
-
-    def behalf(self, effect: str, own: Address) -> Behalf | None:
-        """What the call inherits; the locks around it unless it stops, which needs none.
-
-        Raises:
-            LockLost: it actuates, and would do so under a lock that holds no more.
-        """
-        outer, around = self.outer, self.around
-        if own in handed_down:
-            around = (handed_down[own], *around)
-        if outer is None and not around:
-            return None
-        locks = [lock for lock in around if lock.owner == own]
-        tokens: tuple[Token, ...] = ()
-        if effect != "stop":
-            tokens = tuple(token for lock in locks if effect == "actuate" or lock.held for token in lock.tokens())
-        if outer is None:
-            return Behalf((), (), tokens) if tokens else None
-        inherited = outer.behalf or _NOBODY
-        if effect != "stop":
-            tokens += inherited.tokens
-        return Behalf(outer.sessions, (outer.id, *inherited.calls), tokens)
-
-    def ignore_outer_deadline(self) -> None:
-        self.deadline_s, self.deadline_ns = self.asked_s, self.asked_ns
-
-
-def new_request(deadline_s: float | None) -> Request:
-    """A call that begins now."""
-    now, outer, around, client = monotonic_ns(), running.get(), holding.get(), speaking.get()
-    if deadline_s is None:
-        asked_s, asked_ns = DEFAULT_DEADLINE_S, now + _DEFAULT_DEADLINE_NS
-    else:
-        asked_s, asked_ns = deadline_s, now + int(deadline_s * 1e9)
-    if outer is None:
-        return Request(asked_s, asked_ns, (), asked_s, asked_ns, None, around, client)
-    chain = (*outer.chain, outer.service)
-    if outer.expires_ns is None or outer.expires_ns >= asked_ns:
-        return Request(asked_s, asked_ns, chain, asked_s, asked_ns, outer, around, client)
-    left_s = max(0.0, (outer.expires_ns - now) / 1e9)
-    return Request(left_s, outer.expires_ns, chain, asked_s, asked_ns, outer, around, client)
 
 
 class LocalTarget:
@@ -130,16 +58,27 @@ class LocalTarget:
         self._codec = codec
         self._label = service.label
         self._is_stop = service.effect == "stop"
-        self._straight = not service.strict and service.serial is None
         self._effect = service.effect
         self._own = own
         self._identity = own.identity
         self._session = session
         self._new_id = new_id
 
+    def call(self, args: tuple[Any, ...], kwargs: dict[str, Any], deadline_s: float | None) -> Any:
+        """A call that begins now; most inherit nothing and wait for nothing, and need no request."""
+        inherits = running.get() is not None or speaking.get() is not None or holding.get() or handed_down
+        if inherits or self._service.serial is not None:
+            return self.invoke(args, kwargs, new_request(deadline_s))
+        expires_ns = None if self._is_stop else monotonic_ns() + in_ns(deadline_s)
+        context = CallContext(self._new_id(), self._label, self._identity, self._session, expires_ns)
+        if not self._service.strict:
+            return self._service.call(args, kwargs, context)
+        taken = self._taken(args, kwargs)
+        self._check_time(expires_ns, deadline_s or DEFAULT_DEADLINE_S)
+        return self._copied(taken, context)
+
     def invoke(self, args: tuple[Any, ...], kwargs: dict[str, Any], request: Request) -> Any:
-        if self._straight:
-            return self._service.call(args, kwargs, self._context(request, None))
+        """A call that was asked for already."""
         taken = self._taken(args, kwargs) if self._service.strict else (args, kwargs)
         if self._service.serial is None:
             return self._run(taken, request, None)
@@ -189,30 +128,31 @@ class LocalTarget:
         context = self._context(request, ongoing)
         if isinstance(taken, tuple):
             return service.call(*taken, context)
-        if service.signature.has_secrets:
-            return self._discreet(taken, context)
         return self._copied(taken, context)
 
     def _context(self, request: Request, ongoing: Ongoing | None) -> CallContext:
         expires_ns = None if self._is_stop else request.deadline_ns
+        self._check_time(expires_ns, request.deadline_s)
+        behalf, session = None, self._session
+        if request.inherited is not None:
+            behalf, client = request.presence(self._effect, self._own)
+            session = client or session
+        call_id, chain = self._new_id(), request.chain
+        return CallContext(call_id, self._label, self._identity, session, expires_ns, chain, ongoing, behalf)
+
+    def _check_time(self, expires_ns: int | None, deadline_s: float) -> None:
         if expires_ns is not None and monotonic_ns() >= expires_ns:
-            raise DeadlineExceeded(service=self._label, deadline_s=request.deadline_s)
-        behalf, session = request.behalf(self._effect, self._own), request.session(self._own) or self._session
-        return CallContext(
-            self._new_id(), self._label, self._identity, session, expires_ns, request.chain, ongoing, behalf
-        )
+            raise DeadlineExceeded(service=self._label, deadline_s=deadline_s)
 
     def _copied(self, raw: bytes, context: CallContext) -> Any:
         service = self._service
-        return service.signature.copy_result(service.label, service.run(raw, context))
-
-    def _discreet(self, raw: bytes, context: CallContext) -> Any:
-        """An error as it would come over the wire: without what is secret."""
         try:
-            return self._copied(raw, context)
-        except Exception as error:  # noqa: BLE001 - whatever a provider raises
-            masked = unpack_error(self._service.failure(error, raw), self._service.label)
-        raise masked
+            return service.signature.copy_result(service.label, service.run(raw, context))
+        except Exception as error:  # whatever a provider raises
+            if not service.signature.has_secrets:
+                raise
+            masked = unpack_error(service.failure(error, raw), service.label)
+        raise masked  # as it would come over the wire: without what is secret
 
 
 class RemoteTarget:
@@ -231,7 +171,12 @@ class RemoteTarget:
         self._decode = _result_decoder(codec, record.info)
         self._decode_any = codec.decoder(Any)
 
+    def call(self, args: tuple[Any, ...], kwargs: dict[str, Any], deadline_s: float | None) -> Any:
+        """A call that begins now."""
+        return self.invoke(args, kwargs, new_request(deadline_s))
+
     def invoke(self, args: tuple[Any, ...], kwargs: dict[str, Any], request: Request) -> Any:
+        """A call that was asked for already."""
         values = self._values(args, kwargs, request)
         if not self._may_go:
             reply = self._ask(self._clock, CLOCK, EMPTY_ARGUMENTS, None, request)
@@ -292,8 +237,8 @@ class RemoteTarget:
         return None if self._is_stop else self._peer.expiry_ns(request.deadline_ns)
 
     def _ask(self, publisher: Any, service: str, args: Any, expires_ns: int | None, request: Request) -> Reply:
-        own, chain = self._caller.own, request.chain
-        behalf, session = request.behalf(self._info.effect, own), request.session(own)
+        chain = request.chain
+        behalf, session = request.presence(self._info.effect, self._caller.own)
         return self._caller.ask(
             self._peer, publisher, service, args, request.deadline_ns, expires_ns, chain, behalf, self._message, session
         )
@@ -309,8 +254,8 @@ class RemoteTarget:
         on_progress: Callable[[Reply], None] | None = None,
     ) -> int:
         peer, deadline_ns, chain = self._peer, request.deadline_ns, request.chain
-        own, encode = self._caller.own, self._message
-        behalf, session = request.behalf(self._info.effect, own), request.session(own)
+        encode = self._message
+        behalf, session = request.presence(self._info.effect, self._caller.own)
         return self._caller.start(
             peer, publisher, service, args, deadline_ns, expires_ns, chain, then, on_progress, behalf, encode, session
         )

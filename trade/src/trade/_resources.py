@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Generator, Iterable, Sequence
 from typing import Any, Final, NamedTuple
 
-from msgspec import Struct
+from msgspec import Struct, structs
 
 from trade._context import CallContext, running
 from trade._session import foreign
@@ -98,12 +98,17 @@ class Resource:
     @moving.setter
     def moving(self, value: bool) -> None:
         was, self._moving = self._moving, value
-        if was and not value and self._rested is not None:
-            self._rested()
+        if was and not value:
+            self.tell_rest()
 
     def on_rest(self, tell: Callable[[], None]) -> None:
-        """Have this called whenever it comes to rest or a call on it ends."""
+        """Have this called whenever it comes to rest, and when a call on it ends while it is being emptied."""
         self._rested = tell
+
+    def tell_rest(self) -> None:
+        """Have those who wait for it look again."""
+        if self._rested is not None:
+            self._rested()
 
     def stop(self, by: str, sessions: Iterable[str] = (), reason: str = "stop was called") -> None:
         """Void everything admitted so far; by a session other than the motion's own or the lock owner's, latch (S08).
@@ -113,11 +118,11 @@ class Resource:
             sessions: of who stops; none: whoever drives the resource, which never latches.
             reason: why.
         """
-        self.stops = _stop_numbers()  # not += 1: of two at once one would be lost
         asking = set(sessions)
         used = self.holder is not None or self.busy or self.movers
         if asking and used and not self._is_of(asking):
-            self.latch = Latch(by, reason)
+            self.latch = Latch(by, reason)  # first: who is let in under the new number has seen it
+        self.stops = _stop_numbers()  # not += 1: of two at once one would be lost
 
     def _is_of(self, asking: set[str]) -> bool:
         """Whether all that moves it belongs to these, or its lock does."""
@@ -135,6 +140,11 @@ class Resource:
     def busy(self) -> bool:
         """Whether something moves it or is about to."""
         return self._moving or bool(self.calls)
+
+    @property
+    def guarded(self) -> bool:
+        """Whether somebody has it or is about to; asked in this order, as a grant holds before it ceases to pend."""
+        return self.pending is not None or self.live != 0
 
     def resume(self) -> None:
         """Let it move again after a stop that latched, and be granted again after one that failed."""
@@ -160,7 +170,7 @@ class Resource:
         Raises:
             LockedByOther, LockLost: see `check`.
         """
-        live, holder, shown = self.live, self.holder, False
+        pending, live, holder, shown = self.pending, self.live, self.holder, False  # in the order of `guarded`
         for token in tokens:
             if token.epoch == self.epoch:
                 if why := self.over(token.number):
@@ -170,8 +180,8 @@ class Resource:
             if not shown or holder is None or not (caller == holder.identity or caller in holder.delegates):
                 raise locked(self, holder, session)
             self.uses, self.used_at = self.uses + 1, time.time()
-        elif self.pending is not None:
-            raise locked(self, self.pending, session)
+        elif pending is not None:
+            raise locked(self, pending, session)
 
     def __repr__(self) -> str:
         return f"<Resource {self.name}>"
@@ -203,19 +213,15 @@ def locked(resource: Resource, holder: Holder | None, session: str = "") -> Lock
     )
 
 
-class Permit:
-    """What a call was admitted under, for each of its resources: the grant and the number of stops."""
+class Permit(Struct, eq=False):
+    """What a call was admitted under."""
 
-    __slots__ = ("call_id", "cancel", "fences", "sessions")
-
-    def __init__(
-        self, resources: Sequence[Resource], call_id: int, sessions: tuple[str, ...], cancel: Callable[[], None] | None
-    ) -> None:
-        self.call_id: Final = call_id
-        self.sessions: Final = sessions
-        self.cancel: Final = cancel
-        """Asks what runs under it to end."""
-        self.fences: Final = [(resource, resource.live, resource.stops) for resource in resources]
+    call_id: int
+    sessions: tuple[str, ...]
+    cancel: Callable[[], None] | None
+    """Asks what runs under it to end."""
+    fences: list[tuple[Resource, int, int]] = []
+    """Of each of its resources the grant and the number of stops."""
 
     def gate(self) -> None:
         """The last look before bytes go out.
@@ -244,13 +250,12 @@ class Permit:
         """The call has ended."""
         for resource, _, _ in self.fences:
             resource.calls.pop(self.call_id, None)
-            if resource._rested is not None:  # pyright: ignore[reportPrivateUsage] - two halves of one thing
-                resource._rested()  # pyright: ignore[reportPrivateUsage]
+            if resource.pending is not None:
+                resource.tell_rest()
 
 
 def admit(
     resources: Sequence[Resource],
-    *,
     call_id: int,
     caller: str,
     tokens: Sequence[Token],
@@ -259,21 +264,22 @@ def admit(
 ) -> Permit:
     """Let a call begin on its resources; it is counted until the permit is closed.
 
-    It is counted first and checked then, so that whoever empties a resource either sees it or has refused it.
+    It is counted first, what holds is noted then, and checked last: whoever empties a resource either sees it or has
+    refused it, and whatever comes after the check voids it at its gate.
 
     Raises:
         Stopped, LockedByOther, LockLost: see `Resource.check`; nothing is counted then.
         SessionEnded: one for whom it is made is not there any more; likewise.
     """
-    permitted = Permit(resources, call_id, sessions, cancel)
-    for resource in resources:
-        resource.calls[call_id] = permitted
+    permitted = Permit(call_id, sessions, cancel)
     try:
         for resource in resources:
-            resource.check(tokens, caller, sessions[0] if sessions else "")
+            resource.calls[call_id] = permitted
+            permitted.fences.append((resource, resource.live, resource.stops))
+            if tokens or resource.guarded or resource.latch is not None or resource.estop is not None:
+                resource.check(tokens, caller, sessions[0] if sessions else "")
             if (ended := resource.gone(sessions)) is not None:
                 raise ended
-        permitted.gate()
     except BaseException:
         permitted.close()
         raise
@@ -283,16 +289,14 @@ def admit(
 
 
 def admitted(resources: Sequence[Resource], context: CallContext) -> Permit:
-    """Admit a call that came through the middleware."""
-    ongoing = context.ongoing
-    return admit(
-        resources,
-        call_id=context.id,
-        caller=context.caller,
-        tokens=context.tokens,
-        sessions=context.sessions,
-        cancel=None if ongoing is None else ongoing.cancel,
-    )
+    """Admit a call that came through the middleware, which has the permit then."""
+    ongoing, behalf = context.ongoing, context.behalf
+    cancel = None if ongoing is None else ongoing.cancel
+    tokens = () if behalf is None else behalf.tokens
+    sessions = (context.session,) if behalf is None else (context.session, *behalf.sessions)
+    permitted = admit(resources, context.id, context.caller, tokens, sessions, cancel)
+    structs.force_setattr(context, "permit", permitted)
+    return permitted
 
 
 @contextlib.contextmanager
@@ -311,7 +315,7 @@ def permit(resources: Sequence[Resource]) -> Generator[Permit, None, None]:
         yield own
         return
     sessions = () if call is None else call.sessions
-    fresh = admit(resources, call_id=_permit_ids(), caller="", tokens=(), sessions=sessions, cancel=None)
+    fresh = admit(resources, _permit_ids(), "", (), sessions, None)
     try:
         yield fresh
     finally:

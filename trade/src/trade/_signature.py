@@ -41,6 +41,8 @@ class Signature:
         kinds = {parameter.name: hints.get(parameter.name, Any) for parameter in parameters}
         returns = hints.get("return", Any)
         self._secrets = frozenset(name for name, kind in kinds.items() if is_secret(kind))
+        self.has_secrets: Final = bool(self._secrets)
+        """Whether an argument is secret."""
         self._codec = codec
         self._decode_any = codec.decoder(Any)
         self._positional = [p.name for p in parameters if p.kind in _POSITIONAL]
@@ -48,6 +50,7 @@ class Signature:
         self._all_given = not self._keyword_only and all(p.default is p.empty for p in parameters)
         self._decode_array, self._decode_map = self._decoders(where, parameters, kinds)
         self._must_be_finite = mark.effect != "read" and any(_mentions_float(kind) for kind in kinds.values())
+        self._is_finite = math.isfinite if all(_is_number(kind) for kind in kinds.values()) else _finite
         self._result_is_plain = returns if returns is Any or (isinstance(returns, type) and returns in _PLAIN) else None
         self._result_is_itself = returns if returns in _SAME_WHEN_COPIED else None
         self._decode_result = described(where, "its result", lambda: codec.decoder(returns))
@@ -71,10 +74,11 @@ class Signature:
     def decode(self, service: str, raw: Raw | bytes) -> tuple[Sequence[Any], dict[str, Any]]:
         """Validate arguments from the wire. Raises InvalidArgument; no code of the provider has run then."""
         try:
-            args, kwargs = self._by_name(raw) if memoryview(raw)[0] in _MAP_HEADS else (self._by_place(raw), {})
+            head = raw[0] if type(raw) is bytes else memoryview(raw)[0]
+            args, kwargs = self._by_name(raw) if head in _MAP_HEADS else (self._by_place(raw), {})
         except (msgspec.ValidationError, msgspec.DecodeError) as bad:
             raise self._explain(service, str(bad), raw) from None
-        if self._must_be_finite and not (all(map(_finite, args)) and (not kwargs or _finite(kwargs))):
+        if self._must_be_finite and not (all(map(self._is_finite, args)) and (not kwargs or _finite(kwargs))):
             raise self._not_finite(service, args, kwargs)
         return args, kwargs
 
@@ -140,11 +144,6 @@ class Signature:
     def copy_progress(self, service: str, value: Any) -> Any:
         """The same as a caller on the other side of the wire would get it."""
         return self._decode_any(self.encode_progress(service, value))
-
-    @property
-    def has_secrets(self) -> bool:
-        """Whether an argument is secret."""
-        return bool(self._secrets)
 
     def named(self, args: Sequence[Any], kwargs: Mapping[str, Any]) -> dict[str, Any]:
         """Arguments by name, for everybody's eyes."""
@@ -219,6 +218,11 @@ def _parameters(where: str, function: Callable[..., Any]) -> list[inspect.Parame
             problem = f"argument {name!r} has no type hint; write {name}: float, say, or {name}: Any to take anything"
             raise ConfigurationError(where=where, problem=problem)
     return every
+
+
+def _is_number(kind: Any) -> bool:
+    """Whether it takes numbers only, limited or not."""
+    return getattr(kind, "__origin__", kind) in (float, int, bool)
 
 
 def _mentions_float(kind: Any) -> bool:
