@@ -2,12 +2,13 @@
 
 import threading
 from collections.abc import Callable, Generator
+from contextlib import contextmanager
 from typing import Final, Protocol
 
 from trade import Permit
 from trade.errors import DeadlineExceeded, DeviceFault, TradeError
 
-__all__ = ["Device", "Gate", "PortLost", "Steps", "Work", "check_admitted"]
+__all__ = ["Device", "Gate", "NoAnswer", "PortLost", "Steps", "WireError", "Work", "check_admitted", "losing"]
 
 Steps = Generator[None, None, None]
 """Yields after each exchange on the wire, so that stops and cycles come in between."""
@@ -21,6 +22,30 @@ _TELL_S: Final = 0.1
 
 class PortLost(Exception):
     """The port itself is gone: unplugged, down, or never opened."""
+
+
+@contextmanager
+def losing(*troubles: type[Exception]) -> Generator[None, None, None]:
+    """Have these, which a library raises when its port is gone, become ``PortLost``."""
+    try:
+        yield
+    except TradeError:  # a gate's: some of them are OSErrors, too
+        raise
+    except troubles as gone:
+        raise PortLost(str(gone)) from None
+
+
+class WireError(Exception):
+    """An exchange with a device failed."""
+
+
+class NoAnswer(WireError):
+    """Nothing came within the time that was whole and belonged to the question."""
+
+    def __init__(self, device_id: int, waited_s: float) -> None:
+        super().__init__(f"id {device_id} did not answer within {waited_s * 1e3:.0f} ms")
+        self.device_id = device_id
+        self.waited_s = waited_s
 
 
 class Device(Protocol):
