@@ -333,7 +333,7 @@ def test_S17_a_provider_that_moves_but_cannot_be_stopped_is_refused(start_contai
 
 
 def _enable(sim: DynamixelBus, device_id: int = 1, **goal: int) -> None:
-    servo = next(servo for servo in sim.servos if servo.device_id == device_id)
+    servo = next(servo for servo in sim.devices if servo.device_id == device_id)
     servo.write(64, b"\1", time.monotonic())
     for counts in goal.values():
         servo.write(112, (5).to_bytes(4, "little") + counts.to_bytes(4, "little"), time.monotonic())
