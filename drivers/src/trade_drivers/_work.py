@@ -1,9 +1,9 @@
 """What services ask of the thread that owns a bus: work that is waited for, and what lets a command pass."""
 
 import threading
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
-from typing import Final, Protocol
+from typing import Final, Generic, Protocol, TypeVar
 
 from trade import Permit
 from trade.errors import DeadlineExceeded, DeviceFault, TradeError
@@ -61,11 +61,15 @@ class Device(Protocol):
         ...
 
 
-class Work:
+_Device_co = TypeVar("_Device_co", bound=Device, covariant=True)
+
+
+class Work(Generic[_Device_co]):
     """Something that is waited for. As it stands it needs no leave: it ends motion."""
 
-    def __init__(self, device: Device) -> None:
-        self._device = device
+    def __init__(self, devices: Sequence[_Device_co]) -> None:
+        self.devices = tuple(devices)
+        """Those it touches, or waits for; at least one."""
         self._ended = threading.Event()
         self._error: TradeError | None = None
         self._steps: Steps | None = None
@@ -115,7 +119,7 @@ class Work:
             if tell is not None:
                 tell()
             if not alive():
-                self.finish(self._device.faulty("the thread of its bus has ended"))
+                self.finish(self.devices[0].faulty("the thread of its bus has ended"))
         if self._error is not None:
             raise self._error
 

@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Final, cast
 
+from trade_drivers._exchange import PROBE_NS
 from trade_drivers.cia402 import _jobs as jobs
 from trade_drivers.cia402 import _machine as machine
 from trade_drivers.cia402 import _table as table
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
 __all__ = ["DriveExchange"]
 
 _log = logging.getLogger(__name__)
-_PROBE_NS: Final = 500_000_000
 _BEATS_MISSED: Final = 3
 
 
@@ -148,7 +148,7 @@ class DriveExchange(Exchange):
             if axis.age_ns(now_ns) > self.stale_after_ns or now_ns - axis.beat_ns > self._deaf_ns:
                 _log.warning("%s is not heard on %s", axis.name, axis.bus)
                 axis.forget(now_ns)
-                axis.probe_at_ns = now_ns + _PROBE_NS
+                axis.probe_at_ns = now_ns + PROBE_NS
 
     def _shake_hands(self) -> None:
         """A set-point that was taken is taken back, so that the next one has an edge."""
@@ -162,7 +162,7 @@ class DriveExchange(Exchange):
         now_ns = self.clock()
         for axis in self.drives:
             if axis.silent and now_ns >= axis.probe_at_ns:
-                axis.probe_at_ns = now_ns + _PROBE_NS
+                axis.probe_at_ns = now_ns + PROBE_NS
                 self._readmit(axis)
                 return
 
