@@ -30,7 +30,7 @@ def settings(**registers: int) -> Callable[[DynamixelBus], None]:
 
     def prepare(bus: DynamixelBus) -> None:
         for name, value in registers.items():
-            bus.servos[0].table.set(name, value)
+            bus.devices[0].table.set(name, value)
 
     return prepare
 
@@ -130,7 +130,7 @@ def test_a_setting_that_is_wrong_for_us_is_named_with_the_right_one(
 
 
 def test_a_hardware_error_does_not_keep_the_others_from_being_attached(rig: Rig) -> None:
-    rig.plug(prepare=lambda bus: bus.servos[0].fail(0x20, time.monotonic()))
+    rig.plug(prepare=lambda bus: bus.devices[0].fail(0x20, time.monotonic()))
     robot = rig.attach()
     assert "overload" in robot.motor("neck.pan").state().fault
     robot.motor("neck.tilt").move_to(0.1)

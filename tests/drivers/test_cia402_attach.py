@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from drivers.legs import HIP, Leg, leg, rig
+from drivers.legs import HIP, KNEE, Leg, leg, rig
 from trade.errors import ConfigurationError
 from trade_drivers import load
 from trade_hil_sim import Absent, Mute, Unplug
@@ -39,6 +39,13 @@ def test_an_absent_drive_is_named_with_what_to_check(leg: Leg) -> None:
     text = refused(leg)
     for part in ('leg.toml: joint."leg.hip"', "node 1", leg.sim.port, "power", "bit rate", "terminations"):
         assert part in text
+
+
+def test_a_drive_that_answers_but_sends_no_heartbeat_is_not_taken_on(leg: Leg) -> None:
+    leg.sim.do(Mute(ids=(KNEE,), instruction="heartbeat"))
+    text = refused(leg)
+    assert 'leg.toml: joint."leg.knee": node 2 answers, but sends no heartbeat (1017h)' in text
+    assert not leg.frames("rpdo1")
 
 
 def test_a_single_lost_answer_is_forgiven(leg: Leg) -> None:

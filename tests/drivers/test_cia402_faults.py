@@ -16,6 +16,7 @@ from trade_hil_sim import (
     Command,
     Duplicate,
     Emergency,
+    Entry,
     Freeze,
     Heal,
     Jam,
@@ -105,6 +106,23 @@ def test_a_drive_that_is_not_heard_does_not_keep_the_others(leg: Leg, fault: Com
     assert knee.move_to(0.3) == pytest.approx(0.3, abs=0.01)
 
 
+@pytest.mark.parametrize("fault", [CASES[1].fault, CASES[2].fault], ids=["no measurements", "no heartbeat"])
+def test_a_drive_that_answers_but_is_not_heard_is_not_back_until_it_is(leg: Leg, fault: Command) -> None:
+    hip = leg.attach().motor("leg.hip")
+    axis = hip._axes[0]  # type: ignore[attr-defined]
+    leg.sim.do(fault)
+    wait_until(lambda: axis.silent, "it is given up")
+    mark, since_ns = written_now(), axis.silent_since_ns
+    wait_until(lambda: len(_set_up(leg, mark)) >= 3, "it was set up again and again")
+    assert (axis.silent, axis.silent_since_ns) == (True, since_ns)
+    with pytest.raises(DeviceFault, match="node 1 answers, but sends no"):
+        hip.move_to(0.1)
+    leg.sim.do(Heal())
+    wait_until(lambda: not _is_silent(hip.state), "it is back")
+    hip.enable()
+    assert hip.move_to(0.1) == pytest.approx(0.1, abs=0.01)
+
+
 @pytest.mark.parametrize(
     "nuisance",
     [
@@ -169,6 +187,11 @@ def test_S07_stop_of_a_drive_that_is_not_heard_says_so(leg: Leg) -> None:
     wait_until(lambda: _is_silent(hip.state), "it is not heard")
     with pytest.raises(DeviceSilent):
         hip.stop()
+
+
+def _set_up(leg: Leg, since: float) -> list[Entry]:
+    """Frames that start the hip, with which a set-up ends."""
+    return [entry for entry in leg.frames("nmt", since=since) if entry.data == bytes((1, HIP))]
 
 
 def _is_silent(ask: Callable[[], object]) -> bool:

@@ -145,6 +145,8 @@ def test_closing_the_driver_stops_moving_fingers(hand: HandRig) -> None:
         ("max_speed_m_s = 0.15", "max_speed_m_s = 0.2", "max_speed_m_s: 0.2 is outside"),
         ("max_force_n = 200.0", "max_force_n = 10.0", "max_force_n: 10 is outside"),
         ("baud = 115200", 'baud = 115200\nleave = "relax"', "is nothing a 2F-85 can"),
+        ("baud = 115200", "baud = 115200\nwatchdog_s = 0.3", "hand.toml: bus.hand.watchdog_s: a 2F-85 has no watchdog"),
+        ("baud = 115200", "baud = 115200\nfast_sync = false", "bus.hand.fast_sync: a 2F-85 has no joined answers"),
         ("baud = 115200", "baud = 115200\nrate_hz = 900", "rate_hz: 1 grippers at 115200 baud need"),
         ("id = 9", "id = 8", "no gripper answers to id 8 on bus 'hand'"),
     ],

@@ -351,7 +351,7 @@ def test_S05_a_move_ends_with_its_session_and_what_is_held_stays_held(
 
 def tell(bus: RobotiqBus, *values: int) -> None:
     """What somebody else wrote before."""
-    bus.grippers[0].write(0x03E8, values, time.monotonic())
+    bus.devices[0].write(0x03E8, values, time.monotonic())
     bus._line.nudge()
 
 

@@ -275,9 +275,9 @@ def test_S07_a_stop_waits_for_one_exchange_at_most_although_a_joint_is_silent(he
 
 
 def test_S07_no_exchange_waits_longer_than_a_stop_may() -> None:
-    from trade_drivers.dynamixel import _wire
+    from trade_drivers import _serial
 
-    assert _wire.LONGEST_WAIT_S < 0.050
+    assert _serial.LONGEST_WAIT_S < 0.050
 
 
 def test_S08_a_command_admitted_before_a_stop_is_dropped_after_it(head: Rig, gate: Gate) -> None:
@@ -333,7 +333,7 @@ def test_S17_a_provider_that_moves_but_cannot_be_stopped_is_refused(start_contai
 
 
 def _enable(sim: DynamixelBus, device_id: int = 1, **goal: int) -> None:
-    servo = next(servo for servo in sim.servos if servo.device_id == device_id)
+    servo = next(servo for servo in sim.devices if servo.device_id == device_id)
     servo.write(64, b"\1", time.monotonic())
     for counts in goal.values():
         servo.write(112, (5).to_bytes(4, "little") + counts.to_bytes(4, "little"), time.monotonic())

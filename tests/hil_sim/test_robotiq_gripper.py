@@ -123,7 +123,7 @@ def test_a_hollow_object_is_met_from_inside(hand: Hand) -> None:
     hand.gripper.put(Object(0.05, 20_000, inside=True), hand.clock.now)
     hand.tell(0x0900, 0, 0xFFFF, s=5.0)
     assert hand.contact == 1
-    assert hand.gripper.truth(hand.clock.now).holding
+    assert hand.gripper.state(hand.clock.now).holding
 
 
 def test_an_object_that_goes_lets_the_fingers_close(hand: Hand) -> None:
@@ -189,7 +189,7 @@ def test_a_frozen_sensor_shows_one_position_while_the_fingers_move(hand: Hand) -
     hand.gripper.freeze(True, hand.clock.now)
     hand.tell(0x0900, 255, 0xFFFF, s=5.0)
     assert hand.status[3] == 3
-    assert hand.gripper.truth(hand.clock.now).position_counts == 230
+    assert hand.gripper.state(hand.clock.now).position_counts == 230
 
 
 def test_registers_that_are_not_there_are_neither_read_nor_written(hand: Hand) -> None:

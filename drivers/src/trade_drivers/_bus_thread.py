@@ -5,9 +5,10 @@ import threading
 import time
 from collections.abc import Callable
 from functools import partial
-from typing import Final, Generic, Protocol, TypeVar
+from typing import Any, Final, Generic, Protocol, TypeVar
 
 from trade.errors import BusGone, TradeError
+from trade_drivers._exchange import BusExchange
 from trade_drivers._work import Device, PortLost
 from trade_drivers.robotfile import Bus
 
@@ -33,43 +34,7 @@ class Port(Protocol):
         ...
 
 
-class Exchange(Protocol):
-    """What happens on the bus. ``leave`` is called from any thread, the rest from the bus thread."""
-
-    refusing: Callable[[Device], TradeError] | None
-    """Why nothing is taken on at present."""
-
-    @property
-    def wake(self) -> threading.Event:
-        """Set when something should not wait for the next cycle."""
-        ...
-
-    def cycle(self) -> None:
-        """One round: stops, measurements, work, motions."""
-        ...
-
-    def idle(self, seconds: float) -> None:
-        """Between two cycles; ends early when something came up."""
-        ...
-
-    def halt_all(self, reason: str) -> None:
-        """End every motion."""
-        ...
-
-    def forget_measurements(self) -> None:
-        """The port is gone."""
-        ...
-
-    def fail_all(self, error_of: Callable[[Device], TradeError]) -> None:
-        """End everything anyone waits for."""
-        ...
-
-    def leave(self, alive: Callable[[], bool], *, relax: bool) -> None:
-        """Stop everything, then hold or relax; waits until that is done, or the bus thread has ended."""
-        ...
-
-
-_Exchange_co = TypeVar("_Exchange_co", bound=Exchange, covariant=True)
+_Exchange_co = TypeVar("_Exchange_co", bound=BusExchange[Any], covariant=True)
 
 
 class BusThread(Generic[_Exchange_co]):

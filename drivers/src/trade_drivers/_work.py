@@ -1,13 +1,14 @@
 """What services ask of the thread that owns a bus: work that is waited for, and what lets a command pass."""
 
 import threading
-from collections.abc import Callable, Generator
-from typing import Final, Protocol
+from collections.abc import Callable, Generator, Sequence
+from contextlib import contextmanager
+from typing import Final, Generic, Protocol, TypeVar
 
 from trade import Permit
 from trade.errors import DeadlineExceeded, DeviceFault, TradeError
 
-__all__ = ["Device", "Gate", "PortLost", "Steps", "Work", "check_admitted"]
+__all__ = ["Device", "Gate", "NoAnswer", "PortLost", "Steps", "WireError", "Work", "check_admitted", "losing"]
 
 Steps = Generator[None, None, None]
 """Yields after each exchange on the wire, so that stops and cycles come in between."""
@@ -23,6 +24,30 @@ class PortLost(Exception):
     """The port itself is gone: unplugged, down, or never opened."""
 
 
+@contextmanager
+def losing(*troubles: type[Exception]) -> Generator[None, None, None]:
+    """Have these, which a library raises when its port is gone, become ``PortLost``."""
+    try:
+        yield
+    except TradeError:  # a gate's: some of them are OSErrors, too
+        raise
+    except troubles as gone:
+        raise PortLost(str(gone)) from None
+
+
+class WireError(Exception):
+    """An exchange with a device failed."""
+
+
+class NoAnswer(WireError):
+    """Nothing came within the time that was whole and belonged to the question."""
+
+    def __init__(self, device_id: int, waited_s: float) -> None:
+        super().__init__(f"id {device_id} did not answer within {waited_s * 1e3:.0f} ms")
+        self.device_id = device_id
+        self.waited_s = waited_s
+
+
 class Device(Protocol):
     """Something on a bus, as errors tell of it."""
 
@@ -36,11 +61,15 @@ class Device(Protocol):
         ...
 
 
-class Work:
+_Device_co = TypeVar("_Device_co", bound=Device, covariant=True)
+
+
+class Work(Generic[_Device_co]):
     """Something that is waited for. As it stands it needs no leave: it ends motion."""
 
-    def __init__(self, device: Device) -> None:
-        self._device = device
+    def __init__(self, devices: Sequence[_Device_co]) -> None:
+        self.devices = tuple(devices)
+        """Those it touches, or waits for; at least one."""
         self._ended = threading.Event()
         self._error: TradeError | None = None
         self._steps: Steps | None = None
@@ -90,7 +119,7 @@ class Work:
             if tell is not None:
                 tell()
             if not alive():
-                self.finish(self._device.faulty("the thread of its bus has ended"))
+                self.finish(self.devices[0].faulty("the thread of its bus has ended"))
         if self._error is not None:
             raise self._error
 

@@ -140,6 +140,8 @@ class Robot(Struct, frozen=True, kw_only=True):
     where: str
     """The file the robot was read from."""
     grippers: list[Gripper] = []
+    given: dict[str, list[str]] = {}
+    """By bus: the keys that its table has, so that a driver can refuse those that mean nothing to it."""
 
     def joints_on(self, bus: str) -> list[Joint]:
         """The joints on one bus, in file order."""
@@ -189,14 +191,17 @@ def parse(text: str, where: str) -> Robot:
     except ValueError as bad:  # tomllib.TOMLDecodeError is one
         raise ConfigurationError(where=where, problem=f"not valid TOML: {bad}") from None
     _only_known(raw, where)
+    name = _robot_name(raw.get("robot"), where)
+    buses = _tables(raw, "bus", where)
     robot = Robot(
-        name=_robot_name(raw.get("robot"), where),
-        buses=[_bus(*entry, where) for entry in _tables(raw, "bus", where)],
+        name=name,
+        buses=[_bus(*entry, where) for entry in buses],
         joints=[_record(*entry, Joint, where) for entry in _tables(raw, "joint", where)],
         grippers=[_record(*entry, Gripper, where) for entry in _tables(raw, "gripper", where)],
         groups=[_record(*entry, Group, where) for entry in _tables(raw, "group", where)],
         coupled=_coupled(raw.get("coupled", []), where),
         where=where,
+        given={name: list(table) for _, name, table in buses},
     )
     _check_links(robot)
     return robot

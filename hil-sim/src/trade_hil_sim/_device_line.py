@@ -7,11 +7,13 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
+import msgspec
+
 from . import _faults as faults
 from ._errors import SimulationError
 from ._line import SerialLine
 from ._log import ByteLog
-from ._state import BusState
+from ._state import BusState, DeviceState, GripperTruth
 
 __all__ = ["DeviceLine"]
 
@@ -30,6 +32,10 @@ class Device(Protocol):
 
     def next_due(self) -> float | None:
         """When something happens by itself; None if never."""
+        ...
+
+    def state(self, t: float) -> DeviceState | GripperTruth:
+        """The truth about it at time `t`."""
         ...
 
 
@@ -84,9 +90,23 @@ class DeviceLine(ABC, Generic[_Device]):
     def __exit__(self, *exc: object) -> None:
         self.close()
 
-    @abstractmethod
+    @property
+    def devices(self) -> Sequence[_Device]:
+        """The devices; take care, the bus's own thread uses them, too."""
+        return tuple(self._devices)
+
     def state(self) -> BusState:
         """The truth about the bus and its devices, now."""
+        with self._lock:
+            t = self._clock()
+            truths = [msgspec.structs.replace(device.state(t), bus=self.name) for device in self._devices]
+        return BusState(
+            name=self.name,
+            port=str(self.port),
+            plugged=self._line.plugged,
+            devices=[truth for truth in truths if isinstance(truth, DeviceState)],
+            grippers=[truth for truth in truths if isinstance(truth, GripperTruth)],
+        )
 
     # faults and orders
 

@@ -9,9 +9,9 @@ from typing import Any, Final, NamedTuple
 import can
 
 from trade.errors import ConfigurationError
+from trade_drivers._work import PortLost, losing
 from trade_drivers.can._errors import ErrorState, error_state
 from trade_drivers.can._load import LoadMeter
-from trade_drivers.joints import PortLost
 
 __all__ = ["CanPort", "Frame", "split_port"]
 
@@ -69,12 +69,11 @@ class CanPort:
         """
         self.close()
         options = self._options()
-        try:
-            self._bus = can.Bus(interface=self._interface, **options)
-        except (can.CanInterfaceNotImplementedError, ImportError) as unknown:
-            raise ConfigurationError(where=f"{self._where}.interface", problem=f"{self.path}: {unknown}") from None
-        except _TROUBLE as bad:
-            raise PortLost(str(bad)) from None
+        with losing(*_TROUBLE):
+            try:
+                self._bus = can.Bus(interface=self._interface, **options)
+            except (can.CanInterfaceNotImplementedError, ImportError) as unknown:
+                raise ConfigurationError(where=f"{self._where}.interface", problem=f"{self.path}: {unknown}") from None
         self.state, self.errors = ErrorState.ACTIVE, 0
         self.meter = LoadMeter(self._bitrate, time.monotonic_ns())
 
@@ -114,10 +113,8 @@ class CanPort:
             PortLost: it could not be sent.
         """
         message = can.Message(arbitration_id=frame_id, data=data, is_extended_id=False)
-        try:
+        with losing(*_TROUBLE):
             self._open_bus().send(message, timeout=0)
-        except _TROUBLE as bad:
-            raise PortLost(str(bad)) from None
         self._count(len(data))
 
     def receive(self, timeout_s: float) -> Frame | None:
@@ -126,10 +123,8 @@ class CanPort:
         Raises:
             PortLost: the bus is gone, or this end has switched itself off it.
         """
-        try:
+        with losing(*_TROUBLE):
             message = self._open_bus().recv(timeout_s)
-        except _TROUBLE as bad:
-            raise PortLost(str(bad)) from None
         if message is None:
             return None
         if message.is_error_frame:

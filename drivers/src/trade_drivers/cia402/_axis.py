@@ -58,6 +58,10 @@ class DriveAxis(Axis):
         """When its heartbeat came last."""
         self.awaited_ns = 0
         """When it was last asked for a measurement; 0 once that has come."""
+        self.set_up_ns = 0
+        """When it was looked over and set up, while it is left out until it is heard; else 0."""
+        self.answered_ns = 0
+        """When it was asked for a measurement that came while it was left out."""
 
     # --- what it says
 
@@ -67,9 +71,13 @@ class DriveAxis(Axis):
         if not asked_ns:
             return
         try:
-            self.statusword, position, torque = table.STATUS.layout.unpack(data)
+            statusword, position, torque = table.STATUS.layout.unpack(data)
         except BadLength:
             return
+        if self.silent:
+            self.answered_ns = asked_ns
+            return
+        self.statusword = statusword
         self.state_now = state_of(self.statusword)
         self.note(Sample(position, self.velocity, torque, asked_ns))
         self._judge(asked_ns)
@@ -94,9 +102,10 @@ class DriveAxis(Axis):
         state = data[0] & 0x7F if data else table.BOOT_UP
         if state == table.BOOT_UP:
             self._lose("it has restarted; is its supply sound?", now_ns)
-        elif state != table.OPERATIONAL and not self.silent:
+        elif state == table.OPERATIONAL:
+            self.beat_ns = now_ns
+        elif not self.silent:
             self._lose(f"somebody has made it {table.NMT_STATES.get(state, hex(state))}", now_ns)
-        self.beat_ns = now_ns
 
     def _lose(self, why: str, now_ns: int) -> None:
         if self.ready:
@@ -106,8 +115,16 @@ class DriveAxis(Axis):
     def forget(self, now_ns: int) -> None:
         """Leave it out until it was looked over again."""
         if not self.silent:
-            self.silent, self.silent_since_ns, self.probe_at_ns = True, now_ns, now_ns
-        self.controlword = self.asked_ns = self.awaited_ns = 0
+            self.silent, self.silent_since_ns = True, now_ns
+            self.probe_at_ns = now_ns
+        elif self.set_up_ns:
+            self.probe_at_ns = now_ns
+        self.controlword = self.asked_ns = self.awaited_ns = self.set_up_ns = 0
+
+    def welcome(self, now_ns: int) -> None:
+        """It was set up, and is heard."""
+        self.silent, self.silent_since_ns, self.sample = False, now_ns, None
+        self.controlword = self.asked_ns = self.awaited_ns = self.set_up_ns = 0
 
     def latch(self, fault: str) -> None:
         """Note what speaks against moving on, until it is enabled again; the first that says something is kept."""
@@ -131,6 +148,13 @@ class DriveAxis(Axis):
     # --- what it is
 
     @property
+    def unheard(self) -> str:
+        """What it has not sent since it was set up."""
+        if self.beat_ns <= self.set_up_ns:
+            return "no heartbeat (1017h)"
+        return "" if self.answered_ns > self.set_up_ns else "no TPDO1 (1800h) after a SYNC"
+
+    @property
     def acknowledged(self) -> bool:
         """It shows that it has taken a set-point."""
         return bool(self.statusword & machine.ACKNOWLEDGED)
@@ -143,6 +167,11 @@ class DriveAxis(Axis):
     @property
     def may_hold_torque(self) -> bool:
         return self.state_now is None or self.state_now.torque
+
+    def fresh(self, now_ns: int, stale_after_ns: int) -> Sample:
+        if self.silent:  # also if it was measured a moment ago: it is not taken on again yet
+            raise self.deaf(now_ns)
+        return super().fresh(now_ns, stale_after_ns)
 
     def state(self, now_ns: int, stale_after_ns: int) -> MotorState:
         sample = self.fresh(now_ns, stale_after_ns)

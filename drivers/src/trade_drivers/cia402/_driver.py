@@ -20,6 +20,7 @@ __all__ = ["Cia402Driver", "open_exchange"]
 _PATIENCE_S: Final = 1.0
 """A drive that has just been switched on needs a moment before it answers."""
 _FIRST_CYCLES: Final = 3
+"""As many measurements as it takes to see whether a joint moves."""
 
 
 class Cia402Driver(Driver):
@@ -72,13 +73,26 @@ def open_exchange(robot: Robot, bus: CanBus, port: str) -> "DriveExchange":
                 raise ConfigurationError(where=f"{where}.channel", problem=problem)
             for axis in axes:
                 _take_on(exchange, axis, wire, robot.where)
-            for _ in range(_FIRST_CYCLES):
-                exchange.cycle()
+            _wait_for_all(exchange, robot.where)
         except PortLost as lost:
             problem = f"{port}: {lost}; is the interface up? `ip link` shows those there are"
             raise ConfigurationError(where=f"{where}.channel", problem=problem) from None
         undo.pop_all()
     return exchange
+
+
+def _wait_for_all(exchange: "DriveExchange", where: str) -> None:
+    """Cycle until every drive is heard and measured."""
+    until = time.monotonic() + _PATIENCE_S + exchange.deaf_ns / 1e9
+    while unheard := [axis for axis in exchange.drives if axis.silent]:
+        if time.monotonic() > until:
+            axis = unheard[0]
+            problem = f"node {axis.id} answers, but sends {axis.unheard}; a drive without it cannot be used"
+            raise ConfigurationError(where=f'{where}: joint."{axis.joint.name}"', problem=problem)
+        exchange.cycle()
+        exchange.idle(exchange.period_ns / 1e9)
+    for _ in range(_FIRST_CYCLES):
+        exchange.cycle()
 
 
 def _take_on(exchange: "DriveExchange", axis: "DriveAxis", wire: "CanPort", where: str) -> None:

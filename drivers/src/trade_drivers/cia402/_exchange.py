@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Final, cast
 
+from trade_drivers._exchange import PROBE_NS
 from trade_drivers.cia402 import _jobs as jobs
 from trade_drivers.cia402 import _machine as machine
 from trade_drivers.cia402 import _table as table
@@ -21,8 +22,9 @@ if TYPE_CHECKING:
 __all__ = ["DriveExchange"]
 
 _log = logging.getLogger(__name__)
-_PROBE_NS: Final = 500_000_000
 _BEATS_MISSED: Final = 3
+_UNHEARD_NS: Final = 2_000_000_000
+"""How long a drive that was set up is waited for before it is set up again."""
 
 
 class DriveExchange(Exchange):
@@ -41,11 +43,13 @@ class DriveExchange(Exchange):
         self._bus = bus
         self._beat_ns = int(bus.watchdog_s * 1e9 / 5)
         self._beaten_ns = 0
-        self._deaf_ns = _BEATS_MISSED * heartbeat_ms(bus) * 1_000_000
+        self.deaf_ns = _BEATS_MISSED * heartbeat_ms(bus) * 1_000_000
+        """A drive whose heartbeat has not come for so long is left out."""
         self.rival = False
         """Somebody else sends heartbeats as this driver does."""
         self.net.hear(table.HEARTBEAT + table.OUR_NODE, self._hear_rival)
         for axis in axes:
+            axis.forget(clock())
             self._listen_to(axis)
 
     def _hear_rival(self, _: bytes) -> None:
@@ -135,8 +139,9 @@ class DriveExchange(Exchange):
 
     def _measure(self, began_ns: int) -> None:
         asked = [axis for axis in self.drives if not axis.silent]
-        for axis in asked:
-            axis.awaited_ns = began_ns  # not when it came: a frozen process would take old values for new
+        for axis in self.drives:
+            if not axis.silent or axis.set_up_ns:
+                axis.awaited_ns = began_ns  # not when it came: a frozen process would take old values for new
         self.port.send(table.SYNC, b"")
         self.net.take_in(self.period_ns / 2e9, lambda: not any(axis.awaited_ns for axis in asked))
 
@@ -145,10 +150,10 @@ class DriveExchange(Exchange):
         for axis in self.drives:
             if axis.silent:
                 continue
-            if axis.age_ns(now_ns) > self.stale_after_ns or now_ns - axis.beat_ns > self._deaf_ns:
+            if axis.age_ns(now_ns) > self.stale_after_ns or now_ns - axis.beat_ns > self.deaf_ns:
                 _log.warning("%s is not heard on %s", axis.name, axis.bus)
                 axis.forget(now_ns)
-                axis.probe_at_ns = now_ns + _PROBE_NS
+                axis.probe_at_ns = now_ns + PROBE_NS
 
     def _shake_hands(self) -> None:
         """A set-point that was taken is taken back, so that the next one has an edge."""
@@ -158,33 +163,42 @@ class DriveExchange(Exchange):
                 self.command(axis, axis.controlword & ~machine.NEW_SET_POINT)
 
     def _recover(self) -> None:
-        """Look one of those over that are away, when it is its turn; enables nothing, moves nothing."""
+        """Take back who is heard, and look one of the others over when it is its turn; enables and moves nothing."""
         now_ns = self.clock()
         for axis in self.drives:
+            if axis.silent and axis.set_up_ns and not axis.unheard:
+                _log.info("%s is heard on %s", axis.name, axis.bus)
+                axis.welcome(now_ns)
+        for axis in self.drives:
             if axis.silent and now_ns >= axis.probe_at_ns:
-                axis.probe_at_ns = now_ns + _PROBE_NS
-                self._readmit(axis)
+                axis.probe_at_ns = now_ns + PROBE_NS
+                self._look_over(axis)
                 return
 
-    def _readmit(self, axis: DriveAxis) -> None:
+    def _look_over(self, axis: DriveAxis) -> None:
+        if axis.set_up_ns:
+            axis.fault, axis.ready = f"node {axis.id} answers, but sends {axis.unheard}", False
         try:
             self.admit(axis)
         except NoAnswer:
-            return
+            axis.set_up_ns = 0
         except (Unfit, Refused) as unfit:
+            axis.set_up_ns = 0
             axis.fault = str(unfit)  # whatever was wrong before, this has to be mended first
-            return
-        _log.info("%s answers again", axis.name)
 
     def admit(self, axis: DriveAxis) -> None:
-        """Take a drive on that answers.
+        """Look a drive over that answers, and set it up; it is taken on, in a cycle, once it is heard.
 
         Raises:
             NoAnswer, Refused, Unfit: it cannot be used, or not yet.
         """
         set_up(self.net, axis, self._bus)
-        now_ns = self.clock()
         if axis.ready:
             axis.latch("it was away")
-        axis.silent, axis.silent_since_ns, axis.beat_ns, axis.sample = False, now_ns, now_ns, None
-        axis.controlword = axis.asked_ns = axis.awaited_ns = 0
+        axis.set_up_ns = self.clock()
+        axis.probe_at_ns = axis.set_up_ns + max(_UNHEARD_NS, 2 * self.deaf_ns)
+
+    def forget_measurements(self) -> None:
+        now_ns = self.clock()
+        for axis in self.drives:
+            axis.forget(now_ns)

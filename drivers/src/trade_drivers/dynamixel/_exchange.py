@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Final, cast
 
+from trade_drivers._exchange import PROBE_NS
 from trade_drivers.dynamixel import _jobs as jobs
 from trade_drivers.dynamixel import _table as table
 from trade_drivers.dynamixel._axis import CYCLIC, SLOW, Health, ServoAxis
@@ -18,8 +19,6 @@ if TYPE_CHECKING:
 __all__ = ["ServoExchange"]
 
 _log = logging.getLogger(__name__)
-_RETRIES: Final = 3
-_PROBE_NS: Final = 500_000_000
 _HEALTH_NS: Final = 500_000_000
 _CLEAN_NS: Final = 1_000_000_000
 _SPANS: Final = tuple(
@@ -47,7 +46,7 @@ class ServoExchange(Exchange):
         self._cycle_ns = clock()
         self._span = 0
         self._failed_ns = 0
-        wire.pause = self._pause
+        wire.pause = self.pause
 
     # --- what a servo is told
 
@@ -134,15 +133,6 @@ class ServoExchange(Exchange):
 
     # --- parts of a cycle
 
-    def _pause(self, seconds: float) -> None:
-        """Keep silent, except for stops; at least those that have come are served before every exchange."""
-        self.serve_stops()
-        until = time.monotonic() + seconds
-        while (left_s := until - time.monotonic()) > 0:
-            if self.wake.wait(left_s):
-                self.wake.clear()
-                self.serve_stops()
-
     def _look_after_a_gap(self) -> None:
         """The process was frozen: watchdogs may have expired, so health comes before anything else."""
         for axis in self.servos:
@@ -162,23 +152,17 @@ class ServoExchange(Exchange):
             for axis in part:
                 answer = answers.get(axis.id)
                 if answer is None:
-                    self._missed(axis)
+                    self.missed(axis)
                     continue
                 axis.take_sample(answer.data, asked_ns)
                 if answer.alert and not axis.fault:
                     axis.health_due_ns = 0
             self.serve_stops()
 
-    def _missed(self, axis: ServoAxis) -> None:
-        now_ns = self._failed_ns = self.clock()
+    def missed(self, device: Axis) -> None:
+        self._failed_ns = self.clock()
         self._span = (self._span + 1) % len(_SPANS)
-        axis.misses += 1
-        axis.doubted = True
-        if axis.misses >= _RETRIES and not axis.silent:
-            _log.warning("%s does not answer on %s", axis.name, axis.bus)
-            axis.silent, axis.silent_since_ns = True, now_ns
-        if axis.silent:
-            axis.probe_at_ns = now_ns + _PROBE_NS * max(1, min(4, axis.misses - _RETRIES + 1))
+        super().missed(device)
 
     def _recover(self) -> None:
         """Ping those in doubt, and those long silent when it is their turn; the first that fails ends the round."""
@@ -194,12 +178,12 @@ class ServoExchange(Exchange):
                     self.wire.ping(axis.id)
                     axis.doubted = False
             except NoAnswer:
-                self._missed(axis)
+                self.missed(axis)
                 return
             except Refused as refused:
                 axis.fault = f"it refuses to be read: {refused}"
             if axis.silent:
-                axis.probe_at_ns = self.clock() + _PROBE_NS
+                axis.probe_at_ns = self.clock() + PROBE_NS
 
     def _read_health(self) -> None:
         now_ns = self.clock()
@@ -211,7 +195,7 @@ class ServoExchange(Exchange):
         try:
             self._refresh_health(axis)
         except NoAnswer:
-            self._missed(axis)
+            self.missed(axis)
             return False
         except Refused as refused:
             axis.fault = f"it refuses to be read: {refused}"

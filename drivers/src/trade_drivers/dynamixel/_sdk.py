@@ -7,29 +7,17 @@ and does not look at the length of an answer. All this is mended here by overrid
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
 # pyright: reportUntypedBaseClass=false, reportUnknownParameterType=false, reportIncompatibleMethodOverride=false
 
-import errno
-import os
-import select
-import termios
 import time
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
-from typing import Any, Final
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Final
 
-import serial
 from dynamixel_sdk import COMM_RX_CORRUPT, COMM_RX_TIMEOUT, COMM_SUCCESS, PortHandler, Protocol2PacketHandler
 
-from trade.errors import ConfigurationError, TradeError
+from trade.errors import ConfigurationError
+from trade_drivers._serial import SerialLine, SerialWire
 from trade_drivers.dynamixel._frames import HEADER, OVERHEAD, Corrupt, crc16, take_status, unstuffed
-from trade_drivers.dynamixel._wire import (
-    ANSWER_MARGIN_S,
-    DRAIN_S,
-    LONGEST_WAIT_S,
-    Answer,
-    BadAnswer,
-    NoAnswer,
-    Refused,
-)
+from trade_drivers.dynamixel._wire import Answer, BadAnswer, NoAnswer, Refused
 from trade_drivers.joints import Gate, PortLost
 
 __all__ = ["Wire"]
@@ -42,74 +30,45 @@ _BAUDS: Final = (9600, 57600, 115200, 1_000_000, 2_000_000, 3_000_000, 4_000_000
 
 
 class _QuietPort(PortHandler):
-    """The SDK's port, owned exclusively, that sleeps until bytes arrive and counts time by the monotonic clock."""
+    """Our line as the SDK's port."""
 
-    gate: Gate | None = None
     expected: int | None = None
     """Bytes of parameters the answer must have; another length is the late answer of an earlier question."""
 
-    def __init__(self, path: str, baud: int) -> None:
+    def __init__(self, line: SerialLine, path: str) -> None:
         super().__init__(path)
-        self.baudrate = baud
-        self._received = bytearray()
-        self._sent = 0
-        self._byte_s = 10 / baud
-        self._deadline = 0.0
-        self._poll = select.poll()
+        self._line = line
 
-    def setupPort(self, cflag_baud: int) -> bool:  # noqa: ARG002, N802
-        self.ser: Any = serial.Serial(self.port_name, self.baudrate, timeout=0, write_timeout=0, exclusive=True)
-        with suppress(ValueError, OSError, AttributeError):  # not every adapter has it
-            self.ser.set_low_latency_mode(True)
-        self.is_open = True
-        self._poll = select.poll()
-        self._poll.register(self.ser.fd, select.POLLIN)
-        self.clearPort()
-        return True
+    @property
+    def is_using(self) -> bool:
+        """The library's "busy", which would stay for ever once a call raised; one thread uses the line anyway."""
+        return False
+
+    @is_using.setter
+    def is_using(self, _: bool) -> None: ...
 
     def clearPort(self) -> None:  # noqa: N802
-        self._received.clear()
-        termios.tcflush(self.ser.fd, termios.TCIFLUSH)
+        self._line.flush()
 
     def writePort(self, packet: Sequence[int]) -> int:  # noqa: N802
-        data = bytes(packet)
-        if self.gate is not None:
-            self.gate()
-        self._sent = os.write(self.ser.fd, data)
-        return self._sent
+        return self._line.write(bytes(packet))
 
     def setPacketTimeout(self, packet_length: int) -> None:  # noqa: N802
-        on_the_wire = (self._sent + packet_length) * self._byte_s
-        self._deadline = time.monotonic() + min(on_the_wire + ANSWER_MARGIN_S, LONGEST_WAIT_S)
-
-    def wait(self, deadline: float) -> bool:
-        """More bytes by then, or False; a port that hung up raises OSError."""
-        left = deadline - time.monotonic()
-        if left <= 0 or not self._poll.poll(left * 1e3):
-            return False
-        data = os.read(self.ser.fd, 4096)
-        if not data:
-            raise OSError(errno.EIO, "the port hung up")
-        self._received += data
-        return True
+        self._line.expect(packet_length)
 
     def frame(self) -> bytes | None:
         """The next status packet of the expected length, or None if none came in time; Corrupt if it is damaged."""
         while True:
-            frame = take_status(self._received)
+            frame = take_status(self._line.received)
             if frame is None:
-                if self.wait(self._deadline):
+                if self._line.more():
                     continue
-                if self._received:
+                if self._line.received:
                     raise Corrupt
                 return None
             frame = frame if frame[4] == _BROADCAST else unstuffed(frame)
             if self.expected is None or len(frame) == OVERHEAD + self.expected or frame[8] & ~_ALERT:
                 return frame
-
-    def more(self, for_s: float) -> bool:
-        """Anything else that arrives within this time."""
-        return bool(self._received) or self.wait(time.monotonic() + for_s)
 
 
 class _Packets(Protocol2PacketHandler):
@@ -131,71 +90,23 @@ class _Packets(Protocol2PacketHandler):
             frame = port.frame()
         except Corrupt:
             return b"", COMM_RX_CORRUPT
-        finally:
-            port.is_using = False
         return (b"", COMM_RX_TIMEOUT) if frame is None else (frame, COMM_SUCCESS)
 
 
-def _error_number(bad: BaseException | None) -> int | None:
-    """The system's number of an error, which pyserial often leaves in the error that its own stands for."""
-    if bad is None:
-        return None
-    numbers = [getattr(bad, "errno", None), *bad.args[:1]]
-    return next((number for number in numbers if isinstance(number, int)), None) or _error_number(bad.__context__)
-
-
-class Wire:
-    """One serial port and the packets on it. Not thread safe: one thread owns it.
-
-    After an exchange that failed, the next one first keeps silent until ``settled_at``. ``pause`` is how it waits; it
-    is called before every exchange, so that whoever gives it can put in what must not wait.
-    """
+class Wire(SerialWire):
+    """One serial port and the packets on it. All but a sync write may wait until the line is settled."""
 
     def __init__(self, path: str, baud: int, where: str = "bus") -> None:
-        self.path = path
-        self._where = where
-        """The table of the robot file that describes this bus, for messages."""
-        self.settled_at = 0.0
-        self.pause: Callable[[float], None] = time.sleep
-        self._port = _QuietPort(path, baud)
+        super().__init__(path, baud, where)
+        self._baud = baud
+        self._port = _QuietPort(self._line, path)
         self._packets = _Packets()
 
     def open(self) -> None:
-        """Take the port for this process alone.
-
-        Raises:
-            ConfigurationError: another driver owns it, it is no serial port, or its baud rate or permissions are wrong.
-            PortLost: there is no such device.
-        """
-        try:
-            opened = self._port.openPort()
-        except (OSError, termios.error) as bad:
-            self.close()
-            raise self._cannot_open(bad) from None
-        if not opened:
-            problem = f"{self._port.baudrate} cannot be set; the servos know {', '.join(map(str, _BAUDS))}"
+        if self._port.getCFlagBaud(self._baud) <= 0:
+            problem = f"{self._baud} cannot be set; the servos know {', '.join(map(str, _BAUDS))}"
             raise ConfigurationError(where=f"{self._where}.baud", problem=problem)
-
-    def _cannot_open(self, bad: Exception) -> Exception:
-        match _error_number(bad):
-            case errno.EAGAIN | errno.EBUSY:
-                problem = f"another driver owns this port; stop it first (`fuser {self.path}` names the process)"
-            case errno.EACCES | errno.EPERM:
-                problem = "no permission to open it; add yourself to its group (often dialout) and log in again"
-            case errno.ENOTTY | errno.EISDIR:
-                problem = "is no serial port; `ls -l /dev/serial/by-id` shows those there are"
-            case errno.ENOENT:
-                return PortLost("there is no such device")
-            case _:
-                return PortLost(str(bad))
-        return ConfigurationError(where=f"{self._where}.port", problem=f"{self.path}: {problem}")
-
-    def close(self) -> None:
-        """Let go of the port; more than once is fine."""
-        self._port.is_using = False
-        if self._port.ser is not None:
-            with suppress(OSError, termios.error):
-                self._port.closePort()
+        super().open()
 
     def ping(self, device_id: int) -> int:
         """The model number of a device."""
@@ -206,8 +117,8 @@ class Wire:
 
     def answers_twice(self) -> bool:
         """Whether anything follows the answer just received, as it does when two devices share an id."""
-        with self._lost():
-            return self._port.more(_WHOLE_SECOND_ANSWER_S)
+        with self._use():
+            return bool(self._line.received) or self._line.more(_WHOLE_SECOND_ANSWER_S)
 
     def read(self, device_id: int, address: int, size: int) -> Answer:
         """Bytes of one device's control table."""
@@ -226,7 +137,7 @@ class Wire:
         """The same registers of several devices, in one packet that nobody answers. Never waits, not even to settle."""
         size = len(next(iter(data.values())))
         parameters = [byte for device_id, value in data.items() for byte in (device_id, *value)]
-        with self._lost(), self._gated(gate):
+        with self._use(gate):
             result = self._packets.syncWriteTxOnly(self._port, address, size, parameters, len(parameters))
         if result != COMM_SUCCESS:
             raise PortLost("the packet could not be written as a whole")
@@ -234,7 +145,7 @@ class Wire:
     def sync_read(self, address: int, size: int, ids: Sequence[int], *, fast: bool = False) -> dict[int, Answer]:
         """The same registers of several devices; those that did not answer properly are left out."""
         self._settle()
-        with self._lost():
+        with self._use():
             self._port.expected = len(ids) * (size + 4) - 3 if fast else size
             result = self._packets.syncReadTx(self._port, address, size, ids, len(ids), fast)
             if result != COMM_SUCCESS:
@@ -270,39 +181,12 @@ class Wire:
         self._settle()
         self._port.expected = expected
         began = time.monotonic()
-        with self._lost(), self._gated(gate):
+        with self._use(gate):
             try:
                 yield
             except NoAnswer as silent:
                 self._unsettle()
                 raise type(silent)(device_id, time.monotonic() - began) from None
-
-    @contextmanager
-    def _gated(self, gate: Gate | None) -> Generator[None, None, None]:
-        self._port.gate = gate
-        try:
-            yield
-        finally:
-            self._port.gate = None
-
-    @contextmanager
-    def _lost(self) -> Generator[None, None, None]:
-        if not self._port.is_open:
-            raise PortLost("it is not open")
-        try:
-            yield
-        except TradeError:  # a gate's: some of them are OSErrors, too
-            raise
-        except (OSError, termios.error) as gone:
-            raise PortLost(str(gone)) from None
-        finally:
-            self._port.is_using = False
-
-    def _settle(self) -> None:
-        self.pause(max(0.0, self.settled_at - time.monotonic()))
-
-    def _unsettle(self) -> None:
-        self.settled_at = time.monotonic() + DRAIN_S
 
     def _require(self, result: int, device_id: int, error: int = 0) -> None:
         match result:

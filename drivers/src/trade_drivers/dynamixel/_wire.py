@@ -2,14 +2,9 @@
 
 from typing import Final, NamedTuple
 
-__all__ = ["DRAIN_S", "LONGEST_WAIT_S", "Answer", "BadAnswer", "NoAnswer", "Refused", "WireError"]
+from trade_drivers._work import NoAnswer, WireError
 
-ANSWER_MARGIN_S: Final = 0.034
-"""Patience beyond the time the bytes take: twice the default 16 ms latency of an FTDI adapter, and 2 ms."""
-LONGEST_WAIT_S: Final = 0.048
-"""No exchange waits longer than this, so that a stop is never more than 50 ms from the wire."""
-DRAIN_S: Final = 0.030
-"""Silence kept after a failed exchange: an answer that is late arrives now and is thrown away, not believed later."""
+__all__ = ["Answer", "BadAnswer", "NoAnswer", "Refused", "WireError"]
 
 _NUMBERS: Final = {
     1: "could not carry it out",
@@ -28,19 +23,6 @@ class Answer(NamedTuple):
     data: bytes
     alert: bool
     """The device has a hardware error latched; register 70 says which."""
-
-
-class WireError(Exception):
-    """An exchange failed."""
-
-
-class NoAnswer(WireError):
-    """Nothing came within the time."""
-
-    def __init__(self, device_id: int, waited_s: float) -> None:
-        super().__init__(f"id {device_id} did not answer within {waited_s * 1e3:.0f} ms")
-        self.device_id = device_id
-        self.waited_s = waited_s
 
 
 class BadAnswer(NoAnswer):

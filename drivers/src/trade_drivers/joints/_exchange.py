@@ -1,17 +1,16 @@
 """The cyclic exchange with the joints of one bus, whoever built them: stops, work, motions, holding."""
 
-import threading
 import time
-from abc import ABC, abstractmethod
-from collections import deque
+from abc import abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from trade.errors import MotionStopped, TradeError
+from trade_drivers._exchange import HALT_NS, BusExchange, StopTicket
 from trade_drivers._work import Device, Gate, Steps
 from trade_drivers.joints._axis import Axis, Goal
-from trade_drivers.joints._jobs import Job, Leave, StopTicket
+from trade_drivers.joints._jobs import Job, Leave
 from trade_drivers.joints._motion import Motion
 
 if TYPE_CHECKING:
@@ -19,38 +18,18 @@ if TYPE_CHECKING:
 
 __all__ = ["Exchange"]
 
-_HALT_NS: Final = 2_000_000_000
 
-
-class Exchange(ABC):
-    """What happens on one bus. Everything but ``submit`` and ``stop`` belongs to the thread that calls ``cycle()``."""
+class Exchange(BusExchange[Axis]):
+    """What happens on one bus of joints. ``stop`` is for any thread, too."""
 
     cycles_a_goal = 1
     """How many cycles it takes at most until a joint can take the next goal."""
 
     def __init__(self, bus: "Bus", axes: Sequence[Axis], clock: Callable[[], int] = time.monotonic_ns) -> None:
+        super().__init__(bus, axes, clock)
         self.axes = tuple(axes)
-        self.clock = clock
-        self.wake = threading.Event()
-        """Set when something should not wait for the next cycle."""
-        self.stale_after_ns = int(bus.stale_after_s * 1e9)
-        self.refusing: Callable[[Device], TradeError] | None = None
-        """Why nothing is taken on at present."""
-        self.period_ns = int(1e9 / bus.rate_hz)
-        self._inbox: deque[Job] = deque()
-        self._stops: deque[StopTicket] = deque()
-        self._working: list[Job] = []
-        self._stopping: list[StopTicket] = []
 
     # --- what a device of this kind is told, and how
-
-    @abstractmethod
-    def cycle(self) -> None:
-        """One round: stops, measurements, work, motions.
-
-        Raises:
-            PortLost: the wire is gone.
-        """
 
     @abstractmethod
     def write_goals(self, goals: Mapping[Axis, Goal], gate: Gate) -> None:
@@ -90,30 +69,11 @@ class Exchange(ABC):
 
     # --- from any thread
 
-    def submit(self, job: Job) -> None:
-        """Take work on; the job's ``wait`` tells what became of it."""
-        if self.refusing is not None:
-            job.finish(self.refusing(job.axes[0]))
-        else:
-            self._inbox.append(job)
-
-    def stop(self, axes: Sequence[Axis], reason: str = "stop() was called") -> StopTicket:
+    def stop(self, axes: Sequence[Axis], reason: str = "stop() was called") -> StopTicket[Axis]:
         """Void what was admitted for these joints, and have them hold before anything else happens on the bus."""
-        for axis in axes:
-            axis.resource.stop("its driver", reason=reason)
-        ticket = StopTicket(self, axes, reason)
-        if self.refusing is not None:
-            ticket.finish(self.refusing(axes[0]))
-        self._stops.append(ticket)
-        self.wake.set()
-        return ticket
+        return self.order_stop(axes, reason, lambda: self.halt(axes, reason))
 
     def leave(self, alive: Callable[[], bool], *, relax: bool) -> None:
-        """Stop everything, then hold or relax; waits until that is done, or the bus thread has ended.
-
-        Raises:
-            TradeError: not everything could be left so.
-        """
         if not self.axes:
             return
         with suppress(TradeError):  # a joint that cannot be heard keeps its watchdog; the others are left properly
@@ -123,20 +83,6 @@ class Exchange(ABC):
         leave.wait(alive)
 
     # --- from the bus thread
-
-    def idle(self, seconds: float) -> None:
-        """Between two cycles; ends early when something came up. Stops do not wait."""
-        if self.wake.wait(seconds):
-            self.wake.clear()
-            self.serve_stops()
-
-    def serve_stops(self) -> None:
-        """Write the hold of every stop that has come."""
-        while self._stops:
-            ticket = self._stops.popleft()
-            if not ticket.ended:
-                self._stopping.append(ticket)
-            self.halt(ticket.axes, ticket.reason)
 
     def halt(self, axes: Iterable[Axis], reason: str) -> None:
         """End the motions of these joints, whole groups, and have all of them hold where they are."""
@@ -153,7 +99,6 @@ class Exchange(ABC):
                     self._forget(axis.motion, MotionStopped(device=axis.name, reason=reason))
 
     def halt_all(self, reason: str) -> None:
-        """The same for all joints."""
         self.halt(self.axes, reason)
 
     def _at_rest(self, axis: Axis, now_ns: int) -> bool:
@@ -185,22 +130,9 @@ class Exchange(ABC):
             self._forget(old, MotionStopped(device=motion.axes[0].name, reason="another move took over"))
             self.hold(left, self.clock())
 
-    def fail_all(self, error_of: Callable[[Device], TradeError]) -> None:
-        """End everything anyone waits for."""
-        for axis in self.axes:
-            if axis.motion is not None:
-                self._forget(axis.motion, error_of(axis))
-        for job in (*self._working, *self._drain(self._inbox), *self._stopping, *self._drain(self._stops)):
-            job.finish(error_of(job.axes[0]))
-        self._working.clear()
-        self._stopping.clear()
-
-    def forget_measurements(self) -> None:
-        """The port is gone: nothing is known any more but how long ago it was."""
-        now_ns = self.clock()
-        for axis in self.axes:
-            if not axis.silent:
-                axis.silent, axis.silent_since_ns, axis.probe_at_ns = True, now_ns, now_ns
+    def fail_motion(self, device: Axis, error_of: Callable[[Device], TradeError]) -> None:
+        if device.motion is not None:
+            self._forget(device.motion, error_of(device))
 
     def require_answering(self, axis: Axis) -> None:
         """Raises ``DeviceSilent`` for a joint that is left out because it does not answer."""
@@ -208,28 +140,6 @@ class Exchange(ABC):
             raise axis.deaf(self.clock())
 
     # --- parts of a cycle
-
-    def worked_on(self, axis: Axis) -> bool:
-        """Whether a job is in the middle of its exchanges with this joint."""
-        return any(axis in job.axes for job in self._working)
-
-    def work(self, until_ns: int) -> None:
-        """Go on with the jobs, an exchange of each in turn; a stop or the time ends the round."""
-        while self._inbox:
-            self._working.append(self._inbox.popleft())
-        while self._working and not self._stops:
-            taken: set[Axis] = set()
-            for job in tuple(self._working):
-                if not job.ended and not taken.isdisjoint(job.axes):
-                    continue  # one at a time touches a joint
-                taken.update(job.axes)
-                if job.ended or not job.step():
-                    self._working.remove(job)
-                    job.done_stepping()
-                if self._stops:
-                    break
-            if self.clock() >= until_ns:
-                return
 
     def watch(self) -> None:
         """Look at motions and stops with what was measured, and end what is over."""
@@ -243,26 +153,13 @@ class Exchange(ABC):
         self.hold(again, now_ns)
         for axis in self.axes:
             axis.tell_moving()
-        for ticket in tuple(self._stopping):
-            self._answer(ticket, now_ns)
+        self.answer_stops(now_ns)
 
     def _watch_halt(self, axis: Axis, now_ns: int, again: list[Axis]) -> None:
         if axis.still >= 2 or not axis.may_hold_torque or axis.fault:
             axis.halting_since_ns = 0
-        elif now_ns - axis.halting_since_ns <= _HALT_NS and axis.moved_since_held:
+        elif now_ns - axis.halting_since_ns <= HALT_NS and axis.moved_since_held:
             again.append(axis)  # it was still on its way: so it need not come back as far
-
-    def _answer(self, ticket: StopTicket, now_ns: int) -> None:
-        error: TradeError | None = None
-        for axis in ticket.axes:
-            if axis.silent or axis.age_ns(now_ns) > self.stale_after_ns:
-                error = axis.deaf(now_ns)
-            elif axis.halting_since_ns and now_ns - axis.halting_since_ns > _HALT_NS:
-                error = axis.faulty("told to hold, but it is still moving")
-            elif axis.halting_since_ns:
-                return
-        self._stopping.remove(ticket)
-        ticket.finish(error)
 
     def hold(self, axes: Sequence[Axis], now_ns: int) -> None:
         """Have joints hold, and watch them until they are at rest."""
@@ -281,9 +178,3 @@ class Exchange(ABC):
                 axis.motion = None
                 axis.tell_moving()
         motion.finish(error)
-
-    @staticmethod
-    def _drain(queue: "deque[Job] | deque[StopTicket]") -> list[Job]:
-        jobs: list[Job] = list(queue)
-        queue.clear()
-        return jobs

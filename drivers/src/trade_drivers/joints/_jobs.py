@@ -11,14 +11,14 @@ from trade_drivers.joints._axis import Axis
 if TYPE_CHECKING:
     from trade_drivers.joints._exchange import Exchange
 
-__all__ = ["Command", "Enable", "Halt", "Job", "Leave", "Relax", "Steps", "StopTicket"]
+__all__ = ["Command", "Enable", "Halt", "Job", "Leave", "Relax", "Steps"]
 
 
-class Job(Work):
+class Job(Work[Axis]):
     """Something that is waited for. As it stands it needs no leave: it ends motion."""
 
     def __init__(self, exchange: "Exchange", axes: Sequence[Axis]) -> None:
-        super().__init__(axes[0])
+        super().__init__(axes)
         self.exchange = exchange
         self.axes = tuple(axes)
 
@@ -46,14 +46,6 @@ class Command(Job):
         check_admitted(
             self.service, self.permit, admitted_ns=self._admitted_ns, expires_ns=self.expires_ns, now_ns=now_ns
         )
-
-
-class StopTicket(Job):
-    """A stop: it has no expiry and needs no permit, and ends when all its joints are at rest."""
-
-    def __init__(self, exchange: "Exchange", axes: Sequence[Axis], reason: str) -> None:
-        super().__init__(exchange, axes)
-        self.reason = reason
 
 
 class Enable(Command):

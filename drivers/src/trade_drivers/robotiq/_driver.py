@@ -25,6 +25,12 @@ _ATTEMPTS: Final = 3
 _BITS_A_READ: Final = (8 + 11) * 10 + 35
 """Request, answer, and the gap of three and a half characters before it."""
 
+_MEANINGLESS: Final = {
+    "watchdog_s": "a 2F-85 has no watchdog: left alone, it ends the move it was told; leave this key out",
+    "fast_sync": "a 2F-85 has no joined answers: each is read by itself; leave this key out",
+}
+"""Keys of a serial bus that no gripper keeps, and why."""
+
 
 class AttachedGrippers(AttachedBus):
     """A bus with its grippers, and the thread that owns it."""
@@ -111,6 +117,9 @@ def _check(robot: Robot, bus: SerialBus) -> None:
         ):
             if not low <= value <= high:
                 _wrong(f"{key}.{name}", f"{value:g} is outside of what a {model.name} can: {low:g} to {high:g}")
+    for key, problem in _MEANINGLESS.items():
+        if key in robot.given.get(bus.name, ()):
+            _wrong(f"{where}.{key}", problem)
     if bus.leave != "hold":
         problem = '"relax" is nothing a 2F-85 can: its fingers stand without power, too; use "hold"'
         _wrong(f"{where}.leave", problem)

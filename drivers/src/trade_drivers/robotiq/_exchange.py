@@ -1,17 +1,16 @@
 """The cyclic exchange with all grippers of one bus: stops, measurements, work. One thread calls ``cycle()``."""
 
 import logging
-import threading
 import time
-from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
-from typing import TYPE_CHECKING, Final, TypeVar
+from typing import TYPE_CHECKING, Final
 
 from trade.errors import MotionStopped, TradeError
+from trade_drivers._exchange import HALT_NS, BusExchange, StopTicket
 from trade_drivers._work import Device, Gate
 from trade_drivers.robotiq._hand import Hand
-from trade_drivers.robotiq._jobs import Command, Motion, StopTicket
+from trade_drivers.robotiq._jobs import Motion
 from trade_drivers.robotiq._wire import NoAnswer, Refused
 
 if TYPE_CHECKING:
@@ -20,54 +19,30 @@ if TYPE_CHECKING:
 
 __all__ = ["Exchange"]
 
-_Job = TypeVar("_Job")
-
 _log = logging.getLogger(__name__)
-_RETRIES: Final = 3
-_PROBE_NS: Final = 500_000_000
-_HALT_NS: Final = 2_000_000_000
 _TAKEN_NS: Final = 15_000_000
 """So long after a write the status may still be that of before: the device takes it over 200 times a second."""
 
 
-class Exchange:
-    """What happens on one bus. All but ``submit``, ``stop`` and ``leave`` is for the thread that calls ``cycle``."""
+class Exchange(BusExchange[Hand]):
+    """What happens on one bus of grippers. ``stop`` is for any thread, too."""
 
     def __init__(
         self, wire: "Wire", bus: "SerialBus", hands: Sequence[Hand], clock: Callable[[], int] = time.monotonic_ns
     ) -> None:
+        super().__init__(bus, hands, clock)
         self.wire = wire
         self.hands = tuple(hands)
-        self.clock = clock
-        self.wake = threading.Event()
-        self.stale_after_ns = int(bus.stale_after_s * 1e9)
-        self.refusing: Callable[[Device], TradeError] | None = None
-        self._period_ns = int(1e9 / bus.rate_hz)
-        self._inbox: deque[Command] = deque()
-        self._stops: deque[StopTicket] = deque()
-        self._working: list[Command] = []
-        self._stopping: list[StopTicket] = []
-        wire.pause = self._pause
+        wire.pause = self.pause
 
     # --- from any thread
 
-    def submit(self, job: Command) -> None:
-        """Take work on; the job's ``wait`` tells what became of it."""
-        if self.refusing is not None:
-            job.finish(self.refusing(job.hand))
-        else:
-            self._inbox.append(job)
+    def stop(self, hands: Sequence[Hand], reason: str = "stop() was called", *, grip: bool = False) -> StopTicket[Hand]:
+        """Void what was admitted for these grippers, and have them stand before anything else happens on the bus.
 
-    def stop(self, hands: Sequence[Hand], reason: str = "stop() was called", *, grip: bool = False) -> StopTicket:
-        """Void what was admitted for these grippers, and have them stand before anything else happens on the bus."""
-        for hand in hands:
-            hand.resource.stop("its driver", reason=reason)
-        ticket = StopTicket(hands, reason, grip=grip)
-        if self.refusing is not None:
-            ticket.finish(self.refusing(hands[0]))
-        self._stops.append(ticket)
-        self.wake.set()
-        return ticket
+        With ``grip``, those at rest are left as they are, pressing on what they hold.
+        """
+        return self.order_stop(hands, reason, lambda: self._halt(hands, reason, grip=grip))
 
     def leave(self, alive: Callable[[], bool], *, relax: bool) -> None:  # noqa: ARG002 - no robot file here says so
         """Stop what moves; what is held stays held."""
@@ -76,31 +51,12 @@ class Exchange:
     # --- from the bus thread
 
     def cycle(self) -> None:
-        """One round: stops, measurements, work, motions.
-
-        Raises:
-            PortLost: the wire is gone.
-        """
         began_ns = self.clock()
         for hand in self.hands:
             self.serve_stops()
             self._measure(hand)
-        self._work(began_ns + self._period_ns // 2)
+        self.work(began_ns + self.period_ns // 2)
         self._watch()
-
-    def idle(self, seconds: float) -> None:
-        """Between two cycles; ends early when something came up. Stops do not wait."""
-        if self.wake.wait(seconds):
-            self.wake.clear()
-            self.serve_stops()
-
-    def serve_stops(self) -> None:
-        """Write every stop that has come."""
-        while self._stops:
-            ticket = self._stops.popleft()
-            if not ticket.ended:
-                self._stopping.append(ticket)
-            self._halt(ticket.hands, ticket.reason, grip=ticket.grip)
 
     def halt_all(self, reason: str) -> None:
         """End every motion; what is held stays held."""
@@ -127,25 +83,14 @@ class Exchange:
         finally:
             self._forget(motion, error)
 
-    def fail_all(self, error_of: Callable[[Device], TradeError]) -> None:
-        """End everything anyone waits for."""
-        for hand in self.hands:
-            if hand.motion is not None:
-                self._forget(hand.motion, error_of(hand))
-        for job in (*self._working, *_drained(self._inbox)):
-            job.finish(error_of(job.hand))
-        for ticket in (*self._stopping, *_drained(self._stops)):
-            ticket.finish(error_of(ticket.hands[0]))
-        self._working.clear()
-        self._stopping.clear()
+    def fail_motion(self, device: Hand, error_of: Callable[[Device], TradeError]) -> None:
+        if device.motion is not None:
+            self._forget(device.motion, error_of(device))
 
     def forget_measurements(self) -> None:
-        """The port is gone: nothing is known any more but how long ago it was."""
-        now_ns = self.clock()
+        super().forget_measurements()
         for hand in self.hands:
             hand.halting_since_ns = 0
-            if not hand.silent:
-                hand.silent, hand.silent_since_ns, hand.probe_at_ns = True, now_ns, now_ns
 
     def admit(self, hand: Hand) -> None:
         """Take a gripper on that was looked over, or is back: found moving and owned by nobody, it is stopped."""
@@ -173,27 +118,8 @@ class Exchange:
         try:
             act()
         except NoAnswer:
-            self._missed(hand)
+            self.missed(hand)
             raise
-
-    def _missed(self, hand: Hand) -> None:
-        now_ns = self.clock()
-        hand.misses += 1
-        hand.doubted = True
-        if hand.misses >= _RETRIES and not hand.silent:
-            _log.warning("%s does not answer on %s", hand.name, hand.bus)
-            hand.silent, hand.silent_since_ns = True, now_ns
-        if hand.silent:
-            hand.probe_at_ns = now_ns + _PROBE_NS * max(1, min(4, hand.misses - _RETRIES + 1))
-
-    def _pause(self, seconds: float) -> None:
-        """Keep silent, except for stops; at least those that have come are served before every exchange."""
-        self.serve_stops()
-        until = time.monotonic() + seconds
-        while (left_s := until - time.monotonic()) > 0:
-            if self.wake.wait(left_s):
-                self.wake.clear()
-                self.serve_stops()
 
     # --- parts of a cycle
 
@@ -213,23 +139,6 @@ class Exchange:
                 hand.silent = False
                 self.admit(hand)
 
-    def _work(self, until_ns: int) -> None:
-        while self._inbox:
-            self._working.append(self._inbox.popleft())
-        while self._working and not self._stops:
-            taken: set[Hand] = set()
-            for job in tuple(self._working):
-                if not job.ended and job.hand in taken:
-                    continue  # one at a time touches a gripper
-                taken.add(job.hand)
-                if job.ended or not job.step():
-                    self._working.remove(job)
-                    job.done_stepping()
-                if self._stops:
-                    break
-            if self.clock() >= until_ns:
-                return
-
     def _watch(self) -> None:
         now_ns = self.clock()
         for hand in self.hands:
@@ -238,8 +147,7 @@ class Exchange:
             if hand.halting_since_ns:
                 self._watch_halt(hand, now_ns)
             hand.tell_moving()
-        for ticket in tuple(self._stopping):
-            self._answer(ticket, now_ns)
+        self.answer_stops(now_ns)
 
     def _watch_halt(self, hand: Hand, now_ns: int) -> None:
         if hand.standing(now_ns, self.stale_after_ns):
@@ -248,20 +156,8 @@ class Exchange:
         sample = hand.sample
         told = sample is not None and (sample.activating or (sample.going and sample.activated))
         seen = sample is not None and sample.at_ns > hand.held_ns + _TAKEN_NS
-        if told and seen and now_ns - hand.halting_since_ns <= _HALT_NS:
+        if told and seen and now_ns - hand.halting_since_ns <= HALT_NS:
             self._stand(hand)  # the stop was not heard
-
-    def _answer(self, ticket: StopTicket, now_ns: int) -> None:
-        error: TradeError | None = None
-        for hand in ticket.hands:
-            if hand.silent or hand.age_ns(now_ns) > self.stale_after_ns:
-                error = hand.deaf(now_ns)
-            elif hand.halting_since_ns and now_ns - hand.halting_since_ns > _HALT_NS:
-                error = hand.faulty("told to stop, but it is still moving")
-            elif hand.halting_since_ns:
-                return
-        self._stopping.remove(ticket)
-        ticket.finish(error)
 
     def _halt(self, hands: Iterable[Hand], reason: str, *, grip: bool) -> None:
         for hand in hands:
@@ -287,9 +183,3 @@ class Exchange:
             motion.hand.motion = None
             motion.hand.tell_moving()
         motion.finish(error)
-
-
-def _drained(queue: "deque[_Job]") -> list[_Job]:
-    jobs = list(queue)
-    queue.clear()
-    return jobs

@@ -14,7 +14,7 @@ from trade_drivers.robotiq._wire import NoAnswer, Refused
 if TYPE_CHECKING:
     from trade_drivers.robotiq._exchange import Exchange
 
-__all__ = ["Activate", "ClearFault", "Command", "Motion", "Move", "StopTicket"]
+__all__ = ["Activate", "ClearFault", "Command", "Motion", "Move"]
 
 _ATTEMPTS: Final = 3
 _RESET_NS: Final = 1_000_000_000
@@ -25,24 +25,11 @@ _NEAR_COUNTS: Final = 8
 _MOST_PER_CYCLE_S: Final = 0.1
 
 
-class StopTicket(Work):
-    """A stop: it has no expiry and needs no permit, and ends when all its grippers are at rest.
-
-    With ``grip``, those at rest are left as they are, pressing on what they hold.
-    """
-
-    def __init__(self, hands: Sequence[Hand], reason: str, *, grip: bool = False) -> None:
-        super().__init__(hands[0])
-        self.hands = tuple(hands)
-        self.reason = reason
-        self.grip = grip
-
-
-class Command(Work):
+class Command(Work[Hand]):
     """What needs leave: it carries an expiry, and the permit under which its call was admitted."""
 
     def __init__(self, exchange: "Exchange", hand: Hand, *, service: str, expires_ns: int, permit: Permit) -> None:
-        super().__init__(hand)
+        super().__init__([hand])
         self.exchange = exchange
         self.hand = hand
         self.service = service

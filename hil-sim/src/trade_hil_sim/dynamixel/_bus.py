@@ -5,13 +5,10 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-import msgspec
-
 from trade_hil_sim import _faults as faults
 from trade_hil_sim._device_line import DeviceLine
 from trade_hil_sim._errors import SimulationError
 from trade_hil_sim._log import ByteLog
-from trade_hil_sim._state import BusState
 
 from ._dispatch import Dispatch
 from ._journal import Journal
@@ -77,18 +74,6 @@ class DynamixelBus(DeviceLine[Servo]):
         clock = time.monotonic
         servos = [_servo_for(bus, joint, clock()) for joint in joints]
         return cls(servos, port, name=bus.name, log=log, paced=paced, clock=clock)
-
-    @property
-    def servos(self) -> Sequence[Servo]:
-        """The servos; take care, the bus's own thread uses them, too."""
-        return tuple(self._devices)
-
-    def state(self) -> BusState:
-        """The truth about the bus and its servos, now."""
-        with self._lock:
-            t = self._clock()
-            devices = [msgspec.structs.replace(servo.state(t), bus=self.name) for servo in self._devices]
-        return BusState(name=self.name, port=str(self.port), plugged=self._line.plugged, devices=devices)
 
     def _do_to(self, device: Servo, command: faults.Command, t: float) -> None:
         _do_to(device, command, t)

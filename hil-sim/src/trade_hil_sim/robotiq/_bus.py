@@ -5,13 +5,10 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-import msgspec
-
 from trade_hil_sim import _faults as faults
 from trade_hil_sim._device_line import DeviceLine
 from trade_hil_sim._errors import SimulationError
 from trade_hil_sim._log import ByteLog, Entry
-from trade_hil_sim._state import BusState
 
 from . import _table as table
 from ._gripper import Gripper, Object
@@ -99,18 +96,6 @@ class RobotiqBus(DeviceLine[Gripper]):
         clock = time.monotonic
         grippers = [Gripper(device.id, name=device.name, t=clock(), baud=bus.baud) for device in devices]
         return cls(grippers, port, name=bus.name, log=log, paced=paced, clock=clock)
-
-    @property
-    def grippers(self) -> Sequence[Gripper]:
-        """The grippers; take care, the bus's own thread uses them, too."""
-        return tuple(self._devices)
-
-    def state(self) -> BusState:
-        """The truth about the bus and its grippers, now."""
-        with self._lock:
-            t = self._clock()
-            grippers = [msgspec.structs.replace(gripper.truth(t), bus=self.name) for gripper in self._devices]
-        return BusState(name=self.name, port=str(self.port), plugged=self._line.plugged, grippers=grippers)
 
     def _do_to(self, device: Gripper, command: faults.Command, t: float) -> None:
         match command:

@@ -325,7 +325,7 @@ class Gripper:
         self._halt(t)
         self.emit(self, "brown_out", t, "")
 
-    def truth(self, t: float) -> GripperTruth:
+    def state(self, t: float) -> GripperTruth:
         """The truth about it, now."""
         self.advance(t)
         going = self._going and self._activated
