@@ -204,9 +204,10 @@ class ZenohTransport(Transport):
             )
         return ZenohPublisher(declared, lambda: self._session.undeclare(known))
 
-    def subscribe(self, pattern: str) -> Channel:
+    def subscribe(self, pattern: str, *, newest: bool = False) -> Channel:
+        kept = zenoh.handlers.RingChannel(_CHANNEL_CAPACITY) if newest else _fifo()
         with _refusing():
-            return ZenohChannel(self._session.declare_subscriber(pattern, _fifo()), declare_on=self._session)
+            return ZenohChannel(self._session.declare_subscriber(pattern, kept), declare_on=self._session)
 
     def announce(self, key: str, payload: bytes) -> None:
         with _refusing():
