@@ -7,6 +7,8 @@ import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 
+import pytest
+
 from trade._rendezvous import free_endpoint
 from trade._transport import ChannelClosed, Presence, Questions
 from trade._zenoh import _CHANNEL_CAPACITY, ZenohTransport, configuration
@@ -58,6 +60,12 @@ class TestZenoh(TransportConformance):
                 waiting = other.submit(read, questions)
                 questions.close()
                 waiting.result(60)
+
+
+@pytest.mark.parametrize(("bridge", "shared"), [([], True), ([["eth0"], ["eth1"]], False)])
+def test_a_bridge_shares_no_memory_with_its_neighbours(bridge: list[list[str]], shared: bool) -> None:
+    settings = configuration(namespace="lab", listen=["tcp/127.0.0.1:0"], connect=[], bridge=bridge)
+    assert settings["transport/shared_memory/enabled"] is shared
 
 
 def _wait_for_links(transport: ZenohTransport, count: int) -> None:

@@ -60,6 +60,8 @@ def configuration(
         "id": new_session_id(dials=all(Endpoint.read(own).loopback for own in listen)),
         "mode": "router" if bridge else "peer",
         "gateway": {"south": [_region(interfaces) for interfaces in bridge]} if bridge else {},
+        # A bridge's neighbours are on other hosts; what it would share with those of its own takes 16 MiB for each.
+        "transport/shared_memory/enabled": not bridge,
         "namespace": namespace,
         "listen/endpoints": list(listen),
         "connect/endpoints": list(connect),
