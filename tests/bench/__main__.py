@@ -7,6 +7,7 @@ parts:
   registry   10,000 services as a late joiner sees them: time, memory, finding one (--full: of 10,000 providers, too)
   deadman    how long a joint moves on after its client was killed or frozen
   locks      taking and giving back four services of two containers; what the checks of resources add to a call
+  gateway    calls through one gateway and two, certificates and policy on; floods; an idle one (root, iproute2)
   servo      the Dynamixel driver against what a bus of 1 Mbaud can carry
 
 Progress goes to stderr, tables and targets (met or missed) to stdout. Peers that are not installed are skipped.
@@ -15,7 +16,7 @@ Progress goes to stderr, tables and targets (met or missed) to stdout. Peers tha
 import argparse
 from collections.abc import Callable, Mapping
 
-from tests.bench import _calls, _deadman, _local, _locks, _registry, _servo
+from tests.bench import _calls, _deadman, _gateway, _local, _locks, _registry, _servo
 
 _SERVICES_EACH = 10
 
@@ -33,10 +34,11 @@ _PARTS: Mapping[str, Callable[[argparse.Namespace], None]] = {
     "registry": _run_registry,
     "deadman": lambda options: _deadman.run(options.rounds),
     "locks": lambda options: _locks.run(options.n, options.rounds),
+    "gateway": lambda options: _gateway.run(options.n, options.rounds, options.idle),
     "servo": lambda options: _servo.run(options.n, options.rounds, options.seconds),
 }
-_QUICK = {"n": 200, "rounds": 8, "seconds": 1.5}
-_FULL = {"n": 500, "rounds": 20, "seconds": 3.0}
+_QUICK = {"n": 200, "rounds": 8, "seconds": 1.5, "idle": 20.0}
+_FULL = {"n": 500, "rounds": 20, "seconds": 3.0, "idle": 60.0}
 
 
 def main() -> None:
@@ -48,6 +50,9 @@ def main() -> None:
     parser.add_argument("-n", type=int, help=f"calls or cycles in a round ({_QUICK['n']}, full {_FULL['n']})")
     parser.add_argument("--rounds", type=int, help=f"turns of each peer ({_QUICK['rounds']}, full {_FULL['rounds']})")
     parser.add_argument("--seconds", type=float, help="length of a 100 Hz round of the servo bus")
+    parser.add_argument(
+        "--idle", type=float, help=f"seconds for the idle gateway ({_QUICK['idle']}, full {_FULL['idle']})"
+    )
     parser.add_argument("--services", type=int, default=10_000, help="of the registry part (default: %(default)s)")
     options = parser.parse_args()
     if unknown := set(options.parts) - set(_PARTS):

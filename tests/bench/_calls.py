@@ -28,9 +28,9 @@ _MOST_P50: Final = 1.3
 _MOST_CPU: Final = 1.5
 _LEAST_RATE: Final = 0.6
 
-_P50 = ("p50_us", "p50_us")
+P50 = ("p50_us", "p50_us")
 _P99 = ("p99_us", "p50_us")
-_CPU = ("cpu_us", "cpu_us")
+CPU = ("cpu_us", "cpu_us")
 _RATE = ("calls_per_s", "calls_per_s")
 """What of one peer is divided by what of another."""
 
@@ -46,7 +46,7 @@ def run(n: int, rounds: int) -> None:
     """
     with up(_PEERS) as peers:
         for size, share in _SIZES.items():
-            results = _measure(f"calls of {_NAMES[size]}", peers, Job(size, max(1, int(n * share))), rounds)
+            results = measure(f"calls of {_NAMES[size]}", peers, Job(size, max(1, int(n * share))), rounds)
             _print_latency(results, size, max(1, int(n * share)))
             _print_latency_targets(results, size)
 
@@ -56,7 +56,7 @@ def run_in_flight(n: int, rounds: int) -> None:
     with up(_IN_FLIGHT_PEERS) as peers:
         for size, share in _SIZES.items():
             job = Job(size, max(min(n, _IN_FLIGHT), int(n * share)), _IN_FLIGHT)
-            _print_rate(_measure(f"{_IN_FLIGHT} in flight of {_NAMES[size]}", peers, job, rounds), job)
+            _print_rate(measure(f"{_IN_FLIGHT} in flight of {_NAMES[size]}", peers, job, rounds), job)
 
 
 @contextmanager
@@ -69,7 +69,8 @@ def up(wanted: Sequence[Peer]) -> Iterator[list[Running]]:
         yield [stack.enter_context(running(peer)) for peer in wanted if not peer.missing]
 
 
-def _measure(what: str, peers: Sequence[Running], job: Job, rounds: int) -> Results:
+def measure(what: str, peers: Sequence[Running], job: Job, rounds: int) -> Results:
+    """So many rounds of each, interleaved; who comes first changes."""
     for peer in peers:
         peer.run(job)  # a first round for caches and connections; not counted
     results: dict[str, list[Round]] = {peer.name: [] for peer in peers}
@@ -88,7 +89,7 @@ def _print_latency(results: Results, size: int, n: int) -> None:
     print(f"{'':16}{'p50':>10}{'p99':>11}{'CPU':>11}{'p50':>8}{'p99':>8}{'CPU':>8}")
     for name, rounds in results.items():
         us = [median(getattr(one, what) for one in rounds) for what in ("p50_us", "p99_us", "cpu_us")]
-        x = [median(_ratios(rounds, bare, *what)) for what in (_P50, _P99, _CPU)]
+        x = [median(ratios(rounds, bare, *what)) for what in (P50, _P99, CPU)]
         print(f"{name:15}" + "".join(f"{value:8.1f} us" for value in us) + "".join(f"{value:7.2f}x" for value in x))
 
 
@@ -99,15 +100,15 @@ def _print_rate(results: Results, job: Job) -> None:
     print(f"{'':16}{'calls/s':>10}{'CPU a call':>13}{'rate':>8}{'CPU':>8}")
     for name, rounds in results.items():
         rate, cpu_us = (median(getattr(one, what) for one in rounds) for what in ("calls_per_s", "cpu_us"))
-        x = "".join(f"{median(_ratios(rounds, bare, *what)):7.2f}x" for what in (_RATE, _CPU))
+        x = "".join(f"{median(ratios(rounds, bare, *what)):7.2f}x" for what in (_RATE, CPU))
         print(f"{name:16}{rate:10.0f}{cpu_us:10.1f} us{x}")
     for name in (Trade.name, TradeThreads.name):
         what = f"{name}: rate / bare pair"
-        share = _ratios(results[name], bare, *_RATE)
+        share = ratios(results[name], bare, *_RATE)
         print_target(what, share, f"at least {_LEAST_RATE}", lambda x: x >= _LEAST_RATE)
 
 
-def _ratios(rounds: Sequence[Round], others: Sequence[Round], what: str, of: str) -> list[float]:
+def ratios(rounds: Sequence[Round], others: Sequence[Round], what: str, of: str) -> list[float]:
     """Round by round: two that stand next to each other saw the same machine."""
     return [getattr(one, what) / getattr(other, of) for one, other in zip(rounds, others, strict=True)]
 
@@ -115,7 +116,7 @@ def _ratios(rounds: Sequence[Round], others: Sequence[Round], what: str, of: str
 def _print_latency_targets(results: Results, size: int) -> None:
     ours, bare = results[Trade.name], results[BarePair.name]
     of = _NAMES[size]
-    print_target(f"{of}: p50 / bare pair", _ratios(ours, bare, *_P50), f"at most {_MOST_P50}", lambda x: x <= _MOST_P50)
-    print_target(f"{of}: CPU / bare pair", _ratios(ours, bare, *_CPU), f"at most {_MOST_CPU}", lambda x: x <= _MOST_CPU)
+    print_target(f"{of}: p50 / bare pair", ratios(ours, bare, *P50), f"at most {_MOST_P50}", lambda x: x <= _MOST_P50)
+    print_target(f"{of}: CPU / bare pair", ratios(ours, bare, *CPU), f"at most {_MOST_CPU}", lambda x: x <= _MOST_CPU)
     if rpyc := results.get(Rpyc.name):
-        print_target(f"{of}: p50 / rpyc", _ratios(ours, rpyc, *_P50), "below 1", lambda x: x < 1)
+        print_target(f"{of}: p50 / rpyc", ratios(ours, rpyc, *P50), "below 1", lambda x: x < 1)

@@ -1,6 +1,8 @@
 """A peer in two processes, its server and its caller, told over pipes what to do; both end with the block."""
 
+import ctypes
 import multiprocessing
+import os
 import random
 import statistics
 import time
@@ -8,11 +10,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
+from pathlib import Path
 
 from tests.bench._links import Link, Peer, check
 
 _SPAWN = multiprocessing.get_context("spawn")
 _PATIENCE_S = 60.0
+_NETWORK = 0x40000000
+"""CLONE_NEWNET of setns(2): os.setns came with Python 3.12."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,16 +63,19 @@ class Running:
 @contextmanager
 def running(peer: Peer) -> Iterator[Running]:
     """Start both processes of a peer. Raises RuntimeError if one of them does not come up."""
-    with child(_serve, peer) as server, child(_call, peer, hear(server)) as caller:
+    with (
+        child(_serve, peer, inside=peer.server_at) as server,
+        child(_call, peer, hear(server), inside=peer.caller_at) as caller,
+    ):
         hear(caller)
         yield Running(peer.name, server, caller)
 
 
 @contextmanager
-def child(main, *args: object) -> Iterator[Connection]:
-    """A process that runs ``main(pipe, *args)``, and our end of the pipe."""
+def child(main, *args: object, inside: str = "") -> Iterator[Connection]:
+    """A process that runs ``main(pipe, *args)``, in a network namespace if one is named, and our end of the pipe."""
     ours, theirs = _SPAWN.Pipe()
-    process = _SPAWN.Process(target=main, args=(theirs, *args), daemon=True)
+    process = _SPAWN.Process(target=_run, args=(inside, main, theirs, *args), daemon=True)
     process.start()
     theirs.close()
     try:
@@ -78,6 +86,20 @@ def child(main, *args: object) -> Iterator[Connection]:
         if process.is_alive():
             process.kill()
             process.join()
+
+
+def _run(inside: str, main, *args: object) -> None:
+    if inside:
+        _enter(Path("/run/netns") / inside)
+    main(*args)
+
+
+def _enter(namespace: Path) -> None:
+    """Go into a network namespace: this thread, and all it starts. Raises OSError."""
+    with namespace.open("rb") as place:
+        if ctypes.CDLL(None, use_errno=True).setns(place.fileno(), _NETWORK):
+            code = ctypes.get_errno()
+            raise OSError(code, os.strerror(code), str(namespace))
 
 
 def _serve(pipe: Connection, peer: Peer) -> None:

@@ -16,7 +16,7 @@ class Trade(Peer):
     @contextmanager
     def serve(self) -> Iterator[str]:
         with _container("server", self.system) as container:
-            container.register(_provider(), "bench")
+            container.register(provider(), "bench")
             yield ""
 
     @contextmanager
@@ -79,7 +79,7 @@ class LocalTrade(Peer):
     @contextmanager
     def connect(self, address: str) -> Iterator[Link]:
         with _container("alone", "one") as container:
-            yield _Shared(container.register(_provider(), "bench")[0])
+            yield _Shared(container.register(provider(), "bench")[0])
 
 
 def _container(name: str, system: str):
@@ -88,7 +88,8 @@ def _container(name: str, system: str):
     return Container(Settings.read(container=name, system=f"bench-{system}"))
 
 
-def _provider() -> object:
+def provider() -> object:
+    """Something with a service that gives back what it is given."""
     from trade import service
 
     class Echo:

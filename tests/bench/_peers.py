@@ -4,6 +4,7 @@ import itertools
 import json
 import socket
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -11,6 +12,8 @@ from typing import Any
 from tests.bench._links import Link, Peer, Pipeline
 
 _SIZE_BYTES = 4
+_PATIENCE_S = 20.0
+_CALLS, _REPLIES = "call/bench", "reply/bench"
 _MOST_UNREAD = 256 * 1024
 """Bytes that raw TCP may have under way: with more, both ends could wait to send and nobody would read."""
 
@@ -73,19 +76,13 @@ class BarePair(Peer):
     def serve(self) -> Iterator[str]:
         endpoint = _free_endpoint()
         with _bare_session(listen=endpoint) as session:
-            calls = session.declare_subscriber("call/bench", _fifo())
-            replies = _declare(session, "reply/bench")
-            threading.Thread(target=_answer_all, args=(calls, replies), daemon=True).start()
+            serve_bare(session, _CALLS, _REPLIES)
             yield endpoint
 
     @contextmanager
     def connect(self, address: str) -> Iterator[Link]:
         with _bare_session(connect=address) as session:
-            replies = session.declare_subscriber("reply/bench", _fifo())
-            calls = _declare(session, "call/bench")
-            while not calls.matching_status.matching:
-                threading.Event().wait(0.01)
-            yield _BareLink(calls.put, replies.handler.recv)
+            yield bare_link(session, _CALLS, _REPLIES)
 
 
 class _BareLink(Pipeline):
@@ -104,6 +101,23 @@ class _BareLink(Pipeline):
             answer = self._receive().payload.to_bytes()
             if answer[:8] == begun:
                 return answer[8:]
+
+
+def serve_bare(session, calls: str, replies: str) -> None:
+    """Answer what comes on one key on another one, until the session closes."""
+    heard, answers = session.declare_subscriber(calls, _fifo()), _declare(session, replies)
+    threading.Thread(target=_answer_all, args=(heard, answers), daemon=True).start()
+
+
+def bare_link(session, calls: str, replies: str) -> Link:
+    """The caller's end; raises RuntimeError if nobody comes to hear its calls."""
+    heard, asked = session.declare_subscriber(replies, _fifo()), _declare(session, calls)
+    until = time.monotonic() + _PATIENCE_S
+    while not asked.matching_status.matching:
+        if time.monotonic() > until:
+            raise RuntimeError(f"nobody hears {calls}")
+        threading.Event().wait(0.01)
+    return _BareLink(asked.put, heard.recv)
 
 
 def _answer_all(calls, replies) -> None:

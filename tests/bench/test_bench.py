@@ -1,5 +1,6 @@
 """The bench runs and prints its lines; how fast anything is, is not this test's business."""
 
+import os
 import re
 import subprocess
 import sys
@@ -7,7 +8,9 @@ from pathlib import Path
 
 import pytest
 from tests.bench._calls import up
+from tests.bench._flood import FLOODS
 from tests.bench._others import Rpyc
+from tests.system.networks import why_not
 
 ROOT = Path(__file__).parents[2]
 
@@ -16,9 +19,9 @@ def targets(printed: str) -> list[str]:
     return [re.split("  | [0-9]+[.]", line)[0] for line in printed.splitlines() if "  target " in line]
 
 
-def bench(*arguments: str) -> str:
+def bench(*arguments: str, timeout_s: float = 100) -> str:
     command = [sys.executable, "-m", "tests.bench", *arguments]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=100, check=False)
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=timeout_s, check=False)
     assert done.returncode == 0, done.stderr
     return done.stdout
 
@@ -72,6 +75,26 @@ def test_the_bench_of_the_servo_bus_prints_its_targets() -> None:
     assert "156 bytes a cycle" in printed
     assert "190 bytes a cycle" in printed
     assert printed.count("target") == 3
+
+
+@pytest.mark.timeout(300)
+def test_the_bench_of_gateways_prints_every_pair_every_flood_and_every_target() -> None:
+    if reason := why_not():
+        pytest.fail(reason) if os.environ.get("CI") == "true" else pytest.skip(reason)
+    printed = bench("gateway", "-n", "3", "--rounds", "1", "--idle", "0.5", timeout_s=250)
+    assert targets(printed) == [
+        "idle gateway: RSS, MiB",
+        "idle gateway: % of a core",
+        *(f"{flood.name}: {what}" for flood in FLOODS for what in ("call p99 / none", "stop, ms")),
+        "one gateway: p50 / direct",
+        "one gateway: p50 / bare pair",
+        "one, plain: p50 / bare, plain",
+        "two gateways: p50 / direct",
+        "one gateway, 32 in flight: /s",
+    ]
+    assert "23 services known across it" in printed
+    for flood in FLOODS:
+        assert len(re.findall(rf"^{flood.name} .*[1-9]", printed, re.MULTILINE)) == 1
 
 
 def test_the_bench_of_the_deadman_prints_every_way_to_end() -> None:

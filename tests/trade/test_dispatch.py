@@ -323,7 +323,9 @@ def test_no_thread_goes_back_into_a_transport_that_is_being_left(monkeypatch: py
             self.inner.close()
 
     subscribe = MemoryTransport.subscribe
-    monkeypatch.setattr(MemoryTransport, "subscribe", lambda self, pattern: Watched(subscribe(self, pattern)))
+    monkeypatch.setattr(
+        MemoryTransport, "subscribe", lambda self, pattern, **how: Watched(subscribe(self, pattern, **how))
+    )
     with memory_system() as system:
         there, endless = system.container("there"), Endless()
         there.register(endless, "robot")

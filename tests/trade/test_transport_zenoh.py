@@ -7,9 +7,11 @@ import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 
+import pytest
+
 from trade._rendezvous import free_endpoint
 from trade._transport import ChannelClosed, Presence, Questions
-from trade._zenoh import ZenohTransport, configuration
+from trade._zenoh import _CHANNEL_CAPACITY, ZenohTransport, configuration
 from trade.testing import LossConformance, Severable, TransportConformance
 
 
@@ -35,6 +37,17 @@ class TestZenoh(TransportConformance):
 
             yield open_transport
 
+    def test_what_nobody_reads_holds_up_nothing_where_only_the_newest_is_wanted(self) -> None:
+        with self.network() as open_transport:
+            here, there = open_transport(), open_transport()
+            unread, read = there.subscribe("flood", newest=True), there.subscribe("call")
+            flood, call = here.publish("flood"), here.publish("call")
+            for number in range(2 * _CHANNEL_CAPACITY):
+                flood.put(str(number).encode())
+            call.put(b"at last")
+            assert read.receive().payload == b"at last"
+            assert unread.receive().payload == str(_CHANNEL_CAPACITY).encode()
+
     def test_who_waits_for_questions_while_they_are_closed_hears_that_they_are(self) -> None:
         def read(questions: Questions) -> None:
             with contextlib.suppress(ChannelClosed):
@@ -47,6 +60,12 @@ class TestZenoh(TransportConformance):
                 waiting = other.submit(read, questions)
                 questions.close()
                 waiting.result(60)
+
+
+@pytest.mark.parametrize(("bridge", "shared"), [([], True), ([["eth0"], ["eth1"]], False)])
+def test_a_bridge_shares_no_memory_with_its_neighbours(bridge: list[list[str]], shared: bool) -> None:
+    settings = configuration(namespace="lab", listen=["tcp/127.0.0.1:0"], connect=[], bridge=bridge)
+    assert settings["transport/shared_memory/enabled"] is shared
 
 
 def _wait_for_links(transport: ZenohTransport, count: int) -> None:

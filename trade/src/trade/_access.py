@@ -62,13 +62,19 @@ def decide_call(policy: Policy, who: str, domain: str, name: str, effect: str) -
 class Access:
     """The policy a container goes by; without one everybody may do everything."""
 
-    def __init__(self, path: Path | None = None) -> None:
-        """Read the policy. Raises ConfigurationError: it is wrong."""
+    def __init__(self, path: Path | None = None, *, certified: bool = False) -> None:
+        """Read the policy; ``certified``: links tell who is who. Raises ConfigurationError: it is wrong."""
+        self._certified = certified
         self.policy: Policy | None = None if path is None else read_policy(path)
 
     def load(self, path: Path) -> None:
         """Go by another one from now on. Raises ConfigurationError: it is wrong, and the old one stays."""
         self.policy = read_policy(path)
+
+    def callers(self) -> list[str]:
+        """Who can call, one by one; nobody where that cannot be told."""
+        policy = self.policy if self._certified else None
+        return [] if policy is None else [*policy.names(), *policy.gateways]
 
     # --- calls
 

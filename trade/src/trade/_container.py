@@ -80,7 +80,7 @@ class Container(Hosting, Hooking, Guarding, Bordering):
         self._closed = False
         self.system: Final = System(lambda: self)
         """Its own switches: who it is linked to, and whether it lets itself be found."""
-        self.access: Final = Access(self._settings.policy)
+        self.access: Final = Access(self._settings.policy, certified=self._settings.tls is not None)
         """What the policy means for it."""
         self._targets: dict[ServiceKey, LocalTarget | RemoteTarget] = {}
         self._codec = Codec(self._handle_to_data, self._data_to_handle, (Handle,))
@@ -147,7 +147,7 @@ class Container(Hosting, Hooking, Guarding, Bordering):
             self.withdrawn = Withdrawn(self._providers, self._deadman.rest)
             """What was taken off from elsewhere and can be offered again."""
             self._dispatcher = Dispatcher(
-                self._transport, self.address, self._providers.lookup, coroutines, self.access
+                self._transport, self.address, self._providers.lookup, coroutines, self.access, self.access.callers()
             )
             leaving.callback(self._dispatcher.close)
             own = OwnServices(
@@ -187,6 +187,7 @@ class Container(Hosting, Hooking, Guarding, Bordering):
         self._check_open()
         self.access.load(Path(path))
         self._targets.clear()
+        self._dispatcher.hear(self.access.callers())
         self._registry.judge_anew()
         self._hooks.judge_anew()
         for info in self._table.infos():

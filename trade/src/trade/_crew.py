@@ -1,4 +1,9 @@
-"""Threads that take turns at one channel: the one that takes a call is replaced before it runs it."""
+"""Threads that take turns at one channel: the one that takes a call is replaced before it runs it.
+
+Quick calls need few of them, however many calls there are: more would only wait for each other, and for the interpreter
+with all others of the process. So beyond a few a call that finds none but its own thread waits a moment for one to come
+back before another is started, and who comes back to enough others ends.
+"""
 
 import logging
 import threading
@@ -11,6 +16,9 @@ from trade._transport import Channel, ChannelClosed, Message
 _logger = logging.getLogger("trade")
 
 MOST_THREADS: Final = 64
+_FEW: Final = 4
+_MOMENT_S: Final = 0.005
+"""A call that takes longer is not quick."""
 
 
 class Crew:
@@ -23,11 +31,12 @@ class Crew:
         self._channel = channel
         self._work = work
         self._refuse = refuse
-        self._lock = threading.Lock()
+        self._back = threading.Condition(threading.Lock())
         self._threads: list[threading.Thread] = []
+        self._hired = 0
         self._idle = 0
         self._dismissed = False
-        with self._lock:
+        with self._back:
             self._hire()
 
     @property
@@ -35,9 +44,10 @@ class Crew:
         return self._idle > 0
 
     def _hire(self) -> None:
-        thread = threading.Thread(target=self._main, name=f"{self._name}-{len(self._threads)}", daemon=True)
+        thread = threading.Thread(target=self._main, name=f"{self._name}-{self._hired}", daemon=True)
         thread.start()
         self._threads.append(thread)
+        self._hired += 1
         self._idle += 1
 
     def _main(self) -> None:
@@ -53,15 +63,15 @@ class Crew:
                 _logger.debug("no answer on %s: the container is closing", message.key)
             except Exception:
                 _logger.exception("a call on %s could not be answered", message.key)
-            finally:
-                if left:
-                    with self._lock:
-                        self._idle += 1
+            if left and not self._join_idle():
+                return
 
     def _leave_idle(self) -> bool:
         """Whether this thread may run the call: somebody else must be left to take the next one."""
-        with self._lock:
+        with self._back:
             try:
+                if self._idle == 1 and _FEW <= len(self._threads) < MOST_THREADS:
+                    self._back.wait_for(lambda: self._idle > 1 or self._dismissed, _MOMENT_S)
                 if self._idle == 1 and len(self._threads) < MOST_THREADS and not self._dismissed:
                     self._hire()
             except RuntimeError:  # the process may have no more threads
@@ -71,15 +81,26 @@ class Crew:
             self._idle -= 1
             return True
 
+    def _join_idle(self) -> bool:
+        """Whether this thread, whose call has ended, is to take more."""
+        with self._back:
+            if self._idle >= _FEW:
+                self._threads.remove(threading.current_thread())
+                return False
+            self._idle += 1
+            self._back.notify()
+            return True
+
     def dismiss(self) -> None:
         """Take no more calls. No thread goes back into the transport, where the end of the process would abort it."""
-        with self._lock:
+        with self._back:
             self._dismissed = True
+            self._back.notify_all()
         self._channel.close()
 
     def wait(self, most_s: float) -> None:
         """Wait until every thread has ended, or for so long."""
         deadline = time.monotonic() + most_s
-        for thread in self._threads:
+        for thread in list(self._threads):
             if thread is not threading.current_thread():
                 thread.join(max(0.0, deadline - time.monotonic()))

@@ -8,7 +8,7 @@ import asyncio
 import logging
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from types import CoroutineType
 from typing import Any, Final, Protocol
 
@@ -54,6 +54,7 @@ _logger = logging.getLogger("trade")
 _PARTING_S: Final = 2.0
 _COROUTINE: Final[type] = CoroutineType
 """What an ``async def`` gives; asked of every result, so without a call."""
+ANYBODY: Final = "*"
 _KINDS: Final = frozenset(("call", "stop"))
 _MOST_REPLY_KEYS: Final = 1024
 _MOST_CALLERS: Final = 1024
@@ -179,7 +180,15 @@ Lookup = Callable[[str, str], LocalService | None]
 class Dispatcher:
     """Every incoming call of one container."""
 
-    def __init__(self, transport: Transport, own: Address, lookup: Lookup, loop: AsyncLoop, access: Access) -> None:
+    def __init__(
+        self,
+        transport: Transport,
+        own: Address,
+        lookup: Lookup,
+        loop: AsyncLoop,
+        access: Access,
+        callers: Sequence[str] = (),
+    ) -> None:
         self._transport = transport
         self._access = access
         self._loop = loop
@@ -192,10 +201,32 @@ class Dispatcher:
         self._once = Once()
         self._herald = Herald(self._send_progress)
         self.malformed = 0
-        self._crews = [
-            Crew("trade-call", transport.subscribe(calls_to(own, stop=False)), self._serve, self._busy),
-            Crew("trade-stop", transport.subscribe(calls_to(own, stop=True)), self._serve, self._serve),
-        ]
+        self.callers = set[str]()
+        """Who is heard by channels of its own; nobody: all are heard by the same."""
+        self._crews: list[Crew] = []
+        if callers:
+            self.hear(callers)
+        else:
+            self._hire(ANYBODY)
+
+    def hear(self, callers: Iterable[str]) -> None:
+        """Take calls of these from now on, too: each by channels of its own, so that who floods fills only those."""
+        with self._lock:
+            new = [caller for caller in dict.fromkeys(callers) if caller not in self.callers]
+            self.callers.update(new)
+            for caller in () if self._closed else new:
+                self._hire(caller)
+
+    def _hire(self, caller: str) -> None:
+        """Threads for the calls of one caller and for its stops.
+
+        Who can be told from others loses what it sends faster than it is taken: made to wait, it would hold up all who
+        come by the same link.
+        """
+        for name, stop, refuse in (("trade-call", False, self._busy), ("trade-stop", True, self._serve)):
+            pattern = calls_to(self._own, stop=stop, caller=caller)
+            channel = self._transport.subscribe(pattern, newest=caller != ANYBODY)
+            self._crews.append(Crew(name, channel, self._serve, refuse))
 
     @property
     def draining(self) -> bool:
@@ -361,7 +392,8 @@ class Dispatcher:
 
     def close(self) -> None:
         """Take no more calls; those running may finish within two seconds. Idempotent."""
-        self._closed = True
+        with self._lock:
+            self._closed = True
         for crew in self._crews:
             crew.dismiss()
         for crew in self._crews:

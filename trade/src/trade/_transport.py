@@ -115,8 +115,12 @@ class Transport(ABC):
         """
 
     @abstractmethod
-    def subscribe(self, pattern: str) -> Channel:
-        """Hear what is put on keys that match."""
+    def subscribe(self, pattern: str, *, newest: bool = False) -> Channel:
+        """Hear what is put on keys that match.
+
+        Whoever puts faster than it is read waits, and with it whatever else comes by the same link. ``newest``: nobody
+        waits, and of what is not read in time the oldest is lost.
+        """
 
     @abstractmethod
     def announce(self, key: str, payload: bytes) -> None:

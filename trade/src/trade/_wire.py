@@ -53,8 +53,8 @@ def call_key(caller: str, callee: Address, domain: str, provider: str, *, stop: 
     return f"{'stop' if stop else 'call'}/{caller}/{callee}/{domain}/{provider}"
 
 
-def calls_to(callee: Address, *, stop: bool) -> str:
-    return f"{'stop' if stop else 'call'}/*/{callee}/**"
+def calls_to(callee: Address, *, stop: bool, caller: str = "*") -> str:
+    return f"{'stop' if stop else 'call'}/{caller}/{callee}/**"
 
 
 def reply_key(callee: str, caller: str, container: str, channel: str) -> str:

@@ -64,6 +64,8 @@ def configuration(
         "id": new_session_id(dials=all(Endpoint.read(own).loopback for own in listen)),
         "mode": "router" if bridge else "peer",
         "gateway": {"south": [_region(interfaces) for interfaces in bridge]} if bridge else {},
+        # A bridge's neighbours are on other hosts; what it would share with those of its own takes 16 MiB for each.
+        "transport/shared_memory/enabled": not bridge,
         "namespace": namespace,
         "listen/endpoints": list(listen),
         "connect/endpoints": list(connect),
@@ -210,9 +212,10 @@ class ZenohTransport(Transport):
             )
         return ZenohPublisher(declared, lambda: self._session.undeclare(known))
 
-    def subscribe(self, pattern: str) -> Channel:
+    def subscribe(self, pattern: str, *, newest: bool = False) -> Channel:
+        kept = zenoh.handlers.RingChannel(_CHANNEL_CAPACITY) if newest else _fifo()
         with _refusing():
-            return ZenohChannel(self._session.declare_subscriber(pattern, _fifo()), declare_on=self._session)
+            return ZenohChannel(self._session.declare_subscriber(pattern, kept), declare_on=self._session)
 
     def announce(self, key: str, payload: bytes) -> None:
         with _refusing():

@@ -67,7 +67,7 @@ class MemoryTransport(Transport):
         self._check_open()
         return MemoryPublisher(self, key, Kind.DROPPABLE if droppable else Kind.URGENT if urgent else Kind.PUT)
 
-    def subscribe(self, pattern: str) -> Channel:
+    def subscribe(self, pattern: str, *, newest: bool = False) -> Channel:  # noqa: ARG002 - here nobody ever waits
         return self._listen(pattern, self.node.ears)
 
     def announce(self, key: str, payload: bytes) -> None:

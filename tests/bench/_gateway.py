@@ -1,0 +1,109 @@
+"""Gateways: calls through one and two in a row, beside the direct call and a bare zenoh pair over the same regions.
+
+Before that one that has nothing to do, and one through which somebody floods.
+"""
+
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from statistics import median
+from typing import Final
+
+from tests.bench import _flood, _idle
+from tests.bench._across import BareAcross, TradeAcross
+from tests.bench._calls import CPU, P50, Results, measure, ratios, up
+from tests.bench._children import Job, Running, child, hear
+from tests.bench._report import print_target
+from tests.bench._site import PLAIN, SECURE, Site, site
+
+_SIZE: Final = 64
+_IN_FLIGHT: Final = 32
+_MOST_OF_DIRECT, _MOST_OF_BARE, _MOST_OF_DIRECT_TWO, _LEAST_RATE = 2.0, 1.2, 3.0, 5000
+
+_DIRECT, _ONE, _TWO = "TRADE, direct", "TRADE, one gateway", "TRADE, two gateways"
+_BARE, _BARE_TLS, _BARE_RULES = "bare pair, plain", "bare pair, TLS", "bare pair, rules"
+_DIRECT_PLAIN, _ONE_PLAIN = "TRADE, direct, plain", "TRADE, one, plain"
+
+
+def run(n: int, rounds: int, idle_s: float) -> None:
+    """Measure and print.
+
+    Args:
+        n: calls of each pair in a round, and of the honest caller beside a flood.
+        rounds: turns of each pair; a quarter as many of each flood.
+        idle_s: how long the idle gateway is looked at.
+    """
+    with site() as where:
+        if where is not None:
+            door = where.begin_gateway("door", SECURE)
+            _idle.run(where, door, idle_s)
+            _flood.run(where, n, max(1, rounds // 4))
+            _run_pairs(where, n, rounds)
+
+
+def _run_pairs(site: Site, n: int, rounds: int) -> None:
+    with _up(site) as pairs:
+        _print(measure("calls through gateways", pairs, Job(_SIZE, n), rounds), n)
+        through = [pair for pair in pairs if pair.name in (_BARE_TLS, _DIRECT, _ONE_PLAIN, _ONE)]
+        job = Job(_SIZE, max(n, _IN_FLIGHT), _IN_FLIGHT)
+        _print_rate(measure(f"{_IN_FLIGHT} in flight through a gateway", through, job, rounds))
+
+
+@contextmanager
+def _up(site: Site) -> Iterator[Sequence[Running]]:
+    bare = (
+        BareAcross(site, _BARE, 7471),
+        BareAcross(site, _BARE_TLS, 7472, tls=True),
+        BareAcross(site, _BARE_RULES, 7473, tls=True, rules=True),
+    )
+    ours = (
+        TradeAcross(site, _DIRECT_PLAIN, "aside", PLAIN),
+        TradeAcross(site, _ONE_PLAIN, "office", PLAIN, "door"),
+        TradeAcross(site, _DIRECT, "aside", SECURE),
+        TradeAcross(site, _ONE, "office", SECURE, "door"),
+        TradeAcross(site, _TWO, "home", SECURE, "gate"),
+    )
+    with ExitStack() as stack:
+        for pair in bare:
+            hear(stack.enter_context(child(_route, pair, inside=pair.router_at)))
+        for gateway, port in (("gate", SECURE), ("door", PLAIN)):
+            site.begin_gateway(gateway, port)
+        yield stack.enter_context(up([*bare, *ours]))
+
+
+def _route(pipe, pair: BareAcross) -> None:
+    pair.route(pipe)
+
+
+def _print(results: Results, n: int) -> None:
+    rounds = len(results[_DIRECT])
+    print(f"\nremote call of {_SIZE} B between hosts: medians over {rounds} rounds of {n} calls")
+    print(f"{'':22}{'p50':>10}{'p99':>11}{'CPU of ends':>14}{'p50 / direct':>14}{'p50 / bare':>12}")
+    for name, measured in results.items():
+        us = [median(getattr(one, what) for one in measured) for what in ("p50_us", "p99_us", "cpu_us")]
+        x = [median(ratios(measured, results[other], *P50)) for other in (_DIRECT, _BARE_TLS)]
+        print(f"{name:22}{us[0]:7.1f} us{us[1]:8.1f} us{us[2]:11.1f} us{x[0]:13.2f}x{x[1]:11.2f}x")
+    print("bare: the pair with TLS; both kinds of direct call are between two hosts of one network")
+    for what, one, other in (
+        ("TLS costs a bare pair", _BARE_TLS, _BARE),
+        ("rules cost a bare pair", _BARE_RULES, _BARE_TLS),
+        ("both cost a direct call", _DIRECT, _DIRECT_PLAIN),
+        ("both cost through a gateway", _ONE, _ONE_PLAIN),
+    ):
+        x = [median(ratios(results[one], results[other], *ratio)) for ratio in (P50, CPU)]
+        print(f"{what:32} {x[0]:5.2f} x the p50, {x[1]:.2f} x the CPU of the ends")
+    for what, one, other, most in (
+        ("one gateway: p50 / direct", _ONE, _DIRECT, _MOST_OF_DIRECT),
+        ("one gateway: p50 / bare pair", _ONE, _BARE_TLS, _MOST_OF_BARE),
+        ("one, plain: p50 / bare, plain", _ONE_PLAIN, _BARE, _MOST_OF_BARE),
+        ("two gateways: p50 / direct", _TWO, _DIRECT, _MOST_OF_DIRECT_TWO),
+    ):
+        x = ratios(results[one], results[other], *P50)
+        print_target(what, x, f"at most {most:.1f}", lambda x, most=most: x <= most)
+
+
+def _print_rate(results: Results) -> None:
+    rates = {name: [one.calls_per_s for one in measured] for name, measured in results.items()}
+    for name in (_BARE_TLS, _DIRECT, _ONE_PLAIN):
+        print(f"{_IN_FLIGHT} in flight, {name:20} {median(rates[name]):8.0f} calls/s")
+    what = f"one gateway, {_IN_FLIGHT} in flight: /s"
+    print_target(what, rates[_ONE], f"at least {_LEAST_RATE}", lambda x: x >= _LEAST_RATE)

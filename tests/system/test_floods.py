@@ -1,0 +1,91 @@
+"""Where certificates tell who is who, nobody takes another one's turn."""
+
+import threading
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from certificates import Papers
+from trade import Container, Settings, _crew, service, where
+from trade._endpoints import free_endpoint
+from trade.errors import Busy
+
+POLICY = """
+[roles.driver]
+register = ["lab"]
+[roles.operator]
+read = ["*"]
+call = ["lab"]
+[identities]
+robot = ["driver"]
+planner = ["operator"]
+mallory = ["operator"]
+"""
+
+
+class Room:
+    def __init__(self) -> None:
+        self.open = threading.Event()
+        self.inside = threading.Semaphore(0)
+
+    @service(effect="read")
+    def enter(self) -> None:
+        self.inside.release()
+        self.open.wait(60)
+
+    @service(effect="read")
+    def knock(self) -> str:
+        return "who is there?"
+
+
+class Lab:
+    """Containers by identity, each with a certificate and the policy; the robot is dialled by the others."""
+
+    def __init__(self, folder: Path, stack: ExitStack) -> None:
+        self.papers = Papers(folder / "pki")
+        self.policy = folder / "policy.toml"
+        self.policy.write_text(POLICY)
+        self.endpoint = free_endpoint().replace("tcp/", "tls/")
+        self._stack = stack
+        self.robot = self.join("robot", listen=[self.endpoint])
+
+    def join(self, identity: str, **how: Any) -> Container:
+        how = how or {"connect": [self.endpoint]}
+        settings = Settings.read(
+            container=f"of-{identity}", tls=self.papers.of(identity), policy=self.policy, environment={}, **how
+        )
+        return self._stack.enter_context(Container(settings))
+
+
+@pytest.fixture
+def lab(tmp_path: Path, system: str) -> Iterator[Lab]:
+    with ExitStack() as stack:
+        yield Lab(tmp_path, stack)
+
+
+def test_who_has_all_threads_of_its_own_busy_leaves_those_of_others_alone(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(_crew, "MOST_THREADS", 2)
+    room = Room()
+    lab.robot.register(room, "lab")
+    mallory, planner = lab.join("mallory"), lab.join("planner")
+    enter = mallory.find(where(name="enter", group="lab"), wait_s=20)
+    knock = planner.find(where(name="knock", group="lab"), wait_s=20)
+    runs = [enter.start() for _ in range(20)]
+    assert room.inside.acquire(timeout=20)
+    assert any(isinstance(run.exception(20), Busy) for run in runs[1:])
+    assert knock() == "who is there?"
+    room.open.set()
+
+
+def test_who_comes_with_another_policy_is_heard(lab: Lab) -> None:
+    lab.robot.register(Room(), "lab")
+    lab.policy.write_text(POLICY + 'guest = ["operator"]\n')
+    guest = lab.join("guest")
+    assert guest.services(where(group="lab")) == []  # the robot's rules are those it began with
+    lab.robot.load_policy(lab.policy)
+    assert "guest" in lab.robot._dispatcher.callers

@@ -1,0 +1,77 @@
+"""How many threads a channel of calls has."""
+
+import queue
+import threading
+from collections.abc import Callable, Iterator
+from statistics import median
+
+import pytest
+
+from trade._crew import MOST_THREADS, Crew
+from trade._transport import Channel, ChannelClosed, Message
+
+CALL = Message("call/a/b", b"")
+
+
+class Queue(Channel):
+    def __init__(self) -> None:
+        self.waiting: queue.SimpleQueue[Message | None] = queue.SimpleQueue()
+
+    def receive(self) -> Message:
+        message = self.waiting.get(timeout=60)
+        if message is None:
+            self.close()
+            raise ChannelClosed
+        return message
+
+    def close(self) -> None:
+        self.waiting.put(None)
+
+
+@pytest.fixture
+def channel() -> Iterator[Queue]:
+    made = Queue()
+    yield made
+    made.close()
+
+
+def test_very_many_quick_calls_are_taken_by_few_threads(channel: Queue) -> None:
+    done = threading.Semaphore(0)
+    at_once: list[int] = []
+
+    def work(_message: Message) -> None:
+        at_once.append(sum(thread.name.startswith("quick-") for thread in threading.enumerate()))
+        threading.Event().wait(0.0002)  # as an answer does, it lets others run
+        done.release()
+
+    for _ in range(3000):
+        channel.waiting.put(CALL)
+    crew = Crew("quick", channel, work, refuse=work)
+    for _ in range(3000):
+        assert done.acquire(timeout=60)
+    assert median(at_once) < MOST_THREADS // 4
+    crew.dismiss()
+    crew.wait(20)
+
+
+def test_slow_calls_get_a_thread_each_which_ends_with_them(
+    channel: Queue, eventually: Callable[[Callable[[], bool]], bool]
+) -> None:
+    inside, leave, refused = threading.Semaphore(0), threading.Event(), threading.Event()
+
+    def work(_message: Message) -> None:
+        inside.release()
+        leave.wait(60)
+
+    crew = Crew("slow", channel, work, refuse=lambda _message: refused.set())
+    for _ in range(MOST_THREADS - 1):
+        channel.waiting.put(CALL)
+    for _ in range(MOST_THREADS - 1):
+        assert inside.acquire(timeout=20)
+    channel.waiting.put(CALL)
+    assert refused.wait(20)
+    assert crew.draining
+    leave.set()
+    assert eventually(lambda: sum(thread.name.startswith("slow-") for thread in threading.enumerate()) == 4)
+    crew.dismiss()
+    crew.wait(20)
