@@ -72,6 +72,7 @@ def open_exchange(robot: Robot, bus: CanBus, port: str) -> "DriveExchange":
                 raise ConfigurationError(where=f"{where}.channel", problem=problem)
             for axis in axes:
                 _take_on(exchange, axis, wire, robot.where)
+            exchange.begin()
             for _ in range(_FIRST_CYCLES):
                 exchange.cycle()
         except PortLost as lost:

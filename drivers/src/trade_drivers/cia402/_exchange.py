@@ -188,3 +188,9 @@ class DriveExchange(Exchange):
             axis.latch("it was away")
         axis.silent, axis.silent_since_ns, axis.beat_ns, axis.sample = False, now_ns, now_ns, None
         axis.controlword = axis.asked_ns = axis.awaited_ns = 0
+
+    def begin(self) -> None:
+        """All are taken on: who was the first has been asked nothing since, and is not away for that."""
+        now_ns = self.clock()
+        for axis in self.drives:
+            axis.silent_since_ns = axis.beat_ns = now_ns
