@@ -164,8 +164,8 @@ def wait_for_the_user(scene: Stage) -> None:
     print("\nThe robot stays up; Ctrl-C here ends it. In another terminal, on the laboratory's network:\n")
     way = [scene.places.way_in(), "source .venv/bin/activate", f"source {script}", "trade services --group rosie"]
     way += ["trade call rosie.head.move_to '[0.3, -0.2]'", "trade call rosie.left.hand.open", "trade locks"]
-    print("\n".join(f"  {line}" for line in way if line), flush=True)
     with contextlib.suppress(KeyboardInterrupt):
+        print("\n".join(f"  {line}" for line in way if line))
         while True:
             time.sleep(1)
 
