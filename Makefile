@@ -24,7 +24,7 @@ $(UV):
 	@echo "fetching uv into .uv/ (once)"
 	@$(PYTHON) -m venv .uv && .uv/bin/python -m pip install --quiet --disable-pip-version-check 'uv==0.13.8'
 
-demo: $(UV) ## a simulated pan-tilt head moves through remote service calls (ARGS=--stay keeps it up)
+demo: $(UV) ## a simulated robot looks, walks and grips for behaviours beyond a gateway (ARGS=--stay keeps it up)
 	@$(RUN) python examples/demo.py $(ARGS)
 
 test: $(UV) ## the whole test suite

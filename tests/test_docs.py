@@ -63,7 +63,7 @@ def test_every_error_is_in_the_guides_table() -> None:
 def test_the_command_for_the_simulator_strikes_it() -> None:
     page = (ROOT / "docs" / "simulators.md").read_text(encoding="utf-8")
     [command] = re.findall(r"```sh\n(python .*?)\n```", page)
-    with SimProcess(ROOT / "examples" / "rosie.toml") as sim:
+    with SimProcess(ROOT / "examples" / "head.toml") as sim:
         words = [sys.executable, *shlex.split(command)[1:-1], str(sim.control_path)]
         subprocess.run(words, timeout=60, check=True)
         assert events(sim.entries(), "brown_out", device_id=1)

@@ -21,7 +21,7 @@ import trade
 from trade_hil_sim import SimProcess, events
 
 _ROOT = Path(__file__).parents[2]
-_ROSIE = _ROOT / "examples" / "rosie.toml"
+_HEAD = _ROOT / "examples" / "head.toml"
 _MOVER = _ROOT / "tests" / "system" / "mover.py"
 _PATIENCE_S = 30.0
 _HOME_RAD = -1.2
@@ -55,9 +55,9 @@ def run(rounds: int) -> None:
 def _robot(stack: ExitStack) -> SimProcess:
     """Simulated servos and their driver, each in a process of its own."""
     folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-    sim = stack.enter_context(SimProcess(_ROSIE))
+    sim = stack.enter_context(SimProcess(_HEAD))
     robot_file = folder / "rosie.toml"
-    lines = _ROSIE.read_text().splitlines()
+    lines = _HEAD.read_text().splitlines()
     robot_file.write_text(
         "\n".join(f'port = "{sim.ports["neck"]}"' if line.startswith("port =") else line for line in lines)
     )

@@ -275,7 +275,7 @@ def test_close_withdraws_what_was_announced_and_can_be_repeated(head: Rig) -> No
 def test_the_example_describes_a_robot_that_can_be_attached(rig: Rig) -> None:
     from pathlib import Path
 
-    rig.robot = load(Path(__file__).parents[2] / "examples" / "rosie.toml")
+    rig.robot = load(Path(__file__).parents[2] / "examples" / "head.toml")
     rig.plug()
     robot = rig.attach()
     assert robot.group("head").joints() == ["rosie.neck.pan", "rosie.neck.tilt"]

@@ -123,6 +123,15 @@ def test_a_drive_that_answers_but_is_not_heard_is_not_back_until_it_is(leg: Leg,
     assert hip.move_to(0.1) == pytest.approx(0.1, abs=0.01)
 
 
+def test_drives_that_are_slow_to_be_attached_are_not_away_when_all_are(rig: Leg) -> None:
+    rig.plug()
+    rig.sim.do(Late(instruction="sdo_reply", s=0.015))
+    rig.sim.do(Mute(instruction="tpdo1", count=3))
+    robot = rig.attach()
+    assert not any(axis.silent for axis in robot.group("leg")._axes)  # type: ignore[attr-defined]
+    assert robot.group("leg").move_to([0.1, 0.1]) == pytest.approx([0.1, 0.1], abs=0.01)
+
+
 @pytest.mark.parametrize(
     "nuisance",
     [

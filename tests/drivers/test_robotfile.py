@@ -210,6 +210,16 @@ def test_grippers_are_records_and_members_like_joints() -> None:
     assert robot.members() == {"rosie": ["rosie.left.hand"], "rosie.left": ["rosie.left.hand"]}
 
 
+def test_rosie_is_her_parts() -> None:
+    examples = Path(__file__).parents[2] / "examples"
+    whole = load(examples / "rosie.toml")
+    parts = [load(examples / name) for name in ("head.toml", "hand.toml", "legs.toml")]
+    assert whole.joints == [joint for part in parts for joint in part.joints]
+    assert whole.grippers == [gripper for part in parts for gripper in part.grippers]
+    assert whole.groups == [group for part in parts for group in part.groups]
+    assert [bus.name for bus in whole.buses] == [bus.name for part in parts for bus in part.buses]
+
+
 GRIPPER_MISTAKES = [
     ("max_force_n = 200.0\n", "", "gripper.\"left.hand\": missing required key 'max_force_n'"),
     ("max_width_m = 0.085", "max_width_m = nan", 'gripper."left.hand".max_width_m'),

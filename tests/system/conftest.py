@@ -20,7 +20,7 @@ from trade_hil_sim import SimProcess, events, writes
 from waiting import PATIENCE_S, wait_until
 
 ROOT = Path(__file__).parents[2]
-ROSIE = ROOT / "examples" / "rosie.toml"
+ROSIES_HEAD = ROOT / "examples" / "head.toml"
 DORA = ROOT / "examples" / "dora.toml"
 
 
@@ -133,7 +133,7 @@ def trade_command(system: str) -> Callable[..., subprocess.CompletedProcess[str]
 
 
 class Rosie:
-    """``trade up examples/rosie.toml --sim``, ready."""
+    """``trade up examples/head.toml --sim``, ready."""
 
     def __init__(self, program: Program, log: Path) -> None:
         self.program = program
@@ -148,7 +148,7 @@ def rosie_up(run: Callable[..., Program], tmp_path: Path) -> Callable[[], Rosie]
 
     def up() -> Rosie:
         log = tmp_path / f"bytes-{next(counter)}.jsonl"
-        return Rosie(run("-m", "trade_gateway", "up", ROSIE, "--sim", "--sim-log", log, "--json"), log)
+        return Rosie(run("-m", "trade_gateway", "up", ROSIES_HEAD, "--sim", "--sim-log", log, "--json"), log)
 
     return up
 
@@ -225,4 +225,4 @@ def benches(system: str, tmp_path: Path, run: Callable[..., Program]) -> Iterato
 
 @pytest.fixture
 def bench(benches: Callable[..., Bench]) -> Bench:
-    return benches(ROSIE)
+    return benches(ROSIES_HEAD)

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import trade
-from system.conftest import DORA, ROSIE
+from system.conftest import DORA, ROSIES_HEAD
 from trade import where
 from trade_hil_sim import SimControl, SimProcess, events, motion_writes, read_log
 from waiting import wait_until
@@ -85,7 +85,7 @@ def test_a_bad_call_is_one_line_that_says_what_to_do_and_moves_nothing(
         (["call", "rosie.head.move_to", "[0.1,", "-0.2]"], "forgot quotes? The shell splits at spaces: '[0.1, -0.2]'"),
         (["call", "rosie.*.stop"], "UsageError: service 'rosie.*.stop': group='rosie.*' would match nothing"),
         (["services", "--group", "rosie*"], "UsageError: --group rosie*: group='rosie*' would match nothing"),
-        (["up", ROSIE, "--sim-log", "log"], "UsageError: --sim-log: is the log of the simulator; it needs --sim"),
+        (["up", ROSIES_HEAD, "--sim-log", "log"], "UsageError: --sim-log: is the log of the simulator; it needs --sim"),
     ],
 )
 def test_wrong_words_are_one_line_and_exit_code_2(words: list[str], complaint: str, trade_command: Command) -> None:
@@ -122,11 +122,11 @@ def test_faults_that_latch_and_heal_are_told_with_what_to_do(rosie_up, trade_com
 
 
 def test_a_watchdog_that_expired_under_an_earlier_driver_is_told_at_attach(system: str, run, tmp_path) -> None:
-    with SimProcess(ROSIE) as sim:
+    with SimProcess(ROSIES_HEAD) as sim:
         robot_file = tmp_path / "rosie.toml"
-        port_line = next(line for line in ROSIE.read_text(encoding="utf-8").splitlines() if line.startswith("port ="))
-        text = ROSIE.read_text(encoding="utf-8").replace(port_line, f'port = "{sim.ports["neck"]}"')
-        robot_file.write_text(text, encoding="utf-8")
+        text = ROSIES_HEAD.read_text(encoding="utf-8")
+        port_line = next(line for line in text.splitlines() if line.startswith("port ="))
+        robot_file.write_text(text.replace(port_line, f'port = "{sim.ports["neck"]}"'), encoding="utf-8")
         first = run("-m", "trade_gateway", "up", robot_file, "--json")
         first.json()
         trade.find(where(name="enable", group="rosie.neck.pan"), wait_s=30)()
@@ -141,7 +141,7 @@ def test_a_watchdog_that_expired_under_an_earlier_driver_is_told_at_attach(syste
 
 
 def test_what_a_killed_simulation_left_is_removed_by_the_next(run, system: str) -> None:
-    words = ("-m", "trade_gateway", "up", ROSIE, "--sim", "--json")
+    words = ("-m", "trade_gateway", "up", ROSIES_HEAD, "--sim", "--json")
     first = run(*words)
     folder = Path(first.json()["control"]).parent
     first.signal(signal.SIGKILL)
@@ -153,7 +153,7 @@ def test_what_a_killed_simulation_left_is_removed_by_the_next(run, system: str) 
 
 
 def test_the_path_of_the_simulators_socket_and_that_nothing_is_wrong_are_said(run, system: str) -> None:
-    up = run("-m", "trade_gateway", "up", ROSIE, "--sim")
+    up = run("-m", "trade_gateway", "up", ROSIES_HEAD, "--sim")
     while "to strike the simulator with faults" not in (line := up.line()):
         pass
     with SimControl(line.split(": ")[1].strip()) as control:
@@ -218,14 +218,14 @@ def test_a_call_that_is_killed_or_loses_its_terminal_stops_the_motion(number: in
 
 def test_a_robot_of_a_name_that_is_up_is_refused(rosie_up, trade_command: Command) -> None:
     rosie = rosie_up()
-    second = trade_command("up", ROSIE, "--sim")
+    second = trade_command("up", ROSIES_HEAD, "--sim")
     assert second.returncode == 1
     assert f"'rosie' is up already (process {rosie.program.process.pid}" in second.stderr
 
 
 def test_a_mistake_only_the_simulator_sees_is_one_line(trade_command: Command, tmp_path) -> None:
     broken = tmp_path / "broken.toml"
-    broken.write_text(ROSIE.read_text(encoding="utf-8").replace("XL430-W250", "XL430-W25"), encoding="utf-8")
+    broken.write_text(ROSIES_HEAD.read_text(encoding="utf-8").replace("XL430-W250", "XL430-W25"), encoding="utf-8")
     started = trade_command("up", broken, "--sim")
     assert started.returncode == 1
     assert "ConfigurationError" in started.stderr

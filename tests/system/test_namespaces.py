@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from certificates import Papers
-from system.conftest import ROSIE, Bench, Program
+from system.conftest import ROSIES_HEAD, Bench, Program
 from system.member import PROVIDERS
 from system.networks import Member, Networks, ip
 from trade_hil_sim import events
@@ -126,7 +126,7 @@ def test_S05_what_a_client_moves_stops_when_its_link_is_cut(
     monkeypatch.setenv("TRADE_INSECURE_LAN", "1")
     monkeypatch.setenv("TRADE_CREDENTIALS", "lab:secret")
     monkeypatch.setenv("TRADE_LISTEN", "tcp/10.231.7.1:7447")
-    bench = benches(ROSIE, inside=cable.left)
+    bench = benches(ROSIES_HEAD, inside=cable.left)
     monkeypatch.setenv("TRADE_RUNTIME_DIR", str(tmp_path / "right"))
     monkeypatch.setenv("TRADE_LISTEN", "tcp/10.231.7.2:0")
     monkeypatch.setenv("TRADE_CONNECT", "tcp/10.231.7.1:7447")

@@ -85,7 +85,7 @@ def test_S20_a_second_robot_on_the_port_is_refused_and_sends_nothing(
     bench.driver.signal(signal.SIGSTOP)  # what the log shows from now on is not the first driver's
     try:
         time_of_stop = time.monotonic()
-        second = run("-m", "trade_gateway", "up", tmp_path / "rosie.toml", "--name", "second", "--json")
+        second = run("-m", "trade_gateway", "up", tmp_path / "head.toml", "--name", "second", "--json")
         assert second.wait() == 1
         assert "neck" in "".join(second.errors)
         heard = received(bench.sim.entries(), since=time_of_stop + 0.1)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from system.conftest import DORA, ROSIE, Bench
+from system.conftest import DORA, ROSIES_HEAD, Bench
 from trade import Container, where
 from trade.errors import ContainerLost, IncompleteGroup, LockedByOther, LockLost, ServiceGone, TradeError
 from trade_hil_sim import events, writes
@@ -22,7 +22,7 @@ pytestmark = pytest.mark.timeout(120 + 20 * ROUNDS)
 
 @pytest.fixture
 def rosie(benches: Callable[[Path], Bench]) -> Bench:
-    return benches(ROSIE)
+    return benches(ROSIES_HEAD)
 
 
 @pytest.fixture

@@ -14,6 +14,7 @@ from trade._dispatch import LocalService
 from trade._failures import passed_on
 from trade._handle import LONGEST_DEADLINE_S, Handle
 from trade._resources import Resource
+from trade._schemas import read_schema
 from trade._service import Effect, ServiceMark
 from trade._signature import Signature
 from trade._wire import MOST_BYTES, ErrorInfo, ServiceInfo
@@ -33,6 +34,10 @@ class _Passed(Signature):
         self.info = info
         self._codec = codec
         self._plain = codec.decoder(Any)
+        self._positional = [parameter.name for parameter in info.parameters if not parameter.keyword_only]
+        properties: dict[str, Any] = read_schema(info.arguments_schema).get("properties", {})
+        self._secrets = frozenset(name for name, schema in properties.items() if schema.get("writeOnly"))
+        self.has_secrets = False  # what is secret was left out of errors where the service is at home
 
     def decode(self, service: str, raw: Raw | bytes) -> tuple[Sequence[Any], dict[str, Any]]:
         try:
@@ -68,10 +73,6 @@ class _Passed(Signature):
         if len(data) > MOST_BYTES:
             raise TooLarge(service=service, what=what, size_bytes=len(data), limit_bytes=MOST_BYTES)
         return data
-
-    @property
-    def has_secrets(self) -> bool:
-        return False  # what is secret was left out of errors where the service is at home
 
 
 class PassedOn(LocalService):

@@ -41,7 +41,7 @@ class Signature:
         kinds = {parameter.name: hints.get(parameter.name, Any) for parameter in parameters}
         returns = hints.get("return", Any)
         self._secrets = frozenset(name for name, kind in kinds.items() if is_secret(kind))
-        self.has_secrets: Final = bool(self._secrets)
+        self.has_secrets = bool(self._secrets)
         """Whether an argument is secret."""
         self._codec = codec
         self._decode_any = codec.decoder(Any)

@@ -1,0 +1,103 @@
+"""The judge of the demo: what the simulated devices say that happened, against what was claimed."""
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TypeVar
+
+import walk
+from demo_stage import PATIENCE_S, ROBOT, DemoFailed
+
+import trade_drivers
+from trade_hil_sim import Entry, events, frames, motion_writes, read_log
+
+AGREE_RAD = 0.02
+"""A servo's own dead band is about a tenth of this."""
+PAN = "neck.pan"
+
+_T = TypeVar("_T")
+
+
+class Judge:
+    """Reads the simulator's log of one run; whatever disagrees raises DemoFailed."""
+
+    def __init__(self, log: Path) -> None:
+        self._log = log
+        self._robot = trade_drivers.load(ROBOT)
+
+    def rests(self, joint: str, since: float) -> list[Entry]:
+        """Each time a joint came to rest."""
+        return [entry for entry in events(read_log(self._log), "at_rest", since=since) if entry.joint == joint]
+
+    def moves(self, joint: str, since: float) -> list[Entry]:
+        """Each time it began to move."""
+        return [entry for entry in events(read_log(self._log), "motion_started", since=since) if entry.joint == joint]
+
+    def wait_for(self, what: Callable[[], _T]) -> _T:
+        """What the log shows, once it does."""
+        until = time.monotonic() + PATIENCE_S
+        while not (found := what()):
+            if time.monotonic() > until:
+                raise DemoFailed("the simulator's log does not show what should have happened")
+            time.sleep(0.05)
+        return found
+
+    def looked(self, looks_rad: Sequence[float], since: float) -> None:
+        """The pan servo came to rest there, one after the other, and nothing was sent for the refused command."""
+        rests = self.rests(PAN, since)
+        say("of what the pan servo itself did:")
+        for entry in rests:
+            angle_rad, counts = entry.position_rad or 0.0, entry.position_counts
+            print(f"    {entry.t - since:6.2f} s  at rest at {angle_rad:+.3f} rad ({counts} counts)")
+        angles = [entry.position_rad or 0.0 for entry in rests]
+        if len(angles) != len(looks_rad) or any(not _near(*pair) for pair in zip(angles, looks_rad, strict=True)):
+            raise DemoFailed(f"the servo should have come to rest at {looks_rad}, but was at {angles}")
+        late = motion_writes(read_log(self._log), since=rests[-1].t, bus="neck")
+        print(f"    after that {len(late)} writes that could move it: the refused command was never sent")
+        if late:
+            raise DemoFailed("the refused command reached the wire")
+
+    def walked(self, began_s: float, stood_s: float) -> None:
+        """Three steps, by nobody but who had the legs, while the head moved, too."""
+        stands = walk.STAND[0]
+        ends = [walk.FORWARD[0] if leg == "left" else walk.BACK[0] for leg in walk.STEPS]
+        expected = {"legs.left.hip": [*ends, stands], "legs.right.hip": [*(-end for end in ends), stands]}
+        say("of the drives and the servos:")
+        for joint, through in expected.items():
+            angles = [entry.position_rad or 0.0 for entry in self.rests(joint, began_s)]
+            if not _in_order(through, angles):
+                raise DemoFailed(f"{joint} should have come to rest at {through}, but was at {angles}")
+            print(f"    {joint:<15} came to rest at {', '.join(f'{angle:+.2f}' for angle in through)} rad")
+        highest = max(self._knee_targets(began_s))
+        print(f"    legs.left.knee  was told to go to {highest:.2f} rad at most; the kick wanted {walk.KICK_RAD:.2f}")
+        if not _near(highest, walk.LIFTED[1]):
+            raise DemoFailed("somebody else's goal is among those of the walk, or the walk's own are not there")
+        if late := motion_writes(read_log(self._log), since=stood_s, bus="legs"):
+            raise DemoFailed(f"the legs were told {len(late)} things after the walk had ended")
+        meanwhile = [entry for entry in self.rests(PAN, began_s) if entry.t < stood_s]
+        print(f"    neck.pan        came to rest {len(meanwhile)} times meanwhile: the head's lock is another one")
+        if not meanwhile:
+            raise DemoFailed("the head did not look around during the walk")
+
+    def _knee_targets(self, since: float) -> list[float]:
+        """The angles of all frames that command the left knee."""
+        joint = next(joint for joint in self._robot.joints if joint.name == "legs.left.knee")
+        assert joint.counts_per_rev
+        rad_per_count = math.tau / (joint.counts_per_rev * joint.gear)
+        commands = frames(read_log(self._log), "rpdo1", device_id=joint.id, since=since, bus="legs")
+        return [int.from_bytes(frame.data[2:6], "little", signed=True) * rad_per_count for frame in commands]
+
+
+def say(what: str) -> None:
+    print(f"  the simulator's log, {what}")
+
+
+def _near(angle: float, expected: float) -> bool:
+    return abs(angle - expected) <= AGREE_RAD
+
+
+def _in_order(expected: Sequence[float], angles: Sequence[float]) -> bool:
+    """Whether these are among the angles, in this order, and the last of them is the last."""
+    left = iter(angles)
+    return all(any(_near(angle, each) for angle in left) for each in expected) and _near(angles[-1], expected[-1])

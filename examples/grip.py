@@ -1,0 +1,31 @@
+"""A behaviour: activate a hand, grip what is there, and say whether it is held.
+
+Run it while a robot with a hand is up (`trade up examples/rosie.toml --sim`):
+
+    python examples/grip.py
+"""
+
+import sys
+
+import trade
+from trade import errors, where
+
+HAND = where(kind="Gripper", group="rosie.left")
+
+
+def grip() -> None:
+    activate, open_, close = (trade.find(HAND & where(name=name)) for name in ("activate", "open", "close"))
+    with trade.lock(HAND, purpose="grip"):
+        activate.with_(deadline_s=30)()  # the fingers go all the way, so it is never done by itself
+        print("activated: the fingers have found their stops")
+        open_()
+        state = close(force_n=40)
+        found = "holding" if state.holding else "nothing there"
+        print(f"{found}: the fingers stand {state.width_m * 1e3:.0f} mm apart")
+
+
+if __name__ == "__main__":
+    try:
+        grip()
+    except errors.TradeError as failed:
+        sys.exit(f"{type(failed).__name__}: {failed}")
