@@ -73,6 +73,8 @@ class CanPort:
         """
         self.close()
         options = self._options()
+        if self.state is not ErrorState.BUS_OFF:  # of that only a frame, or the system, says that it is over
+            self.state = ErrorState.ACTIVE
         if self._interface == "socketcan":
             self._look_over()
         try:
@@ -81,8 +83,6 @@ class CanPort:
             raise ConfigurationError(where=f"{self._where}.interface", problem=f"{self.path}: {unknown}") from None
         except _TROUBLE as bad:
             raise PortLost(str(bad)) from None
-        if self.state is not ErrorState.BUS_OFF:  # of that only a frame, or the system, says that it is over
-            self.state = ErrorState.ACTIVE
 
     def _look_over(self) -> None:
         """What the system knows of the interface already.
