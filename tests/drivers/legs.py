@@ -72,7 +72,7 @@ class Leg:
             assert before in text, before
             text = text.replace(before, after)
         if self.interface:  # where there is one slow processor, and each frame costs several calls of the system
-            text = text.replace('"can0"', f'"{self.interface}"\nrate_hz = 40\nstale_after_s = 1')
+            text = text.replace('"can0"', f'"{self.interface}"\nrate_hz = 20\nstale_after_s = 1')
         self.text = text
         self.robot: Robot = parse(text, "leg.toml")
 
