@@ -10,7 +10,7 @@ ARGS ?=
 SEED ?= 1
 MINUTES ?= 3
 
-.PHONY: demo test soak-registry chaos chaos-robots check bench clean
+.PHONY: demo test test-socketcan soak-registry chaos chaos-robots check bench clean
 .DEFAULT_GOAL := help
 
 help: ## show the targets
@@ -29,6 +29,9 @@ demo: $(UV) ## a simulated robot looks, walks and grips for behaviours beyond a 
 
 test: $(UV) ## the whole test suite
 	@$(RUN) pytest $(ARGS)
+
+test-socketcan: $(UV) ## the CAN suites on kernel interfaces; where the kernel has none, inside User-Mode Linux
+	@$(RUN) tests/socketcan/run pytest tests/socketcan $(ARGS)
 
 chaos: $(UV) ## locks under kill -9, freezes, cuts and delays; 240 clients (SEED=.. MINUTES=..; exits 1 on a violation)
 	@$(RUN) python -m tests.chaos --seed $(SEED) --minutes $(MINUTES) --clients 8 --threads 30 --drivers 3 $(ARGS)

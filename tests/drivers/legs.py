@@ -5,6 +5,7 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
+import can
 import pytest
 
 from trade.errors import TradeError
@@ -56,12 +57,13 @@ COUNTS_PER_RAD = 4096 * 50 / 6.283185307179586
 
 
 class Leg:
-    """The simulated bus and whoever is attached to it."""
+    """The simulated bus and whoever is attached to it: on its own adapter, or on an interface of the system."""
 
-    def __init__(self, undo: ExitStack) -> None:
+    def __init__(self, undo: ExitStack, interface: str = "") -> None:
         self._undo = undo
-        self.robot: Robot = parse(LEG, "leg.toml")
+        self.interface = interface
         self.announced: list[object] = []
+        self.configure()
 
     def configure(self, *changes: tuple[str, str]) -> None:
         """Change the robot file's text."""
@@ -69,11 +71,15 @@ class Leg:
         for before, after in changes:
             assert before in text, before
             text = text.replace(before, after)
-        self.robot = parse(text, "leg.toml")
+        if self.interface:  # where there is one slow processor, and each frame costs several calls of the system
+            text = text.replace('"can0"', f'"{self.interface}"\nrate_hz = 20\nstale_after_s = 1')
+        self.text = text
+        self.robot: Robot = parse(text, "leg.toml")
 
     def plug(self, *, prepare: Callable[[Cia402Bus], None] = lambda _: None, paced: bool = False) -> Cia402Bus:
         bus = self.robot.buses[0]
-        self.sim = Cia402Bus.from_robot(bus, self.robot.joints_on(bus.name), Path("unused"), paced=paced)
+        joints, options = self.robot.joints_on(bus.name), {"paced": paced, "interface": self.interface}
+        self.sim = Cia402Bus.from_robot(bus, joints, Path("unused"), **options)
         prepare(self.sim)
         self._undo.enter_context(self.sim)
         wait_until(lambda: {e.device_id for e in self.frames("boot_up")} >= {HIP, KNEE}, "both have booted")
@@ -81,13 +87,21 @@ class Leg:
 
     def attach(self, **options: Any) -> AttachedRobot:
         """Attach the driver; it is closed with the test, whatever that says."""
-        if "ports" not in options:
+        if "ports" not in options and not self.interface:  # the robot file names the interface
             options["ports"] = {"legs": self.sim.port}
-        robot = attach(
-            self.robot, register=lambda _, groups: self.announced.append(groups), deregister=lambda _: None, **options
-        )
+        options.setdefault("register", lambda _, groups: self.announced.append(groups))
+        options.setdefault("deregister", lambda _: None)
+        robot = attach(self.robot, **options)
         self._undo.callback(_close, robot)
         return robot
+
+    def listen(self) -> can.BusABC:
+        """Another client of the bus."""
+        if self.interface:
+            return can.Bus(interface="socketcan", channel=self.interface)
+        address, _, channel = self.sim.port.removeprefix("socketcand:").partition("/")
+        host, _, port = address.partition(":")
+        return can.Bus(interface="socketcand", host=host, port=int(port), channel=channel, tcp_tune=True)
 
     @property
     def log(self) -> list[Entry]:

@@ -114,9 +114,11 @@ def test_a_bus_off_is_a_loss_and_what_comes_before_it_is_only_noted(channel: str
         peer.send(can.Message(arbitration_id=0x040, data=bytes(8), is_error_frame=True))
         with pytest.raises(PortLost, match="bus-off"):
             port.receive(5)
-    assert port.state is ErrorState.BUS_OFF
-    port.open()
-    assert port.state is ErrorState.ACTIVE
+        port.open()
+        assert port.state is ErrorState.BUS_OFF  # that it could be opened does not say that it is over
+        peer.send(can.Message(arbitration_id=0x123, is_extended_id=False))
+        assert port.receive(5) == (0x123, b"")
+    assert (port.state, port.errors, port.bus_offs) == (ErrorState.ACTIVE, 2, 1)
     port.close()
 
 

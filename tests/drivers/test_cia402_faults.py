@@ -56,7 +56,7 @@ CASES = [
     Case("blocked", Jam(ids=(HIP,)), DeviceFault, "error 8611h, following error", "error 8611h"),
     Case("EMCY", Emergency(ids=(HIP,), code=0x4310), DeviceFault, "error 4310h, over-temperature", "error 4310h"),
     Case("restart", BrownOut(ids=(HIP,)), DeviceError, "", "it has restarted"),
-    Case("adapter off the bus", BusOff(), BusGone, "", "it was away"),
+    Case("adapter off the bus", BusOff(), BusGone, "bus-off: too many errors", "it was away"),
     Case("adapter unplugged", Unplug(), BusGone, "", "it was away"),
 ]
 

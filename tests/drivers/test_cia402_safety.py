@@ -14,7 +14,7 @@ import can
 import pytest
 
 from drivers.conftest import Outcome, sleep_past, written_now
-from drivers.legs import GO, HALT, HIP, KNEE, LEG, Leg, leg, rig
+from drivers.legs import GO, HALT, HIP, KNEE, Leg, leg, rig
 from trade.errors import DeadlineExceeded, LimitExceeded, LockedByOther, MotionStopped
 from trade_drivers.joints._motion import Move
 from trade_hil_sim import Entry, Mute
@@ -76,7 +76,7 @@ class Child:
 
     def __init__(self, leg: Leg, tmp_path: Path) -> None:
         file = tmp_path / "leg.toml"
-        file.write_text(LEG)
+        file.write_text(leg.text)
         script = str(Path(__file__).with_name("driver_process.py"))
         self.process = subprocess.Popen(
             [sys.executable, script, str(file), leg.sim.port, "legs", "leg.hip"],
@@ -264,9 +264,7 @@ def test_S18_attaching_commands_nothing(leg: Leg) -> None:
 
 
 def test_S18_a_drive_found_moving_and_owned_by_nobody_is_stopped_and_left_enabled(leg: Leg) -> None:
-    host, _, channel = leg.sim.port.removeprefix("socketcand:").partition("/")
-    address, _, port = host.partition(":")
-    with can.Bus(interface="socketcand", host=address, port=int(port), channel=channel, tcp_tune=True) as other:
+    with leg.listen() as other:
 
         def write(index: int, size: int, value: int) -> None:
             head = bytes((0x2F - 4 * (size - 1),)) + index.to_bytes(2, "little") + b"\0"

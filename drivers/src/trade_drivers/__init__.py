@@ -1,6 +1,7 @@
 """Motors, grippers and arms as TRADE services: interfaces in SI units, the robot file, and drivers by vendor."""
 
 from trade_drivers._attach import AttachedRobot, attach
+from trade_drivers._can_monitor import CanBusState, CanMonitor
 from trade_drivers._driver import AttachedBus, Driver, drivers
 from trade_drivers._interfaces import Gripper, GripperLimits, GripperState, JointGroup, Motor, MotorState
 from trade_drivers._load import load
@@ -13,6 +14,8 @@ __all__ = [
     "AttachedRobot",
     "Bus",
     "CanBus",
+    "CanBusState",
+    "CanMonitor",
     "Coupled",
     "Driver",
     "FollowProgress",

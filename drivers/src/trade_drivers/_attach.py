@@ -9,6 +9,7 @@ from contextlib import ExitStack
 import trade
 from trade.errors import ConfigurationError, TradeError
 from trade_drivers._across import AcrossGroup
+from trade_drivers._can_monitor import CanMonitor, HealthTeller
 from trade_drivers._driver import AttachedBus, load_driver
 from trade_drivers._interfaces import Gripper, JointGroup, Motor
 from trade_drivers.robotfile import Group, Robot
@@ -17,9 +18,10 @@ __all__ = ["AttachedRobot", "attach"]
 
 _log = logging.getLogger(__name__)
 
-Provider = Motor | JointGroup | Gripper
+Provider = Motor | JointGroup | Gripper | CanMonitor
 Register = Callable[[object, Sequence[str]], object]
 Deregister = Callable[[object], object]
+SetHealth = Callable[[object, str], object]
 
 
 class AttachedRobot:
@@ -28,7 +30,8 @@ class AttachedRobot:
     def __init__(self, robot: Robot, providers: Mapping[str, Provider], undo: ExitStack) -> None:
         self.robot = robot
         self.providers = dict(providers)
-        """By group: ``rosie.neck.pan`` -> a Motor, ``rosie.head`` -> a JointGroup, ``rosie.left.hand`` -> a Gripper."""
+        """By group: ``rosie.neck.pan`` -> a Motor, ``rosie.head`` -> a JointGroup, ``rosie.left.hand`` -> a Gripper,
+        ``rosie.bus.legs`` -> a CanMonitor."""
         self._undo = undo
         self._lock = threading.Lock()
         atexit.register(self.close)
@@ -52,6 +55,13 @@ class AttachedRobot:
         provider = self.providers[f"{self.robot.name}.{name}"]
         if not isinstance(provider, Gripper):
             raise KeyError(name)
+        return provider
+
+    def monitor(self, bus: str) -> CanMonitor:
+        """The provider of a CAN bus, named as in the robot file; KeyError if there is none."""
+        provider = self.providers[_bus_group(self.robot, bus)]
+        if not isinstance(provider, CanMonitor):
+            raise KeyError(bus)
         return provider
 
     def close(self) -> None:
@@ -80,19 +90,21 @@ def attach(
     *,
     register: Register | None = None,
     deregister: Deregister | None = None,
+    set_health: SetHealth | None = None,
     ports: Mapping[str, str] | None = None,
     healthy: Callable[[], bool] = _always,
 ) -> AttachedRobot:
     """Attach all devices of a robot, then announce their services. Nothing is moved or enabled; what moves is stopped.
 
     Joint ``neck.pan`` of robot ``rosie`` becomes a Motor in group ``rosie.neck.pan``, group ``head`` a JointGroup in
-    ``rosie.head``, whether its joints share a bus or not, gripper ``left.hand`` a Gripper in ``rosie.left.hand``. If
-    anything is wrong, nothing is announced and every port is let go of.
+    ``rosie.head``, whether its joints share a bus or not, gripper ``left.hand`` a Gripper in ``rosie.left.hand``, CAN
+    bus ``legs`` a CanMonitor in ``rosie.bus.legs``. If anything is wrong, nothing is announced and no port is kept.
 
     Args:
         robot: what ``load`` read.
         register: what announces a provider in its groups; ``trade.register`` by default.
         deregister: its opposite; ``trade.deregister`` by default.
+        set_health: what says how a provider is; ``trade.set_health`` by default, nothing if ``register`` is given.
         ports: bus name -> serial device, or ``INTERFACE:CHANNEL`` of a CAN bus, instead of the file's: for simulated
             devices.
         healthy: asked by every bus thread in every cycle; while it says no, devices are told to hold once and the bus
@@ -107,6 +119,8 @@ def attach(
         for name, provider in providers.items():
             (register or trade.register)(provider, (name,))
             undo.callback(_withdraw, deregister or trade.deregister, provider)
+        if (tell := set_health or (trade.set_health if register is None else None)) is not None:
+            _tell_health(robot, providers, tell, undo)
         return AttachedRobot(robot, providers, undo.pop_all())
 
 
@@ -128,7 +142,7 @@ def _attach_buses(
 
 
 def _providers(robot: Robot, buses: Mapping[str, AttachedBus]) -> dict[str, Provider]:
-    providers: dict[str, Provider] = {
+    providers: dict[str, Motor | JointGroup | Gripper] = {
         f"{robot.name}.{joint.name}": buses[joint.bus].motor(joint.name) for joint in robot.joints
     }
     for gripper in robot.grippers:
@@ -138,7 +152,36 @@ def _providers(robot: Robot, buses: Mapping[str, AttachedBus]) -> dict[str, Prov
     members = robot.members()
     for provider in providers.values():
         provider.members = members
-    return providers
+    return providers | _monitors(robot, buses, providers)
+
+
+def _bus_group(robot: Robot, bus: str) -> str:
+    return f"{robot.name}.bus.{bus}"
+
+
+def _monitors(robot: Robot, buses: Mapping[str, AttachedBus], others: Mapping[str, object]) -> dict[str, CanMonitor]:
+    monitors: dict[str, CanMonitor] = {}
+    for bus, attached in buses.items():
+        name = _bus_group(robot, bus)
+        if (monitor := attached.monitor(name)) is None:
+            continue
+        if name in others:
+            raise ConfigurationError(where=robot.where, problem=f"{name} is the bus itself; name the joints otherwise")
+        monitors[name] = monitor
+    return monitors
+
+
+def _tell_health(robot: Robot, providers: Mapping[str, Provider], tell: SetHealth, undo: ExitStack) -> None:
+    """Have what hangs on a CAN bus, and the bus itself, tell when that is not well."""
+    watched: dict[CanMonitor, list[object]] = {}
+    for bus in robot.buses:
+        monitor = providers.get(_bus_group(robot, bus.name))
+        if isinstance(monitor, CanMonitor):
+            here = {joint.name for joint in robot.joints_on(bus.name)}
+            groups = [group.name for group in robot.groups if not here.isdisjoint(group.joints)]
+            watched[monitor] = [monitor, *(providers[f"{robot.name}.{name}"] for name in (*here, *groups))]
+    if watched:
+        undo.callback(HealthTeller(watched, tell, f"health of {robot.name}").close)
 
 
 def _group(robot: Robot, group: Group, buses: Mapping[str, AttachedBus]) -> JointGroup:

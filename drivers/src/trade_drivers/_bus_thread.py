@@ -47,6 +47,7 @@ class BusThread(Generic[_Exchange_co]):
         self._healthy = healthy
         self._sick = False
         self._lost_at = 0.0
+        self._lost_why = ""
         self._reopen_at = 0.0
         self._reopen_s = _REOPEN_FIRST_S
         self._leaving = False
@@ -122,7 +123,7 @@ class BusThread(Generic[_Exchange_co]):
             act()
         except PortLost as lost:
             _log.warning("bus %s: port %s is gone: %s", self._bus.name, self._wire.path, lost)
-            self._lost_at = time.monotonic()
+            self._lost_at, self._lost_why = time.monotonic(), str(lost)
             self._reopen_s = _REOPEN_FIRST_S
             self._reopen_at = self._lost_at + self._reopen_s
             self._wire.close()
@@ -131,7 +132,8 @@ class BusThread(Generic[_Exchange_co]):
             self.exchange.fail_all(self._gone)
 
     def _gone(self, device: Device) -> TradeError:
-        return BusGone(device=device.name, bus=self._wire.path, waited_s=time.monotonic() - self._lost_at)
+        waited_s = time.monotonic() - self._lost_at
+        return BusGone(device=device.name, bus=self._wire.path, waited_s=waited_s, reason=self._lost_why)
 
     def _reopen(self) -> None:
         self.exchange.fail_all(self._gone)
@@ -139,7 +141,8 @@ class BusThread(Generic[_Exchange_co]):
             return
         try:
             self._wire.open()
-        except (PortLost, TradeError):
+        except (PortLost, TradeError) as still:
+            self._lost_why = str(still)
             self._reopen_s = min(_REOPEN_MOST_S, 2 * self._reopen_s)
             self._reopen_at = time.monotonic() + self._reopen_s
             return

@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from importlib.metadata import EntryPoint, entry_points
 
 from trade.errors import ConfigurationError
+from trade_drivers._can_monitor import CanMonitor
 from trade_drivers._interfaces import Gripper, JointGroup, Motor
 from trade_drivers.robotfile import Bus, Robot
 
@@ -32,6 +33,10 @@ class AttachedBus(ABC):
         """
         problem = "the driver of its bus has no grippers; one that has is robotiq"
         raise ConfigurationError(where=f'gripper."{name}"', problem=problem)
+
+    def monitor(self, name: str) -> CanMonitor | None:  # noqa: ARG002 - most have none
+        """The bus itself, to look at; ``name`` has the robot's before it. None if there is nothing to tell of it."""
+        return None
 
     @abstractmethod
     def close(self) -> None:

@@ -50,6 +50,7 @@ def up(
                 robot,
                 register=container.register,
                 deregister=container.deregister,
+                set_health=container.set_health,
                 ports=ports,
                 healthy=container.healthy,
             )

@@ -459,12 +459,16 @@ class DeviceFault(DeviceError, RuntimeError):
 
 @dataclass(kw_only=True, eq=False)
 class BusGone(DeviceSilent, ConnectionError):
-    """The port of a bus is gone: its adapter was unplugged. It is opened again by itself when it comes back."""
+    """The port of a bus is gone: unplugged, down, or off the bus. It is opened again by itself when it comes back."""
+
+    reason: str = ""
+    """What its system or its adapter says."""
 
     def describe(self) -> str:
+        why = self.reason or "plug its adapter in again"
         return (
-            f"{self.device} cannot be reached: port {self.bus} is gone (for {self.waited_s:.1f} s); plug its adapter "
-            "in again. The driver reconnects by itself and moves nothing"
+            f"{self.device} cannot be reached: port {self.bus} is gone (for {self.waited_s:.1f} s): {why}. "
+            "The driver reconnects by itself and moves nothing"
         )
 
 

@@ -6,6 +6,8 @@ Source: Linux ``include/uapi/linux/can/error.h``: the class is in the identifier
 from enum import IntEnum
 from typing import Final
 
+from trade_drivers._can_monitor import ErrorWord
+
 __all__ = ["ErrorState", "error_state"]
 
 _CONTROLLER: Final = 0x004
@@ -26,6 +28,19 @@ class ErrorState(IntEnum):
     """It may no longer signal errors to others."""
     BUS_OFF = 3
     """It has switched itself off the bus."""
+
+    @property
+    def word(self) -> ErrorWord:
+        """Its name in ISO 11898-1."""
+        return _WORDS[self]
+
+
+_WORDS: Final[dict[ErrorState, ErrorWord]] = {
+    ErrorState.ACTIVE: "error-active",
+    ErrorState.WARNING: "error-warning",
+    ErrorState.PASSIVE: "error-passive",
+    ErrorState.BUS_OFF: "bus-off",
+}
 
 
 def error_state(frame_id: int, data: bytes) -> ErrorState | None:

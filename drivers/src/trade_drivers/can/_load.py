@@ -27,6 +27,10 @@ class LoadMeter:
     def add(self, size: int, now_ns: int) -> None:
         """A frame of that many bytes went over the bus."""
         self._bits += frame_bits(size)
+        self.tick(now_ns)
+
+    def tick(self, now_ns: int) -> None:
+        """Time has passed."""
         elapsed_ns = now_ns - self._since_ns
         if elapsed_ns >= _WINDOW_NS:
             self.load = self._bits * 1e9 / elapsed_ns / self._bitrate

@@ -9,9 +9,11 @@ from typing import Any, Final, NamedTuple
 import can
 
 from trade.errors import ConfigurationError
+from trade_drivers._can_monitor import CanBusState
 from trade_drivers._work import PortLost, losing
 from trade_drivers.can._errors import ErrorState, error_state
 from trade_drivers.can._load import LoadMeter
+from trade_drivers.can._netlink import look_at
 
 __all__ = ["CanPort", "Frame", "split_port"]
 
@@ -52,7 +54,9 @@ class CanPort:
         self.path = path
         self.state = ErrorState.ACTIVE
         self.errors = 0
-        """Error frames received since it was opened."""
+        """Error frames received, ever."""
+        self.bus_offs = 0
+        """How often it went bus-off."""
         self._where = where
         self._interface, self._channel = split_port(path, where)
         self._bitrate = bitrate
@@ -69,13 +73,40 @@ class CanPort:
         """
         self.close()
         options = self._options()
+        if self.state is not ErrorState.BUS_OFF:  # of that only a frame, or the system, says that it is over
+            self.state = ErrorState.ACTIVE
+        if self._interface == "socketcan":
+            self._look_over()
         with losing(*_TROUBLE):
             try:
                 self._bus = can.Bus(interface=self._interface, **options)
             except (can.CanInterfaceNotImplementedError, ImportError) as unknown:
                 raise ConfigurationError(where=f"{self._where}.interface", problem=f"{self.path}: {unknown}") from None
-        self.state, self.errors = ErrorState.ACTIVE, 0
-        self.meter = LoadMeter(self._bitrate, time.monotonic_ns())
+
+    def _look_over(self) -> None:
+        """What the system knows of the interface already.
+
+        Raises:
+            PortLost: it is not there, is down, or its controller is bus-off.
+        """
+        with losing(OSError):
+            link = look_at(self._channel)
+        if not link.up:
+            raise PortLost(f"it is down; `ip link set {self._channel} up`")
+        if link.state is not None:
+            self._enter(link.state)
+
+    def look(self, name: str) -> CanBusState:
+        """How it is now; from any thread."""
+        return CanBusState(
+            name=name,
+            port=self.path,
+            up=self._bus is not None,
+            state=self.state.word,
+            load=self.meter.load,
+            error_frames=self.errors,
+            bus_offs=self.bus_offs,
+        )
 
     def _options(self) -> dict[str, Any]:
         match self._interface:
@@ -102,6 +133,7 @@ class CanPort:
     def close(self) -> None:
         """Let go of it; more than once is fine."""
         bus, self._bus = self._bus, None
+        self.meter = LoadMeter(self._bitrate, time.monotonic_ns())
         if bus is not None:
             with suppress(*_TROUBLE):
                 bus.shutdown()
@@ -126,10 +158,13 @@ class CanPort:
         with losing(*_TROUBLE):
             message = self._open_bus().recv(timeout_s)
         if message is None:
+            self.meter.tick(time.monotonic_ns())
             return None
         if message.is_error_frame:
             self._take_error(message.arbitration_id, bytes(message.data))
             return None
+        if self.state is ErrorState.BUS_OFF:
+            self._enter(ErrorState.ACTIVE)  # nothing is heard in bus-off
         self._count(len(message.data))
         if message.is_extended_id or message.is_remote_frame:
             return None
@@ -152,14 +187,25 @@ class CanPort:
     def _take_error(self, frame_id: int, data: bytes) -> None:
         self.errors += 1
         state = error_state(frame_id, data)
-        if state is None or state == self.state:
-            return
-        _log.log(
-            logging.INFO if state < self.state else logging.WARNING, "%s: the bus is now %s", self.path, state.name
-        )
-        self.state = state
+        if state is not None:
+            self._enter(state)
+
+    def _enter(self, state: ErrorState) -> None:
+        """Note how its controller is; raises PortLost for bus-off."""
+        before, self.state = self.state, state
+        if state != before:
+            _log.log(logging.INFO if state < before else logging.WARNING, "%s: the bus is %s", self.path, state.word)
         if state is ErrorState.BUS_OFF:
-            raise PortLost("bus-off: too many errors on the bus; check bit rate, termination and cable")
+            self.bus_offs += state != before
+            raise PortLost(self._bus_off())
+
+    def _bus_off(self) -> str:
+        remedy = "check bit rate, termination and cable"
+        if self._interface == "socketcan":
+            here = self._channel
+            remedy += f", then `ip link set {here} down` and `up`; with `ip link set {here} type can restart-ms 100` "
+            remedy += "it comes back by itself"
+        return f"bus-off: too many errors on the bus; {remedy}"
 
 
 def _greet(host: str, port: int) -> None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 from trade.errors import ConfigurationError
 from trade_drivers._driver import AttachedBus, Driver
-from trade_drivers.joints import AttachedJoints, BusThread, PortLost
+from trade_drivers.joints import BusThread, PortLost
 from trade_drivers.robotfile import Bus, CanBus, Robot
 
 if TYPE_CHECKING:
@@ -36,9 +36,9 @@ class Cia402Driver(Driver):
             thread = BusThread(exchange, exchange.port, bus, healthy, name=f"bus {robot.name}.{bus.name}")
             thread.start()
             undo.pop_all()
-        from trade_drivers.cia402._motor import Drive  # noqa: PLC0415 - the libraries are optional
+        from trade_drivers.cia402._motor import AttachedDrives  # noqa: PLC0415 - the libraries are optional
 
-        return AttachedJoints(thread, Drive)
+        return AttachedDrives(thread, exchange.port)
 
 
 def open_exchange(robot: Robot, bus: CanBus, port: str) -> "DriveExchange":

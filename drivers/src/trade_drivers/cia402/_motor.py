@@ -1,16 +1,21 @@
-"""A motor with what only a drive can: finding its zero."""
+"""A motor with what only a drive can: finding its zero. And a bus of drives, with how it is itself."""
 
-from typing import Annotated, cast
+from functools import partial
+from typing import TYPE_CHECKING, Annotated, cast
 
 from trade import Meta, permit, service
 from trade_drivers._asked import expiry
+from trade_drivers._can_monitor import CanMonitor
 from trade_drivers._checks import within
 from trade_drivers.cia402._axis import DriveAxis
 from trade_drivers.cia402._exchange import DriveExchange
 from trade_drivers.cia402._homing import Homing
-from trade_drivers.joints import BusMotor
+from trade_drivers.joints import AttachedJoints, BusMotor, BusThread
 
-__all__ = ["Drive"]
+if TYPE_CHECKING:
+    from trade_drivers.can import CanPort
+
+__all__ = ["AttachedDrives", "Drive"]
 
 Method = Annotated[int, Meta(ge=-128, le=37, description="homing method of CiA 402-2; 37: where it is now is its zero")]
 Slow = Annotated[float, Meta(gt=0, description="speed of the search in rad/s; by default a tenth of the joint's limit")]
@@ -49,3 +54,14 @@ class Drive(BusMotor):
             )
             self._finish(homing)
         return axis.scale.angle_rad(axis.fresh(self._exchange.clock(), self._exchange.stale_after_ns).position)
+
+
+class AttachedDrives(AttachedJoints):
+    """A bus of drives."""
+
+    def __init__(self, thread: BusThread[DriveExchange], port: "CanPort") -> None:
+        super().__init__(thread, Drive)
+        self._port = port
+
+    def monitor(self, name: str) -> CanMonitor:
+        return CanMonitor(partial(self._port.look, name))

@@ -18,10 +18,11 @@ from trade_hil_sim._errors import SimulationError
 from trade_hil_sim._log import ByteLog, Entry
 from trade_hil_sim._state import BusState
 
+from ._adapter import Adapter, Client
 from ._device import Device, Label, plain
 from ._frame import Frame
-from ._hub import LOOPBACK, Client, Hub
-from ._text import error_text, frame_text
+from ._hub import Hub
+from ._interface import Interface
 from ._wire import Station, Wire
 
 __all__ = ["CanBus"]
@@ -38,7 +39,7 @@ _T = TypeVar("_T")
 
 
 class CanBus:
-    """Devices on one CAN bus; clients reach it by the socketcand protocol, at `port`.
+    """Devices on one CAN bus; clients reach it at `port`: by the socketcand protocol, or on an interface of the system.
 
     Args:
         devices: on the bus.
@@ -48,6 +49,7 @@ class CanBus:
         log: where to record; default: a log in memory, at `log`.
         paced: let frames take as long as on a real wire; else none takes time.
         label: says what frames are.
+        interface: a ``vcan`` of the system that the devices sit on, instead of a server of their own.
     """
 
     def __init__(
@@ -60,6 +62,7 @@ class CanBus:
         log: ByteLog | None = None,
         paced: bool = True,
         label: Label = plain,
+        interface: str = "",
     ) -> None:
         self.name = name
         self.log = ByteLog() if log is None else log
@@ -69,7 +72,7 @@ class CanBus:
         self._echo = False
         self._adapter_off = False
         self._wire = Wire(bitrate if paced else None, self)
-        self._hub = Hub(channel, self)
+        self._adapter: Adapter = Interface(interface, self) if interface else Hub(channel, self)
         self._wall_offset_s = time.time() - time.monotonic()
         self._clients: dict[Client, Station] = {}
         self._stations = {device.device_id: self._attach(device) for device in self._devices}
@@ -88,18 +91,13 @@ class CanBus:
 
     @property
     def port(self) -> str:
-        """What a client is given: ``socketcand:127.0.0.1:29536/can0``; known from `open` on."""
-        return f"socketcand:{LOOPBACK}:{self._hub.tcp_port}/{self._hub.channel}"
-
-    @property
-    def tcp_port(self) -> int:
-        """The TCP port of the adapter; known from `open` on."""
-        return self._hub.tcp_port
+        """What a client is given: ``socketcand:127.0.0.1:29536/can0``, or ``socketcan:vcan0``; known from `open` on."""
+        return self._adapter.port
 
     @property
     def channel(self) -> str:
         """The interface clients open."""
-        return self._hub.channel
+        return self._adapter.channel
 
     @property
     def devices(self) -> Sequence[Device]:
@@ -110,7 +108,7 @@ class CanBus:
         """Plug the adapter in and power the devices."""
         if self._thread is not None:
             raise SimulationError(f"bus {self.name} is open, or was; make a new one")
-        self._hub.open()
+        self._adapter.open()
         self._bell, self._rope = os.pipe()
         os.set_blocking(self._rope, False)
         self._thread = threading.Thread(target=self._run, name=f"sim-{self.name}", daemon=True)
@@ -170,15 +168,15 @@ class CanBus:
     def _run(self) -> None:
         try:
             while not self._closing:
-                if self._hub.serve(self._bell, self._patience_s(), self._pass_time):
+                if self._adapter.serve(self._bell, self._patience_s(), self._pass_time):
                     os.read(self._bell, 4096)
                     while self._asked:
                         self._asked.popleft()()
                 self._pass_time(time.monotonic())
-                self._hub.flush()
+                self._adapter.flush()
         finally:
             self._closing = True
-            self._hub.close()
+            self._adapter.close()
             os.close(self._bell)
             os.close(self._rope)
 
@@ -207,17 +205,17 @@ class CanBus:
             msgspec.structs.replace(d.state(t), bus=self.name, absent=not self._stations[d.device_id].connected)
             for d in self._devices
         ]
-        return BusState(name=self.name, port=self.port, plugged=self._hub.plugged, devices=devices)
+        return BusState(name=self.name, port=self.port, plugged=self._adapter.plugged, devices=devices)
 
     def _do(self, command: faults.Command) -> None:
         t = time.monotonic()
         self._pass_time(t)
         match command:
             case faults.Unplug():
-                self._hub.unplug()
+                self._adapter.unplug()
                 self._note("unplugged", t)
             case faults.Replug():
-                self._hub.plug_in()
+                self._adapter.plug_in()
                 self._note("plugged", t)
             case faults.Echo():
                 self._echo = command.on
@@ -232,7 +230,7 @@ class CanBus:
                 self._named(command.ids)
                 self._script.unmute(command.ids)
             case faults.BusOff(ids=None):
-                self._adapter(command.on, t)
+                self._switch_adapter(command.on, t)
             case _:
                 self._do_to_devices(command, t)
 
@@ -248,20 +246,20 @@ class CanBus:
                 station.fall_silent()
             device.do(command, t)
 
-    def _adapter(self, off: bool, t: float) -> None:
+    def _switch_adapter(self, off: bool, t: float) -> None:
         """The adapter's controller goes bus-off, or is started again."""
         self._adapter_off = off
         for client, station in self._clients.items():
             station.off, station.errors = off, 0
             station.fall_silent()
-            client.tell(error_text(BUS_OFF if off else RESTARTED, t + self._wall_offset_s))
+            client.tell_error(BUS_OFF if off else RESTARTED, t + self._wall_offset_s)
         self._note("bus_off" if off else "restarted", t, source="adapter")
 
     def _heal(self, t: float) -> None:
         self._script.heal()
         self._echo = False
         if self._adapter_off:
-            self._adapter(False, t)
+            self._switch_adapter(False, t)
         for device in self._devices:
             station = self._stations[device.device_id]
             station.connected, station.off, station.errors = True, False, 0
@@ -308,9 +306,9 @@ class CanBus:
         """Log it and tell all clients."""
         self._frame("destroyed", sender, frame, t)
         for client in self._clients:
-            client.tell(error_text(BUS_ERROR, t + self._wall_offset_s))
+            client.tell_error(BUS_ERROR, t + self._wall_offset_s)
         if sender.off and sender.device_id is None:
-            self._adapter(True, t)
+            self._switch_adapter(True, t)
         elif sender.off:
             self._note("bus_off", t, source=sender.name, device_id=sender.device_id)
 
@@ -318,7 +316,7 @@ class CanBus:
         """Log it."""
         self._frame("lost", sender, frame, t)
 
-    # the hub's tenant
+    # the adapter's tenant
 
     def joined(self, client: Client) -> None:
         """It is a station of its own."""
@@ -342,7 +340,7 @@ class CanBus:
         self._note("misunderstood", time.monotonic(), source=client.name, detail=text)
 
     def _tell(self, client: Client, frame: Frame, t: float) -> None:
-        if not client.tell(frame_text(frame, t + self._wall_offset_s)) and client.overrun == 1:
+        if not client.tell_frame(frame, t + self._wall_offset_s) and client.overrun == 1:
             self._note("overrun", t, source=client.name, detail="the client does not read; frames for it are lost")
 
     def _note(self, name: str, t: float, *, source: str = "", device_id: int | None = None, detail: str = "") -> None:

@@ -4,15 +4,16 @@ import socket
 import time
 from collections.abc import Callable, Iterable
 from contextlib import suppress
-from typing import Final, Protocol
+from typing import Final
 
 from trade_hil_sim._errors import SimulationError
 from trade_hil_sim._ready import ready
 
+from ._adapter import Tenant
 from ._frame import Frame
-from ._text import GREETING, OK, Reader, parse_send, refusal
+from ._text import GREETING, OK, Reader, error_text, frame_text, parse_send, refusal
 
-__all__ = ["Client", "Hub", "Tenant"]
+__all__ = ["Hub", "HubClient"]
 
 LOOPBACK: Final = "127.0.0.1"
 SETTLE_S: Final = 0.05
@@ -23,27 +24,7 @@ MOST_UNSENT: Final = 65_536
 """Bytes kept for a client that does not read; what comes on top is lost, as in a full receive buffer."""
 
 
-class Tenant(Protocol):
-    """Who hears what clients do. Called from the thread that calls `Hub.serve`."""
-
-    def joined(self, client: "Client") -> None:
-        """A client is in raw mode: it may send, and is to be told frames."""
-        ...
-
-    def left(self, client: "Client") -> None:
-        """A client that had joined is gone."""
-        ...
-
-    def said(self, client: "Client", frame: Frame, t: float) -> None:
-        """A client wants a frame sent; its text was read at `t` seconds (monotonic)."""
-        ...
-
-    def misunderstood(self, client: "Client", text: str) -> None:
-        """A client said what makes no sense."""
-        ...
-
-
-class Client:
+class HubClient:
     """One connection. It is opened, then put in raw mode, then it sends and is told frames."""
 
     def __init__(self, connection: socket.socket, number: int) -> None:
@@ -70,6 +51,14 @@ class Client:
         self.unsent += text
         return True
 
+    def tell_frame(self, frame: Frame, wall_s: float) -> bool:
+        """Queue what it is told of a frame; False if it is lost."""
+        return self.tell(frame_text(frame, wall_s))
+
+    def tell_error(self, bits: int, wall_s: float) -> bool:
+        """Queue what it is told of an error."""
+        return self.tell(error_text(bits, wall_s))
+
     def flush(self) -> None:
         """Write what can be written without waiting; raises OSError when it is gone."""
         if self.unsent and time.monotonic() >= self.quiet_until:
@@ -95,7 +84,7 @@ class Hub:
         self._tenant = tenant
         self._holder: socket.socket | None = None
         self._listener: socket.socket | None = None
-        self._clients: list[Client] = []
+        self._clients: list[HubClient] = []
         self._count = 0
 
     @property
@@ -104,12 +93,17 @@ class Hub:
         return 0 if self._holder is None else int(self._holder.getsockname()[1])
 
     @property
+    def port(self) -> str:
+        """What a client is given: ``socketcand:127.0.0.1:29536/can0``."""
+        return f"socketcand:{LOOPBACK}:{self.tcp_port}/{self.channel}"
+
+    @property
     def plugged(self) -> bool:
         """Whether anybody can connect."""
         return self._listener is not None
 
     @property
-    def clients(self) -> Iterable[Client]:
+    def clients(self) -> Iterable[HubClient]:
         """Those in raw mode."""
         return tuple(client for client in self._clients if client.raw)
 
@@ -140,17 +134,8 @@ class Hub:
             self._holder.close()
 
     def serve(self, bell: int, wait_s: float, awake: Callable[[float], None]) -> bool:
-        """Wait for clients, the bell or the end of the wait, then do what clients want.
-
-        Args:
-            bell: a file descriptor that ends the wait.
-            wait_s: how long to wait, in seconds.
-            awake: called with the time, in seconds (monotonic), before anything of a client is carried out.
-
-        Returns:
-            Whether the bell was rung.
-        """
-        watched: list[int | Client | socket.socket] = [bell, *self._clients]
+        """Wait for clients, the bell or the end of the wait, then do what clients want; see `Adapter`."""
+        watched: list[int | HubClient | socket.socket] = [bell, *self._clients]
         if self._listener is not None:
             watched.append(self._listener)
         writing = [client for client in self._clients if client.unsent]
@@ -163,7 +148,7 @@ class Hub:
         for thing in readable:
             if thing is self._listener:
                 self._accept()
-            elif isinstance(thing, Client):
+            elif isinstance(thing, HubClient):
                 self._read(thing, t)
         return bell in readable
 
@@ -184,11 +169,11 @@ class Hub:
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
             self._count += 1
-            client = Client(connection, self._count)
+            client = HubClient(connection, self._count)
             self._clients.append(client)
             client.say(GREETING)
 
-    def _read(self, client: Client, t: float) -> None:
+    def _read(self, client: HubClient, t: float) -> None:
         if client not in self._clients:
             return
         try:
@@ -204,7 +189,7 @@ class Hub:
             pass
         self._drop(client)
 
-    def _obey(self, client: Client, words: list[str], t: float) -> None:
+    def _obey(self, client: HubClient, words: list[str], t: float) -> None:
         match words:
             case ["open", channel] if not client.opened:
                 client.opened = channel == self.channel
@@ -219,7 +204,7 @@ class Hub:
                 self._tenant.misunderstood(client, " ".join(words))
                 client.tell(refusal("unknown command"))
 
-    def _send(self, client: Client, words: list[str], t: float) -> None:
+    def _send(self, client: HubClient, words: list[str], t: float) -> None:
         try:
             frame = parse_send(words)
         except SimulationError as problem:
@@ -227,7 +212,7 @@ class Hub:
         else:
             self._tenant.said(client, frame, t)
 
-    def _drop(self, client: Client) -> None:
+    def _drop(self, client: HubClient) -> None:
         if client in self._clients:
             self._clients.remove(client)
             client.connection.close()

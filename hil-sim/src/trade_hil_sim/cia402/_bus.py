@@ -30,6 +30,7 @@ class Cia402Bus(CanBus):
         bitrate: bits a second, if paced.
         log: where to record; default: a log in memory, at `log`.
         paced: let frames take as long as on a real wire.
+        interface: a ``vcan`` of the system that the drives sit on, instead of a server of their own.
     """
 
     def __init__(
@@ -41,8 +42,18 @@ class Cia402Bus(CanBus):
         bitrate: int = 1_000_000,
         log: ByteLog | None = None,
         paced: bool = True,
+        interface: str = "",
     ) -> None:
-        super().__init__(drives, name=name, channel=channel, bitrate=bitrate, log=log, paced=paced, label=canopen_label)
+        super().__init__(
+            drives,
+            name=name,
+            channel=channel,
+            bitrate=bitrate,
+            log=log,
+            paced=paced,
+            label=canopen_label,
+            interface=interface,
+        )
 
     @classmethod
     def from_robot(
@@ -53,6 +64,7 @@ class Cia402Bus(CanBus):
         *,
         log: ByteLog | None = None,
         paced: bool = True,
+        interface: str = "",
     ) -> "Cia402Bus":
         """The bus a robot file describes, each joint at its zero (or as near as its limits allow).
 
@@ -62,6 +74,7 @@ class Cia402Bus(CanBus):
             port: not used; clients are given `port` instead.
             log: where to record.
             paced: take as long as the real wire.
+            interface: a ``vcan`` of the system to sit on.
 
         Raises:
             SimulationError: a node id there cannot be, or a joint that does not tell its counts.
@@ -71,7 +84,15 @@ class Cia402Bus(CanBus):
         record = cast("CanRecord", bus)
         drives = [_drive_for(joint, time.monotonic()) for joint in joints]
         channel = record.channel.rpartition("/")[2] if record.interface == "socketcand" else "can0"
-        return cls(drives, name=bus.name, channel=channel, bitrate=record.bitrate, log=log, paced=paced)
+        return cls(
+            drives,
+            name=bus.name,
+            channel=channel,
+            bitrate=record.bitrate,
+            log=log,
+            paced=paced,
+            interface=interface,
+        )
 
 
 def _drive_for(joint: "Joint", t: float) -> Drive:

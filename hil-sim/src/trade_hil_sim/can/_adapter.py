@@ -1,0 +1,94 @@
+"""What a simulated bus is reached through, and who reaches it: the seam between the wire and its clients."""
+
+from collections.abc import Callable
+from typing import Protocol
+
+from ._frame import Frame
+
+__all__ = ["Adapter", "Client", "Tenant"]
+
+
+class Client(Protocol):
+    """Who is on the bus through an adapter."""
+
+    name: str
+    overrun: int
+    """Frames lost in a row because it does not read."""
+
+    def tell_frame(self, frame: Frame, wall_s: float) -> bool:
+        """A frame was on the bus, at `wall_s` seconds since the epoch; False if it is lost."""
+        ...
+
+    def tell_error(self, bits: int, wall_s: float) -> bool:
+        """An error was, of these classes (linux/can/error.h)."""
+        ...
+
+
+class Tenant(Protocol):
+    """Who hears what clients do. Called from the thread that calls `Adapter.serve`."""
+
+    def joined(self, client: Client) -> None:
+        """A client may send from now on, and is to be told frames."""
+        ...
+
+    def left(self, client: Client) -> None:
+        """A client that had joined is gone."""
+        ...
+
+    def said(self, client: Client, frame: Frame, t: float) -> None:
+        """A client wants a frame sent; it was read at `t` seconds (monotonic)."""
+        ...
+
+    def misunderstood(self, client: Client, text: str) -> None:
+        """A client said what makes no sense."""
+        ...
+
+
+class Adapter(Protocol):
+    """Brings clients to the bus."""
+
+    channel: str
+    """The interface clients open."""
+
+    @property
+    def port(self) -> str:
+        """What a client is given: ``INTERFACE:CHANNEL``, in python-can's words."""
+        ...
+
+    @property
+    def plugged(self) -> bool:
+        """Whether the bus can be reached."""
+        ...
+
+    def open(self) -> None:
+        """Let clients come; raises SimulationError if there is no such interface."""
+        ...
+
+    def plug_in(self) -> None:
+        """Let them come again."""
+        ...
+
+    def unplug(self) -> None:
+        """Hang up on everybody."""
+        ...
+
+    def close(self) -> None:
+        """Unplug, for good."""
+        ...
+
+    def serve(self, bell: int, wait_s: float, awake: Callable[[float], None]) -> bool:
+        """Wait for clients, the bell or the end of the wait, then do what clients want.
+
+        Args:
+            bell: a file descriptor that ends the wait.
+            wait_s: how long to wait, in seconds.
+            awake: called with the time, in seconds (monotonic), before anything of a client is carried out.
+
+        Returns:
+            Whether the bell was rung.
+        """
+        ...
+
+    def flush(self) -> None:
+        """Write to clients what they can take."""
+        ...
