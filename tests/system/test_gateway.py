@@ -1,6 +1,5 @@
 """``trade gateway`` between networks: what crosses, what does not, and what becomes of it on bad days."""
 
-import json
 import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -121,8 +120,7 @@ def test_a_policy_is_changed_while_calls_run(site: Site, arm: Member, planner: M
 
 def _tried(member: Member) -> str:
     member.tell("try_move", "rosie.arm", "1")
-    assert member._process.stdout is not None
-    said = json.loads(member._process.stdout.readline())
+    said = member.says()
     return "moved" if "answer" in said else said["error"].partition(":")[0]
 
 
