@@ -12,8 +12,7 @@ import threading
 from pathlib import Path
 from typing import Any
 
-from waiting import PATIENCE_S
-
+PATIENCE_S = 60.0
 MEMBER = Path(__file__).with_name("member.py")
 
 

@@ -27,6 +27,7 @@ DRAIN_S: Final = 0.030
 """Silence kept after a failed exchange: an answer that is late arrives now and is thrown away, not believed later."""
 
 _BITS_PER_BYTE: Final = 10
+_REMEDY: Final = "plug its adapter in again"
 
 
 class SerialLine:
@@ -140,9 +141,9 @@ class SerialWire:
             case errno.ENOTTY | errno.EISDIR:
                 problem = "is no serial port; `ls -l /dev/serial/by-id` shows those there are"
             case errno.ENOENT:
-                return PortLost("there is no such device")
+                return PortLost(f"there is no such device; {_REMEDY}")
             case _:
-                return PortLost(str(bad))
+                return PortLost(f"{bad}; {_REMEDY}")
         return ConfigurationError(where=f"{self._where}.port", problem=f"{self.path}: {problem}")
 
     def close(self) -> None:
@@ -156,7 +157,7 @@ class SerialWire:
             raise PortLost("it is not open")
         self._line.gate = gate
         try:
-            with losing(OSError, termios.error):
+            with losing(OSError, termios.error, remedy=_REMEDY):
                 yield
         finally:
             self._line.gate = None

@@ -25,14 +25,23 @@ class PortLost(Exception):
 
 
 @contextmanager
-def losing(*troubles: type[Exception]) -> Generator[None, None, None]:
-    """Have these, which a library raises when its port is gone, become ``PortLost``."""
+def losing(*troubles: type[Exception], remedy: str = "") -> Generator[None, None, None]:
+    """Have these, which a library raises when its port is gone, become ``PortLost``; that ends with what to do."""
     try:
         yield
     except TradeError:  # a gate's: some of them are OSErrors, too
         raise
     except troubles as gone:
-        raise PortLost(str(gone)) from None
+        raise PortLost(f"{_said(gone)}; {remedy}" if remedy else _said(gone)) from None
+
+
+def _said(gone: Exception) -> str:
+    """In words, where the system gave a number and words."""
+    match gone.args:
+        case (int(), str(words), *_):
+            return words
+        case _:
+            return str(gone)
 
 
 class WireError(Exception):

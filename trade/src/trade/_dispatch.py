@@ -121,13 +121,10 @@ class LocalService:
         args, kwargs = self.signature.decode(self.label, raw)
         return self.call(args, kwargs, context)
 
-    def call(self, args: Sequence[Any], kwargs: dict[str, Any], context: CallContext) -> Any:
-        """Call with the arguments as they are."""
-        around = self.around
-        return self.call_bare(args, kwargs, context) if around is None else around.run(self, args, kwargs, context)
-
-    def call_bare(self, args: Sequence[Any], kwargs: dict[str, Any], context: CallContext) -> Any:
-        """The same without what is called before and after it."""
+    def call(self, args: Sequence[Any], kwargs: dict[str, Any], context: CallContext, *, bare: bool = False) -> Any:
+        """Call with the arguments as they are; ``bare``: without what is called before and after it."""
+        if self.around is not None and not bare:
+            return self.around.run(self, args, kwargs, context)
         if not self.resources or self.effect != "actuate":
             self._look(context)
             return self.run_admitted(args, kwargs, context)

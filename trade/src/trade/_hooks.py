@@ -180,7 +180,7 @@ class Around:
                 raise DeadlineExceeded(service=service.label, deadline_s=(time.monotonic_ns() - began_ns) / 1e9)
         result, error = None, ""
         try:
-            result = service.call_bare(args, kwargs, context)
+            result = service.call(args, kwargs, context, bare=True)
         except BaseException as raised:
             error = _error_text(service, raised)
             raise
