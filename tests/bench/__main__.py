@@ -7,6 +7,7 @@ parts:
   registry   10,000 services as a late joiner sees them: time, memory, finding one (--full: of 10,000 providers, too)
   deadman    how long a joint moves on after its client was killed or frozen
   locks      taking and giving back four services of two containers; what the checks of resources add to a call
+  watching   a thousand notifications every 0.1 s; what hooks cost a call that has none
   gateway    calls through one gateway and two, certificates and policy on; floods; an idle one (root, iproute2)
   servo      the Dynamixel driver against what a bus of 1 Mbaud can carry
 
@@ -16,7 +17,7 @@ Progress goes to stderr, tables and targets (met or missed) to stdout. Peers tha
 import argparse
 from collections.abc import Callable, Mapping
 
-from tests.bench import _calls, _deadman, _gateway, _local, _locks, _registry, _servo
+from tests.bench import _calls, _deadman, _gateway, _local, _locks, _registry, _servo, _watching
 
 _SERVICES_EACH = 10
 
@@ -34,6 +35,7 @@ _PARTS: Mapping[str, Callable[[argparse.Namespace], None]] = {
     "registry": _run_registry,
     "deadman": lambda options: _deadman.run(options.rounds),
     "locks": lambda options: _locks.run(options.n, options.rounds),
+    "watching": lambda options: _watching.run(options.n, options.rounds, options.seconds),
     "gateway": lambda options: _gateway.run(options.n, options.rounds, options.idle),
     "servo": lambda options: _servo.run(options.n, options.rounds, options.seconds),
 }

@@ -70,6 +70,11 @@ def test_the_bench_of_locks_prints_its_targets() -> None:
     assert targets(bench("locks", "-n", "3", "--rounds", "1")) == ["lock and unlock / call", "checked / unchecked call"]
 
 
+def test_the_bench_of_watching_prints_its_targets() -> None:
+    printed = bench("watching", "-n", "3", "--rounds", "1", "--seconds", "0.3")
+    assert targets(printed) == ["merged ticks, %", "another watched / none"]
+
+
 def test_the_bench_of_the_servo_bus_prints_its_targets() -> None:
     printed = bench("servo", "-n", "3", "--rounds", "1", "--seconds", "0.05")
     assert "156 bytes a cycle" in printed
