@@ -80,7 +80,7 @@ class Container(Hosting, Hooking, Guarding, Bordering):
         self._closed = False
         self.system: Final = System(lambda: self)
         """Its own switches: who it is linked to, and whether it lets itself be found."""
-        self.access: Final = Access(self._settings.policy, certified=self._settings.tls is not None)
+        self.access = Access(self._settings.policy, certified=self._settings.tls is not None)
         """What the policy means for it."""
         self._targets: dict[ServiceKey, LocalTarget | RemoteTarget] = {}
         self._codec = Codec(self._handle_to_data, self._data_to_handle, (Handle,))
