@@ -42,7 +42,7 @@ def gateway(
         out.say(f"{file} is right")
         _say_what_crosses(out, plan)
         return
-    with leaving() as asked_to_leave, _hangups() as hangup:
+    with leaving() as asked_to_leave, hangups() as hangup:
         seen = digest(file)
         running = Gateway(plan, named_digest(file))
         try:
@@ -121,7 +121,7 @@ class Gateway:
 
 
 @contextmanager
-def _hangups() -> Generator[threading.Event]:
+def hangups() -> Generator[threading.Event]:
     """An event that SIGHUP sets."""
     event = threading.Event()
 
