@@ -123,8 +123,9 @@ class LocalService:
 
     def call(self, args: Sequence[Any], kwargs: dict[str, Any], context: CallContext, *, bare: bool = False) -> Any:
         """Call with the arguments as they are; ``bare``: without what is called before and after it."""
-        if self.around is not None and not bare:
-            return self.around.run(self, args, kwargs, context)
+        around = self.around  # it may end at any time
+        if around is not None and not bare:
+            return around.run(self, args, kwargs, context)
         if not self.resources or self.effect != "actuate":
             self._look(context)
             return self.run_admitted(args, kwargs, context)
