@@ -298,6 +298,7 @@ class Dispatcher:
                 self._end(ongoing, service, replier, call, cancelled(service.label))
 
         ongoing.on_cancel(drop)
+        ongoing.queued_ns = time.monotonic_ns()
         if not serial.submit(begin):
             self._end(ongoing, service, replier, call, (Status.BUSY, EMPTY))
 
@@ -413,5 +414,6 @@ def _run(caller: str, call: Call, service: LocalService, ongoing: Ongoing | None
         info = service.failure(error, call.args)
         if not isinstance(error, TradeError) or isinstance(error, _DEFECTS):
             who = foreign(call.session) or caller
-            _logger.warning("%s failed in a call of %s:\n%s", service.label, who, info.traceback or info.message)
+            text = info.traceback or info.message
+            _logger.warning("%s failed in a call of %s:\n%s", service.label, who, text, extra={"call_id": call.id})
         return Status.ERROR, Raw(encode_message(info))
