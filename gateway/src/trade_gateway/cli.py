@@ -6,7 +6,20 @@ from typing import Annotated
 import typer
 
 from trade.errors import TradeError
-from trade_gateway import _call, _estop, _gateway, _list, _lock, _locks, _pki_commands, _policy, _up
+from trade_gateway import (
+    _call,
+    _estop,
+    _gateway,
+    _list,
+    _lock,
+    _locks,
+    _logs,
+    _pki_commands,
+    _policy,
+    _profile,
+    _trace,
+    _up,
+)
 from trade_gateway._output import UsageError, say_error
 from trade_gateway._system_choice import SystemChoice
 
@@ -31,6 +44,10 @@ app.command("locks")(_locks.locks)
 app.command("unlock")(_locks.unlock)
 app.command("resume")(_locks.resume)
 app.command("estop")(_estop.estop)
+app.command("tracing")(_trace.tracing)
+app.command("trace")(_trace.trace)
+app.command("logs")(_logs.logs)
+app.command("profile")(_profile.profile)
 app.add_typer(_pki_commands.app, name="pki")
 app.add_typer(_policy.app, name="policy")
 
