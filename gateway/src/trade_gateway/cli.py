@@ -6,7 +6,22 @@ from typing import Annotated
 import typer
 
 from trade.errors import TradeError
-from trade_gateway import _call, _estop, _gateway, _list, _lock, _locks, _pki_commands, _policy, _rules, _up, _watchers
+from trade_gateway import (
+    _call,
+    _estop,
+    _gateway,
+    _list,
+    _lock,
+    _locks,
+    _logs,
+    _pki_commands,
+    _policy,
+    _profile,
+    _rules,
+    _trace,
+    _up,
+    _watchers,
+)
 from trade_gateway._output import UsageError, say_error
 from trade_gateway._system_choice import SystemChoice
 
@@ -33,6 +48,10 @@ app.command("resume")(_locks.resume)
 app.command("estop")(_estop.estop)
 app.command("notifications")(_watchers.notifications)
 app.command("hooks")(_watchers.hooks)
+app.command("tracing")(_trace.tracing)
+app.command("trace")(_trace.trace)
+app.command("logs")(_logs.logs)
+app.command("profile")(_profile.profile)
 app.add_typer(_pki_commands.app, name="pki")
 app.add_typer(_policy.app, name="policy")
 app.add_typer(_rules.app, name="rules")

@@ -22,6 +22,7 @@ from trade._hooking import Hook
 from trade._hooks import Called, HookInfo
 from trade._lock import Lock, OnLost, OnRequest
 from trade._locking import LEASE_S
+from trade._logbook import LogLine
 from trade._many import Outcome
 from trade._notifications import Notification, NotificationInfo
 from trade._notifying import POLL_S
@@ -31,8 +32,10 @@ from trade._secret import Secret
 from trade._service import service
 from trade._session import Session
 from trade._settings import Settings
+from trade._spans import Span
 from trade._system import ContainerInfo, System
 from trade._terms import LockInfo
+from trade._tracing import LogReader, Trace
 from trade._wire import HEALTHY, Estop, Scalar
 
 __all__ = [
@@ -49,6 +52,8 @@ __all__ = [
     "HookInfo",
     "Lock",
     "LockInfo",
+    "LogLine",
+    "LogReader",
     "Meta",
     "Notification",
     "NotificationInfo",
@@ -59,7 +64,9 @@ __all__ = [
     "Secret",
     "Session",
     "Settings",
+    "Span",
     "System",
+    "Trace",
     "acall",
     "acall_all",
     "acall_sequence",
@@ -92,6 +99,7 @@ __all__ = [
     "left",
     "lock",
     "locks",
+    "logs",
     "notifications",
     "once",
     "open_session",
@@ -105,8 +113,11 @@ __all__ = [
     "services",
     "set_groups",
     "set_health",
+    "set_tracing",
+    "spans",
     "start",
     "system",
+    "trace",
     "where",
 ]
 
@@ -138,6 +149,9 @@ def container() -> Container:
         return running
     with _lock:
         return _default if _default is not None else start()
+
+
+_running = container  # where an argument has its name
 
 
 def close() -> None:
@@ -331,6 +345,26 @@ def hooks() -> list[HookInfo]:
 def detach_hook(hook: str) -> None:
     """End a hook by its id, wherever it is attached; see `Container.detach_hook`."""
     container().detach_hook(hook)
+
+
+def set_tracing(on: bool, *, container: str = "*") -> list[str]:
+    """Have containers note every call they make and serve, or no more; see `Container.set_tracing`."""
+    return _running().set_tracing(on, container=container)
+
+
+def spans(*, container: str = "*") -> list[Span]:
+    """What the containers noted of calls while they were traced; see `Container.spans`."""
+    return _running().spans(container=container)
+
+
+def trace(call_id: int) -> Trace:
+    """The whole tree that a call belongs to; see `Container.trace`."""
+    return container().trace(call_id)
+
+
+def logs(*, container: str = "*") -> list[LogLine]:
+    """What the processes of the system logged lately; see `Container.logs`."""
+    return _running().logs(container=container)
 
 
 def lock(

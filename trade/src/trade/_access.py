@@ -35,6 +35,9 @@ FUNCTIONS: Final = {
     "detach_hook": _ALL,  # asks itself for administer if it is another's
     "hooks": _ALL,
     "hook_suspended": _ALL,
+    "set_tracing": "instrument",
+    "spans": "read",
+    "log_lines": "read",
     "acquire": _ALL,  # asks itself for lock over the groups of the resources
     "break_lock": _ALL,  # asks itself for administer over them
     "resume": _ALL,  # asks itself for administer over those whose lock is not one's own

@@ -43,6 +43,7 @@ from trade._resources import Holder
 from trade._session import Session
 from trade._settings import Settings
 from trade._system import DOMAIN, PROVIDER, ContainerInfo, System
+from trade._tracing import Tracing, new_spans
 from trade._transport import ChannelClosed, Transport
 from trade._watch import Watch
 from trade._wire import Address, ServiceKey, Token, alive_key, as_chunk, encode_message
@@ -57,7 +58,7 @@ _PATIENCE_S: Final = 1.0
 """How long a call waits for the registry to hear of a handle that came by message before its registry entry did."""
 
 
-class Container(Hosting, Hooking, Guarding, Bordering):
+class Container(Hosting, Hooking, Tracing, Guarding, Bordering):
     """A participant of a system; most programs use the default one through the functions of ``trade``.
 
     Joins on construction. A context manager; ``close()`` leaves and is idempotent.
@@ -129,6 +130,8 @@ class Container(Hosting, Hooking, Guarding, Bordering):
                 self._denied_hook,
             )
             self._registry.listen(self._hooks.changed)
+            self._spans = new_spans(self.address, self.session, self._table)
+            self._trace_here(self._settings.trace)
             self._told_of_ends.append(self._hooks.session_ended)
             self._hook_numbers = itertools.count(1)
             state = self._settings.state_dir
@@ -164,6 +167,8 @@ class Container(Hosting, Hooking, Guarding, Bordering):
                 self._registry,
                 self._hooks,
                 self,
+                self._spans,
+                self._trace_here,
             )
             self._providers.add(own, (DOMAIN,), name=PROVIDER)
             self._estopping.begin(own)

@@ -123,8 +123,9 @@ class LocalService:
 
     def call(self, args: Sequence[Any], kwargs: dict[str, Any], context: CallContext, *, bare: bool = False) -> Any:
         """Call with the arguments as they are; ``bare``: without what is called before and after it."""
-        if self.around is not None and not bare:
-            return self.around.run(self, args, kwargs, context)
+        around = self.around  # it may end at any time
+        if around is not None and not bare:
+            return around.run(self, args, kwargs, context)
         if not self.resources or self.effect != "actuate":
             self._look(context)
             return self.run_admitted(args, kwargs, context)
@@ -297,6 +298,7 @@ class Dispatcher:
                 self._end(ongoing, service, replier, call, cancelled(service.label))
 
         ongoing.on_cancel(drop)
+        ongoing.queued_ns = time.monotonic_ns()
         if not serial.submit(begin):
             self._end(ongoing, service, replier, call, (Status.BUSY, EMPTY))
 
@@ -412,5 +414,6 @@ def _run(caller: str, call: Call, service: LocalService, ongoing: Ongoing | None
         info = service.failure(error, call.args)
         if not isinstance(error, TradeError) or isinstance(error, _DEFECTS):
             who = foreign(call.session) or caller
-            _logger.warning("%s failed in a call of %s:\n%s", service.label, who, info.traceback or info.message)
+            text = info.traceback or info.message
+            _logger.warning("%s failed in a call of %s:\n%s", service.label, who, text, extra={"call_id": call.id})
         return Status.ERROR, Raw(encode_message(info))

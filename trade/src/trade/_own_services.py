@@ -13,11 +13,13 @@ from trade._notification_services import Home, NotificationServices
 from trade._notifications import Notifier
 from trade._registry import Registry
 from trade._service import service
+from trade._spans import Spans
 from trade._system import System, SystemServices
+from trade._trace_services import Switch, TraceServices
 from trade._wire import Address, Estop
 
 
-class OwnServices(SystemServices, LockServices, NotificationServices, HookServices):
+class OwnServices(SystemServices, LockServices, NotificationServices, HookServices, TraceServices):
     """One provider, so that one registry entry tells of all its container's own functions."""
 
     def __init__(
@@ -35,11 +37,14 @@ class OwnServices(SystemServices, LockServices, NotificationServices, HookServic
         registry: Registry,
         hooks: Hooks,
         home: Home,
+        spans: Spans,
+        trace_here: Switch,
     ) -> None:
         SystemServices.__init__(self, system)
         LockServices.__init__(self, locks, own, ask, asked, access, groups, borrowed)
         NotificationServices.__init__(self, notifier, registry, home, access)
         HookServices.__init__(self, hooks, home, access)
+        TraceServices.__init__(self, own.container, spans, trace_here)
         self._estopping = estopping
 
     @property

@@ -32,6 +32,7 @@ _VARIABLES: Final = (
     "TRADE_POLICY",
     "TRADE_RUNTIME_DIR",
     "TRADE_STATE_DIR",
+    "TRADE_TRACE",
 )
 _CERTIFY: Final = "set TRADE_TLS to the folder that trade pki issue made"
 
@@ -75,6 +76,8 @@ class Settings:
     """A lock that the process around this one holds for it; see `Lock.environment`."""
     state_dir: Path | None = None
     """Where what must outlive a process is kept, such as open e-stops; none: nowhere."""
+    trace: bool = False
+    """Note calls from the start; see `Container.set_tracing`."""
 
     def __post_init__(self) -> None:
         for what, text in (("system", self.system), ("identity", self.identity), ("container", self.container)):
@@ -179,8 +182,8 @@ class Settings:
         The environment has ``TRADE_SYSTEM``, ``TRADE_IDENTITY``, ``TRADE_CONTAINER``, ``TRADE_LISTEN`` and
         ``TRADE_CONNECT`` (comma-separated), ``TRADE_CREDENTIALS`` (``user:password``), ``TRADE_TLS`` (a folder),
         ``TRADE_POLICY`` (a file), ``TRADE_INSECURE_LAN`` (``1``), ``TRADE_BRIDGE`` (comma-separated), ``TRADE_LOCK``
-        (set by ``trade lock``), ``TRADE_RUNTIME_DIR`` and ``TRADE_STATE_DIR`` (else the user's folder for state).
-        Others that begin with ``TRADE_`` are warned of.
+        (set by ``trade lock``), ``TRADE_TRACE`` (``1``), ``TRADE_RUNTIME_DIR`` and ``TRADE_STATE_DIR`` (else the
+        user's folder for state). Others that begin with ``TRADE_`` are warned of.
         """
         _warn_of_unknown(environment)
         named = system or environment.get("TRADE_SYSTEM") or None
@@ -201,6 +204,7 @@ class Settings:
             explicit_system=named is not None,
             lock=environment.get("TRADE_LOCK", ""),
             state_dir=_state_dir(environment),
+            trace=environment.get("TRADE_TRACE") == "1",
         )
 
 

@@ -32,6 +32,7 @@ __all__ = [
     "LockLost",
     "LockedByOther",
     "MotionStopped",
+    "NoSuchCall",
     "NoSuchEstop",
     "NoSuchHook",
     "NoSuchNotification",
@@ -275,6 +276,19 @@ class NoSuchHook(CallerError, LookupError):
 
     def describe(self) -> str:
         return f"there is no hook {self.id}: it was detached, or who attached it has ended; `trade hooks` lists them"
+
+
+@dataclass(kw_only=True, eq=False)
+class NoSuchCall(CallerError, LookupError):
+    """No container has noted a call of that id."""
+
+    id: int
+
+    def describe(self) -> str:
+        return (
+            f"no container has noted a call {self.id}: none that it touched is traced (`trade tracing on`), it has not "
+            "ended, or newer calls took its place"
+        )
 
 
 @dataclass(kw_only=True, eq=False)

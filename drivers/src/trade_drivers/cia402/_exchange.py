@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 __all__ = ["DriveExchange"]
 
-_log = logging.getLogger(__name__)
+_log = logging.getLogger("trade")
 _BEATS_MISSED: Final = 3
 _UNHEARD_NS: Final = 2_000_000_000
 """How long a drive that was set up is waited for before it is set up again."""

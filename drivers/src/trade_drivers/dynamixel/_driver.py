@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 __all__ = ["DynamixelDriver", "open_exchange"]
 
-_log = logging.getLogger(__name__)
+_log = logging.getLogger("trade")
 _SLOW_ANSWER_S: Final = 100e-6
 
 
