@@ -18,6 +18,7 @@ _ALL: Final = ""
 FUNCTIONS: Final = {
     "clock": _ALL,
     "containers": _ALL,
+    "load": _ALL,
     "withdrawn": _ALL,
     "locks": _ALL,
     "renew": _ALL,  # only what is one's own

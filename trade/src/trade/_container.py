@@ -31,6 +31,7 @@ from trade._hosting import Hosting
 from trade._inherited import InheritedLock
 from trade._invoke import LocalTarget, RemoteTarget, container_closed
 from trade._joining import join
+from trade._load import Load
 from trade._locking import Locking
 from trade._locks import LockTable
 from trade._notifications import Notifier
@@ -150,6 +151,8 @@ class Container(Hosting, Hooking, Guarding, Bordering):
                 self._transport, self.address, self._providers.lookup, coroutines, self.access, self.access.callers()
             )
             leaving.callback(self._dispatcher.close)
+            self.meter = Load(self.name, lambda: list(self._dispatcher._crews), self._providers.waiting)
+            """How busy it is."""
             own = OwnServices(
                 self.system,
                 self._table,

@@ -7,6 +7,7 @@ from typing import Final, Protocol
 from msgspec import Struct
 
 from trade._handle import Handle
+from trade._load import Load, LoadInfo
 from trade._reach import Reach
 from trade._service import service
 from trade._wire import Address, ServiceKey
@@ -47,6 +48,7 @@ class _Member(Protocol):
     """The container the switches belong to."""
 
     address: Final[Address]
+    meter: Load
 
     @property
     def reach(self) -> Reach: ...
@@ -105,6 +107,10 @@ class System:
     def containers(self) -> list[ContainerInfo]:
         """The containers of the system, this one included."""
         return self._member().containers()
+
+    def load(self) -> LoadInfo:
+        """How busy this container, its process and its host are."""
+        return self._member().meter.read()
 
     def deregister(self, service: Handle) -> str:
         """Withdraw the provider of a service of this container, which keeps the object to register it again.
@@ -169,6 +175,11 @@ class SystemServices:
     def containers(self) -> list[ContainerInfo]:
         """The containers that this one knows of, itself included."""
         return self._system.containers()
+
+    @service(effect="read")
+    def load(self) -> LoadInfo:
+        """How busy this container, its process and its host are."""
+        return self._system.load()
 
     @service
     def deregister(self, service: Handle) -> str:
