@@ -41,6 +41,9 @@ FUNCTIONS: Final = {
     "resume": _ALL,  # asks itself for administer over those whose lock is not one's own
     "deregister": "administer",
     "register": "administer",
+    "instantiate": "administer",
+    "terminate": "administer",
+    "terminate_container": "administer",
     "set_discovery": "administer",
     "set_broadcast": "administer",
     "connect": "administer",

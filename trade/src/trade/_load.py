@@ -74,6 +74,11 @@ class Load:
         busy, ticks = _host_ticks()
         return _Sample(self._clock(), time.process_time(), busy, ticks, sum(crew.taken for crew in self._crews()))
 
+    @property
+    def running(self) -> int:
+        """Calls of other containers that have a thread now."""
+        return sum(crew.working for crew in self._crews())
+
     def read(self) -> LoadInfo:
         """As it is now."""
         with self._lock:
@@ -93,7 +98,7 @@ class Load:
             memory_bytes=_resident_bytes(),
             calls=now.calls,
             calls_per_s=(now.calls - before.calls) / over_s,
-            in_flight=sum(crew.working for crew in self._crews()),
+            in_flight=self.running,
             queued=self._queued(),
             threads=threading.active_count(),
         )

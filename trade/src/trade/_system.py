@@ -1,8 +1,8 @@
 """The middleware's own functions as services, in group ``trade`` of every container."""
 
 import time
-from collections.abc import Callable, Sequence
-from typing import Final, Protocol
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Final, Protocol
 
 from msgspec import Struct
 
@@ -44,6 +44,17 @@ class _Withdrawn(Protocol):
     def infos(self) -> list[WithdrawnInfo]: ...
 
 
+class _Making(Protocol):
+    def find(self, class_path: str) -> type: ...
+    def make(self, kind: type, args: Sequence[Any] | Mapping[str, Any]) -> object: ...
+    def offer(self, made: object, groups: Sequence[str]) -> tuple[Handle, ...]: ...
+    def terminate(self, service: Handle) -> None: ...
+
+
+class _Terminating(Protocol):
+    def begin(self, reason: str, who: str) -> list[str]: ...
+
+
 class _Member(Protocol):
     """The container the switches belong to."""
 
@@ -54,6 +65,10 @@ class _Member(Protocol):
     def reach(self) -> Reach: ...
     @property
     def withdrawn(self) -> _Withdrawn: ...
+    @property
+    def making(self) -> _Making: ...
+    @property
+    def terminating(self) -> _Terminating: ...
     def handle(self, key: ServiceKey) -> Handle: ...
     def containers(self) -> list[ContainerInfo]: ...
     def load_policy(self, path: str) -> None: ...
@@ -147,6 +162,54 @@ class System:
     def withdrawn(self) -> list[WithdrawnInfo]:
         """What `register` can offer again, by name."""
         return self._member().withdrawn.infos()
+
+    def instantiate(
+        self, class_path: str, args: Sequence[Any] | Mapping[str, Any] = (), groups: str | Sequence[str] = ()
+    ) -> tuple[Handle, ...]:
+        """Make an object of a class and offer its services.
+
+        Args:
+            class_path: such as ``mypkg.vision:Camera``; the container's ``instantiable`` must allow it.
+            args: for its constructor, in order or by name; plain data.
+            groups: as for `register`.
+
+        Returns:
+            Handles of its services.
+
+        Raises:
+            NotInstantiable: the container's settings do not allow it; nothing was imported.
+            NoSuchClass: there is no such class there.
+            CannotInstantiate: its module or its constructor raised.
+            ConfigurationError: nothing to offer, or a malformed group; what was made is closed again.
+        """
+        making = self._member().making
+        named = (groups,) if isinstance(groups, str) else tuple(groups)
+        return making.offer(making.make(making.find(class_path), args), named)
+
+    def terminate(self, service: Handle) -> None:
+        """End a provider that `instantiate` made in this container: what it moves stops, then it is closed.
+
+        ``close()`` of the object is called, if it has one.
+
+        Raises:
+            ConfigurationError: it was not made by this container, or has ended.
+            DeviceFault: it could not be stopped; it is offered as before.
+        """
+        self._member().making.terminate(service)
+
+    def terminate_container(self, reason: str = "", *, who: str = "itself") -> list[str]:
+        """End this container: what moves stops, its services are withdrawn. Does not wait for its end.
+
+        The process goes on, unless it is one of ``trade container``, ``trade up`` or ``trade gateway``.
+
+        Args:
+            reason: why, for people; it is logged.
+            who: asks for it; likewise.
+
+        Returns:
+            What could not be stopped, and why; it ends all the same.
+        """
+        return self._member().terminating.begin(reason, who)
 
     def load_policy(self, path: str) -> None:
         """Go by another access policy, or by the same file as it is now; calls under way go on.

@@ -18,6 +18,7 @@ __all__ = [
     "CallerError",
     "Cancelled",
     "CannotConnect",
+    "CannotInstantiate",
     "ConfigurationError",
     "ContainerLost",
     "DeadlineExceeded",
@@ -32,10 +33,12 @@ __all__ = [
     "LockLost",
     "LockedByOther",
     "MotionStopped",
+    "NoSuchClass",
     "NoSuchEstop",
     "NoSuchHook",
     "NoSuchNotification",
     "NoSuchService",
+    "NotInstantiable",
     "NotSerialisable",
     "OutcomeUnknown",
     "RemoteError",
@@ -278,6 +281,37 @@ class NoSuchHook(CallerError, LookupError):
 
 
 @dataclass(kw_only=True, eq=False)
+class NotInstantiable(CallerError, PermissionError):
+    """The settings of the container do not allow to make objects of that class; nothing was imported."""
+
+    class_path: str
+    container: str
+    allowed: Sequence[str] = ()
+
+    def describe(self) -> str:
+        allowed = f"only {_some(self.allowed)}" if self.allowed else "none at all"
+        return (
+            f"container {self.container} may not make a {self.class_path}: it allows {allowed}; start it with "
+            f"`trade container --allow {self.class_path}`, or TRADE_INSTANTIABLE"
+        )
+
+
+@dataclass(kw_only=True, eq=False)
+class NoSuchClass(CallerError, LookupError):
+    """The container's Python has no class of that path."""
+
+    class_path: str
+    container: str
+    reason: str
+
+    def describe(self) -> str:
+        return (
+            f"there is no class {self.class_path} in container {self.container}: {self.reason}; is its package "
+            "installed there, and is it package.module:Class?"
+        )
+
+
+@dataclass(kw_only=True, eq=False)
 class AccessDenied(CallerError, PermissionError):
     """The access policy does not allow it; nothing was done."""
 
@@ -396,6 +430,18 @@ class Busy(CallError, BlockingIOError):
 
     def describe(self) -> str:
         return f"{self.service} did not run: container {self.container} has no free handler thread; try again shortly"
+
+
+@dataclass(kw_only=True, eq=False)
+class CannotInstantiate(CallError, RuntimeError):
+    """The class raised when it was imported or made; nothing was registered."""
+
+    class_path: str
+    container: str
+    problem: str
+
+    def describe(self) -> str:
+        return f"{self.class_path} could not be made in container {self.container}: {self.problem}"
 
 
 @dataclass(kw_only=True, eq=False)
