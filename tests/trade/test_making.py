@@ -242,7 +242,14 @@ def test_who_administers_makes_and_ends(governed: Path, asker: Container) -> Non
     assert list(ask(asker, "terminate_container", "")) == []
 
 
-@pytest.mark.parametrize(("name", "args"), [("instantiate", ("workshop:Lamp",)), ("terminate_container", ("because",))])
+@pytest.mark.parametrize(
+    ("name", "args"),
+    [
+        ("instantiate", ("workshop:Lamp",)),
+        ("terminate_container", ("because",)),
+        ("start_container", ("robot", "eyes")),
+    ],
+)
 def test_who_does_not_administer_is_refused_by_who_is_asked(
     governed: Path, memory: MemorySystem, maker: Container, events: list[str], name: str, args: tuple[str, ...]
 ) -> None:

@@ -6,7 +6,19 @@ from typing import Annotated
 import typer
 
 from trade.errors import TradeError
-from trade_gateway import _call, _empty_container, _estop, _gateway, _list, _lock, _locks, _pki_commands, _policy, _up
+from trade_gateway import (
+    _call,
+    _empty_container,
+    _estop,
+    _gateway,
+    _list,
+    _lock,
+    _locks,
+    _pki_commands,
+    _policy,
+    _start,
+    _up,
+)
 from trade_gateway._output import UsageError, say_error
 from trade_gateway._system_choice import SystemChoice
 
@@ -25,6 +37,7 @@ app.command("up")(_up.up)
 app.command("gateway")(_gateway.gateway)
 app.command("services")(_list.services)
 app.command("container")(_empty_container.container)
+app.command("start")(_start.start)
 app.command("containers")(_list.containers)
 app.command("call", context_settings={"ignore_unknown_options": True})(_call.call)
 app.command("lock", cls=_lock.WithCommand)(_lock.lock)

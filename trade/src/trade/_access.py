@@ -42,6 +42,7 @@ FUNCTIONS: Final = {
     "deregister": "administer",
     "register": "administer",
     "instantiate": "administer",
+    "start_container": "administer",
     "terminate": "administer",
     "terminate_container": "administer",
     "set_discovery": "administer",

@@ -5,7 +5,7 @@ from typing import Any
 from trade._context import current_call
 from trade._handle import Handle
 from trade._service import service
-from trade._system import System
+from trade._system import ContainerInfo, System
 
 
 class MakingServices:
@@ -20,6 +20,11 @@ class MakingServices:
     ) -> tuple[Handle, ...]:
         """Make an object of a class that this container allows, and offer its services."""
         return self._of_here.instantiate(class_path, args, groups)
+
+    @service
+    def start_container(self, host: str, name: str, allow: tuple[str, ...] = ()) -> ContainerInfo:
+        """Start an empty container on another host through the ssh program of this one, with its user's keys."""
+        return self._of_here.start_container(host, name, allow=allow)
 
     @service
     def terminate(self, service: Handle) -> None:

@@ -1,17 +1,22 @@
 """The middleware's own functions as services, in group ``trade`` of every container."""
 
+import contextlib
 import time
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any, Final, Protocol
 
 from msgspec import Struct
 
+from trade._constraints import Constraint, where
 from trade._handle import Handle
 from trade._load import Load, LoadInfo
 from trade._reach import Reach
 from trade._service import service
+from trade._settings import Settings
+from trade._starting import start
 from trade._wire import Address, ServiceKey
-from trade.errors import ConfigurationError, LinkStays
+from trade.errors import CannotStart, ConfigurationError, LinkStays, NoSuchService, TooManyServices
 
 DOMAIN: Final = "trade"
 PROVIDER: Final = "system"
@@ -69,6 +74,9 @@ class _Member(Protocol):
     def making(self) -> _Making: ...
     @property
     def terminating(self) -> _Terminating: ...
+    @property
+    def settings(self) -> Settings: ...
+    def find(self, constraint: Constraint, *, wait_s: float = ...) -> Handle: ...
     def handle(self, key: ServiceKey) -> Handle: ...
     def containers(self) -> list[ContainerInfo]: ...
     def load_policy(self, path: str) -> None: ...
@@ -185,6 +193,58 @@ class System:
         making = self._member().making
         named = (groups,) if isinstance(groups, str) else tuple(groups)
         return making.offer(making.make(making.find(class_path), args), named)
+
+    def start_container(
+        self,
+        host: str,
+        name: str,
+        *,
+        allow: Sequence[str] = (),
+        connect: Sequence[str] = (),
+        command: Sequence[str] = ("trade",),
+        environment: Mapping[str, str] | None = None,
+        ssh_config: Path | None = None,
+        wait_s: float = 10.0,
+    ) -> ContainerInfo:
+        """Start an empty container of this system on another host, and wait until it is seen here.
+
+        The ``ssh`` program does it, with the keys and the configuration of this user. Nothing is asked of people, and
+        only hosts whose key is known are talked to. What the container needs to come into the system (certificate,
+        policy, credentials) is set up there, or given in ``environment``, which others on either host may see.
+
+        Args:
+            host: ``HOST`` or ``USER@HOST``, as for ssh.
+            name: of the container.
+            allow: classes that may be made in it.
+            connect: endpoints it dials, as seen from there; none: what its environment says.
+            command: what ``trade`` is there; a path, or more words.
+            environment: variables for it.
+            ssh_config: instead of the user's own.
+            wait_s: how long it may take to be seen, once it is up there.
+
+        Raises:
+            CannotStart: with the reason, and what to do.
+            ConfigurationError: what cannot be a host or a variable.
+        """
+        member = self._member()
+        started = start(
+            host,
+            name,
+            system=member.settings.system,
+            allow=allow,
+            connect=connect,
+            command=command,
+            environment=environment,
+            ssh_config=ssh_config,
+        )
+        with contextlib.suppress(NoSuchService, TooManyServices):  # which one it is the epoch tells
+            member.find(where(name=CLOCK, group=DOMAIN, container=name), wait_s=wait_s)
+        found = next((info for info in self.containers() if info.epoch == started.epoch), None)
+        if found is None:
+            said = f"it is up there as process {started.pid}, and not seen here within {wait_s:g} s"
+            remedy = "tell it whom to dial (connect=...), and give it the credentials or certificates of this system"
+            raise CannotStart(host=host, container=name, reason="not seen", said=said, remedy=remedy)
+        return found
 
     def terminate(self, service: Handle) -> None:
         """End a provider that `instantiate` made in this container: what it moves stops, then it is closed.

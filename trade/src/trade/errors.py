@@ -19,6 +19,7 @@ __all__ = [
     "Cancelled",
     "CannotConnect",
     "CannotInstantiate",
+    "CannotStart",
     "ConfigurationError",
     "ContainerLost",
     "DeadlineExceeded",
@@ -563,6 +564,24 @@ class CannotConnect(SetupError, ConnectionError):
 
     def describe(self) -> str:
         return f"no link to {self.endpoint}: {self.reason}"
+
+
+@dataclass(kw_only=True, eq=False)
+class CannotStart(SetupError, ConnectionError):
+    """No container was started on the host, or it does not come into this system."""
+
+    host: str
+    container: str
+    reason: str
+    """``unknown host key``, ``changed host key``, ``not let in``, ``refused``, ``timeout``, ``unknown host``,
+    ``no trade there``, ``it did not come up``, ``no answer``, ``not seen``, ``no ssh here`` or ``ssh failed``."""
+    said: str
+    """By ssh, or by the command there."""
+    remedy: str
+
+    def describe(self) -> str:
+        said = f" ({self.said})" if self.said else ""
+        return f"container {self.container} was not started on {self.host}: {self.reason}{said}; {self.remedy}"
 
 
 @dataclass(kw_only=True, eq=False)
