@@ -190,6 +190,16 @@ def test_what_was_made_is_terminated_at_rest_and_closed(
         ask(asker, "terminate", handles["turn"])
 
 
+def test_what_was_made_and_is_withdrawn_is_terminated_too(
+    asker: Container, maker: Container, memory: MemorySystem, events: list[str]
+) -> None:
+    [kind] = ask(asker, "instantiate", "workshop:Lamp")
+    ask(asker, "deregister", kind)
+    ask(asker, "terminate", kind)
+    assert events == ["closed"]
+    assert maker.system.withdrawn() == []
+
+
 def test_only_what_was_made_there_is_terminated(asker: Container, maker: Container) -> None:
     clock = asker.find(where(name="clock", container="maker"))
     [kind] = ask(asker, "instantiate", "workshop:Lamp")

@@ -86,21 +86,19 @@ class Making:
 
     def terminate(self, service: Handle) -> None:
         """See `System.terminate`."""
-        key = service.key
-        offered = self._providers.offer(f"{key.domain}/{key.provider}") if key.address == self._home.address else None
+        key, offered = service.key, None
+        if key.address == self._home.address:
+            offered = self._providers.offer(f"{key.domain}/{key.provider}") or self._withdrawn.offer(key.provider)
         made = None if offered is None else self._made.get(id(offered.provider))
         if made is None:
             problem = "it was not made by instantiate of this container; deregister withdraws others"
             raise ConfigurationError(where=service.label, problem=problem)
-        self._withdrawn.take_off(key)
+        if self._withdrawn.offer(key.provider) is None:
+            self._withdrawn.take_off(key)
         self._withdrawn.forget(made)
-        self.let_go(made)
-        end(made)
-
-    def let_go(self, made: object) -> None:
-        """It is somebody else's to close."""
         with self._lock:
             self._made.pop(id(made), None)
+        end(made)
 
     def close(self) -> None:
         """Close all that was made here. Idempotent."""
