@@ -55,6 +55,17 @@ def test_containers_are_listed(rosie_up, trade_command: Command) -> None:
     assert (container["name"], container["pid"]) == ("rosie", rosie.program.process.pid)
 
 
+def test_loads_are_of_the_second_before_and_the_command_itself_is_left_out(rosie_up, trade_command: Command) -> None:
+    rosie_up()
+    [load] = json.loads(trade_command("containers", "--load", "--json").stdout)
+    assert load["container"] == "rosie"
+    assert load["calls"] >= 2
+    assert load["cpu_percent"] > 0
+    head, row = trade_command("containers", "--load").stdout.splitlines()
+    assert head.split()[:2] == ["CONTAINER", "CPU"]
+    assert row.split()[0] == "rosie"
+
+
 @pytest.mark.parametrize(
     ("words", "complaint"),
     [

@@ -8,6 +8,7 @@ import typer
 from trade.errors import TradeError
 from trade_gateway import (
     _call,
+    _empty_container,
     _estop,
     _gateway,
     _list,
@@ -18,6 +19,7 @@ from trade_gateway import (
     _policy,
     _profile,
     _rules,
+    _start,
     _trace,
     _up,
     _watchers,
@@ -39,6 +41,8 @@ app = typer.Typer(
 app.command("up")(_up.up)
 app.command("gateway")(_gateway.gateway)
 app.command("services")(_list.services)
+app.command("container")(_empty_container.container)
+app.command("start")(_start.start)
 app.command("containers")(_list.containers)
 app.command("call", context_settings={"ignore_unknown_options": True})(_call.call)
 app.command("lock", cls=_lock.WithCommand)(_lock.lock)

@@ -20,6 +20,7 @@ from trade._estopping import LIMIT_S
 from trade._handle import Bound, Handle, Run
 from trade._hooking import Hook
 from trade._hooks import Called, HookInfo
+from trade._load import LoadInfo
 from trade._lock import Lock, OnLost, OnRequest
 from trade._locking import LEASE_S
 from trade._logbook import LogLine
@@ -50,6 +51,7 @@ __all__ = [
     "Handle",
     "Hook",
     "HookInfo",
+    "LoadInfo",
     "Lock",
     "LockInfo",
     "LogLine",

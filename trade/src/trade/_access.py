@@ -18,6 +18,7 @@ _ALL: Final = ""
 FUNCTIONS: Final = {
     "clock": _ALL,
     "containers": _ALL,
+    "load": _ALL,
     "withdrawn": _ALL,
     "locks": _ALL,
     "renew": _ALL,  # only what is one's own
@@ -43,6 +44,10 @@ FUNCTIONS: Final = {
     "resume": _ALL,  # asks itself for administer over those whose lock is not one's own
     "deregister": "administer",
     "register": "administer",
+    "instantiate": "administer",
+    "start_container": "administer",
+    "terminate": "administer",
+    "terminate_container": "administer",
     "set_discovery": "administer",
     "set_broadcast": "administer",
     "connect": "administer",

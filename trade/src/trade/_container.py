@@ -31,8 +31,10 @@ from trade._hosting import Hosting
 from trade._inherited import InheritedLock
 from trade._invoke import LocalTarget, RemoteTarget, container_closed
 from trade._joining import join
+from trade._load import Load
 from trade._locking import Locking
 from trade._locks import LockTable
+from trade._making import Making
 from trade._notifications import Notifier
 from trade._own_services import OwnServices
 from trade._providers import Providers
@@ -43,6 +45,7 @@ from trade._resources import Holder
 from trade._session import Session
 from trade._settings import Settings
 from trade._system import DOMAIN, PROVIDER, ContainerInfo, System
+from trade._terminating import Terminating
 from trade._tracing import Tracing, new_spans
 from trade._transport import ChannelClosed, Transport
 from trade._watch import Watch
@@ -149,10 +152,19 @@ class Container(Hosting, Hooking, Tracing, Guarding, Bordering):
             self._table.stop_with(self._deadman.stop)
             self.withdrawn = Withdrawn(self._providers, self._deadman.rest)
             """What was taken off from elsewhere and can be offered again."""
+            self.making = Making(self, self._providers, self.withdrawn, self._settings.instantiable)
+            """What it made for others."""
+            leaving.callback(self.making.close)
             self._dispatcher = Dispatcher(
                 self._transport, self.address, self._providers.lookup, coroutines, self.access, self.access.callers()
             )
             leaving.callback(self._dispatcher.close)
+            self.meter = Load(self.name, lambda: list(self._dispatcher._crews), self._providers.waiting)
+            """How busy it is."""
+            self.terminating = Terminating(
+                self.name, self._deadman.rest, self._table.resources, lambda: self.meter.running, self.close
+            )
+            """Its end, if others want it."""
             own = OwnServices(
                 self.system,
                 self._table,

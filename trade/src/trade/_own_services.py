@@ -9,6 +9,7 @@ from trade._hook_services import HookServices
 from trade._hooks import Hooks
 from trade._lock_services import Ask, Asked, GroupsOf, LockServices
 from trade._locks import LockTable
+from trade._making_services import MakingServices
 from trade._notification_services import Home, NotificationServices
 from trade._notifications import Notifier
 from trade._registry import Registry
@@ -19,7 +20,7 @@ from trade._trace_services import Switch, TraceServices
 from trade._wire import Address, Estop
 
 
-class OwnServices(SystemServices, LockServices, NotificationServices, HookServices, TraceServices):
+class OwnServices(SystemServices, LockServices, NotificationServices, HookServices, TraceServices, MakingServices):
     """One provider, so that one registry entry tells of all its container's own functions."""
 
     def __init__(
@@ -45,6 +46,7 @@ class OwnServices(SystemServices, LockServices, NotificationServices, HookServic
         NotificationServices.__init__(self, notifier, registry, home, access)
         HookServices.__init__(self, hooks, home, access)
         TraceServices.__init__(self, own.container, spans, trace_here)
+        MakingServices.__init__(self, system)
         self._estopping = estopping
 
     @property

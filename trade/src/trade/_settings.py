@@ -29,6 +29,7 @@ _VARIABLES: Final = (
     "TRADE_BRIDGE",
     "TRADE_INSECURE_LAN",
     "TRADE_LOCK",
+    "TRADE_INSTANTIABLE",
     "TRADE_POLICY",
     "TRADE_RUNTIME_DIR",
     "TRADE_STATE_DIR",
@@ -74,6 +75,8 @@ class Settings:
     explicit_system: bool = False
     lock: str = ""
     """A lock that the process around this one holds for it; see `Lock.environment`."""
+    instantiable: tuple[str, ...] = ()
+    """Classes that others may make objects of here, such as ``mypkg.vision:Camera`` or ``mypkg.*``; none: none."""
     state_dir: Path | None = None
     """Where what must outlive a process is kept, such as open e-stops; none: nowhere."""
     trace: bool = False
@@ -175,6 +178,7 @@ class Settings:
         bridge: Sequence[str] | None = None,
         exports: Mapping[str, Sequence[str]] | None = None,
         policy: Path | None = None,
+        instantiable: Sequence[str] | None = None,
         environment: Mapping[str, str] = os.environ,
     ) -> "Settings":
         """Settings from arguments, else from the environment, else the defaults.
@@ -182,8 +186,9 @@ class Settings:
         The environment has ``TRADE_SYSTEM``, ``TRADE_IDENTITY``, ``TRADE_CONTAINER``, ``TRADE_LISTEN`` and
         ``TRADE_CONNECT`` (comma-separated), ``TRADE_CREDENTIALS`` (``user:password``), ``TRADE_TLS`` (a folder),
         ``TRADE_POLICY`` (a file), ``TRADE_INSECURE_LAN`` (``1``), ``TRADE_BRIDGE`` (comma-separated), ``TRADE_LOCK``
-        (set by ``trade lock``), ``TRADE_TRACE`` (``1``), ``TRADE_RUNTIME_DIR`` and ``TRADE_STATE_DIR`` (else the
-        user's folder for state). Others that begin with ``TRADE_`` are warned of.
+        (set by ``trade lock``), ``TRADE_INSTANTIABLE`` (comma-separated), ``TRADE_TRACE`` (``1``), ``TRADE_RUNTIME_DIR``
+        and ``TRADE_STATE_DIR`` (else the user's folder for state).
+        Others that begin with ``TRADE_`` are warned of.
         """
         _warn_of_unknown(environment)
         named = system or environment.get("TRADE_SYSTEM") or None
@@ -203,6 +208,7 @@ class Settings:
             policy=policy or _path(environment.get("TRADE_POLICY")),
             explicit_system=named is not None,
             lock=environment.get("TRADE_LOCK", ""),
+            instantiable=tuple(_split(environment, "TRADE_INSTANTIABLE") if instantiable is None else instantiable),
             state_dir=_state_dir(environment),
             trace=environment.get("TRADE_TRACE") == "1",
         )
