@@ -27,10 +27,12 @@ from trade._notifications import Notification, NotificationInfo
 from trade._notifying import POLL_S
 from trade._occasions import What
 from trade._resources import Permit, Resource, permit
+from trade._sample import Sample
 from trade._secret import Secret
 from trade._service import service
 from trade._session import Session
 from trade._settings import Settings
+from trade._stream import If, Stream
 from trade._system import ContainerInfo, System
 from trade._terms import LockInfo
 from trade._wire import HEALTHY, Estop, Scalar
@@ -56,9 +58,11 @@ __all__ = [
     "Permit",
     "Resource",
     "Run",
+    "Sample",
     "Secret",
     "Session",
     "Settings",
+    "Stream",
     "System",
     "acall",
     "acall_all",
@@ -106,6 +110,7 @@ __all__ = [
     "set_groups",
     "set_health",
     "start",
+    "stream",
     "system",
     "where",
 ]
@@ -331,6 +336,19 @@ def hooks() -> list[HookInfo]:
 def detach_hook(hook: str) -> None:
     """End a hook by its id, wherever it is attached; see `Container.detach_hook`."""
     container().detach_hook(hook)
+
+
+def stream(
+    target: Handle | Constraint,
+    *,
+    hz: float = 10.0,
+    on_change: bool = False,
+    if_: If | None = None,
+    call: What | None = None,
+    keep: int = 16,
+) -> Stream:
+    """Have a service sampled as long as one listens; see `Container.stream`."""
+    return container().stream(target, hz=hz, on_change=on_change, if_=if_, call=call, keep=keep)
 
 
 def lock(

@@ -35,6 +35,8 @@ FUNCTIONS: Final = {
     "detach_hook": _ALL,  # asks itself for administer if it is another's
     "hooks": _ALL,
     "hook_suspended": _ALL,
+    "listen": _ALL,  # asks itself for read over the service
+    "unlisten": _ALL,  # only what is one's own
     "acquire": _ALL,  # asks itself for lock over the groups of the resources
     "break_lock": _ALL,  # asks itself for administer over them
     "resume": _ALL,  # asks itself for administer over those whose lock is not one's own

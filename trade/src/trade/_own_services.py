@@ -13,11 +13,13 @@ from trade._notification_services import Home, NotificationServices
 from trade._notifications import Notifier
 from trade._registry import Registry
 from trade._service import service
+from trade._stream_services import StreamServices
+from trade._streams import Streams
 from trade._system import System, SystemServices
 from trade._wire import Address, Estop
 
 
-class OwnServices(SystemServices, LockServices, NotificationServices, HookServices):
+class OwnServices(SystemServices, LockServices, NotificationServices, HookServices, StreamServices):
     """One provider, so that one registry entry tells of all its container's own functions."""
 
     def __init__(
@@ -35,11 +37,13 @@ class OwnServices(SystemServices, LockServices, NotificationServices, HookServic
         registry: Registry,
         hooks: Hooks,
         home: Home,
+        streams: Streams,
     ) -> None:
         SystemServices.__init__(self, system)
         LockServices.__init__(self, locks, own, ask, asked, access, groups, borrowed)
         NotificationServices.__init__(self, notifier, registry, home, access)
         HookServices.__init__(self, hooks, home, access)
+        StreamServices.__init__(self, streams)
         self._estopping = estopping
 
     @property
