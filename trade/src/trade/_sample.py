@@ -7,8 +7,9 @@ from msgspec import Meta, Raw, Struct
 
 from trade._wire import MOST_BYTES, PROTOCOL, Malformed, ServiceKey, why_malformed
 
-__all__ = ["Sample", "StreamSample", "decode_sample", "stream_key"]
+__all__ = ["STREAMS", "Sample", "StreamSample", "decode_sample", "stream_key"]
 
+STREAMS: Final = "stream/**"
 _MOST_MESSAGE_BYTES: Final = MOST_BYTES + (1 << 20)
 
 
