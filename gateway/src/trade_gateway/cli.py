@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from trade.errors import TradeError
-from trade_gateway import _call, _estop, _gateway, _list, _lock, _locks, _pki_commands, _policy, _up
+from trade_gateway import _call, _estop, _gateway, _list, _lock, _locks, _pki_commands, _policy, _stream, _up
 from trade_gateway._output import UsageError, say_error
 from trade_gateway._system_choice import SystemChoice
 
@@ -26,6 +26,7 @@ app.command("gateway")(_gateway.gateway)
 app.command("services")(_list.services)
 app.command("containers")(_list.containers)
 app.command("call", context_settings={"ignore_unknown_options": True})(_call.call)
+app.command("stream")(_stream.stream)
 app.command("lock", cls=_lock.WithCommand)(_lock.lock)
 app.command("locks")(_locks.locks)
 app.command("unlock")(_locks.unlock)
