@@ -70,6 +70,10 @@ def test_the_bench_of_locks_prints_its_targets() -> None:
     assert targets(bench("locks", "-n", "3", "--rounds", "1")) == ["lock and unlock / call", "checked / unchecked call"]
 
 
+def test_the_bench_of_streams_prints_its_target() -> None:
+    assert targets(bench("streams", "--rounds", "1", "--seconds", "0.1")) == ["five listeners / one"]
+
+
 def test_the_bench_of_the_servo_bus_prints_its_targets() -> None:
     printed = bench("servo", "-n", "3", "--rounds", "1", "--seconds", "0.05")
     assert "156 bytes a cycle" in printed
