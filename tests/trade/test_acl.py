@@ -270,7 +270,7 @@ def keys_of(rules: dict[str, Any], who: str, message: str, flow: str) -> set[str
 
 
 def test_what_a_network_does_not_export_is_neither_offered_nor_called_across_it() -> None:
-    roles = [Role("all", {"call": ["*"], "register": ["rosie", "lab"]})]
+    roles = [Role("all", {"call": ["*"], "read": ["*"], "register": ["rosie", "lab"]})]
     policy = Policy(roles, {"rosie": ["all"], "planner": ["all"]})
     crossing = crossings({"eth0": ["rosie.head"], "eth1": []})
     assert crossing == {"eth0": (["rosie.head"], []), "eth1": ([], ["rosie.head"])}
@@ -285,6 +285,12 @@ def test_what_a_network_does_not_export_is_neither_offered_nor_called_across_it(
     seen = keys_of(rules, "planner eth0 lo", "reply", "egress")
     assert seen == {"registry/trade/*/*/*/*"}
     assert "stop/planner/**" in keys_of(rules, "planner eth1", "put", "ingress")
+    exported = {f"stream/{group}/*/*/*/*/*" for group in ("trade", "rosie.head", "rosie.head.$*")}
+    for message, flow in (("put", "egress"), ("declare_subscriber", "ingress")):
+        heard = keys_of(rules, "planner eth1", message, flow)
+        assert {key for key in heard if key.startswith("stream/")} == exported
+        unheard = keys_of(rules, "planner eth0 lo", message, flow)
+        assert {key for key in unheard if key.startswith("stream/")} == {"stream/trade/*/*/*/*/*"}
 
 
 def test_without_certificates_only_what_crosses_is_looked_at() -> None:
