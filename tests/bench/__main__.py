@@ -9,6 +9,7 @@ parts:
   locks      taking and giving back four services of two containers; what the checks of resources add to a call
   watching   a thousand notifications every 0.1 s; what hooks cost a call that has none
   gateway    calls through one gateway and two, certificates and policy on; floods; an idle one (root, iproute2)
+  streams    what five listeners to a joint-state stream at 200 Hz cost its source, beside one
   servo      the Dynamixel driver against what a bus of 1 Mbaud can carry
 
 Progress goes to stderr, tables and targets (met or missed) to stdout. Peers that are not installed are skipped.
@@ -17,7 +18,7 @@ Progress goes to stderr, tables and targets (met or missed) to stdout. Peers tha
 import argparse
 from collections.abc import Callable, Mapping
 
-from tests.bench import _calls, _deadman, _gateway, _local, _locks, _registry, _servo, _watching
+from tests.bench import _calls, _deadman, _gateway, _local, _locks, _registry, _servo, _streams, _watching
 
 _SERVICES_EACH = 10
 
@@ -37,6 +38,7 @@ _PARTS: Mapping[str, Callable[[argparse.Namespace], None]] = {
     "locks": lambda options: _locks.run(options.n, options.rounds),
     "watching": lambda options: _watching.run(options.n, options.rounds, options.seconds),
     "gateway": lambda options: _gateway.run(options.n, options.rounds, options.idle),
+    "streams": lambda options: _streams.run(max(1, options.rounds // 2), 2 * options.seconds),
     "servo": lambda options: _servo.run(options.n, options.rounds, options.seconds),
 }
 _QUICK = {"n": 200, "rounds": 8, "seconds": 1.5, "idle": 20.0}

@@ -75,6 +75,10 @@ def test_the_bench_of_watching_prints_its_targets() -> None:
     assert targets(printed) == ["merged ticks, %", "another watched / none"]
 
 
+def test_the_bench_of_streams_prints_its_target() -> None:
+    assert targets(bench("streams", "--rounds", "1", "--seconds", "0.1")) == ["five listeners / one"]
+
+
 def test_the_bench_of_the_servo_bus_prints_its_targets() -> None:
     printed = bench("servo", "-n", "3", "--rounds", "1", "--seconds", "0.05")
     assert "156 bytes a cycle" in printed

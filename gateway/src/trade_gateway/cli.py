@@ -20,6 +20,7 @@ from trade_gateway import (
     _profile,
     _rules,
     _start,
+    _stream,
     _trace,
     _up,
     _watchers,
@@ -45,6 +46,7 @@ app.command("container")(_empty_container.container)
 app.command("start")(_start.start)
 app.command("containers")(_list.containers)
 app.command("call", context_settings={"ignore_unknown_options": True})(_call.call)
+app.command("stream")(_stream.stream)
 app.command("lock", cls=_lock.WithCommand)(_lock.lock)
 app.command("locks")(_locks.locks)
 app.command("unlock")(_locks.unlock)

@@ -29,11 +29,13 @@ from trade._notifications import Notification, NotificationInfo
 from trade._notifying import POLL_S
 from trade._occasions import What
 from trade._resources import Permit, Resource, permit
+from trade._sample import Sample
 from trade._secret import Secret
 from trade._service import service
 from trade._session import Session
 from trade._settings import Settings
 from trade._spans import Span
+from trade._stream import If, Stream
 from trade._system import ContainerInfo, System
 from trade._terms import LockInfo
 from trade._tracing import LogReader, Trace
@@ -63,10 +65,12 @@ __all__ = [
     "Permit",
     "Resource",
     "Run",
+    "Sample",
     "Secret",
     "Session",
     "Settings",
     "Span",
+    "Stream",
     "System",
     "Trace",
     "acall",
@@ -118,6 +122,7 @@ __all__ = [
     "set_tracing",
     "spans",
     "start",
+    "stream",
     "system",
     "trace",
     "where",
@@ -367,6 +372,19 @@ def trace(call_id: int) -> Trace:
 def logs(*, container: str = "*") -> list[LogLine]:
     """What the processes of the system logged lately; see `Container.logs`."""
     return _running().logs(container=container)
+
+
+def stream(
+    target: Handle | Constraint,
+    *,
+    hz: float = 10.0,
+    on_change: bool = False,
+    if_: If | None = None,
+    call: What | None = None,
+    keep: int = 16,
+) -> Stream:
+    """Have a service sampled as long as one listens; see `Container.stream`."""
+    return container().stream(target, hz=hz, on_change=on_change, if_=if_, call=call, keep=keep)
 
 
 def lock(

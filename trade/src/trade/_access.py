@@ -39,6 +39,8 @@ FUNCTIONS: Final = {
     "set_tracing": "instrument",
     "spans": "read",
     "log_lines": "read",
+    "listen": _ALL,  # asks itself for read over the service
+    "unlisten": _ALL,  # only what is one's own
     "acquire": _ALL,  # asks itself for lock over the groups of the resources
     "break_lock": _ALL,  # asks itself for administer over them
     "resume": _ALL,  # asks itself for administer over those whose lock is not one's own

@@ -57,6 +57,8 @@ _COROUTINE: Final[type] = CoroutineType
 ANYBODY: Final = "*"
 _KINDS: Final = frozenset(("call", "stop"))
 _MOST_REPLY_KEYS: Final = 1024
+_MOST_WAITING: Final = 4096
+"""Calls of one caller that is told from others."""
 _MOST_CALLERS: Final = 1024
 """Of one service, whose admission is kept."""
 _SYSTEM: Final = f"{DOMAIN}/{PROVIDER}"
@@ -223,7 +225,7 @@ class Dispatcher:
         """
         for name, stop, refuse in (("trade-call", False, self._busy), ("trade-stop", True, self._serve)):
             pattern = calls_to(self._own, stop=stop, caller=caller)
-            channel = self._transport.subscribe(pattern, newest=caller != ANYBODY)
+            channel = self._transport.subscribe(pattern, newest=0 if caller == ANYBODY else _MOST_WAITING)
             self._crews.append(Crew(name, channel, self._serve, refuse))
 
     @property

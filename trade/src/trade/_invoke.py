@@ -169,7 +169,7 @@ class RemoteTarget:
         self._is_stop = record.info.effect == "stop"
         self._publisher = caller.publisher(address, key.domain, key.provider, stop=self._is_stop)
         self._clock = caller.publisher(address, DOMAIN, PROVIDER, stop=False)
-        self._decode = _result_decoder(codec, record.info)
+        self._decode = result_decoder(codec, record.info)
         self._decode_any = codec.decoder(Any)
         self._traceable = traceable(key)
 
@@ -315,7 +315,7 @@ class RemoteTarget:
             return RemoteError(service=self._label, type_name="an error that cannot be read", message=str(bad))
 
 
-def _result_decoder(codec: Codec, info: ServiceInfo) -> Callable[[Any], Any]:
+def result_decoder(codec: Codec, info: ServiceInfo) -> Callable[[Any], Any]:
     """A decoder for the result, as typed as its description allows."""
     try:
         return codec.decoder(type_from_schema(read_schema(info.result_schema), info.types))

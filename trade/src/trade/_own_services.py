@@ -15,12 +15,16 @@ from trade._notifications import Notifier
 from trade._registry import Registry
 from trade._service import service
 from trade._spans import Spans
+from trade._stream_services import StreamServices
+from trade._streams import Streams
 from trade._system import System, SystemServices
 from trade._trace_services import Switch, TraceServices
 from trade._wire import Address, Estop
 
 
-class OwnServices(SystemServices, LockServices, NotificationServices, HookServices, TraceServices, MakingServices):
+class OwnServices(
+    SystemServices, LockServices, NotificationServices, HookServices, TraceServices, MakingServices, StreamServices
+):
     """One provider, so that one registry entry tells of all its container's own functions."""
 
     def __init__(
@@ -40,6 +44,7 @@ class OwnServices(SystemServices, LockServices, NotificationServices, HookServic
         home: Home,
         spans: Spans,
         trace_here: Switch,
+        streams: Streams,
     ) -> None:
         SystemServices.__init__(self, system)
         LockServices.__init__(self, locks, own, ask, asked, access, groups, borrowed)
@@ -47,6 +52,7 @@ class OwnServices(SystemServices, LockServices, NotificationServices, HookServic
         HookServices.__init__(self, hooks, home, access)
         TraceServices.__init__(self, own.container, spans, trace_here)
         MakingServices.__init__(self, system)
+        StreamServices.__init__(self, streams)
         self._estopping = estopping
 
     @property

@@ -187,7 +187,8 @@ class Settings:
         ``TRADE_CONNECT`` (comma-separated), ``TRADE_CREDENTIALS`` (``user:password``), ``TRADE_TLS`` (a folder),
         ``TRADE_POLICY`` (a file), ``TRADE_INSECURE_LAN`` (``1``), ``TRADE_BRIDGE`` (comma-separated), ``TRADE_LOCK``
         (set by ``trade lock``), ``TRADE_INSTANTIABLE`` (comma-separated), ``TRADE_TRACE`` (``1``),
-        ``TRADE_RUNTIME_DIR`` and ``TRADE_STATE_DIR`` (else the user's folder for state). Others that begin with ``TRADE_`` are warned of.
+        ``TRADE_RUNTIME_DIR`` and ``TRADE_STATE_DIR`` (else the user's folder for state).
+        Others that begin with ``TRADE_`` are warned of.
         """
         _warn_of_unknown(environment)
         named = system or environment.get("TRADE_SYSTEM") or None

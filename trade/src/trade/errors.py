@@ -47,6 +47,7 @@ __all__ = [
     "ServiceGone",
     "SessionEnded",
     "SetupError",
+    "SourceLost",
     "Stopped",
     "ToleranceExceeded",
     "TooLarge",
@@ -433,6 +434,17 @@ class ContainerLost(CallError, ConnectionError):
         return (
             f"container {self.container} was lost during a call of {self.service}; whether it ran is unknown. "
             "Find the service again and look at its state"
+        )
+
+
+@dataclass(kw_only=True, eq=False)
+class SourceLost(ContainerLost):
+    """The container whose service is listened to ended or became unreachable."""
+
+    def describe(self) -> str:
+        return (
+            f"container {self.container} was lost while {self.service} was listened to; samples come again when it is "
+            "back. If it was restarted, find the service again and open another stream"
         )
 
 
