@@ -10,13 +10,16 @@ from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
 
+import can
 import pytest
 
 from drivers.conftest import Outcome, sleep_past, written_now
 from drivers.legs import HIP, KNEE, LEG, Leg, fault_of, leg, rig
 from trade.errors import DeviceSilent, TradeError
 from trade_drivers import AttachedRobot, Motor, attach, parse
-from trade_hil_sim import Absent, BrownOut, Entry, Heal, Late, SimProcess, events, frames
+from trade_drivers.cia402 import _table as table
+from trade_drivers.cia402._axis import Stage
+from trade_hil_sim import Absent, BrownOut, Entry, Heal, Late, Mute, SimProcess, events, frames
 from waiting import wait_until
 
 __all__ = ["leg", "rig"]
@@ -42,7 +45,10 @@ def syncs_of_a_move(leg: Leg, knee: Motor, goal_rad: float) -> int:
     return len([entry for entry in leg.frames("sync", since=started.t) if entry.t < rest.t])
 
 
-def test_a_drive_that_is_looked_over_does_not_disturb_the_others_however_late_it_answers(leg: Leg) -> None:
+def test_a_drive_that_is_looked_over_does_not_disturb_the_others_however_late_it_answers(rig: Leg) -> None:
+    leg = rig
+    leg.configure(('channel = "can0"', 'channel = "can0"\nwatchdog_s = 2'))  # a busy host is another matter
+    leg.plug()
     robot = leg.attach()
     hip, knee = robot.motor("leg.hip"), robot.motor("leg.knee")
     undisturbed = syncs_of_a_move(leg, knee, 0.9)
@@ -85,6 +91,23 @@ def test_a_drive_that_restarts_while_it_is_looked_over_is_looked_over_from_the_b
     leg.sim.do(Heal())
     hip.enable()
     assert hip.move_to(0.1) == pytest.approx(0.1, abs=0.01)
+
+
+def test_a_drive_that_does_not_stay_started_is_started_again(leg: Leg) -> None:
+    hip = leg.attach().motor("leg.hip")
+    axis = hip._axes[0]  # type: ignore[attr-defined]
+    leg.sim.do(Mute(ids=(HIP,), instruction="tpdo1"))
+    wait_until(lambda: axis.silent, "it is given up")
+    mark = written_now()
+    wait_until(lambda: armings(leg, mark) and axis.stage is Stage.SET_UP, "it is awaited")
+    sent = written_now()
+    with leg.listen() as other:
+        other.send(can.Message(arbitration_id=0, data=bytes((table.NMT_PREOPERATIONAL, HIP)), is_extended_id=False))
+        slept = leg.wait_for("nmt", HIP, sent)
+        wait_until(lambda: leg.frames("nmt", since=slept.t)[-1].data == bytes((1, HIP)), "it is started again")
+    leg.sim.do(Heal())
+    wait_until(lambda: not is_silent(hip), "the hip is back")
+    assert not armings(leg, sent)
 
 
 def armings(leg: Leg, since: float) -> list[Entry]:

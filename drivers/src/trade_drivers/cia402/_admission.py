@@ -4,6 +4,7 @@ import logging
 from typing import TYPE_CHECKING, Final
 
 from trade_drivers._exchange import PROBE_NS
+from trade_drivers.cia402 import _table as table
 from trade_drivers.cia402._attach import Unfit, set_up
 from trade_drivers.cia402._axis import DriveAxis, Stage
 from trade_drivers.cia402._net import NoAnswer, Refused
@@ -71,6 +72,9 @@ class Admission:
 
     def _await(self) -> None:
         axis, now_ns = self.axis, self._exchange.clock()
+        if axis.to_start:
+            axis.to_start = False
+            self._exchange.net.command(axis.id, table.NMT_START)
         if not axis.unheard:
             _log.info("%s is heard on %s", axis.name, axis.bus)
             axis.welcome(now_ns)

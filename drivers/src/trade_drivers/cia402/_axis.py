@@ -74,6 +74,8 @@ class DriveAxis(Axis):
         """When it was last looked over and set up."""
         self.answered_ns = 0
         """When it was asked for a measurement that came while it was left out."""
+        self.to_start = False
+        """It was started, and its heartbeat says that it is not: the frame was lost, or it went back."""
 
     # --- what it says
 
@@ -116,6 +118,8 @@ class DriveAxis(Axis):
             self._lose("it has restarted; is its supply sound?", now_ns)
         elif state == table.OPERATIONAL:
             self.beat_ns = now_ns
+        elif self.stage is Stage.SET_UP:
+            self.to_start = True
         elif not self.silent:
             self._lose(f"somebody has made it {table.NMT_STATES.get(state, hex(state))}", now_ns)
 

@@ -2,7 +2,6 @@
 
 import logging
 import time
-from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Final, cast
 
@@ -25,8 +24,6 @@ __all__ = ["DriveExchange"]
 
 _log = logging.getLogger(__name__)
 _BEATS_MISSED: Final = 3
-_CYCLES: Final = 3
-"""As many in a row are to listen in vain before a drive is left out."""
 
 
 class DriveExchange(Exchange):
@@ -45,8 +42,8 @@ class DriveExchange(Exchange):
         self.admissions = tuple(Admission(self, axis, bus) for axis in axes)
         self._beat_ns = int(bus.watchdog_s * 1e9 / 5)
         self._beaten_ns = 0
-        self._began_ns: deque[int] = deque(maxlen=_CYCLES)
-        """When the last cycles began."""
+        self._began_ns = self._listening_ns = clock()
+        """When the last cycle began, and since when they have followed each other in time."""
         self.deaf_ns = _BEATS_MISSED * heartbeat_ms(bus) * 1_000_000
         """A drive whose heartbeat has not come for so long is left out."""
         self.rival = False
@@ -126,7 +123,9 @@ class DriveExchange(Exchange):
     def cycle(self) -> None:
         """One round: stops, heartbeat, measurements, handshakes, work, motions."""
         began_ns = self.clock()
-        self._began_ns.append(began_ns)
+        if began_ns - self._began_ns > self.stale_after_ns // 2:
+            self._listening_ns = began_ns
+        self._began_ns = began_ns
         self.net.take_in(0.0)  # what came late is no answer to the next SYNC
         self._beat(began_ns)
         self._measure(began_ns)
@@ -152,8 +151,8 @@ class DriveExchange(Exchange):
 
     def _listen(self, now_ns: int) -> None:
         """Who has not been heard for too long is left out, and asked now and then whether it is back."""
-        if now_ns - self._began_ns[0] > self.stale_after_ns:
-            return  # on a busy host it was this thread that did not listen
+        if now_ns - self._listening_ns <= self.stale_after_ns:
+            return  # on a busy host it was this thread that was silent
         for axis in self.drives:
             if axis.silent:
                 continue
