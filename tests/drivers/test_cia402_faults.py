@@ -1,5 +1,6 @@
 """What goes wrong on a CAN bus: what the caller is told, what the others do, and that nothing moves when it is over."""
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -42,22 +43,23 @@ class Case:
     says: str
     """Part of what the mover is told."""
     back: str = ""
-    """Part of the fault that is latched once the drive is heard again; none if it may just be moved again."""
+    """What the fault says that is latched once the drive is heard again, as a regular expression."""
 
 
+AWAY = "it was away|it has not heard this driver"  # its own watchdog may have had its say as it came back
 CASES = [
     Case("silence", Mute(ids=(HIP,)), DeviceSilent, "did not answer", "it was away"),
     Case("no measurements", Mute(ids=(HIP,), instruction="tpdo1"), DeviceSilent, "did not answer", "it was away"),
     Case("heartbeat lost", Mute(ids=(HIP,), instruction="heartbeat"), DeviceSilent, "did not answer", "it was away"),
     Case("cut short", Truncate(ids=(HIP,), instruction="tpdo1", missing=3), DeviceSilent, "did not answer", "away"),
-    Case("off the bus", BusOff(ids=(HIP,)), DeviceSilent, "did not answer", "it was away"),
-    Case("cable off", Absent(ids=(HIP,)), DeviceSilent, "did not answer", "it was away"),
+    Case("off the bus", BusOff(ids=(HIP,)), DeviceSilent, "did not answer", AWAY),
+    Case("cable off", Absent(ids=(HIP,)), DeviceSilent, "did not answer", AWAY),
     Case("frozen value", Freeze(ids=(HIP,)), DeviceFault, "it makes no progress", "it makes no progress"),
     Case("blocked", Jam(ids=(HIP,)), DeviceFault, "error 8611h, following error", "error 8611h"),
     Case("EMCY", Emergency(ids=(HIP,), code=0x4310), DeviceFault, "error 4310h, over-temperature", "error 4310h"),
     Case("restart", BrownOut(ids=(HIP,)), DeviceError, "", "it has restarted"),
-    Case("adapter off the bus", BusOff(), BusGone, "bus-off: too many errors", "it was away"),
-    Case("adapter unplugged", Unplug(), BusGone, "", "it was away"),
+    Case("adapter off the bus", BusOff(), BusGone, "bus-off: too many errors", AWAY),
+    Case("adapter unplugged", Unplug(), BusGone, "", AWAY),
 ]
 
 
@@ -77,7 +79,7 @@ def test_a_fault_while_moving_ends_the_move_and_nothing_moves_on_recovery(leg: L
     leg.sim.do(Heal())
     if isinstance(case.fault, Unplug):
         leg.sim.do(Replug())
-    wait_until(lambda: fault_of(hip) != "" and case.back in fault_of(hip), f"it is heard again, with {case.back!r}")
+    wait_until(lambda: (fault := fault_of(hip)) and re.search(case.back, fault), f"heard again: {case.back!r}")
     with pytest.raises(DeviceFault):
         hip.move_to(0.0)
     assert len(leg.goals(HIP)) == 1
