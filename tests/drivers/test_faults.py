@@ -3,7 +3,7 @@
 import pytest
 
 import trade_hil_sim as sim
-from drivers.conftest import Outcome, Rig, written_now
+from drivers.conftest import Outcome, Rig, goal_counts, written_now
 from trade import permit
 from trade.errors import BusGone, DeviceFault, DeviceSilent
 from trade_drivers import AttachedRobot, MotorState
@@ -107,6 +107,20 @@ def test_stopping_a_silent_joint_is_tried_and_reported(head: Rig, robot: Attache
     assert moving.wait().error is not None
     wait_until(lambda: not head.truth(1).moving, "it rests")
     assert head.truth(1).position_rad < 0.5
+
+
+def test_stopping_a_silent_joint_once_more_does_not_turn_it_back(head: Rig, robot: AttachedRobot) -> None:
+    moving = Outcome(lambda: robot.motor("neck.pan").move_to(1.3, 1.0))
+    wait_until(lambda: head.truth(1).position_rad > 0.2, "it is under way")
+    mark = written_now()
+    head.sim.do(sim.Mute(ids=(1,)))
+    assert isinstance(moving.wait().error, DeviceSilent)
+    held = [goal_counts(entry) for entry in head.goals(1, mark)]
+    with pytest.raises(DeviceSilent):
+        robot.motor("neck.pan").stop()
+    again = [goal_counts(entry) for entry in head.goals(1, mark)]
+    assert len(again) > len(held)
+    assert set(again) == set(held)
 
 
 # --- damaged, late, cut, slow, double
