@@ -117,7 +117,7 @@ def _tells(subject: Subject, wanted: type[DeviceError] | str) -> bool:
         fault = subject.provider.state().fault
     except DeviceError as error:
         return isinstance(wanted, type) and isinstance(error, wanted)
-    return isinstance(wanted, str) and wanted in fault
+    return isinstance(wanted, str) and (wanted in fault if wanted else not fault)
 
 
 def _latched(subject: Subject) -> str:
