@@ -22,11 +22,11 @@ ACTIVATION_COUNTS_S: Final = 320.0
 PATIENCE_S: Final = 1.0
 """Heard nothing for this long: fault 09, until the cycle after the next request."""
 HOT_C: Final = 85
-"""From here on fault 08 is shown (manual, table of faults) ..."""
+"""From here on fault 08 is shown: an assumption, as are the two below."""
 COOL_C: Final = 80
-"""... until it is cooler than this."""
+"""Until it is cooler than this."""
 LEAST_V: Final = 21.6
-"""24 V less a tenth: below it fault 0A."""
+"""Below it, 24 V less a tenth, fault 0A."""
 _MOVING_CURRENT: Final = 12
 _NEVER: Final = inf
 _CLOSE_COUNTS: Final = 0.5
