@@ -5,7 +5,7 @@ from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from typing import Final, Generic, Protocol, TypeVar
 
-from trade import Permit, current_call
+from trade import Permit
 from trade.errors import DeadlineExceeded, DeviceFault, TradeError
 
 __all__ = ["Device", "Gate", "NoAnswer", "PortLost", "Steps", "WireError", "Work", "check_admitted", "losing"]
@@ -25,23 +25,14 @@ class PortLost(Exception):
 
 
 @contextmanager
-def losing(*troubles: type[Exception], remedy: str = "") -> Generator[None, None, None]:
-    """Have these, which a library raises when its port is gone, become ``PortLost``; that ends with what to do."""
+def losing(*troubles: type[Exception]) -> Generator[None, None, None]:
+    """Have these, which a library raises when its port is gone, become ``PortLost``."""
     try:
         yield
     except TradeError:  # a gate's: some of them are OSErrors, too
         raise
     except troubles as gone:
-        raise PortLost(f"{_said(gone)}; {remedy}" if remedy else _said(gone)) from None
-
-
-def _said(gone: Exception) -> str:
-    """In words, where the system gave a number and words."""
-    match gone.args:
-        case (int(), str(words), *_):
-            return words
-        case _:
-            return str(gone)
+        raise PortLost(str(gone)) from None
 
 
 class WireError(Exception):
@@ -79,7 +70,6 @@ class Work(Generic[_Device_co]):
     def __init__(self, devices: Sequence[_Device_co]) -> None:
         self.devices = tuple(devices)
         """Those it touches, or waits for; at least one."""
-        self._call = current_call()
         self._ended = threading.Event()
         self._error: TradeError | None = None
         self._steps: Steps | None = None
@@ -108,11 +98,6 @@ class Work(Generic[_Device_co]):
             self.finish(problem)
             return False
         return True
-
-    def note(self, done: str) -> None:
-        """Tell whoever traces the call that asked for it what has just been done, such as ``wrote goal``."""
-        if self._call is not None:
-            self._call.event(f"{', '.join(device.name for device in self.devices)}: {done}")
 
     def done_stepping(self) -> None:
         """All its exchanges have been made."""

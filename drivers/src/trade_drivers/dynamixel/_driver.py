@@ -66,7 +66,7 @@ def open_exchange(robot: Robot, bus: SerialBus, port: str) -> ServoExchange:
         exchange.cycle()
     except PortLost as lost:
         wire.close()
-        problem = f"{port}: {lost}; is its adapter plugged in? `ls -l /dev/serial/by-id` shows those that are"
+        problem = f"{port}: {lost}; `ls -l /dev/serial/by-id` shows those that are"
         raise ConfigurationError(where=where, problem=problem) from None
     except WireError as bad:
         wire.close()

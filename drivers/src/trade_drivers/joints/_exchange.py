@@ -169,7 +169,7 @@ class Exchange(BusExchange[Axis]):
         positions: dict[Axis, int] = {}
         for axis in axes:
             if (position := axis.hold_counts(now_ns)) is not None:
-                positions[axis] = position
+                positions[axis] = axis.held_counts = position
             axis.still, axis.held_ns = 0, now_ns
             axis.halting_since_ns = axis.halting_since_ns or now_ns
         if positions:
