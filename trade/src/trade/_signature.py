@@ -33,7 +33,7 @@ _SAME_WHEN_COPIED: Final = (bool, float, type(None))
 
 
 _infos: Final[WeakValueDictionary[tuple[str, ServiceMark, Callable[..., Any]], ServiceInfo]] = WeakValueDictionary()
-"""What all containers of this process say of a method, as long as one does: the middleware's own are in each."""
+"""What was said of a method last. Believed of the middleware's own, which are in every container and do not change."""
 
 
 class Signature:
@@ -59,9 +59,10 @@ class Signature:
         self._result_is_plain = returns if returns is Any or (isinstance(returns, type) and returns in _PLAIN) else None
         self._result_is_itself = returns if returns in _SAME_WHEN_COPIED else None
         self._decode_result = described(where, "its result", lambda: codec.decoder(returns))
-        self.info = _infos.get((name, mark, function)) or _infos.setdefault(
-            (name, mark, function), describe(where, name, mark, function, parameters, kinds, returns, codec)
-        )
+        key = (name, mark, function)
+        known = _infos.get(key) if function.__module__.startswith("trade.") else None
+        self.info = known or describe(where, name, mark, function, parameters, kinds, returns, codec)
+        _infos[key] = self.info
 
     def _decoders(
         self, where: str, parameters: Sequence[inspect.Parameter], kinds: Mapping[str, Any]
