@@ -60,7 +60,8 @@ class Signature:
         self._result_is_itself = returns if returns in _SAME_WHEN_COPIED else None
         self._decode_result = described(where, "its result", lambda: codec.decoder(returns))
         key = (name, mark, function)
-        known = _infos.get(key) if function.__module__.startswith("trade.") else None
+        # What a program executes from text may have no module.
+        known = _infos.get(key) if (function.__module__ or "").startswith("trade.") else None
         self.info = known or describe(where, name, mark, function, parameters, kinds, returns, codec)
         _infos[key] = self.info
 
