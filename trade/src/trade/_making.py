@@ -21,8 +21,8 @@ _PATH: Final = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*")
 class Home(Protocol):
     """The container they are registered in."""
 
-    address: Final[Address]
-
+    @property
+    def address(self) -> Address: ...
     def register(self, provider: object, groups: str | Sequence[str] = ()) -> tuple[Handle, ...]: ...
 
 
