@@ -56,6 +56,49 @@ def test_without_any_list_everything_crosses_and_with_one_the_rest_does(file: Pa
     assert read_gateway_file(file).settings.exports is None
 
 
+LIMIT = "# stream_hz = 50.0"
+"""In the example, as a comment."""
+
+
+@pytest.mark.parametrize(
+    ("written", "limits"),
+    [
+        ("stream_hz = 20.0", {"rosie": 20}),
+        ("stream_hz = { rosie = 5 }", {"rosie": 5}),
+        ("", {}),
+    ],
+)
+def test_streams_are_limited_by_group_or_all_alike(file: Path, written: str, limits: dict[str, float]) -> None:
+    change(file, LIMIT, f"{written} #")
+    assert read_gateway_file(file).settings.stream_hz == {"eth0": limits, "eth1": {}}
+
+
+def test_streams_of_all_are_limited_where_no_groups_are_named(file: Path) -> None:
+    change(file, 'export = ["rosie"]', "stream_hz = 100")
+    change(file, "export = []", "")
+    settings = read_gateway_file(file).settings
+    assert (settings.exports, settings.stream_hz["eth0"]) == ({"eth0": ("*",), "eth1": ("*",)}, {"*": 100})
+    told = CliRunner().invoke(app, ["gateway", str(file), "--check"]).stdout
+    assert "at most 100 samples a second of each stream of everything" in " ".join(told.split())
+
+
+@pytest.mark.parametrize(
+    ("limit", "said"),
+    [
+        ("{ lab = 20 }", r"stream_hz of eth0: 'lab' is not exported as such; there is rosie, rosie.imu"),
+        ("25", r"stream_hz of eth0: 25 for rosie is none of 1, 2, 5, 10, 20, 50, 100, 200, 500 a second"),
+        ("true", r"stream_hz: Expected `float \| object`, got `bool`"),
+        ('{ "rosie.imu" = 20 }', r"rosie.imu is exported with all of 'rosie' as well, which lets more pass"),
+        ('{ rosie = 50, "rosie.imu" = 20 }', r"rosie.imu is exported with all of 'rosie' as well"),
+    ],
+)
+def test_a_limit_that_would_not_hold_is_refused(file: Path, limit: str, said: str) -> None:
+    change(file, 'export = ["rosie"]', 'export = ["rosie", "rosie.imu"]')
+    change(file, LIMIT, f"stream_hz = {limit} #")
+    with pytest.raises(ConfigurationError, match=said):
+        read_gateway_file(file)
+
+
 @pytest.mark.parametrize(
     ("before", "after", "said"),
     [

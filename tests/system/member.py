@@ -12,8 +12,9 @@ from typing import Any
 
 import zenoh
 
-from trade import Called, Container, Handle, Lock, Resource, Run, Settings, current_call, service, where
+from trade import Called, Container, Handle, Lock, Resource, Run, Settings, Stream, current_call, service, where
 from trade._links import _others
+from trade._sample import stream_key
 
 PROVIDERS = 5
 
@@ -54,6 +55,17 @@ class Joint(Echo):
         self.greeted.append(f"{call.caller} {newcomer.label}")
 
 
+class Ticker:
+    @service(effect="read")
+    def asked(self) -> int:
+        """How often."""
+        self._asked += 1
+        return self._asked
+
+    def __init__(self) -> None:
+        self._asked = 0
+
+
 class Watch:
     """Notes what the calls that it is told of were made with."""
 
@@ -88,6 +100,7 @@ class Member:
         self._lock: Lock | None = None
         self._providers: dict[str, Echo] = {}
         self._tapped: list[Any] = []
+        self._stream: Stream | None = None
 
     @property
     def up(self) -> Container:
@@ -356,6 +369,34 @@ class Member:
             },
             "refused": self.up.reach._refused,
         }
+
+    def register_ticker(self, group: str) -> None:
+        self.up.register(Ticker(), group)
+
+    def listen(self, group: str, hz: str) -> None:
+        self._stream = self.up.stream(where(name="asked", group=group), hz=float(hz), keep=10_000)
+
+    def rate(self) -> float:
+        """Of the stream that is listened to."""
+        assert self._stream is not None
+        return self._stream.hz
+
+    def skip(self) -> None:
+        """What has come by now."""
+        assert self._stream is not None
+        while self._stream.take() is not None:
+            pass
+
+    def heard(self, count: str) -> list[list[int]]:
+        """Value, number and dropped of so many samples."""
+        assert self._stream is not None
+        samples = [self._stream.next(30) for _ in range(int(count))]
+        return [[sample.value, sample.number, sample.dropped] for sample in samples]
+
+    def overhear(self, group: str, hz: str) -> None:
+        """Hear samples at a rate that nobody here asked for."""
+        key = self.up.find(where(name="asked", group=group)).key
+        self._tapped = [self._session.declare_subscriber(stream_key(key, float(hz)), zenoh.handlers.FifoChannel(8192))]
 
     def stop(self) -> None:
         self.up.close()

@@ -156,6 +156,31 @@ def test_S12_a_gateway_that_opens_anew_loses_nobody_no_call_and_no_lock(
     assert planner.ask("sees", "2") == ["rosie.arm.echo", "rosie.arm.p0.echo"]
 
 
+def test_of_a_stream_so_many_samples_cross_as_its_export_says(site: Site, arm: Member, planner: Member) -> None:
+    arm.ask("register_ticker", "rosie.arm")
+    near = site.member("left", "chief")
+    near.ask("listen", "rosie.arm", "200")
+    planner.ask("listen", "rosie.arm", "200")
+    assert planner.ask("rate") == 200
+    site.change(site.file, 'export = ["rosie.arm"]', 'export = ["rosie.arm"]\nstream_hz = 20.0')
+    assert site.said()["reloaded"]
+    wait_until(lambda: planner.ask("rate") == 20, "it asks for no more than comes through")
+    planner.ask("skip")
+    planner.ask("overhear", "rosie.arm", "200")  # which the one nearby is given at this moment
+    near.ask("heard", "100")
+    (first, first_number, _), *others = planner.ask("heard", "20")
+    last, last_number, _ = others[-1]
+    assert last - first > 5 * len(others)  # of ten that are taken one crosses
+    assert sum(dropped + 1 for _, _, dropped in others) == last_number - first_number
+    assert sum(dropped for _, _, dropped in others) < len(others)  # what is not put for it is not missing
+    assert planner.ask("tapped") == []
+    site.change(site.file, "stream_hz = 20.0", "")
+    assert site.said()["reloaded"]
+    wait_until(lambda: planner.ask("rate") == 200, "and follows when more does")
+    planner.ask("skip")
+    planner.ask("heard", "1")
+
+
 def test_a_gateway_that_is_killed_ends_the_calls_under_way_and_the_next_one_serves(
     site: Site, arm: Member, planner: Member
 ) -> None:

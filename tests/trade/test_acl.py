@@ -46,7 +46,7 @@ thief = ["operator", "driver"]
 """
 SYSTEM: Final = "rules"
 STAR: Final = ("planner", "drv", "dash", "mallory")
-HEARD: Final = ("stream/rosie.neck/*/*/*/*/*", "stream/rosie.neck.$*/*/*/*/*/*", "stream/**")
+HEARD: Final = ("stream/rosie.neck/*/*/*/*/*/*", "stream/rosie.neck.$*/*/*/*/*/*/*", "stream/**")
 WAIT_S: Final = 20.0
 """Before something that is to come is given up."""
 MANY: Final = 200
@@ -170,13 +170,13 @@ PUTS: Final = {
     "a forged entry": ("mallory", "planner", "registry/rosie.neck/drv/c/e1/P", False),
     "a forged tally": ("mallory", "planner", "registry/trade/drv/c/e1/tally", False),
     "an entry one may not see": ("drv", "dash", "registry/rosie.neck/drv/c/e1/P", False),
-    "a sample": ("drv", "planner", "stream/rosie.neck/drv/c/e1/P/angle", True),
-    "a sample beneath the group": ("drv", "planner", "stream/rosie.neck.pan/drv/c/e1/P/angle", True),
-    "a sample of a group of others": ("drv", "planner", "stream/lab/drv/c/e1/P/angle", False),
-    "a forged sample": ("mallory", "planner", "stream/rosie.neck/drv/c/e1/P/angle", False),
-    "a sample one may not read": ("drv", "dash", "stream/rosie.neck/drv/c/e1/P/angle", False),
-    "a sample to everybody": ("drv", "planner", "stream/*/drv/c/e1/P/angle", False),
-    "a sample of a reader": ("dash", "planner", "stream/rosie.neck/dash/c/e1/P/angle", False),
+    "a sample": ("drv", "planner", "stream/rosie.neck/drv/c/e1/P/angle/20", True),
+    "a sample beneath the group": ("drv", "planner", "stream/rosie.neck.pan/drv/c/e1/P/angle/20", True),
+    "a sample of a group of others": ("drv", "planner", "stream/lab/drv/c/e1/P/angle/20", False),
+    "a forged sample": ("mallory", "planner", "stream/rosie.neck/drv/c/e1/P/angle/20", False),
+    "a sample one may not read": ("drv", "dash", "stream/rosie.neck/drv/c/e1/P/angle/20", False),
+    "a sample to everybody": ("drv", "planner", "stream/*/drv/c/e1/P/angle/20", False),
+    "a sample of a reader": ("dash", "planner", "stream/rosie.neck/dash/c/e1/P/angle/20", False),
     "an e-stop": ("dash", "drv", "estop/dash", True),
     "a forged e-stop": ("mallory", "drv", "estop/planner", False),
     "a confirmation": ("drv", "dash", "estop/drv/c/e1", True),
@@ -273,7 +273,7 @@ def test_what_a_network_does_not_export_is_neither_offered_nor_called_across_it(
     roles = [Role("all", {"call": ["*"], "read": ["*"], "register": ["rosie", "lab"]})]
     policy = Policy(roles, {"rosie": ["all"], "planner": ["all"]})
     crossing = crossings({"eth0": ["rosie.head"], "eth1": []})
-    assert crossing == {"eth0": (["rosie.head"], []), "eth1": ([], ["rosie.head"])}
+    assert crossing == {"eth0": (["rosie.head"], [], {}, {}), "eth1": ([], ["rosie.head"], {}, {})}
     rules = acl(policy, namespace=SYSTEM, networks={("eth0", "lo"): crossing["eth0"], ("eth1",): crossing["eth1"]})
     subjects = {subject["id"]: subject for subject in rules["access_control"]["subjects"]}
     assert subjects["rosie eth0 lo"]["interfaces"] == ["eth0", "lo"]
@@ -285,12 +285,36 @@ def test_what_a_network_does_not_export_is_neither_offered_nor_called_across_it(
     seen = keys_of(rules, "planner eth0 lo", "reply", "egress")
     assert seen == {"registry/trade/*/*/*/*"}
     assert "stop/planner/**" in keys_of(rules, "planner eth1", "put", "ingress")
-    exported = {f"stream/{group}/*/*/*/*/*" for group in ("trade", "rosie.head", "rosie.head.$*")}
+    exported = {f"stream/{group}/*/*/*/*/*/*" for group in ("trade", "rosie.head", "rosie.head.$*")}
     for message, flow in (("put", "egress"), ("declare_subscriber", "ingress")):
         heard = keys_of(rules, "planner eth1", message, flow)
         assert {key for key in heard if key.startswith("stream/")} == exported
         unheard = keys_of(rules, "planner eth0 lo", message, flow)
-        assert {key for key in unheard if key.startswith("stream/")} == {"stream/trade/*/*/*/*/*"}
+        assert {key for key in unheard if key.startswith("stream/")} == {"stream/trade/*/*/*/*/*/*"}
+
+
+def rates_of(keys: set[str], group: str) -> set[str]:
+    """At which streams of a group pass."""
+    return {key.rpartition("/")[2] for key in keys if key.startswith(f"stream/{group}/")}
+
+
+def test_streams_of_what_is_limited_pass_at_rates_up_to_that() -> None:
+    limits = {"eth0": {"rosie": 5, "rosie.imu": 20}, "eth2": {"rosie": 10}}
+    exports = {"eth0": ["rosie", "rosie.imu", "lab"], "eth1": [], "eth2": ["rosie"]}
+    crossing = crossings(exports, limits)
+    assert crossing["eth1"].seen_hz == {"rosie": 10, "rosie.imu": 20}
+    rules = acl(None, namespace=SYSTEM, networks={(name,): what for name, what in crossing.items()})
+    for who, message, flow, rosie in (
+        ("* eth0", "put", "ingress", {"0.$*", "1", "2", "5"}),
+        ("* eth0", "liveliness_token", "ingress", {"0.$*", "1", "2", "5"}),
+        ("* eth1", "put", "egress", {"0.$*", "1", "2", "5", "10"}),
+        ("* eth1", "liveliness_token", "egress", {"0.$*", "1", "2", "5", "10"}),
+        ("* eth1", "declare_subscriber", "ingress", {"0.$*", "1", "2", "5", "10"}),
+    ):
+        keys = keys_of(rules, who, message, flow)
+        assert rates_of(keys, "rosie") == rosie
+        assert rates_of(keys, "rosie.imu") == {"0.$*", "1", "2", "5", "10", "20"}
+        assert rates_of(keys, "lab") == {"*"}
 
 
 def test_without_certificates_only_what_crosses_is_looked_at() -> None:

@@ -346,3 +346,16 @@ def test_a_copy_of_a_handle_is_the_handle(here: Container) -> None:
     handle = here.services()[0]
     assert copy.copy(handle) is handle
     assert copy.deepcopy({"handle": handle})["handle"] is handle
+
+
+def test_whoever_is_told_of_an_end_and_fails_keeps_it_from_nobody(
+    here: Container, caplog: pytest.LogCaptureFixture
+) -> None:
+    [add] = [handle for handle in here.register(Counter(), "told") if handle.name == "add"]
+    run = add.start(5)
+    assert run.result(20) == 5
+    told: list[int] = []
+    run.when_done(lambda _: told.append(1 // 0))
+    run.when_done(lambda ended: told.append(ended.result()))
+    assert told == [5]
+    assert "has ended failed" in caplog.text

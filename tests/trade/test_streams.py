@@ -4,16 +4,17 @@ import asyncio
 import itertools
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import pytest
 
 from trade import Container, Handle, Sample, Stream, service, where
-from trade._memory import MemoryTransport, Passage
+from trade._memory import Kind, MemoryTransport, Passage
 from trade._pace import Pace
+from trade._sample import STEPS_HZ, StreamSample, stream_key
 from trade._streams import Source, Wish
-from trade._transport import Publisher
+from trade._wire import EMPTY, PROTOCOL
 from trade.errors import AccessDenied, ConfigurationError, ServiceGone, SessionEnded, SourceLost
 from trade.testing import MemorySystem, memory_system
 
@@ -105,7 +106,7 @@ def some(stream: Stream, count: int) -> list[Sample]:
 
 def _is_sample(passage: Passage) -> bool:
     """One that is sent from one container to another."""
-    return passage.key.startswith("stream/") and not passage.arrived
+    return passage.key.startswith("stream/") and passage.kind not in (Kind.RISE, Kind.FALL) and not passage.arrived
 
 
 def numbers(samples: list[Sample]) -> list[int]:
@@ -176,38 +177,132 @@ def test_who_wants_fewer_is_given_fewer(two: Two) -> None:
 @pytest.mark.parametrize(
     ("source_hz", "hz", "taken"), [(200, 200, 100), (200, 20, 10), (200, 150, 75), (20, 200, 100), (200, 199, 100)]
 )
-def test_a_listener_takes_its_own_rate_whatever_the_source_does(source_hz: int, hz: int, taken: int) -> None:
+def test_a_rate_is_kept_to_whatever_the_source_does(source_hz: int, hz: int, taken: int) -> None:
     pace = Pace(hz)
     jitter_ns = itertools.cycle((0, 400_000, -300_000, 900_000))
     moments = [int(tick * 1e9 / source_hz) + next(jitter_ns) for tick in range(100)]
     assert sum(pace.takes(moment) for moment in moments) == pytest.approx(taken, abs=1)
 
 
-def test_after_a_pause_a_listener_takes_no_more_than_before() -> None:
+def test_after_a_pause_no_more_are_put_than_before() -> None:
     pace = Pace(10)
     assert pace.takes(0)
     assert pace.takes(10_000_000_000)
     assert sum(pace.takes(10_000_000_000 + tick * 5_000_000) for tick in range(1, 101)) <= 6
 
 
+def alone(source: Handle) -> Stream:
+    """A stream that hears what the test tells it."""
+    return Stream(
+        *("s", source, 100.0, lambda _: 0), on_change=False, if_=None, keep=9, opened_by=None, ended=lambda _: None
+    )
+
+
+def hear(stream: Stream, number: int, at_ns: int = 0) -> None:
+    stream.hear(StreamSample(PROTOCOL, number, 0.0, at_ns, failed=False, body=EMPTY))
+
+
+def test_a_source_that_counts_anew_has_lost_nothing(apart: Two) -> None:
+    stream = alone(apart.service("count"))
+    for number in (9, 1, 2):
+        hear(stream, number)
+    assert [sample.dropped for sample in some(stream, 3)] == [0, 0, 0]
+
+
+def test_samples_of_another_rate_are_counted_for_themselves(apart: Two) -> None:
+    stream = alone(apart.service("count"))
+    hear(stream, 1)
+    stream.at_rate(50)
+    hear(stream, 40)
+    hear(stream, 42)
+    assert [sample.dropped for sample in some(stream, 3)] == [0, 0, 1]
+
+
 @pytest.mark.parametrize(
-    ("hz", "after", "missed"),
-    [(100, 1, 0), (100, 4, 3), (10, 4, 0), (10, 25, 2), (1000, 4, 3)],
-    ids=["none is missing", "all were wanted", "none was wanted", "some were", "the source is slower"],
+    ("passing", "wanted", "given"),
+    [
+        (STEPS_HZ, 33, 33),
+        (STEPS_HZ[:5], 200, 20),
+        (STEPS_HZ[:5], 12.5, 10),
+        (STEPS_HZ[:5], 0.5, 0.5),
+        (STEPS_HZ[3:5], 2, 2),
+        ((), 33, 33),
+    ],
+    ids=["all", "fewer", "a step below", "slower than any", "not all seen", "none seen"],
 )
-def test_what_is_missing_of_those_wanted_is_counted(hz: int, after: int, missed: int) -> None:
-    pace = Pace(hz)
-    for number in (1, 1 + after):
-        at_ns = number * 10_000_000
-        count = pace.missed(number, at_ns)
-        pace.takes(at_ns)
-    assert count == missed
+def test_who_is_behind_a_gateway_is_put_what_it_lets_pass(
+    apart: Two,
+    memory: MemorySystem,
+    monkeypatch: pytest.MonkeyPatch,
+    eventually: Any,
+    passing: Sequence[float],
+    wanted: float,
+    given: float,
+) -> None:
+    put: list[str] = []
+    signs = [stream_key(apart.service("count").key, hz) for hz in passing]
+    monkeypatch.setattr(apart.here._parts.transport, "bridged", lambda: True)
+    monkeypatch.setattr(apart.here._parts.transport, "present", lambda pattern, timeout_s: signs)
+    with apart.here.stream(apart.service("count"), hz=wanted) as stream:
+        assert stream.hz == given
+        memory.tap(lambda passage: put.append(passage.key) if _is_sample(passage) else None)
+        assert eventually(lambda: len(put) > 1)
+    assert put[-1].rpartition("/")[2] == f"{given:g}"
 
 
-def test_a_source_that_counts_anew_has_lost_nothing() -> None:
-    pace = Pace(100)
-    assert pace.takes(0)
-    assert [pace.missed(number, number * 10_000_000) for number in (9, 1, 2)] == [0, 0, 0]
+def test_when_a_gateway_lets_more_pass_or_less_its_listeners_follow(
+    apart: Two, monkeypatch: pytest.MonkeyPatch, eventually: Any
+) -> None:
+    passing = list(STEPS_HZ[:5])
+    key = apart.service("count").key
+    monkeypatch.setattr(apart.here._parts.transport, "bridged", lambda: True)
+    monkeypatch.setattr(
+        apart.here._parts.transport, "present", lambda pattern, timeout_s: [stream_key(key, hz) for hz in passing]
+    )
+    with apart.here.stream(apart.service("count"), hz=FAST_HZ) as stream:
+        assert stream.hz == 20
+        passing.extend(STEPS_HZ[5:])
+        assert eventually(lambda: stream.hz == FAST_HZ)
+        del passing[3:]
+        assert eventually(lambda: stream.hz == 5)
+        heard = [stream.next(PATIENCE_S) for _ in range(3)]
+        assert heard[-1].dropped == 0
+
+
+def test_the_same_source_puts_each_rate_by_itself(apart: Two, memory: MemorySystem) -> None:
+    put: list[str] = []
+    with (
+        apart.here.stream(apart.service("count"), hz=FAST_HZ) as fast,
+        apart.here.stream(apart.service("count"), hz=FAST_HZ / 10, keep=100) as slow,
+    ):
+        some(fast, 1)
+        some(slow, 1)
+        memory.tap(lambda passage: put.append(passage.key) if _is_sample(passage) else None)
+        asked = apart.battery.asked
+        assert [sample.dropped for sample in some(slow, 5)] == [0] * 5
+        asked = apart.battery.asked - asked
+    rates = [key.rpartition("/")[2] for key in put]
+    assert set(rates) == {"200", "20"}
+    assert rates.count("20") <= asked / 10 + 2
+
+
+def test_rates_that_look_alike_in_keys_are_one(apart: Two) -> None:
+    with (
+        apart.here.stream(apart.service("count"), hz=FAST_HZ, keep=100) as one,
+        apart.here.stream(apart.service("count"), hz=FAST_HZ + 1e-6, keep=100) as other,
+    ):
+        for stream in (one, other):
+            heard = numbers(some(stream, 10))
+            assert heard == list(range(heard[0], heard[0] + 10))
+
+
+def test_a_source_is_not_put_at_any_number_of_rates(apart: Two) -> None:
+    source = Source(apart.service("count").key, lambda _: None, apart.there._parts.transport, itertools.count(1).__next__)
+    for rate in range(64):
+        source.wish(("session", f"{rate}"), Wish("tester", rate + 1, on_change=False))
+    with pytest.raises(ConfigurationError, match="64 different rates"):
+        source.wish(("session", "another"), Wish("tester", 0.5, on_change=False))
+    source.wish(("session", "the same"), Wish("tester", 1, on_change=False))
 
 
 def test_on_change_only_what_differs_is_given_and_the_first_at_once(two: Two) -> None:
@@ -270,6 +365,14 @@ def test_who_is_slow_has_the_newest_and_knows_how_many_are_missing(two: Two, eve
         assert first.dropped == first.number - 1
         together = others[-1].number - first.number
         assert sum(sample.dropped + 1 for sample in others) == together
+
+
+def test_who_stood_still_is_told_of_all_that_it_missed(apart: Two) -> None:
+    """It began out of turn, and the samples before it stood still were a little late, the one after it was not."""
+    stream = alone(apart.service("count"))
+    for number, at_ms in ((1, 5.2), (2, 10.3), (3, 20.3), (7, 60.0)):
+        hear(stream, number, int(at_ms * 1e6))
+    assert [sample.dropped for sample in some(stream, 4)] == [0, 0, 0, 3]
 
 
 def test_the_latest_is_there_without_being_taken(two: Two, eventually: Any) -> None:
@@ -487,7 +590,7 @@ def test_what_is_no_sample_is_dropped_and_counted(memory: MemorySystem, apart: T
         stream.next(PATIENCE_S)
         key = apart.service("charge").key
         forger = MemoryTransport(memory.network)
-        forger.publish(f"stream/{key.domain}/{key.address}/{key.provider}/{key.name}").put(b"garbage")
+        forger.publish(stream_key(key, FAST_HZ)).put(b"garbage")
         assert eventually(lambda: apart.here.dropped_messages == 1)
         apart.battery.percent = 1
         assert stream.next(PATIENCE_S).value == 1
@@ -567,17 +670,11 @@ def test_a_source_that_is_killed_is_lost(start_container: Any, start_program: An
 # --- the source alone
 
 
-class Quiet(Publisher):
-    def put(self, payload: bytes) -> None: ...
-
-    def close(self) -> None: ...
-
-
 def test_who_does_not_say_again_that_it_listens_is_let_go_of(here: Container) -> None:
     battery = Battery()
     [count] = [handle for handle in here.register(battery, "rosie") if handle.name == "count"]
     local = here._parts.providers.service(count.key)
-    source = Source(count.key, lambda: local, Quiet(), itertools.count(1).__next__)
+    source = Source(count.key, lambda _: local, here._parts.transport, itertools.count(1).__next__)
     now = time.monotonic_ns()
     source.wish(("session", "kept"), Wish("tester", 1, on_change=False, until_ns=now + 10**12))
     assert source.tick() is not None

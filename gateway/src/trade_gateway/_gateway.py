@@ -178,6 +178,8 @@ def _say_what_crosses(out: Output, plan: Plan) -> None:
     for name in settings.bridge:
         groups = (EVERYTHING,) if settings.exports is None else settings.exports[name]
         out.say(f"  {name}: others see {_listed(groups)} of it")
+        for group, hz in settings.stream_hz.get(name, {}).items():
+            out.say(f"    and at most {hz:g} samples a second of each stream of {_listed([group])}")
     for name, share in plan.file.share.items():
         guest = plan.shares[name]
         out.say(f"  system {guest.system}, as {guest.identity}: it sees {_listed(share.export)} of {settings.system}")

@@ -47,6 +47,15 @@ class Network(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Endpoints on it; none is fine if the gateway only dials out by it."""
     export: list[str] | None = None
     """Groups whose services on this network the others see and call; an empty list: none; left out: all."""
+    stream_hz: float | dict[str, float] = {}
+    """How many samples a second of each stream of these the others hear at most: of all, or by group."""
+
+    @property
+    def limits(self) -> Mapping[str, float]:
+        """By group."""
+        if isinstance(self.stream_hz, dict):
+            return self.stream_hz
+        return dict.fromkeys(_or_all(self.export), self.stream_hz)
 
 
 class Share(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, rename={"import_": "import"}):
@@ -124,7 +133,7 @@ class GatewayFile(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
         if self.policy:
             read_policy(beside / self.policy)  # wrong is wrong before anything is closed for it
         networks = [] if self.alone else list(self.network.values())
-        limited = any(network.export is not None for network in networks)
+        limited = any(network.export is not None or network.limits for network in networks)
         exports = {network.interface: tuple(_or_all(network.export)) for network in networks}
         return Settings.read(
             system=self.system,
@@ -136,6 +145,7 @@ class GatewayFile(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
             insecure_lan=self.insecure_lan,
             bridge=[network.interface for network in networks],
             exports=exports if limited else None,
+            stream_hz={network.interface: network.limits for network in networks},
             policy=beside / self.policy if self.policy else None,
             environment=_without_system(),
         )
@@ -207,9 +217,10 @@ def _check(file: GatewayFile, where: str) -> None:
                 problem = f"{endpoint}: lo is known by 127.0.0.1 alone, and nothing would cross; write that one"
                 raise ConfigurationError(where=f"{where}: network.{name}.listen", problem=problem)
         _check_groups(network.export or (), f"{where}: network.{name}.export")
-        if file.alone and network.export is not None:
+        given = {"export": network.export is not None, "stream_hz": network.stream_hz != {}}
+        for key in [key for key, is_given in given.items() if is_given and file.alone]:
             problem = "there is no other network of this system; leave it out: what other systems see is in [share...]"
-            raise ConfigurationError(where=f"{where}: network.{name}.export", problem=problem)
+            raise ConfigurationError(where=f"{where}: network.{name}.{key}", problem=problem)
     _check_proof(file, file, f"{where}: ", "NAME --for gateway")
     for name, share in file.share.items():
         at = f"{where}: share.{name}."

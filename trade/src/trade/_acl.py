@@ -5,10 +5,12 @@ what an identity may send to whoever holds the rules, and what it may be sent.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
+from math import inf
+from types import MappingProxyType
 from typing import Any, Final, Literal, NamedTuple
 
 from trade._policies import EVERYTHING, VERBS, Policy
-from trade._sample import STREAMS
+from trade._sample import STEPS_HZ, STREAMS
 from trade._system import DOMAIN
 from trade._wire import ALIVE, ESTOPS, REGISTRY
 
@@ -48,17 +50,34 @@ class Crossing(NamedTuple):
     """Groups whose services of this network the others see and call."""
     seen: Sequence[str]
     """Groups of the others that are seen and called from this network."""
+    offered_hz: Mapping[str, float] = MappingProxyType({})
+    """Of the groups offered whose streams are limited: samples a second."""
+    seen_hz: Mapping[str, float] = MappingProxyType({})
 
 
-def crossings(exports: Mapping[str, Sequence[str]]) -> dict[str, Crossing]:
-    """From what each network lets out, by interface, to what crosses at each."""
-    return {
-        name: Crossing(groups, sorted({group for other in exports if other != name for group in exports[other]}))
-        for name, groups in exports.items()
-    }
+def crossings(
+    exports: Mapping[str, Sequence[str]], limits: Mapping[str, Mapping[str, float]] = MappingProxyType({})
+) -> dict[str, Crossing]:
+    """From what each network lets out, by interface, and how fast, to what crosses at each.
+
+    A group that several let out is seen at the highest of their limits; each one's own holds where it is offered.
+    """
+    made: dict[str, Crossing] = {}
+    for name, groups in exports.items():
+        others = [other for other in exports if other != name]
+        seen: dict[str, float] = {}
+        for other in others:
+            for group in exports[other]:
+                seen[group] = max(seen.get(group, 0.0), limits.get(other, {}).get(group, inf))
+        seen_hz = {group: hz for group, hz in seen.items() if hz < inf}
+        made[name] = Crossing(groups, sorted(seen), limits.get(name, {}), seen_hz)
+    return made
 
 
 _EVERYTHING_CROSSES: Final = Crossing((EVERYTHING,), (EVERYTHING,))
+
+_SLOWER: Final = "0.$*"
+"""All rates below 1 Hz, as they stand in keys."""
 
 _Row = tuple[str, str, Sequence[str]]
 """Flow, message, keys."""
@@ -131,8 +150,8 @@ def _rows(policy: Policy | None, me: str, crossing: Crossing) -> list[_Row]:
     calls = _over(policy, me, ("call", "read"), crossing.seen, f"call/{me}/*/*/*/{{}}/*")
     offers = _over(policy, me, ("register",), crossing.offered, f"registry/{{}}/{me}/*/*/*")
     sees = _over(policy, me, _SEEING, crossing.seen, "registry/{}/*/*/*/*")
-    puts = _over(policy, me, ("register",), crossing.offered, f"stream/{{}}/{me}/*/*/*/*")
-    hears = _over(policy, me, ("read",), crossing.seen, "stream/{}/*/*/*/*/*")
+    puts = _paced(policy, me, "register", crossing.offered, crossing.offered_hz, f"stream/{{}}/{me}/*/*/*/*")
+    hears = _paced(policy, me, "read", crossing.seen, crossing.seen_hz, "stream/{}/*/*/*/*/*")
     own = f"registry/*/{me}/*/*/*"
     to_it = [f"call/*/{me}/**", f"stop/*/{me}/**", f"reply/*/{me}/**", ESTOPS]
     return [
@@ -141,15 +160,15 @@ def _rows(policy: Policy | None, me: str, crossing: Crossing) -> list[_Row]:
         (_IN, "query", [REGISTRY]),
         (_IN, "declare_subscriber", [REGISTRY, *to_it, *hears]),
         (_IN, "declare_queryable", [own]),
-        (_IN, "liveliness_token", [f"alive/{me}/**"]),
+        (_IN, "liveliness_token", [f"alive/{me}/**", *puts]),
         (_IN, "declare_liveliness_subscriber", [ALIVE]),
-        (_IN, "liveliness_query", [ALIVE]),
+        (_IN, "liveliness_query", [ALIVE, STREAMS]),
         (_OUT, "put", [*sees, *to_it, *hears]),
         (_OUT, "reply", sees),
         (_OUT, "query", [REGISTRY]),
         (_OUT, "declare_subscriber", [REGISTRY, "call/**", "stop/**", "reply/**", STREAMS, ESTOPS]),
         (_OUT, "declare_queryable", [REGISTRY]),
-        (_OUT, "liveliness_token", [ALIVE]),
+        (_OUT, "liveliness_token", [ALIVE, *hears]),
     ]
 
 
@@ -161,6 +180,23 @@ def _over(policy: Policy | None, who: str, verbs: Iterable[str], among: Sequence
     own = [DOMAIN] if DOMAIN not in groups else []
     beneath = [chunk for group in groups for chunk in (group, f"{group}.$*")]
     return [pattern.format(chunk) for chunk in (*own, *beneath)]
+
+
+def _paced(
+    policy: Policy | None,
+    who: str,
+    verb: str,
+    among: Sequence[str],
+    limits: Mapping[str, float],
+    pattern: str,
+) -> list[str]:
+    """Keys of the streams of these groups, of limited ones at those rates only."""
+    keys: list[str] = []
+    for limit in sorted({limits.get(group, inf) for group in among} or {inf}):
+        groups = [group for group in among if limits.get(group, inf) == limit]
+        rates = ["*"] if limit == inf else [_SLOWER, *(str(step) for step in STEPS_HZ if step <= limit)]
+        keys += [f"{key}/{rate}" for key in _over(policy, who, (verb,), groups, pattern) for rate in rates]
+    return list(dict.fromkeys(keys))
 
 
 def _both(some: Sequence[str], others: Sequence[str]) -> list[str]:

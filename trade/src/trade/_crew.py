@@ -31,14 +31,17 @@ class Crew:
         self._channel = channel
         self._work = work
         self._refuse = refuse
-        self._back = threading.Condition(threading.Lock())
+        self._lock = threading.Lock()
+        self._back = threading.Condition(self._lock)
+        self._expecting = 0
+        """Threads that wait for another one to come back."""
         self._threads: list[threading.Thread] = []
         self._hired = 0
         self._idle = 0
         self.taken = 0
         """Messages it has begun to work at, refused ones left out."""
         self._dismissed = False
-        with self._back:
+        with self._lock:
             self._hire()
 
     @property
@@ -48,7 +51,7 @@ class Crew:
     @property
     def working(self) -> int:
         """Threads that work at a message now."""
-        with self._back:
+        with self._lock:
             return len(self._threads) - self._idle
 
     def _hire(self) -> None:
@@ -76,33 +79,40 @@ class Crew:
 
     def _leave_idle(self) -> bool:
         """Whether this thread may run the call: somebody else must be left to take the next one."""
-        with self._back:
-            try:
-                if self._idle == 1 and _FEW <= len(self._threads) < MOST_THREADS:
-                    self._back.wait_for(lambda: self._idle > 1 or self._dismissed, _MOMENT_S)
-                if self._idle == 1 and len(self._threads) < MOST_THREADS and not self._dismissed:
-                    self._hire()
-            except RuntimeError:  # the process may have no more threads
-                _logger.exception("%s cannot have another thread", self._name)
-            if self._idle == 1:
+        with self._lock:
+            if self._idle == 1 and not self._get_another():
                 return False
             self._idle -= 1
             self.taken += 1
             return True
 
+    def _get_another(self) -> bool:
+        """Whether somebody comes back in a moment, or can be hired; with the lock held."""
+        if _FEW <= len(self._threads) < MOST_THREADS:
+            self._expecting += 1
+            self._back.wait_for(lambda: self._idle > 1 or self._dismissed, _MOMENT_S)
+            self._expecting -= 1
+        if self._idle == 1 and len(self._threads) < MOST_THREADS and not self._dismissed:
+            try:
+                self._hire()
+            except RuntimeError:  # the process may have no more threads
+                _logger.exception("%s cannot have another thread", self._name)
+        return self._idle > 1
+
     def _join_idle(self) -> bool:
         """Whether this thread, whose call has ended, is to take more."""
-        with self._back:
+        with self._lock:
             if self._idle >= _FEW:
                 self._threads.remove(threading.current_thread())
                 return False
             self._idle += 1
-            self._back.notify()
+            if self._expecting:
+                self._back.notify()
             return True
 
     def dismiss(self) -> None:
         """Take no more calls. No thread goes back into the transport, where the end of the process would abort it."""
-        with self._back:
+        with self._lock:
             self._dismissed = True
             self._back.notify_all()
         self._channel.close()

@@ -1,7 +1,6 @@
 """Handles: values that name one service of one boot, and calls that were started without waiting."""
 
 import asyncio
-import concurrent.futures
 import contextlib
 import logging
 import threading
@@ -43,10 +42,10 @@ class Run:
 
     def __init__(self, handle: "Handle") -> None:
         self._handle = handle
-        self._future: concurrent.futures.Future[Any] = concurrent.futures.Future()
-        self._future.set_running_or_notify_cancel()  # only its end ends it
+        self._outcome: tuple[Any, BaseException | None] | None = None
+        """Its result or its error, once it has ended."""
         self._ended = Bell()
-        self._future.add_done_callback(lambda _: self._ended.ring())
+        self._told: list[Callable[[Run], object]] = []
         self._progress: Any = None
         self._on_progress: Callable[[Any], object] | None = None
         self._cancelling = False
@@ -58,23 +57,43 @@ class Run:
         Args:
             timeout_s: give up waiting (not the call) after this long; raises TimeoutError.
         """
-        if not self._ended.wait_for(self._future.done, timeout_s):
-            raise TimeoutError(f"{self._handle} has not ended after {timeout_s} s; it goes on")
-        return self._future.result()
+        result, error = self._wait(timeout_s)
+        if error is not None:
+            raise error
+        return result
 
     def done(self) -> bool:
         """Whether it has ended, well or not."""
-        return self._future.done()
+        return self._outcome is not None
 
     def exception(self, timeout_s: float | None = None) -> BaseException | None:
         """The error it ended with, or None."""
-        if not self._ended.wait_for(self._future.done, timeout_s):
+        return self._wait(timeout_s)[1]
+
+    def _wait(self, timeout_s: float | None) -> tuple[Any, BaseException | None]:
+        if self._outcome is None:
+            self._ended.wait_for(self.done, timeout_s)
+        if self._outcome is None:
             raise TimeoutError(f"{self._handle} has not ended after {timeout_s} s; it goes on")
-        return self._future.exception()
+        return self._outcome
 
     def when_done(self, tell: "Callable[[Run], object]") -> None:
         """Have this called once it has ended, on the thread that learns of it; at once if it has."""
-        self._future.add_done_callback(lambda _: tell(self))
+        self._told.append(tell)
+        if self._outcome is not None:
+            self._tell()
+
+    def _tell(self) -> None:
+        """Each once, whichever thread comes first."""
+        while self._told:
+            try:
+                tell = self._told.pop(0)
+            except IndexError:  # another thread has told the last one
+                return
+            try:
+                tell(self)
+            except Exception:
+                _logger.exception("who was to learn that %s has ended failed", self._handle)
 
     def cancel(self) -> None:
         """End it early; the result then tells how it ended.
@@ -82,7 +101,7 @@ class Run:
         A call that has not begun never will, and raises Cancelled. One that runs is asked to end, and goes on if
         it does not heed that. If its provider names a service that ends it, that is called, and waited for.
         """
-        if self._future.done():
+        if self._outcome is not None:
             return
         self.ask_to_end()
         if self._handle.record.info.cancel is not None:
@@ -124,14 +143,21 @@ class Run:
 
     def fail(self, error: BaseException) -> None:
         """Told by the container: it could not begin."""
-        self._future.set_exception(error)
+        self._end(None, error)
 
     def end(self, outcome: Callable[[], Any]) -> None:
         """Told by the container: the outcome is what this returns or raises."""
         try:
-            self._future.set_result(outcome())
+            result = outcome()
         except BaseException as error:  # noqa: BLE001 - whatever the service raised belongs to who asks for the result
-            self._future.set_exception(error)
+            self._end(None, error)
+        else:
+            self._end(result, None)
+
+    def _end(self, result: Any, error: BaseException | None) -> None:
+        self._outcome = (result, error)
+        self._ended.ring()
+        self._tell()
 
     async def settled(self) -> None:
         """Wait for its end from asyncio, well or not; the service goes on if this waiting is cancelled."""
@@ -141,11 +167,15 @@ class Run:
             with contextlib.suppress(RuntimeError):  # nobody waits any more: that loop has ended
                 loop.call_soon_threadsafe(ended.set)
 
-        self._future.add_done_callback(tell)
+        self.when_done(tell)
         await ended.wait()
 
     def __await__(self) -> Generator[Any, None, Any]:
-        return asyncio.wrap_future(self._future).__await__()
+        return self._awaited().__await__()
+
+    async def _awaited(self) -> Any:
+        await self.settled()
+        return self.result()
 
 
 def _cancel(run: Run) -> None:

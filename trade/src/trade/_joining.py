@@ -93,7 +93,7 @@ def _rules(settings: Settings, networks: list[list[str]]) -> dict[str, Any]:
         )
     crossing = None
     if settings.exports is not None:
-        known = crossings(settings.exports)
+        known = crossings(settings.exports, settings.stream_hz)
         crossing = {tuple(interfaces): known[interfaces[0]] for interfaces in networks}
     return acl(policy, namespace=settings.system, networks=crossing)
 

@@ -1,4 +1,8 @@
-"""What one container hears of streams: a subscription and a thread for each, which asks its source to go on."""
+"""What one container hears of streams: a subscription and a thread for each, which asks its source to go on.
+
+Between it and the source there may be gateways that let only lower rates pass. What passes the listener sees by the
+signs that reach it, and then asks for no more than that.
+"""
 
 import contextlib
 import itertools
@@ -14,7 +18,7 @@ from trade._codec import Codec
 from trade._handle import Handle
 from trade._invoke import container_closed, result_decoder
 from trade._registry import Change
-from trade._sample import decode_sample, stream_key
+from trade._sample import STEPS_HZ, decode_sample, rate_of, signs_of, stream_key
 from trade._session import Session
 from trade._stream import If, Stream
 from trade._streams import Home
@@ -28,6 +32,7 @@ _logger = logging.getLogger("trade")
 AGAIN_S: Final = 2.0
 """How often a listener says that it still listens: often enough for the lease at the source, and to be back soon."""
 _DEADLINE_S: Final = 5.0
+_SIGNS_S: Final = 1.0
 _RING: Final = 64
 """So many messages at least are kept while a whole process stands still."""
 
@@ -39,16 +44,25 @@ class _Ear:
         self,
         home: Home,
         stream: Stream,
-        channel: Channel,
+        transport: Transport,
+        keep: int,
         clockwork: Clockwork,
         malformed: Callable[[Malformed], None],
     ) -> None:
         self._home = home
         self._stream = stream
-        self._channel = channel
+        self._transport = transport
+        self._keep = keep
+        self._wanted_hz = stream.hz
+        self._channel = self._subscribe(stream.hz)
+        self._lock = threading.Lock()
+        self._closed = False
         self._malformed = malformed
         self._due = clockwork.due(self._again)
         self._thread = threading.Thread(target=self._read, name="trade-stream", daemon=True)
+
+    def _subscribe(self, hz: float) -> Channel:
+        return self._transport.subscribe(stream_key(self._stream.source.key, hz), newest=self._keep)
 
     def begin(self) -> None:
         """Ask the source for samples, and hear them from now on. Raises what it answers."""
@@ -69,6 +83,29 @@ class _Ear:
         self._home.require_call(self._home.address.identity, stream.source)
         with self._speaking():
             self._function("listen")(stream.name, stream.source, stream.hz, stream.on_change)
+            passing = self._passing_hz()
+            if passing != stream.hz:
+                self._change_to(passing)
+                self._function("listen")(stream.name, stream.source, stream.hz, stream.on_change)
+
+    def _passing_hz(self) -> float:
+        """The rate that is wanted, unless a gateway lets only some below it pass; as it is if none is seen to."""
+        wanted = self._wanted_hz
+        if not self._transport.bridged():
+            return wanted
+        signs = self._transport.present(signs_of(self._stream.source.key), _SIGNS_S)
+        passing = sorted(map(rate_of, signs))
+        if not passing or passing[-1] == STEPS_HZ[-1]:
+            return wanted if passing else self._stream.hz
+        return max((hz for hz in passing if hz <= wanted), default=min(wanted, passing[0]))
+
+    def _change_to(self, hz: float) -> None:
+        channel = self._subscribe(hz)
+        with self._lock:
+            if not self._closed:
+                self._channel, channel = channel, self._channel
+                self._stream.at_rate(hz)
+        channel.close()
 
     def _function(self, name: str) -> Handle:
         key = ServiceKey(self._stream.source.key.address, DOMAIN, PROVIDER, name)
@@ -93,16 +130,21 @@ class _Ear:
 
     def _read(self) -> None:
         while True:
+            channel = self._channel
             try:
-                self._stream.hear(decode_sample(self._channel.receive().payload or b""))
+                self._stream.hear(decode_sample(channel.receive().payload or b""))
             except ChannelClosed:
-                return
+                with self._lock:
+                    if channel is self._channel:
+                        return
             except Malformed as bad:
                 self._malformed(bad)
 
     def close(self) -> None:
         """Listen no more, and tell the source if it can be told; what it does not hear its lease ends."""
         self._due.cancel()
+        with self._lock:
+            self._closed = True
         self._channel.close()
         with contextlib.suppress(TradeError, ChannelClosed), self._speaking():
             if self._stream.source.alive:
@@ -149,17 +191,19 @@ class Listening:
             ended=self._ended,
         )
         try:
-            channel = self._transport.subscribe(stream_key(source.key), newest=max(keep, _RING))
+            newest = max(keep, _RING)
+            ear = _Ear(self._home, stream, self._transport, newest, self._clockwork, self._note_malformed)
         except ChannelClosed:  # closed by another thread meanwhile
             raise container_closed(self._home.address) from None
-        ear = _Ear(self._home, stream, channel, self._clockwork, self._note_malformed)
         with self._lock:
             self._ears[stream.name] = (stream, ear)
         try:
             ear.begin()
-        except BaseException:
+        except BaseException as error:
             with self._lock:
                 self._ears.pop(stream.name, None)
+            if isinstance(error, ChannelClosed):
+                raise container_closed(self._home.address) from None
             raise
         return stream
 

@@ -7,9 +7,20 @@ from msgspec import Meta, Raw, Struct
 
 from trade._wire import MOST_BYTES, PROTOCOL, Malformed, ServiceKey, why_malformed
 
-__all__ = ["STREAMS", "Sample", "StreamSample", "decode_sample", "stream_key"]
+__all__ = [
+    "STEPS_HZ",
+    "STREAMS",
+    "Sample",
+    "StreamSample",
+    "decode_sample",
+    "rate_of",
+    "signs_of",
+    "stream_key",
+]
 
 STREAMS: Final = "stream/**"
+STEPS_HZ: Final = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
+"""Through a gateway that limits rates, streams go at one of these, or more slowly than the first."""
 _MOST_MESSAGE_BYTES: Final = MOST_BYTES + (1 << 20)
 
 
@@ -22,10 +33,11 @@ class Sample(Struct, frozen=True, kw_only=True):
     at_ns: int
     """``time.monotonic_ns()`` of the source at that moment: for intervals between samples of one stream."""
     number: int
-    """Of the samples that the source has put, counted from 1; a listener with a lower rate leaves some out."""
+    """Of the samples that the source has put at this rate, counted from 1."""
     dropped: int = 0
-    """How many that were wanted are missing since the one before: not taken in time, or lost on the way. Whether they
-    would have met the listener's condition nobody knows."""
+    """How many are missing since the one before: not taken in time, or lost on the way. What was never put at this
+    rate, the listener's own or that of a gateway between, is not missing. Whether they would have met the condition
+    nobody knows."""
 
 
 class StreamSample(Struct, frozen=True, array_like=True, gc=False):
@@ -44,9 +56,27 @@ class StreamSample(Struct, frozen=True, array_like=True, gc=False):
 _decoder: Final = msgspec.msgpack.Decoder(StreamSample)
 
 
-def stream_key(service: ServiceKey) -> str:
-    """Where the samples of a service are put."""
+def stream_key(service: ServiceKey, hz: float) -> str:
+    """Where the samples of a service are put for those who want so many a second.
+
+    On the keys of the steps a source also shows that it can be heard: its signs reach those whom its samples reach.
+    """
+    return f"{_all_rates(service)}/{hz:g}"
+
+
+def signs_of(service: ServiceKey) -> str:
+    """All signs of a source."""
+    return f"{_all_rates(service)}/*"
+
+
+def _all_rates(service: ServiceKey) -> str:
     return f"stream/{service.domain}/{service.address}/{service.provider}/{service.name}"
+
+
+def rate_of(sign: str) -> float:
+    """The rate that a sign is for; 0 if it is none."""
+    text = sign.rpartition("/")[2]
+    return float(text) if text.isdecimal() else 0.0
 
 
 def decode_sample(payload: bytes) -> StreamSample:

@@ -6,11 +6,15 @@ import os
 import socket
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from math import inf
 from pathlib import Path
+from types import MappingProxyType
 from typing import Final
 
 from trade._endpoints import Endpoint, dialled_from_here
+from trade._policies import EVERYTHING
+from trade._sample import STEPS_HZ
 from trade._tls import Certificate
 from trade._wire import as_chunk, is_chunk
 from trade.errors import ConfigurationError
@@ -72,6 +76,9 @@ class Settings:
     crosses unless ``exports`` says what."""
     exports: Mapping[str, tuple[str, ...]] | None = None
     """By interface of the bridge, the groups whose services on that network others see and call; none: everything."""
+    stream_hz: Mapping[str, Mapping[str, float]] = field(default_factory=dict[str, Mapping[str, float]])
+    """By interface of the bridge and exported group: how many samples a second of each stream others hear at most, one
+    of 1, 2, 5, 10, 20, 50, 100, 200 and 500; of the others: as many as they ask for."""
     explicit_system: bool = False
     lock: str = ""
     """A lock that the process around this one holds for it; see `Lock.environment`."""
@@ -102,10 +109,14 @@ class Settings:
         if len(set(self.bridge)) == 1 and not self.connect:
             problem = "joins networks, and this is only one; name a second interface, or connect to another bridge"
             raise ConfigurationError(where=f"bridge {self.bridge[0]}", problem=problem)
+        self._check_exports()
 
+    def _check_exports(self) -> None:
         if self.exports is not None and set(self.exports) != set(self.bridge):
             problem = f"must name the interfaces of the bridge, {', '.join(self.bridge) or 'none'}, each once"
             raise ConfigurationError(where=f"exports of {', '.join(self.exports)}", problem=problem)
+        for name, limits in self.stream_hz.items():
+            check_stream_hz(limits, (self.exports or {}).get(name, ()), f"stream_hz of {name}")
 
     def check_may_dial(self, endpoint: str) -> None:
         """S21: raises ConfigurationError if that would reach a network by accident."""
@@ -177,6 +188,7 @@ class Settings:
         insecure_lan: bool | None = None,
         bridge: Sequence[str] | None = None,
         exports: Mapping[str, Sequence[str]] | None = None,
+        stream_hz: Mapping[str, Mapping[str, float]] = MappingProxyType({}),
         policy: Path | None = None,
         instantiable: Sequence[str] | None = None,
         environment: Mapping[str, str] = os.environ,
@@ -205,6 +217,7 @@ class Settings:
             insecure_lan=environment.get("TRADE_INSECURE_LAN") == "1" if insecure_lan is None else insecure_lan,
             bridge=tuple(_split(environment, "TRADE_BRIDGE") if bridge is None else bridge),
             exports=None if exports is None else {name: tuple(groups) for name, groups in exports.items()},
+            stream_hz=stream_hz,
             policy=policy or _path(environment.get("TRADE_POLICY")),
             explicit_system=named is not None,
             lock=environment.get("TRADE_LOCK", ""),
@@ -212,6 +225,22 @@ class Settings:
             state_dir=_state_dir(environment),
             trace=environment.get("TRADE_TRACE") == "1",
         )
+
+
+def check_stream_hz(limits: Mapping[str, float], exported: Sequence[str], where: str) -> None:
+    """Raises ConfigurationError: no such limits, or they would not hold."""
+    for group, hz in limits.items():
+        if group not in exported:
+            problem = f"{group!r} is not exported as such; there is {', '.join(exported) or 'nothing'}"
+            raise ConfigurationError(where=where, problem=problem)
+        if hz not in STEPS_HZ[:-1]:
+            problem = f"{hz:g} for {group} is none of {', '.join(map(str, STEPS_HZ[:-1]))} a second"
+            raise ConfigurationError(where=where, problem=problem)
+        wider = [one for one in exported if group.startswith(f"{one}.") or (one == EVERYTHING != group)]
+        above = next((one for one in wider if limits.get(one, inf) > hz), None)
+        if above is not None:
+            problem = f"{group} is exported with all of {above!r} as well, which lets more pass; limit that, too"
+            raise ConfigurationError(where=where, problem=problem)
 
 
 def _warn_of_unknown(environment: Mapping[str, str]) -> None:

@@ -12,7 +12,6 @@ import msgspec
 from trade._bell import Bell
 from trade._failures import unpack_error
 from trade._handle import Handle
-from trade._pace import Pace
 from trade._sample import Sample, StreamSample
 from trade._session import Session
 from trade._wire import ErrorInfo
@@ -58,20 +57,20 @@ class Stream:
         """Names it among the listeners of its container."""
         self.source: Final = source
         """The service."""
-        self.hz: Final = hz
+        self.hz = hz
+        """How many samples a second at most: what was asked for, or fewer if a gateway lets no more pass."""
         self.on_change: Final = on_change
         self.opened_by: Final = opened_by
         """The session that it ends with; none: its container."""
         self._decode = decode
         self._if = if_
         self._tell_ended = ended
-        self._pace = Pace(hz)
         self._lock = threading.Lock()
         self._waiting: deque[_Heard | BaseException] = deque()
         self._keep = keep
         self._body: tuple[bool, bytes] | None = None
         """What was heard last, of those that are its own."""
-        self._missed = self._told = self._overflowed = 0
+        self._number = self._missed = self._told = self._overflowed = 0
         self._latest: Sample | BaseException | None = None
         self._end: BaseException | None = None
         self._closed = False
@@ -215,9 +214,11 @@ class Stream:
 
     def hear(self, message: StreamSample) -> None:
         """Told by the container: the source has put this."""
-        self._missed += self._pace.missed(message.number, message.at_ns)
+        if self._number:  # a lower number: the source counts anew
+            self._missed += max(0, message.number - self._number - 1)
+        self._number = message.number
         body = (message.failed, bytes(message.body))
-        if (self.on_change and body == self._body) or not self._pace.takes(message.at_ns):
+        if self.on_change and body == self._body:
             return
         self._body = body
         try:
@@ -241,6 +242,10 @@ class Stream:
         if self._if is not None and not self._if(value):
             return None
         return Sample(value=value, at=message.at, at_ns=message.at_ns, number=message.number)
+
+    def at_rate(self, hz: float) -> None:
+        """Told by the container: what comes now are samples of that rate, which are counted for themselves."""
+        self.hz, self._number = hz, 0
 
     def lost(self, error: BaseException) -> None:
         """Told by the container: the source is out of reach. What it says when it is back is news, changed or not."""

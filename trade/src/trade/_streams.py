@@ -1,13 +1,14 @@
 """Services sampled while somebody listens: the source's side of streams.
 
-However many listen, a service is called once a tick, its answer encoded once and put once.
+However many listen, a service is called once a tick, its answer encoded once, and put once for each rate.
 """
 
 import logging
 import threading
 import time
 from collections.abc import Callable
-from typing import Final, Protocol
+from contextlib import ExitStack
+from typing import Final, NamedTuple, Protocol
 
 from msgspec import Raw, Struct, structs
 
@@ -15,8 +16,9 @@ from trade._clockwork import Clockwork
 from trade._context import CallContext
 from trade._dispatch import LocalService
 from trade._handle import Handle
+from trade._pace import Pace
 from trade._registry import Change
-from trade._sample import StreamSample, stream_key
+from trade._sample import STEPS_HZ, StreamSample, stream_key
 from trade._serial import Turn
 from trade._transport import ChannelClosed, Publisher, Transport
 from trade._wire import EMPTY_ARGUMENTS, PROTOCOL, Address, ServiceKey, encode_message
@@ -34,6 +36,8 @@ _PATIENCE_S: Final = 10.0
 """How long a sample may take."""
 _MOST: Final = 10_000
 """So many may listen to one service."""
+_MOST_RATES: Final = 64
+"""At so many different rates."""
 
 Listener = tuple[str, str]
 """Session and name."""
@@ -59,44 +63,103 @@ class Wish(Struct, frozen=True):
     until_ns: int = 0
     """When its lease ends."""
 
-    @property
-    def period_ns(self) -> int:
-        return int(1e9 / self.hz)
+
+class Wished(NamedTuple):
+    """What all who want the same rate would like to have."""
+
+    always: bool
+    """Somebody wants more than changes."""
+    newly: bool
+    """Somebody wants a sample now."""
+
+
+def period_ns(hz: float) -> int:
+    """Of a rate."""
+    return int(1e9 / hz)
+
+
+class _Rate:
+    """What is put for all who want so many samples a second. Used by the clockwork only."""
+
+    def __init__(self, hz: float, publisher: Publisher) -> None:
+        self._pace = Pace(hz)
+        self._publisher = publisher
+        self._period_ns = period_ns(hz)
+        self._number = 0
+        self._put: tuple[bool, bytes] | None = None
+        self._put_ns = 0
+
+    def offer(self, answer: tuple[bool, bytes], at: float, at_ns: int, wished: Wished, every_ns: int) -> None:
+        """Put it, unless that would be too soon, or nothing new to those who want changes only.
+
+        Args:
+            answer: whether the service failed, and what it answered.
+            at: ``time.time()`` when it was asked.
+            at_ns: the monotonic clock at that moment.
+            wished: how.
+            every_ns: how often it is asked.
+        """
+        stale = at_ns - self._put_ns >= SIGN_S * 1e9
+        if not (wished.newly or stale or wished.always or answer != self._put):
+            return
+        on_time = every_ns >= self._period_ns or self._pace.takes(at_ns)
+        if not (wished.newly or on_time):
+            return
+        self._number += 1
+        self._publisher.put(encode_message(StreamSample(PROTOCOL, self._number, at, at_ns, answer[0], Raw(answer[1]))))
+        self._put, self._put_ns = answer, at_ns
+
+    def close(self) -> None:
+        self._publisher.close()
 
 
 class Source:
     """A service of this container that is listened to, or once was. Done by the clockwork: never twice at once."""
 
     def __init__(
-        self, key: ServiceKey, find: Callable[[], LocalService | None], publisher: Publisher, new_id: Callable[[], int]
+        self,
+        key: ServiceKey,
+        services: Callable[[ServiceKey], LocalService | None],
+        transport: Transport,
+        new_id: Callable[[], int],
     ) -> None:
         self._key = key
-        self._find = find
-        self._publisher = publisher
+        self._services = services
+        self._transport = transport
         self._new_id = new_id
+        self._shown = ExitStack()
         self._lock = threading.Lock()
         self._wishes: dict[Listener, Wish] = {}
-        self._someone_new = False
+        self._new: set[float] = set()
+        """Rates at which somebody wants a sample at once."""
+        self._rates: dict[float, _Rate] = {}
         self._next_ns = 0
-        self._number = 0
-        self._put: tuple[bool, bytes] | None = None
-        self._put_ns = self._changed_ns = 0
         self._problem = ""
+
+    def show(self) -> None:
+        """Put up the signs by which listeners see what rates reach them."""
+        for hz in STEPS_HZ:
+            self._shown.callback(self._transport.appear(stream_key(self._key, hz)).close)
 
     def wish(self, listener: Listener, wish: Wish) -> bool:
         """Somebody listens from now on, or still does; whether it is another wish than before.
 
         Raises:
-            ConfigurationError: too many listen.
+            ConfigurationError: too many listen, or at too many rates.
         """
+        where = f"{self._key.domain}.{self._key.name}"
         with self._lock:
             before = self._wishes.get(listener)
             if before is None and len(self._wishes) >= _MOST:
-                problem = f"{_MOST} listen to it already"
-                raise ConfigurationError(where=f"{self._key.domain}.{self._key.name}", problem=problem)
+                raise ConfigurationError(where=where, problem=f"{_MOST} listen to it already")
+            rates = {other.hz for other in self._wishes.values()}
+            if wish.hz not in rates and len(rates) >= _MOST_RATES:
+                problem = f"it is listened to at {_MOST_RATES} different rates already; ask for one of {sorted(rates)}"
+                raise ConfigurationError(where=where, problem=problem)
             self._wishes[listener] = wish
             new = before is None or (before.hz, before.on_change) != (wish.hz, wish.on_change)
-            self._someone_new |= new
+            if new:
+                self._new.add(wish.hz)
             return new
 
     def drop(self, which: Callable[[Listener, Wish], bool]) -> None:
@@ -113,32 +176,35 @@ class Source:
         """Sample it if anybody still listens; when to do so again."""
         now = time.monotonic_ns()
         self.drop(lambda _, wish: wish.until_ns <= now)
-        with self._lock:
-            wishes, someone_new, self._someone_new = list(self._wishes.values()), self._someone_new, False
-        service = self._find()
-        if not wishes or service is None:
-            self._next_ns = 0
-            return None
-        at = time.time()
-        answer = self._sampled(service, now)
-        if answer != self._put:
-            self._changed_ns = now
-        if someone_new or answer != self._put or not self._may_be_quiet(wishes, now):
-            self._number += 1
-            sample = StreamSample(PROTOCOL, self._number, at, now, answer[0], Raw(answer[1]))
-            try:
-                self._publisher.put(encode_message(sample))
-            except ChannelClosed:
+        service = self._services(self._key)
+        wished = {} if service is None else self._wished()
+        try:
+            self._keep_only(wished)
+            if service is None or not wished:
+                self._next_ns = 0
                 return None
-            self._put, self._put_ns = answer, now
-        return self._after(now, min(wish.period_ns for wish in wishes))
+            at, every_ns = time.time(), period_ns(max(wished))
+            answer = self._sampled(service, now)
+            for hz, how in wished.items():
+                self._rates[hz].offer(answer, at, now, how, every_ns)
+        except ChannelClosed:
+            return None
+        return self._after(now, every_ns)
 
-    def _may_be_quiet(self, wishes: list[Wish], now: int) -> bool:
-        """Whether all want changes only, and have had the last one: who is slower takes a later sample of it."""
-        if not all(wish.on_change for wish in wishes) or now - self._put_ns >= SIGN_S * 1e9:
-            return False
-        periods = {wish.period_ns for wish in wishes}
-        return len(periods) == 1 or now - self._changed_ns > max(periods)
+    def _wished(self) -> dict[float, Wished]:
+        """By rate."""
+        with self._lock:
+            new, self._new = self._new, set[float]()
+            always = {wish.hz for wish in self._wishes.values() if not wish.on_change}
+            return {wish.hz: Wished(wish.hz in always, wish.hz in new) for wish in self._wishes.values()}
+
+    def _keep_only(self, wished: dict[float, Wished]) -> None:
+        """Put at these rates, and at no others any more."""
+        for hz in [hz for hz in self._rates if hz not in wished]:
+            self._rates.pop(hz).close()
+        for hz in wished:
+            if hz not in self._rates:
+                self._rates[hz] = _Rate(hz, self._transport.publish(stream_key(self._key, hz), droppable=True))
 
     def _after(self, now: int, period_ns: int) -> int:
         """The next tick; those that have passed meanwhile are left out, and one out of turn moves no others."""
@@ -165,9 +231,9 @@ class Source:
         return False, answer
 
     def close(self) -> None:
-        """Sample it no more. Idempotent."""
+        """Sample it no more; the last tick lets go of its keys. Idempotent."""
         self.drop(lambda _listener, _wish: True)
-        self._publisher.close()
+        self._shown.close()
 
 
 def _in_turn(service: LocalService, context: CallContext) -> object:
@@ -219,22 +285,22 @@ class Streams:
         self._home.require_call(wish.identity, handle)
         source, again = self._source(key)
         until_ns = time.monotonic_ns() + int(LEASE_S * 1e9)
-        if source.wish(listener, structs.replace(wish, until_ns=until_ns)):
+        in_key = float(f"{wish.hz:g}")  # what differs less than that is one rate
+        if source.wish(listener, structs.replace(wish, hz=in_key, until_ns=until_ns)):
             again(time.monotonic_ns())
 
     def _source(self, key: ServiceKey) -> tuple[Source, Callable[[int], None]]:
         known = self._sources.get(key)
         if known is not None:
             return known
-        publisher = self._transport.publish(stream_key(key), droppable=True)
-        made = Source(key, lambda: self._services(key), publisher, self._new_id)
+        made = Source(key, self._services, self._transport, self._new_id)
         with self._lock:
             known = self._sources.get(key)
             if known is None:
                 due = self._clockwork.due(made.tick)
                 known = self._sources[key] = (made, due.at)
-                return known
-        publisher.close()
+        if known[0] is made:
+            made.show()
         return known
 
     def unlisten(self, listener: Listener) -> None:
