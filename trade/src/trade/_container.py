@@ -135,7 +135,7 @@ class Container(Hosting, Streaming, Tracing, Guarding, Bordering):
                 self._denied_hook,
             )
             self._registry.listen(self._hooks.changed)
-            self._spans = new_spans(self.address, self.session, self._table)
+            self._spans = new_spans(self.address, self.session, self._table, self._settings, leaving)
             self._trace_here(self._settings.trace)
             self._told_of_ends.append(self._hooks.session_ended)
             self._hook_numbers = itertools.count(1)

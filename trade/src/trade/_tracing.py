@@ -2,6 +2,7 @@
 
 import itertools
 from collections.abc import Iterable, Sequence
+from contextlib import ExitStack
 from typing import Final
 
 from msgspec import Struct
@@ -13,6 +14,8 @@ from trade._locks import LockTable
 from trade._logbook import LogLine, listen
 from trade._looking import Looking
 from trade._many import Outcome
+from trade._otlp import open_export
+from trade._settings import Settings
 from trade._spans import Span, Spans
 from trade._system import DOMAIN
 from trade._wire import Address, ServiceKey, Token
@@ -154,15 +157,24 @@ class Tracing(Looking):
         self._caller.spans = spans
 
 
-def new_spans(own: Address, session: str, table: LockTable) -> Spans:
-    """For a container; its process keeps what it logs from now on."""
+def new_spans(own: Address, session: str, table: LockTable, settings: Settings, leaving: ExitStack) -> Spans:
+    """For a container; its process keeps what it logs from now on.
+
+    Raises:
+        ConfigurationError: it is to send them to a collector, and what that takes is not installed.
+    """
     listen()
+    tell = None
+    if settings.otlp:
+        names = {"service.name": own.container, "service.namespace": settings.system, "service.instance.id": own.epoch}
+        tell, close = open_export(settings.otlp, names)
+        leaving.callback(close)
 
     def purposes(tokens: Sequence[Token]) -> list[str]:
         held = (info.holder for info in table.infos() if info.token in tokens)
         return [f"{holder.purpose} ({holder.owner})" if holder.purpose else holder.owner for holder in held]
 
-    return Spans(own.container, own.identity, session, purposes)
+    return Spans(own.container, own.identity, session, purposes, tell)
 
 
 def granted(outcomes: Iterable[Outcome]) -> list[Outcome]:
