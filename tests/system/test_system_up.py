@@ -2,6 +2,7 @@
 
 import json
 import re
+import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -11,13 +12,14 @@ import psutil
 import pytest
 
 import trade
-from system.conftest import ROOT
+from system.conftest import ROOT, Program
 from system.sshd import Sshd
 from trade import where
 from trade.errors import LockLost
 from waiting import wait_until
 
 Command = Callable[..., subprocess.CompletedProcess[str]]
+Run = Callable[..., Program]
 TRADE = Path(sys.executable).parent / "trade"
 
 
@@ -183,6 +185,44 @@ def test_who_is_up_elsewhere_but_not_seen_is_ended_there(home: Deployment) -> No
     told, ended = home.say("up", "--wait", "1")
     assert "not seen" in ended.stderr
     assert [(one["container"], one["state"]) for one in told[1:]] == [("eyes", "ended"), ("rosie", "ended")]
+    wait_until(home.gone)
+
+
+def test_robots_and_rules_run_on_another_host_and_gateways_here(
+    home: Deployment, system: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = home.file.parent
+    (folder / "care.toml").write_text((ROOT / "examples" / "care.toml").read_text())
+    monkeypatch.setenv("TRADE_CREDENTIALS", "a:b")
+    laboratory = 'insecure_lan = true\ncredentials = "a:b"\n'
+    (folder / "gateway.toml").write_text(
+        f'system = "{system}"\nname = "door"\n{laboratory}[share.clinic]\nsystem = "clinic"\ncredentials = "c:d"\n'
+    )
+    there = folder / "trade"
+    there.write_text(f'#!/bin/sh\nTRADE_CREDENTIALS=a:b exec "{TRADE}" "$@"\n')
+    there.chmod(0o755)
+    far = f'host = "robot"\ncommand = "{there}"\n'
+    home.file.write_text(
+        f'[system]\nname = "{system}"\n[container.door]\ngateway = "gateway.toml"\n'
+        f'[container.rosie]\n{far}robot = "{folder}/head.toml"\nsim = true\n'
+        f'[container.care]\n{far}rules = "{folder}/care.toml"\nafter = ["rosie"]\n'
+    )
+    assert home.states("up") == dict.fromkeys(("door", "rosie", "care"), "started")
+    assert home.states("status") == dict.fromkeys(("door", "rosie", "care"), "up")
+    assert set(home.states("down").values()) == {"ended"}
+    wait_until(home.gone)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_who_interrupts_has_what_was_begun_taken_down_again(
+    home: Deployment, sshd: Sshd, run: Run, number: signal.Signals
+) -> None:
+    words = ("-m", "trade_gateway", "system", "up", home.file, "--ssh-config", sshd.config, "--json")
+    up = run(*words)
+    assert up.json()["container"] == "rosie"
+    up.signal(number)
+    up.wait_for(lambda told: (told["container"], told["state"]) == ("rosie", "ended"))
+    assert up.wait() != 0
     wait_until(home.gone)
 
 

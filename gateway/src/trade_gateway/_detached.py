@@ -69,6 +69,9 @@ def detached(words: Sequence[str], settings: Settings, environment: Mapping[str,
         said = log.read_text(errors="replace").strip()[-500:] or f"nothing; it was not up within {_UP_S:g} s"
         here, why = socket.gethostname(), "it did not come up"
         raise CannotStart(host=here, container=name, reason=why, said=said, remedy=f"its log is {log}") from None
+    except BaseException:  # nobody waits for it any more
+        _end(process)
+        raise
 
 
 def ready(container: Container) -> dict[str, object]:

@@ -13,6 +13,7 @@ from trade_gateway._output import Output, UsageError
 from trade_gateway._system_choice import choice_of
 from trade_gateway._system_file import SystemPlan, read_system_file
 from trade_gateway._system_up import Bringing, Told, check_hosts
+from trade_gateway._up import leaving
 
 app = typer.Typer(no_args_is_help=True, help="A whole system from one file, over its hosts.")
 
@@ -45,8 +46,9 @@ def up(
         check_hosts(plan, plan.parts, ssh_config)
         _say_order(out, plan)
         return
-    with Container(plan.settings) as member:
-        Bringing(plan, member, ssh_config=ssh_config, wait_s=wait, tell=_teller(out)).up(keep=keep)
+    with leaving() as interrupted, Container(plan.settings) as member:
+        bringing = Bringing(plan, member, ssh_config=ssh_config, wait_s=wait, tell=_teller(out))
+        bringing.up(keep=keep, interrupted=interrupted)
     out.say(f"[bold green]system {escape(plan.settings.system)} is up[/]; to end it: trade system down {file}")
 
 

@@ -66,13 +66,15 @@ class Bringing:
         self._wait_s = wait_s
         self._tell = tell
 
-    def up(self, *, keep: bool) -> None:
+    def up(self, *, keep: bool, interrupted: threading.Event) -> None:
         """Start what is not up, in order; leave what is. What fails has what this began taken down again.
 
         Args:
             keep: leave what was begun as it is.
+            interrupted: ends it likewise, once the container that is being started is up and known by its process.
 
         Raises:
+            KeyboardInterrupt: it was interrupted.
             CannotStart, ConfigurationError: with the reason; before anything is started if a host is out of reach.
             TradeError: an object could not be made.
         """
@@ -81,6 +83,8 @@ class Bringing:
         try:
             for part in self._plan.parts:
                 self._bring(part, began)
+                if interrupted.is_set():
+                    raise KeyboardInterrupt
         except BaseException:
             if not keep:
                 self._undo(began)

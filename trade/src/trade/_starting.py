@@ -118,7 +118,8 @@ def missing_there(
     ended = _run(host, name, ssh_words(host, ssh_config, words))
     if ended.returncode != 0:
         raise _refusal(host, name, command[0], words, ended)
-    return ended.stdout.splitlines()
+    told = ended.stdout.splitlines()  # and whatever its shell says by itself
+    return [file for file in files if file in told]
 
 
 def end_there(host: str, name: str, pid: int, ssh_config: Path | None) -> None:
@@ -147,7 +148,13 @@ def ssh_words(host: str, ssh_config: Path | None, words: Sequence[str]) -> list[
 def _run(host: str, name: str, words: Sequence[str]) -> "subprocess.CompletedProcess[str]":
     try:
         return subprocess.run(  # noqa: S603 - the host is checked, and the words are quoted for its shell
-            words, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=LONGEST_S, check=False
+            words,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            timeout=LONGEST_S,
+            check=False,
+            start_new_session=True,  # Ctrl-C is for whoever starts it, who is told what came of it
         )
     except FileNotFoundError:
         remedy = "install it (Debian: apt-get install openssh-client)"
