@@ -49,7 +49,7 @@ check: $(UV) ## lint, formatting, types, import rules, isolated install of the c
 	@$(RUN) basedpyright
 	@$(RUN) lint-imports
 	@$(UV) run --isolated --no-project --with ./trade python -W error -c 'import trade, sys; \
-	  foreign = {"serial", "cryptography", "dynamixel_sdk", "typer", "trade_drivers"} & set(sys.modules); \
+	  foreign = {"serial", "cryptography", "dynamixel_sdk", "typer", "trade_drivers", "opentelemetry"} & set(sys.modules); \
 	  sys.exit(f"the core alone imports {foreign}" if foreign else 0)'
 
 bench: $(UV) ## speed as ratios against peers in the same run

@@ -16,6 +16,7 @@ from typing import Any
 import pytest
 
 from system.networks import Networks, why_not
+from system.sshd import Sshd, why_no_sshd
 from trade_hil_sim import SimProcess, events, writes
 from waiting import PATIENCE_S, wait_until
 
@@ -226,3 +227,24 @@ def benches(system: str, tmp_path: Path, run: Callable[..., Program]) -> Iterato
 @pytest.fixture
 def bench(benches: Callable[..., Bench]) -> Bench:
     return benches(ROSIES_HEAD)
+
+
+@pytest.fixture
+def sshd(system: str, tmp_path: Path) -> Iterator[Sshd]:
+    """This host as another one, where Python finds a module ``sight``."""
+    missing = why_no_sshd()
+    if missing:
+        if os.environ.get("CI") == "true":
+            pytest.fail(missing)
+        pytest.skip(missing)
+    folder = tmp_path / "ssh"
+    folder.mkdir()
+    package = tmp_path / "packages"
+    package.mkdir()
+    (package / "sight.py").write_text(
+        "from trade import service\nclass Eye:\n    @service(effect='read')\n    def see(self) -> str: return 'a cat'\n"
+    )
+    names = ("TRADE_RUNTIME_DIR", "TRADE_STATE_DIR")
+    running = Sshd(folder, {**{name: os.environ[name] for name in names}, "PYTHONPATH": str(package)})
+    yield running
+    running.close()

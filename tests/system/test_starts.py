@@ -2,7 +2,6 @@
 
 import contextlib
 import json
-import os
 import shlex
 import socket
 import subprocess
@@ -14,33 +13,13 @@ import psutil
 import pytest
 
 import trade
-from system.sshd import Sshd, why_no_sshd
+from system.sshd import Sshd
 from trade import _starting, where
 from trade.errors import CannotStart, ConfigurationError
 from waiting import wait_until
 
 Command = Callable[..., subprocess.CompletedProcess[str]]
 HERE = (sys.executable, "-m", "trade_gateway")
-
-
-@pytest.fixture
-def sshd(system: str, tmp_path: Path) -> Iterator[Sshd]:
-    missing = why_no_sshd()
-    if missing:
-        if os.environ.get("CI") == "true":
-            pytest.fail(missing)
-        pytest.skip(missing)
-    folder = tmp_path / "ssh"
-    folder.mkdir()
-    package = tmp_path / "packages"
-    package.mkdir()
-    (package / "sight.py").write_text(
-        "from trade import service\nclass Eye:\n    @service(effect='read')\n    def see(self) -> str: return 'a cat'\n"
-    )
-    names = ("TRADE_RUNTIME_DIR", "TRADE_STATE_DIR")
-    running = Sshd(folder, {**{name: os.environ[name] for name in names}, "PYTHONPATH": str(package)})
-    yield running
-    running.close()
 
 
 @contextlib.contextmanager
@@ -152,8 +131,8 @@ def test_what_is_no_host_never_reaches_ssh(system: str, host: str, monkeypatch: 
 
 def test_words_reach_the_far_shell_as_they_are() -> None:
     hostile = "a b; $(reboot) 'x'"
-    words = _starting._words("eyes", "lab", [hostile], [], ["trade"], {"TRADE_CONNECT": hostile})
+    words = [*_starting._assigned({"TRADE_CONNECT": hostile}), "trade", "--allow", hostile]
     assert shlex.split(_starting.ssh_words("robot", None, words)[-1]) == words
     assert words[:2] == ["env", f"TRADE_CONNECT={hostile}"]
     with pytest.raises(ConfigurationError, match="is no name of a variable"):
-        _starting._words("eyes", "lab", [], [], ["trade"], {"A;B": "1"})
+        _starting._assigned({"A;B": "1"})

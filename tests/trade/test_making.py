@@ -11,6 +11,7 @@ from trade.errors import (
     AccessDenied,
     CannotInstantiate,
     ConfigurationError,
+    InUse,
     NoSuchClass,
     NoSuchService,
     NotInstantiable,
@@ -226,6 +227,26 @@ def test_a_container_ends_at_rest_when_it_is_told_to_and_who_asked_is_answered(
     wait_until(lambda: events[2:] == ["closed"])
     wait_until(lambda: not maker.healthy())
     assert "container maker is terminated by chief: the cart goes home" in caplog.text
+
+
+def test_what_is_to_end_only_at_rest_is_left_while_it_moves_or_is_locked(
+    asker: Container, maker: Container, memory: MemorySystem, events: list[str]
+) -> None:
+    handles = {one.name: one for one in ask(asker, "instantiate", "workshop:Wheel", (), ["cart"])}
+    memory.settle()
+    handles["turn"]()
+    with pytest.raises(InUse, match="wheel moves"):
+        ask(asker, "terminate_container", "", True)
+    handles["stop"]()
+    with (
+        asker.lock(where(group="cart"), purpose="parade"),
+        pytest.raises(InUse, match=r"wheel is locked by .*asker for 'parade'"),
+    ):
+        ask(asker, "terminate_container", "", True)
+    assert events == ["turns", "stopped"]
+    assert maker.healthy()
+    assert list(ask(asker, "terminate_container", "", True)) == []
+    wait_until(lambda: not maker.healthy())
 
 
 def test_to_end_it_twice_is_to_end_it_once(maker: Container) -> None:

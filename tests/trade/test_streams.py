@@ -297,7 +297,9 @@ def test_rates_that_look_alike_in_keys_are_one(apart: Two) -> None:
 
 
 def test_a_source_is_not_put_at_any_number_of_rates(apart: Two) -> None:
-    source = Source(apart.service("count").key, lambda _: None, apart.there._parts.transport, itertools.count(1).__next__)
+    source = Source(
+        apart.service("count").key, lambda _: None, apart.there._parts.transport, itertools.count(1).__next__
+    )
     for rate in range(64):
         source.wish(("session", f"{rate}"), Wish("tester", rate + 1, on_change=False))
     with pytest.raises(ConfigurationError, match="64 different rates"):

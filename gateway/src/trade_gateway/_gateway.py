@@ -13,6 +13,7 @@ import typer
 from trade import Container, Settings
 from trade.errors import TradeError
 from trade.policies import EVERYTHING
+from trade_gateway._detached import Detach, detach_now, ready
 from trade_gateway._gateway_file import Plan, digest, named_digest, read_gateway_file
 from trade_gateway._guests import Guests, opened
 from trade_gateway._list import Json
@@ -25,6 +26,7 @@ _LOOK_EVERY_S: Final = 1.0
 def gateway(
     file: Annotated[Path, typer.Argument(metavar="GATEWAY.toml", help="The gateway file.")],
     check: Annotated[bool, typer.Option("--check", help="Only say whether the file is right.")] = False,
+    detach: Detach = False,
     as_json: Json = False,
 ) -> None:
     """Carry calls between networks that have no way to each other, as far as the file and its policy allow.
@@ -41,6 +43,9 @@ def gateway(
     if check:
         out.say(f"{file} is right")
         _say_what_crosses(out, plan)
+        return
+    if detach:
+        detach_now(out, plan.settings)
         return
     with leaving() as asked_to_leave, hangups() as hangup:
         seen = digest(file)
@@ -147,9 +152,7 @@ def _say_ready(out: Output, running: Gateway, plan: Plan) -> None:
         networks = {name: None if settings.exports is None else settings.exports[name] for name in settings.bridge}
         out.data(
             {
-                "ready": True,
-                "container": running.container.name,
-                "system": settings.system,
+                **ready(running.container),
                 "identity": settings.identity,
                 "listen": settings.listen,
                 "networks": networks,

@@ -11,11 +11,12 @@ from rich.markup import escape
 from trade import Container, where
 from trade.errors import TradeError
 from trade.rules import GROUP, Did, Firing, Rehearsal, RuleInfo, Rules, read_rules, rehearse
+from trade_gateway._detached import Detach, detach_now, ready
 from trade_gateway._gateway import hangups
 from trade_gateway._list import Json
 from trade_gateway._output import Output, complain
 from trade_gateway._system_choice import choice_of, visitor
-from trade_gateway._up import leaving
+from trade_gateway._up import leaving, refuse_twice
 
 _LOOK_EVERY_S: Final = 0.5
 
@@ -35,6 +36,7 @@ def run(
     name: Annotated[str, typer.Option(help="Name of the container; its identity's rights are those of the rules.")] = (
         "rules"
     ),
+    detach: Detach = False,
     as_json: Json = False,
 ) -> None:
     """Run the rules of a file until told to leave; a line tells of every firing.
@@ -43,13 +45,18 @@ def run(
 
     For example: trade rules run examples/rules.toml --audit rules.jsonl
     """
-    out, told = Output(as_json=as_json), queue.SimpleQueue[Firing]()
+    out, told, settings = Output(as_json=as_json), queue.SimpleQueue[Firing](), choice_of(context).settings(name)
+    if detach:
+        detach_now(out, settings)
+        return
     with (
         leaving() as asked_to_leave,
         hangups() as hangup,
-        Container(choice_of(context).settings(name)) as container,
+        Container(settings) as container,
         Rules(container, file, audit=audit, dry_run=dry_run, tell=told.put) as rules,
     ):
+        container.terminating.close = asked_to_leave.set
+        refuse_twice(container, "trade rules run")
         seen = _contents(file)
         _say_ready(out, container, rules)
         while not asked_to_leave.wait(_LOOK_EVERY_S):
@@ -73,7 +80,7 @@ def _contents(file: Path) -> bytes | None:
 def _say_ready(out: Output, container: Container, rules: Rules) -> None:
     names = [info.name for info in rules.rules()]
     if out.as_json:
-        out.data({"ready": True, "container": container.name, "system": container.settings.system, "rules": names})
+        out.data({**ready(container), "rules": names})
     out.say(f"[bold green]{container.name} is up[/] as {escape(container.address.identity)}: {', '.join(names)}")
     out.say("Ctrl-C leaves; the file is read again when it changes")
 

@@ -14,6 +14,7 @@ from trade import Container
 from trade.errors import ConfigurationError
 from trade_drivers import attach, load
 from trade_drivers.robotfile import Robot
+from trade_gateway._detached import Detach, detach_now, ready
 from trade_gateway._faults import FaultWatch
 from trade_gateway._list import Json
 from trade_gateway._output import Output, UsageError
@@ -28,6 +29,7 @@ def up(
     sim: Annotated[bool, typer.Option("--sim", help="Simulate the devices: the same bytes, no hardware.")] = False,
     sim_log: Annotated[Path | None, typer.Option(help="With --sim: where to write the log of all bytes.")] = None,
     name: Annotated[str | None, typer.Option(help="Name of the container; by default the robot's.")] = None,
+    detach: Detach = False,
     as_json: Json = False,
 ) -> None:
     """Bring a robot up and keep it up; Ctrl-C or SIGTERM leaves it as its file says (hold or relax).
@@ -38,6 +40,9 @@ def up(
         raise UsageError(where="--sim-log", problem="is the log of the simulator; it needs --sim")
     out = Output(as_json=as_json)
     robot = load(robot_file)
+    if detach:
+        detach_now(out, choice_of(context).settings(name or robot.name))
+        return
     with ExitStack() as stack:
         asked_to_leave = stack.enter_context(leaving())
         simulation = stack.enter_context(_simulation(robot_file, sim_log)) if sim else None
@@ -112,9 +117,8 @@ def _say_attaching(out: Output, robot: Robot, ports: dict[str, str] | None) -> N
 def _say_ready(out: Output, robot: Robot, container: Container, simulation: Any) -> None:
     mine = [handle for handle in container.services() if handle.local and "trade" not in handle.groups]
     if out.as_json:
-        ready = {"ready": True, "robot": robot.name, "container": container.name, "system": container.settings.system}
         extra = {"control": str(simulation.control_path)} if simulation else {}
-        out.data({**ready, **extra, "services": [handle.label for handle in mine]})
+        out.data({**ready(container), "robot": robot.name, **extra, "services": [handle.label for handle in mine]})
         return
     out.say(f"[bold green]{robot.name} is up[/]: {len(mine)} services in container {container.name}")
     example = next((handle.label for handle in mine if handle.name == "state"), None)

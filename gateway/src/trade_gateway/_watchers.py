@@ -77,7 +77,7 @@ def hooks(
             container.detach_hook(detach)
             out.say(f"detached: {escape(detach)}")
             return
-        found = container.hooks()
+        found = [info for info in container.hooks() if info.container != container.name]
     if as_json:
         out.data(found)
     elif not found:

@@ -21,6 +21,7 @@ from trade_gateway import (
     _rules,
     _start,
     _stream,
+    _system_commands,
     _trace,
     _up,
     _watchers,
@@ -61,6 +62,7 @@ app.command("profile")(_profile.profile)
 app.add_typer(_pki_commands.app, name="pki")
 app.add_typer(_policy.app, name="policy")
 app.add_typer(_rules.app, name="rules")
+app.add_typer(_system_commands.app, name="system")
 
 
 def _version(wanted: bool) -> None:

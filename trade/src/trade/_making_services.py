@@ -32,7 +32,8 @@ class MakingServices:
         self._of_here.terminate(service)
 
     @service
-    def terminate_container(self, reason: str = "") -> list[str]:
+    def terminate_container(self, reason: str = "", only_at_rest: bool = False) -> list[str]:
         """End this container: what moves stops, its services are withdrawn; what could not be stopped, and why."""
         call = current_call()
-        return self._of_here.terminate_container(reason, who="itself" if call is None else call.caller)
+        who = "itself" if call is None else call.caller
+        return self._of_here.terminate_container(reason, only_at_rest=only_at_rest, who=who)

@@ -27,6 +27,7 @@ from trade._locking import Locking
 from trade._locks import LockTable
 from trade._making import Making
 from trade._notifications import Notifier
+from trade._otlp import open_export
 from trade._providers import Providers
 from trade._reach import Reach
 from trade._registry import Record, Registry
@@ -113,7 +114,7 @@ class Parts:
             self.registry.listen(self.hooks.changed)
             self.told_of_ends.append(self.hooks.session_ended)
             self.hook_numbers = itertools.count(1)
-            self.spans = new_spans(address, session, self.locks)
+            self.spans = new_spans(address, session, self.locks, open_export(settings, address, leaving))
             self.trace(settings.trace)
             self.streams = Streams(home, self.transport, self.providers.service, self.clockwork, self.caller.new_id)
             self.registry.listen(self.streams.changed)

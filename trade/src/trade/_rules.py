@@ -267,7 +267,7 @@ class Rules:
         self._standing = {name: old[name] if name in kept else _Standing(self, name, rules[name]) for name in rules}
         for name in old.keys() - kept:
             old[name].end()
-        for name in rules.keys() - kept:
+        for name in (name for name in rules if name not in kept):
             self.causes.forget(name)
             self._standing[name].begin()
         self._show_health()

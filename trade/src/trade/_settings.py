@@ -11,6 +11,7 @@ from math import inf
 from pathlib import Path
 from types import MappingProxyType
 from typing import Final
+from urllib.parse import SplitResult, urlsplit
 
 from trade._endpoints import Endpoint, dialled_from_here
 from trade._policies import EVERYTHING
@@ -38,6 +39,7 @@ _VARIABLES: Final = (
     "TRADE_RUNTIME_DIR",
     "TRADE_STATE_DIR",
     "TRADE_TRACE",
+    "TRADE_OTLP",
 )
 _CERTIFY: Final = "set TRADE_TLS to the folder that trade pki issue made"
 
@@ -88,12 +90,16 @@ class Settings:
     """Where what must outlive a process is kept, such as open e-stops; none: nowhere."""
     trace: bool = False
     """Note calls from the start; see `Container.set_tracing`."""
+    otlp: str = ""
+    """URL of a collector that gets what is noted, such as ``http://127.0.0.1:4318``; none: nobody does. Takes the extra
+    ``trade-core[otel]``."""
 
     def __post_init__(self) -> None:
         for what, text in (("system", self.system), ("identity", self.identity), ("container", self.container)):
             if not is_chunk(text) or text.strip(".") == "":  # the system names a folder, too
                 problem = f"{text!r} is no name for a {what}; use letters, digits, . _ - (at most 80)"
                 raise ConfigurationError(where=what, problem=problem)
+        self._check_collector(urlsplit(self.otlp))
         certificate = self.certificate()
         for endpoint in self.listen:
             self._check_reach(f"listen {endpoint}", Endpoint.read(endpoint))
@@ -126,6 +132,16 @@ class Settings:
         problem = self._refused_plain(endpoint) if self.tls is None else self._refused_certified(endpoint)
         if problem:
             raise ConfigurationError(where=where, problem=problem)
+
+    def _check_collector(self, url: SplitResult) -> None:
+        if not self.otlp:
+            return
+        if url.scheme not in ("http", "https") or not url.hostname:
+            problem = f"{self.otlp!r} is no URL of a collector; write http://127.0.0.1:4318"
+            raise ConfigurationError(where="TRADE_OTLP", problem=problem)
+        if url.scheme == "http" and not (Endpoint("tcp", url.hostname, 0).loopback or self.insecure_lan):
+            problem = f"who calls what would cross the network for all to read; write https://{url.netloc}"
+            raise ConfigurationError(where="TRADE_OTLP", problem=problem)
 
     def _refused_plain(self, endpoint: Endpoint) -> str:
         if endpoint.protocol == "tls":
@@ -198,8 +214,8 @@ class Settings:
         The environment has ``TRADE_SYSTEM``, ``TRADE_IDENTITY``, ``TRADE_CONTAINER``, ``TRADE_LISTEN`` and
         ``TRADE_CONNECT`` (comma-separated), ``TRADE_CREDENTIALS`` (``user:password``), ``TRADE_TLS`` (a folder),
         ``TRADE_POLICY`` (a file), ``TRADE_INSECURE_LAN`` (``1``), ``TRADE_BRIDGE`` (comma-separated), ``TRADE_LOCK``
-        (set by ``trade lock``), ``TRADE_INSTANTIABLE`` (comma-separated), ``TRADE_TRACE`` (``1``),
-        ``TRADE_RUNTIME_DIR`` and ``TRADE_STATE_DIR`` (else the user's folder for state).
+        (set by ``trade lock``), ``TRADE_INSTANTIABLE`` (comma-separated), ``TRADE_TRACE`` (``1``), ``TRADE_OTLP`` (a
+        URL), ``TRADE_RUNTIME_DIR`` and ``TRADE_STATE_DIR`` (else the user's folder for state).
         Others that begin with ``TRADE_`` are warned of.
         """
         _warn_of_unknown(environment)
@@ -223,7 +239,8 @@ class Settings:
             lock=environment.get("TRADE_LOCK", ""),
             instantiable=tuple(_split(environment, "TRADE_INSTANTIABLE") if instantiable is None else instantiable),
             state_dir=_state_dir(environment),
-            trace=environment.get("TRADE_TRACE") == "1",
+            trace=environment.get("TRADE_TRACE") == "1" or bool(environment.get("TRADE_OTLP")),
+            otlp=environment.get("TRADE_OTLP", ""),
         )
 
 

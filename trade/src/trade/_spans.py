@@ -49,6 +49,8 @@ class Span(Struct, frozen=True, kw_only=True):
     """The locks it ran under in that container: what for, and whose."""
     events: tuple[tuple[float, str], ...] = ()
     """What was noted of it, and how many seconds after it began."""
+    remote: bool = False
+    """Whether it was ``served`` for another container."""
 
     @property
     def ids(self) -> tuple[int, ...]:
@@ -64,12 +66,21 @@ def traceable(key: ServiceKey) -> bool:
 class Spans:
     """Owns what one container noted."""
 
-    def __init__(self, container: str, identity: str, session: str, locks: Callable[[Sequence[Token]], list[str]]):
+    def __init__(
+        self,
+        container: str,
+        identity: str,
+        session: str,
+        locks: Callable[[Sequence[Token]], list[str]],
+        tell: Callable[[Span], None] | None = None,
+    ) -> None:
         self._container = container
         self._identity = identity
         self._session = session
         self.locks = locks
         """What those tokens stand for here."""
+        self._tell = tell
+        """Told of each span."""
         self._lock = Lock()
         self._kept: deque[Span] = deque(maxlen=MOST)
 
@@ -104,7 +115,8 @@ class Spans:
         error: BaseException | None,
     ) -> None:
         """A call to this container has ended."""
-        queued_ns = 0 if context.ongoing is None else context.ongoing.queued_ns
+        ongoing = context.ongoing
+        queued_ns = 0 if ongoing is None else ongoing.queued_ns
         self._keep(
             Span(
                 call_id=context.id,
@@ -120,12 +132,15 @@ class Spans:
                 outcome=_outcome(error),
                 locks=tuple(locks),
                 events=tuple(((at_ns - began_ns) / 1e9, text) for at_ns, text in context.events or ()),
+                remote=ongoing is not None and ongoing.call is not None,
             )
         )
 
     def _keep(self, span: Span) -> None:
         with self._lock:
             self._kept.append(span)
+        if self._tell is not None:
+            self._tell(span)
 
     def kept(self, calls: Collection[int] | None = None) -> list[Span]:
         """What is kept, oldest first; of these calls and those that they led to, or of all."""
@@ -169,12 +184,12 @@ def _outcome(error: BaseException | None) -> str:
     return "ok" if error is None else type(error).__name__
 
 
-def new_spans(own: Address, session: str, table: "LockTable") -> Spans:
-    """For a container; its process keeps what it logs from now on."""
+def new_spans(own: Address, session: str, table: "LockTable", tell: Callable[[Span], None] | None) -> Spans:
+    """For a container, which tells of each as well, if asked; its process keeps what it logs from now on."""
     listen()
 
     def purposes(tokens: Sequence[Token]) -> list[str]:
         held = (info.holder for info in table.infos() if info.token in tokens)
         return [f"{holder.purpose} ({holder.owner})" if holder.purpose else holder.owner for holder in held]
 
-    return Spans(own.container, own.identity, session, purposes)
+    return Spans(own.container, own.identity, session, purposes, tell)

@@ -79,37 +79,62 @@ def start(
     ssh_config: Path | None = None,
 ) -> Started:
     """See `System.start_container`. Returns when it is up there."""
-    words = _words(name, system, allow, connect, command, environment or {})
-    return _read(host, name, command[0], words, _run(host, name, ssh_words(host, ssh_config, words)))
+    dialled = [word for endpoint in connect for word in ("--connect", endpoint)]
+    allowed = [word for pattern in allow for word in ("--allow", pattern)]
+    words = ["--system", system, *dialled, "container", "--name", name, *allowed]
+    return launch(host, name, words, command=command, environment=environment, ssh_config=ssh_config)
 
 
-def _words(
+def launch(
+    host: str,
     name: str,
-    system: str,
-    allow: Sequence[str],
-    connect: Sequence[str],
-    command: Sequence[str],
-    environment: Mapping[str, str],
+    words: Sequence[str],
+    *,
+    command: Sequence[str] = ("trade",),
+    environment: Mapping[str, str] | None = None,
+    ssh_config: Path | None = None,
+) -> Started:
+    """Run ``trade WORDS --detach`` on another host; returns when that says that the container is up.
+
+    Raises:
+        CannotStart: with the reason, and what to do.
+        ConfigurationError: what cannot be a host or a variable.
+    """
+    there = [*_assigned(environment or {}), *command, *words, "--detach", "--json"]
+    return _read(host, name, command[0], there, _run(host, name, ssh_words(host, ssh_config, there)))
+
+
+def missing_there(
+    host: str, name: str, command: Sequence[str], files: Sequence[str], ssh_config: Path | None
 ) -> list[str]:
+    """Those of the files that the host does not have, or does not let this user read.
+
+    Raises:
+        CannotStart: the host, or ``trade`` on it, is out of reach.
+        ConfigurationError: what cannot be a host.
+    """
+    script = f'{shlex.join(command)} --version >&2 && for one; do [ -r "$one" ] || echo "$one"; done'
+    words = ["sh", "-c", script, "sh", *files]
+    ended = _run(host, name, ssh_words(host, ssh_config, words))
+    if ended.returncode != 0:
+        raise _refusal(host, name, command[0], words, ended)
+    told = ended.stdout.splitlines()  # and whatever its shell says by itself
+    return [file for file in files if file in told]
+
+
+def end_there(host: str, name: str, pid: int, ssh_config: Path | None) -> None:
+    """Have a process leave that was started there and is not in the system. Raises CannotStart if ssh fails."""
+    words = ["kill", str(pid)]
+    ended = _run(host, name, ssh_words(host, ssh_config, words))
+    if ended.returncode == _SSH_FAILED:
+        raise _refusal(host, name, words[0], words, ended)
+
+
+def _assigned(environment: Mapping[str, str]) -> list[str]:
     for variable in environment:
         if not _VARIABLE.fullmatch(variable):
             raise ConfigurationError(where="start_container", problem=f"{variable!r} is no name of a variable")
-    before = ["env", *(f"{key}={value}" for key, value in environment.items())] if environment else []
-    dialled = [word for endpoint in connect for word in ("--connect", endpoint)]
-    allowed = [word for pattern in allow for word in ("--allow", pattern)]
-    return [
-        *before,
-        *command,
-        "--system",
-        system,
-        *dialled,
-        "container",
-        "--name",
-        name,
-        *allowed,
-        "--detach",
-        "--json",
-    ]
+    return ["env", *(f"{key}={value}" for key, value in environment.items())] if environment else []
 
 
 def ssh_words(host: str, ssh_config: Path | None, words: Sequence[str]) -> list[str]:
@@ -123,7 +148,13 @@ def ssh_words(host: str, ssh_config: Path | None, words: Sequence[str]) -> list[
 def _run(host: str, name: str, words: Sequence[str]) -> "subprocess.CompletedProcess[str]":
     try:
         return subprocess.run(  # noqa: S603 - the host is checked, and the words are quoted for its shell
-            words, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=LONGEST_S, check=False
+            words,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            timeout=LONGEST_S,
+            check=False,
+            start_new_session=True,  # Ctrl-C is for whoever starts it, who is told what came of it
         )
     except FileNotFoundError:
         remedy = "install it (Debian: apt-get install openssh-client)"
@@ -136,13 +167,21 @@ def _run(host: str, name: str, words: Sequence[str]) -> "subprocess.CompletedPro
 def _read(
     host: str, name: str, command: str, words: Sequence[str], ended: "subprocess.CompletedProcess[str]"
 ) -> Started:
-    said = " ".join(ended.stderr.split())[-500:]
-    if ended.returncode == 0:
-        try:
-            return msgspec.json.decode(ended.stdout.strip().splitlines()[-1], type=Started)
-        except (msgspec.DecodeError, IndexError):
-            reason, remedy = "no answer", f"it said {ended.stdout[-200:]!r}; does its shell print something by itself?"
-    elif ended.returncode == _SSH_FAILED:
+    if ended.returncode != 0:
+        raise _refusal(host, name, command, words, ended)
+    try:
+        return msgspec.json.decode(ended.stdout.strip().splitlines()[-1], type=Started)
+    except (msgspec.DecodeError, IndexError):
+        remedy = f"it said {ended.stdout[-200:]!r}; does its shell print something by itself?"
+        raise CannotStart(
+            host=host, container=name, reason="no answer", said=_complaint(ended), remedy=remedy
+        ) from None
+
+
+def _refusal(
+    host: str, name: str, command: str, words: Sequence[str], ended: "subprocess.CompletedProcess[str]"
+) -> CannotStart:
+    if ended.returncode == _SSH_FAILED:
         reason, remedy = next(
             ((reason, remedy) for pattern, reason, remedy in _REASONS if pattern.search(ended.stderr)),
             ("ssh failed", f"try `ssh {host} true`"),
@@ -152,4 +191,8 @@ def _read(
         remedy = f"{command!r} is not found by its shell; install trade-gateway there, or give the path of its `trade`"
     else:
         reason, remedy = "it did not come up", f"try `ssh {host} {shlex.join(words)}`"
-    raise CannotStart(host=host, container=name, reason=reason, said=said, remedy=remedy)
+    return CannotStart(host=host, container=name, reason=reason, said=_complaint(ended), remedy=remedy)
+
+
+def _complaint(ended: "subprocess.CompletedProcess[str]") -> str:
+    return " ".join(ended.stderr.split())[-500:]

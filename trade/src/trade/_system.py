@@ -57,7 +57,7 @@ class _Making(Protocol):
 
 
 class _Terminating(Protocol):
-    def begin(self, reason: str, who: str) -> list[str]: ...
+    def begin(self, reason: str, who: str, *, only_at_rest: bool = False) -> list[str]: ...
 
 
 class _Member(Protocol):
@@ -257,19 +257,23 @@ class System:
         """
         self._member().making.terminate(service)
 
-    def terminate_container(self, reason: str = "", *, who: str = "itself") -> list[str]:
+    def terminate_container(self, reason: str = "", *, only_at_rest: bool = False, who: str = "itself") -> list[str]:
         """End this container: what moves stops, its services are withdrawn. Does not wait for its end.
 
         The process goes on, unless it is one of ``trade container``, ``trade up`` or ``trade gateway``.
 
         Args:
             reason: why, for people; it is logged.
+            only_at_rest: not while something of it is locked or moves.
             who: asks for it; likewise.
 
         Returns:
             What could not be stopped, and why; it ends all the same.
+
+        Raises:
+            InUse: it was to end ``only_at_rest``, and something is locked or moves.
         """
-        return self._member().terminating.begin(reason, who)
+        return self._member().terminating.begin(reason, who, only_at_rest=only_at_rest)
 
     def load_policy(self, path: str) -> None:
         """Go by another access policy, or by the same file as it is now; calls under way go on.

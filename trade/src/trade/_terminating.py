@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from typing import Final
 
 from trade._resources import Resource
+from trade.errors import InUse
 
 _logger = logging.getLogger("trade")
 _ANSWERED_S: Final = 2.0
@@ -32,8 +33,14 @@ class Terminating:
         """What ends it; a program that lives for its container puts its own end here, which closes the container."""
         self._first = threading.Lock()
 
-    def begin(self, reason: str, who: str) -> list[str]:
-        """Stop what moves, and see to it that the container closes; what could not be stopped, and why."""
+    def begin(self, reason: str, who: str, *, only_at_rest: bool = False) -> list[str]:
+        """Stop what moves, and see to it that the container closes; what could not be stopped, and why.
+
+        Raises:
+            InUse: something is locked or moves, and it was to end ``only_at_rest``; nothing was done.
+        """
+        if only_at_rest and (uses := _uses(self._resources())):
+            raise InUse(container=self._name, uses=uses)
         problems = self._rest(self._resources(), f"container {self._name} is terminated: {reason}")
         if self._first.acquire(blocking=False):
             _logger.warning("container %s is terminated by %s: %s", self._name, who, reason or "no reason given")
@@ -45,3 +52,16 @@ class Terminating:
         while self._running() and time.monotonic() < until:
             time.sleep(_LOOK_EVERY_S)
         self.close()
+
+
+def _uses(resources: Sequence[Resource]) -> list[str]:
+    """What speaks against an end, a text for each resource."""
+    uses: list[str] = []
+    for resource in resources:
+        holder = resource.pending or resource.holder
+        if resource.guarded and holder is not None:
+            aim = f" for {holder.purpose!r}" if holder.purpose else ""
+            uses.append(f"{resource.name} is locked by {holder.owner}{aim}")
+        elif resource.busy:
+            uses.append(f"{resource.name} moves")
+    return uses

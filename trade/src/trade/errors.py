@@ -26,6 +26,7 @@ __all__ = [
     "DeviceError",
     "DeviceFault",
     "DeviceSilent",
+    "InUse",
     "IncompleteGroup",
     "InvalidArgument",
     "InvalidResult",
@@ -367,6 +368,17 @@ class LockedByOther(CallerError, PermissionError):
         else:
             hint = "wait with trade.lock(..., wait_s=...) or ask with trade.request_release(...)"
         return f"{what} is locked by {self.owner}{aim}{when}; {hint}"
+
+
+@dataclass(kw_only=True, eq=False)
+class InUse(CallerError, PermissionError):
+    """A container was to end only if nothing of it is locked and nothing moves; nothing was done."""
+
+    container: str
+    uses: Sequence[str]
+
+    def describe(self) -> str:
+        return f"container {self.container} is in use: {'; '.join(self.uses)}; wait, or ask its user to let go"
 
 
 @dataclass(kw_only=True, eq=False)

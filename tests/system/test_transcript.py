@@ -1,0 +1,157 @@
+"""What the commands say about a running robot, as the docs show it."""
+
+import getpass
+import os
+import re
+import shlex
+import socket
+import subprocess
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from typing import Final, NamedTuple
+
+import psutil
+import pytest
+
+from system.conftest import ROOT, Program
+from waiting import wait_until
+
+PAGE: Final = ROOT / "docs" / "transcript.md"
+MARKS: Final = ("<!-- transcript: made by test_the_transcript_is_what_happens -->\n", "<!-- end of transcript -->\n")
+Command = Callable[..., subprocess.CompletedProcess[str]]
+
+
+class Step(NamedTuple):
+    """A command, and what it is good for."""
+
+    why: str
+    command: str
+    """``{call}`` is the last id of a call that was shown."""
+    numbers: bool = True
+    """Whether numbers are shown as they are."""
+
+
+STEPS: Final = (
+    Step("A system of three containers comes up from one file.", "trade system up examples/system.toml"),
+    Step("It is as the file says:", "trade system status examples/system.toml", numbers=False),
+    Step("How busy is each?", "trade containers --load", numbers=False),
+    Step("In another terminal a program begins to watch her.", "python examples/watch.py &"),
+    Step("What does she offer at her head, and what does the house?", "trade services --group rosie.head"),
+    Step("", "trade services --group home"),
+    Step("What has been asked to happen by itself?", "trade notifications", numbers=False),
+    Step("Who is told of calls, and of which?", "trade hooks"),
+    Step("From now on calls are noted.", "trade tracing on"),
+    Step("She looks to the left, and down.", "trade call rosie.head.move_to '[0.3, -0.2]'"),
+    Step("Which calls were there, and what happened in this one?", "trade trace"),
+    Step("", "trade trace {call}"),
+    Step("What was logged, and in which call?", "trade logs --container diary"),
+    Step("What would the rules do now? Nothing is called.", "trade rules test examples/care.toml"),
+    Step("They stand:", "trade rules list"),
+    Step("Who may do what, by a policy?", "trade policy check planner call rosie.head --policy examples/policy.toml"),
+    Step("", "trade policy check ann call rosie.head --policy examples/policy.toml"),
+    Step("The end; what was started last is ended first.", "trade system down examples/system.toml"),
+)
+
+
+class Terminal:
+    """Runs commands as a user would, and what goes on in the background."""
+
+    def __init__(self, trade_command: Command, run: Callable[..., Program]) -> None:
+        self._command = trade_command
+        self._run = run
+        self._call = ""
+
+    def type(self, step: Step) -> str:
+        """A step as the page has it."""
+        command = step.command.format(call=self._call)
+        said = normalised(self._said(command), numbers=step.numbers)
+        shown = f"```console\n$ {_words(command)}\n{said}```\n"
+        return f"{step.why}\n\n{shown}\n" if step.why else f"{shown}\n"
+
+    def _said(self, command: str) -> str:
+        program, *words = shlex.split(command)
+        if program == "python":
+            return self._run(*words[:-1]).line()
+        ended = self._command(*words)
+        assert not ended.stderr, f"{command}: {ended.stderr}"
+        self._call = (re.findall(r"\b\d{15,}\b", ended.stdout) or [self._call])[0]
+        return ended.stdout
+
+
+def normalised(text: str, *, numbers: bool = True) -> str:
+    """What differs from run to run, put in words; the columns of a table are drawn anew around them."""
+    head, *rows = lines = text.splitlines()
+    if not re.match(r"[A-Z]+(  |$)", head):
+        return "".join(f"{_words(line)}\n" for line in lines)
+    starts = [found.start() for found in re.finditer(r"\S+(?: \S+)*", head)]
+    spans = list(zip(starts, [*starts[1:], None], strict=True))
+    cells = [[_words(line[a:b].rstrip()) for a, b in spans] for line in (head, *rows)]
+    if not numbers:
+        cells = [[re.sub(r"^\d[\d./]*$", "N", cell) for cell in row] for row in cells]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    return "".join("  ".join(map(str.ljust, row, widths)).rstrip() + "\n" for row in cells)
+
+
+def _words(text: str) -> str:
+    for pattern, word in (
+        (r"(?<![.\d])\d{15,}\b", "CALL"),
+        (r"\b\d\d:\d\d:\d\d\.\d{3}", "TIME"),
+        (r"\b[0-9a-f]{12}\b", "EPOCH"),
+        (r"\bprocess \d+", "process PID"),
+        (r"\b\d+\.\d m?s\b", "TIME"),
+        (rf"\b{re.escape(getpass.getuser())}\b", "USER"),
+        (rf"\b{re.escape(socket.gethostname())}\b", "HOST"),
+    ):
+        text = re.sub(pattern, word, text)
+    return re.sub(r"-?\d+\.\d{4,}", lambda found: f"{float(found[0]):.1f}", text)
+
+
+@pytest.fixture
+def terminal(
+    system: str, trade_command: Command, run: Callable[..., Program], monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Terminal]:
+    monkeypatch.setenv("TRADE_SYSTEM", "home")
+    monkeypatch.chdir(ROOT)
+    with ExitStack() as left:
+        before = set(psutil.pids())
+        left.callback(_end, before)
+        yield Terminal(trade_command, run)
+
+
+def _end(before: set[int]) -> None:
+    """End what the test has left of its system, which is one of its own by its folders."""
+
+    def ours() -> list[psutil.Process]:
+        found = [one for one in psutil.process_iter() if one.pid not in before]
+        return [one for one in found if _folder(one) == os.environ["TRADE_RUNTIME_DIR"]]
+
+    for process in ours():
+        process.terminate()
+    wait_until(lambda: not ours(), "the system has ended")
+
+
+def _folder(process: psutil.Process) -> str | None:
+    try:
+        return None if process.status() == psutil.STATUS_ZOMBIE else process.environ().get("TRADE_RUNTIME_DIR")
+    except psutil.Error:
+        return None
+
+
+def test_the_transcript_is_what_happens(terminal: Terminal) -> None:
+    """With WRITE_TABLES=1 in the environment it is written anew."""
+    told = "\n" + "".join(terminal.type(step) for step in STEPS)
+    before, mark, rest = PAGE.read_text(encoding="utf-8").partition(MARKS[0])
+    shown, end, after = rest.partition(MARKS[1])
+    if os.environ.get("WRITE_TABLES"):
+        PAGE.write_text(before + mark + told + end + after, encoding="utf-8")
+        return
+    assert told == shown
+
+
+def test_what_differs_from_run_to_run_is_put_in_words_and_the_rest_stays() -> None:
+    line = "eyes: up 12 after 3.1 s, process 4711 (call 2858444437409759234) 0.300660234425585 -0.19942 0.5\n"
+    assert normalised(line) == "eyes: up 12 after TIME, process PID (call CALL) 0.3 -0.2 0.5\n"
+    assert normalised("CALL  AT       LAST\na     3.4 ms\n  b   12.4 ms  no\n") == (
+        "CALL  AT    LAST\na     TIME\n  b   TIME  no\n"
+    )
+    assert normalised("CALLS  N\nx      7\n", numbers=False) == "CALLS  N\nx      N\n"
