@@ -6,7 +6,7 @@ import pytest
 
 from drivers.conftest import Outcome, call, sleep_past, written_now
 from drivers.gate import Gate
-from drivers.legs import COUNTS_PER_RAD, HALT, HIP, KNEE, Leg, rig
+from drivers.legs import COUNTS_PER_RAD, HALT, HIP, KNEE, PATIENT, Leg, rig
 from trade import Container, Handle, where
 from trade.errors import DeadlineExceeded, DeviceFault, LockedByOther, LockLost, MotionStopped, Stopped, TradeError
 from trade_drivers import AttachedRobot, Motor
@@ -33,7 +33,7 @@ def halts(frame: Entry) -> bool:
 
 @pytest.fixture
 def leg(rig: Leg) -> Leg:
-    rig.configure(('channel = "can0"', 'channel = "can0"\nwatchdog_s = 2'))  # the bus is held up here
+    rig.configure(PATIENT)
     rig.plug()
     return rig
 
