@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from drivers.gate import Gate
 from robots import HEAD
 from trade._context import CallContext, running
 from trade_drivers import AttachedRobot, Robot, attach, parse
@@ -128,6 +129,13 @@ def _close(robot: AttachedRobot) -> None:
         robot.close()
     except Exception as error:  # noqa: BLE001 - what closing says is tested where it matters
         print(f"closing: {error}")
+
+
+@pytest.fixture
+def gate() -> Iterator[Gate]:
+    made = Gate()
+    yield made
+    made.let_go()
 
 
 @pytest.fixture

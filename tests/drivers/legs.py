@@ -50,6 +50,8 @@ max_accel_rad_s2 = 20.0
 [group.leg]
 joints = ["leg.hip", "leg.knee"]
 """
+PATIENT = ('channel = "can0"', 'channel = "can0"\nwatchdog_s = 2')
+"""A change for where the host is busy, or the bus is held up: drives that do not stop at once."""
 HIP, KNEE = 1, 2
 GO = 1 << 4
 HALT = 1 << 8
@@ -59,8 +61,9 @@ COUNTS_PER_RAD = 4096 * 50 / 6.283185307179586
 class Leg:
     """The simulated bus and whoever is attached to it: on its own adapter, or on an interface of the system."""
 
-    def __init__(self, undo: ExitStack, interface: str = "") -> None:
+    def __init__(self, undo: ExitStack, interface: str = "", rate_hz: int = 20) -> None:
         self._undo = undo
+        self._rate_hz = rate_hz  # on an interface
         self.interface = interface
         self.announced: list[object] = []
         self.configure()
@@ -72,7 +75,7 @@ class Leg:
             assert before in text, before
             text = text.replace(before, after)
         if self.interface:  # where there is one slow processor, and each frame costs several calls of the system
-            text = text.replace('"can0"', f'"{self.interface}"\nrate_hz = 20\nstale_after_s = 1')
+            text = text.replace('"can0"', f'"{self.interface}"\nrate_hz = {self._rate_hz}\nstale_after_s = 1')
         self.text = text
         self.robot: Robot = parse(text, "leg.toml")
 

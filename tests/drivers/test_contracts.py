@@ -5,6 +5,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from importlib.metadata import entry_points
 from pathlib import Path
 
 import pytest
@@ -13,7 +14,8 @@ from drivers.legs import LEG
 from drivers.test_across import LEGS
 from robots import HAND, HEAD
 from trade import where
-from trade_drivers import AttachedRobot, JointGroup, Motor, attach, parse
+from trade_drivers import AttachedRobot, JointGroup, Motor, Robot, attach, parse
+from trade_drivers.robotfile import Bus
 from trade_drivers.testing import JointGroupContract, MotorContract
 from trade_hil_sim import ByteLog, SimProcess, events
 from trade_hil_sim._robot import buses_of
@@ -69,6 +71,17 @@ class TestJointGroup(JointGroupContract):
         group = robots[file].group(name)
         yield group
         group.relax()
+
+
+def test_every_simulator_has_its_contracts() -> None:
+    files = {name: parse(text, f"{name}.toml") for name, text in FILES.items()}
+    drivers = {bus.driver for file, joint in MOTORS for bus in files[file].buses if _is_on(files[file], bus, joint)}
+    grippers = {"robotiq"}  # TestRobotiqGripper
+    assert drivers | grippers == {simulator.name for simulator in entry_points(group="trade.sims")}
+
+
+def _is_on(robot: Robot, bus: Bus, joint: str) -> bool:
+    return any(record.name == joint for record in robot.joints_on(bus.name))
 
 
 def test_servos_drives_and_grippers_are_one_robot(robots: dict[str, AttachedRobot]) -> None:

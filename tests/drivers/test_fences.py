@@ -1,12 +1,12 @@
 """Locks, stops and sessions on a real bus: containers here, the judge is what the simulated servos received and did."""
 
 import math
-import threading
 from collections.abc import Callable, Iterator
 
 import pytest
 
 from drivers.conftest import Rig, goal_counts, written_now
+from drivers.gate import Gate
 from trade import Container, Handle, where
 from trade.errors import IncompleteGroup, LockedByOther, LockLost, MotionStopped, Stopped
 from trade_drivers import AttachedRobot, Motor
@@ -14,35 +14,6 @@ from waiting import wait_until
 
 FAR_COUNTS = 2048 + 1.25 * 4096 / math.tau
 """Beyond this only a command to go there puts a goal; who holds, holds where the joint is."""
-
-
-class Gate:
-    """A health check that can hold the bus thread up."""
-
-    def __init__(self) -> None:
-        self._open, self._reached = threading.Event(), threading.Event()
-        self._open.set()
-
-    def __call__(self) -> bool:
-        if not self._open.is_set():
-            self._reached.set()
-            self._open.wait(20)
-        return True
-
-    def hold_up(self) -> None:
-        self._reached.clear()
-        self._open.clear()
-        assert self._reached.wait(20)
-
-    def let_go(self) -> None:
-        self._open.set()
-
-
-@pytest.fixture
-def gate() -> Iterator[Gate]:
-    made = Gate()
-    yield made
-    made.let_go()
 
 
 @pytest.fixture

@@ -5,7 +5,6 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -13,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from drivers.conftest import Outcome, call, sleep_past, written_now
+from drivers.gate import Gate
 from drivers.gripper_rig import HandRig, made_rig
 from robots import HAND
 from trade import Container, Handle, where
@@ -30,40 +30,10 @@ from trade.errors import (
     Stopped,
 )
 from trade_drivers import Gripper
-from trade_hil_sim import BrownOut, Heal, Mute, Put, Replug, RobotiqBus, Unplug, events, received
+from trade_hil_sim import BrownOut, Heal, Mute, Put, Replug, RobotiqBus, Unplug, events, instructions, received
 from waiting import wait_until
 
 SLOW_M_S = 0.02
-
-
-class Gate:
-    """A health check that can hold the bus thread up, or say no."""
-
-    def __init__(self) -> None:
-        self._open, self._reached = threading.Event(), threading.Event()
-        self._open.set()
-        self.says = True
-
-    def __call__(self) -> bool:
-        if not self._open.is_set():
-            self._reached.set()
-            self._open.wait(20)
-        return self.says
-
-    def hold_up(self) -> None:
-        self._reached.clear()
-        self._open.clear()
-        assert self._reached.wait(20)
-
-    def let_go(self) -> None:
-        self._open.set()
-
-
-@pytest.fixture
-def gate() -> Iterator[Gate]:
-    made = Gate()
-    yield made
-    made.let_go()
 
 
 @pytest.fixture
@@ -188,6 +158,25 @@ def test_S06_a_defect_in_the_bus_thread_is_silence_and_an_error_for_everybody(
     for act in (gripper.activate, gripper.stop, gripper.close):
         with pytest.raises(DeviceError):
             act()
+
+
+# --- S07
+
+
+def test_S07_a_stop_is_the_first_thing_on_a_bus_that_was_held_up(hand: HandRig, gate: Gate) -> None:
+    gripper = hand.active(healthy=gate)
+    moving = Outcome(lambda: gripper.close(SLOW_M_S))
+    under_way(hand)
+    gate.hold_up()
+    mark = written_now()
+    stop = Outcome(gripper.stop)
+    wait_until(lambda: gripper._exchange._stops, "the stop is there")  # type: ignore[attr-defined]
+    gate.let_go()
+    assert stop.wait().error is None
+    assert isinstance(moving.wait().error, MotionStopped)
+    first = instructions(hand.log, since=mark)[0]
+    assert (first.name, first.moves) == ("read_write", False)
+    assert not hand.truth.moving
 
 
 # --- S08

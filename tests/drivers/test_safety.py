@@ -14,6 +14,7 @@ import pytest
 
 import trade_hil_sim
 from drivers.conftest import Outcome, Rig, call, goal_counts, sleep_past, written_now
+from drivers.gate import Gate
 from robots import HEAD
 from trade import permit, service
 from trade.errors import (
@@ -34,35 +35,6 @@ from waiting import wait_until
 WATCHDOG_S = 0.3
 
 
-class Gate:
-    """A health check that can hold the bus thread up."""
-
-    def __init__(self) -> None:
-        self.open = threading.Event()
-        self.open.set()
-        self.reached = threading.Event()
-        self.says = True
-
-    def __call__(self) -> bool:
-        if not self.open.is_set():
-            self.reached.set()
-            self.open.wait(20)
-        return self.says
-
-
-@pytest.fixture
-def gate() -> Iterator[Gate]:
-    made = Gate()
-    yield made
-    made.open.set()
-
-
-def hold_up(gate: Gate) -> None:
-    gate.reached.clear()
-    gate.open.clear()
-    assert gate.reached.wait(20)
-
-
 # --- S01 late is never
 
 
@@ -76,12 +48,12 @@ def test_S01_a_command_that_expires_while_the_bus_is_held_up_is_never_written(
         "enable": pan.enable,
         "relax": pan.relax,
     }
-    hold_up(gate)
+    gate.hold_up()
     mark = written_now()
     late = Outcome(act[command], deadline_s=0.05)
     with call(0.05) as expires_ns:
         sleep_past(expires_ns)
-    gate.open.set()
+    gate.let_go()
     assert isinstance(late.wait().error, DeadlineExceeded)
     assert not head.moves(since=mark)
 
@@ -89,12 +61,12 @@ def test_S01_a_command_that_expires_while_the_bus_is_held_up_is_never_written(
 def test_S01_a_move_of_an_enabled_joint_that_expires_meanwhile_is_never_written(head: Rig, gate: Gate) -> None:
     pan = head.attach(healthy=gate).motor("neck.pan")
     pan.enable()
-    hold_up(gate)
+    gate.hold_up()
     mark = written_now()
     late = Outcome(lambda: pan.move_to(0.5), deadline_s=0.05)
     with call(0.05) as expires_ns:
         sleep_past(expires_ns)
-    gate.open.set()
+    gate.let_go()
     assert isinstance(late.wait().error, DeadlineExceeded)
     assert not head.moves(since=mark)
 
@@ -113,12 +85,12 @@ def test_S01_a_command_that_expires_while_a_silent_joint_holds_the_bus_up_is_nev
 
 def test_S01_a_plain_call_waits_one_second_for_its_turn_at_most(head: Rig, gate: Gate) -> None:
     pan = head.attach(healthy=gate).motor("neck.pan")
-    hold_up(gate)
+    gate.hold_up()
     mark = written_now()
     late = Outcome(lambda: pan.move_to(0.5))
     with call(1.05) as expires_ns:
         sleep_past(expires_ns)
-    gate.open.set()
+    gate.let_go()
     assert isinstance(late.wait().error, DeadlineExceeded)
     assert not head.moves(since=mark)
 
@@ -283,14 +255,14 @@ def test_S07_no_exchange_waits_longer_than_a_stop_may() -> None:
 def test_S08_a_command_admitted_before_a_stop_is_dropped_after_it(head: Rig, gate: Gate) -> None:
     pan = head.attach(healthy=gate).motor("neck.pan")
     pan.enable()
-    hold_up(gate)
+    gate.hold_up()
     mark = written_now()
     resting = head.truth(1).position_counts
     moving = Outcome(lambda: pan.move_to(0.5))
     wait_until(lambda: pan._exchange._inbox, "the move is admitted")  # type: ignore[attr-defined]
     stopping = Outcome(pan.stop)
     wait_until(lambda: pan._exchange._stops, "the stop is admitted")  # type: ignore[attr-defined]
-    gate.open.set()
+    gate.let_go()
     assert isinstance(moving.wait().error, MotionStopped)
     stopping.wait()
     assert all(abs(goal_counts(entry) - resting) <= 1 for entry in head.goals(1, mark))
@@ -437,7 +409,7 @@ def test_S19_a_joint_that_cannot_be_heard_keeps_its_watchdog(head: Rig) -> None:
 
 def test_S20_a_second_driver_on_the_port_is_refused_and_sends_not_one_byte(head: Rig, gate: Gate) -> None:
     head.attach(healthy=gate)
-    hold_up(gate)
+    gate.hold_up()
     mark = written_now()
     with pytest.raises(ConfigurationError, match="another driver owns this port") as refused:
         head.attach()

@@ -1,46 +1,18 @@
 """Set-points: what they move, and what ends them; the judge is what the simulated servos received and did."""
 
 import math
-import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import pytest
 
 from drivers.conftest import Outcome, Rig, call, goal_counts, sleep_past, written_now
+from drivers.gate import Gate
 from trade.errors import DeadlineExceeded, InvalidArgument, LimitExceeded, MotionStopped
 from trade_drivers import AttachedRobot, Motor
 from trade_hil_sim import Servo
 from waiting import wait_until
 
 COUNTS_PER_RAD = 4096 / math.tau
-
-
-class Gate:
-    """A health check that can hold the bus thread up."""
-
-    def __init__(self) -> None:
-        self._open, self._reached = threading.Event(), threading.Event()
-        self._open.set()
-
-    def __call__(self) -> bool:
-        if not self._open.is_set():
-            self._reached.set()
-            self._open.wait(20)
-        return True
-
-    def hold_up(self) -> None:
-        self._open.clear()
-        assert self._reached.wait(20)
-
-    def let_go(self) -> None:
-        self._open.set()
-
-
-@pytest.fixture
-def gate() -> Iterator[Gate]:
-    made = Gate()
-    yield made
-    made.let_go()
 
 
 @pytest.fixture

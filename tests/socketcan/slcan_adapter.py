@@ -10,7 +10,7 @@ import tty
 
 import can
 
-from socketcan.conftest import ip
+from socketcan.interfaces import ip
 
 _N_SLCAN = 17
 _SIOCGIFNAME = 0x8910

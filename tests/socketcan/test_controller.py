@@ -1,13 +1,11 @@
 """A real controller's states as a port sees them, and interfaces that go."""
 
-import re
 from collections.abc import Iterator
 
 import pytest
 
-from drivers.conftest import Outcome
 from drivers.legs import Leg, leg
-from socketcan.conftest import ip
+from socketcan.interfaces import down, up
 from socketcan.slcan_adapter import SlcanAdapter
 from trade.errors import ConfigurationError
 from trade_drivers.can import CanPort, ErrorState
@@ -15,16 +13,9 @@ from trade_drivers.can._netlink import look_at
 from trade_drivers.joints import PortLost
 from trade_hil_sim import SimulationError
 from trade_hil_sim.can import CanBus
-from waiting import PATIENCE_S, wait_until
+from waiting import wait_until
 
 __all__ = ["leg"]
-
-
-@pytest.fixture
-def adapter(interface: str) -> Iterator[SlcanAdapter]:
-    made = SlcanAdapter(interface)
-    yield made
-    made.close()
 
 
 @pytest.fixture
@@ -33,14 +24,6 @@ def port(adapter: SlcanAdapter) -> Iterator[CanPort]:
     made.open()
     yield made
     made.close()
-
-
-def down(interface: str) -> None:
-    ip("link", "set", interface, "down")
-
-
-def up(interface: str) -> None:
-    ip("link", "set", interface, "up")
 
 
 def test_a_controller_that_is_bus_off_is_not_attached_to(leg: Leg, adapter: SlcanAdapter) -> None:
@@ -85,24 +68,6 @@ def test_a_bus_off_is_a_loss_until_the_interface_was_down_and_up(adapter: SlcanA
     up(adapter.interface)
     port.open()
     assert (port.look("x").state, port.bus_offs) == ("error-active", 1)
-
-
-@pytest.mark.parametrize(("going", "says"), [("down", "Error Code 100"), ("deleted", "Error Code (19|6)")])
-def test_a_receive_that_waits_and_a_send_end_when_the_interface_goes(interface: str, going: str, says: str) -> None:
-    port = CanPort(f"socketcan:{interface}", 1_000_000)
-    port.open()
-    waiting = Outcome(lambda: port.receive(PATIENCE_S))
-    if going == "down":
-        down(interface)
-    else:
-        ip("link", "del", interface)
-    error = waiting.wait().error
-    assert isinstance(error, PortLost)
-    assert re.search(f"Error Code 100|{says}", str(error))  # who is deleted goes down first
-    with pytest.raises(PortLost, match=says):
-        port.send(0x123, b"")
-    with pytest.raises(PortLost, match="there is no interface" if going == "deleted" else "it is down"):
-        port.open()
 
 
 def test_simulated_devices_refuse_an_interface_that_is_not_there() -> None:
