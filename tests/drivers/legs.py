@@ -51,9 +51,20 @@ max_accel_rad_s2 = 20.0
 joints = ["leg.hip", "leg.knee"]
 """
 HIP, KNEE = 1, 2
+PROFILE_POSITION, PROFILE_VELOCITY, HOMING, CYCLIC_POSITION, CYCLIC_VELOCITY = 1, 3, 6, 8, 9
 GO = 1 << 4
 HALT = 1 << 8
 COUNTS_PER_RAD = 4096 * 50 / 6.283185307179586
+
+
+def only(*modes: int) -> Callable[[Cia402Bus], None]:
+    """Drives that say that they have these modes of operation and no others."""
+
+    def change(bus: Cia402Bus) -> None:
+        for device in bus.devices:
+            device.store.set("supported_modes", sum(1 << mode - 1 for mode in set(modes)))  # type: ignore[attr-defined]
+
+    return change
 
 
 class Leg:

@@ -10,6 +10,7 @@ from trade_drivers.cia402 import _machine as machine
 from trade_drivers.cia402 import _table as table
 from trade_drivers.cia402._machine import State, state_of
 from trade_drivers.cia402._net import emergency_text
+from trade_drivers.cia402._stream import Following, Turning
 from trade_drivers.joints import Axis, Grain, Sample
 from trade_drivers.robotfile import Joint
 
@@ -48,6 +49,12 @@ class DriveAxis(Axis):
         self.state_now: State | None = None
         self.statusword = 0
         self.mode = 0
+        self.modes: frozenset[int] = frozenset()
+        """Those it can be used in."""
+        self.entered = 0
+        """The mode it was enabled in; 0 if that is not known any more."""
+        self.stream: Following | Turning | None = None
+        """In a mode without a goal: what it is sent in every cycle."""
         self.velocity = 0
         self.controlword = 0
         """What was commanded last."""
@@ -120,6 +127,7 @@ class DriveAxis(Axis):
         elif self.set_up_ns:
             self.probe_at_ns = now_ns
         self.controlword = self.asked_ns = self.awaited_ns = self.set_up_ns = 0
+        self.entered, self.stream = 0, None
 
     def welcome(self, now_ns: int) -> None:
         """It was set up, and is heard."""
@@ -163,6 +171,22 @@ class DriveAxis(Axis):
     def can_take_goal(self) -> bool:
         """The handshake of the last set-point is over."""
         return not self.controlword & machine.NEW_SET_POINT and not self.acknowledged
+
+    @property
+    def turning_mode(self) -> int:
+        """The mode in which it is told speeds; profile position, where their goal is the end of the range, if none."""
+        for mode in (table.CYCLIC_VELOCITY, table.PROFILE_VELOCITY_MODE):
+            if mode in self.modes:
+                return mode
+        return table.PROFILE_POSITION
+
+    def braking(self, accel: int) -> bytes:
+        """The data of the frame with its deceleration; its target velocity, if that is in there, is 0."""
+        return (
+            table.BRAKING.layout.pack(accel)
+            if self.turning_mode == table.PROFILE_POSITION
+            else table.TURNING.layout.pack(accel, 0)
+        )
 
     @property
     def may_hold_torque(self) -> bool:

@@ -42,7 +42,8 @@ class Homing(Motion):
     def steps(self) -> Steps:
         axis = self._axis
         axis.check_usable(self.exchange.clock(), self.exchange.stale_after_ns)
-        if not axis.ready:
+        yield from jobs.resting(self._bus, self, axis)
+        if not axis.ready or axis.stream is not None:
             yield from self.exchange.enabling(self, axis)
         for entry, value in (
             (table.HOMING_METHOD, self._method),
@@ -51,7 +52,7 @@ class Homing(Motion):
             (table.HOMING_ACCELERATION, axis.accel_counts),
         ):
             yield from jobs.write(self._bus, self, axis, entry, value)
-        axis.ready = False  # whatever becomes of it, it is not in its usual mode any more
+        axis.ready, axis.entered = False, 0  # whatever becomes of it, it is not in its usual mode any more
         yield from jobs.set_mode(self._bus, self, axis, table.HOMING)
         self.launch()
 

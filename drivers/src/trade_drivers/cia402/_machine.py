@@ -44,6 +44,8 @@ RESET_FAULT: Final = 0x0080
 HALT: Final = 0x0100
 """Brake, and stand under torque."""
 HOLD: Final = OPERATE | HALT
+QUICK_STOP: Final = 0x0002
+"""Brake on the quick-stop ramp, in whatever mode: the cyclic ones know no halt."""
 GO: Final = OPERATE | NEW_SET_POINT | AT_ONCE
 
 _UPWARDS: Final = {

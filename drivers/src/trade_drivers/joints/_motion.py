@@ -42,7 +42,7 @@ class Motion(Command):
         for axis in self.axes:
             if not axis.ready:
                 yield from exchange.enabling(self, axis)
-        yield from exchange.making_way(self.axes)
+        yield from exchange.making_way(self)
         self.launch()
 
     def launch(self) -> None:
