@@ -9,6 +9,7 @@ parts:
   locks      taking and giving back four services of two containers; what the checks of resources add to a call
   gateway    calls through one gateway and two, certificates and policy on; floods; an idle one (root, iproute2)
   servo      the Dynamixel driver against what a bus of 1 Mbaud can carry
+  can        cycles of six CiA 402 drives near what 1 Mbit/s can carry: how many are late
 
 Progress goes to stderr, tables and targets (met or missed) to stdout. Peers that are not installed are skipped.
 """
@@ -16,7 +17,7 @@ Progress goes to stderr, tables and targets (met or missed) to stdout. Peers tha
 import argparse
 from collections.abc import Callable, Mapping
 
-from tests.bench import _calls, _deadman, _gateway, _local, _locks, _registry, _servo
+from tests.bench import _calls, _cans, _deadman, _gateway, _local, _locks, _registry, _servo
 
 _SERVICES_EACH = 10
 
@@ -36,6 +37,7 @@ _PARTS: Mapping[str, Callable[[argparse.Namespace], None]] = {
     "locks": lambda options: _locks.run(options.n, options.rounds),
     "gateway": lambda options: _gateway.run(options.n, options.rounds, options.idle),
     "servo": lambda options: _servo.run(options.n, options.rounds, options.seconds),
+    "can": lambda options: _cans.run(max(1, options.rounds // 2), options.seconds),
 }
 _QUICK = {"n": 200, "rounds": 8, "seconds": 1.5, "idle": 20.0}
 _FULL = {"n": 500, "rounds": 20, "seconds": 3.0, "idle": 60.0}
@@ -49,7 +51,9 @@ def main() -> None:
     parser.add_argument("--full", action="store_true", help="longer rounds and more of them: some fifteen minutes")
     parser.add_argument("-n", type=int, help=f"calls or cycles in a round ({_QUICK['n']}, full {_FULL['n']})")
     parser.add_argument("--rounds", type=int, help=f"turns of each peer ({_QUICK['rounds']}, full {_FULL['rounds']})")
-    parser.add_argument("--seconds", type=float, help="length of a 100 Hz round of the servo bus")
+    parser.add_argument(
+        "--seconds", type=float, help="length of a round of the servo bus at 100 Hz, and of a trajectory on the CAN bus"
+    )
     parser.add_argument(
         "--idle", type=float, help=f"seconds for the idle gateway ({_QUICK['idle']}, full {_FULL['idle']})"
     )
