@@ -27,8 +27,8 @@ $(UV):
 demo: $(UV) ## a simulated robot looks, walks and grips for behaviours beyond a gateway (ARGS=--stay keeps it up)
 	@$(RUN) python examples/demo.py $(ARGS)
 
-test: $(UV) ## the whole test suite
-	@$(RUN) pytest $(ARGS)
+test: $(UV) ## the whole test suite, in three processes (ARGS="-n 0" for one)
+	@$(RUN) pytest -n 3 --dist loadfile $(ARGS)
 
 test-socketcan: $(UV) ## the CAN suites on kernel interfaces; where the kernel has none, inside User-Mode Linux
 	@$(RUN) tests/socketcan/run pytest tests/socketcan $(ARGS)

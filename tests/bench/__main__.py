@@ -7,7 +7,9 @@ parts:
   registry   10,000 services as a late joiner sees them: time, memory, finding one (--full: of 10,000 providers, too)
   deadman    how long a joint moves on after its client was killed or frozen
   locks      taking and giving back four services of two containers; what the checks of resources add to a call
+  watching   a thousand notifications every 0.1 s; what hooks cost a call that has none
   gateway    calls through one gateway and two, certificates and policy on; floods; an idle one (root, iproute2)
+  streams    what five listeners to a joint-state stream at 200 Hz cost its source, beside one
   servo      the Dynamixel driver against what a bus of 1 Mbaud can carry
   can        cycles of six CiA 402 drives near what 1 Mbit/s can carry: how many are late
 
@@ -17,7 +19,7 @@ Progress goes to stderr, tables and targets (met or missed) to stdout. Peers tha
 import argparse
 from collections.abc import Callable, Mapping
 
-from tests.bench import _calls, _cans, _deadman, _gateway, _local, _locks, _registry, _servo
+from tests.bench import _calls, _cans, _deadman, _gateway, _local, _locks, _registry, _servo, _streams, _watching
 
 _SERVICES_EACH = 10
 
@@ -35,7 +37,9 @@ _PARTS: Mapping[str, Callable[[argparse.Namespace], None]] = {
     "registry": _run_registry,
     "deadman": lambda options: _deadman.run(options.rounds),
     "locks": lambda options: _locks.run(options.n, options.rounds),
+    "watching": lambda options: _watching.run(options.n, options.rounds, options.seconds),
     "gateway": lambda options: _gateway.run(options.n, options.rounds, options.idle),
+    "streams": lambda options: _streams.run(max(1, options.rounds // 2), 2 * options.seconds),
     "servo": lambda options: _servo.run(options.n, options.rounds, options.seconds),
     "can": lambda options: _cans.run(max(1, options.rounds // 2), options.seconds),
 }

@@ -76,6 +76,15 @@ def test_the_bench_of_the_can_bus_prints_its_targets() -> None:
     assert printed.count("late in an empty loop") == 2
 
 
+def test_the_bench_of_watching_prints_its_targets() -> None:
+    printed = bench("watching", "-n", "3", "--rounds", "1", "--seconds", "0.3")
+    assert targets(printed) == ["merged ticks, %", "another watched / none"]
+
+
+def test_the_bench_of_streams_prints_its_target() -> None:
+    assert targets(bench("streams", "--rounds", "1", "--seconds", "0.1")) == ["five listeners / one"]
+
+
 def test_the_bench_of_the_servo_bus_prints_its_targets() -> None:
     printed = bench("servo", "-n", "3", "--rounds", "1", "--seconds", "0.05")
     assert "156 bytes a cycle" in printed

@@ -76,6 +76,11 @@ def test_without_any_list_everything_crosses_and_with_one_the_rest_does(file: Pa
         ('policy = "policy.toml"', "", r"listening beyond loopback needs a policy"),
         ('"tls/10.0.0.7:7450"', '"tcp/10.0.0.7:7450"', r"must be tls/10.0.0.7:7450"),
         ('"tls/10.0.0.7:7450"', '"tls/10.0.0.8:7450"', r"not for 10.0.0.8"),
+        (
+            '"tls/10.0.0.7:7450"',
+            '"tls/127.0.5.1:7450"',
+            r"listen: tls/127.0.5.1:7450: lo is known by 127.0.0.1",
+        ),
         ('tls = "pki/issued/door"', 'credentials = "lab:secret"', r"credentials: is for laboratories"),
         ("[network.lab]", "[network", r"not valid TOML"),
     ],

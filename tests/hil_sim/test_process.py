@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import psutil
@@ -139,16 +140,23 @@ def test_the_package_alone_imports_nothing_of_ours() -> None:
     assert subprocess.run(command, capture_output=True, timeout=60, check=True).stdout == b"[]\n"
 
 
+@pytest.fixture
+def short() -> Iterator[Path]:
+    """A folder whose path leaves room for a socket's, which may have 107 characters."""
+    with tempfile.TemporaryDirectory(prefix="short-") as folder:
+        yield Path(folder)
+
+
 def test_only_folders_of_its_kind_whose_owner_is_gone_are_removed(
-    robot_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    robot_file: Path, short: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "tmp"))
+    monkeypatch.setattr(tempfile, "tempdir", str(short))
     for name in ("trade-sim-dead", "trade-sim-stranger", "trade-demo-dead"):
-        (tmp_path / "tmp" / name).mkdir(parents=True)
+        (short / name).mkdir()
     for name in ("trade-sim-dead", "trade-demo-dead"):
-        (tmp_path / "tmp" / name / "_owner.pid").write_text("4711")
+        (short / name / "_owner.pid").write_text("4711")
     with SimProcess(robot_file) as alive:
-        assert remove_leftovers() == [tmp_path / "tmp" / "trade-sim-dead"]
-        left = sorted(path.name for path in (tmp_path / "tmp").iterdir())
+        assert remove_leftovers() == [short / "trade-sim-dead"]
+        left = sorted(path.name for path in short.iterdir())
         assert left == sorted(["trade-demo-dead", "trade-sim-stranger", alive.control_path.parent.name])
         assert ping(alive.ports["neck"], 1)

@@ -225,9 +225,21 @@ def test_unplugging_takes_the_port_away_and_the_gripper_stays_as_it_was(
     assert truth(line).activated
 
 
+def test_another_device_in_its_place_refuses_its_registers(line: RobotiqBus, pymodbus: ModbusSerialClient) -> None:
+    line.do(sim.WrongModel(number=0))
+    for answer in (
+        pymodbus.read_input_registers(STATUS, count=3, device_id=9),
+        pymodbus.write_registers(COMMAND, [0x0100, 0, 0], device_id=9),
+    ):
+        assert (answer.isError(), answer.exception_code) == (True, 2)
+    assert not sim.events(line.log.entries, "activating")
+    line.do(sim.Heal())
+    assert pymodbus.read_input_registers(STATUS, count=3, device_id=9).registers[0] == 0
+
+
 def test_orders_that_are_none_for_a_gripper_are_refused(line: RobotiqBus) -> None:
-    with pytest.raises(SimulationError, match="Supply is nothing that happens to a 2F-85"):
-        line.do(sim.Supply(voltage_v=12.0))
+    with pytest.raises(SimulationError, match="Place is nothing that happens to a 2F-85"):
+        line.do(sim.Place(counts=12))
     with pytest.raises(SimulationError, match=r"no device \[3\]; it has \[9\]"):
         line.do(sim.Mute(ids=(3,)))
 

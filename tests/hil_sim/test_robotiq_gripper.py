@@ -167,6 +167,27 @@ def test_a_major_fault_stops_it_until_it_is_activated_anew(hand: Hand) -> None:
     assert hand.status[0] == ACTIVE
 
 
+def test_heat_is_a_fault_until_it_has_cooled_down_and_nothing_is_resumed(hand: Hand) -> None:
+    hand.tell(0x0900, 255, 0)
+    hand.gripper.set_supply(hand.clock.now, temperature_c=85)
+    stood = hand.status[3]
+    for celsius, fault in ((80, 0x08), (79, 0)):
+        hand.gripper.set_supply(hand.clock.now, temperature_c=celsius)
+        hand.wait(1.0)
+        assert hand.status[1:] == (fault, 255, stood)
+
+
+def test_a_low_supply_is_a_fault_that_a_reset_does_not_end(hand: Hand) -> None:
+    hand.gripper.set_supply(hand.clock.now, voltage_v=21.0)
+    hand.tell(0, 0, 0)
+    assert hand.status[1] == 0x0A
+    hand.gripper.set_supply(hand.clock.now, voltage_v=24.0)
+    assert hand.status[1] == 0x0A
+    hand.tell(0x0100, 0, 0)
+    hand.tell(0, 0, 0)
+    assert hand.status[1] == 0
+
+
 def test_a_brown_out_loses_registers_and_activation(hand: Hand) -> None:
     hand.tell(0x0900, 255, 0x00FF, s=0.5)
     hand.gripper.lose_power(hand.clock.now)

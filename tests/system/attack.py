@@ -33,6 +33,8 @@ register = ["lab.dash"]
 [roles.chief]
 read = ["*"]
 administer = ["*"]
+instrument = ["*"]
+register = ["lab.chief"]
 
 [identities]
 arm = ["driver"]

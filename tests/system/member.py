@@ -12,7 +12,7 @@ from typing import Any
 
 import zenoh
 
-from trade import Container, Handle, Lock, Resource, Run, Settings, current_call, service, where
+from trade import Called, Container, Handle, Lock, Resource, Run, Settings, current_call, service, where
 from trade._links import _others
 
 PROVIDERS = 5
@@ -52,6 +52,17 @@ class Joint(Echo):
         call = current_call()
         assert call is not None
         self.greeted.append(f"{call.caller} {newcomer.label}")
+
+
+class Watch:
+    """Notes what the calls that it is told of were made with."""
+
+    def __init__(self) -> None:
+        self.noted: list[Any] = []
+
+    @service(effect="read")
+    def see(self, called: Called) -> None:
+        self.noted.append(called.args)
 
 
 class Relay:
@@ -230,6 +241,27 @@ class Member:
     def greet_joining(self, group: str, of: str) -> None:
         """From now on a joint greets, in our name, whatever of the group joins."""
         self.up.joined(where(name="echo", group=group), self.up.find(where(name="greet", group=of)))
+
+    def watch_moves(self, group: str, mine: str) -> None:
+        """From now on note, in a service of that group of ours, what moves there."""
+        self._watch = Watch()
+        [see] = self.up.register(self._watch, mine)
+        self._hook = self.up.after_service(self.up.find(where(name="move", group=group)), see)
+
+    def seen_moving(self) -> list[Any]:
+        return self._watch.noted
+
+    def watch_no_more(self) -> None:
+        self._hook.detach()
+
+    def once_at(self, host: str, name: str, group: str, *arguments: str) -> Any:
+        """Have another container make a call; how that went."""
+        call = self.up.find(where(name=name, group=group)).bind(*map(json.loads, arguments))
+        asked = self.up.every(0.02, call, host=host)
+        while not (info := asked.info()).fired and not info.failures:
+            time.sleep(0.01)
+        asked.cancel()
+        return info.last_error or "done"
 
     def call(self, name: str, group: str, container: str, *arguments: str) -> Any:
         """Call a service of that container; the arguments are JSON."""

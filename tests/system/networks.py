@@ -3,6 +3,7 @@
 import contextlib
 import json
 import os
+import queue
 import secrets
 import shutil
 import subprocess
@@ -11,6 +12,7 @@ import threading
 from pathlib import Path
 from typing import Any
 
+PATIENCE_S = 60.0
 MEMBER = Path(__file__).with_name("member.py")
 
 
@@ -74,6 +76,9 @@ class Member:
             text=True,
             env=environment,
         )
+        self._said: queue.SimpleQueue[str] = queue.SimpleQueue()
+        self._listener = threading.Thread(target=self._listen, name=f"listen-{name}", daemon=True)
+        self._listener.start()
 
     def tell(self, *words: str) -> None:
         assert self._process.stdin is not None
@@ -81,10 +86,24 @@ class Member:
         self._process.stdin.flush()
 
     def heard(self) -> Any:
-        assert self._process.stdout is not None
-        said = json.loads(self._process.stdout.readline())
+        said = self.says()
         assert "error" not in said, said["error"]
         return said["answer"]
+
+    def says(self) -> dict[str, Any]:
+        """What it says next; a member that says nothing fails the test instead of holding it up."""
+        try:
+            line = self._said.get(timeout=PATIENCE_S)
+        except queue.Empty:
+            raise AssertionError(f"a member said nothing for {PATIENCE_S} s") from None
+        assert line, "the member has ended"
+        return json.loads(line)
+
+    def _listen(self) -> None:
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            self._said.put(line)
+        self._said.put("")
 
     def ask(self, *words: str) -> Any:
         self.tell(*words)
@@ -93,8 +112,7 @@ class Member:
     def refused(self, *words: str) -> str:
         """The error that it gets."""
         self.tell(*words)
-        assert self._process.stdout is not None
-        said = json.loads(self._process.stdout.readline())
+        said = self.says()
         assert "error" in said, said
         return said["error"]
 
@@ -103,15 +121,17 @@ class Member:
         self._process.wait(20)
 
     def close(self) -> None:
-        for pipe in (self._process.stdin, self._process.stdout):
-            assert pipe is not None
-            with contextlib.suppress(OSError):
-                pipe.close()
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        with contextlib.suppress(OSError):
+            self._process.stdin.close()
         try:
             self._process.wait(20)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
+        self._listener.join(20)
+        self._process.stdout.close()
 
 
 class Networks:

@@ -100,6 +100,15 @@ class Stage:
         finally:
             self.all_clear()
 
+    def watch(self, actor: Container) -> bool:
+        moved, looked = (actor.find(where(name=name, group=ARM, container="arm")) for name in ("move", "angle"))
+        actor.after_service(moved, looked).detach()
+        return True
+
+    def notify(self, actor: Container) -> bool:
+        actor.after(60, actor.find(where(name="angle", group=ARM, container="arm")), host="planner").cancel()
+        return True
+
     def all_clear(self) -> None:
         if open_ := [known.id for known in self.chief.estops()]:
             self.chief.estop_clear(open_)
@@ -135,6 +144,8 @@ ACTIONS: Final[Mapping[str, Action]] = {
     "offer a provider": Action("register", Stage.register, lambda _, name, who: f"registry/{ARM}/{who}/{name}/e1/P"),
     "lock": Action("lock", Stage.lock, _middleware),
     "take a lock away": Action("administer", Stage.break_lock, _middleware),
+    "watch a service with a hook": Action("instrument", Stage.watch, _middleware),
+    "have another container notify": Action("instrument", Stage.notify, _middleware),
     "load a policy": Action("administer", lambda s, c: s.call(c, "load_policy", "trade", str(s.policy)), _middleware),
     "clear an e-stop": Action("administer", Stage.estop_clear, _estop),
     "call a stop": Action("", lambda s, c: s.call(c, "halt"), lambda a, _, who: a.key(who, kind="stop")),

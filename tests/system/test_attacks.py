@@ -151,6 +151,25 @@ def test_a_notification_does_nothing_that_its_owner_may_not(attack: Attack) -> N
     assert attack.arm.ask("greeted", ARM) == ["planner lab.planner.bell.echo"]
 
 
+def test_a_hook_is_attached_by_who_may_instrument(attack: Attack) -> None:
+    denied = attack.dash.refused("watch_moves", ARM, "lab.dash.eye")
+    assert denied.startswith("AccessDenied: dash may not instrument rosie.arm.move")
+    attack.chief.ask("watch_moves", ARM, "lab.chief.eye")
+    attack.planner.ask("move", ARM, "3")
+    assert attack.chief.ask("seen_moving") == [{"number": number} for number in range(3)]
+    attack.chief.ask("watch_no_more")
+
+
+def test_a_notification_elsewhere_may_what_who_asked_for_it_may(attack: Attack) -> None:
+    """The container that makes the call has the right to; that does not help who asked."""
+    denied = attack.dash.refused("once_at", "planner", "move", ARM, "4")
+    assert denied.startswith("AccessDenied: dash may not instrument trade.notify")
+    before = attack.moved()
+    assert attack.chief.ask("once_at", "planner", "move", ARM, "4").startswith("AccessDenied: chief may not call")
+    assert attack.moved() == before
+    assert attack.chief.ask("once_at", "planner", "echo", ARM, "4") == "done"
+
+
 def test_a_nested_call_may_what_its_container_may_whoever_asked_for_it(attack: Attack) -> None:
     attack.dash.ask("register_relay", "lab.dash.relay", ARM)
     attack.planner.ask("register_relay", "lab.planner.relay", ARM)

@@ -49,10 +49,39 @@ def test_a_negative_number_and_a_named_argument_are_no_options(rosie_up, trade_c
     assert json.loads(called.stdout) == pytest.approx(-0.2, abs=0.02)
 
 
+def test_the_states_of_all_joints_are_one_stream_of_json_lines(rosie_up, trade_command: Command) -> None:
+    rosie_up()
+    printed = trade_command("stream", "rosie.head.state", "--hz", "50", "--count", "4", "--json")
+    assert printed.returncode == 0, printed.stderr
+    samples = [json.loads(line) for line in printed.stdout.splitlines()]
+    assert [sample["number"] for sample in samples] == [1, 2, 3, 4]
+    assert all(
+        [joint["name"] for joint in sample["value"]] == ["rosie.neck.pan", "rosie.neck.tilt"] for sample in samples
+    )
+
+
+def test_what_moves_is_no_stream(rosie_up, trade_command: Command) -> None:
+    rosie_up()
+    refused = trade_command("stream", "rosie.head.move_to")
+    assert (refused.returncode, refused.stdout) == (1, "")
+    assert "it does not only read" in refused.stderr
+
+
 def test_containers_are_listed(rosie_up, trade_command: Command) -> None:
     rosie = rosie_up()
     [container] = json.loads(trade_command("containers", "--json").stdout)
     assert (container["name"], container["pid"]) == ("rosie", rosie.program.process.pid)
+
+
+def test_loads_are_of_the_second_before_and_the_command_itself_is_left_out(rosie_up, trade_command: Command) -> None:
+    rosie_up()
+    [load] = json.loads(trade_command("containers", "--load", "--json").stdout)
+    assert load["container"] == "rosie"
+    assert load["calls"] >= 2
+    assert load["cpu_percent"] > 0
+    head, row = trade_command("containers", "--load").stdout.splitlines()
+    assert head.split()[:2] == ["CONTAINER", "CPU"]
+    assert row.split()[0] == "rosie"
 
 
 @pytest.mark.parametrize(

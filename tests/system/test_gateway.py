@@ -1,6 +1,5 @@
 """``trade gateway`` between networks: what crosses, what does not, and what becomes of it on bad days."""
 
-import json
 import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -29,7 +28,12 @@ register = ["lobby"]
 [roles.viewer]
 read = ["*"]
 
+[roles.chief]
+read = ["*"]
+administer = ["trade"]
+
 [identities]
+chief = ["chief"]
 arm = ["driver"]
 planner = ["operator"]
 dash = ["viewer"]
@@ -121,8 +125,7 @@ def test_a_policy_is_changed_while_calls_run(site: Site, arm: Member, planner: M
 
 def _tried(member: Member) -> str:
     member.tell("try_move", "rosie.arm", "1")
-    assert member._process.stdout is not None
-    said = json.loads(member._process.stdout.readline())
+    said = member.says()
     return "moved" if "answer" in said else said["error"].partition(":")[0]
 
 
@@ -167,3 +170,11 @@ def test_a_gateway_that_is_killed_ends_the_calls_under_way_and_the_next_one_serv
     planner.ask("group", "rosie.arm", "arm")
     planner.ask("call", "move", "rosie.arm", "arm", "3")
     assert arm.ask("moved", "rosie.arm") == [1, 3]
+
+
+def test_a_gateway_that_is_terminated_leaves_in_order(site: Site) -> None:
+    chief = site.member("right", "chief")
+    name = str(site.ready["container"])
+    assert chief.ask("call", "terminate_container", "trade", name, '"walled_up"') == []
+    assert site.gateway.wait(20) == 0
+    assert f"container {name} is terminated by chief: walled_up" in site.complaints()

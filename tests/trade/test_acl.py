@@ -46,6 +46,7 @@ thief = ["operator", "driver"]
 """
 SYSTEM: Final = "rules"
 STAR: Final = ("planner", "drv", "dash", "mallory")
+HEARD: Final = ("stream/rosie.neck/*/*/*/*/*", "stream/rosie.neck.$*/*/*/*/*/*", "stream/**")
 WAIT_S: Final = 20.0
 """Before something that is to come is given up."""
 MANY: Final = 200
@@ -96,7 +97,7 @@ class Star:
         heard: queue.SimpleQueue[str] = queue.SimpleQueue()
         hear = zenoh.handlers.Callback(lambda sample: heard.put(str(sample.key_expr)), indirect=False)  # so in order
         own = [f"{kind}/*/{name}/**" for kind in ("call", "stop", "reply")]
-        for pattern in (*own, "estop/**", "registry/**", "**", "call/**", "reply/**"):
+        for pattern in (*own, "estop/**", "registry/**", "**", "call/**", "reply/**", *HEARD):
             self.sessions[name].declare_subscriber(pattern, hear, allowed_origin=zenoh.Locality.REMOTE)
         return heard
 
@@ -169,6 +170,13 @@ PUTS: Final = {
     "a forged entry": ("mallory", "planner", "registry/rosie.neck/drv/c/e1/P", False),
     "a forged tally": ("mallory", "planner", "registry/trade/drv/c/e1/tally", False),
     "an entry one may not see": ("drv", "dash", "registry/rosie.neck/drv/c/e1/P", False),
+    "a sample": ("drv", "planner", "stream/rosie.neck/drv/c/e1/P/angle", True),
+    "a sample beneath the group": ("drv", "planner", "stream/rosie.neck.pan/drv/c/e1/P/angle", True),
+    "a sample of a group of others": ("drv", "planner", "stream/lab/drv/c/e1/P/angle", False),
+    "a forged sample": ("mallory", "planner", "stream/rosie.neck/drv/c/e1/P/angle", False),
+    "a sample one may not read": ("drv", "dash", "stream/rosie.neck/drv/c/e1/P/angle", False),
+    "a sample to everybody": ("drv", "planner", "stream/*/drv/c/e1/P/angle", False),
+    "a sample of a reader": ("dash", "planner", "stream/rosie.neck/dash/c/e1/P/angle", False),
     "an e-stop": ("dash", "drv", "estop/dash", True),
     "a forged e-stop": ("mallory", "drv", "estop/planner", False),
     "a confirmation": ("drv", "dash", "estop/drv/c/e1", True),
@@ -262,7 +270,7 @@ def keys_of(rules: dict[str, Any], who: str, message: str, flow: str) -> set[str
 
 
 def test_what_a_network_does_not_export_is_neither_offered_nor_called_across_it() -> None:
-    roles = [Role("all", {"call": ["*"], "register": ["rosie", "lab"]})]
+    roles = [Role("all", {"call": ["*"], "read": ["*"], "register": ["rosie", "lab"]})]
     policy = Policy(roles, {"rosie": ["all"], "planner": ["all"]})
     crossing = crossings({"eth0": ["rosie.head"], "eth1": []})
     assert crossing == {"eth0": (["rosie.head"], []), "eth1": ([], ["rosie.head"])}
@@ -277,6 +285,12 @@ def test_what_a_network_does_not_export_is_neither_offered_nor_called_across_it(
     seen = keys_of(rules, "planner eth0 lo", "reply", "egress")
     assert seen == {"registry/trade/*/*/*/*"}
     assert "stop/planner/**" in keys_of(rules, "planner eth1", "put", "ingress")
+    exported = {f"stream/{group}/*/*/*/*/*" for group in ("trade", "rosie.head", "rosie.head.$*")}
+    for message, flow in (("put", "egress"), ("declare_subscriber", "ingress")):
+        heard = keys_of(rules, "planner eth1", message, flow)
+        assert {key for key in heard if key.startswith("stream/")} == exported
+        unheard = keys_of(rules, "planner eth0 lo", message, flow)
+        assert {key for key in unheard if key.startswith("stream/")} == {"stream/trade/*/*/*/*/*"}
 
 
 def test_without_certificates_only_what_crosses_is_looked_at() -> None:
@@ -399,6 +413,8 @@ def test_containers_do_all_they_may_under_the_rules(
     planner = join("planner")
     call = {name: planner.find(where(name=name, group="rosie.neck"), wait_s=WAIT_S) for name in ("move", "angle")}
     assert (call["move"](0.1), call["angle"]()) == (0.1, 0.5)
+    with planner.stream(call["angle"], hz=100) as angles:
+        assert [angles.next(WAIT_S).value for _ in range(3)] == [0.5] * 3
     planner.call(where(name="stop"))
     drv.register(arm, "rosie.neck.left")
     assert planner.find(where(name="move", group="rosie.neck.left"), wait_s=WAIT_S)(0.2) == 0.2

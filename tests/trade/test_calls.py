@@ -57,7 +57,7 @@ class PaperTransport(Transport):
     def publish(self, key: str, *, urgent: bool = False, droppable: bool = False) -> Publisher:
         return PaperPublisher(self)
 
-    def subscribe(self, pattern: str, *, newest: bool = False) -> Channel:
+    def subscribe(self, pattern: str, *, newest: int = 0) -> Channel:
         return self.channels.setdefault(pattern.removeprefix("reply/*/"), PaperChannel())
 
     def wake(self, key: str, payload: bytes) -> None:

@@ -231,7 +231,7 @@ def test_a_handle_works_before_its_registry_entry_came(here: Container, there: C
         def hello(self) -> str:
             return "hello"
 
-    key = ServiceKey(there.address, "late", "Late-2", "hello")  # its second provider, which is still to come
+    key = ServiceKey(there.address, "late", "Late-1", "hello")  # its first provider, which is still to come
     early = here.handle(key)
     assert early.last_record is None
     coming = threading.Timer(0.05, lambda: there.register(Late(), "late"))

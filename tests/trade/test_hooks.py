@@ -4,12 +4,14 @@ import logging
 import queue
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
 
 from trade import Called, Container, Handle, Secret, current_call, errors, service, where
+from trade._context import CallContext
+from trade._dispatch import LocalService
 from trade.errors import AccessDenied, ConfigurationError, NoSuchHook
 from waiting import wait_until
 
@@ -401,3 +403,28 @@ administer = ["*"]
     plan("coffee")
     assert hook.infos()[0].fired == 1
     assert hook.infos()[0].services == ()
+
+
+def test_a_call_goes_on_when_the_last_hook_is_detached_as_it_begins(
+    here: Container, planner: Planner, observer: Observer, watch: Callable[[str], Handle]
+) -> None:
+    [plan, *_] = here.register(planner, "mind")
+    here.before_service(plan, watch("see"))
+    hooked = here._providers.service(plan.key)
+    assert hooked is not None
+
+    class Detached(LocalService):
+        """Its hooks are there at the first look at them, and gone at the second."""
+
+        looks: Iterator[Any] = iter([hooked.around])
+
+        @property
+        def around(self) -> Any:  # type: ignore[override]
+            return next(self.looks, None)
+
+    service = object.__new__(Detached)
+    for name in LocalService.__slots__:
+        if name != "around":
+            setattr(service, name, getattr(hooked, name))
+    context = CallContext(7, hooked.label, "ui", here.session, time.monotonic_ns() + 10**10)
+    assert service.call(("tea", 1), {}, context) == ["tea"]

@@ -40,7 +40,7 @@ class TestZenoh(TransportConformance):
     def test_what_nobody_reads_holds_up_nothing_where_only_the_newest_is_wanted(self) -> None:
         with self.network() as open_transport:
             here, there = open_transport(), open_transport()
-            unread, read = there.subscribe("flood", newest=True), there.subscribe("call")
+            unread, read = there.subscribe("flood", newest=_CHANNEL_CAPACITY), there.subscribe("call")
             flood, call = here.publish("flood"), here.publish("call")
             for number in range(2 * _CHANNEL_CAPACITY):
                 flood.put(str(number).encode())

@@ -16,7 +16,7 @@ from trade_drivers.robotfile import Group, Robot
 
 __all__ = ["AttachedRobot", "attach"]
 
-_log = logging.getLogger(__name__)
+_log = logging.getLogger("trade")
 
 Provider = Motor | JointGroup | Gripper | CanMonitor
 Register = Callable[[object, Sequence[str]], object]

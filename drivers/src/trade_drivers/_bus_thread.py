@@ -14,7 +14,7 @@ from trade_drivers.robotfile import Bus
 
 __all__ = ["BusThread", "Port"]
 
-_log = logging.getLogger(__name__)
+_log = logging.getLogger("trade")
 _REOPEN_FIRST_S: Final = 0.1
 _REOPEN_MOST_S: Final = 1.0
 

@@ -15,7 +15,7 @@ from trade_drivers.robotfile import Bus
 
 __all__ = ["HALT_NS", "PROBE_NS", "BusDevice", "BusExchange", "StopTicket"]
 
-_log = logging.getLogger(__name__)
+_log = logging.getLogger("trade")
 PROBE_NS: Final = 500_000_000
 """How long a device that does not answer is left alone, at first, before it is asked again."""
 HALT_NS: Final = 2_000_000_000

@@ -14,8 +14,8 @@ from typing import Final
 
 import serial
 
-from trade.errors import ConfigurationError
-from trade_drivers._work import Gate, PortLost, losing
+from trade.errors import ConfigurationError, TradeError
+from trade_drivers._work import Gate, PortLost
 
 __all__ = ["ANSWER_MARGIN_S", "DRAIN_S", "LONGEST_WAIT_S", "SerialLine", "SerialWire"]
 
@@ -140,9 +140,9 @@ class SerialWire:
             case errno.ENOTTY | errno.EISDIR:
                 problem = "is no serial port; `ls -l /dev/serial/by-id` shows those there are"
             case errno.ENOENT:
-                return PortLost("there is no such device")
+                return _lost("there is no such device")
             case _:
-                return PortLost(str(bad))
+                return _lost(_text(bad))
         return ConfigurationError(where=f"{self._where}.port", problem=f"{self.path}: {problem}")
 
     def close(self) -> None:
@@ -156,8 +156,11 @@ class SerialWire:
             raise PortLost("it is not open")
         self._line.gate = gate
         try:
-            with losing(OSError, termios.error):
-                yield
+            yield
+        except TradeError:  # the gate's: some of them are OSErrors, too
+            raise
+        except (OSError, termios.error) as gone:
+            raise _lost(_text(gone)) from None
         finally:
             self._line.gate = None
 
@@ -166,6 +169,15 @@ class SerialWire:
 
     def _unsettle(self, drain_s: float = DRAIN_S) -> None:
         self.settled_at = time.monotonic() + drain_s
+
+
+def _lost(why: str) -> PortLost:
+    return PortLost(f"{why}; plug its adapter in again")
+
+
+def _text(bad: Exception) -> str:
+    number = _error_number(bad)
+    return os.strerror(number) if number else str(bad)
 
 
 def _error_number(bad: BaseException | None) -> int | None:

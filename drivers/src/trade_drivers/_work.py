@@ -5,7 +5,7 @@ from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from typing import Final, Generic, Protocol, TypeVar
 
-from trade import Permit
+from trade import Permit, current_call
 from trade.errors import DeadlineExceeded, DeviceFault, TradeError
 
 __all__ = ["Device", "Gate", "NoAnswer", "PortLost", "Steps", "WireError", "Work", "check_admitted", "losing"]
@@ -70,6 +70,7 @@ class Work(Generic[_Device_co]):
     def __init__(self, devices: Sequence[_Device_co]) -> None:
         self.devices = tuple(devices)
         """Those it touches, or waits for; at least one."""
+        self._call = current_call()
         self._ended = threading.Event()
         self._error: TradeError | None = None
         self._steps: Steps | None = None
@@ -98,6 +99,11 @@ class Work(Generic[_Device_co]):
             self.finish(problem)
             return False
         return True
+
+    def note(self, done: str) -> None:
+        """Tell whoever traces the call that asked for it what has just been done, such as ``wrote goal``."""
+        if self._call is not None:
+            self._call.event(f"{', '.join(device.name for device in self.devices)}: {done}")
 
     def done_stepping(self) -> None:
         """All its exchanges have been made."""

@@ -2,7 +2,7 @@
 
 import signal
 import threading
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
@@ -42,9 +42,9 @@ def gateway(
         out.say(f"{file} is right")
         _say_what_crosses(out, plan)
         return
-    with leaving() as asked_to_leave, _hangups() as hangup:
+    with leaving() as asked_to_leave, hangups() as hangup:
         seen = digest(file)
-        running = Gateway(plan, named_digest(file))
+        running = Gateway(plan, named_digest(file), asked_to_leave.set)
         try:
             _say_ready(out, running, plan)
             while not asked_to_leave.wait(_LOOK_EVERY_S):
@@ -61,12 +61,15 @@ def gateway(
 class Gateway:
     """The container that joins the networks, and its guests in other systems, as the file says now."""
 
-    def __init__(self, plan: Plan, named: str = "") -> None:
+    def __init__(self, plan: Plan, named: str, leave: Callable[[], None]) -> None:
         self._plan = plan
+        self._leave = leave
+        """What ends the gateway when its container is terminated."""
         self._named = named
         """What the files said that it names."""
         self._guests = Guests()
         self._container = Container(plan.settings)
+        self._container.terminating.close = leave
         self._running: Settings | None = plan.settings
         """What the container that is open was started with."""
         try:
@@ -111,6 +114,7 @@ class Gateway:
             self._running = None
             self.close()
             self._container = opened(plan.settings)
+            self._container.terminating.close = self._leave
             self._running = plan.settings
         self._guests.apply(self._container, plan)
 
@@ -121,7 +125,7 @@ class Gateway:
 
 
 @contextmanager
-def _hangups() -> Generator[threading.Event]:
+def hangups() -> Generator[threading.Event]:
     """An event that SIGHUP sets."""
     event = threading.Event()
 

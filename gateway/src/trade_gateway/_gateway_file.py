@@ -23,6 +23,8 @@ else:
 __all__ = ["GatewayFile", "Network", "Plan", "Share", "digest", "named_digest", "read_gateway_file"]
 
 _GROUP: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_-]*(\.[A-Za-z0-9_-]+)*")
+_UNKNOWN_LOOPBACK: Final = re.compile(r"/127\.(?!0\.0\.1:)")
+"""The transport knows the interface of a link by the interface's own addresses; it would apply no rule."""
 _AT: Final = re.compile(r" - at `\$\.?([^`]*)`$")
 _MISSING: Final = re.compile(r"missing required field `([^`]*)`")
 _UNKNOWN: Final = re.compile(r"contains unknown field `([^`]*)`")
@@ -200,6 +202,10 @@ def _check(file: GatewayFile, where: str) -> None:
             problem = f"{network.interface} is the interface of network {other!r} already"
             raise ConfigurationError(where=f"{where}: network.{name}.interface", problem=problem)
         owners[network.interface] = name
+        for endpoint in network.listen:
+            if _UNKNOWN_LOOPBACK.search(endpoint):
+                problem = f"{endpoint}: lo is known by 127.0.0.1 alone, and nothing would cross; write that one"
+                raise ConfigurationError(where=f"{where}: network.{name}.listen", problem=problem)
         _check_groups(network.export or (), f"{where}: network.{name}.export")
         if file.alone and network.export is not None:
             problem = "there is no other network of this system; leave it out: what other systems see is in [share...]"

@@ -1,16 +1,19 @@
 """``trade services`` and ``trade containers``: what there is."""
 
+from collections.abc import Sequence
 from textwrap import indent
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
 import typer
 from rich.markup import escape
 
-from trade import Constraint, Container, Handle, where
+from trade import Constraint, Container, Handle, LoadInfo, where
 from trade.errors import ConfigurationError
+from trade_gateway._loads import loads, loads_table
 from trade_gateway._output import Output, UsageError
 from trade_gateway._system_choice import visitor
 
+_ALONE: Final = "no other container is up in this system; [bold]trade up examples/rosie.toml --sim[/] starts one"
 Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
 
@@ -84,17 +87,33 @@ def _row(handle: Handle) -> tuple[str, ...]:
     return handle.label, handle.signature, handle.effect, handle.container, handle.host
 
 
-def containers(context: typer.Context, as_json: Json = False) -> None:
+def containers(
+    context: typer.Context,
+    load: Annotated[bool, typer.Option("--load", help="How busy each is, over one second.")] = False,
+    as_json: Json = False,
+) -> None:
     """List the containers of the system."""
     out = Output(as_json=as_json)
     with visitor(context) as container:
+        if load:
+            _say_loads(out, loads(container))
+            return
         found = [info for info in container.containers() if info.epoch != container.address.epoch]
         if as_json:
             out.data(found)
         elif not found:
-            out.say("no other container is up in this system; [bold]trade up examples/rosie.toml --sim[/] starts one")
+            out.say(_ALONE)
         else:
             rows = [
                 (info.name, info.identity, info.host, str(info.pid), str(info.services), info.epoch) for info in found
             ]
             out.table(("CONTAINER", "IDENTITY", "HOST", "PID", "SERVICES", "EPOCH"), rows)
+
+
+def _say_loads(out: Output, found: Sequence[LoadInfo]) -> None:
+    if out.as_json:
+        out.data(found)
+    elif not found:
+        out.say(_ALONE)
+    else:
+        out.table(*loads_table(found))

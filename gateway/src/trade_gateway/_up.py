@@ -43,7 +43,8 @@ def up(
         simulation = stack.enter_context(_simulation(robot_file, sim_log)) if sim else None
         ports: dict[str, str] | None = simulation.ports if simulation else None
         container = stack.enter_context(Container(choice_of(context).settings(name or robot.name)))
-        _refuse_twice(container)
+        container.terminating.close = asked_to_leave.set
+        refuse_twice(container, "trade up")
         _say_attaching(out, robot, ports)
         attached = stack.enter_context(
             attach(
@@ -93,12 +94,12 @@ def _simulation(robot_file: Path, log: Path | None) -> Any:
         raise ConfigurationError(where=str(robot_file), problem=str(problem)) from None
 
 
-def _refuse_twice(container: Container) -> None:
-    """Two robots of one name would make every look-up ambiguous."""
+def refuse_twice(container: Container, command: str) -> None:
+    """Two containers of one name that stay up would make every look-up ambiguous."""
     for other in container.containers():
         if other.name == container.name and other.epoch != container.address.epoch:
             problem = f"{other.name!r} is up already (process {other.pid} on {other.host}); stop it, or choose a --name"
-            raise ConfigurationError(where="trade up", problem=problem)
+            raise ConfigurationError(where=command, problem=problem)
 
 
 def _say_attaching(out: Output, robot: Robot, ports: dict[str, str] | None) -> None:

@@ -6,7 +6,25 @@ from typing import Annotated
 import typer
 
 from trade.errors import TradeError
-from trade_gateway import _call, _estop, _gateway, _list, _lock, _locks, _pki_commands, _policy, _up
+from trade_gateway import (
+    _call,
+    _empty_container,
+    _estop,
+    _gateway,
+    _list,
+    _lock,
+    _locks,
+    _logs,
+    _pki_commands,
+    _policy,
+    _profile,
+    _rules,
+    _start,
+    _stream,
+    _trace,
+    _up,
+    _watchers,
+)
 from trade_gateway._output import UsageError, say_error
 from trade_gateway._system_choice import SystemChoice
 
@@ -24,15 +42,25 @@ app = typer.Typer(
 app.command("up")(_up.up)
 app.command("gateway")(_gateway.gateway)
 app.command("services")(_list.services)
+app.command("container")(_empty_container.container)
+app.command("start")(_start.start)
 app.command("containers")(_list.containers)
 app.command("call", context_settings={"ignore_unknown_options": True})(_call.call)
+app.command("stream")(_stream.stream)
 app.command("lock", cls=_lock.WithCommand)(_lock.lock)
 app.command("locks")(_locks.locks)
 app.command("unlock")(_locks.unlock)
 app.command("resume")(_locks.resume)
 app.command("estop")(_estop.estop)
+app.command("notifications")(_watchers.notifications)
+app.command("hooks")(_watchers.hooks)
+app.command("tracing")(_trace.tracing)
+app.command("trace")(_trace.trace)
+app.command("logs")(_logs.logs)
+app.command("profile")(_profile.profile)
 app.add_typer(_pki_commands.app, name="pki")
 app.add_typer(_policy.app, name="policy")
+app.add_typer(_rules.app, name="rules")
 
 
 def _version(wanted: bool) -> None:

@@ -206,7 +206,7 @@ class Jam(_Devices, frozen=True, kw_only=True, tag="jam"):
 
 
 class WrongModel(_Devices, frozen=True, kw_only=True, tag="wrong_model"):
-    """Devices report another model number, as after a swap."""
+    """Devices report another model number, as after a swap; in a gripper's place is one without its registers."""
 
     number: Annotated[int, Meta(ge=0, le=65_535)]
 

@@ -20,19 +20,25 @@ from trade._estopping import LIMIT_S
 from trade._handle import Bound, Handle, Run
 from trade._hooking import Hook
 from trade._hooks import Called, HookInfo
+from trade._load import LoadInfo
 from trade._lock import Lock, OnLost, OnRequest
 from trade._locking import LEASE_S
+from trade._logbook import LogLine
 from trade._many import Outcome
 from trade._notifications import Notification, NotificationInfo
 from trade._notifying import POLL_S
 from trade._occasions import What
 from trade._resources import Permit, Resource, permit
+from trade._sample import Sample
 from trade._secret import Secret
 from trade._service import service
 from trade._session import Session
 from trade._settings import Settings
+from trade._spans import Span
+from trade._stream import If, Stream
 from trade._system import ContainerInfo, System
 from trade._terms import LockInfo
+from trade._tracing import LogReader, Trace
 from trade._wire import HEALTHY, Estop, Scalar
 
 __all__ = [
@@ -47,8 +53,11 @@ __all__ = [
     "Handle",
     "Hook",
     "HookInfo",
+    "LoadInfo",
     "Lock",
     "LockInfo",
+    "LogLine",
+    "LogReader",
     "Meta",
     "Notification",
     "NotificationInfo",
@@ -56,10 +65,14 @@ __all__ = [
     "Permit",
     "Resource",
     "Run",
+    "Sample",
     "Secret",
     "Session",
     "Settings",
+    "Span",
+    "Stream",
     "System",
+    "Trace",
     "acall",
     "acall_all",
     "acall_sequence",
@@ -92,6 +105,7 @@ __all__ = [
     "left",
     "lock",
     "locks",
+    "logs",
     "notifications",
     "once",
     "open_session",
@@ -105,8 +119,12 @@ __all__ = [
     "services",
     "set_groups",
     "set_health",
+    "set_tracing",
+    "spans",
     "start",
+    "stream",
     "system",
+    "trace",
     "where",
 ]
 
@@ -138,6 +156,9 @@ def container() -> Container:
         return running
     with _lock:
         return _default if _default is not None else start()
+
+
+_running = container  # where an argument has its name
 
 
 def close() -> None:
@@ -331,6 +352,39 @@ def hooks() -> list[HookInfo]:
 def detach_hook(hook: str) -> None:
     """End a hook by its id, wherever it is attached; see `Container.detach_hook`."""
     container().detach_hook(hook)
+
+
+def set_tracing(on: bool, *, container: str = "*") -> list[str]:
+    """Have containers note every call they make and serve, or no more; see `Container.set_tracing`."""
+    return _running().set_tracing(on, container=container)
+
+
+def spans(*, container: str = "*") -> list[Span]:
+    """What the containers noted of calls while they were traced; see `Container.spans`."""
+    return _running().spans(container=container)
+
+
+def trace(call_id: int) -> Trace:
+    """The whole tree that a call belongs to; see `Container.trace`."""
+    return container().trace(call_id)
+
+
+def logs(*, container: str = "*") -> list[LogLine]:
+    """What the processes of the system logged lately; see `Container.logs`."""
+    return _running().logs(container=container)
+
+
+def stream(
+    target: Handle | Constraint,
+    *,
+    hz: float = 10.0,
+    on_change: bool = False,
+    if_: If | None = None,
+    call: What | None = None,
+    keep: int = 16,
+) -> Stream:
+    """Have a service sampled as long as one listens; see `Container.stream`."""
+    return container().stream(target, hz=hz, on_change=on_change, if_=if_, call=call, keep=keep)
 
 
 def lock(

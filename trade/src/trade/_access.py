@@ -18,6 +18,7 @@ _ALL: Final = ""
 FUNCTIONS: Final = {
     "clock": _ALL,
     "containers": _ALL,
+    "load": _ALL,
     "withdrawn": _ALL,
     "locks": _ALL,
     "renew": _ALL,  # only what is one's own
@@ -35,11 +36,20 @@ FUNCTIONS: Final = {
     "detach_hook": _ALL,  # asks itself for administer if it is another's
     "hooks": _ALL,
     "hook_suspended": _ALL,
+    "set_tracing": "instrument",
+    "spans": "read",
+    "log_lines": "read",
+    "listen": _ALL,  # asks itself for read over the service
+    "unlisten": _ALL,  # only what is one's own
     "acquire": _ALL,  # asks itself for lock over the groups of the resources
     "break_lock": _ALL,  # asks itself for administer over them
     "resume": _ALL,  # asks itself for administer over those whose lock is not one's own
     "deregister": "administer",
     "register": "administer",
+    "instantiate": "administer",
+    "start_container": "administer",
+    "terminate": "administer",
+    "terminate_container": "administer",
     "set_discovery": "administer",
     "set_broadcast": "administer",
     "connect": "administer",

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Final, Literal, NamedTuple
 
 from trade._policies import EVERYTHING, VERBS, Policy
+from trade._sample import STREAMS
 from trade._system import DOMAIN
 from trade._wire import ALIVE, ESTOPS, REGISTRY
 
@@ -130,21 +131,23 @@ def _rows(policy: Policy | None, me: str, crossing: Crossing) -> list[_Row]:
     calls = _over(policy, me, ("call", "read"), crossing.seen, f"call/{me}/*/*/*/{{}}/*")
     offers = _over(policy, me, ("register",), crossing.offered, f"registry/{{}}/{me}/*/*/*")
     sees = _over(policy, me, _SEEING, crossing.seen, "registry/{}/*/*/*/*")
+    puts = _over(policy, me, ("register",), crossing.offered, f"stream/{{}}/{me}/*/*/*/*")
+    hears = _over(policy, me, ("read",), crossing.seen, "stream/{}/*/*/*/*/*")
     own = f"registry/*/{me}/*/*/*"
     to_it = [f"call/*/{me}/**", f"stop/*/{me}/**", f"reply/*/{me}/**", ESTOPS]
     return [
-        (_IN, "put", [*calls, f"stop/{me}/**", f"reply/{me}/**", *offers, f"estop/{me}/**"]),
+        (_IN, "put", [*calls, f"stop/{me}/**", f"reply/{me}/**", *offers, *puts, f"estop/{me}/**"]),
         (_IN, "reply", offers),
         (_IN, "query", [REGISTRY]),
-        (_IN, "declare_subscriber", [REGISTRY, *to_it]),
+        (_IN, "declare_subscriber", [REGISTRY, *to_it, *hears]),
         (_IN, "declare_queryable", [own]),
         (_IN, "liveliness_token", [f"alive/{me}/**"]),
         (_IN, "declare_liveliness_subscriber", [ALIVE]),
         (_IN, "liveliness_query", [ALIVE]),
-        (_OUT, "put", [*sees, *to_it]),
+        (_OUT, "put", [*sees, *to_it, *hears]),
         (_OUT, "reply", sees),
         (_OUT, "query", [REGISTRY]),
-        (_OUT, "declare_subscriber", [REGISTRY, "call/**", "stop/**", "reply/**", ESTOPS]),
+        (_OUT, "declare_subscriber", [REGISTRY, "call/**", "stop/**", "reply/**", STREAMS, ESTOPS]),
         (_OUT, "declare_queryable", [REGISTRY]),
         (_OUT, "liveliness_token", [ALIVE]),
     ]

@@ -15,6 +15,7 @@ from typing import Any, Final
 from msgspec import Raw, structs
 
 from trade._peer import NEVER, Peer
+from trade._spans import Spans
 from trade._system import CLOCK, DOMAIN, PROVIDER
 from trade._transport import Channel, ChannelClosed, Message, Publisher, Transport
 from trade._wire import (
@@ -105,6 +106,8 @@ class Caller:
         self._next_deadline_ns: float = NEVER
         self._sooner = threading.Event()
         self.malformed = 0
+        self.spans: Spans | None = None
+        """Where calls are noted while this container is traced."""
         self._spawn("trade-deadlines", self._watch_deadlines)
 
     @property

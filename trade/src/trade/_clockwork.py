@@ -65,9 +65,13 @@ class Clockwork:
         """A thread was called to lead and has not got there yet."""
         self._closed = False
 
+    def due(self, act: Act) -> Due:
+        """Something to be done once it is told when."""
+        return Due(self, act)
+
     def begin(self, act: Act, due_ns: int) -> Due:
         """Have something done at a time of ``time.monotonic_ns()``; one that has passed means now."""
-        due = Due(self, act)
+        due = self.due(act)
         due.at(due_ns)
         return due
 

@@ -25,14 +25,16 @@ from trade._dispatch import Dispatcher
 from trade._estopping import Estopping
 from trade._guarding import Guarding
 from trade._handle import Handle, Run
-from trade._hooking import Hooking
 from trade._hooks import Hooks
 from trade._hosting import Hosting
 from trade._inherited import InheritedLock
 from trade._invoke import LocalTarget, RemoteTarget, container_closed
 from trade._joining import join
+from trade._listening import Listening
+from trade._load import Load
 from trade._locking import Locking
 from trade._locks import LockTable
+from trade._making import Making
 from trade._notifications import Notifier
 from trade._own_services import OwnServices
 from trade._providers import Providers
@@ -42,7 +44,11 @@ from trade._request import new_request
 from trade._resources import Holder
 from trade._session import Session
 from trade._settings import Settings
+from trade._streaming import Streaming
+from trade._streams import Streams
 from trade._system import DOMAIN, PROVIDER, ContainerInfo, System
+from trade._terminating import Terminating
+from trade._tracing import Tracing, new_spans
 from trade._transport import ChannelClosed, Transport
 from trade._watch import Watch
 from trade._wire import Address, ServiceKey, Token, alive_key, as_chunk, encode_message
@@ -57,7 +63,7 @@ _PATIENCE_S: Final = 1.0
 """How long a call waits for the registry to hear of a handle that came by message before its registry entry did."""
 
 
-class Container(Hosting, Hooking, Guarding, Bordering):
+class Container(Hosting, Streaming, Tracing, Guarding, Bordering):
     """A participant of a system; most programs use the default one through the functions of ``trade``.
 
     Joins on construction. A context manager; ``close()`` leaves and is idempotent.
@@ -80,7 +86,7 @@ class Container(Hosting, Hooking, Guarding, Bordering):
         self._closed = False
         self.system: Final = System(lambda: self)
         """Its own switches: who it is linked to, and whether it lets itself be found."""
-        self.access: Final = Access(self._settings.policy, certified=self._settings.tls is not None)
+        self.access = Access(self._settings.policy, certified=self._settings.tls is not None)
         """What the policy means for it."""
         self._targets: dict[ServiceKey, LocalTarget | RemoteTarget] = {}
         self._codec = Codec(self._handle_to_data, self._data_to_handle, (Handle,))
@@ -95,7 +101,7 @@ class Container(Hosting, Hooking, Guarding, Bordering):
                 leaving.callback(self._reach.close)
             self._caller = Caller(self._transport, self.address, self.session)
             leaving.callback(self._caller.close)
-            clockwork = Clockwork("trade-clock")
+            clockwork = self._clockwork = Clockwork("trade-clock")
             leaving.callback(clockwork.close)
             epoch = self.address.epoch
             self._notifier = Notifier(self, clockwork, epoch, lambda record: Handle(self, record.key, record))
@@ -129,8 +135,18 @@ class Container(Hosting, Hooking, Guarding, Bordering):
                 self._denied_hook,
             )
             self._registry.listen(self._hooks.changed)
+            self._spans = new_spans(self.address, self.session, self._table)
+            self._trace_here(self._settings.trace)
             self._told_of_ends.append(self._hooks.session_ended)
             self._hook_numbers = itertools.count(1)
+            self._streams = Streams(self, self._transport, self._providers.service, clockwork, self._caller.new_id)
+            self._registry.listen(self._streams.changed)
+            self._told_of_ends.append(self._streams.session_ended)
+            leaving.callback(self._streams.close)
+            self._listening = Listening(self, self._transport, clockwork, self._codec, self._registry.removed)
+            self._registry.listen(self._listening.changed)
+            self._told_of_ends.append(self._listening.session_ended)
+            leaving.callback(self._listening.close)
             state = self._settings.state_dir
             self._estopping = Estopping(
                 self._transport,
@@ -146,10 +162,19 @@ class Container(Hosting, Hooking, Guarding, Bordering):
             self._table.stop_with(self._deadman.stop)
             self.withdrawn = Withdrawn(self._providers, self._deadman.rest)
             """What was taken off from elsewhere and can be offered again."""
+            self.making = Making(self, self._providers, self.withdrawn, self._settings.instantiable)
+            """What it made for others."""
+            leaving.callback(self.making.close)
             self._dispatcher = Dispatcher(
                 self._transport, self.address, self._providers.lookup, coroutines, self.access, self.access.callers()
             )
             leaving.callback(self._dispatcher.close)
+            self.meter = Load(self.name, lambda: list(self._dispatcher._crews), self._providers.waiting)
+            """How busy it is."""
+            self.terminating = Terminating(
+                self.name, self._deadman.rest, self._table.resources, lambda: self.meter.running, self.close
+            )
+            """Its end, if others want it."""
             own = OwnServices(
                 self.system,
                 self._table,
@@ -164,6 +189,9 @@ class Container(Hosting, Hooking, Guarding, Bordering):
                 self._registry,
                 self._hooks,
                 self,
+                self._spans,
+                self._trace_here,
+                self._streams,
             )
             self._providers.add(own, (DOMAIN,), name=PROVIDER)
             self._estopping.begin(own)
@@ -190,6 +218,7 @@ class Container(Hosting, Hooking, Guarding, Bordering):
         self._dispatcher.hear(self.access.callers())
         self._registry.judge_anew()
         self._hooks.judge_anew()
+        self._streams.judge_anew()
         for info in self._table.infos():
             held = [(name, self._providers.groups_of(name)) for name in info.resources]
             denied = self.access.denied_lock(info.holder.identity, held)
@@ -391,7 +420,8 @@ class Container(Hosting, Hooking, Guarding, Bordering):
     @property
     def dropped_messages(self) -> int:
         """Messages that were malformed or of another protocol version."""
-        return self._dispatcher.malformed + self._caller.malformed + self._watch.malformed + self._estopping.malformed
+        readers = (self._dispatcher, self._caller, self._watch, self._estopping, self._listening)
+        return sum(reader.malformed for reader in readers)
 
     @property
     def catching_up(self) -> bool:

@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 
 __all__ = ["CallContext", "current_call", "progress"]
 
+_MOST_EVENTS: Final = 100
+
 
 class CallContext(Struct, frozen=True, gc=False):
     """One call, seen from inside the service."""
@@ -38,6 +40,8 @@ class CallContext(Struct, frozen=True, gc=False):
     """What it inherited; its own calls inherit it, too, while it runs."""
     permit: "Permit | None" = None
     """What it may do to the resources of its service."""
+    events: list[tuple[int, str]] | None = None
+    """What was noted of it, and when by ``time.monotonic_ns()``; None if it is not traced."""
 
     @property
     def sessions(self) -> tuple[str, ...]:
@@ -87,6 +91,15 @@ class CallContext(Struct, frozen=True, gc=False):
         report = None if ongoing is None else ongoing.report
         if ongoing is not None and report is not None:
             report(ongoing, value)
+
+    def event(self, text: str) -> None:
+        """Note what has just happened, for whoever traces it; never a secret. Untraced it does nothing.
+
+        Of one call the first hundred are kept.
+        """
+        events = self.events
+        if events is not None and len(events) < _MOST_EVENTS:
+            events.append((time.monotonic_ns(), text))
 
     @property
     def remaining_s(self) -> float | None:

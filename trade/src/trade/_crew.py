@@ -35,6 +35,8 @@ class Crew:
         self._threads: list[threading.Thread] = []
         self._hired = 0
         self._idle = 0
+        self.taken = 0
+        """Messages it has begun to work at, refused ones left out."""
         self._dismissed = False
         with self._back:
             self._hire()
@@ -42,6 +44,12 @@ class Crew:
     @property
     def draining(self) -> bool:
         return self._idle > 0
+
+    @property
+    def working(self) -> int:
+        """Threads that work at a message now."""
+        with self._back:
+            return len(self._threads) - self._idle
 
     def _hire(self) -> None:
         thread = threading.Thread(target=self._main, name=f"{self._name}-{self._hired}", daemon=True)
@@ -79,6 +87,7 @@ class Crew:
             if self._idle == 1:
                 return False
             self._idle -= 1
+            self.taken += 1
             return True
 
     def _join_idle(self) -> bool:

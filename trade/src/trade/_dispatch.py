@@ -57,6 +57,8 @@ _COROUTINE: Final[type] = CoroutineType
 ANYBODY: Final = "*"
 _KINDS: Final = frozenset(("call", "stop"))
 _MOST_REPLY_KEYS: Final = 1024
+_MOST_WAITING: Final = 4096
+"""Calls of one caller that is told from others."""
 _MOST_CALLERS: Final = 1024
 """Of one service, whose admission is kept."""
 _SYSTEM: Final = f"{DOMAIN}/{PROVIDER}"
@@ -121,13 +123,11 @@ class LocalService:
         args, kwargs = self.signature.decode(self.label, raw)
         return self.call(args, kwargs, context)
 
-    def call(self, args: Sequence[Any], kwargs: dict[str, Any], context: CallContext) -> Any:
-        """Call with the arguments as they are."""
-        around = self.around
-        return self.call_bare(args, kwargs, context) if around is None else around.run(self, args, kwargs, context)
-
-    def call_bare(self, args: Sequence[Any], kwargs: dict[str, Any], context: CallContext) -> Any:
-        """The same without what is called before and after it."""
+    def call(self, args: Sequence[Any], kwargs: dict[str, Any], context: CallContext, *, bare: bool = False) -> Any:
+        """Call with the arguments as they are; ``bare``: without what is called before and after it."""
+        around = self.around  # it may end at any time
+        if around is not None and not bare:
+            return around.run(self, args, kwargs, context)
         if not self.resources or self.effect != "actuate":
             self._look(context)
             return self.run_admitted(args, kwargs, context)
@@ -225,7 +225,7 @@ class Dispatcher:
         """
         for name, stop, refuse in (("trade-call", False, self._busy), ("trade-stop", True, self._serve)):
             pattern = calls_to(self._own, stop=stop, caller=caller)
-            channel = self._transport.subscribe(pattern, newest=caller != ANYBODY)
+            channel = self._transport.subscribe(pattern, newest=0 if caller == ANYBODY else _MOST_WAITING)
             self._crews.append(Crew(name, channel, self._serve, refuse))
 
     @property
@@ -300,6 +300,7 @@ class Dispatcher:
                 self._end(ongoing, service, replier, call, cancelled(service.label))
 
         ongoing.on_cancel(drop)
+        ongoing.queued_ns = time.monotonic_ns()
         if not serial.submit(begin):
             self._end(ongoing, service, replier, call, (Status.BUSY, EMPTY))
 
@@ -415,5 +416,6 @@ def _run(caller: str, call: Call, service: LocalService, ongoing: Ongoing | None
         info = service.failure(error, call.args)
         if not isinstance(error, TradeError) or isinstance(error, _DEFECTS):
             who = foreign(call.session) or caller
-            _logger.warning("%s failed in a call of %s:\n%s", service.label, who, info.traceback or info.message)
+            text = info.traceback or info.message
+            _logger.warning("%s failed in a call of %s:\n%s", service.label, who, text, extra={"call_id": call.id})
         return Status.ERROR, Raw(encode_message(info))

@@ -5,6 +5,7 @@ import itertools
 import logging
 from typing import Final
 
+from trade._access import Access
 from trade._constraints import Constraint, where
 from trade._handle import Bound, Handle, Run
 from trade._hooks import HookInfo, Side
@@ -80,6 +81,7 @@ class Hooking(Notifying):
     """Hooks of this container on services anywhere."""
 
     _hook_numbers: "itertools.count[int]"
+    access: Access
 
     def before_service(self, target: Handle | Constraint, call: Handle) -> Hook:
         """Have a service called before each call of another one, with what that is called with.
@@ -112,9 +114,20 @@ class Hooking(Notifying):
         if not isinstance(call, Handle):  # pyright: ignore[reportUnnecessaryIsInstance]
             rest = "without arguments of its own" if isinstance(call, Bound) else "as it runs where the service does"
             raise ConfigurationError(where=named, problem=f"call must be a handle, {rest}, not {call!r}")
+        self._require_instrument(target)
         hook = Hook(self, f"{self.address.epoch}.h{next(self._hook_numbers)}", side, target, call)
         hook.begin()
         return hook
+
+    def _require_instrument(self, target: Handle | Constraint) -> None:
+        """Raises AccessDenied: by the policy as it is here, all of these would refuse it."""
+        known = [target] if isinstance(target, Handle) else self.services(target)
+        mine = [one for one in known if one.key.domain != DOMAIN]
+        who = self.address.identity
+        denials = [self.access.denied(who, "instrument", one.key.domain, one.label) for one in mine]
+        denied = next((one for one in denials if one is not None), None)
+        if denied is not None and all(denials):
+            raise denied
 
     def hooks(self) -> list[HookInfo]:
         """Every hook in the system, once for each container it is attached in."""

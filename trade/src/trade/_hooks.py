@@ -18,6 +18,7 @@ from trade._dispatch import LocalService
 from trade._handle import Handle
 from trade._registry import Change, Record
 from trade._session import speaking
+from trade._spans import Recorded, Spans, traceable
 from trade._system import DOMAIN
 from trade._wire import ServiceKey
 from trade.errors import AccessDenied, ConfigurationError, DeadlineExceeded
@@ -180,7 +181,7 @@ class Around:
                 raise DeadlineExceeded(service=service.label, deadline_s=(time.monotonic_ns() - began_ns) / 1e9)
         result, error = None, ""
         try:
-            result = service.call_bare(args, kwargs, context)
+            result = service.call(args, kwargs, context, bare=True)
         except BaseException as raised:
             error = _error_text(service, raised)
             raise
@@ -265,6 +266,8 @@ class Hooks:
         self._lock = threading.RLock()
         self._attached: dict[tuple[str, str], Attached] = {}
         """By session and name."""
+        self._spans: Spans | None = None
+        """Where calls are noted while this container is traced."""
         self.suspended: Callable[[Attached], None] = lambda _: None
         """Told of each that is suspended."""
 
@@ -319,14 +322,24 @@ class Hooks:
 
     def changed(self, change: Change) -> None:
         """Told by the registry."""
-        if self._attached and any(record.local for record in (*change.joined, *change.replaced, *change.left)):
+        if self._in_use and any(record.local for record in (*change.joined, *change.replaced, *change.left)):
             self.judge_anew()
 
     def judge_anew(self) -> None:
         """What is offered here, or who may instrument it, has changed."""
         with self._lock:
-            if self._attached:
+            if self._in_use:
                 self._refresh()
+
+    def trace(self, spans: Spans | None) -> None:
+        """Note every call of a service there from now on; None: none any more."""
+        with self._lock:
+            self._spans = spans
+            self._refresh()
+
+    @property
+    def _in_use(self) -> bool:
+        return bool(self._attached) or self._spans is not None
 
     def _refresh(self) -> None:
         hooks = list(self._attached.values())
@@ -334,12 +347,16 @@ class Hooks:
             hook.services = {}
         for record in self._records():
             service = self._services(record.key)
-            if service is not None and _hookable(record):
-                mine = [hook for hook in hooks if self._concerns(hook, record)]
-                for hook in mine:
-                    hook.services[record.key] = record.label
+            if service is None:
+                continue
+            mine = [hook for hook in hooks if _hookable(record) and self._concerns(hook, record)]
+            for hook in mine:
+                hook.services[record.key] = record.label
+            around = None
+            if mine:
                 around = Around(self._home, self._codec, self._clockwork, self._home.handle(record.key), mine)
-                service.around = around if mine else None
+            traced = self._spans if traceable(record.key) else None
+            service.around = around if traced is None else Recorded(traced, around)
 
     def _concerns(self, hook: Attached, record: Record) -> bool:
         return hook.means(record) and self._denied(hook.identity, record) is None

@@ -25,6 +25,7 @@ from trade._request import DEFAULT_DEADLINE_S, Request, in_ns, new_request
 from trade._schemas import read_schema
 from trade._serial import Serial, Turn
 from trade._session import speaking
+from trade._spans import traceable
 from trade._system import CLOCK, DOMAIN, PROVIDER
 from trade._wire import EMPTY_ARGUMENTS, Address, Call, ErrorInfo, Reply, ServiceInfo, Status
 from trade.errors import (
@@ -168,8 +169,9 @@ class RemoteTarget:
         self._is_stop = record.info.effect == "stop"
         self._publisher = caller.publisher(address, key.domain, key.provider, stop=self._is_stop)
         self._clock = caller.publisher(address, DOMAIN, PROVIDER, stop=False)
-        self._decode = _result_decoder(codec, record.info)
+        self._decode = result_decoder(codec, record.info)
         self._decode_any = codec.decoder(Any)
+        self._traceable = traceable(key)
 
     def call(self, args: tuple[Any, ...], kwargs: dict[str, Any], deadline_s: float | None) -> Any:
         """A call that begins now."""
@@ -261,8 +263,12 @@ class RemoteTarget:
         )
 
     def _unpack(self, reply: Reply, request: Request) -> Any:
-        if reply.status != Status.OK:
-            raise self._failure(reply, request)
+        error = None if reply.status == Status.OK else self._failure(reply, request)
+        spans = self._caller.spans
+        if spans is not None and self._traceable:
+            spans.asked(reply.id, self._label, request, error)
+        if error is not None:
+            raise error
         try:
             return self._decode(reply.body)
         except msgspec.DecodeError as bad:
@@ -309,7 +315,7 @@ class RemoteTarget:
             return RemoteError(service=self._label, type_name="an error that cannot be read", message=str(bad))
 
 
-def _result_decoder(codec: Codec, info: ServiceInfo) -> Callable[[Any], Any]:
+def result_decoder(codec: Codec, info: ServiceInfo) -> Callable[[Any], Any]:
     """A decoder for the result, as typed as its description allows."""
     try:
         return codec.decoder(type_from_schema(read_schema(info.result_schema), info.types))

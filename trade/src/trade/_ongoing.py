@@ -34,7 +34,7 @@ class Ongoing:
 
     __slots__ = (
         *("_event", "_on_cancel", "also", "answer", "call", "caller"),
-        *("cancelled", "report", "service", "size"),
+        *("cancelled", "queued_ns", "report", "service", "size"),
     )
 
     def __init__(
@@ -54,6 +54,8 @@ class Ongoing:
         self.also: list[Call] | None = None
         """The same call, come again while it ran."""
         self.size = 0
+        self.queued_ns = 0
+        """When it was put in the queue of a serial provider; 0 if it was not."""
         self._event: threading.Event | None = None
         self._on_cancel: list[Callable[[], object]] | None = None
 

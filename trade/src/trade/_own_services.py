@@ -9,15 +9,22 @@ from trade._hook_services import HookServices
 from trade._hooks import Hooks
 from trade._lock_services import Ask, Asked, GroupsOf, LockServices
 from trade._locks import LockTable
+from trade._making_services import MakingServices
 from trade._notification_services import Home, NotificationServices
 from trade._notifications import Notifier
 from trade._registry import Registry
 from trade._service import service
+from trade._spans import Spans
+from trade._stream_services import StreamServices
+from trade._streams import Streams
 from trade._system import System, SystemServices
+from trade._trace_services import Switch, TraceServices
 from trade._wire import Address, Estop
 
 
-class OwnServices(SystemServices, LockServices, NotificationServices, HookServices):
+class OwnServices(
+    SystemServices, LockServices, NotificationServices, HookServices, TraceServices, MakingServices, StreamServices
+):
     """One provider, so that one registry entry tells of all its container's own functions."""
 
     def __init__(
@@ -35,11 +42,17 @@ class OwnServices(SystemServices, LockServices, NotificationServices, HookServic
         registry: Registry,
         hooks: Hooks,
         home: Home,
+        spans: Spans,
+        trace_here: Switch,
+        streams: Streams,
     ) -> None:
         SystemServices.__init__(self, system)
         LockServices.__init__(self, locks, own, ask, asked, access, groups, borrowed)
         NotificationServices.__init__(self, notifier, registry, home, access)
         HookServices.__init__(self, hooks, home, access)
+        TraceServices.__init__(self, own.container, spans, trace_here)
+        MakingServices.__init__(self, system)
+        StreamServices.__init__(self, streams)
         self._estopping = estopping
 
     @property

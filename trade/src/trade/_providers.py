@@ -272,6 +272,11 @@ class Providers:
             if not any(parameter.required for parameter in service.signature.info.parameters)
         ]
 
+    def waiting(self) -> int:
+        """Calls of serial services whose turn has not come."""
+        services = [service for hosted in list(self._hosted.values()) for service in hosted.services.values()]
+        return sum(serial.waiting for serial in {service.serial for service in services} if serial is not None)
+
     def offer(self, place: str) -> Offer | None:
         """What is registered at a place (``domain/provider``)."""
         known = self._hosted.get(place)

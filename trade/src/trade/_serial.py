@@ -41,6 +41,11 @@ class Serial:
         self._taken = False
 
     @property
+    def waiting(self) -> int:
+        """Calls whose turn has not come."""
+        return len(self._queue)
+
+    @property
     def mine(self) -> bool:
         """Whether the running code is a serial service of this provider: its own nested calls do not queue."""
         return self in _held.get()

@@ -29,9 +29,11 @@ _VARIABLES: Final = (
     "TRADE_BRIDGE",
     "TRADE_INSECURE_LAN",
     "TRADE_LOCK",
+    "TRADE_INSTANTIABLE",
     "TRADE_POLICY",
     "TRADE_RUNTIME_DIR",
     "TRADE_STATE_DIR",
+    "TRADE_TRACE",
 )
 _CERTIFY: Final = "set TRADE_TLS to the folder that trade pki issue made"
 
@@ -73,8 +75,12 @@ class Settings:
     explicit_system: bool = False
     lock: str = ""
     """A lock that the process around this one holds for it; see `Lock.environment`."""
+    instantiable: tuple[str, ...] = ()
+    """Classes that others may make objects of here, such as ``mypkg.vision:Camera`` or ``mypkg.*``; none: none."""
     state_dir: Path | None = None
     """Where what must outlive a process is kept, such as open e-stops; none: nowhere."""
+    trace: bool = False
+    """Note calls from the start; see `Container.set_tracing`."""
 
     def __post_init__(self) -> None:
         for what, text in (("system", self.system), ("identity", self.identity), ("container", self.container)):
@@ -172,6 +178,7 @@ class Settings:
         bridge: Sequence[str] | None = None,
         exports: Mapping[str, Sequence[str]] | None = None,
         policy: Path | None = None,
+        instantiable: Sequence[str] | None = None,
         environment: Mapping[str, str] = os.environ,
     ) -> "Settings":
         """Settings from arguments, else from the environment, else the defaults.
@@ -179,7 +186,8 @@ class Settings:
         The environment has ``TRADE_SYSTEM``, ``TRADE_IDENTITY``, ``TRADE_CONTAINER``, ``TRADE_LISTEN`` and
         ``TRADE_CONNECT`` (comma-separated), ``TRADE_CREDENTIALS`` (``user:password``), ``TRADE_TLS`` (a folder),
         ``TRADE_POLICY`` (a file), ``TRADE_INSECURE_LAN`` (``1``), ``TRADE_BRIDGE`` (comma-separated), ``TRADE_LOCK``
-        (set by ``trade lock``), ``TRADE_RUNTIME_DIR`` and ``TRADE_STATE_DIR`` (else the user's folder for state).
+        (set by ``trade lock``), ``TRADE_INSTANTIABLE`` (comma-separated), ``TRADE_TRACE`` (``1``),
+        ``TRADE_RUNTIME_DIR`` and ``TRADE_STATE_DIR`` (else the user's folder for state).
         Others that begin with ``TRADE_`` are warned of.
         """
         _warn_of_unknown(environment)
@@ -200,7 +208,9 @@ class Settings:
             policy=policy or _path(environment.get("TRADE_POLICY")),
             explicit_system=named is not None,
             lock=environment.get("TRADE_LOCK", ""),
+            instantiable=tuple(_split(environment, "TRADE_INSTANTIABLE") if instantiable is None else instantiable),
             state_dir=_state_dir(environment),
+            trace=environment.get("TRADE_TRACE") == "1",
         )
 
 

@@ -1,16 +1,22 @@
 """The middleware's own functions as services, in group ``trade`` of every container."""
 
+import contextlib
 import time
-from collections.abc import Callable, Sequence
-from typing import Final, Protocol
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final, Protocol
 
 from msgspec import Struct
 
+from trade._constraints import Constraint, where
 from trade._handle import Handle
+from trade._load import Load, LoadInfo
 from trade._reach import Reach
 from trade._service import service
+from trade._settings import Settings
+from trade._starting import start
 from trade._wire import Address, ServiceKey
-from trade.errors import ConfigurationError, LinkStays
+from trade.errors import CannotStart, ConfigurationError, LinkStays, NoSuchService, TooManyServices
 
 DOMAIN: Final = "trade"
 PROVIDER: Final = "system"
@@ -43,15 +49,34 @@ class _Withdrawn(Protocol):
     def infos(self) -> list[WithdrawnInfo]: ...
 
 
+class _Making(Protocol):
+    def find(self, class_path: str) -> type: ...
+    def make(self, kind: type, args: Sequence[Any] | Mapping[str, Any]) -> object: ...
+    def offer(self, made: object, groups: Sequence[str]) -> tuple[Handle, ...]: ...
+    def terminate(self, service: Handle) -> None: ...
+
+
+class _Terminating(Protocol):
+    def begin(self, reason: str, who: str) -> list[str]: ...
+
+
 class _Member(Protocol):
     """The container the switches belong to."""
 
     address: Final[Address]
+    meter: Load
 
     @property
     def reach(self) -> Reach: ...
     @property
     def withdrawn(self) -> _Withdrawn: ...
+    @property
+    def making(self) -> _Making: ...
+    @property
+    def terminating(self) -> _Terminating: ...
+    @property
+    def settings(self) -> Settings: ...
+    def find(self, constraint: Constraint, *, wait_s: float = ...) -> Handle: ...
     def handle(self, key: ServiceKey) -> Handle: ...
     def containers(self) -> list[ContainerInfo]: ...
     def load_policy(self, path: str) -> None: ...
@@ -106,6 +131,10 @@ class System:
         """The containers of the system, this one included."""
         return self._member().containers()
 
+    def load(self) -> LoadInfo:
+        """How busy this container, its process and its host are."""
+        return self._member().meter.read()
+
     def deregister(self, service: Handle) -> str:
         """Withdraw the provider of a service of this container, which keeps the object to register it again.
 
@@ -142,6 +171,106 @@ class System:
         """What `register` can offer again, by name."""
         return self._member().withdrawn.infos()
 
+    def instantiate(
+        self, class_path: str, args: Sequence[Any] | Mapping[str, Any] = (), groups: str | Sequence[str] = ()
+    ) -> tuple[Handle, ...]:
+        """Make an object of a class and offer its services.
+
+        Args:
+            class_path: such as ``mypkg.vision:Camera``; the container's ``instantiable`` must allow it.
+            args: for its constructor, in order or by name; plain data.
+            groups: as for `register`.
+
+        Returns:
+            Handles of its services.
+
+        Raises:
+            NotInstantiable: the container's settings do not allow it; nothing was imported.
+            NoSuchClass: there is no such class there.
+            CannotInstantiate: its module or its constructor raised.
+            ConfigurationError: nothing to offer, or a malformed group; what was made is closed again.
+        """
+        making = self._member().making
+        named = (groups,) if isinstance(groups, str) else tuple(groups)
+        return making.offer(making.make(making.find(class_path), args), named)
+
+    def start_container(
+        self,
+        host: str,
+        name: str,
+        *,
+        allow: Sequence[str] = (),
+        connect: Sequence[str] = (),
+        command: Sequence[str] = ("trade",),
+        environment: Mapping[str, str] | None = None,
+        ssh_config: Path | None = None,
+        wait_s: float = 10.0,
+    ) -> ContainerInfo:
+        """Start an empty container of this system on another host, and wait until it is seen here.
+
+        The ``ssh`` program does it, with the keys and the configuration of this user. Nothing is asked of people, and
+        only hosts whose key is known are talked to. What the container needs to come into the system (certificate,
+        policy, credentials) is set up there, or given in ``environment``, which others on either host may see.
+
+        Args:
+            host: ``HOST`` or ``USER@HOST``, as for ssh.
+            name: of the container.
+            allow: classes that may be made in it.
+            connect: endpoints it dials, as seen from there; none: what its environment says.
+            command: what ``trade`` is there; a path, or more words.
+            environment: variables for it.
+            ssh_config: instead of the user's own.
+            wait_s: how long it may take to be seen, once it is up there.
+
+        Raises:
+            CannotStart: with the reason, and what to do.
+            ConfigurationError: what cannot be a host or a variable.
+        """
+        member = self._member()
+        started = start(
+            host,
+            name,
+            system=member.settings.system,
+            allow=allow,
+            connect=connect,
+            command=command,
+            environment=environment,
+            ssh_config=ssh_config,
+        )
+        with contextlib.suppress(NoSuchService, TooManyServices):  # which one it is the epoch tells
+            member.find(where(name=CLOCK, group=DOMAIN, container=name), wait_s=wait_s)
+        found = next((info for info in self.containers() if info.epoch == started.epoch), None)
+        if found is None:
+            said = f"it is up there as process {started.pid}, and not seen here within {wait_s:g} s"
+            remedy = "tell it whom to dial (connect=...), and give it the credentials or certificates of this system"
+            raise CannotStart(host=host, container=name, reason="not seen", said=said, remedy=remedy)
+        return found
+
+    def terminate(self, service: Handle) -> None:
+        """End a provider that `instantiate` made in this container: what it moves stops, then it is closed.
+
+        ``close()`` of the object is called, if it has one.
+
+        Raises:
+            ConfigurationError: it was not made by this container, or has ended.
+            DeviceFault: it could not be stopped; it is offered as before.
+        """
+        self._member().making.terminate(service)
+
+    def terminate_container(self, reason: str = "", *, who: str = "itself") -> list[str]:
+        """End this container: what moves stops, its services are withdrawn. Does not wait for its end.
+
+        The process goes on, unless it is one of ``trade container``, ``trade up`` or ``trade gateway``.
+
+        Args:
+            reason: why, for people; it is logged.
+            who: asks for it; likewise.
+
+        Returns:
+            What could not be stopped, and why; it ends all the same.
+        """
+        return self._member().terminating.begin(reason, who)
+
     def load_policy(self, path: str) -> None:
         """Go by another access policy, or by the same file as it is now; calls under way go on.
 
@@ -169,6 +298,11 @@ class SystemServices:
     def containers(self) -> list[ContainerInfo]:
         """The containers that this one knows of, itself included."""
         return self._system.containers()
+
+    @service(effect="read")
+    def load(self) -> LoadInfo:
+        """How busy this container, its process and its host are."""
+        return self._system.load()
 
     @service
     def deregister(self, service: Handle) -> str:

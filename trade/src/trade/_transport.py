@@ -111,15 +111,19 @@ class Transport(ABC):
         Args:
             key: a literal one.
             urgent: what is put overtakes all others.
-            droppable: ``put`` waits for nobody; what a stalled receiver cannot take at once it never gets.
+            droppable: ``put`` waits for nobody; what a stalled receiver cannot take at once it never gets. What is
+                droppable and not urgent goes behind all others.
         """
 
     @abstractmethod
-    def subscribe(self, pattern: str, *, newest: bool = False) -> Channel:
+    def subscribe(self, pattern: str, *, newest: int = 0) -> Channel:
         """Hear what is put on keys that match.
 
-        Whoever puts faster than it is read waits, and with it whatever else comes by the same link. ``newest``: nobody
-        waits, and of what is not read in time the oldest is lost.
+        Whoever puts faster than it is read waits, and with it whatever else comes by the same link.
+
+        Args:
+            pattern: of keys.
+            newest: nobody waits, and of what is not read in time only so many are kept; the oldest is lost first.
         """
 
     @abstractmethod

@@ -70,6 +70,11 @@ class Withdrawn:
                 del self._kept[name]
         return bool(names)
 
+    def offer(self, provider: str) -> Offer | None:
+        """What was withdrawn under that name, and how it was registered."""
+        with self._lock:
+            return self._kept.get(provider)
+
     def infos(self) -> list[WithdrawnInfo]:
         """What can be put back, by name."""
         with self._lock:

@@ -204,16 +204,17 @@ class ZenohTransport(Transport):
         self.links: Final = Links(self._session, settings)
 
     def publish(self, key: str, *, urgent: bool = False, droppable: bool = False) -> Publisher:
-        priority = zenoh.Priority.REAL_TIME if urgent else zenoh.Priority.DATA
+        behind = droppable and not urgent
+        priority = zenoh.Priority.REAL_TIME if urgent else zenoh.Priority.BACKGROUND if behind else zenoh.Priority.DATA
         with _refusing():
             known = self._session.declare_keyexpr(key)
             declared = self._session.declare_publisher(
-                known, congestion_control=_DROP if droppable else _BLOCK, express=True, priority=priority
+                known, congestion_control=_DROP if droppable else _BLOCK, express=not behind, priority=priority
             )
         return ZenohPublisher(declared, lambda: self._session.undeclare(known))
 
-    def subscribe(self, pattern: str, *, newest: bool = False) -> Channel:
-        kept = zenoh.handlers.RingChannel(_CHANNEL_CAPACITY) if newest else _fifo()
+    def subscribe(self, pattern: str, *, newest: int = 0) -> Channel:
+        kept = zenoh.handlers.RingChannel(newest) if newest else _fifo()
         with _refusing():
             return ZenohChannel(self._session.declare_subscriber(pattern, kept), declare_on=self._session)
 

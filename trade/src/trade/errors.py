@@ -18,6 +18,8 @@ __all__ = [
     "CallerError",
     "Cancelled",
     "CannotConnect",
+    "CannotInstantiate",
+    "CannotStart",
     "ConfigurationError",
     "ContainerLost",
     "DeadlineExceeded",
@@ -32,16 +34,20 @@ __all__ = [
     "LockLost",
     "LockedByOther",
     "MotionStopped",
+    "NoSuchCall",
+    "NoSuchClass",
     "NoSuchEstop",
     "NoSuchHook",
     "NoSuchNotification",
     "NoSuchService",
+    "NotInstantiable",
     "NotSerialisable",
     "OutcomeUnknown",
     "RemoteError",
     "ServiceGone",
     "SessionEnded",
     "SetupError",
+    "SourceLost",
     "Stopped",
     "ToleranceExceeded",
     "TooLarge",
@@ -278,6 +284,50 @@ class NoSuchHook(CallerError, LookupError):
 
 
 @dataclass(kw_only=True, eq=False)
+class NoSuchCall(CallerError, LookupError):
+    """No container has noted a call of that id."""
+
+    id: int
+
+    def describe(self) -> str:
+        return (
+            f"no container has noted a call {self.id}: none that it touched is traced (`trade tracing on`), it has not "
+            "ended, or newer calls took its place"
+        )
+
+
+@dataclass(kw_only=True, eq=False)
+class NotInstantiable(CallerError, PermissionError):
+    """The settings of the container do not allow to make objects of that class; nothing was imported."""
+
+    class_path: str
+    container: str
+    allowed: Sequence[str] = ()
+
+    def describe(self) -> str:
+        allowed = f"only {_some(self.allowed)}" if self.allowed else "none at all"
+        return (
+            f"container {self.container} may not make a {self.class_path}: it allows {allowed}; start it with "
+            f"`trade container --allow {self.class_path}`, or TRADE_INSTANTIABLE"
+        )
+
+
+@dataclass(kw_only=True, eq=False)
+class NoSuchClass(CallerError, LookupError):
+    """The container's Python has no class of that path."""
+
+    class_path: str
+    container: str
+    reason: str
+
+    def describe(self) -> str:
+        return (
+            f"there is no class {self.class_path} in container {self.container}: {self.reason}; is its package "
+            "installed there, and is it package.module:Class?"
+        )
+
+
+@dataclass(kw_only=True, eq=False)
 class AccessDenied(CallerError, PermissionError):
     """The access policy does not allow it; nothing was done."""
 
@@ -388,6 +438,17 @@ class ContainerLost(CallError, ConnectionError):
 
 
 @dataclass(kw_only=True, eq=False)
+class SourceLost(ContainerLost):
+    """The container whose service is listened to ended or became unreachable."""
+
+    def describe(self) -> str:
+        return (
+            f"container {self.container} was lost while {self.service} was listened to; samples come again when it is "
+            "back. If it was restarted, find the service again and open another stream"
+        )
+
+
+@dataclass(kw_only=True, eq=False)
 class Busy(CallError, BlockingIOError):
     """All handler threads of the container are taken; nothing ran."""
 
@@ -396,6 +457,18 @@ class Busy(CallError, BlockingIOError):
 
     def describe(self) -> str:
         return f"{self.service} did not run: container {self.container} has no free handler thread; try again shortly"
+
+
+@dataclass(kw_only=True, eq=False)
+class CannotInstantiate(CallError, RuntimeError):
+    """The class raised when it was imported or made; nothing was registered."""
+
+    class_path: str
+    container: str
+    problem: str
+
+    def describe(self) -> str:
+        return f"{self.class_path} could not be made in container {self.container}: {self.problem}"
 
 
 @dataclass(kw_only=True, eq=False)
@@ -517,6 +590,24 @@ class CannotConnect(SetupError, ConnectionError):
 
     def describe(self) -> str:
         return f"no link to {self.endpoint}: {self.reason}"
+
+
+@dataclass(kw_only=True, eq=False)
+class CannotStart(SetupError, ConnectionError):
+    """No container was started on the host, or it does not come into this system."""
+
+    host: str
+    container: str
+    reason: str
+    """``unknown host key``, ``changed host key``, ``not let in``, ``refused``, ``timeout``, ``unknown host``,
+    ``no trade there``, ``it did not come up``, ``no answer``, ``not seen``, ``no ssh here`` or ``ssh failed``."""
+    said: str
+    """By ssh, or by the command there."""
+    remedy: str
+
+    def describe(self) -> str:
+        said = f" ({self.said})" if self.said else ""
+        return f"container {self.container} was not started on {self.host}: {self.reason}{said}; {self.remedy}"
 
 
 @dataclass(kw_only=True, eq=False)

@@ -17,7 +17,7 @@ from trade_drivers.can._netlink import look_at
 
 __all__ = ["CanPort", "Frame", "split_port"]
 
-_log = logging.getLogger(__name__)
+_log = logging.getLogger("trade")
 logging.getLogger("can.interfaces.socketcand").setLevel(logging.ERROR)  # else it warns of every frame in two pieces
 _HELLO_S: Final = 1.0
 _SOCKETCAND_PORT: Final = 29536

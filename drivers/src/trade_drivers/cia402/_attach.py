@@ -9,9 +9,10 @@ from trade_drivers.cia402 import _machine as machine
 from trade_drivers.cia402 import _table as table
 from trade_drivers.cia402._axis import DriveAxis
 from trade_drivers.cia402._machine import State, state_of
-from trade_drivers.cia402._net import Net, Refused
+from trade_drivers.cia402._net import Answer, Net, Refused
 from trade_drivers.cia402._stream import interpolation_period
 from trade_drivers.cia402._table import Entry, Pdo
+from trade_drivers.joints import Steps
 
 if TYPE_CHECKING:
     from trade_drivers.robotfile import CanBus
@@ -85,39 +86,43 @@ def motion_every(bus: "CanBus") -> int:
     return max(1, min(240, round(bus.rate_hz / 100)))
 
 
-def set_up(net: Net, axis: DriveAxis, bus: "CanBus") -> None:
+def set_up(net: Net, axis: DriveAxis, bus: "CanBus") -> Steps:
     """Check who a drive is, arm its watchdog and map its frames; found moving and owned by nobody, it is stopped.
+
+    Some sixty requests, one at a time: yields while an answer is awaited.
 
     Raises:
         Unfit: it cannot be used.
         NoAnswer: it does not answer.
     """
-    _check_identity(net, axis)
-    _check_abilities(net, axis)
-    _halt_if_moving(net, axis)
+    yield from _check_identity(net, axis)
+    yield from _check_abilities(net, axis)
+    yield from _halt_if_moving(net, axis)
     try:
-        _arm(net, axis, bus)
+        yield from _arm(net, axis, bus)
         for pdo, kind in ((table.STATUS, 1), (table.MOTION, motion_every(bus))):
-            _map(net, axis.id, pdo, kind, table.NO_REMOTE)
+            yield from _map(net, axis.id, pdo, kind, table.NO_REMOTE)
         for pdo in (table.COMMAND, table.PROFILE):
-            _map(net, axis.id, pdo, table.AT_ONCE, 0)
-        _map_streams(net, axis, bus)
+            yield from _map(net, axis.id, pdo, table.AT_ONCE, 0)
+        yield from _map_streams(net, axis, bus)
     except Refused as refused:
         raise Unfit(f"it refuses to be set up: {refused}") from None
     for record in table.UNUSED:
-        _try_write(net, axis.id, Entry(record, "u4", 1), _disabled(record, axis.id))
+        yield from _try_write(net, axis.id, Entry(record, "u4", 1), _disabled(record, axis.id))
     net.command(axis.id, table.NMT_START)
 
 
-def _check_identity(net: Net, axis: DriveAxis) -> None:
-    kind = net.read(axis.id, table.DEVICE_TYPE, attempts=1) & 0xFFFF  # who is away costs the others no more time
+def _check_identity(net: Net, axis: DriveAxis) -> Steps:
+    kind = (yield from net.read(axis.id, table.DEVICE_TYPE)) & 0xFFFF
     if kind != table.DRIVE_PROFILE:
         raise Unfit(f"node {axis.id} is no CiA 402 drive: its device type (1000h) names profile {kind}")
-    identity = tuple(_read(net, axis.id, entry) for entry in table.IDENTITY)
+    identity: tuple[int, ...] = ()
+    for entry in table.IDENTITY:
+        identity += ((yield from _read(net, axis.id, entry)),)
     if axis.identity and identity != axis.identity:
         raise Unfit(f"another drive answers as node {axis.id}: {_named(identity)}, not {_named(axis.identity)}")
     try:
-        name = net.read_text(axis.id, table.DEVICE_NAME)
+        name = yield from net.read_text(axis.id, table.DEVICE_NAME)
     except Refused:
         name = axis.joint.model  # it does not say, and need not
     if name != axis.joint.model:
@@ -130,12 +135,13 @@ def _named(identity: Sequence[int]) -> str:
     return f"vendor {vendor:X}h, product {product:X}h, serial number {serial}"
 
 
-def _check_abilities(net: Net, axis: DriveAxis) -> None:
-    modes = _read(net, axis.id, table.SUPPORTED_MODES, 1 << table.PROFILE_POSITION - 1)
+def _check_abilities(net: Net, axis: DriveAxis) -> Steps:
+    modes = yield from _read(net, axis.id, table.SUPPORTED_MODES, 1 << table.PROFILE_POSITION - 1)
     axis.modes = frozenset(mode for mode in range(1, 33) if modes >> mode - 1 & 1)
     if table.PROFILE_POSITION not in axis.modes:
         raise Unfit("it has no profile position mode (6502h)")
-    low, high = (_read(net, axis.id, entry) for entry in table.POSITION_LIMITS)
+    low = yield from _read(net, axis.id, table.POSITION_LIMITS[0])
+    high = yield from _read(net, axis.id, table.POSITION_LIMITS[1])
     if low < high and (axis.low < low or axis.high > high):
         ends = sorted((axis.scale.angle_rad(low), axis.scale.angle_rad(high)))
         joint = axis.joint
@@ -143,58 +149,58 @@ def _check_abilities(net: Net, axis: DriveAxis) -> None:
             f"min_rad {joint.min_rad:.6g} to max_rad {joint.max_rad:.6g} is more than the drive's own range (607Dh), "
             f"{ends[0]:.6g} to {ends[1]:.6g} rad; narrow the one or widen the other"
         )
-    fastest = _read(net, axis.id, table.MAX_PROFILE_VELOCITY)
+    fastest = yield from _read(net, axis.id, table.MAX_PROFILE_VELOCITY)
     if 0 < fastest < axis.speed_counts:
         limit = fastest * axis.grain.rad_s
         problem = f"{axis.joint.max_speed_rad_s:.6g} is above the drive's own limit {limit:.4g} (607Fh)"
         raise Unfit(problem, ".max_speed_rad_s")
 
 
-def _halt_if_moving(net: Net, axis: DriveAxis) -> None:
+def _halt_if_moving(net: Net, axis: DriveAxis) -> Steps:
     """Nobody's motion ends; torque stays as it is."""
-    state = state_of(net.read(axis.id, table.STATUSWORD))
-    if state is not State.ENABLED or abs(net.read(axis.id, table.VELOCITY)) <= axis.grain.still_velocity:
+    state = state_of((yield from net.read(axis.id, table.STATUSWORD)))
+    if state is not State.ENABLED or abs((yield from net.read(axis.id, table.VELOCITY))) <= axis.grain.still_velocity:
         return
-    if net.read(axis.id, table.MODE_DISPLAY) < table.CYCLIC_POSITION:
-        net.write(axis.id, table.CONTROLWORD, machine.HOLD)
+    if (yield from net.read(axis.id, table.MODE_DISPLAY)) < table.CYCLIC_POSITION:
+        yield from net.write(axis.id, table.CONTROLWORD, machine.HOLD)
         return
-    _try_write(net, axis.id, table.QUICK_STOP_OPTION, _BRAKE_AND_STAY)
-    net.write(axis.id, table.CONTROLWORD, machine.QUICK_STOP)
+    yield from _try_write(net, axis.id, table.QUICK_STOP_OPTION, _BRAKE_AND_STAY)
+    yield from net.write(axis.id, table.CONTROLWORD, machine.QUICK_STOP)
 
 
-def _arm(net: Net, axis: DriveAxis, bus: "CanBus") -> None:
+def _arm(net: Net, axis: DriveAxis, bus: "CanBus") -> Steps:
     for entry, value in (
         (table.ABORT_CONNECTION, _QUICK_STOP),
         (table.CONSUMER_HEARTBEAT, table.OUR_NODE << 16 | round(bus.watchdog_s * 1e3)),
         (table.PRODUCER_HEARTBEAT, heartbeat_ms(bus)),
     ):
-        net.write(axis.id, entry, value)
+        yield from net.write(axis.id, entry, value)
     for entry, value in ((table.QUICK_STOP_OPTION, _BRAKE_AND_STAY), (table.HALT_OPTION, _BRAKE)):
-        _try_write(net, axis.id, entry, value)
-    _try_write(net, axis.id, table.QUICK_STOP_DECELERATION, axis.accel_counts)
+        yield from _try_write(net, axis.id, entry, value)
+    yield from _try_write(net, axis.id, table.QUICK_STOP_DECELERATION, axis.accel_counts)
 
 
-def _map_streams(net: Net, axis: DriveAxis, bus: "CanBus") -> None:
+def _map_streams(net: Net, axis: DriveAxis, bus: "CanBus") -> Steps:
     """What its modes without a goal need. One that lacks it is used without them: they are a way, not a condition."""
-    if _read(net, axis.id, table.QUICK_STOP_OPTION) not in table.STANDING:
+    if (yield from _read(net, axis.id, table.QUICK_STOP_OPTION)) not in table.STANDING:
         axis.modes -= {table.PROFILE_VELOCITY_MODE, table.CYCLIC_VELOCITY, table.CYCLIC_POSITION}
     if axis.turning_mode != table.PROFILE_POSITION:
         try:
-            _map(net, axis.id, table.TURNING, table.AT_ONCE, 0)
+            yield from _map(net, axis.id, table.TURNING, table.AT_ONCE, 0)
         except Refused:
             axis.modes -= {table.PROFILE_VELOCITY_MODE, table.CYCLIC_VELOCITY}
     if axis.turning_mode == table.PROFILE_POSITION:
-        _map(net, axis.id, table.BRAKING, table.AT_ONCE, 0)
+        yield from _map(net, axis.id, table.BRAKING, table.AT_ONCE, 0)
     if table.CYCLIC_POSITION in axis.modes:
         try:
             for entry, value in zip(table.INTERPOLATION_PERIOD, interpolation_period(bus.rate_hz), strict=True):
-                net.write(axis.id, entry, value)
-            _map(net, axis.id, table.FOLLOWING, table.AT_NEXT_SYNC, 0)
+                yield from net.write(axis.id, entry, value)
+            yield from _map(net, axis.id, table.FOLLOWING, table.AT_NEXT_SYNC, 0)
         except Refused:
             axis.modes -= {table.CYCLIC_POSITION}
     if table.CYCLIC_POSITION not in axis.modes:
         record = table.FOLLOWING.communication
-        _try_write(net, axis.id, Entry(record, "u4", 1), _disabled(record, axis.id))
+        yield from _try_write(net, axis.id, Entry(record, "u4", 1), _disabled(record, axis.id))
 
 
 def heartbeat_ms(bus: "CanBus") -> int:
@@ -202,16 +208,16 @@ def heartbeat_ms(bus: "CanBus") -> int:
     return max(10, round(bus.stale_after_s * 1e3 / 3))
 
 
-def _map(net: Net, node: int, pdo: Pdo, kind: int, flags: int) -> None:
+def _map(net: Net, node: int, pdo: Pdo, kind: int, flags: int) -> Steps:
     """In the order that drives insist on: invalid, empty, filled, counted, valid."""
     record, mapping, cob = pdo.communication, pdo.communication + 0x200, pdo.base + node | flags
-    net.write(node, Entry(record, "u4", 1), cob | table.INVALID)
-    net.write(node, Entry(record, "u1", 2), kind)
-    net.write(node, Entry(mapping, "u1", 0), 0)
+    yield from net.write(node, Entry(record, "u4", 1), cob | table.INVALID)
+    yield from net.write(node, Entry(record, "u1", 2), kind)
+    yield from net.write(node, Entry(mapping, "u1", 0), 0)
     for place, word in enumerate(pdo.mapping(), 1):
-        net.write(node, Entry(mapping, "u4", place), word)
-    net.write(node, Entry(mapping, "u1", 0), len(pdo.entries))
-    net.write(node, Entry(record, "u4", 1), cob)
+        yield from net.write(node, Entry(mapping, "u4", place), word)
+    yield from net.write(node, Entry(mapping, "u1", 0), len(pdo.entries))
+    yield from net.write(node, Entry(record, "u4", 1), cob)
 
 
 def _disabled(record: int, node: int) -> int:
@@ -219,19 +225,19 @@ def _disabled(record: int, node: int) -> int:
     return table.INVALID | (base + node)
 
 
-def _read(net: Net, node: int, entry: Entry, default: int = 0) -> int:
+def _read(net: Net, node: int, entry: Entry, default: int = 0) -> Answer[int]:
     """A number that not every drive has."""
     try:
-        return net.read(node, entry)
+        return (yield from net.read(node, entry))
     except Refused as refused:
         if refused.code in table.NO_SUCH_OBJECT:
             return default
         raise Unfit(f"it refuses to be read: {refused}") from None
 
 
-def _try_write(net: Net, node: int, entry: Entry, value: int) -> None:
+def _try_write(net: Net, node: int, entry: Entry, value: int) -> Steps:
     """A number that not every drive has, or lets be changed; its own choice does as well."""
     try:
-        net.write(node, entry, value)
+        yield from net.write(node, entry, value)
     except Refused:
         return

@@ -1,6 +1,7 @@
 """One drive as the bus thread knows it: what its frames said last, and what speaks against moving on."""
 
 from collections.abc import Sequence
+from enum import Enum, auto
 from math import tau
 from struct import error as BadLength  # noqa: N812 - what unpacking raises for another number of bytes
 from typing import Final
@@ -14,7 +15,7 @@ from trade_drivers.cia402._stream import Following, Turning
 from trade_drivers.joints import Axis, Grain, Sample
 from trade_drivers.robotfile import Joint
 
-__all__ = ["DriveAxis"]
+__all__ = ["DriveAxis", "Stage"]
 
 _STILL_RAD_S: Final = 0.01
 _ARRIVED_RAD: Final = 0.004
@@ -37,6 +38,15 @@ def grain_of(joint: Joint, rate_hz: float) -> Grain:
         arrived=max(2, round(_ARRIVED_RAD / rad)),
         near=max(4, round(_NEAR_RAD / rad)),
     )
+
+
+class Stage(Enum):
+    """How far a drive is on its way into the cycle; ``Admission`` tells what happens in each."""
+
+    AWAY = auto()
+    LOOKED_OVER = auto()
+    SET_UP = auto()
+    HERE = auto()
 
 
 class DriveAxis(Axis):
@@ -65,10 +75,14 @@ class DriveAxis(Axis):
         """When its heartbeat came last."""
         self.awaited_ns = 0
         """When it was last asked for a measurement; 0 once that has come."""
+        self.stage = Stage.AWAY
+        """Only in the last one it is not ``silent``."""
         self.set_up_ns = 0
-        """When it was looked over and set up, while it is left out until it is heard; else 0."""
+        """When it was last looked over and set up."""
         self.answered_ns = 0
         """When it was asked for a measurement that came while it was left out."""
+        self.to_start = False
+        """It was started, and its heartbeat says that it is not: the frame was lost, or it went back."""
 
     # --- what it says
 
@@ -111,6 +125,8 @@ class DriveAxis(Axis):
             self._lose("it has restarted; is its supply sound?", now_ns)
         elif state == table.OPERATIONAL:
             self.beat_ns = now_ns
+        elif self.stage is Stage.SET_UP:
+            self.to_start = True
         elif not self.silent:
             self._lose(f"somebody has made it {table.NMT_STATES.get(state, hex(state))}", now_ns)
 
@@ -120,19 +136,25 @@ class DriveAxis(Axis):
         self.forget(now_ns)
 
     def forget(self, now_ns: int) -> None:
-        """Leave it out until it was looked over again."""
+        """Leave it out until it was looked over again, which may be at once."""
         if not self.silent:
             self.silent, self.silent_since_ns = True, now_ns
-            self.probe_at_ns = now_ns
-        elif self.set_up_ns:
-            self.probe_at_ns = now_ns
-        self.controlword = self.asked_ns = self.awaited_ns = self.set_up_ns = 0
+        self.stage, self.probe_at_ns = Stage.AWAY, now_ns
+        self.controlword = self.asked_ns = self.awaited_ns = 0
+        self.entered, self.stream = 0, None
+
+    def be_awaited(self, now_ns: int) -> None:
+        """It was set up: it is to be heard."""
+        if self.ready:
+            self.latch("it was away")
+        self.stage, self.set_up_ns = Stage.SET_UP, now_ns
         self.entered, self.stream = 0, None
 
     def welcome(self, now_ns: int) -> None:
-        """It was set up, and is heard."""
+        """It is heard."""
+        self.stage = Stage.HERE
         self.silent, self.silent_since_ns, self.sample = False, now_ns, None
-        self.controlword = self.asked_ns = self.awaited_ns = self.set_up_ns = 0
+        self.controlword = self.asked_ns = self.awaited_ns = 0
 
     def latch(self, fault: str) -> None:
         """Note what speaks against moving on, until it is enabled again; the first that says something is kept."""

@@ -11,8 +11,7 @@ from trade_drivers.joints import BusThread, PortLost
 from trade_drivers.robotfile import Bus, CanBus, Robot
 
 if TYPE_CHECKING:
-    from trade_drivers.can import CanPort
-    from trade_drivers.cia402._axis import DriveAxis
+    from trade_drivers.cia402._admission import Admission
     from trade_drivers.cia402._exchange import DriveExchange
 
 __all__ = ["Cia402Driver", "open_exchange"]
@@ -71,9 +70,7 @@ def open_exchange(robot: Robot, bus: CanBus, port: str) -> "DriveExchange":
             if exchange.rival:
                 problem = f"{port}: another driver commands the drives of this bus already; stop it first"
                 raise ConfigurationError(where=f"{where}.channel", problem=problem)
-            for axis in axes:
-                _take_on(exchange, axis, wire, robot.where)
-            _wait_for_all(exchange, robot.where)
+            _bring_in(exchange, robot.where)
         except PortLost as lost:
             problem = f"{port}: {lost}; is the interface up? `ip link` shows those there are"
             raise ConfigurationError(where=f"{where}.channel", problem=problem) from None
@@ -81,39 +78,39 @@ def open_exchange(robot: Robot, bus: CanBus, port: str) -> "DriveExchange":
     return exchange
 
 
-def _wait_for_all(exchange: "DriveExchange", where: str) -> None:
-    """Cycle until every drive is heard and measured."""
-    until = time.monotonic() + _PATIENCE_S + exchange.deaf_ns / 1e9
-    while unheard := [axis for axis in exchange.drives if axis.silent]:
-        if time.monotonic() > until:
-            axis = unheard[0]
-            problem = f"node {axis.id} answers, but sends {axis.unheard}; a drive without it cannot be used"
-            raise ConfigurationError(where=f'{where}: joint."{axis.joint.name}"', problem=problem)
+def _bring_in(exchange: "DriveExchange", where: str) -> None:
+    """Cycle until every drive is taken on, heard and measured.
+
+    Raises:
+        ConfigurationError: one of them is not; names its joint, and what to check.
+    """
+    until = time.monotonic() + _PATIENCE_S
+    while away := [admission for admission in exchange.admissions if admission.axis.silent]:
+        for admission in away:
+            _check(admission, where, last=time.monotonic() > until)
         exchange.cycle()
         exchange.idle(exchange.period_ns / 1e9)
     for _ in range(_FIRST_CYCLES):
         exchange.cycle()
 
 
-def _take_on(exchange: "DriveExchange", axis: "DriveAxis", wire: "CanPort", where: str) -> None:
+def _check(admission: "Admission", where: str, *, last: bool) -> None:
     from trade_drivers.cia402._attach import Unfit  # noqa: PLC0415 - the libraries are optional
+    from trade_drivers.cia402._axis import Stage  # noqa: PLC0415
     from trade_drivers.cia402._net import NoAnswer, Refused  # noqa: PLC0415
 
+    axis = admission.axis
     key = f'{where}: joint."{axis.joint.name}"'
-    until = time.monotonic() + _PATIENCE_S
-    while True:
-        try:
-            exchange.admit(axis)
-        except NoAnswer as silent:
-            if time.monotonic() < until:
-                continue
+    match admission.problem:
+        case Unfit() as unfit:
+            raise ConfigurationError(where=f"{key}{unfit.key}", problem=str(unfit))
+        case Refused() as refused:
+            raise ConfigurationError(where=key, problem=f"it refuses to be read: {refused}")
+        case NoAnswer() as silent if last and axis.stage is Stage.AWAY:
             problem = (
-                f"no drive answers as node {axis.id} on {wire.path} ({silent}); check its power and cable, its node "
+                f"no drive answers as node {axis.id} on {axis.bus} ({silent}); check its power and cable, its node "
                 "id and bit rate, and the two terminations of the bus"
             )
-            raise ConfigurationError(where=key, problem=problem) from None
-        except Unfit as unfit:
-            raise ConfigurationError(where=f"{key}{unfit.key}", problem=str(unfit)) from None
-        except Refused as refused:
-            raise ConfigurationError(where=key, problem=f"it refuses to be read: {refused}") from None
-        return
+            raise ConfigurationError(where=key, problem=problem)
+        case _:
+            pass

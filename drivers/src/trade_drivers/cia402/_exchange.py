@@ -9,10 +9,11 @@ from trade_drivers._exchange import PROBE_NS
 from trade_drivers.cia402 import _jobs as jobs
 from trade_drivers.cia402 import _machine as machine
 from trade_drivers.cia402 import _table as table
-from trade_drivers.cia402._attach import Unfit, heartbeat_ms, set_up
-from trade_drivers.cia402._axis import DriveAxis
+from trade_drivers.cia402._admission import Admission
+from trade_drivers.cia402._attach import heartbeat_ms
+from trade_drivers.cia402._axis import DriveAxis, Stage
 from trade_drivers.cia402._machine import State
-from trade_drivers.cia402._net import Net, NoAnswer, Refused
+from trade_drivers.cia402._net import Net
 from trade_drivers.cia402._stream import Following, Turning
 from trade_drivers.joints import Axis, Exchange, Gate, Goal, Job, Manner, Motion, Steps
 
@@ -22,10 +23,8 @@ if TYPE_CHECKING:
 
 __all__ = ["DriveExchange"]
 
-_log = logging.getLogger(__name__)
+_log = logging.getLogger("trade")
 _BEATS_MISSED: Final = 3
-_UNHEARD_NS: Final = 2_000_000_000
-"""How long a drive that was set up is waited for before it is set up again."""
 _HANDSHAKE: Final = 3
 """Cycles of a set-point in profile position: raised, acknowledged, taken back."""
 
@@ -39,11 +38,13 @@ class DriveExchange(Exchange):
         super().__init__(bus, axes, clock)
         self.port = port
         self.drives = tuple(axes)
-        self.net = Net(port, self.serve_stops)
+        self.net = Net(port, between=self.serve_stops, meanwhile=self._admit)
+        self.admissions = tuple(Admission(self, axis, bus) for axis in axes)
         self._bus = bus
         self._beat_ns = int(bus.watchdog_s * 1e9 / 5)
         self._beaten_ns = 0
-        self._synced_ns = 0
+        self._began_ns = self._listening_ns = self._synced_ns = clock()
+        """When the last cycle began, and since when they have followed each other in time."""
         self.deaf_ns = _BEATS_MISSED * heartbeat_ms(bus) * 1_000_000
         """A drive whose heartbeat has not come for so long is left out."""
         self.rival = False
@@ -183,12 +184,15 @@ class DriveExchange(Exchange):
     def cycle(self) -> None:
         """One round: stops, heartbeat, measurements, handshakes, work, motions, streams."""
         began_ns = self.clock()
+        if began_ns - self._began_ns > self.stale_after_ns // 2:
+            self._listening_ns = began_ns
+        self._began_ns = began_ns
         self.net.take_in(0.0)  # what came late is no answer to the next SYNC
         self._beat(began_ns)
         self._measure(began_ns)
         self._listen(began_ns)
         self._shake_hands()
-        self._recover()
+        self._admit()
         self.work(began_ns + self.period_ns // 2)
         self.watch()
         self._stream()
@@ -209,13 +213,15 @@ class DriveExchange(Exchange):
         self._synced_ns = began_ns
         asked = [axis for axis in self.drives if not axis.silent]
         for axis in self.drives:
-            if not axis.silent or axis.set_up_ns:
+            if axis.stage in {Stage.SET_UP, Stage.HERE}:
                 axis.awaited_ns = began_ns  # not when it came: a frozen process would take old values for new
         self.port.send(table.SYNC, b"")
         self.net.take_in(self.period_ns / 2e9, lambda: not any(axis.awaited_ns for axis in asked))
 
     def _listen(self, now_ns: int) -> None:
         """Who has not been heard for too long is left out, and asked now and then whether it is back."""
+        if now_ns - self._listening_ns <= self.stale_after_ns:
+            return  # on a busy host it was this thread that was silent
         for axis in self.drives:
             if axis.silent:
                 continue
@@ -231,42 +237,10 @@ class DriveExchange(Exchange):
                 axis.asked_ns = 0
                 self.command(axis, axis.controlword & ~machine.NEW_SET_POINT)
 
-    def _recover(self) -> None:
-        """Take back who is heard, and look one of the others over when it is its turn; enables and moves nothing."""
-        now_ns = self.clock()
-        for axis in self.drives:
-            if axis.silent and axis.set_up_ns and not axis.unheard:
-                _log.info("%s is heard on %s", axis.name, axis.bus)
-                axis.welcome(now_ns)
-        for axis in self.drives:
-            if axis.silent and now_ns >= axis.probe_at_ns:
-                axis.probe_at_ns = now_ns + PROBE_NS
-                self._look_over(axis)
-                return
-
-    def _look_over(self, axis: DriveAxis) -> None:
-        if axis.set_up_ns:
-            axis.fault, axis.ready = f"node {axis.id} answers, but sends {axis.unheard}", False
-        try:
-            self.admit(axis)
-        except NoAnswer:
-            axis.set_up_ns = 0
-        except (Unfit, Refused) as unfit:
-            axis.set_up_ns = 0
-            axis.fault = str(unfit)  # whatever was wrong before, this has to be mended first
-
-    def admit(self, axis: DriveAxis) -> None:
-        """Look a drive over that answers, and set it up; it is taken on, in a cycle, once it is heard.
-
-        Raises:
-            NoAnswer, Refused, Unfit: it cannot be used, or not yet.
-        """
-        set_up(self.net, axis, self._bus)
-        if axis.ready:
-            axis.latch("it was away")
-        axis.entered, axis.stream = 0, None
-        axis.set_up_ns = self.clock()
-        axis.probe_at_ns = axis.set_up_ns + max(_UNHEARD_NS, 2 * self.deaf_ns)
+    def _admit(self) -> None:
+        """Go on with those that are not here; it never waits for them."""
+        for admission in self.admissions:
+            admission.advance()
 
     def forget_measurements(self) -> None:
         now_ns = self.clock()

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 
 __all__ = ["enabling", "leaving", "looking", "relaxing", "resting", "set_mode", "until", "write"]
 
-_ATTEMPTS: Final = 3
 _CHANGE_NS: Final = 600_000_000
 """How long a drive may take to go from one state to the next."""
 _WAIT_S: Final = 0.001
@@ -168,16 +167,20 @@ def until(
 
 
 def write(bus: "DriveExchange", job: Job, axis: DriveAxis, entry: Entry, value: int) -> Steps:
-    """Change its dictionary, and hear that it did, within the retry budget. A repeated write does no harm."""
+    """Change its dictionary, and hear that it did.
+
+    Raises:
+        DeviceFault: it refused.
+        DeviceSilent: it did not answer, or fell silent.
+    """
     began_ns = bus.clock()
-    for _ in range(_ATTEMPTS):
-        try:
-            bus.net.write(axis.id, entry, value, job.gate, attempts=1)
-        except NoAnswer:
+    bus.require_answering(axis)
+    try:
+        for _ in bus.net.write(axis.id, entry, value, job.gate):
+            bus.net.take_in(_WAIT_S)
             yield
-        except Refused as refused:
-            raise axis.faulty(f"it refused a command: {refused}") from None
-        else:
-            yield
-            return
-    raise DeviceSilent(device=axis.name, bus=axis.bus, waited_s=(bus.clock() - began_ns) / 1e9)
+            bus.require_answering(axis)
+    except NoAnswer:
+        raise DeviceSilent(device=axis.name, bus=axis.bus, waited_s=(bus.clock() - began_ns) / 1e9) from None
+    except Refused as refused:
+        raise axis.faulty(f"it refused a command: {refused}") from None

@@ -1,31 +1,33 @@
-"""canopen's network, fed and driven by the bus thread: none of the library's own threads, and no state it caches."""
+"""The nodes of one CAN bus: listeners for frames, requests to dictionaries that never hold up who makes them."""
 
-import struct
 import time
-from collections.abc import Callable
-from queue import Queue
-from typing import Any, Final
+from collections import deque
+from collections.abc import Callable, Generator
+from typing import Final, TypeVar
 
-from canopen import Network, ObjectDictionary
 from canopen.emcy import EmcyError
-from canopen.sdo.client import SdoClient
-from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
+from canopen.sdo.exceptions import SdoAbortedError
 
 from trade_drivers.can import CanPort
+from trade_drivers.cia402 import _sdo as sdo
 from trade_drivers.cia402 import _table as table
+from trade_drivers.cia402._sdo import Aborted, Transfer
 from trade_drivers.cia402._table import Entry
 from trade_drivers.joints import Gate
 
-__all__ = ["Net", "NoAnswer", "Refused", "emergency_text"]
+__all__ = ["Answer", "Net", "NoAnswer", "Refused", "emergency_text"]
 
-ATTEMPTS: Final = 3
-_ANSWER_S: Final = 0.040
-"""Patience for one answer, so that a stop is never more than 50 ms from the wire."""
-_DRAIN_S: Final = 0.030
-"""After a failed exchange: an answer that is late arrives now and is thrown away, not believed later."""
-_SDO_SIZE: Final = 8
+_ATTEMPTS: Final = 3
+_ANSWER_S: Final = 0.25
+"""Patience for one answer: drives take milliseconds, and nobody is held up, but a busy host takes its time."""
+_KEPT: Final = 8
+"""Frames of a server that are looked at; one of them at most is the answer."""
 _SLICE_S: Final = 0.004
 """Longest wait for a frame before stops are looked for."""
+
+_T = TypeVar("_T")
+Answer = Generator[None, None, _T]
+"""Yields until the answer is there, and returns what it says."""
 
 
 class NoAnswer(Exception):
@@ -61,51 +63,24 @@ _CODES: Final = {
 }
 
 
-class _Client(SdoClient):
-    """The library's SDO client, but who waits takes the frames in itself."""
-
-    RESPONSE_TIMEOUT = 0
-    """What is there when the wait is over is there."""
-    responses: "Queue[bytes]"
-
-    def __init__(self, node: int, net: "Net") -> None:
-        super().__init__(table.SDO_REQUEST + node, table.SDO_ANSWER + node, ObjectDictionary())
-        self.network = self._net = net
-        net.hear(table.SDO_ANSWER + node, self._keep)
-
-    def _keep(self, data: bytes) -> None:
-        if len(data) == _SDO_SIZE:
-            self.responses.put(data)
-
-    def read_response(self) -> bytes:
-        self._net.take_in(_ANSWER_S, lambda: not self.responses.empty())
-        return super().read_response()  # pyright: ignore[reportUnknownVariableType]
-
-    def abort(self, abort_code: int = 0x08000000) -> None:
-        self._net.port.send(self.rx_cobid, struct.pack("<BHBI", 0x80, 0, 0, abort_code))
-
-
-class Net(Network):
+class Net:
     """One CAN bus with its nodes. Everything belongs to the thread that owns the port."""
 
-    def __init__(self, port: CanPort, between: Callable[[], None]) -> None:
-        super().__init__()
+    def __init__(self, port: CanPort, between: Callable[[], None], meanwhile: Callable[[], None]) -> None:
         self.port = port
-        self.between = between
+        self._between = between
         """Called between frames: it may send, but not wait."""
-        self._clients: dict[int, _Client] = {}
-
-    def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:  # noqa: ARG002
-        """One frame out, for the library."""
-        self.port.send(can_id, bytes(data))
+        self._meanwhile = meanwhile
+        """The same, but only where there is time left."""
+        self._listeners: dict[int, Callable[[bytes], None]] = {}
+        self._answers: dict[int, deque[bytes]] = {}
+        """What came from the SDO server of a node."""
+        self._heard_at = 0.0
+        """All that had come by then has been taken in."""
 
     def hear(self, can_id: int, listener: Callable[[bytes], None]) -> None:
         """Have frames of an identifier given to a listener."""
-
-        def hand_on(_: int, data: Any, __: float) -> None:
-            listener(bytes(data))
-
-        self.subscribe(can_id, hand_on)
+        self._listeners[can_id] = listener
 
     def take_in(self, seconds: float, enough: Callable[[], bool] = lambda: False) -> None:
         """Take frames in for that long, or until it is enough; 0 takes in what has come already.
@@ -115,56 +90,79 @@ class Net(Network):
         """
         until = time.monotonic() + seconds
         while True:
-            self.between()
+            self._between()
             if enough():
                 return
-            left_s = until - time.monotonic()
-            frame = self.port.receive(max(0.0, min(left_s, _SLICE_S)))
-            if frame is not None:
-                self.notify(frame.id, bytearray(frame.data), time.time())
-            elif left_s <= 0:
-                return
+            now = time.monotonic()
+            if now < until:
+                self._meanwhile()
+            frame = self.port.receive(max(0.0, min(until - now, _SLICE_S)))
+            if frame is None:
+                self._heard_at = now
+                if now >= until:
+                    return
+            elif (listener := self._listeners.get(frame.id)) is not None:
+                listener(frame.data)
 
     def command(self, node: int, word: int) -> None:
         """Network management: start a node, and so on. Nobody confirms it."""
         self.port.send(table.NMT, bytes((word, node)))
 
-    def read(self, node: int, entry: Entry, attempts: int = ATTEMPTS) -> int:
+    def read(self, node: int, entry: Entry) -> Answer[int]:
         """A number out of a drive's dictionary.
 
         Raises:
             NoAnswer, Refused: what became of it.
         """
-        data = self._transfer(node, entry, lambda client: client.upload(entry.index, entry.sub), attempts)
+        data = yield from self._ask(node, entry, lambda: sdo.upload(entry.index, entry.sub))
         if len(data) < entry.size:
             raise NoAnswer(f"{entry} came with {len(data)} bytes")
         return entry.decode(data)
 
-    def read_text(self, node: int, index: int) -> str:
+    def read_text(self, node: int, index: int) -> Answer[str]:
         """A text out of a drive's dictionary."""
-        data = self._transfer(node, f"{index:04X}h", lambda client: client.upload(index, 0), ATTEMPTS)
+        data = yield from self._ask(node, f"{index:04X}h", lambda: sdo.upload(index, 0))
         return data.rstrip(b"\0 ").decode("ascii", "replace")
 
-    def write(self, node: int, entry: Entry, value: int, gate: Gate | None = None, attempts: int = ATTEMPTS) -> None:
-        """A number into a drive's dictionary; the gate is asked right before each attempt."""
+    def write(self, node: int, entry: Entry, value: int, gate: Gate = lambda: None) -> Answer[None]:
+        """A number into a drive's dictionary, more than once if need be; the gate is asked before each attempt."""
 
-        def download(client: _Client) -> bytes:
-            if gate is not None:
-                gate()
-            client.download(entry.index, entry.sub, entry.encode(value))
-            return b""
+        def download() -> Transfer:
+            gate()
+            return sdo.download(entry.index, entry.sub, entry.encode(value))
 
-        self._transfer(node, entry, download, attempts)
+        yield from self._ask(node, entry, download)
 
-    def _transfer(self, node: int, entry: object, act: Callable[[_Client], bytes], attempts: int) -> bytes:
-        client = self._clients.get(node) or self._clients.setdefault(node, _Client(node, self))
-        problem: Exception | None = None
-        for _ in range(attempts):
+    def _ask(self, node: int, entry: object, begin: Callable[[], Transfer]) -> Answer[bytes]:
+        for _ in range(_ATTEMPTS):
             try:
-                return bytes(act(client))
-            except SdoAbortedError as refused:
-                raise Refused(entry, refused.code, str(refused)) from None
-            except (SdoCommunicationError, struct.error) as silent:
-                problem = silent
-                self.take_in(_DRAIN_S)
-        raise NoAnswer(f"{entry}: {problem}")
+                data = yield from self._transfer(node, begin())
+            except Aborted as refused:
+                raise Refused(entry, refused.code, str(SdoAbortedError(refused.code))) from None
+            if data is not None:
+                return data
+        raise NoAnswer(f"{entry}: no answer within {_ATTEMPTS * _ANSWER_S * 1e3:.0f} ms")
+
+    def _transfer(self, node: int, transfer: Transfer) -> Answer[bytes | None]:
+        """What came of it; None if an answer is missing."""
+        answers = self._answers_of(node)
+        request = next(transfer)
+        while True:
+            answers.clear()
+            self.port.send(table.SDO_REQUEST + node, request.data)
+            give_up_at = time.monotonic() + _ANSWER_S
+            while (answer := next(filter(request.is_answered_by, answers), None)) is None:
+                if self._heard_at > give_up_at:
+                    self.port.send(table.SDO_REQUEST + node, sdo.abort(request, sdo.TIMED_OUT))
+                    return None
+                yield
+            try:
+                request = transfer.send(answer)
+            except StopIteration as done:
+                return done.value
+
+    def _answers_of(self, node: int) -> deque[bytes]:
+        if node not in self._answers:
+            self._answers[node] = deque(maxlen=_KEPT)
+            self.hear(table.SDO_ANSWER + node, self._answers[node].append)
+        return self._answers[node]

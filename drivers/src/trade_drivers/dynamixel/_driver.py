@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 __all__ = ["DynamixelDriver", "open_exchange"]
 
-_log = logging.getLogger(__name__)
+_log = logging.getLogger("trade")
 _SLOW_ANSWER_S: Final = 100e-6
 
 
@@ -66,7 +66,7 @@ def open_exchange(robot: Robot, bus: SerialBus, port: str) -> ServoExchange:
         exchange.cycle()
     except PortLost as lost:
         wire.close()
-        problem = f"{port}: {lost}; is its adapter plugged in? `ls -l /dev/serial/by-id` shows those that are"
+        problem = f"{port}: {lost}; `ls -l /dev/serial/by-id` shows those that are"
         raise ConfigurationError(where=where, problem=problem) from None
     except WireError as bad:
         wire.close()

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 __all__ = ["ServoExchange"]
 
-_log = logging.getLogger(__name__)
+_log = logging.getLogger("trade")
 _HEALTH_NS: Final = 500_000_000
 _CLEAN_NS: Final = 1_000_000_000
 _SPANS: Final = tuple(

@@ -113,6 +113,8 @@ class Axis(ABC):
         """When it was told to hold; 0 once it was seen at rest."""
         self.held_ns = 0
         """When it was last told to."""
+        self.held_counts: int | None = None
+        """Where that was."""
         self.still = 0
         """Measurements in a row in which it did not move."""
 
@@ -162,11 +164,16 @@ class Axis(ABC):
         return now_ns - (self.sample.at_ns if self.sample else self.silent_since_ns)
 
     def hold_counts(self, now_ns: int) -> int | None:
-        """Where to hold: where it was measured, or, if that is old, where it must have got to since on its way."""
+        """Where to hold: where it was measured, or, if that is old, where it must have got to since on its way.
+
+        Told to hold and not measured since, it stays there: to go back to the measurement would be motion.
+        """
         sample = self.sample
         if sample is None:
             return None
         age_s = (now_ns - sample.at_ns) / 1e9
+        if self.motion is None and sample.at_ns <= self.held_ns and self.held_counts is not None:
+            return self.held_counts
         if self.motion is None or age_s < 0.05:
             return sample.position
         goal = self.motion.goal_of(self)

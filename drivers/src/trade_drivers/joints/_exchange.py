@@ -124,11 +124,14 @@ class Exchange(BusExchange[Axis]):
         try:
             if error is not None:
                 self.hold([axis for axis in motion.axes if axis.may_hold_torque], self.clock())
+            else:
+                motion.note("at rest")
         finally:
             self._forget(motion, error)
 
     def take_over(self, motion: Motion) -> None:
         """A motion's goals are out: those it replaces have ended, and what they left behind holds."""
+        motion.note("wrote goal")
         replaced = dict.fromkeys(axis.motion for axis in motion.axes if axis.motion is not None)
         for axis in motion.axes:
             axis.motion, axis.still, axis.halting_since_ns = motion, 0, 0
@@ -174,7 +177,7 @@ class Exchange(BusExchange[Axis]):
         positions: dict[Axis, int] = {}
         for axis in axes:
             if (position := axis.hold_counts(now_ns)) is not None:
-                positions[axis] = position
+                positions[axis] = axis.held_counts = position
             axis.still, axis.held_ns = 0, now_ns
             axis.halting_since_ns = axis.halting_since_ns or now_ns
         if positions:

@@ -71,6 +71,7 @@ class Enable(Command):
                 yield from self.exchange.looking(axis)
             if not axis.ready:
                 yield from self.exchange.enabling(self, axis)
+        self.note("torque on, read back")
 
 
 class Halt(Command):
@@ -93,6 +94,7 @@ class Relax(Command):
             self.gate()
             self.exchange.end_motion(axis, f"{axis.name} was relaxed")
             yield from self.exchange.relaxing(self, axis)
+        self.note("torque off")
 
 
 class Leave(Job):

@@ -87,7 +87,7 @@ def open_exchange(robot: Robot, bus: SerialBus, port: str) -> Exchange:
         exchange.cycle()
     except PortLost as lost:
         wire.close()
-        problem = f"{port}: {lost}; is its adapter plugged in? `ls -l /dev/serial/by-id` shows those that are"
+        problem = f"{port}: {lost}; `ls -l /dev/serial/by-id` shows those that are"
         raise ConfigurationError(where=f"{where}.port", problem=problem) from None
     except WireError as bad:
         wire.close()

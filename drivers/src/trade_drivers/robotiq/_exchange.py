@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Exchange"]
 
-_log = logging.getLogger(__name__)
+_log = logging.getLogger("trade")
 _TAKEN_NS: Final = 15_000_000
 """So long after a write the status may still be that of before: the device takes it over 200 times a second."""
 

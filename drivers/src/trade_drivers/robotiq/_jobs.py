@@ -117,6 +117,7 @@ class Motion(Command):
         except TradeError as problem:
             self.exchange.release(self, problem)
             raise
+        self.note("wrote goal")
         self._patience_s = patience_s
         self._began_ns = self._watched_ns = self.exchange.clock()
 

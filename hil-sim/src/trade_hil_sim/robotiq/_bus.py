@@ -109,6 +109,10 @@ class RobotiqBus(DeviceLine[Gripper]):
                 device.lose_power(t)
             case faults.HardwareFault():
                 device.fail(command.bits, t)
+            case faults.Supply():
+                device.set_supply(t, voltage_v=command.voltage_v, temperature_c=command.temperature_c)
+            case faults.WrongModel():
+                device.foreign = True
             case faults.Put(width_m=None):
                 device.put(None, t)
             case faults.Put(width_m=float(width_m)):
@@ -142,7 +146,7 @@ class RobotiqBus(DeviceLine[Gripper]):
             answer = _obey(gripper, request, now)
             if isinstance(answer, ExceptionCode):
                 self._event(gripper, "refused", now, answer.name.lower())
-                answer = exception(request, answer) if gripper.exceptions else None
+                answer = exception(request, answer) if gripper.exceptions or gripper.foreign else None
             silenced = self._script.silences(gripper.device_id, request.name)
             if answer is not None and request.device_id != BROADCAST and not silenced:
                 gap_s = _GAP_CHARACTERS * _BITS / gripper.baud
@@ -207,6 +211,8 @@ def _obey(gripper: Gripper, request: Request, t: float) -> bytes | ExceptionCode
         return ExceptionCode.FUNCTION
     if not request.whole or request.read_count > MOST_REGISTERS:
         return ExceptionCode.VALUE
+    if gripper.foreign:
+        return ExceptionCode.ADDRESS
     reads = request.function not in {Function.WRITE_ONE, Function.WRITE}
     if reads and gripper.read(request.read_at, request.read_count, t) is None:
         return ExceptionCode.ADDRESS

@@ -21,6 +21,12 @@ ACTIVATION_COUNTS_S: Final = 320.0
 """How fast the fingers close and open while they find their stops."""
 PATIENCE_S: Final = 1.0
 """Heard nothing for this long: fault 09, until the cycle after the next request."""
+HOT_C: Final = 85
+"""From here on fault 08 is shown: an assumption, as are the two below."""
+COOL_C: Final = 80
+"""Until it is cooler than this."""
+LEAST_V: Final = 21.6
+"""Below it, 24 V less a tenth, fault 0A."""
 _MOVING_CURRENT: Final = 12
 _NEVER: Final = inf
 _CLOSE_COUNTS: Final = 0.5
@@ -100,6 +106,9 @@ class Gripper:
         self.device_id, self.name, self.baud, self.exceptions = device_id, name, baud, exceptions
         self.emit: Emit = _quiet
         self.absent = False
+        self.foreign = False
+        """Another Modbus device has its id, with other registers."""
+        self._volts, self._celsius = 24.0, 30
         self._wanted = [0, 0, 0]
         self._taken = [0, 0, 0]
         self._take_at = _NEVER
@@ -221,6 +230,7 @@ class Gripper:
         self._activated = self._activating = False
         self._fault = 0
         self._halt(t)
+        self._feel(t)
 
     def _begin_activation(self, t: float) -> None:
         if self._fault < table.MAJOR_FAULT:
@@ -309,10 +319,26 @@ class Gripper:
         self._halt(t)
         self.emit(self, "fault", t, f"{fault:#04x}")
 
+    def set_supply(self, t: float, *, voltage_v: float | None = None, temperature_c: int | None = None) -> None:
+        """Change what it measures of its supply and housing; outside of its limits that is a fault."""
+        self._volts = self._volts if voltage_v is None else voltage_v
+        self._celsius = self._celsius if temperature_c is None else temperature_c
+        if self._fault == table.HOT_FAULT and self._celsius < COOL_C:
+            self._fault = 0
+        self._feel(t)
+
+    def _feel(self, t: float) -> None:
+        """Fail, unless it has failed already, while its supply or its housing is outside of its limits."""
+        if self._volts < LEAST_V and self._fault < table.MAJOR_FAULT:
+            self.fail(table.LOW_VOLTAGE_FAULT, t)
+        elif self._celsius >= HOT_C and not self._fault:
+            self.fail(table.HOT_FAULT, t)
+
     def heal(self, t: float) -> None:
         """End what was done to it but for a major fault, which only a new activation clears."""
-        self.absent = False
+        self.absent = self.foreign = False
         self._frozen = None
+        self._volts, self._celsius = 24.0, 30
         if self._fault < table.MAJOR_FAULT:
             self._fault = 0
         self.jam(False, t)

@@ -12,6 +12,8 @@ __all__ = [
     "COMMAND",
     "COMMUNICATION_FAULT",
     "GO",
+    "HOT_FAULT",
+    "LOW_VOLTAGE_FAULT",
     "MAJOR_FAULT",
     "OPEN_COUNTS",
     "REGISTERS",
@@ -37,6 +39,8 @@ AUTO_RELEASE: Final = 0x10
 DELAYED_FAULT: Final = 0x05
 NOT_ACTIVATED_FAULT: Final = 0x07
 COMMUNICATION_FAULT: Final = 0x09
+HOT_FAULT: Final = 0x08
+LOW_VOLTAGE_FAULT: Final = 0x0A
 MAJOR_FAULT: Final = 0x0A
 """From here on the fingers stand until rACT has been 0."""
 

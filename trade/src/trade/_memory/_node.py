@@ -1,5 +1,6 @@
 """One transport as its network sees it: what it announces, which signs it shows, what it hears."""
 
+import contextlib
 import queue
 from collections.abc import Callable
 from typing import Final, Generic, TypeVar
@@ -48,10 +49,19 @@ class Inbox(Generic[_T]):
 class MemoryChannel(Inbox[Message], Channel):
     """What one subscription hears."""
 
-    def __init__(self, pattern: str, forget: Callable[[Inbox[Message]], None], *, of_others: bool = False) -> None:
+    def __init__(
+        self, pattern: str, forget: Callable[[Inbox[Message]], None], *, of_others: bool = False, newest: int = 0
+    ) -> None:
         super().__init__(pattern, forget)
         self.of_others: Final = of_others
         """Whether it hears announcements, those of others."""
+        self._newest = newest
+
+    def take(self, item: Message) -> None:
+        if self._newest and self._queue.qsize() >= self._newest:
+            with contextlib.suppress(queue.Empty):  # its reader was quicker
+                self._queue.get_nowait()
+        super().take(item)
 
 
 class MemoryQuestions(Inbox[Question], Questions):

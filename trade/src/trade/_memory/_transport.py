@@ -67,8 +67,8 @@ class MemoryTransport(Transport):
         self._check_open()
         return MemoryPublisher(self, key, Kind.DROPPABLE if droppable else Kind.URGENT if urgent else Kind.PUT)
 
-    def subscribe(self, pattern: str, *, newest: bool = False) -> Channel:  # noqa: ARG002 - here nobody ever waits
-        return self._listen(pattern, self.node.ears)
+    def subscribe(self, pattern: str, *, newest: int = 0) -> Channel:
+        return self._listen(pattern, self.node.ears, newest=newest)
 
     def announce(self, key: str, payload: bytes) -> None:
         self.network.spread(self.node, Message(key, payload), Kind.ANNOUNCE)
@@ -115,10 +115,12 @@ class MemoryTransport(Transport):
         if self.closed:
             raise ChannelClosed
 
-    def _listen(self, pattern: str, among: list[MemoryChannel], *, of_others: bool = False) -> MemoryChannel:
+    def _listen(
+        self, pattern: str, among: list[MemoryChannel], *, of_others: bool = False, newest: int = 0
+    ) -> MemoryChannel:
         with self.network.lock:
             self._check_open()
-            channel = MemoryChannel(pattern, self._forget_in(among), of_others=of_others)
+            channel = MemoryChannel(pattern, self._forget_in(among), of_others=of_others, newest=newest)
             among.append(channel)
             return channel
 

@@ -4,7 +4,7 @@ import contextlib
 import math
 import threading
 import time
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -45,12 +45,18 @@ class MemorySystem:
 
     # --- containers
 
-    def container(self, name: str, *, identity: str = "tester") -> Container:
+    def container(self, name: str, *, identity: str = "tester", instantiable: Sequence[str] = ()) -> Container:
         """The container of that name, started if there is none or if it was killed or closed."""
         node = self.network.node(name)
         if node is not None and not node.closed:
             return self._containers[name]
-        settings = Settings(system="memory", identity=identity, container=name, state_dir=self._state_dir)
+        settings = Settings(
+            system="memory",
+            identity=identity,
+            container=name,
+            state_dir=self._state_dir,
+            instantiable=tuple(instantiable),
+        )
         container = Container(settings, transport=MemoryTransport(self.network, name))
         self._containers[name] = container
         self._every.append(container)

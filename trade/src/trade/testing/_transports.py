@@ -145,6 +145,25 @@ class TransportConformance(StandingConformance):
                 publisher.put(number)
                 assert ear.next().payload == number
 
+    def test_what_may_be_dropped_and_is_not_urgent_arrives_in_order_where_nobody_stalls(self) -> None:
+        with self.pair() as (one, other):
+            ear = listen(other, "room/a", speaker=one)
+            publisher = one.publish("room/a", droppable=True)
+            for number in range(50):
+                publisher.put(str(number).encode())
+                assert ear.next().payload == str(number).encode()
+
+    def test_who_keeps_the_newest_makes_nobody_wait_and_loses_the_oldest(self) -> None:
+        with self.pair() as (one, other):
+            newest = other.subscribe("room/a", newest=4)
+            every = listen(other, "room/*", speaker=one)
+            publisher = one.publish("room/a")
+            for number in range(100):
+                publisher.put(str(number).encode())
+            one.publish("room/b").put(b"all")  # behind them
+            every.until("room/b", b"all")
+            assert [newest.receive().payload for _ in range(4)] == [b"96", b"97", b"98", b"99"]
+
     # --- waking
 
     def test_waking_reaches_the_readers_of_the_same_transport_and_nobody_else(self) -> None:

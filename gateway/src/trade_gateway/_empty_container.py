@@ -1,0 +1,60 @@
+"""``trade container``: a process with nothing in it, for others to put providers into."""
+
+import os
+from dataclasses import replace
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+
+from trade import Container
+from trade_gateway._detached import detached
+from trade_gateway._list import Json
+from trade_gateway._output import Output
+from trade_gateway._system_choice import choice_of
+from trade_gateway._up import leaving, refuse_twice
+
+_LOOK_EVERY_S = 0.2
+
+
+def container(
+    context: typer.Context,
+    name: Annotated[str | None, typer.Option(help="Its name. \\[env: TRADE_CONTAINER]")] = None,
+    allow: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Classes that may be made in it: mypkg.vision:Camera, mypkg.*; repeatable. \\[env: TRADE_INSTANTIABLE]"
+        ),
+    ] = None,
+    detach: Annotated[
+        bool, typer.Option("--detach", help="Return when it is up; it goes on without this terminal.")
+    ] = False,
+    as_json: Json = False,
+) -> None:
+    """Keep an empty container up until Ctrl-C, SIGTERM or its function terminate_container.
+
+    For example: trade container --name eyes --allow "mypkg.vision:*"
+    """
+    out, settings = Output(as_json=as_json), choice_of(context).settings(name)
+    if detach:
+        dialled = [word for endpoint in settings.connect for word in ("--connect", endpoint)]
+        allowed = [word for pattern in allow or () for word in ("--allow", pattern)]
+        words = ["--system", settings.system, *dialled, "container", "--name", settings.container, *allowed]
+        told = detached(words, settings)
+        out.data(told) if as_json else out.say(f"[bold green]{told['container']} is up[/], process {told['pid']}")
+        return
+    if allow:
+        settings = replace(settings, instantiable=tuple(allow))
+    with leaving() as asked_to_leave, Container(settings) as running:
+        running.terminating.close = asked_to_leave.set
+        refuse_twice(running, "trade container")
+        if as_json:
+            ready = {"ready": True, "container": running.name, "epoch": running.address.epoch, "pid": os.getpid()}
+            out.data({**ready, "system": settings.system, "instantiable": settings.instantiable})
+        out.say(
+            f"[bold green]{running.name} is up[/]; it may make {escape(', '.join(settings.instantiable)) or 'nothing'}"
+        )
+        out.say("Ctrl-C leaves")
+        while not asked_to_leave.wait(_LOOK_EVERY_S):
+            pass
+        out.say("leaving")

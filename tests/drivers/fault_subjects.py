@@ -1,0 +1,238 @@
+"""The devices that the table of faults strikes: one of each kind, in the same words."""
+
+from abc import ABC, abstractmethod
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+from drivers.conftest import Outcome, Rig, goal_counts
+from drivers.fault_table import Order, Recovery, Sick
+from drivers.gripper_rig import HandRig
+from drivers.legs import HALT, HIP, Leg
+from trade.errors import DeviceError
+from trade_drivers import Motor
+from trade_hil_sim import BrownOut, Entry, events, instructions, motion_writes, writes
+from waiting import wait_until
+
+__all__ = ["SUBJECTS", "Subject"]
+
+_BEATS = 15
+"""Exchanges with a device in which something would have begun to move."""
+_HERE_COUNTS = 6
+_PATIENT = "stale_after_s = 0.4"
+"""So that a loaded machine does not look like a fault."""
+
+
+class Subject(ABC):
+    """One simulated device, its driver, and the log as the judge."""
+
+    device_id = 1
+    ends = ("shutdown", "torque_off", "brown_out", "bus_off")
+    """Events with which a device ends its motion itself."""
+
+    def __init__(self, rig: Any) -> None:
+        self.rig = rig
+        self.sound = True
+        """Fit for another fault: nothing is left over from the last one."""
+        self.well = True
+        self.told: dict[object, str] = {}
+        self.robot = rig.attach(healthy=lambda: self.well, set_health=self.told.__setitem__)
+        self.provider = self.get()
+
+    @abstractmethod
+    def get(self) -> Any:
+        """The provider."""
+
+    @abstractmethod
+    def go(self) -> object:
+        """Make a slow move of several seconds."""
+
+    @abstractmethod
+    def use(self) -> None:
+        """Move it there and back to where it begins; it must arrive."""
+
+    @abstractmethod
+    def share(self, place: Any) -> float:
+        """How much of the slow move, 0 to 1, lies behind it where it was then, or is."""
+
+    @abstractmethod
+    def holds(self, since: float) -> list[Entry]:
+        """What it was told on the wire that makes it hold, or stand."""
+
+    @abstractmethod
+    def exchanges(self, since: float) -> list[Entry]:
+        """What the driver asked it, and it could answer."""
+
+    @property
+    def truth(self) -> Any:
+        return self.rig.truth(self.device_id)
+
+    @property
+    def travelled(self) -> float:
+        """How much of the slow move it has really made, 0 to 1."""
+        return self.share(self.truth)
+
+    @property
+    def log(self) -> list[Entry]:
+        return list(self.rig.log)
+
+    def moves(self, since: float) -> list[Entry]:
+        """What it was told that could move it."""
+        return motion_writes(self.log, device_id=self.device_id, since=since)
+
+    def events(self, name: str, since: float) -> list[Entry]:
+        return events(self.log, name, device_id=self.device_id, since=since)
+
+    def places(self, since: float) -> list[float]:
+        """Where it was at each of its events, as `share` says it."""
+        found = events(self.log, device_id=self.device_id, since=since)
+        return [self.share(entry) for entry in found if entry.position_counts is not None]
+
+    def set_off(self) -> Outcome:
+        """The slow move, under way."""
+        moving = Outcome(self.go)
+        wait_until(lambda: moving.error or (self.travelled > 0.03 and self.truth.moving), "it is under way")
+        assert moving.error is None
+        return moving
+
+    def strike(self, *orders: Order) -> None:
+        for order in orders:
+            if isinstance(order, Sick):
+                self.well = not order.on
+            else:
+                self.rig.sim.do(order)
+
+    def wait_for_exchanges(self, since: float) -> None:
+        wait_until(lambda: len(self.exchanges(since)) >= _BEATS, "it is asked as usual")
+
+    def fault(self) -> str | None:
+        """What ``state()`` tells; None while that is an error."""
+        try:
+            return str(self.provider.state().fault)
+        except DeviceError:
+            return None
+
+    def recover(self, recovery: Recovery, since: float) -> None:
+        if recovery is Recovery.POWER:
+            self.rig.sim.do(BrownOut(ids=(self.device_id,)))
+            wait_until(lambda: self.events("booted", since), "it has booted")
+            wait_until(lambda: self.fault() is not None, "it answers")
+        if recovery is not Recovery.NOTHING:
+            self.provider.enable()
+
+
+class _Joint(Subject):
+    goal_rad = 1.3
+    provider: Motor
+
+    def go(self) -> float:
+        return self.provider.move_to(self.goal_rad, 0.3)
+
+    def use(self) -> None:
+        for goal_rad in (0.15, 0.0):
+            assert abs(self.provider.move_to(goal_rad) - goal_rad) < 0.03
+
+    def share(self, place: Any) -> float:
+        return float(place.position_rad / self.goal_rad)
+
+
+class Servo(_Joint):
+    """A Dynamixel servo of a head."""
+
+    def get(self) -> Motor:
+        return self.robot.motor("neck.pan")
+
+    def holds(self, since: float) -> list[Entry]:
+        return writes(self.log, device_id=self.device_id, register="goal_position", since=since)
+
+    def exchanges(self, since: float) -> list[Entry]:
+        asked = instructions(self.log, "sync_read", since=since)
+        return [entry for entry in asked if self.device_id in (entry.ids or (entry.device_id,))]
+
+    def moves(self, since: float) -> list[Entry]:
+        """To be told to hold where it stands does not count."""
+        here = self.truth.position_counts
+        found = super().moves(since)
+        return [
+            entry
+            for entry in found
+            if entry.registers[-1] != "goal_position" or abs(goal_counts(entry) - here) > _HERE_COUNTS
+        ]
+
+
+class Drive(_Joint):
+    """A CiA 402 drive of a leg."""
+
+    goal_rad = 0.9
+
+    def get(self) -> Motor:
+        return self.robot.motor("leg.hip")
+
+    def holds(self, since: float) -> list[Entry]:
+        told = self.rig.frames("rpdo1", HIP, since)
+        return [entry for entry in told if int.from_bytes(entry.data[:2], "little") & HALT]
+
+    def exchanges(self, since: float) -> list[Entry]:
+        return self.rig.frames("tpdo1", HIP, since)
+
+
+class Hand(Subject):
+    """A 2F-85."""
+
+    device_id = 9
+    ends = ("fault", "brown_out")
+
+    def get(self) -> Any:
+        gripper = self.robot.gripper("left.hand")
+        gripper.activate()
+        return gripper
+
+    def go(self) -> object:
+        return self.provider.move_to(0.03, 0.02)
+
+    def use(self) -> None:
+        for width_m in (0.07, 0.085):
+            assert abs(self.provider.move_to(width_m).width_m - width_m) < 0.001
+
+    def share(self, place: Any) -> float:
+        return float((0.085 - place.width_m) / 0.055)
+
+    @property
+    def truth(self) -> Any:
+        return self.rig.truth
+
+    def holds(self, since: float) -> list[Entry]:
+        return [entry for entry in self.rig.writes(since) if not entry.moves]
+
+    def exchanges(self, since: float) -> list[Entry]:
+        return instructions(self.log, device_id=self.device_id, since=since)
+
+    def recover(self, recovery: Recovery, since: float) -> None:
+        if recovery is not Recovery.NOTHING:
+            self.provider.clear_fault()
+            self.provider.activate()
+
+
+def _servo(tmp_path: Path, undo: ExitStack) -> Subject:
+    rig = Rig(tmp_path, undo)
+    rig.configure(('driver = "dynamixel"', f'driver = "dynamixel"\n{_PATIENT}\nwatchdog_s = 0.4'))
+    rig.plug()
+    return Servo(rig)
+
+
+def _drive(_: Path, undo: ExitStack) -> Subject:
+    rig = Leg(undo)
+    rig.configure(('driver = "cia402"', f'driver = "cia402"\n{_PATIENT}\nwatchdog_s = 0.4'))
+    rig.plug()
+    return Drive(rig)
+
+
+def _hand(tmp_path: Path, undo: ExitStack) -> Subject:
+    rig = HandRig(tmp_path, undo)
+    rig.configure(('driver = "robotiq"', f'driver = "robotiq"\n{_PATIENT}'))
+    rig.plug()
+    return Hand(rig)
+
+
+SUBJECTS = {"dynamixel": _servo, "cia402": _drive, "robotiq": _hand}
+"""What makes one of each kind."""

@@ -1,0 +1,308 @@
+"""What can go wrong with a device and its bus, and what is to come of it: the tests judge by this table.
+
+``python -m tests.drivers.fault_table > docs/faults.md`` writes the page.
+"""
+
+from collections.abc import Iterator
+from enum import Enum
+from typing import Final, Literal, NamedTuple
+
+import msgspec
+
+from trade.errors import BusGone, DeviceError, DeviceFault, DeviceSilent, MotionStopped
+from trade_hil_sim import (
+    Absent,
+    BadCrc,
+    BrownOut,
+    BusOff,
+    Command,
+    Emergency,
+    Freeze,
+    Garbage,
+    HardwareFault,
+    Heal,
+    Jam,
+    Late,
+    Mute,
+    Replug,
+    Supply,
+    Truncate,
+    Unplug,
+    WrongModel,
+)
+
+__all__ = ["TABLE", "Device", "Order", "Recovery", "Row", "Sick", "Stop", "page"]
+
+Device = Literal["dynamixel", "cia402", "robotiq"]
+STRUCK: Final = {"dynamixel": (1,), "cia402": (1,), "robotiq": (9,)}
+"""The ids of the devices that are struck."""
+ONE: Final = STRUCK["dynamixel"]
+
+
+class Sick(msgspec.Struct, frozen=True, tag_field="do", tag="sick"):
+    """The driver's own process says that it is not healthy: no fault of the simulator."""
+
+    on: bool = True
+
+
+Order = Command | Sick
+
+
+class Stop(Enum):
+    """What ends the motion that was under way."""
+
+    NOTHING = "it does not stop: the move ends as asked"
+    HOLD = "the driver has it hold"
+    WATCHDOG = "its own watchdog"
+    BOTH = "the driver has it hold and falls silent; then its own watchdog"
+    ITSELF = "the device itself"
+    GOAL = "nothing can reach it, and it has no watchdog: it ends the move it was told"
+
+
+class Recovery(Enum):
+    """What somebody has to do, once the cause is gone, before it moves again."""
+
+    NOTHING = "nothing"
+    ENABLE = "`enable()`"
+    POWER = "power off and on, `enable()`"
+    ACTIVATE = "`clear_fault()`, `activate()`"
+
+
+class Row(NamedTuple):
+    """One fault that strikes one kind of device in the middle of a slow move."""
+
+    device: Device
+    fault: str
+    strike: tuple[Order, ...]
+    error: type[DeviceError] | None
+    """What the move ends with; None: it goes unnoticed."""
+    says: str = ""
+    """Part of its message."""
+    state: type[DeviceError] | str = ""
+    """What ``state()`` raises while it lasts, or part of the fault it tells."""
+    stop: Stop = Stop.HOLD
+    stop_error: type[DeviceError] | None = None
+    """What ``stop()`` raises while it lasts."""
+    recovery: Recovery = Recovery.ENABLE
+    then: tuple[Order, ...] = ()
+    """What happens once it has been noticed."""
+    found: str = ""
+    """The fault that is latched then."""
+    cure: tuple[Order, ...] = (Heal(),)
+    registry: str = "healthy"
+    """Its health in the registry while it lasts."""
+    reopens: bool = False
+    """The port is closed and opened again."""
+
+    @property
+    def name(self) -> str:
+        """For the test's id."""
+        return f"{self.device}: {self.fault}"
+
+
+_AFTER_SILENCE: Final = {
+    "dynamixel": Recovery.NOTHING,
+    "cia402": Recovery.ENABLE,
+    "robotiq": Recovery.ACTIVATE,
+}
+_AFTER_FAULT: Final = _AFTER_SILENCE | {"dynamixel": Recovery.ENABLE}
+_SICK: Final = "its driver's process is not healthy"
+_REPLUG: Final = "plug its adapter in again"
+
+
+def _silent(device: Device, fault: str, *strike: Order, stop: Stop = Stop.HOLD, after: Recovery | None = None) -> Row:
+    after = after or _AFTER_SILENCE[device]
+    return Row(device, fault, strike, DeviceSilent, "did not answer", DeviceSilent, stop, DeviceSilent, after)
+
+
+def _gone(device: Device, says: str, stop: Stop, after: Recovery, registry: str = "healthy") -> Row:
+    row = Row(device, "unplug and replug", (Unplug(),), BusGone, says, BusGone, stop, BusGone, after)
+    return row._replace(cure=(Replug(),), registry=registry, reopens=True)
+
+
+def _faulty(device: Device, fault: str, strike: Order, says: str, stop: Stop, after: Recovery | None = None) -> Row:
+    return Row(device, fault, (strike,), DeviceFault, says, says, stop, None, after or _AFTER_FAULT[device])
+
+
+def _forgiven(device: Device, fault: str, strike: Order) -> Row:
+    return Row(device, fault, (strike,), None, stop=Stop.NOTHING, recovery=Recovery.NOTHING)
+
+
+def _swapped(device: Device, number: int, found: str, stop: Stop) -> Row:
+    ids = STRUCK[device]
+    row = _silent(device, "wrong device", Absent(ids=ids), stop=stop, after=_AFTER_FAULT[device])
+    return row._replace(then=(WrongModel(ids=ids, number=number), Absent(ids=ids, on=False)), found=found)
+
+
+def _sick(device: Device, fault: str, stop: Stop) -> Row:
+    row = Row(device, fault, (Sick(),), MotionStopped, _SICK, DeviceFault, stop, DeviceFault, _AFTER_FAULT[device])
+    return row._replace(cure=(Sick(on=False),))
+
+
+_DYNAMIXEL: Final = (
+    _silent("dynamixel", "silence", Mute(ids=ONE)),
+    _silent("dynamixel", "late, always", Late(ids=ONE, s=1.0)),
+    _forgiven("dynamixel", "late, once", Late(ids=ONE, s=0.04, count=1)),
+    _silent("dynamixel", "corrupt, always", BadCrc(ids=ONE)),
+    _forgiven("dynamixel", "corrupt, once", BadCrc(ids=ONE, count=1)),
+    _silent("dynamixel", "cut short", Truncate(ids=ONE)),
+    _forgiven("dynamixel", "garbage before answers", Garbage(ids=ONE, count=30)),
+    _silent("dynamixel", "garbage for answers", Garbage(ids=ONE), Truncate(ids=ONE, missing=999)),
+    _faulty("dynamixel", "frozen value", Freeze(ids=ONE), "it makes no progress", Stop.HOLD),
+    _faulty("dynamixel", "frozen clock", Freeze(ids=ONE, tick=True), "its clock jumped", Stop.HOLD),
+    _faulty("dynamixel", "blocked", Jam(ids=ONE), "it makes no progress", Stop.HOLD),
+    _silent("dynamixel", "cable off", Absent(ids=ONE), stop=Stop.WATCHDOG, after=Recovery.ENABLE),
+    _gone("dynamixel", _REPLUG, Stop.WATCHDOG, Recovery.ENABLE),
+    _faulty("dynamixel", "fault latched", HardwareFault(ids=ONE, bits=0x20), "overload", Stop.ITSELF, Recovery.POWER),
+    _faulty(
+        "dynamixel", "over-temperature", Supply(ids=ONE, temperature_c=80), "overheating", Stop.ITSELF, Recovery.POWER
+    )._replace(cure=(Supply(ids=ONE, temperature_c=30),)),
+    _swapped("dynamixel", 1020, "another model answers with its id", Stop.WATCHDOG),
+    Row("dynamixel", "restart", (BrownOut(ids=ONE),), DeviceError, "", "it has restarted", Stop.ITSELF),
+    _sick("dynamixel", "watchdog", Stop.BOTH),
+)
+_CIA402: Final = (
+    _silent("cia402", "silence", Mute(ids=ONE)),
+    _silent("cia402", "no measurements", Mute(ids=ONE, instruction="tpdo1")),
+    _silent("cia402", "heartbeat lost", Mute(ids=ONE, instruction="heartbeat")),
+    _silent("cia402", "late, always", Late(ids=ONE, s=1.0)),
+    _forgiven("cia402", "late, within a cycle", Late(ids=ONE, instruction="tpdo1", s=0.004)),
+    _silent("cia402", "corrupt, always", BadCrc(ids=ONE), stop=Stop.WATCHDOG),
+    _forgiven("cia402", "corrupt, five times", BadCrc(ids=ONE, instruction="tpdo1", count=5)),
+    _silent("cia402", "cut short", Truncate(ids=ONE, instruction="tpdo1")),
+    _silent("cia402", "garbage for measurements", Garbage(ids=ONE, instruction="tpdo1")),
+    _faulty("cia402", "frozen value", Freeze(ids=ONE), "it makes no progress", Stop.HOLD),
+    _faulty("cia402", "blocked", Jam(ids=ONE), "error 8611h, following error", Stop.ITSELF),
+    _silent("cia402", "cable off", Absent(ids=ONE), stop=Stop.WATCHDOG),
+    _gone("cia402", "", Stop.WATCHDOG, Recovery.ENABLE, "degraded: CAN bus gone"),
+    _silent("cia402", "bus-off of the drive", BusOff(ids=ONE), stop=Stop.ITSELF),
+    Row(
+        "cia402",
+        "bus-off of the adapter",
+        (BusOff(),),
+        BusGone,
+        "bus-off: too many errors",
+        DeviceSilent,
+        Stop.WATCHDOG,
+        DeviceSilent,
+        cure=(BusOff(on=False),),
+        registry="degraded: CAN bus-off",
+        reopens=True,
+    ),
+    _faulty("cia402", "EMCY", Emergency(ids=ONE, code=0x2310), "error 2310h, continuous over-current", Stop.ITSELF),
+    _faulty(
+        "cia402",
+        "fault latched",
+        Emergency(ids=ONE, code=0x3220, lasting=True),
+        "error 3220h, under-voltage",
+        Stop.ITSELF,
+    ),
+    _faulty(
+        "cia402",
+        "over-temperature",
+        Supply(ids=ONE, temperature_c=90),
+        "error 4310h, over-temperature",
+        Stop.ITSELF,
+    ),
+    _swapped("cia402", 77, "another drive answers as node 1", Stop.WATCHDOG),
+    Row("cia402", "restart", (BrownOut(ids=ONE),), DeviceError, "", "it has restarted", Stop.ITSELF),
+    _sick("cia402", "watchdog", Stop.BOTH),
+)
+_ROBOTIQ: Final = (
+    _silent("robotiq", "silence", Mute()),
+    _silent("robotiq", "late, always", Late(s=1.0)),
+    _forgiven("robotiq", "late, once", Late(s=0.06, count=1)),
+    _silent("robotiq", "corrupt, always", BadCrc()),
+    _forgiven("robotiq", "corrupt, once", BadCrc(count=1)),
+    _silent("robotiq", "cut short", Truncate()),
+    _forgiven("robotiq", "garbage before answers", Garbage(hex="09040600ff", count=30)),
+    _silent("robotiq", "garbage for answers", Garbage(), Truncate(missing=999)),
+    _faulty("robotiq", "frozen value", Freeze(), "its fingers stand", Stop.HOLD),
+    _silent("robotiq", "cable off", Absent(), stop=Stop.GOAL, after=Recovery.NOTHING),
+    _gone("robotiq", _REPLUG, Stop.GOAL, Recovery.NOTHING),
+    _faulty("robotiq", "fault latched", HardwareFault(bits=0x0E), "overcurrent", Stop.ITSELF),
+    _faulty("robotiq", "over-temperature", Supply(temperature_c=90), "too hot", Stop.ITSELF),
+    _faulty("robotiq", "under-voltage", Supply(voltage_v=20.0), "supply voltage is too low", Stop.ITSELF),
+    _swapped("robotiq", 0, "it is no 2F-85", Stop.GOAL),
+    Row("robotiq", "restart", (BrownOut(),), DeviceFault, "activat", "", Stop.ITSELF, None, Recovery.ACTIVATE),
+    _sick("robotiq", "sick driver", Stop.HOLD)._replace(recovery=Recovery.NOTHING),
+)
+TABLE: Final = (*_DYNAMIXEL, *_CIA402, *_ROBOTIQ)
+
+_TITLES: Final = {
+    "dynamixel": "Dynamixel servos",
+    "cia402": "CiA 402 drives",
+    "robotiq": "2F-85 grippers",
+}
+_HEAD: Final = """# Faults
+
+What is to come of a fault that strikes a device in the middle of a move. This page is written by
+`python -m tests.drivers.fault_table > docs/faults.md` out of the table that
+`test_a_fault_while_moving_ends_the_move_and_nothing_moves_on_recovery` and `test_a_small_fault_goes_unnoticed` run
+through, row by row, with the simulator's log as the judge.
+
+- *Struck by*: orders for the [simulator](simulators.md#faults), for the device that moves; `sick` is
+  `attach(healthy=...)` that says no.
+- *The move ends with* this error. While the fault lasts, further moves are refused.
+- *state()* and *stop()*: what they tell while it lasts. A stop that raises was tried, or could not be: nobody knows
+  that it was heard.
+- *Stopped by*: what ends the motion that was under way.
+- *Then*: what somebody has to call when the cause is gone. Until then **nothing moves**, in every row: what is heard
+  again is neither enabled nor sent anywhere, and at most told to hold where it stands.
+
+What strikes one joint leaves the others of its bus alone, but for those that move in one group with it: they stop.
+In the registry only CAN buses tell their health, and so do the joints on them.
+"""
+_COLUMNS: Final = ("fault", "struck by", "the move ends with", "state()", "stop()", "stopped by", "then")
+
+
+def page() -> str:
+    """The page of the docs."""
+    return "".join([_HEAD, *(line for device in _TITLES for line in _section(device))])
+
+
+def _section(device: str) -> Iterator[str]:
+    yield f"\n## {_TITLES[device]}\n\n"
+    yield f"| {' | '.join(_COLUMNS)} |\n{'|---' * len(_COLUMNS)}|\n"
+    for row in TABLE:
+        if row.device == device:
+            yield f"| {' | '.join(_cells(row))} |\n"
+
+
+def _cells(row: Row) -> tuple[str, ...]:
+    then = f'; when it is noticed, {_orders(row, row.then)}: fault "{row.found}"' if row.then else ""
+    health = "" if row.registry == "healthy" else f'; in the registry "{row.registry}"'
+    if row.error is None:
+        return row.fault, _orders(row, row.strike), "nothing: it arrives", "no fault", "nothing", *_end(row)
+    error = f"`{row.error.__name__}`" + (f': "{row.says}"' if row.says else "")
+    stop = "nothing" if row.stop_error is None else f"`{row.stop_error.__name__}`"
+    return row.fault, _orders(row, row.strike) + then, error, _state(row) + health, stop, *_end(row)
+
+
+def _end(row: Row) -> tuple[str, str]:
+    return row.stop.value, row.recovery.value
+
+
+def _state(row: Row) -> str:
+    if isinstance(row.state, type):
+        return f"`{row.state.__name__}`"
+    return f'fault "{row.state}"' if row.state else "no fault"
+
+
+def _orders(row: Row, orders: tuple[Order, ...]) -> str:
+    return ", ".join(_order(order, STRUCK[row.device]) for order in orders)
+
+
+def _order(order: Order, struck: tuple[int, ...]) -> str:
+    """An order as one would write it, without what is usual."""
+    fields = msgspec.structs.fields(order)
+    told = [
+        f"{field.name} {getattr(order, field.name)}"
+        for field in fields
+        if getattr(order, field.name) not in (field.default, struck)
+    ]
+    return f"`{' '.join([str(order.__struct_config__.tag), *told])}`"
+
+
+if __name__ == "__main__":
+    print(page(), end="")

@@ -1,0 +1,125 @@
+"""Every row of the table of faults: the error, the state, what ends the motion, and that nothing moves on recovery."""
+
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+
+from drivers.conftest import written_now
+from drivers.fault_subjects import SUBJECTS, Subject
+from drivers.fault_table import TABLE, Recovery, Row, Stop, page
+from trade.errors import DeviceError, DeviceFault
+from waiting import wait_until
+
+_ARRIVED = 0.97
+_NOTHING = 0.005
+"""Less than this share of the move is no motion: 0.4 degrees, 0.3 mm."""
+
+
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Subject]]:
+    """One device of each kind that is in use, for all faults that leave its port open."""
+    with ExitStack() as undo:
+        yield {device: make(tmp_path_factory.mktemp(device), undo) for device, make in SUBJECTS.items()}
+
+
+@pytest.fixture
+def subject(row: Row, shared: dict[str, Subject], tmp_path: Path) -> Iterator[Subject]:
+    if shared[row.device].sound and not row.reopens:
+        yield shared[row.device]
+        return
+    with ExitStack() as undo:
+        yield SUBJECTS[row.device](tmp_path, undo)
+
+
+@pytest.mark.parametrize("row", [row for row in TABLE if row.error], ids=lambda row: row.name)
+def test_a_fault_while_moving_ends_the_move_and_nothing_moves_on_recovery(row: Row, subject: Subject) -> None:
+    subject.sound = False
+    moving = subject.set_off()
+    struck = written_now()
+    subject.strike(*row.strike)
+    error = moving.wait().error
+    assert row.error is not None
+    assert isinstance(error, row.error), error
+    assert row.says in str(error)
+    _check_stop(row, subject, struck)
+
+    stood, rested = subject.travelled, written_now()
+    wait_until(lambda: _tells(subject, row.state), f"state() tells {row.state!r}")
+    wait_until(lambda: subject.told.get(subject.provider, "healthy") == row.registry, row.registry)
+    _check_refused(row, subject)
+    if row.then:
+        subject.strike(*row.then)
+        wait_until(lambda: row.found in _latched(subject), "it is found out")
+        _check_refused(row, subject)
+
+    cured = written_now()
+    subject.strike(*row.cure)
+    wait_until(lambda: subject.fault() is not None, "it answers again")
+    subject.wait_for_exchanges(written_now())
+    assert not subject.moves(cured)
+    assert all(abs(place - stood) < _NOTHING for place in (*subject.places(rested), subject.travelled))
+    if row.recovery is not Recovery.NOTHING:
+        with pytest.raises(DeviceFault):
+            subject.use()
+    subject.recover(row.recovery, cured)
+    subject.use()
+    assert subject.provider.state().fault == ""
+    wait_until(lambda: subject.told.get(subject.provider, "healthy") == "healthy", "it is healthy")
+    subject.sound = True
+
+
+@pytest.mark.parametrize("row", [row for row in TABLE if not row.error], ids=lambda row: row.name)
+def test_a_small_fault_goes_unnoticed(row: Row, subject: Subject) -> None:
+    subject.sound = False
+    if row.device != "robotiq":
+        subject.provider.enable()
+    subject.strike(*row.strike)
+    subject.use()
+    assert subject.fault() == ""
+    subject.strike(*row.cure)
+    subject.sound = True
+
+
+def test_the_page_of_the_docs_is_what_the_table_says() -> None:
+    kept = (Path(__file__).parents[2] / "docs" / "faults.md").read_text(encoding="utf-8")
+    assert kept == page(), "write it anew: python -m tests.drivers.fault_table > docs/faults.md"
+
+
+def _check_stop(row: Row, subject: Subject, struck: float) -> None:
+    """What ended the motion, by the log of the simulator."""
+    if row.stop in {Stop.WATCHDOG, Stop.BOTH}:
+        wait_until(lambda: subject.events("watchdog_expired", struck), "its watchdog expires")
+    wait_until(lambda: not subject.truth.moving, "it is at rest")
+    assert (subject.travelled > _ARRIVED) == (row.stop is Stop.GOAL)
+    if row.stop in {Stop.HOLD, Stop.BOTH}:
+        assert subject.holds(struck)
+    if row.stop is Stop.HOLD:
+        assert not subject.events("watchdog_expired", struck)
+    if row.stop is Stop.ITSELF:
+        assert any(subject.events(name, struck) for name in subject.ends)
+
+
+def _check_refused(row: Row, subject: Subject) -> None:
+    """Nothing moves it; a stop says whether it can be believed."""
+    with pytest.raises(DeviceError):
+        subject.use()
+    if row.stop_error is None:
+        subject.provider.stop()
+    else:
+        with pytest.raises(row.stop_error):
+            subject.provider.stop()
+
+
+def _tells(subject: Subject, wanted: type[DeviceError] | str) -> bool:
+    try:
+        fault = subject.provider.state().fault
+    except DeviceError as error:
+        return isinstance(wanted, type) and isinstance(error, wanted)
+    return isinstance(wanted, str) and (wanted in fault if wanted else not fault)
+
+
+def _latched(subject: Subject) -> str:
+    [device] = getattr(subject.provider, "_axes", None) or [subject.provider._hand]
+    return str(device.fault)

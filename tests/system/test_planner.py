@@ -1,0 +1,37 @@
+"""The planner's story, as a user runs it: three processes, and the camera is not linked to the others at first."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from system.conftest import Program
+from trade import Container, where
+from trade._endpoints import free_endpoint
+
+PLANNER = Path(__file__).parents[2] / "examples" / "planner.py"
+
+
+def test_a_planner_that_cannot_see_finds_somebody_who_can(
+    run: Callable[..., Program], monkeypatch: pytest.MonkeyPatch, start_container: Callable[..., Container]
+) -> None:
+    arm = run(PLANNER, "arm")
+    assert arm.line() == "arm: rosie.arm.pick_up\n"
+    alone = free_endpoint()
+    with monkeypatch.context() as apart:
+        apart.setenv("TRADE_LISTEN", alone)
+        apart.setenv("TRADE_CONNECT", alone)
+        assert run(PLANNER, "camera").line() == "camera: rosie.eyes.check_for\n"
+    bystander = start_container("bystander")
+    bystander.find(where(name="pick_up"), wait_s=30)
+    assert bystander.services(where(achieves="see(mug)")) == []
+
+    planner = run(PLANNER, "planner")
+    assert planner.lines() == [
+        "planner: rosie.arm.pick_up achieves holding(mug), and needs see(mug)\n",
+        "planner: nobody of rosie achieves see(mug); looking around\n",
+        "planner: rosie.eyes.check_for has joined in container camera\n",
+        "planner: the mug is at +0.4 m, -0.1 m\n",
+        "planner: holding(mug)\n",
+    ]
+    assert arm.line() == "arm: picking up at +0.4 m, -0.1 m\n"

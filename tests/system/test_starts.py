@@ -1,0 +1,159 @@
+"""Containers started on other hosts, through a real sshd."""
+
+import contextlib
+import json
+import os
+import shlex
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import psutil
+import pytest
+
+import trade
+from system.sshd import Sshd, why_no_sshd
+from trade import _starting, where
+from trade.errors import CannotStart, ConfigurationError
+from waiting import wait_until
+
+Command = Callable[..., subprocess.CompletedProcess[str]]
+HERE = (sys.executable, "-m", "trade_gateway")
+
+
+@pytest.fixture
+def sshd(system: str, tmp_path: Path) -> Iterator[Sshd]:
+    missing = why_no_sshd()
+    if missing:
+        if os.environ.get("CI") == "true":
+            pytest.fail(missing)
+        pytest.skip(missing)
+    folder = tmp_path / "ssh"
+    folder.mkdir()
+    package = tmp_path / "packages"
+    package.mkdir()
+    (package / "sight.py").write_text(
+        "from trade import service\nclass Eye:\n    @service(effect='read')\n    def see(self) -> str: return 'a cat'\n"
+    )
+    names = ("TRADE_RUNTIME_DIR", "TRADE_STATE_DIR")
+    running = Sshd(folder, {**{name: os.environ[name] for name in names}, "PYTHONPATH": str(package)})
+    yield running
+    running.close()
+
+
+@contextlib.contextmanager
+def ended(name: str, pid: int) -> Iterator[None]:
+    """End the container and wait for its process at the end of the block."""
+    process = psutil.Process(pid)
+    try:
+        yield
+        trade.find(where(name="terminate_container", container=name), wait_s=30)("the test is over")
+        wait_until(lambda: not process.is_running() or process.status() == psutil.STATUS_ZOMBIE)
+    finally:
+        with contextlib.suppress(psutil.NoSuchProcess):
+            process.kill()
+
+
+def test_a_container_is_started_used_and_ended_on_another_host(sshd: Sshd) -> None:
+    started = trade.system.start_container(
+        "robot", "eyes", allow=["sight:*"], command=HERE, ssh_config=sshd.config, wait_s=30
+    )
+    with ended("eyes", started.pid):
+        assert (started.name, started.host) == ("eyes", socket.gethostname())
+        instantiate = trade.find(where(name="instantiate", container="eyes"))
+        [see] = instantiate("sight:Eye", (), ["rosie.eyes"])
+        assert see() == "a cat"
+
+
+def test_it_is_started_on_the_command_line_and_outlives_that(sshd: Sshd, trade_command: Command) -> None:
+    command = Path(sys.executable).parent / "trade"
+    ran = trade_command("start", "robot", "eyes", "--command", command, "--ssh-config", sshd.config, "--json")
+    assert ran.returncode == 0, ran.stderr
+    with ended("eyes", json.loads(ran.stdout)["pid"]):
+        assert trade.find(where(name="clock", container="eyes"), wait_s=30)() > 0
+
+
+def test_of_two_of_one_name_the_second_is_not_started(sshd: Sshd) -> None:
+    started = trade.system.start_container("robot", "eyes", command=HERE, ssh_config=sshd.config, wait_s=30)
+    with ended("eyes", started.pid):
+        with pytest.raises(CannotStart, match="'eyes' is up already") as refused:
+            trade.system.start_container("robot", "eyes", command=HERE, ssh_config=sshd.config)
+        assert refused.value.reason == "it did not come up"
+
+
+def test_what_does_not_come_into_the_system_is_told_with_its_process(sshd: Sshd) -> None:
+    with pytest.raises(CannotStart) as refused:
+        trade.system.start_container(
+            "robot",
+            "eyes",
+            command=HERE,
+            environment={"TRADE_CREDENTIALS": "other:secret"},
+            ssh_config=sshd.config,
+            wait_s=1.0,
+        )
+    assert refused.value.reason == "not seen"
+    pid = int(refused.value.said.split("process ")[1].split(",")[0])
+    psutil.Process(pid).terminate()
+    wait_until(lambda: not psutil.pid_exists(pid) or psutil.Process(pid).status() == psutil.STATUS_ZOMBIE)
+
+
+def refused(sshd: Sshd, *command: str) -> CannotStart:
+    with pytest.raises(CannotStart) as told:
+        trade.system.start_container("robot", "eyes", command=command or HERE, ssh_config=sshd.config)
+    return told.value
+
+
+def test_a_host_whose_key_is_not_known_is_not_talked_to_and_stays_unknown(sshd: Sshd) -> None:
+    sshd.known_hosts.write_text("")
+    error = refused(sshd)
+    assert error.reason == "unknown host key"
+    assert "known_hosts" in error.remedy
+    assert sshd.known_hosts.read_text() == ""
+
+
+def test_a_host_with_another_key_than_the_known_one_is_not_talked_to(sshd: Sshd) -> None:
+    sshd.know("stranger")
+    before = sshd.known_hosts.read_text()
+    assert refused(sshd).reason == "changed host key"
+    assert sshd.known_hosts.read_text() == before
+
+
+def test_who_is_not_let_in_is_asked_for_no_password(sshd: Sshd) -> None:
+    sshd.write_config(identity="stranger")
+    assert refused(sshd).reason == "not let in"
+
+
+def test_where_no_sshd_listens_it_is_refused(sshd: Sshd) -> None:
+    sshd.close()
+    assert refused(sshd).reason == "refused"
+
+
+def test_a_host_that_says_nothing_is_given_up(sshd: Sshd, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = [word.replace(f"ConnectTimeout={_starting.CONNECT_S}", "ConnectTimeout=1") for word in _starting._ASKED]
+    monkeypatch.setattr(_starting, "_ASKED", tuple(asked))
+    with socket.create_server(("127.0.0.1", 0)) as mute:
+        sshd.write_config(port=mute.getsockname()[1])
+        assert refused(sshd).reason == "timeout"
+
+
+def test_where_there_is_no_trade_that_is_said(sshd: Sshd) -> None:
+    error = refused(sshd, "no-such-trade")
+    assert (error.reason, "'no-such-trade' is not found" in error.remedy) == ("no trade there", True)
+
+
+@pytest.mark.parametrize("host", ["-oProxyCommand=touch x", "", "robot; reboot", "robot reboot", "$(reboot)"])
+def test_what_is_no_host_never_reaches_ssh(system: str, host: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(subprocess, "run", lambda *_, **__: pytest.fail("it ran"))
+    with pytest.raises(ConfigurationError, match="is no host"):
+        trade.system.start_container(host, "eyes")
+
+
+def test_words_reach_the_far_shell_as_they_are() -> None:
+    hostile = "a b; $(reboot) 'x'"
+    words = _starting._words("eyes", "lab", [hostile], [], ["trade"], {"TRADE_CONNECT": hostile})
+    assert shlex.split(_starting.ssh_words("robot", None, words)[-1]) == words
+    assert words[:2] == ["env", f"TRADE_CONNECT={hostile}"]
+    with pytest.raises(ConfigurationError, match="is no name of a variable"):
+        _starting._words("eyes", "lab", [], [], ["trade"], {"A;B": "1"})

@@ -1,0 +1,79 @@
+"""Log lines of the whole system: kept where they are logged, gathered from anywhere, each once."""
+
+import logging
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from trade import Container, LogReader, where
+from trade._logbook import Logbook
+
+_log = logging.getLogger("trade")
+
+BABBLES = """
+    import logging
+    with Container(Settings.read(container="babbler")):
+        while (word := hear()) != "end":
+            logging.getLogger("trade").warning("babble %s", word)
+            say("logged")
+"""
+
+
+def _record(text: str, *args: object, **options: Any) -> logging.LogRecord:
+    return logging.LogRecord("trade", logging.WARNING, __file__, 1, text, args, options.get("exc_info"))
+
+
+def test_lines_of_other_processes_are_gathered(here: Container, start_program: Callable[..., Any]) -> None:
+    babbler = start_program(BABBLES)
+    here.find(where(name="log_lines", container="babbler"), wait_s=20)
+    babbler.tell("one")
+    assert babbler.heard() == "logged"
+    found = [line for line in here.logs() if line.text == "babble one"]
+    assert [(line.container, line.level_name, line.call_id) for line in found] == [("babbler", "WARNING", 0)]
+    assert here.logs(container="her*") == [line for line in here.logs() if line.container == "here"]
+    assert babbler.errors() == "babble one\n", "what it says on standard error stays as it was"
+    babbler.tell("end")
+    assert babbler.ends() == 0
+
+
+def test_containers_of_one_process_tell_a_line_once(here: Container, there: Container) -> None:
+    here.find(where(name="log_lines", container="there"), wait_s=20)
+    _log.warning("only once")
+    assert [line.text for line in here.logs()].count("only once") == 1
+
+
+def test_a_reader_reads_on(here: Container, there: Container) -> None:
+    reader = LogReader(here, "*")
+    _log.warning("first")
+    assert reader.read()[-1].text == "first"
+    _log.warning("second")
+    _log.warning("third")
+    assert [line.text for line in reader.read()] == ["second", "third"]
+    assert reader.read() == []
+
+
+def test_lines_are_bounded_in_number_and_length() -> None:
+    book = Logbook()
+    for number in range(2100):
+        assert book.filter(_record("%s %d", "x" * 5000, number))
+    lines = book.lines()
+    assert (len(lines), lines[0].number, len(lines[0].text)) == (2000, 101, 2000)
+    assert [line.number for line in book.lines(2098)] == [2099, 2100]
+
+
+def test_a_line_that_cannot_be_written_is_kept_as_it_stands() -> None:
+    book = Logbook()
+    book.filter(_record("%d of %d", "many"))
+    assert [line.text for line in book.lines()] == ["%d of %d"]
+
+
+def test_of_an_error_logged_with_a_line_its_type_is_told() -> None:
+    book = Logbook()
+    book.filter(_record("it failed", exc_info=(ValueError, ValueError("swordfish"), None)))
+    assert [line.text for line in book.lines()] == ["it failed (ValueError)"]
+
+
+def test_formatters_know_the_call(here: Container, caplog: pytest.LogCaptureFixture) -> None:
+    _log.warning("outside")
+    assert [record.call_id for record in caplog.records] == [0]  # type: ignore[attr-defined]

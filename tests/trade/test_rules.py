@@ -1,0 +1,565 @@
+"""Rules at work: on this occasion, if this holds, these steps; watched, stopped when they run in circles."""
+
+import json
+import logging
+import queue
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from trade import Container, Handle, service, where
+from trade import _rule_causes as causes
+from trade import _rules as rules_module
+from trade._rule_causes import Causes, Mark, turns
+from trade.errors import AccessDenied, ConfigurationError
+from trade.rules import Firing, Rules, read_rules, rehearse
+from waiting import wait_until
+
+SOON_S = 0.02
+
+
+class Lamp:
+    @service
+    def switch(self) -> None: ...
+
+
+class Desk:
+    """Hears what rules call, and answers their conditions."""
+
+    def __init__(self) -> None:
+        self.heard: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self.wanted = False
+        self.cpu = 0.1
+        self.asked = 0
+
+    @service
+    def tell(self, what: Handle, word: str = "") -> str:
+        self.heard.put((what.label, word))
+        return "noted"
+
+    @service
+    def note(self, word: str) -> None:
+        self.heard.put(word)
+
+    @service
+    def fail(self) -> None:
+        raise OSError("no ink")
+
+    @service(effect="read")
+    def is_wanted(self) -> bool:
+        self.asked += 1
+        return self.wanted
+
+    @service(effect="read")
+    def load(self) -> dict[str, float]:
+        self.asked += 1
+        return {"cpu": self.cpu}
+
+    def next(self) -> Any:
+        return self.heard.get(timeout=20)
+
+
+@pytest.fixture(autouse=True)
+def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rules_module, "LOOK_S", SOON_S)
+
+
+@pytest.fixture
+def desk(here: Container) -> Desk:
+    desk = Desk()
+    here.register(desk, "desk")
+    return desk
+
+
+class Engine:
+    """Rules of a file that the test writes, and their firings as they come."""
+
+    def __init__(self, container: Container, folder: Path) -> None:
+        self._container = container
+        self.file = folder / "rules.toml"
+        self.audit = folder / "audit.jsonl"
+        self._told: queue.SimpleQueue[Firing] = queue.SimpleQueue()
+        self.running: Rules | None = None
+
+    def __call__(self, text: str, *, dry_run: bool = False) -> Rules:
+        self.file.write_text(text)
+        self.running = Rules(self._container, self.file, audit=self.audit, dry_run=dry_run, tell=self._told.put)
+        return self.running
+
+    def next(self) -> Firing:
+        return self._told.get(timeout=20)
+
+    def quiet(self) -> bool:
+        return self._told.empty()
+
+
+@pytest.fixture
+def engine(here: Container, tmp_path: Path) -> Iterator[Engine]:
+    made = Engine(here, tmp_path)
+    yield made
+    if made.running is not None:
+        made.running.close()
+
+
+TELL = 'do = [{ call = { name = "tell" }, args = ["$service", "$container"] }]'
+NOTE = 'do = [{ call = { name = "note" }, args = ["x"] }]'
+
+
+# --- occasions
+
+
+@pytest.mark.parametrize("kind", ["joined", "left"])
+def test_a_rule_fires_with_what_joins_or_leaves(there: Container, desk: Desk, engine: Engine, kind: str) -> None:
+    engine(f'[rule.r]\nwhen = {{ {kind} = {{ name = "switch" }} }}\n{TELL}')
+    lamp = Lamp()
+    there.register(lamp, "hall")
+    there.deregister(lamp)
+    assert desk.next() == ("hall.switch", "there")
+    firing = engine.next()
+    assert (firing.rule, firing.service, firing.occasion) == ("r", "hall.switch", f"{kind} name='switch'")
+    [did] = firing.steps
+    assert (did.service, did.container, did.result, did.error) == ("desk.tell", "here", "'noted'", "")
+
+
+def test_a_rule_fires_when_a_service_becomes_as_it_says_and_not_when_it_ceases_to_be(
+    there: Container, desk: Desk, engine: Engine
+) -> None:
+    engine(f'[rule.r]\nwhen = {{ changed = {{ name = "switch", healthy = false }} }}\n{TELL}')
+    lamp, other = Lamp(), Lamp()
+    there.register(lamp, "hall")
+    there.register(other, "attic")
+    there.set_health(lamp, "flickers")
+    assert desk.next() == ("hall.switch", "there")
+    there.set_health(lamp)
+    there.set_health(other, "flickers")
+    assert desk.next() == ("attic.switch", "there")
+
+
+def test_a_rule_fires_while_a_service_is_missing(here: Container, desk: Desk, engine: Engine) -> None:
+    running = engine(f'[rule.r]\nwhen = {{ missing = {{ name = "switch" }} }}\n{NOTE}\ncooldown_s = {SOON_S}')
+    assert [desk.next(), desk.next()] == ["x", "x"]
+    here.register(Lamp(), "hall")
+    wait_for_looks(here)  # one may have been under way
+    fired = running.rules()[0].fired
+    wait_for_looks(here)
+    assert (running.rules()[0].fired, running.rules()[0].state) == (fired, "standing")
+
+
+def test_what_is_missing_longer_than_its_steps_take_waits_for_the_cooldown(
+    here: Container, desk: Desk, engine: Engine
+) -> None:
+    running = engine(f'[rule.r]\nwhen = {{ missing = {{ name = "switch" }} }}\n{NOTE}\ncooldown_s = 600')
+    engine.next()
+    wait_for_looks(here)
+    assert running.rules()[0].fired == 1
+
+
+def wait_for_looks(here: Container) -> None:
+    """Until it has been looked for what is missing a few times more."""
+
+    def looks() -> int:
+        return sum(info.fired for info in here.notifications() if info.occasion.startswith("every"))
+
+    before = looks()
+    wait_until(lambda: looks() >= before + 4)
+
+
+def test_occasions_during_the_cooldown_are_left_out_for_that_service_alone(
+    there: Container, desk: Desk, engine: Engine
+) -> None:
+    running = engine(f'[rule.r]\nwhen = {{ joined = {{ name = "switch" }} }}\n{TELL}\ncooldown_s = 600')
+    for _ in range(3):
+        lamp = Lamp()
+        there.register(lamp, "hall")
+        there.deregister(lamp)
+    there.register(Lamp(), "attic")
+    assert [desk.next()[0], desk.next()[0]] == ["hall.switch", "attic.switch"]
+    assert running.rules()[0].skipped == 2
+
+
+def test_a_rule_of_time_fires_only_while_its_condition_holds(desk: Desk, engine: Engine) -> None:
+    engine(f'[rule.r]\nwhen = {{ every_s = {SOON_S} }}\nif = {{ service = {{ name = "is_wanted" }} }}\n{NOTE}')
+    wait_until(lambda: desk.asked >= 3)
+    assert desk.heard.empty()
+    desk.wanted = True
+    assert desk.next() == "x"
+
+
+def test_a_condition_compares_a_field_of_an_answer(desk: Desk, engine: Engine) -> None:
+    condition = 'if = { service = { name = "load" }, field = "cpu", above = 0.8 }'
+    engine(f"[rule.r]\nwhen = {{ every_s = {SOON_S} }}\n{condition}\n{NOTE}")
+    wait_until(lambda: desk.asked >= 3)
+    assert desk.heard.empty()
+    desk.cpu = 0.9
+    assert desk.next() == "x"
+
+
+@pytest.mark.parametrize(
+    ("condition", "said"),
+    [
+        ('{ name = "note" }', "does not only read, so it is no condition"),
+        ('{ name = "nobody" }', "NoSuchService"),
+        ('{ name = "load" }', "needs above, below or is: it answers {'cpu': 0.1}"),
+        ('{ name = "load" }, field = "memory", above = 1', "the answer has none"),
+        ('{ name = "is_wanted" }, above = 1', "which is no number"),
+    ],
+    ids=["actuates", "nobody", "no comparison", "no such field", "no number"],
+)
+def test_a_condition_that_cannot_be_asked_does_not_hold_and_is_told_of_once(
+    desk: Desk, engine: Engine, condition: str, said: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level(logging.WARNING, "trade.rules"):
+        running = engine(f"[rule.r]\nwhen = {{ every_s = {SOON_S} }}\nif = {{ service = {condition} }}\n{NOTE}")
+        wait_until(lambda: running.rules()[0].failed >= 3)
+    [info] = running.rules()
+    assert said in info.last_error
+    assert (info.fired, desk.heard.empty()) == (0, True)
+    assert caplog.text.count(said) == 1
+
+
+# --- steps
+
+
+def test_after_a_step_that_fails_only_those_are_done_that_always_are(desk: Desk, engine: Engine) -> None:
+    engine("""
+        [rule.r]
+        when = { missing = { name = "switch" } }
+        do = [
+          { call = { name = "note" }, args = { word = "on" } },
+          { wait_for = { name = "switch" }, s = 0 },
+          { call = { name = "note" }, args = ["seen"] },
+          { call = { name = "note" }, args = ["off"], always = true },
+          { call = { name = "fail" }, always = true },
+        ]
+        cooldown_s = 600
+        """)
+    firing = engine.next()
+    assert [desk.next(), desk.next()] == ["on", "off"]
+    assert desk.heard.empty()
+    assert [did.error.partition(":")[0] for did in firing.steps] == ["", "NoSuchService", "", "OSError"]
+    assert not firing.ok
+    assert engine.running is not None
+    [info] = engine.running.rules()
+    assert (info.fired, info.failed, info.last_error, info.state) == (1, 2, "OSError: no ink", "standing")
+
+
+def test_the_service_that_changed_is_called_itself(there: Container, engine: Engine) -> None:
+    class Oven:
+        switched = threading.Event()
+
+        @service
+        def off(self) -> None:
+            self.switched.set()
+
+    oven = Oven()
+    there.register(oven, "kitchen")
+    engine('[rule.r]\nwhen = { changed = { healthy = false, name = "off" } }\ndo = [{ call = "$service" }]')
+    wait_until(lambda: engine.running is not None and engine.running.container.services(where(name="off")))
+    there.set_health(oven, "overheating")
+    assert oven.switched.wait(20)
+
+
+# --- telling
+
+
+def test_every_firing_is_audited_in_a_file_and_as_a_service(there: Container, desk: Desk, engine: Engine) -> None:
+    engine(f'[rule.r]\nwhen = {{ joined = {{ name = "switch" }} }}\n{TELL}')
+    there.register(Lamp(), "hall")
+    there.register(Lamp(), "attic")
+    firings = [engine.next(), engine.next()]
+    lines = [json.loads(line) for line in engine.audit.read_text().splitlines()]
+    assert [line["service"] for line in lines] == [firing.service for firing in firings]
+    assert lines[0]["steps"][0]["result"] == "'noted'"
+    told = there.find(where(name="rule_firings"), wait_s=20)()
+    assert told == firings
+    [info] = there.call(where(name="rules", kind="Rules"))
+    assert (info.name, info.container, info.state, info.fired) == ("r", "here", "standing", 2)
+
+
+def test_an_audit_file_that_cannot_be_written_ends_nothing(
+    desk: Desk, engine: Engine, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    engine.audit = tmp_path / "no such folder" / "audit.jsonl"
+    engine(f"[rule.r]\nwhen = {{ every_s = {SOON_S} }}\n{NOTE}")
+    assert [engine.next().ok, engine.next().ok] == [True, True]
+    assert "cannot be written" in caplog.text
+
+
+# --- dry run
+
+
+def test_a_dry_run_says_on_each_occasion_what_it_would_call_and_calls_nothing(
+    there: Container, desk: Desk, engine: Engine
+) -> None:
+    engine(
+        """
+        [rule.r]
+        when = { joined = { name = "switch" } }
+        do = [
+          { call = { name = "nobody" } },
+          { call = { name = "tell" }, args = ["$service"] },
+          { wait_for = { name = "switch" } },
+        ]
+        """,
+        dry_run=True,
+    )
+    there.register(Lamp(), "hall")
+    firing = engine.next()
+    assert firing.dry_run
+    assert [did.error.partition(":")[0] for did in firing.steps] == ["NoSuchService", "", ""]
+    assert [did.result for did in firing.steps] == ["", "would be called", "is there"]
+    assert desk.heard.empty()
+
+
+def test_a_rehearsal_says_what_would_fire_now(here: Container, desk: Desk, tmp_path: Path) -> None:
+    file = tmp_path / "rules.toml"
+    file.write_text(f"""
+        [rule.absent]
+        when = {{ missing = {{ name = "switch" }} }}
+        {NOTE}
+        cooldown_s = 60
+        [rule.timed]
+        when = {{ every_s = 5 }}
+        if = {{ service = {{ name = "is_wanted" }} }}
+        {NOTE}
+        [rule.coming]
+        when = {{ joined = {{ name = "load" }} }}
+        {TELL}
+        [rule.going]
+        when = {{ left = {{ name = "switch" }} }}
+        {TELL}
+        """)
+    told = {rehearsal.rule: rehearsal for rehearsal in rehearse(here, read_rules(file))}
+    assert {name: rehearsal.fires for name, rehearsal in told.items()} == {
+        "absent": True,
+        "timed": False,
+        "coming": False,
+        "going": False,
+    }
+    assert [rehearsal.now for rehearsal in told.values()] == [
+        "nothing matches",
+        "the condition does not hold",
+        "1 match: desk.load",
+        "nothing matches",
+    ]
+    assert [did.service for did in told["coming"].steps] == ["desk.tell"]
+    assert told["going"].steps == ()
+    assert desk.heard.empty()
+
+
+# --- rights
+
+
+def test_a_rule_does_what_its_container_may_at_each_call(start_container: Any, engine: Engine, tmp_path: Path) -> None:
+    policy = tmp_path / "policy.toml"
+    text = """
+    [roles.ruler]
+    register = ["rules", "desk"]
+    read = ["desk", "rules"]
+    MAY
+    [identities]
+    ruler = ["ruler"]
+    """
+    policy.write_text(text.replace("MAY", ""))
+    ruler, desk = start_container("ruler", identity="ruler", policy=policy), Desk()
+    ruler.register(desk, "desk")
+    file = tmp_path / "rules.toml"
+    file.write_text(f"[rule.r]\nwhen = {{ every_s = {SOON_S} }}\n{NOTE}")
+    with Rules(ruler, file) as running:
+        wait_until(lambda: running.rules()[0].fired >= 2)
+        assert running.rules()[0].last_error.startswith("AccessDenied: ruler may not call desk.note")
+        [rehearsal] = rehearse(ruler, read_rules(file))
+        assert rehearsal.steps[0].error.startswith("AccessDenied: ruler may not call desk.note")
+        assert desk.heard.empty()
+        policy.write_text(text.replace("MAY", 'call = ["desk"]'))
+        ruler.load_policy(policy)
+        assert desk.next() == "x"
+
+
+def test_rules_are_offered_only_by_who_may(start_container: Any, tmp_path: Path) -> None:
+    policy, file = tmp_path / "policy.toml", tmp_path / "rules.toml"
+    policy.write_text('[roles.none]\ncall = ["*"]\n[identities]\nruler = ["none"]\n')
+    file.write_text(f"[rule.r]\nwhen = {{ every_s = 1 }}\n{NOTE}")
+    ruler = start_container("ruler", identity="ruler", policy=policy)
+    with pytest.raises(AccessDenied, match="ruler may not register"):
+        Rules(ruler, file)
+    assert ruler.notifications() == []
+
+
+# --- being changed
+
+
+def test_a_changed_file_begins_new_rules_ends_old_ones_and_leaves_the_others_alone(desk: Desk, engine: Engine) -> None:
+    same = f"[rule.same]\nwhen = {{ every_s = {SOON_S} }}\n{NOTE}\n"
+    running = engine(same + f"[rule.old]\nwhen = {{ every_s = 60 }}\n{NOTE}\n")
+    wait_until(lambda: running.rules()[1].fired >= 2)
+    engine.file.write_text(same + f"[rule.new]\nwhen = {{ every_s = 50 }}\n{NOTE}\n")
+    running.load(engine.file)
+    new, kept = running.rules()
+    assert (new.name, kept.name, kept.fired >= 2) == ("new", "same", True)
+    assert len(running.container.notifications()) == 2
+
+
+def test_a_wrong_file_changes_nothing(desk: Desk, engine: Engine) -> None:
+    running = engine(f"[rule.r]\nwhen = {{ every_s = {SOON_S} }}\n{NOTE}\n")
+    engine.file.write_text("[rule.other]\n")
+    with pytest.raises(ConfigurationError, match=r"rule\.other: when is missing"):
+        running.load(engine.file)
+    fired = running.rules()[0].fired
+    wait_until(lambda: running.rules()[0].fired > fired)
+
+
+def test_closed_rules_leave_nothing_behind(here: Container, desk: Desk, engine: Engine) -> None:
+    running = engine(f"[rule.r]\nwhen = {{ every_s = 60 }}\n{NOTE}\n")
+    running.close()
+    running.close()
+    assert here.notifications() == []
+    assert here.services(where(group="rules")) == []
+
+
+# --- circles
+
+
+class Toggle:
+    """Offers a lamp and withdraws it again, as it is told."""
+
+    def __init__(self, container: Container) -> None:
+        self._container = container
+        self._lamp = Lamp()
+        self.turns = 0
+
+    @service
+    def offer(self) -> None:
+        self.turns += 1
+        self._container.register(self._lamp, "hall")
+
+    @service
+    def withdraw(self) -> None:
+        self._container.deregister(self._lamp)
+
+
+def health(container: Container) -> str:
+    return container.find(where(name="rules", kind="Rules"), wait_s=20).health
+
+
+@pytest.mark.parametrize("offers", ["left", "missing"])
+def test_rules_that_trigger_each_other_for_ever_are_stopped_and_reported(
+    there: Container,
+    engine: Engine,
+    offers: str,
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(causes, "AFTERMATH_NS", 600 * 10**9)  # however slow this machine is
+    toggle = Toggle(there)
+    there.register(toggle, "toggle")
+    [offer] = there.services(where(name="offer"))
+    wait_until(lambda: engine._container.services(where(name="offer")))
+    running = engine(f"""
+        [rule.back]
+        when = {{ {offers} = {{ name = "switch" }} }}
+        do = [{{ call = {{ name = "offer" }} }}]
+        cooldown_s = {0.001 if offers == "missing" else 0}
+        [rule.away]
+        when = {{ joined = {{ name = "switch" }} }}
+        do = [{{ call = {{ name = "withdraw" }} }}]
+        """)
+    if offers == "left":
+        offer()
+    wait_until(lambda: any(info.state == "stopped" for info in running.rules()))
+    [stopped] = [info for info in running.rules() if info.state == "stopped"]
+    assert stopped.why.startswith("it brings itself about, 3 times over: ")
+    assert {"back", "away"} <= set(stopped.why.replace(":", " ").split())
+    wait_until(lambda: stopped.why[:60] in health(there))
+    firing = next(firing for firing in iter(engine.next, None) if firing.stopped)
+    assert (firing.rule, firing.ok, firing.steps) == (stopped.name, False, ())
+    assert len(firing.led_by) >= 6
+    assert any(record.levelno == logging.ERROR and stopped.name in record.message for record in caplog.records)
+    audited = [json.loads(line) for line in engine.audit.read_text().splitlines()]
+    assert [line["rule"] for line in audited if line["stopped"]] == [stopped.name]  # not the last: a step may end later
+    assert toggle.turns <= causes.TURNS + 2
+
+
+def test_a_stopped_rule_begins_anew_when_the_file_is_read_again(
+    here: Container, there: Container, engine: Engine
+) -> None:
+    def come_and_go() -> Firing:
+        lamp = Lamp()
+        there.register(lamp, "hall")
+        firing = engine.next()
+        there.deregister(lamp)
+        wait_until(lambda: not here.services(where(name="switch")))
+        return firing
+
+    text = '[rule.r]\nwhen = { joined = { name = "switch" } }\ndo = [{ wait_for = { name = "rules" } }]\n'
+    running = engine(text)
+    while not come_and_go().stopped:
+        pass
+    wait_until(lambda: health(there).startswith("stopped: rule r:"))
+    running.load(engine.file)
+    assert come_and_go().ok
+    assert running.rules()[0].state == "standing"
+    wait_until(lambda: health(there) == "healthy")
+
+
+def test_a_rule_that_fires_too_often_is_stopped(
+    there: Container, desk: Desk, engine: Engine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(causes, "AFTERMATH_NS", 0)  # nothing is its own doing
+    running = engine(f'[rule.r]\nwhen = {{ joined = {{ name = "switch" }} }}\n{TELL}')
+    for number in range(10):
+        lamp = Lamp()
+        there.register(lamp, "hall")
+        there.deregister(lamp)
+        if number < rules_module.MOST:
+            desk.next()
+    wait_until(lambda: running.rules()[0].state == "stopped")
+    [info] = running.rules()
+    assert (info.fired, info.why) == (5, "it fired 5 times within 60 s; give it a longer cooldown_s")
+    assert desk.heard.empty()
+
+
+def test_many_services_that_leave_together_are_no_circle(there: Container, desk: Desk, engine: Engine) -> None:
+    running = engine(f'[rule.r]\nwhen = {{ left = {{ name = "switch" }} }}\n{TELL}')
+    lamps = [Lamp() for _ in range(20)]
+    for number, lamp in enumerate(lamps):
+        there.register(lamp, f"room{number}")
+    wait_until(lambda: len(running.container.services(where(name="switch"))) == 20)
+    for lamp in lamps:
+        there.deregister(lamp)
+    assert {desk.next()[0] for _ in lamps} == {f"room{number}.switch" for number in range(20)}
+    assert running.rules()[0].state == "standing"
+
+
+# --- what may have led to what
+
+
+def fire(known: Causes, mark: Mark, since_ns: int = 0, ended_ns: int | None = 0) -> int:
+    way = known.way_to(mark, since_ns)
+    known.begin(way).ended_ns = ended_ns
+    return turns(way)
+
+
+def test_a_way_leads_back_to_where_it_began() -> None:
+    known, a, b = Causes(), Mark("a", "x"), Mark("b", "x")
+    assert [fire(known, mark) for mark in (a, b, a, b, a, b, a)] == [0, 0, 1, 1, 2, 2, 3]
+
+
+def test_what_ended_long_before_led_to_nothing() -> None:
+    known, a = Causes(), Mark("a", "x")
+    late = causes.AFTERMATH_NS + 1
+    assert [fire(known, a, since, since) for since in (0, late, 2 * late)] == [0, 0, 0]
+
+
+def test_what_is_under_way_may_lead_to_anything() -> None:
+    known, a, b = Causes(), Mark("a"), Mark("b")
+    fire(known, a, ended_ns=None)
+    assert known.way_to(b, 10 * causes.AFTERMATH_NS) == (a, b)
+
+
+def test_the_same_rule_for_another_service_is_another_occasion() -> None:
+    known = Causes()
+    assert [fire(known, Mark("a", str(number))) for number in range(9)] == [0] * 9

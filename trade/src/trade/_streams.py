@@ -1,0 +1,295 @@
+"""Services sampled while somebody listens: the source's side of streams.
+
+However many listen, a service is called once a tick, its answer encoded once and put once.
+"""
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from typing import Final, Protocol
+
+from msgspec import Raw, Struct, structs
+
+from trade._clockwork import Clockwork
+from trade._context import CallContext
+from trade._dispatch import LocalService
+from trade._handle import Handle
+from trade._registry import Change
+from trade._sample import StreamSample, stream_key
+from trade._serial import Turn
+from trade._transport import ChannelClosed, Publisher, Transport
+from trade._wire import EMPTY_ARGUMENTS, PROTOCOL, Address, ServiceKey, encode_message
+from trade.errors import AccessDenied, ConfigurationError, DeadlineExceeded, ServiceGone
+
+_logger = logging.getLogger("trade")
+
+LEAST_HZ: Final = 0.001
+MOST_HZ: Final = 1000.0
+LEASE_S: Final = 10.0
+"""Who has not said again for so long that it listens is taken for gone."""
+SIGN_S: Final = 1.0
+"""What does not change is put once in a while all the same."""
+_PATIENCE_S: Final = 10.0
+"""How long a sample may take."""
+_MOST: Final = 10_000
+"""So many may listen to one service."""
+
+Listener = tuple[str, str]
+"""Session and name."""
+
+
+class Home(Protocol):
+    """What streams need of their container."""
+
+    address: Final[Address]
+
+    @property
+    def name(self) -> str: ...
+    def handle(self, key: ServiceKey) -> Handle: ...
+    def require_call(self, who: str, handle: Handle) -> None: ...
+
+
+class Wish(Struct, frozen=True):
+    """What one listener would like to have."""
+
+    identity: str
+    hz: float
+    on_change: bool
+    until_ns: int = 0
+    """When its lease ends."""
+
+    @property
+    def period_ns(self) -> int:
+        return int(1e9 / self.hz)
+
+
+class Source:
+    """A service of this container that is listened to, or once was. Done by the clockwork: never twice at once."""
+
+    def __init__(
+        self, key: ServiceKey, find: Callable[[], LocalService | None], publisher: Publisher, new_id: Callable[[], int]
+    ) -> None:
+        self._key = key
+        self._find = find
+        self._publisher = publisher
+        self._new_id = new_id
+        self._lock = threading.Lock()
+        self._wishes: dict[Listener, Wish] = {}
+        self._someone_new = False
+        self._next_ns = 0
+        self._number = 0
+        self._put: tuple[bool, bytes] | None = None
+        self._put_ns = self._changed_ns = 0
+        self._problem = ""
+
+    def wish(self, listener: Listener, wish: Wish) -> bool:
+        """Somebody listens from now on, or still does; whether it is another wish than before.
+
+        Raises:
+            ConfigurationError: too many listen.
+        """
+        with self._lock:
+            before = self._wishes.get(listener)
+            if before is None and len(self._wishes) >= _MOST:
+                problem = f"{_MOST} listen to it already"
+                raise ConfigurationError(where=f"{self._key.domain}.{self._key.name}", problem=problem)
+            self._wishes[listener] = wish
+            new = before is None or (before.hz, before.on_change) != (wish.hz, wish.on_change)
+            self._someone_new |= new
+            return new
+
+    def drop(self, which: Callable[[Listener, Wish], bool]) -> None:
+        """Those listen no more."""
+        with self._lock:
+            self._wishes = {who: wish for who, wish in self._wishes.items() if not which(who, wish)}
+
+    def identities(self) -> set[str]:
+        """Of those who listen."""
+        with self._lock:
+            return {wish.identity for wish in self._wishes.values()}
+
+    def tick(self) -> int | None:
+        """Sample it if anybody still listens; when to do so again."""
+        now = time.monotonic_ns()
+        self.drop(lambda _, wish: wish.until_ns <= now)
+        with self._lock:
+            wishes, someone_new, self._someone_new = list(self._wishes.values()), self._someone_new, False
+        service = self._find()
+        if not wishes or service is None:
+            self._next_ns = 0
+            return None
+        at = time.time()
+        answer = self._sampled(service, now)
+        if answer != self._put:
+            self._changed_ns = now
+        if someone_new or answer != self._put or not self._may_be_quiet(wishes, now):
+            self._number += 1
+            sample = StreamSample(PROTOCOL, self._number, at, now, answer[0], Raw(answer[1]))
+            try:
+                self._publisher.put(encode_message(sample))
+            except ChannelClosed:
+                return None
+            self._put, self._put_ns = answer, now
+        return self._after(now, min(wish.period_ns for wish in wishes))
+
+    def _may_be_quiet(self, wishes: list[Wish], now: int) -> bool:
+        """Whether all want changes only, and have had the last one: who is slower takes a later sample of it."""
+        if not all(wish.on_change for wish in wishes) or now - self._put_ns >= SIGN_S * 1e9:
+            return False
+        periods = {wish.period_ns for wish in wishes}
+        return len(periods) == 1 or now - self._changed_ns > max(periods)
+
+    def _after(self, now: int, period_ns: int) -> int:
+        """The next tick; those that have passed meanwhile are left out, and one out of turn moves no others."""
+        self._next_ns = min(self._next_ns or now, now + period_ns)
+        ended = time.monotonic_ns()
+        if self._next_ns <= ended:
+            self._next_ns += ((ended - self._next_ns) // period_ns + 1) * period_ns
+        return self._next_ns
+
+    def _sampled(self, service: LocalService, now: int) -> tuple[bool, bytes]:
+        """Whether it failed, and what it answered: called as by its own container, behind its own locks and turns."""
+        own = self._key.address
+        until_ns = now + int(_PATIENCE_S * 1e9)
+        context = CallContext(self._new_id(), service.label, own.identity, str(own), until_ns)
+        try:
+            answer = service.signature.encode_result(service.label, _in_turn(service, context))
+        except BaseException as error:  # noqa: BLE001 - whatever a provider raises belongs to who listens
+            info = structs.replace(service.failure(error, EMPTY_ARGUMENTS), traceback="")
+            if info.message != self._problem:  # the same again says nothing new
+                _logger.warning("%s fails while it is listened to: %s: %s", service.label, info.type, info.message)
+            self._problem = info.message
+            return True, encode_message(info)
+        self._problem = ""
+        return False, answer
+
+    def close(self) -> None:
+        """Sample it no more. Idempotent."""
+        self.drop(lambda _listener, _wish: True)
+        self._publisher.close()
+
+
+def _in_turn(service: LocalService, context: CallContext) -> object:
+    if service.serial is None:
+        return service.run(EMPTY_ARGUMENTS, context)
+    if not service.serial.enter(Turn(), _PATIENCE_S):
+        raise DeadlineExceeded(service=service.label, deadline_s=_PATIENCE_S)
+    try:
+        with service.serial.held():
+            return service.run(EMPTY_ARGUMENTS, context)
+    finally:
+        service.serial.leave()
+
+
+class Streams:
+    """Owns the sources of one container."""
+
+    def __init__(
+        self,
+        home: Home,
+        transport: Transport,
+        services: Callable[[ServiceKey], LocalService | None],
+        clockwork: Clockwork,
+        new_id: Callable[[], int],
+    ) -> None:
+        self._home = home
+        self._transport = transport
+        self._services = services
+        self._clockwork = clockwork
+        self._new_id = new_id
+        self._lock = threading.Lock()
+        self._sources: dict[ServiceKey, tuple[Source, Callable[[int], None]]] = {}
+
+    def listen(self, handle: Handle, listener: Listener, wish: Wish) -> None:
+        """Sample a service of this container for somebody from now on, for as long as the lease.
+
+        Raises:
+            AccessDenied: the policy does not let it read the service.
+            ConfigurationError: that is no service of this container which can be listened to.
+            ServiceGone: it was deregistered.
+        """
+        key = handle.key
+        service = self._services(key)
+        if key.address != self._home.address:
+            raise ConfigurationError(where=handle.label, problem=f"it is no service of container {self._home.name}")
+        if service is None:
+            raise ServiceGone(service=handle.label)
+        check_sampled(handle)
+        self._home.require_call(wish.identity, handle)
+        source, again = self._source(key)
+        until_ns = time.monotonic_ns() + int(LEASE_S * 1e9)
+        if source.wish(listener, structs.replace(wish, until_ns=until_ns)):
+            again(time.monotonic_ns())
+
+    def _source(self, key: ServiceKey) -> tuple[Source, Callable[[int], None]]:
+        known = self._sources.get(key)
+        if known is not None:
+            return known
+        publisher = self._transport.publish(stream_key(key), droppable=True)
+        made = Source(key, lambda: self._services(key), publisher, self._new_id)
+        with self._lock:
+            known = self._sources.get(key)
+            if known is None:
+                due = self._clockwork.due(made.tick)
+                known = self._sources[key] = (made, due.at)
+                return known
+        publisher.close()
+        return known
+
+    def unlisten(self, listener: Listener) -> None:
+        """It listens no more."""
+        self._drop(lambda who, _wish: who == listener)
+
+    def session_ended(self, session: str) -> None:
+        """Nobody of it is there any more."""
+        self._drop(lambda who, _wish: who[0] == session)
+
+    def judge_anew(self) -> None:
+        """Who may read what has changed: those who may no longer are dropped, and refused when they ask again."""
+        with self._lock:
+            sources = list(self._sources.items())
+        for key, (source, _) in sources:
+            denied = {who for who in source.identities() if self._denied(who, key)}
+            source.drop(lambda _, wish, denied=denied: wish.identity in denied)
+
+    def _denied(self, who: str, key: ServiceKey) -> bool:
+        try:
+            self._home.require_call(who, self._home.handle(key))
+        except (AccessDenied, ServiceGone):
+            return True
+        return False
+
+    def _drop(self, which: Callable[[Listener, Wish], bool]) -> None:
+        with self._lock:
+            sources = list(self._sources.values())
+        for source, _ in sources:
+            source.drop(which)
+
+    def changed(self, change: Change) -> None:
+        """Told by the registry."""
+        for record in change.left:
+            with self._lock:
+                gone = self._sources.pop(record.key, None) if record.local else None
+            if gone is not None:
+                gone[0].close()
+
+    def close(self) -> None:
+        """Sample nothing more. Idempotent."""
+        with self._lock:
+            sources = list(self._sources.values())
+            self._sources.clear()
+        for source, _ in sources:
+            source.close()
+
+
+def check_sampled(handle: Handle) -> None:
+    """Raises ConfigurationError: it cannot be listened to."""
+    info = handle.record.info
+    if info.effect != "read":
+        problem = f"it does not only read (effect={info.effect!r}), so it is not called again and again for listeners"
+        raise ConfigurationError(where=handle.label, problem=problem)
+    required = [parameter.name for parameter in info.parameters if parameter.required]
+    if required:
+        problem = f"it needs {', '.join(required)}; only what needs no arguments can be listened to"
+        raise ConfigurationError(where=handle.label, problem=problem)

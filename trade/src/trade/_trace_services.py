@@ -1,0 +1,35 @@
+"""What every container offers about calls it noted and lines it logged, in group ``trade``."""
+
+from collections.abc import Callable
+
+from msgspec import structs
+
+from trade._logbook import LogLine, logbook
+from trade._service import service
+from trade._spans import Span, Spans
+
+Switch = Callable[[bool], None]
+
+
+class TraceServices:
+    """The wire's side of `Spans` and `Logbook`."""
+
+    def __init__(self, container: str, spans: Spans, switch: Switch) -> None:
+        self._teller = container
+        self._noted = spans
+        self._switch = switch
+
+    @service
+    def set_tracing(self, on: bool) -> None:
+        """Note every call that this container makes and serves; off: what was noted stays."""
+        self._switch(on)
+
+    @service(effect="read")
+    def spans(self, calls: list[int] | None = None) -> list[Span]:
+        """What this container noted of these calls and of those they led to, or of all; oldest first."""
+        return self._noted.kept(None if calls is None else frozenset(calls))
+
+    @service(effect="read")
+    def log_lines(self, after: int = 0) -> list[LogLine]:
+        """What the process logged lately, of its lines after that one."""
+        return [structs.replace(line, container=self._teller) for line in logbook.lines(after)]
