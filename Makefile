@@ -27,8 +27,9 @@ $(UV):
 demo: $(UV) ## a simulated robot looks, walks and grips for behaviours beyond a gateway (ARGS=--stay keeps it up)
 	@$(RUN) python examples/demo.py $(ARGS)
 
-test: $(UV) ## the whole test suite, in three processes (ARGS="-n 0" for one)
-	@$(RUN) pytest -n 3 --dist loadfile $(ARGS)
+test: $(UV) ## the whole test suite; what runs in real time one after the other
+	@$(RUN) pytest -n 3 --dist loadfile --ignore tests/drivers --ignore tests/system --ignore tests/bench --ignore tests/chaos $(ARGS)
+	@$(RUN) pytest tests/drivers tests/system tests/bench tests/chaos $(ARGS)
 
 test-socketcan: $(UV) ## the CAN suites on kernel interfaces; where the kernel has none, inside User-Mode Linux
 	@$(RUN) tests/socketcan/run pytest tests/socketcan $(ARGS)

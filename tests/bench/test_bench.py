@@ -107,7 +107,7 @@ def test_the_bench_of_gateways_prints_every_pair_every_flood_and_every_target() 
         "two gateways: p50 / direct",
         "one gateway, 32 in flight: /s",
     ]
-    assert "23 services known across it" in printed
+    assert re.search(r"\d+ services known across it", printed)
     for flood in FLOODS:
         assert len(re.findall(rf"^{flood.name} .*[1-9]", printed, re.MULTILINE)) == 1
 

@@ -56,6 +56,7 @@ class Stop(Enum):
     WATCHDOG = "its own watchdog"
     BOTH = "the driver has it hold and falls silent; then its own watchdog"
     ITSELF = "the device itself"
+    BLOCKED = "what blocks it; the driver has it hold, or its own overload protection lets go, whichever is first"
     GOAL = "nothing can reach it, and it has no watchdog: it ends the move it was told"
 
 
@@ -93,6 +94,8 @@ class Row(NamedTuple):
     """Its health in the registry while it lasts."""
     reopens: bool = False
     """The port is closed and opened again."""
+    alone: bool = False
+    """It is tried on a robot of its own: which of two signs is seen first depends on what was tried before."""
 
     @property
     def name(self) -> str:
@@ -149,8 +152,10 @@ _DYNAMIXEL: Final = (
     _forgiven("dynamixel", "garbage before answers", Garbage(ids=ONE, count=30)),
     _silent("dynamixel", "garbage for answers", Garbage(ids=ONE), Truncate(ids=ONE, missing=999)),
     _faulty("dynamixel", "frozen value", Freeze(ids=ONE), "it makes no progress", Stop.HOLD),
-    _faulty("dynamixel", "frozen clock", Freeze(ids=ONE, tick=True), "its clock jumped", Stop.HOLD),
-    _faulty("dynamixel", "blocked", Jam(ids=ONE), "it makes no progress", Stop.HOLD),
+    _faulty("dynamixel", "frozen clock", Freeze(ids=ONE, tick=True), "its clock jumped", Stop.HOLD)._replace(
+        alone=True
+    ),
+    _faulty("dynamixel", "blocked", Jam(ids=ONE), "it makes no progress", Stop.BLOCKED)._replace(alone=True),
     _silent("dynamixel", "cable off", Absent(ids=ONE), stop=Stop.WATCHDOG, after=Recovery.ENABLE),
     _gone("dynamixel", _REPLUG, Stop.WATCHDOG, Recovery.ENABLE),
     _faulty("dynamixel", "fault latched", HardwareFault(ids=ONE, bits=0x20), "overload", Stop.ITSELF, Recovery.POWER),

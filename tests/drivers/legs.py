@@ -9,7 +9,7 @@ import can
 import pytest
 
 from trade.errors import TradeError
-from trade_drivers import AttachedRobot, Robot, attach, parse
+from trade_drivers import AttachedRobot, Motor, Robot, attach, parse
 from trade_hil_sim import Entry, events, frames
 from trade_hil_sim.cia402 import Cia402Bus
 from waiting import wait_until
@@ -151,6 +151,14 @@ class Leg:
 def _close(robot: AttachedRobot) -> None:
     with suppress(TradeError):  # what closing says is tested where it matters
         robot.close()
+
+
+def fault_of(motor: Motor) -> str:
+    """What is latched; a joint that is silent has none to tell."""
+    try:
+        return motor.state().fault
+    except TradeError:
+        return ""
 
 
 @pytest.fixture

@@ -26,7 +26,7 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Subje
 
 @pytest.fixture
 def subject(row: Row, shared: dict[str, Subject], tmp_path: Path) -> Iterator[Subject]:
-    if shared[row.device].sound and not row.reopens:
+    if shared[row.device].sound and not row.reopens and not row.alone:
         yield shared[row.device]
         return
     with ExitStack() as undo:
@@ -95,6 +95,8 @@ def _check_stop(row: Row, subject: Subject, struck: float) -> None:
     assert (subject.travelled > _ARRIVED) == (row.stop is Stop.GOAL)
     if row.stop in {Stop.HOLD, Stop.BOTH}:
         assert subject.holds(struck)
+    if row.stop is Stop.BLOCKED:
+        assert subject.holds(struck) or any(subject.events(name, struck) for name in subject.ends)
     if row.stop is Stop.HOLD:
         assert not subject.events("watchdog_expired", struck)
     if row.stop is Stop.ITSELF:

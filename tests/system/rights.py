@@ -84,7 +84,7 @@ class Stage:
             return bool(actor.break_lock(where(group=ARM), "it is needed"))
 
     def estop(self, actor: Container) -> bool:
-        given = actor.estop("a test", limit_s=0.3).id
+        given = actor.estop("a test", limit_s=1.0).id
         self.memory.settle()
         heeded = given in [known.id for known in self.arm.estops()]
         self.all_clear()
@@ -94,7 +94,7 @@ class Stage:
         given = self.chief.estop("a test").id
         self.memory.settle()
         try:
-            actor.estop_clear([given], limit_s=0.3)
+            actor.estop_clear([given], limit_s=1.0)
             self.memory.settle()
             return not self.arm.estops()
         finally:

@@ -32,9 +32,9 @@ for line in sys.stdin:
 sys.exit(7)
 """
 WAITS = """
-import signal, sys, time
+import os, signal, sys, time
 def end(number, frame):
-    print("told", signal.Signals(number).name, flush=True)
+    os.write(1, f"told {signal.Signals(number).name}\\n".encode())  # print may be in the middle of a line
     sys.exit(9)
 signal.signal(signal.SIGTERM, end)
 signal.signal(signal.SIGINT, end)

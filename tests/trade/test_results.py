@@ -9,7 +9,7 @@ import msgspec
 import pytest
 
 from trade import Container, where
-from trade._invoke import _result_decoder
+from trade._invoke import result_decoder
 from trade._records import type_from_schema
 from trade._schemas import schema_message
 from trade._wire import ServiceInfo
@@ -168,4 +168,4 @@ def test_a_result_with_a_description_that_makes_no_sense_stays_plain_data(
     here: Container, broken: dict[str, Any]
 ) -> None:
     info = ServiceInfo(name="go", signature="go()", result_schema=schema_message(broken, {}))
-    assert _result_decoder(here._codec, info)(msgspec.msgpack.encode([1])) == [1]
+    assert result_decoder(here._codec, info)(msgspec.msgpack.encode([1])) == [1]

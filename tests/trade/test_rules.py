@@ -54,7 +54,7 @@ class Desk:
         return self.wanted
 
     @service(effect="read")
-    def load(self) -> dict[str, float]:
+    def strain(self) -> dict[str, float]:
         self.asked += 1
         return {"cpu": self.cpu}
 
@@ -189,7 +189,7 @@ def test_a_rule_of_time_fires_only_while_its_condition_holds(desk: Desk, engine:
 
 
 def test_a_condition_compares_a_field_of_an_answer(desk: Desk, engine: Engine) -> None:
-    condition = 'if = { service = { name = "load" }, field = "cpu", above = 0.8 }'
+    condition = 'if = { service = { name = "strain" }, field = "cpu", above = 0.8 }'
     engine(f"[rule.r]\nwhen = {{ every_s = {SOON_S} }}\n{condition}\n{NOTE}")
     wait_until(lambda: desk.asked >= 3)
     assert desk.heard.empty()
@@ -202,8 +202,8 @@ def test_a_condition_compares_a_field_of_an_answer(desk: Desk, engine: Engine) -
     [
         ('{ name = "note" }', "does not only read, so it is no condition"),
         ('{ name = "nobody" }', "NoSuchService"),
-        ('{ name = "load" }', "needs above, below or is: it answers {'cpu': 0.1}"),
-        ('{ name = "load" }, field = "memory", above = 1', "the answer has none"),
+        ('{ name = "strain" }', "needs above, below or is: it answers {'cpu': 0.1}"),
+        ('{ name = "strain" }, field = "memory", above = 1', "the answer has none"),
         ('{ name = "is_wanted" }, above = 1', "which is no number"),
     ],
     ids=["actuates", "nobody", "no comparison", "no such field", "no number"],
@@ -326,7 +326,7 @@ def test_a_rehearsal_says_what_would_fire_now(here: Container, desk: Desk, tmp_p
         if = {{ service = {{ name = "is_wanted" }} }}
         {NOTE}
         [rule.coming]
-        when = {{ joined = {{ name = "load" }} }}
+        when = {{ joined = {{ name = "strain" }} }}
         {TELL}
         [rule.going]
         when = {{ left = {{ name = "switch" }} }}
@@ -342,7 +342,7 @@ def test_a_rehearsal_says_what_would_fire_now(here: Container, desk: Desk, tmp_p
     assert [rehearsal.now for rehearsal in told.values()] == [
         "nothing matches",
         "the condition does not hold",
-        "1 match: desk.load",
+        "1 match: desk.strain",
         "nothing matches",
     ]
     assert [did.service for did in told["coming"].steps] == ["desk.tell"]

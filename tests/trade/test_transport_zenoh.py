@@ -46,7 +46,7 @@ class TestZenoh(TransportConformance):
                 flood.put(str(number).encode())
             call.put(b"at last")
             assert read.receive().payload == b"at last"
-            assert unread.receive().payload == str(_CHANNEL_CAPACITY).encode()
+            assert int(unread.receive().payload or b"0") >= _CHANNEL_CAPACITY
 
     def test_who_waits_for_questions_while_they_are_closed_hears_that_they_are(self) -> None:
         def read(questions: Questions) -> None:

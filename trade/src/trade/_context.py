@@ -139,6 +139,13 @@ def current_call() -> CallContext | None:
     return running.get()
 
 
+def served_call() -> CallContext:
+    """The call the running code serves: for the middleware's own functions, which are only called as services."""
+    call = running.get()
+    assert call is not None  # noqa: S101
+    return call
+
+
 def progress(value: Any) -> None:
     """Inside a service: tell the caller how far it is; see `CallContext.progress`. Elsewhere it does nothing."""
     call = running.get()

@@ -5,7 +5,7 @@ import logging
 
 from trade._access import Access
 from trade._constraints import Constraint
-from trade._context import CallContext, current_call
+from trade._context import served_call
 from trade._handle import Handle
 from trade._hooks import Attached, HookInfo, Hooks, Side
 from trade._notification_services import Home
@@ -31,7 +31,7 @@ class HookServices:
         self, name: str, side: Side, call: Handle, handle: Handle | None = None, constraint: Constraint | None = None
     ) -> list[str]:
         """Call that one before or after services of this container, now and later ones; which they are now."""
-        asked, target = _call(), constraint if handle is None else handle
+        asked, target = served_call(), constraint if handle is None else handle
         if target is None:
             raise ConfigurationError(where="attach_hook", problem="it needs a handle or a constraint")
         return self._hooks.attach(name, side, target, call, asked.session, asked.caller)
@@ -39,7 +39,7 @@ class HookServices:
     @service
     def detach_hook(self, name: str) -> bool:
         """End hooks of that name here; whether there were any. Another's is for who administers the system."""
-        asked, found = _call(), self._hooks.named(name)
+        asked, found = served_call(), self._hooks.named(name)
         for hook in found:
             if hook.identity != asked.caller:
                 self._judge.require(asked.caller, "administer", DOMAIN, f"hook {name}")
@@ -54,16 +54,12 @@ class HookServices:
     @service
     def hook_suspended(self, name: str, call: str, error: str) -> None:
         """Told by another container: a hook that was attached from here failed too often there."""
-        _logger.warning("hook %s (%s), attached from here, is suspended by %s: %s", name, call, _call().session, error)
+        _logger.warning(
+            "hook %s (%s), attached from here, is suspended by %s: %s", name, call, served_call().session, error
+        )
 
     def _tell_who_attached(self, hook: Attached) -> None:
         owner = Address(*hook.owner.split("/")[:3])
         with contextlib.suppress(CallerError, CallError):  # it has gone
             told = self._watched.handle(ServiceKey(owner, DOMAIN, PROVIDER, "hook_suspended"))
             told.start(hook.name, hook.call.label, hook.last_error)
-
-
-def _call() -> CallContext:
-    call = current_call()
-    assert call is not None  # noqa: S101 - these are only called as services
-    return call

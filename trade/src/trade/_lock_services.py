@@ -9,7 +9,7 @@ from msgspec import structs
 
 from trade._access import Access
 from trade._borrowed import Borrowed
-from trade._context import CallContext, current_call
+from trade._context import CallContext, served_call
 from trade._locks import LockTable
 from trade._resources import Holder, Resource
 from trade._service import service
@@ -54,7 +54,7 @@ class LockServices:
     @service
     def acquire(self, resources: list[str], terms: Terms) -> Granted:
         """Take all of these and what is coupled to them for the calling session."""
-        call = _call()
+        call = served_call()
         named = self._table.named(resources)
         self._require(call, "lock", [resource.name for resource in named])
         calls = () if call.behalf is None else call.behalf.calls
@@ -92,13 +92,13 @@ class LockServices:
     @service(effect="stop")
     def renew(self, grants: list[int]) -> dict[int, str]:
         """Begin the leases of these grants anew; why those that hold no more do not."""
-        held = self._table.renew(grants, _call().caller)
+        held = self._table.renew(grants, served_call().caller)
         return {number: self._table.over(number) or "it is another's" for number in grants if number not in held}
 
     @service(effect="stop")
     def release(self, grant: int, lost: str = "") -> bool:
         """Give a grant back; ``lost`` says why the rest of its lock is, and then what it moves stops."""
-        identity = _call().caller
+        identity = served_call().caller
         if lost and self._table.renew([grant], identity):
             return self._table.lose(grant, lost)
         held = self._table.release(grant, identity)
@@ -114,7 +114,7 @@ class LockServices:
     @service(effect="stop")
     def break_lock(self, grant: int, reason: str) -> bool:
         """Take a lock away from its owner; what it moves stops. Whether it was held."""
-        call = _call()
+        call = served_call()
         held = [info.resources for info in self._table.infos() if info.token.number == grant]
         self._require(call, "administer", held[0] if held else ())
         return self._table.lose(grant, f"broken by {call.caller}: {reason}")
@@ -122,7 +122,7 @@ class LockServices:
     @service
     def request_release(self, resources: list[str], reason: str) -> list[str]:
         """Ask the owners of these to give them back; who was asked."""
-        call = _call()
+        call = served_call()
         who = foreign(call.session) or f"{call.caller}/{_container_of(call.session)}"
         holders: dict[Token, Holder] = {}
         for resource in self._table.named(resources):
@@ -141,7 +141,7 @@ class LockServices:
     @service
     def resume(self, resources: list[str]) -> list[str]:
         """Let these move again after a stop; for the owner of their lock, or who administers what is not locked."""
-        call = _call()
+        call = served_call()
         found = self._table.named(resources)
         for resource in found:
             if resource.holder is not None and not _is_for(resource.holder, call):
@@ -174,12 +174,6 @@ def _resumed(resource: Resource) -> bool:
     was = resource.latch is not None or bool(resource.unsafe)
     resource.resume()
     return was
-
-
-def _call() -> CallContext:
-    call = current_call()
-    assert call is not None  # noqa: S101 - these are only called as services
-    return call
 
 
 def _container_of(session: str) -> str:

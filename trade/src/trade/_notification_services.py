@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Final, Protocol
 
 from trade._access import Access
-from trade._context import CallContext, current_call
+from trade._context import served_call
 from trade._handle import Handle
 from trade._notifications import Notification, NotificationInfo, Notifier, Owner, Standing
 from trade._occasions import OF_SERVICES, Deed, Terms
@@ -70,7 +70,7 @@ class NotificationServices:
     @service
     def notify(self, terms: Terms, call: Deed, if_: Deed | None = None, when: Deed | None = None) -> str:
         """Make that call on that occasion, for who asks, who must be allowed to make it then; its id."""
-        asked = _call()
+        asked = served_call()
         owner = Owner(asked.session, asked.caller, self._guests.of(asked.session))
         try:
             return placed(self._notifier, self._records, terms, call, if_, when, owner).id
@@ -102,11 +102,11 @@ class NotificationServices:
     def notification_failed(self, notification: str, text: str, error: str) -> None:
         """Told by another container: a call that it makes for this one failed."""
         _logger.warning(
-            "the call of %s (%s), asked for here, failed at %s: %s", notification, text, _call().caller, error
+            "the call of %s (%s), asked for here, failed at %s: %s", notification, text, served_call().caller, error
         )
 
     def _mine_or_administered(self, notification: str) -> Standing | None:
-        standing, asked = self._notifier.get(notification), _call()
+        standing, asked = self._notifier.get(notification), served_call()
         if standing is not None and (standing.owner.identity or self._home.address.identity) != asked.caller:
             self._rights.require(asked.caller, "administer", DOMAIN, f"notification {notification}")
         return standing
@@ -170,9 +170,3 @@ class Hosted(Notification):
 
     def detach(self) -> None:
         self._service("detach_notification")(self.id)
-
-
-def _call() -> CallContext:
-    call = current_call()
-    assert call is not None  # noqa: S101 - these are only called as services
-    return call

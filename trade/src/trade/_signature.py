@@ -8,6 +8,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from decimal import Decimal
 from typing import Any, Final, get_type_hints
+from weakref import WeakValueDictionary
 
 import msgspec
 from msgspec import UNSET, Raw
@@ -19,7 +20,7 @@ from trade._description import describe, described, field_of
 from trade._limits import NOT_FINITE, problem_text, value_at
 from trade._secret import MASK, is_secret, mask
 from trade._service import ServiceMark
-from trade._wire import MOST_BYTES, ErrorInfo
+from trade._wire import MOST_BYTES, ErrorInfo, ServiceInfo
 from trade.errors import ConfigurationError, InvalidArgument, InvalidResult, NotSerialisable, TooLarge
 
 _AT: Final = re.compile(r" - at `\$(?:\[(\d+)\]|\.(\w+))(.*)`$")
@@ -29,6 +30,10 @@ _PLAIN: Final = frozenset([bool, int, float, str, bytes, type(None)])
 _SEVERAL: Final = (list, tuple, set, frozenset)
 _SAME_WHEN_COPIED: Final = (bool, float, type(None))
 """Every value of these can be sent, and what arrives is the same."""
+
+
+_infos: Final[WeakValueDictionary[tuple[str, ServiceMark, Callable[..., Any]], ServiceInfo]] = WeakValueDictionary()
+"""What was said of a method last. Believed of the middleware's own, which are in every container and do not change."""
 
 
 class Signature:
@@ -54,7 +59,11 @@ class Signature:
         self._result_is_plain = returns if returns is Any or (isinstance(returns, type) and returns in _PLAIN) else None
         self._result_is_itself = returns if returns in _SAME_WHEN_COPIED else None
         self._decode_result = described(where, "its result", lambda: codec.decoder(returns))
-        self.info = describe(where, name, mark, function, parameters, kinds, returns, codec)
+        key = (name, mark, function)
+        # What a program executes from text may have no module.
+        known = _infos.get(key) if (function.__module__ or "").startswith("trade.") else None
+        self.info = known or describe(where, name, mark, function, parameters, kinds, returns, codec)
+        _infos[key] = self.info
 
     def _decoders(
         self, where: str, parameters: Sequence[inspect.Parameter], kinds: Mapping[str, Any]

@@ -4,7 +4,7 @@ from typing import Annotated
 
 from msgspec import Meta
 
-from trade._context import CallContext, current_call
+from trade._context import served_call
 from trade._handle import Handle
 from trade._service import service
 from trade._streams import LEAST_HZ, MOST_HZ, Streams, Wish
@@ -24,16 +24,10 @@ class StreamServices:
 
         ``name`` is the listener's own; the samples are put on the key of the stream.
         """
-        asked = _call()
+        asked = served_call()
         self._streams.listen(service, (asked.session, name), Wish(asked.caller, hz, on_change))
 
     @service(effect="read")
     def unlisten(self, name: str) -> None:
         """Who asks listens no more under that name."""
-        self._streams.unlisten((_call().session, name))
-
-
-def _call() -> CallContext:
-    call = current_call()
-    assert call is not None  # noqa: S101 - these are only called as services
-    return call
+        self._streams.unlisten((served_call().session, name))
