@@ -282,6 +282,8 @@ class CanBus:
 
     def _struck(self, station: Station, frame: Frame) -> tuple[str, tuple[int, ...] | None]:
         """A frame's name, and whose faults concern it; a client's frame only suffers from those that name it."""
+        if self._script.empty:
+            return "", None
         name, node = self._label(frame)
         if station.device_id is not None:
             return name, (station.device_id,)
