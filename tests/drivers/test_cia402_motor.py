@@ -188,6 +188,17 @@ def test_home_with_a_method_the_drive_does_not_know_is_a_fault_and_moves_nothing
     assert not leg.events("motion_started", HIP, mark)
 
 
+def test_enable_ends_a_search_for_home_and_whoever_waits_for_it_is_told(leg: Leg) -> None:
+    hip = leg.attach().motor("leg.hip")
+    assert isinstance(hip, Drive)
+    hip.enable()
+    slow = Outcome(lambda: hip.home(34, 0.01))
+    leg.wait_for("motion_started", HIP)
+    hip.enable()
+    assert isinstance(slow.wait().error, MotionStopped)
+    assert hip.move_to(0.1) == pytest.approx(0.1, abs=0.01)
+
+
 def test_S22_home_too_fast_is_refused(leg: Leg) -> None:
     hip = leg.attach().motor("leg.hip")
     assert isinstance(hip, Drive)

@@ -66,15 +66,10 @@ class Homing(Motion):
         return axis.sample.position if axis.sample is not None else 0
 
     def watch(self, now_ns: int) -> None:
-        axis, ending = self._axis, self._trouble(now_ns)
-        if ending is None and axis.statusword & machine.HOMING_STATUS != machine.HOMING_DONE:
-            return
-        if ending is None and (
-            axis.sample is None or axis.sample.at_ns <= self._began_ns + 2 * self.exchange.period_ns
-        ):
-            return
-        self._bus.command(axis, machine.HOLD)
-        self.exchange.release(self, ending)
+        ending = self._trouble(now_ns)
+        if ending is not None or self._found():
+            self._bus.command(self._axis, machine.HOLD)
+            self.exchange.release(self, ending)
 
     def _found(self) -> bool:
         """It says that it has found its zero, and says so of this search."""

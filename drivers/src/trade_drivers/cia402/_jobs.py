@@ -29,9 +29,11 @@ _AT_REST: Final = 2
 def enabling(bus: "DriveExchange", job: Job, axis: DriveAxis, mode: int) -> Steps:
     """Torque on where it was measured to be, halted or told to stay there, with its own ramps; all of it confirmed.
 
-    A drive that is enabled already must be at rest: then only its mode changes.
+    A drive that is enabled already must be at rest: then only its mode changes. A search for its zero ends.
     """
     yield from looking(bus, axis)
+    if axis.motion is not None and not axis.fault:
+        bus.end_motion(axis, f"{axis.name} was enabled anew")
     if not axis.statusword & machine.REMOTE:
         raise axis.faulty("it does not obey the bus (statusword bit 9); is it operated from its panel?")
     if axis.state_now is State.FAULT:
@@ -160,7 +162,7 @@ def until(
     give_up_ns = bus.clock() + patience_ns
     while not condition():
         bus.require_answering(axis)
-        if bus.clock() > give_up_ns:
+        if axis.sample is not None and axis.sample.at_ns > give_up_ns:  # what it did not say is another matter
             raise axis.faulty(otherwise)
         bus.net.take_in(_WAIT_S)
         yield

@@ -83,7 +83,7 @@ class Follow(Motion):
             self.gate()
             if ending := self.trouble(now_ns, self._until_ns) or self._trouble(now_ns):
                 raise ending
-            if self._over(now_ns):
+            if self._over():
                 self.final_rad = [axis.scale.angle_rad(axis.sample.position) for axis in self.axes if axis.sample]
                 self.exchange.release(self, None)
                 return
@@ -129,9 +129,10 @@ class Follow(Motion):
         tolerance_rad = self._plan.tolerances.path_rad
         return next((problem for axis in self.axes if (problem := self._astray(axis, "path", tolerance_rad))), None)
 
-    def _over(self, now_ns: int) -> bool:
-        """Whether all are at rest at the end; raises if they had the time to be and are not."""
-        late_s = self._plan.course.elapsed_s(now_ns) - self._plan.course.duration_s
+    def _over(self) -> bool:
+        """Whether all were measured at rest at the end; raises if they had the time to be and were not."""
+        seen_ns = min(axis.sample.at_ns if axis.sample else 0 for axis in self.axes)
+        late_s = self._plan.course.elapsed_s(seen_ns) - self._plan.course.duration_s
         if late_s < 0:
             return False
         tolerances = self._plan.tolerances
