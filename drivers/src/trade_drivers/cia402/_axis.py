@@ -20,6 +20,7 @@ __all__ = ["DriveAxis", "Stage"]
 _STILL_RAD_S: Final = 0.01
 _ARRIVED_RAD: Final = 0.004
 _NEAR_RAD: Final = 0.03
+_FAULTS: Final = (State.FAULT, State.FAULT_REACTION)
 _SOME_FAULT: Final = "it reports a fault"
 _ACKNOWLEDGE_NS: Final = 250_000_000
 """How long a drive may take to take a set-point."""
@@ -109,7 +110,7 @@ class DriveAxis(Axis):
             self.velocity, self.mode, error = table.MOTION.layout.unpack(data)
         except BadLength:
             return
-        if error and self.state_now in {State.FAULT, State.FAULT_REACTION}:
+        if error and self.state_now in _FAULTS:
             self.latch(emergency_text(error))
 
     def take_emergency(self, data: bytes) -> None:
@@ -164,7 +165,7 @@ class DriveAxis(Axis):
 
     def _judge(self, now_ns: int) -> None:
         state = self.state_now
-        if state in {State.FAULT, State.FAULT_REACTION}:
+        if state in _FAULTS:
             self.latch(_SOME_FAULT)
         elif self.ready and state is State.QUICK_STOP:
             self.latch("it has made a quick stop by itself: it heard nothing for too long, or a switch told it to")

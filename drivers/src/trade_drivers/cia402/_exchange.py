@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Final, cast
 
 from trade_drivers._exchange import PROBE_NS
+from trade_drivers.can import Frame
 from trade_drivers.cia402 import _jobs as jobs
 from trade_drivers.cia402 import _machine as machine
 from trade_drivers.cia402 import _table as table
@@ -25,6 +26,7 @@ __all__ = ["DriveExchange"]
 
 _log = logging.getLogger("trade")
 _BEATS_MISSED: Final = 3
+_MEASURED: Final = (Stage.SET_UP, Stage.HERE)
 _HANDSHAKE: Final = 3
 """Cycles of a set-point in profile position: raised, acknowledged, taken back."""
 
@@ -199,9 +201,13 @@ class DriveExchange(Exchange):
 
     def _stream(self) -> None:
         """Every drive in a mode without a goal gets its next set-point, also where nothing moves it."""
-        for axis in self.drives:
-            if axis.stream is not None and axis.ready and axis.sample is not None and not axis.silent:
-                self.port.send(axis.stream.can_id, axis.stream.next(axis.sample.position))
+        frames = [
+            Frame(axis.stream.can_id, axis.stream.next(axis.sample.position))
+            for axis in self.drives
+            if axis.stream is not None and axis.ready and axis.sample is not None and not axis.silent
+        ]
+        if frames:
+            self.port.send_all(frames)
 
     def _beat(self, now_ns: int) -> None:
         """The heartbeat that the drives' own watchdogs live on."""
@@ -213,7 +219,7 @@ class DriveExchange(Exchange):
         self._synced_ns = began_ns
         asked = [axis for axis in self.drives if not axis.silent]
         for axis in self.drives:
-            if axis.stage in {Stage.SET_UP, Stage.HERE}:
+            if axis.stage in _MEASURED:
                 axis.awaited_ns = began_ns  # not when it came: a frozen process would take old values for new
         self.port.send(table.SYNC, b"")
         self.net.take_in(self.period_ns / 2e9, lambda: not any(axis.awaited_ns for axis in asked))
@@ -240,7 +246,8 @@ class DriveExchange(Exchange):
     def _admit(self) -> None:
         """Go on with those that are not here; it never waits for them."""
         for admission in self.admissions:
-            admission.advance()
+            if admission.axis.stage is not Stage.HERE:
+                admission.advance()
 
     def forget_measurements(self) -> None:
         now_ns = self.clock()
