@@ -31,6 +31,7 @@ _COUNT = 6
 _BITRATE = 1_000_000
 _MOST_LATE = 1.0
 _ATTEMPTS = 5
+_WAIT_S = 0.001
 _CASES = ((500, 1), (400, 2))
 """Cycles a second, and TPDOs of each drive in each."""
 _WIDE = Tolerances(start_rad=1.0, path_rad=2.0, goal_rad=1.0, goal_time_s=5.0)
@@ -73,22 +74,24 @@ def run(rounds: int, seconds: float) -> None:
         late: list[float] = []
         empty: list[float] = []
         lasted_s: list[float] = []
+        spent_s: list[float] = []
         for i in range(rounds):
             try:
-                began, took = _drives(rate_hz, tpdos, seconds)
+                began, took, spent = _drives(rate_hz, tpdos, seconds)
             except TradeError as lost:  # too busy a machine loses the drives altogether
                 print(f"can, {rate_hz} Hz: all of a round counts as late: {lost}", file=sys.stderr, flush=True)
                 late.append(100.0)
             else:
                 late.append(_late(began, rate_hz))
                 lasted_s += took
+                spent_s.append(spent)
             empty.append(_late(_ticks(rate_hz, seconds), rate_hz))
             print(f"can, {rate_hz} Hz: round {i + 1} of {rounds}", file=sys.stderr, flush=True)
-        _print(rate_hz, tpdos, late, empty, lasted_s)
+        _print(rate_hz, tpdos, late, empty, lasted_s, spent_s)
 
 
-def _drives(rate_hz: int, tpdos: int, seconds: float) -> tuple[list[float], list[float]]:
-    """When the cycles of one trajectory began, and how long each took, in seconds."""
+def _drives(rate_hz: int, tpdos: int, seconds: float) -> tuple[list[float], list[float], float]:
+    """When the cycles of one trajectory began, how long each took, and the processor time of one, in seconds."""
     text = _BUS.format(bitrate=_BITRATE, rate_hz=rate_hz) + "".join(_JOINT.format(id=i + 1) for i in range(_COUNT))
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "legs.toml"
@@ -100,7 +103,9 @@ def _drives(rate_hz: int, tpdos: int, seconds: float) -> tuple[list[float], list
             exchange = open_exchange(robot, bus, sim.ports["legs"])
             if tpdos == 2:
                 for axis in exchange.drives:
-                    exchange.net.write(axis.id, table.Entry(table.MOTION.communication, "u1", 2), 1)
+                    every_sync = table.Entry(table.MOTION.communication, "u1", 2)
+                    for _ in exchange.net.write(axis.id, every_sync, table.AT_NEXT_SYNC):
+                        exchange.net.take_in(_WAIT_S)
             began, took, cycle = list[float](), list[float](), exchange.cycle
 
             def timed() -> None:
@@ -119,10 +124,12 @@ def _drives(rate_hz: int, tpdos: int, seconds: float) -> tuple[list[float], list
                 ways = [(0.0, 0.0), (seconds / 2, 0.3), (seconds, 0.0)]
                 points = [TrajectoryPoint(time_from_start_s=at, positions_rad=_COUNT * [rad]) for at, rad in ways]
                 group = attached.group("leg", [joint.name for joint in robot.joints])
+                spent_s = -time.process_time()
                 group.follow(Trajectory(joints=names, points=points), _WIDE)
+                spent_s += time.process_time()
             finally:
                 thread.close()
-    return began, took
+    return began, took, spent_s / len(began)
 
 
 def _enable(motor: Motor) -> None:
@@ -148,7 +155,14 @@ def _late(began: Sequence[float], rate_hz: int) -> float:
     return 100 * sum(gap > 1.5 / rate_hz for gap in gaps) / len(gaps)
 
 
-def _print(rate_hz: int, tpdos: int, late: Sequence[float], empty: Sequence[float], lasted_s: Sequence[float]) -> None:
+def _print(
+    rate_hz: int,
+    tpdos: int,
+    late: Sequence[float],
+    empty: Sequence[float],
+    lasted_s: Sequence[float],
+    spent_s: Sequence[float],
+) -> None:
     sizes = [table.FOLLOWING.layout.size, table.STATUS.layout.size, table.MOTION.layout.size][: 1 + tpdos]
     bits = frame_bits(0) + _COUNT * sum(frame_bits(size) for size in sizes)
     ordered = sorted(lasted_s)
@@ -159,6 +173,7 @@ def _print(rate_hz: int, tpdos: int, late: Sequence[float], empty: Sequence[floa
     if ordered:
         p50, p99 = ordered[len(ordered) // 2], ordered[len(ordered) * 99 // 100]
         print(f"  cycle, ms: p50 {1e3 * p50:.2f}  p99 {1e3 * p99:.2f}  period {1e3 / rate_hz:.2f}")
+        print(f"  processor time of the driver, ms a cycle: {1e3 * median(spent_s):.2f}")
     print(f"  late in an empty loop: {median(empty):.2f} % ({min(empty):.2f}-{max(empty):.2f})")
     what = f"late at {rate_hz} Hz, {tpdos} TPDO, %"
     print_target(what, late, f"below {_MOST_LATE:g}", lambda share: share < _MOST_LATE)

@@ -76,6 +76,12 @@ def test_the_bench_of_the_can_bus_prints_its_targets() -> None:
     assert printed.count("late in an empty loop") == 2
 
 
+def test_the_bench_of_a_whole_robot_prints_its_target() -> None:
+    printed = bench("rosie", "--rounds", "3", "--seconds", "0.5")
+    assert "legs 200 Hz" in printed
+    assert targets(printed) == ["all drivers: % of a core"]
+
+
 def test_the_bench_of_watching_prints_its_targets() -> None:
     printed = bench("watching", "-n", "3", "--rounds", "1", "--seconds", "0.3")
     assert targets(printed) == ["merged ticks, %", "another watched / none"]
