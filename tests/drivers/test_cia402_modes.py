@@ -28,6 +28,7 @@ from trade_drivers._plan import Course
 from trade_drivers.cia402 import _table as table
 from trade_drivers.cia402._motor import Drive
 from trade_drivers.cia402._stream import Following, Turning, interpolation_period
+from trade_drivers.joints import Sample
 from trade_hil_sim import Entry, Mute
 from trade_hil_sim.cia402 import Cia402Bus
 from waiting import PATIENCE_S, wait_until
@@ -163,6 +164,19 @@ def test_speeds_rise_as_the_joint_may_accelerate(leg: Leg) -> None:
     wait_until(lambda: min(speeds(leg)) == -int(COUNTS_PER_RAD), "it has its speed")
     changes = [abs(after - before) for before, after in itertools.pairwise(speeds(leg))]
     assert max(changes) <= 20 * COUNTS_PER_RAD / 100 + 1
+
+
+@pytest.mark.parametrize("mode", TURNING)
+def test_S22_a_speed_ends_within_the_range_also_while_nothing_is_measured(rig: Leg, mode: int) -> None:
+    rig.configure(('channel = "can0"', 'channel = "can0"\nstale_after_s = 1.5'))
+    rig.plug(prepare=only(PROFILE_POSITION, mode))
+    hip = rig.attach().motor("leg.hip")
+    hip.enable()
+    hip.set_velocity(2.0, valid_s=1.0)
+    started = rig.wait_for("motion_started", HIP)
+    rig.sim.do(Mute(ids=(HIP,), instruction="tpdo1"))
+    rig.wait_for("at_rest", HIP, started.t)
+    assert rig.truth(HIP).position_rad <= 1.0 + 1 / COUNTS_PER_RAD
 
 
 @pytest.mark.parametrize("mode", [*TURNING, PROFILE_POSITION])
@@ -309,7 +323,8 @@ def test_a_drive_that_would_let_go_after_a_quick_stop_is_not_used_in_these_modes
 
 def run(stream: Following | Turning, cycles: int, measured: int = 0) -> list[int]:
     layout = table.FOLLOWING.layout if isinstance(stream, Following) else table.TURNING.layout
-    return [layout.unpack(stream.next(measured))[-1] for _ in range(cycles)]
+    frames = [stream.next(Sample(measured, 0, 0, now_ns), now_ns) for now_ns in range(1, cycles + 1)]
+    return [layout.unpack(frame)[-1] for frame in frames]
 
 
 def test_positions_that_jump_are_followed_at_the_joints_own_speed_and_acceleration() -> None:
@@ -348,3 +363,15 @@ def test_a_speed_is_slower_the_nearer_the_end_and_zero_behind_it() -> None:
     stream = Turning(1, accel=10**9, period_s=0.01, blind_s=0.3)
     stream.end, stream.fastest = 1000, 500.0
     assert [run(stream, 1, at)[0] for at in (0, 900, 1000)] == [500, pytest.approx(100 / 0.3, rel=0.01), 0]
+
+
+def test_a_joint_that_is_not_measured_is_taken_to_go_on_as_it_was_told() -> None:
+    stream = Turning(1, accel=10**9, period_s=0.01, blind_s=0.3)
+    stream.end, stream.fastest = 1000, 500.0
+    sample, unpack = Sample(0, 0, 0, 1), table.TURNING.layout.unpack
+    told = [unpack(stream.next(sample, 1 + 10_000_000 * k))[-1] for k in range(400)]
+    assert told[0] == 500
+    assert told == sorted(told, reverse=True)
+    assert sum(told) * 0.01 == pytest.approx(1000, abs=20)
+    later = Sample(0, 0, 0, 5_000_000_000)
+    assert unpack(stream.next(later, later.at_ns))[-1] == 500

@@ -201,8 +201,9 @@ class DriveExchange(Exchange):
 
     def _stream(self) -> None:
         """Every drive in a mode without a goal gets its next set-point, also where nothing moves it."""
+        now_ns = self.clock()
         frames = [
-            Frame(axis.stream.can_id, axis.stream.next(axis.sample.position))
+            Frame(axis.stream.can_id, axis.stream.next(axis.sample, now_ns))
             for axis in self.drives
             if axis.stream is not None and axis.ready and axis.sample is not None and not axis.silent
         ]

@@ -4,6 +4,7 @@ from math import copysign, sqrt
 from typing import Final
 
 from trade_drivers.cia402 import _table as table
+from trade_drivers.joints import Sample
 
 __all__ = ["Following", "Turning", "interpolation_period"]
 
@@ -25,7 +26,7 @@ class Following:
         self._speed = 0.0
         self._fastest, self._accel, self._period_s = speed, accel, period_s
 
-    def next(self, measured: int) -> bytes:  # noqa: ARG002 - that is the drive's own business in this mode
+    def next(self, sample: Sample, now_ns: int) -> bytes:  # noqa: ARG002 - that is the drive's own business in this mode
         """The data of the frame for one period more."""
         planned, behind = (self.aim - self._aimed) / self._period_s, self._aimed - self.position
         self._aimed = self.aim
@@ -50,7 +51,8 @@ class Turning:
     """Speeds: cyclic synchronous velocity, or profile velocity, whose own ramps are as steep.
 
     It stands until it is given an end and a speed. It slows down before the end in time for the drive to stop within
-    the range by itself, should the driver fall silent: after ``blind_s``.
+    the range by itself, should the driver fall silent: after ``blind_s``. While nothing new is measured it takes the
+    joint to go on as it was told.
     """
 
     def __init__(self, node: int, *, accel: int, period_s: float, blind_s: float) -> None:
@@ -61,14 +63,22 @@ class Turning:
         """In counts/s, without a sign."""
         self._speed = 0.0
         self._accel, self._period_s, self._blind_s = accel, period_s, blind_s
+        self._measured_ns = self._told_ns = 0
+        self._travelled = 0.0
+        """How far it must have got since it was measured, in counts."""
 
-    def next(self, measured: int) -> bytes:
-        """The data of the frame for one period more, where it was measured now."""
-        wanted = 0.0 if self.end is None else self._allowed(self.end - measured)
+    def next(self, sample: Sample, now_ns: int) -> bytes:
+        """The data of the frame for one period more, where that was measured last."""
+        if sample.at_ns == self._measured_ns:
+            self._travelled += self._speed * (now_ns - self._told_ns) / 1e9
+        else:
+            self._travelled = self._speed * (now_ns - sample.at_ns) / 1e9
+        self._measured_ns, self._told_ns = sample.at_ns, now_ns
+        wanted = 0.0 if self.end is None else self._allowed(self.end - sample.position - self._travelled)
         self._speed = _towards(self._speed, wanted, self._accel * self._period_s)
         return table.TURNING.layout.pack(self._accel, round(self._speed))
 
-    def _allowed(self, left: int) -> float:
+    def _allowed(self, left: float) -> float:
         blind = self._accel * self._blind_s
         return copysign(min(self.fastest, sqrt(blind * blind + 2 * self._accel * abs(left)) - blind), left)
 
