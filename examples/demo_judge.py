@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TypeVar
 
+import msgspec
 import walk
 from demo_stage import PATIENCE_S, ROBOT, DemoFailed
 
@@ -16,6 +17,7 @@ AGREE_RAD = 0.02
 """A servo's own dead band is about a tenth of this."""
 PAN = "neck.pan"
 
+_LINES = msgspec.json.Decoder(Entry)
 _T = TypeVar("_T")
 
 
@@ -25,14 +27,26 @@ class Judge:
     def __init__(self, log: Path) -> None:
         self._log = log
         self._robot = trade_drivers.load(ROBOT)
+        self._read = 0
+        """Bytes of the log from which the events have been taken."""
+        self._events: list[Entry] = []
 
     def rests(self, joint: str, since: float) -> list[Entry]:
         """Each time a joint came to rest."""
-        return [entry for entry in events(read_log(self._log), "at_rest", since=since) if entry.joint == joint]
+        return [entry for entry in events(self._so_far(), "at_rest", since=since) if entry.joint == joint]
 
     def moves(self, joint: str, since: float) -> list[Entry]:
         """Each time it began to move."""
-        return [entry for entry in events(read_log(self._log), "motion_started", since=since) if entry.joint == joint]
+        return [entry for entry in events(self._so_far(), "motion_started", since=since) if entry.joint == joint]
+
+    def _so_far(self) -> list[Entry]:
+        """All events; only what is new is read, since a bus of drives writes thousands of lines a second."""
+        with self._log.open("rb") as log:
+            log.seek(self._read)
+            whole, end, _ = log.read().rpartition(b"\n")
+        self._read += len(whole) + len(end)
+        self._events += events(_LINES.decode_lines(whole))
+        return self._events
 
     def wait_for(self, what: Callable[[], _T]) -> _T:
         """What the log shows, once it does."""
@@ -85,8 +99,12 @@ class Judge:
         joint = next(joint for joint in self._robot.joints if joint.name == "legs.left.knee")
         assert joint.counts_per_rev
         rad_per_count = math.tau / (joint.counts_per_rev * joint.gear)
-        commands = frames(read_log(self._log), "rpdo1", device_id=joint.id, since=since, bus="legs")
-        return [int.from_bytes(frame.data[2:6], "little", signed=True) * rad_per_count for frame in commands]
+        log = read_log(self._log)
+        targets = [
+            *(frame.data[2:6] for frame in frames(log, "rpdo1", device_id=joint.id, since=since, bus="legs")),
+            *(frame.data for frame in frames(log, "rpdo4", device_id=joint.id, since=since, bus="legs")),
+        ]
+        return [int.from_bytes(target, "little", signed=True) * rad_per_count for target in targets]
 
 
 def say(what: str) -> None:

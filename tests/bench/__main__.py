@@ -11,6 +11,8 @@ parts:
   gateway    calls through one gateway and two, certificates and policy on; floods; an idle one (root, iproute2)
   streams    what five listeners to a joint-state stream at 200 Hz cost its source, beside one
   servo      the Dynamixel driver against what a bus of 1 Mbaud can carry
+  can        cycles of six CiA 402 drives near what 1 Mbit/s can carry: how many are late
+  rosie      what all drivers of a robot take of a core, at the rates it is meant for
 
 Progress goes to stderr, tables and targets (met or missed) to stdout. Peers that are not installed are skipped.
 """
@@ -18,7 +20,19 @@ Progress goes to stderr, tables and targets (met or missed) to stdout. Peers tha
 import argparse
 from collections.abc import Callable, Mapping
 
-from tests.bench import _calls, _deadman, _gateway, _local, _locks, _registry, _servo, _streams, _watching
+from tests.bench import (
+    _calls,
+    _cans,
+    _deadman,
+    _gateway,
+    _local,
+    _locks,
+    _registry,
+    _rosie,
+    _servo,
+    _streams,
+    _watching,
+)
 
 _SERVICES_EACH = 10
 
@@ -40,6 +54,8 @@ _PARTS: Mapping[str, Callable[[argparse.Namespace], None]] = {
     "gateway": lambda options: _gateway.run(options.n, options.rounds, options.idle),
     "streams": lambda options: _streams.run(max(1, options.rounds // 2), 2 * options.seconds),
     "servo": lambda options: _servo.run(options.n, options.rounds, options.seconds),
+    "can": lambda options: _cans.run(max(1, options.rounds // 2), options.seconds),
+    "rosie": lambda options: _rosie.run(max(1, options.rounds // 2), options.seconds),
 }
 _QUICK = {"n": 200, "rounds": 8, "seconds": 1.5, "idle": 20.0}
 _FULL = {"n": 500, "rounds": 20, "seconds": 3.0, "idle": 60.0}
@@ -53,7 +69,9 @@ def main() -> None:
     parser.add_argument("--full", action="store_true", help="longer rounds and more of them: some fifteen minutes")
     parser.add_argument("-n", type=int, help=f"calls or cycles in a round ({_QUICK['n']}, full {_FULL['n']})")
     parser.add_argument("--rounds", type=int, help=f"turns of each peer ({_QUICK['rounds']}, full {_FULL['rounds']})")
-    parser.add_argument("--seconds", type=float, help="length of a 100 Hz round of the servo bus")
+    parser.add_argument(
+        "--seconds", type=float, help="length of a round of the servo bus at 100 Hz, and of a trajectory on the CAN bus"
+    )
     parser.add_argument(
         "--idle", type=float, help=f"seconds for the idle gateway ({_QUICK['idle']}, full {_FULL['idle']})"
     )

@@ -70,6 +70,18 @@ def test_the_bench_of_locks_prints_its_targets() -> None:
     assert targets(bench("locks", "-n", "3", "--rounds", "1")) == ["lock and unlock / call", "checked / unchecked call"]
 
 
+def test_the_bench_of_the_can_bus_prints_its_targets() -> None:
+    printed = bench("can", "--rounds", "1", "--seconds", "0.5")
+    assert targets(printed) == ["late at 500 Hz, 1 TPDO, %", "late at 400 Hz, 2 TPDO, %"]
+    assert printed.count("late in an empty loop") == 2
+
+
+def test_the_bench_of_a_whole_robot_prints_its_target() -> None:
+    printed = bench("rosie", "--rounds", "3", "--seconds", "0.5")
+    assert "legs 200 Hz" in printed
+    assert targets(printed) == ["all drivers: % of a core"]
+
+
 def test_the_bench_of_watching_prints_its_targets() -> None:
     printed = bench("watching", "-n", "3", "--rounds", "1", "--seconds", "0.3")
     assert targets(printed) == ["merged ticks, %", "another watched / none"]

@@ -53,9 +53,20 @@ joints = ["leg.hip", "leg.knee"]
 PATIENT = ('channel = "can0"', 'channel = "can0"\nwatchdog_s = 2')
 """A change for where the host is busy, or the bus is held up: drives that do not stop at once."""
 HIP, KNEE = 1, 2
+PROFILE_POSITION, PROFILE_VELOCITY, HOMING, CYCLIC_POSITION, CYCLIC_VELOCITY = 1, 3, 6, 8, 9
 GO = 1 << 4
 HALT = 1 << 8
 COUNTS_PER_RAD = 4096 * 50 / 6.283185307179586
+
+
+def only(*modes: int) -> Callable[[Cia402Bus], None]:
+    """Drives that say that they have these modes of operation and no others."""
+
+    def change(bus: Cia402Bus) -> None:
+        for device in bus.devices:
+            device.store.set("supported_modes", sum(1 << mode - 1 for mode in set(modes)))  # type: ignore[attr-defined]
+
+    return change
 
 
 class Leg:

@@ -6,12 +6,13 @@ import struct
 import threading
 from collections.abc import Iterator
 from contextlib import suppress
+from typing import Any
 
 import can
 import pytest
 
 from trade.errors import ConfigurationError
-from trade_drivers.can import CanPort, ErrorState, LoadMeter, error_state, frame_bits, split_port
+from trade_drivers.can import CanPort, ErrorState, Frame, LoadMeter, error_state, frame_bits, split_port
 from trade_drivers.cia402 import _machine as machine
 from trade_drivers.cia402 import _table as table
 from trade_drivers.cia402._machine import State, command_towards_enabled, state_of
@@ -37,7 +38,7 @@ def test_a_frame_takes_at_most_the_bits_of_the_standard(size: int, bits: int) ->
 def test_the_load_is_the_share_of_the_bit_rate_in_the_last_second() -> None:
     meter = LoadMeter(1_000_000, 0)
     for number in range(1, 5001):
-        meter.add(8, number * 200_000)
+        meter.add(frame_bits(8), number * 200_000)
     assert meter.load == pytest.approx(5000 * 135 / 1_000_000)
 
 
@@ -139,6 +140,20 @@ def test_frames_pass_the_simulated_adapter_both_ways(bus: CanBus) -> None:
     here.send(0x201, bytes(range(8)))
     assert [there.receive(5), there.receive(5)] == [(0x080, b""), (0x201, bytes(range(8)))]
     assert [entry.can_id for entry in frames(bus.log.entries)] == [0x080, 0x201]
+    here.close()
+    there.close()
+
+
+def test_frames_for_a_server_go_out_in_one_write_and_in_order(bus: CanBus, monkeypatch: pytest.MonkeyPatch) -> None:
+    here, there = CanPort(bus.port, 1_000_000), CanPort(bus.port, 1_000_000)
+    here.open()
+    there.open()
+    server: Any = here._bus  # type: ignore[attr-defined]
+    writes, write = list[str](), server._tcp_send
+    monkeypatch.setattr(server, "_tcp_send", lambda text: (writes.append(text), write(text)))
+    here.send_all([Frame(0x501, b"\1"), Frame(0x502, b"\2"), Frame(0x500, b"")])
+    assert [there.receive(5) for _ in range(3)] == [(0x501, b"\1"), (0x502, b"\2"), (0x500, b"")]
+    assert len(writes) == 1
     here.close()
     there.close()
 

@@ -92,7 +92,7 @@ def test_a_setting_that_is_wrong_for_us_is_named(rig: Leg, values: dict[str, int
         (
             'channel = "can0"',
             'channel = "can0"\nbitrate = 20000',
-            "2 drives at 20000 bit/s need 40.2 ms a cycle",
+            "2 drives at 20000 bit/s need 42.2 ms a cycle",
         ),
         ('interface = "socketcan"\nchannel = "can0"', 'port = "/dev/tty"', "driver cia402 needs a CAN bus: interface"),
     ],

@@ -8,6 +8,7 @@ from drivers.conftest import Outcome, written_now
 from drivers.fault_table import TABLE, Sick
 from drivers.legs import HALT, HIP, KNEE, Leg, leg, rig
 from trade.errors import DeviceFault, DeviceSilent
+from trade_drivers import AttachedRobot, Tolerances, Trajectory, TrajectoryPoint
 from trade_hil_sim import (
     Command,
     Duplicate,
@@ -121,6 +122,33 @@ def test_S07_stop_of_a_drive_that_is_not_heard_says_so(leg: Leg) -> None:
     wait_until(lambda: _is_silent(hip.state), "it is not heard")
     with pytest.raises(DeviceSilent):
         hip.stop()
+
+
+@pytest.mark.parametrize("act", ["move", "follow"])
+def test_a_drive_that_falls_silent_on_its_way_is_not_taken_for_blocked(rig: Leg, act: str) -> None:
+    group = _patient(rig).group("leg")
+    points = [TrajectoryPoint(time_from_start_s=at, positions_rad=[rad, rad]) for at, rad in ((0.0, 0.0), (1.0, 0.5))]
+    course = Trajectory(joints=["rosie.leg.hip", "rosie.leg.knee"], points=points)
+    wide = Tolerances(start_rad=1.0, path_rad=2.0, goal_rad=2.0, goal_time_s=0.1)
+    acts = {"move": lambda: group.move_to([0.5, 0.5], 0.3), "follow": lambda: group.follow(course, wide)}
+    moving = Outcome(acts[act])
+    rig.wait_for("motion_started", HIP)
+    rig.sim.do(Mute(ids=(HIP,), instruction="tpdo1"))
+    assert isinstance(moving.wait().error, DeviceSilent)
+
+
+def test_a_drive_that_falls_silent_while_it_is_enabled_has_no_fault(rig: Leg) -> None:
+    hip = _patient(rig).motor("leg.hip")
+    rig.sim.do(Mute(ids=(HIP,), instruction="tpdo1"))
+    with pytest.raises(DeviceSilent):
+        hip.enable()
+
+
+def _patient(rig: Leg) -> AttachedRobot:
+    """It takes longer to be called silent here than a joint may stand on its way."""
+    rig.configure(('channel = "can0"', 'channel = "can0"\nstale_after_s = 1.5'))
+    rig.plug()
+    return rig.attach()
 
 
 def _strike(leg: Leg, fault: str) -> None:

@@ -6,7 +6,7 @@ import itertools
 import pytest
 
 from drivers.conftest import Outcome, written_now
-from drivers.legs import COUNTS_PER_RAD, GO, HALT, HIP, KNEE, Leg, leg, rig
+from drivers.legs import COUNTS_PER_RAD, GO, HALT, HIP, HOMING, KNEE, PROFILE_POSITION, Leg, leg, only, rig
 from trade.errors import ConfigurationError, DeviceFault, InvalidArgument, LimitExceeded, MotionStopped
 from trade_drivers import JointGroup, Tolerances, Trajectory, TrajectoryPoint
 from trade_drivers.cia402._motor import Drive
@@ -80,7 +80,9 @@ def shaken(leg: Leg, joint: int, since: float) -> bool:
     return True
 
 
-def test_a_trajectory_is_streamed_at_the_rate_at_which_drives_take_goals(leg: Leg) -> None:
+def test_a_trajectory_is_streamed_at_the_rate_at_which_drives_take_goals(rig: Leg) -> None:
+    leg = rig
+    leg.plug(prepare=only(PROFILE_POSITION, HOMING))
     group = leg.attach().group("leg")
     group.enable()
     mark = written_now()
@@ -100,7 +102,7 @@ ROUNDS = 5
 def test_a_move_takes_over_from_trajectories_whose_handshakes_alternate(rig: Leg) -> None:
     single = "".join(f'[group.{joint}]\njoints = ["leg.{joint}"]\n' for joint in ("hip", "knee"))
     rig.configure(("[group.leg]", f"{single}[group.leg]"))
-    rig.plug()
+    rig.plug(prepare=only(PROFILE_POSITION, HOMING))
     robot = rig.attach()
     hip, knee, both = (robot.group(name) for name in ("hip", "knee", "leg"))
     both.enable()
@@ -128,7 +130,7 @@ def test_a_move_takes_over_from_trajectories_whose_handshakes_alternate(rig: Leg
 
 def test_a_bus_too_slow_for_set_points_refuses_trajectories(rig: Leg) -> None:
     rig.configure(('channel = "can0"', 'channel = "can0"\nrate_hz = 12'))
-    rig.plug()
+    rig.plug(prepare=only(PROFILE_POSITION, HOMING))
     group = rig.attach().group("leg")
     mark = written_now()
     with pytest.raises(ConfigurationError, match="rate_hz of 15"):
@@ -136,7 +138,9 @@ def test_a_bus_too_slow_for_set_points_refuses_trajectories(rig: Leg) -> None:
     assert not rig.controlwords(HIP, mark)
 
 
-def test_S04_a_set_point_that_is_not_renewed_ends_in_a_halt(leg: Leg) -> None:
+def test_S04_a_set_point_that_is_not_renewed_ends_in_a_halt(rig: Leg) -> None:
+    leg = rig
+    leg.plug(prepare=only(PROFILE_POSITION, HOMING))
     hip = leg.attach().motor("leg.hip")
     hip.enable()
     mark = written_now()
@@ -182,6 +186,17 @@ def test_home_with_a_method_the_drive_does_not_know_is_a_fault_and_moves_nothing
     with pytest.raises(DeviceFault):
         hip.home(method=36)
     assert not leg.events("motion_started", HIP, mark)
+
+
+def test_enable_ends_a_search_for_home_and_whoever_waits_for_it_is_told(leg: Leg) -> None:
+    hip = leg.attach().motor("leg.hip")
+    assert isinstance(hip, Drive)
+    hip.enable()
+    slow = Outcome(lambda: hip.home(34, 0.01))
+    leg.wait_for("motion_started", HIP)
+    hip.enable()
+    assert isinstance(slow.wait().error, MotionStopped)
+    assert hip.move_to(0.1) == pytest.approx(0.1, abs=0.01)
 
 
 def test_S22_home_too_fast_is_refused(leg: Leg) -> None:

@@ -271,6 +271,16 @@ def test_a_jump_is_limited_and_too_large_a_one_is_a_following_error() -> None:
     assert (bench.state, bench.get(0x603F)) == (State.FAULT, 0x8611)
 
 
+@pytest.mark.parametrize(("mode", "halts"), [(Mode.PROFILE_VELOCITY, True), (Mode.CYCLIC_VELOCITY, False)])
+def test_a_cyclic_mode_knows_no_halt(mode: Mode, halts: bool) -> None:
+    bench = enabled(mode)
+    bench.put(0x60FF, 20_000, 4)
+    bench.run(0.5)
+    bench.control(ENABLE | HALT)
+    bench.run(0.5)
+    assert (bench.velocity == 0) == halts
+
+
 def test_a_stale_target_is_followed_as_soon_as_operation_is_enabled() -> None:
     bench = Bench(position_counts=1500)  # the trap: the target is still 0
     bench.enable(Mode.CYCLIC_POSITION)

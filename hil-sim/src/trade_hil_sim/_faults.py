@@ -320,6 +320,11 @@ class Script:
         """End all."""
         self._active.clear()
 
+    @property
+    def empty(self) -> bool:
+        """Whether none is in force."""
+        return not self._active
+
     def silences(self, device_id: int, instruction: str) -> bool:
         """Whether this answer is not given at all; counts as one matched."""
         return self.strikes(Mute, (device_id,), instruction)

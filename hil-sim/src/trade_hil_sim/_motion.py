@@ -3,7 +3,7 @@
 Units: counts, counts/s, counts/s^2; time in seconds on whatever clock the caller uses.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 from math import copysign, sqrt
 
@@ -21,19 +21,19 @@ class Course:
     """Pairs of duration and acceleration."""
     goal: float | None = None
     """Where it ends exactly, if it ends at rest at a place asked for."""
+    ends: float = field(init=False)
+    """When the last stretch is over."""
+    final_speed: float = field(init=False)
+    """Speed after the last stretch."""
 
-    @property
-    def ends(self) -> float:
-        """When the last stretch is over."""
-        return self.begins + sum(duration for duration, _ in self.stretches)
-
-    @property
-    def final_speed(self) -> float:
-        """Speed after the last stretch."""
-        if self.goal is not None:
-            return 0.0
-        speed = self.speed + sum(duration * acceleration for duration, acceleration in self.stretches)
-        return 0.0 if abs(speed) < 1e-6 else speed
+    def __post_init__(self) -> None:
+        """Find what is asked for most often."""
+        lasts, speed = 0.0, self.speed
+        for duration, acceleration in self.stretches:
+            lasts += duration
+            speed += duration * acceleration
+        object.__setattr__(self, "ends", self.begins + lasts)
+        object.__setattr__(self, "final_speed", 0.0 if self.goal is not None or abs(speed) < 1e-6 else speed)
 
     def at(self, t: float) -> tuple[float, float, float]:
         """Position, speed and acceleration at time `t`."""

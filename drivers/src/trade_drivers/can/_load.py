@@ -24,9 +24,9 @@ class LoadMeter:
         self._bits = 0
         self.load = 0.0
 
-    def add(self, size: int, now_ns: int) -> None:
-        """A frame of that many bytes went over the bus."""
-        self._bits += frame_bits(size)
+    def add(self, bits: int, now_ns: int) -> None:
+        """So many bits went over the bus."""
+        self._bits += bits
         self.tick(now_ns)
 
     def tick(self, now_ns: int) -> None:

@@ -3,6 +3,7 @@
 import logging
 import socket
 import time
+from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any, Final, NamedTuple
 
@@ -12,8 +13,9 @@ from trade.errors import ConfigurationError
 from trade_drivers._can_monitor import CanBusState
 from trade_drivers._work import PortLost, losing
 from trade_drivers.can._errors import ErrorState, error_state
-from trade_drivers.can._load import LoadMeter
+from trade_drivers.can._load import LoadMeter, frame_bits
 from trade_drivers.can._netlink import look_at
+from trade_drivers.can._socketcand import ServerBus
 
 __all__ = ["CanPort", "Frame", "split_port"]
 
@@ -79,7 +81,10 @@ class CanPort:
             self._look_over()
         with losing(*_TROUBLE):
             try:
-                self._bus = can.Bus(interface=self._interface, **options)
+                if self._interface == "socketcand":
+                    self._bus = ServerBus(**options)
+                else:
+                    self._bus = can.Bus(interface=self._interface, **options)
             except (can.CanInterfaceNotImplementedError, ImportError) as unknown:
                 raise ConfigurationError(where=f"{self._where}.interface", problem=f"{self.path}: {unknown}") from None
 
@@ -144,10 +149,25 @@ class CanPort:
         Raises:
             PortLost: it could not be sent.
         """
-        message = can.Message(arbitration_id=frame_id, data=data, is_extended_id=False)
-        with losing(*_TROUBLE):
-            self._open_bus().send(message, timeout=0)
-        self._count(len(data))
+        self.send_all([Frame(frame_id, data)])
+
+    def send_all(self, frames: Sequence[Frame]) -> None:
+        """Frames out, in this order, and in one write where the interface has that; never waits.
+
+        Raises:
+            PortLost: they could not be sent, or not all of them.
+        """
+        messages = [can.Message(arbitration_id=frame.id, data=frame.data, is_extended_id=False) for frame in frames]
+        bus = self._open_bus()
+        try:
+            if isinstance(bus, ServerBus):
+                bus.send_all(messages)
+            else:
+                for message in messages:
+                    bus.send(message, timeout=0)
+        except _TROUBLE as gone:
+            raise PortLost(str(gone)) from None
+        self._count(sum(frame_bits(len(frame.data)) for frame in frames))
 
     def receive(self, timeout_s: float) -> Frame | None:
         """One data frame, or None when none has come in that time (or an error frame has).
@@ -155,8 +175,11 @@ class CanPort:
         Raises:
             PortLost: the bus is gone, or this end has switched itself off it.
         """
-        with losing(*_TROUBLE):
-            message = self._open_bus().recv(timeout_s)
+        bus = self._open_bus()
+        try:
+            message = bus.recv(timeout_s)
+        except _TROUBLE as gone:
+            raise PortLost(str(gone)) from None
         if message is None:
             self.meter.tick(time.monotonic_ns())
             return None
@@ -165,7 +188,7 @@ class CanPort:
             return None
         if self.state is ErrorState.BUS_OFF:
             self._enter(ErrorState.ACTIVE)  # nothing is heard in bus-off
-        self._count(len(message.data))
+        self._count(frame_bits(len(message.data)))
         if message.is_extended_id or message.is_remote_frame:
             return None
         return Frame(message.arbitration_id, bytes(message.data))
@@ -175,8 +198,8 @@ class CanPort:
             raise PortLost("it is not open")
         return self._bus
 
-    def _count(self, size: int) -> None:
-        self.meter.add(size, time.monotonic_ns())
+    def _count(self, bits: int) -> None:
+        self.meter.add(bits, time.monotonic_ns())
         full = self.meter.load > _FULL
         if full and not self._told_full:
             _log.warning(

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Admission"]
 
-_log = logging.getLogger(__name__)
+_log = logging.getLogger("trade")
 _UNHEARD_NS: Final = 2_000_000_000
 """How long a drive that was set up is waited for before it is set up again."""
 

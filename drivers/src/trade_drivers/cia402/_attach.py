@@ -10,6 +10,7 @@ from trade_drivers.cia402 import _table as table
 from trade_drivers.cia402._axis import DriveAxis
 from trade_drivers.cia402._machine import State, state_of
 from trade_drivers.cia402._net import Answer, Net, Refused
+from trade_drivers.cia402._stream import interpolation_period
 from trade_drivers.cia402._table import Entry, Pdo
 from trade_drivers.joints import Steps
 
@@ -51,7 +52,7 @@ def check_bus(bus: "CanBus", axes: Sequence[DriveAxis], where: str) -> None:
     if bus.rate_hz < least_hz:
         problem = f"{bus.rate_hz:g} is too slow for watchdog_s and stale_after_s; at least {least_hz:.3g}"
         raise ConfigurationError(where=f"{where}: bus.{bus.name}.rate_hz", problem=problem)
-    frames = frame_bits(table.STATUS.layout.size) + frame_bits(table.COMMAND.layout.size)
+    frames = frame_bits(table.STATUS.layout.size) + frame_bits(table.TURNING.layout.size)
     slower = frame_bits(table.MOTION.layout.size) / motion_every(bus)
     cycle_s = (frame_bits(0) + len(axes) * (frames + slower)) / bus.bitrate
     if cycle_s * bus.rate_hz > 1:
@@ -101,8 +102,9 @@ def set_up(net: Net, axis: DriveAxis, bus: "CanBus") -> Steps:
         yield from _arm(net, axis, bus)
         for pdo, kind in ((table.STATUS, 1), (table.MOTION, motion_every(bus))):
             yield from _map(net, axis.id, pdo, kind, table.NO_REMOTE)
-        for pdo in (table.COMMAND, table.PROFILE, table.BRAKING):
+        for pdo in (table.COMMAND, table.PROFILE):
             yield from _map(net, axis.id, pdo, table.AT_ONCE, 0)
+        yield from _map_streams(net, axis, bus)
     except Refused as refused:
         raise Unfit(f"it refuses to be set up: {refused}") from None
     for record in table.UNUSED:
@@ -134,8 +136,9 @@ def _named(identity: Sequence[int]) -> str:
 
 
 def _check_abilities(net: Net, axis: DriveAxis) -> Steps:
-    modes = yield from _read(net, axis.id, table.SUPPORTED_MODES, table.SUPPORTS_PROFILE_POSITION)
-    if not modes & table.SUPPORTS_PROFILE_POSITION:
+    modes = yield from _read(net, axis.id, table.SUPPORTED_MODES, 1 << table.PROFILE_POSITION - 1)
+    axis.modes = frozenset(mode for mode in range(1, 33) if modes >> mode - 1 & 1)
+    if table.PROFILE_POSITION not in axis.modes:
         raise Unfit("it has no profile position mode (6502h)")
     low = yield from _read(net, axis.id, table.POSITION_LIMITS[0])
     high = yield from _read(net, axis.id, table.POSITION_LIMITS[1])
@@ -155,10 +158,14 @@ def _check_abilities(net: Net, axis: DriveAxis) -> Steps:
 
 def _halt_if_moving(net: Net, axis: DriveAxis) -> Steps:
     """Nobody's motion ends; torque stays as it is."""
-    if state_of((yield from net.read(axis.id, table.STATUSWORD))) is not State.ENABLED:
+    state = state_of((yield from net.read(axis.id, table.STATUSWORD)))
+    if state is not State.ENABLED or abs((yield from net.read(axis.id, table.VELOCITY))) <= axis.grain.still_velocity:
         return
-    if abs((yield from net.read(axis.id, table.VELOCITY))) > axis.grain.still_velocity:
+    if (yield from net.read(axis.id, table.MODE_DISPLAY)) < table.CYCLIC_POSITION:
         yield from net.write(axis.id, table.CONTROLWORD, machine.HOLD)
+        return
+    yield from _try_write(net, axis.id, table.QUICK_STOP_OPTION, _BRAKE_AND_STAY)
+    yield from net.write(axis.id, table.CONTROLWORD, machine.QUICK_STOP)
 
 
 def _arm(net: Net, axis: DriveAxis, bus: "CanBus") -> Steps:
@@ -171,6 +178,29 @@ def _arm(net: Net, axis: DriveAxis, bus: "CanBus") -> Steps:
     for entry, value in ((table.QUICK_STOP_OPTION, _BRAKE_AND_STAY), (table.HALT_OPTION, _BRAKE)):
         yield from _try_write(net, axis.id, entry, value)
     yield from _try_write(net, axis.id, table.QUICK_STOP_DECELERATION, axis.accel_counts)
+
+
+def _map_streams(net: Net, axis: DriveAxis, bus: "CanBus") -> Steps:
+    """What its modes without a goal need. One that lacks it is used without them: they are a way, not a condition."""
+    if (yield from _read(net, axis.id, table.QUICK_STOP_OPTION)) not in table.STANDING:
+        axis.modes -= {table.PROFILE_VELOCITY_MODE, table.CYCLIC_VELOCITY, table.CYCLIC_POSITION}
+    if axis.turning_mode != table.PROFILE_POSITION:
+        try:
+            yield from _map(net, axis.id, table.TURNING, table.AT_ONCE, 0)
+        except Refused:
+            axis.modes -= {table.PROFILE_VELOCITY_MODE, table.CYCLIC_VELOCITY}
+    if axis.turning_mode == table.PROFILE_POSITION:
+        yield from _map(net, axis.id, table.BRAKING, table.AT_ONCE, 0)
+    if table.CYCLIC_POSITION in axis.modes:
+        try:
+            for entry, value in zip(table.INTERPOLATION_PERIOD, interpolation_period(bus.rate_hz), strict=True):
+                yield from net.write(axis.id, entry, value)
+            yield from _map(net, axis.id, table.FOLLOWING, table.AT_NEXT_SYNC, 0)
+        except Refused:
+            axis.modes -= {table.CYCLIC_POSITION}
+    if table.CYCLIC_POSITION not in axis.modes:
+        record = table.FOLLOWING.communication
+        yield from _try_write(net, axis.id, Entry(record, "u4", 1), _disabled(record, axis.id))
 
 
 def heartbeat_ms(bus: "CanBus") -> int:

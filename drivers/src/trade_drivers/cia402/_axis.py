@@ -11,6 +11,7 @@ from trade_drivers.cia402 import _machine as machine
 from trade_drivers.cia402 import _table as table
 from trade_drivers.cia402._machine import State, state_of
 from trade_drivers.cia402._net import emergency_text
+from trade_drivers.cia402._stream import Following, Turning
 from trade_drivers.joints import Axis, Grain, Sample
 from trade_drivers.robotfile import Joint
 
@@ -19,6 +20,7 @@ __all__ = ["DriveAxis", "Stage"]
 _STILL_RAD_S: Final = 0.01
 _ARRIVED_RAD: Final = 0.004
 _NEAR_RAD: Final = 0.03
+_FAULTS: Final = (State.FAULT, State.FAULT_REACTION)
 _SOME_FAULT: Final = "it reports a fault"
 _ACKNOWLEDGE_NS: Final = 250_000_000
 """How long a drive may take to take a set-point."""
@@ -58,6 +60,12 @@ class DriveAxis(Axis):
         self.state_now: State | None = None
         self.statusword = 0
         self.mode = 0
+        self.modes: frozenset[int] = frozenset()
+        """Those it can be used in."""
+        self.entered = 0
+        """The mode it was enabled in; 0 if that is not known any more."""
+        self.stream: Following | Turning | None = None
+        """In a mode without a goal: what it is sent in every cycle."""
         self.velocity = 0
         self.controlword = 0
         """What was commanded last."""
@@ -102,7 +110,7 @@ class DriveAxis(Axis):
             self.velocity, self.mode, error = table.MOTION.layout.unpack(data)
         except BadLength:
             return
-        if error and self.state_now in {State.FAULT, State.FAULT_REACTION}:
+        if error and self.state_now in _FAULTS:
             self.latch(emergency_text(error))
 
     def take_emergency(self, data: bytes) -> None:
@@ -134,12 +142,14 @@ class DriveAxis(Axis):
             self.silent, self.silent_since_ns = True, now_ns
         self.stage, self.probe_at_ns = Stage.AWAY, now_ns
         self.controlword = self.asked_ns = self.awaited_ns = 0
+        self.entered, self.stream = 0, None
 
     def be_awaited(self, now_ns: int) -> None:
         """It was set up: it is to be heard."""
         if self.ready:
             self.latch("it was away")
         self.stage, self.set_up_ns = Stage.SET_UP, now_ns
+        self.entered, self.stream = 0, None
 
     def welcome(self, now_ns: int) -> None:
         """It is heard."""
@@ -155,7 +165,7 @@ class DriveAxis(Axis):
 
     def _judge(self, now_ns: int) -> None:
         state = self.state_now
-        if state in {State.FAULT, State.FAULT_REACTION}:
+        if state in _FAULTS:
             self.latch(_SOME_FAULT)
         elif self.ready and state is State.QUICK_STOP:
             self.latch("it has made a quick stop by itself: it heard nothing for too long, or a switch told it to")
@@ -184,6 +194,22 @@ class DriveAxis(Axis):
     def can_take_goal(self) -> bool:
         """The handshake of the last set-point is over."""
         return not self.controlword & machine.NEW_SET_POINT and not self.acknowledged
+
+    @property
+    def turning_mode(self) -> int:
+        """The mode in which it is told speeds; profile position, where their goal is the end of the range, if none."""
+        for mode in (table.CYCLIC_VELOCITY, table.PROFILE_VELOCITY_MODE):
+            if mode in self.modes:
+                return mode
+        return table.PROFILE_POSITION
+
+    def braking(self, accel: int) -> bytes:
+        """The data of the frame with its deceleration; its target velocity, if that is in there, is 0."""
+        return (
+            table.BRAKING.layout.pack(accel)
+            if self.turning_mode == table.PROFILE_POSITION
+            else table.TURNING.layout.pack(accel, 0)
+        )
 
     @property
     def may_hold_torque(self) -> bool:

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Final, cast
 
 from trade_drivers._exchange import PROBE_NS
+from trade_drivers.can import Frame
 from trade_drivers.cia402 import _jobs as jobs
 from trade_drivers.cia402 import _machine as machine
 from trade_drivers.cia402 import _table as table
@@ -14,7 +15,8 @@ from trade_drivers.cia402._attach import heartbeat_ms
 from trade_drivers.cia402._axis import DriveAxis, Stage
 from trade_drivers.cia402._machine import State
 from trade_drivers.cia402._net import Net
-from trade_drivers.joints import Axis, Exchange, Gate, Goal, Job, Steps
+from trade_drivers.cia402._stream import Following, Turning
+from trade_drivers.joints import Axis, Exchange, Gate, Goal, Job, Manner, Motion, Steps
 
 if TYPE_CHECKING:
     from trade_drivers.can import CanPort
@@ -24,13 +26,13 @@ __all__ = ["DriveExchange"]
 
 _log = logging.getLogger("trade")
 _BEATS_MISSED: Final = 3
+_MEASURED: Final = (Stage.SET_UP, Stage.HERE)
+_HANDSHAKE: Final = 3
+"""Cycles of a set-point in profile position: raised, acknowledged, taken back."""
 
 
 class DriveExchange(Exchange):
     """What happens on one bus of drives."""
-
-    cycles_a_goal = 3
-    """Raised, acknowledged, taken back."""
 
     def __init__(
         self, port: "CanPort", bus: "CanBus", axes: Sequence[DriveAxis], clock: Callable[[], int] = time.monotonic_ns
@@ -40,9 +42,10 @@ class DriveExchange(Exchange):
         self.drives = tuple(axes)
         self.net = Net(port, between=self.serve_stops, meanwhile=self._admit)
         self.admissions = tuple(Admission(self, axis, bus) for axis in axes)
+        self._bus = bus
         self._beat_ns = int(bus.watchdog_s * 1e9 / 5)
         self._beaten_ns = 0
-        self._began_ns = self._listening_ns = clock()
+        self._began_ns = self._listening_ns = self._synced_ns = clock()
         """When the last cycle began, and since when they have followed each other in time."""
         self.deaf_ns = _BEATS_MISSED * heartbeat_ms(bus) * 1_000_000
         """A drive whose heartbeat has not come for so long is left out."""
@@ -75,31 +78,87 @@ class DriveExchange(Exchange):
     def write_goals(self, goals: Mapping[Axis, Goal], gate: Gate) -> None:
         """Ramps first, which move nothing; then the gate, and all joints start in one go."""
         for axis, goal in goals.items():
-            self.port.send(table.PROFILE.base + axis.id, table.PROFILE.layout.pack(goal.speed, goal.accel))
-            self.port.send(table.BRAKING.base + axis.id, table.BRAKING.layout.pack(goal.accel))
+            drive = cast("DriveAxis", axis)
+            if drive.stream is None:
+                self.port.send(table.PROFILE.base + axis.id, table.PROFILE.layout.pack(goal.speed, goal.accel))
+                self.port.send(table.BRAKING.base + axis.id, drive.braking(goal.accel))
+            elif isinstance(drive.stream, Turning):
+                drive.stream.fastest = goal.speed
         self.write_positions({axis: goal.position for axis, goal in goals.items()}, gate)
 
     def write_positions(self, positions: Mapping[Axis, int], gate: Gate) -> None:
         gate()
         for axis, position in positions.items():
             drive = cast("DriveAxis", axis)
-            drive.asked_ns = self.clock()
-            self.command(drive, machine.GO, position)
+            match drive.stream:
+                case None:
+                    drive.asked_ns = self.clock()
+                    self.command(drive, machine.GO, position)
+                case Following() as following:
+                    following.aim = position
+                case Turning() as turning:
+                    turning.end = position
+
+    def cycles_a_goal(self, axes: Sequence[Axis]) -> int:
+        return 1 if _all_follow(axes) else _HANDSHAKE
+
+    def reached_ns(self, axes: Sequence[Axis]) -> int | None:
+        """It counts from the next SYNC on, and is reached a period later."""
+        return self._synced_ns + 2 * self.period_ns if _all_follow(axes) else None
 
     def can_take_goals(self, axes: Sequence[Axis]) -> bool:
-        return all(cast("DriveAxis", axis).can_take_goal and not self.worked_on(axis) for axis in axes)
+        drives = [cast("DriveAxis", axis) for axis in axes]
+        return all((drive.stream or drive.can_take_goal) and not self.worked_on(drive) for drive in drives)
 
     def write_holds(self, positions: Mapping[Axis, int]) -> None:
-        """Halt, on the joint's own ramp; what is not known to be enabled is not told, lest that enable it."""
+        """Halt, on the joint's own ramp; what is not known to be enabled is not told, lest that enable it.
+
+        In a mode without a goal it is a quick stop, which is the drive's own business, too, and stands under torque.
+        """
         for axis, position in positions.items():
             drive = cast("DriveAxis", axis)
             drive.asked_ns = 0
-            if drive.state_now is State.ENABLED:
-                self.port.send(table.BRAKING.base + axis.id, table.BRAKING.layout.pack(axis.accel_counts))
+            if drive.stream is not None or drive.controlword == machine.QUICK_STOP:
+                self._quick_stop(drive)
+            elif drive.state_now is State.ENABLED:
+                self.port.send(table.BRAKING.base + axis.id, drive.braking(axis.accel_counts))
                 self.command(drive, machine.HOLD, position)
 
+    def _quick_stop(self, axis: DriveAxis) -> None:
+        """It has to be enabled anew, then; a target that is not where it was sent last would be a jump for it."""
+        target = axis.stream.target if isinstance(axis.stream, Following) else None
+        axis.stream, axis.ready = None, False
+        if axis.state_now is State.ENABLED:
+            self.command(axis, machine.QUICK_STOP, target)
+
     def enabling(self, job: Job, axis: Axis) -> Steps:
-        return jobs.enabling(self, job, cast("DriveAxis", axis))
+        return jobs.enabling(self, job, cast("DriveAxis", axis), self.mode_for(job, cast("DriveAxis", axis)))
+
+    def mode_for(self, job: Job, axis: DriveAxis) -> int:
+        """The mode of operation for what a job is going to tell this drive."""
+        match job.manner:
+            case Manner.POSITIONS if _all_follow(job.axes):
+                return table.CYCLIC_POSITION
+            case Manner.SPEEDS:
+                return axis.turning_mode
+            case _:
+                return table.PROFILE_POSITION
+
+    def stream_for(self, axis: DriveAxis, mode: int, position: int) -> Following | Turning | None:
+        """What a drive at rest there is sent from now on."""
+        period_s = self.period_ns / 1e9
+        match mode:
+            case table.CYCLIC_POSITION:
+                speed, accel = (
+                    axis.joint.max_speed_rad_s / axis.grain.rad_s,
+                    axis.joint.max_accel_rad_s2 / axis.grain.rad_s2,
+                )
+                return Following(axis.id, position, speed=speed, accel=accel, period_s=period_s)
+            case table.CYCLIC_VELOCITY | table.PROFILE_VELOCITY_MODE:
+                blind_s = self._bus.watchdog_s + 2 * period_s
+                return Turning(axis.id, accel=axis.accel_counts, period_s=period_s, blind_s=blind_s)
+            case _:
+                return None
 
     def relaxing(self, job: Job, axis: Axis) -> Steps:
         return jobs.relaxing(self, job, cast("DriveAxis", axis))
@@ -107,10 +166,14 @@ class DriveExchange(Exchange):
     def looking(self, axis: Axis) -> Steps:
         return jobs.looking(self, cast("DriveAxis", axis))
 
-    def making_way(self, axes: Sequence[Axis]) -> Steps:
-        for axis in axes:
+    def making_way(self, job: Motion) -> Steps:
+        for axis in job.axes:
             drive = cast("DriveAxis", axis)
-            yield from jobs.until(self, drive, lambda: drive.can_take_goal, "it does not end its last handshake")  # noqa: B023 - over before the next
+            if drive.entered != self.mode_for(job, drive):
+                yield from jobs.resting(self, job, drive)
+                yield from self.enabling(job, drive)
+            elif drive.stream is None:
+                yield from jobs.until(self, drive, lambda: drive.can_take_goal, "it does not end its last handshake")  # noqa: B023 - over before the next
 
     def leaving(self, job: Job, axis: Axis, *, relax: bool) -> Steps:
         return jobs.leaving(self, job, cast("DriveAxis", axis), relax=relax)
@@ -121,7 +184,7 @@ class DriveExchange(Exchange):
         self.net.take_in(seconds)
 
     def cycle(self) -> None:
-        """One round: stops, heartbeat, measurements, handshakes, work, motions."""
+        """One round: stops, heartbeat, measurements, handshakes, work, motions, streams."""
         began_ns = self.clock()
         if began_ns - self._began_ns > self.stale_after_ns // 2:
             self._listening_ns = began_ns
@@ -134,6 +197,18 @@ class DriveExchange(Exchange):
         self._admit()
         self.work(began_ns + self.period_ns // 2)
         self.watch()
+        self._stream()
+
+    def _stream(self) -> None:
+        """Every drive in a mode without a goal gets its next set-point, also where nothing moves it."""
+        now_ns = self.clock()
+        frames = [
+            Frame(axis.stream.can_id, axis.stream.next(axis.sample, now_ns))
+            for axis in self.drives
+            if axis.stream is not None and axis.ready and axis.sample is not None and not axis.silent
+        ]
+        if frames:
+            self.port.send_all(frames)
 
     def _beat(self, now_ns: int) -> None:
         """The heartbeat that the drives' own watchdogs live on."""
@@ -142,9 +217,10 @@ class DriveExchange(Exchange):
             self.port.send(table.HEARTBEAT + table.OUR_NODE, bytes((table.OPERATIONAL,)))
 
     def _measure(self, began_ns: int) -> None:
+        self._synced_ns = began_ns
         asked = [axis for axis in self.drives if not axis.silent]
         for axis in self.drives:
-            if axis.stage in {Stage.SET_UP, Stage.HERE}:
+            if axis.stage in _MEASURED:
                 axis.awaited_ns = began_ns  # not when it came: a frozen process would take old values for new
         self.port.send(table.SYNC, b"")
         self.net.take_in(self.period_ns / 2e9, lambda: not any(axis.awaited_ns for axis in asked))
@@ -171,9 +247,14 @@ class DriveExchange(Exchange):
     def _admit(self) -> None:
         """Go on with those that are not here; it never waits for them."""
         for admission in self.admissions:
-            admission.advance()
+            if admission.axis.stage is not Stage.HERE:
+                admission.advance()
 
     def forget_measurements(self) -> None:
         now_ns = self.clock()
         for axis in self.drives:
             axis.forget(now_ns)
+
+
+def _all_follow(axes: Sequence[Axis]) -> bool:
+    return all(table.CYCLIC_POSITION in cast("DriveAxis", axis).modes for axis in axes)

@@ -42,7 +42,8 @@ class Homing(Motion):
     def steps(self) -> Steps:
         axis = self._axis
         axis.check_usable(self.exchange.clock(), self.exchange.stale_after_ns)
-        if not axis.ready:
+        yield from jobs.resting(self._bus, self, axis)
+        if not axis.ready or axis.stream is not None:
             yield from self.exchange.enabling(self, axis)
         for entry, value in (
             (table.HOMING_METHOD, self._method),
@@ -51,7 +52,7 @@ class Homing(Motion):
             (table.HOMING_ACCELERATION, axis.accel_counts),
         ):
             yield from jobs.write(self._bus, self, axis, entry, value)
-        axis.ready = False  # whatever becomes of it, it is not in its usual mode any more
+        axis.ready, axis.entered = False, 0  # whatever becomes of it, it is not in its usual mode any more
         yield from jobs.set_mode(self._bus, self, axis, table.HOMING)
         self.launch()
 
@@ -65,15 +66,10 @@ class Homing(Motion):
         return axis.sample.position if axis.sample is not None else 0
 
     def watch(self, now_ns: int) -> None:
-        axis, ending = self._axis, self._trouble(now_ns)
-        if ending is None and axis.statusword & machine.HOMING_STATUS != machine.HOMING_DONE:
-            return
-        if ending is None and (
-            axis.sample is None or axis.sample.at_ns <= self._began_ns + 2 * self.exchange.period_ns
-        ):
-            return
-        self._bus.command(axis, machine.HOLD)
-        self.exchange.release(self, ending)
+        ending = self._trouble(now_ns)
+        if ending is not None or self._found():
+            self._bus.command(self._axis, machine.HOLD)
+            self.exchange.release(self, ending)
 
     def _found(self) -> bool:
         """It says that it has found its zero, and says so of this search."""

@@ -4,51 +4,89 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Final
 
 from trade.errors import DeviceSilent
+from trade_drivers._exchange import HALT_NS
 from trade_drivers.cia402 import _machine as machine
 from trade_drivers.cia402 import _table as table
 from trade_drivers.cia402._axis import DriveAxis
 from trade_drivers.cia402._machine import State
 from trade_drivers.cia402._net import NoAnswer, Refused
+from trade_drivers.cia402._stream import Following
 from trade_drivers.cia402._table import Entry
 from trade_drivers.joints import Job, Steps
 
 if TYPE_CHECKING:
     from trade_drivers.cia402._exchange import DriveExchange
 
-__all__ = ["enabling", "leaving", "looking", "relaxing", "set_mode", "until", "write"]
+__all__ = ["enabling", "leaving", "looking", "relaxing", "resting", "set_mode", "until", "write"]
 
 _CHANGE_NS: Final = 600_000_000
 """How long a drive may take to go from one state to the next."""
 _WAIT_S: Final = 0.001
+_AT_REST: Final = 2
+"""Measurements in a row in which it did not move."""
 
 
-def enabling(bus: "DriveExchange", job: Job, axis: DriveAxis) -> Steps:
-    """Torque on where it was measured to be, halted, in profile position with its own ramps; all of it confirmed."""
+def enabling(bus: "DriveExchange", job: Job, axis: DriveAxis, mode: int) -> Steps:
+    """Torque on where it was measured to be, halted or told to stay there, with its own ramps; all of it confirmed.
+
+    A drive that is enabled already must be at rest: then only its mode changes. A search for its zero ends.
+    """
     yield from looking(bus, axis)
+    if axis.motion is not None and not axis.fault:
+        bus.end_motion(axis, f"{axis.name} was enabled anew")
     if not axis.statusword & machine.REMOTE:
         raise axis.faulty("it does not obey the bus (statusword bit 9); is it operated from its panel?")
     if axis.state_now is State.FAULT:
         yield from _reset(bus, job, axis)
-    yield from set_mode(bus, job, axis, table.PROFILE_POSITION)
+    yield from _begin_at_rest(bus, job, axis)
+    yield from set_mode(bus, job, axis, mode)
     for entry, value in (
         (table.PROFILE_VELOCITY, axis.speed_counts),
         (table.ACCELERATION, axis.accel_counts),
         (table.DECELERATION, axis.accel_counts),
     ):
         yield from write(bus, job, axis, entry, value)
-    yield from _climb(bus, job, axis)
-    axis.fault, axis.ready = "", True
+    yield from _climb(bus, job, axis, mode)
+    axis.fault, axis.ready, axis.entered = "", True, mode
+    axis.stream = bus.stream_for(axis, mode, axis.target)
 
 
-def _climb(bus: "DriveExchange", job: Job, axis: DriveAxis) -> Steps:
-    """Up to where it is enabled, a state at a time; the goal is where it is."""
+def _begin_at_rest(bus: "DriveExchange", job: Job, axis: DriveAxis) -> Steps:
+    """No target that is left from before may move it in another mode."""
+    if axis.may_hold_torque:
+        yield from until(
+            bus, axis, lambda: axis.still >= _AT_REST, "its mode cannot be changed while it moves", HALT_NS
+        )
+    sample = axis.fresh(bus.clock(), bus.stale_after_ns)
+    job.gate()
+    bus.port.send(table.BRAKING.base + axis.id, axis.braking(axis.accel_counts))
+    if axis.state_now is State.ENABLED:
+        target = axis.stream.target if isinstance(axis.stream, Following) else sample.position
+        bus.command(axis, machine.HOLD, target)
+    axis.entered, axis.stream = 0, None
+
+
+def resting(bus: "DriveExchange", job: Job, axis: DriveAxis) -> Steps:
+    """End what moves it, by its drive's own ramp."""
+    job.gate()
+    bus.halt([axis], "another kind of motion took over")
+    yield from until(bus, axis, lambda: axis.still >= _AT_REST, "told to halt, but it is still moving", HALT_NS)
+
+
+def _climb(bus: "DriveExchange", job: Job, axis: DriveAxis, mode: int) -> Steps:
+    """Up to where it is enabled, a state at a time; the goal is where it is.
+
+    It ends halted, but in a mode without a goal, in which not every drive knows that.
+    """
     while True:
         yield from until(bus, axis, lambda: machine.command_towards_enabled(axis.state_now) is not None, _stays(axis))
-        word = machine.command_towards_enabled(axis.state_now)
+        word = machine.command_towards_enabled(axis.state_now) or 0
+        if mode != table.PROFILE_POSITION:
+            word &= ~machine.HALT
         sample = axis.fresh(bus.clock(), bus.stale_after_ns)
         before = axis.state_now
         job.gate()
-        bus.command(axis, word or 0, sample.position)
+        bus.command(axis, word, sample.position)
         if before is State.ENABLED:
             return
         yield from until(bus, axis, lambda: axis.state_now is not before, _stays(axis))  # noqa: B023 - over before the next round
@@ -108,17 +146,23 @@ def _next_measurement(bus: "DriveExchange", axis: DriveAxis) -> Steps:
     yield from until(bus, axis, lambda: axis.sample is not None and axis.sample.at_ns > since_ns, "it says nothing")
 
 
-def until(bus: "DriveExchange", axis: DriveAxis, condition: Callable[[], bool], otherwise: str) -> Steps:
+def until(
+    bus: "DriveExchange",
+    axis: DriveAxis,
+    condition: Callable[[], bool],
+    otherwise: str,
+    patience_ns: int = _CHANGE_NS,
+) -> Steps:
     """Wait for what the drive's frames are to say.
 
     Raises:
         DeviceFault: it did not come; ``otherwise`` says what is wrong then.
         DeviceSilent: the drive fell silent.
     """
-    give_up_ns = bus.clock() + _CHANGE_NS
+    give_up_ns = bus.clock() + patience_ns
     while not condition():
         bus.require_answering(axis)
-        if bus.clock() > give_up_ns:
+        if axis.sample is not None and axis.sample.at_ns > give_up_ns:  # what it did not say is another matter
             raise axis.faulty(otherwise)
         bus.net.take_in(_WAIT_S)
         yield

@@ -44,8 +44,11 @@ RESET_FAULT: Final = 0x0080
 HALT: Final = 0x0100
 """Brake, and stand under torque."""
 HOLD: Final = OPERATE | HALT
+QUICK_STOP: Final = 0x0002
+"""Brake on the quick-stop ramp, in whatever mode: the cyclic ones know no halt."""
 GO: Final = OPERATE | NEW_SET_POINT | AT_ONCE
 
+_PATTERNS: Final = tuple((state, *state.value) for state in State)
 _UPWARDS: Final = {
     State.SWITCH_ON_DISABLED: SHUTDOWN,
     State.READY: SWITCH_ON,
@@ -57,8 +60,7 @@ _UPWARDS: Final = {
 
 def state_of(statusword: int) -> State | None:
     """The state of a statusword; None for a pattern the standard does not know."""
-    for state in State:
-        mask, value = state.value
+    for state, mask, value in _PATTERNS:
         if statusword & mask == value:
             return state
     return None

@@ -67,12 +67,19 @@ QUICK_STOP_DECELERATION: Final = Entry(0x6085, "u4")
 HOMING_METHOD: Final = Entry(0x6098, "i1")
 HOMING_SPEEDS: Final = (Entry(0x6099, "u4", 1), Entry(0x6099, "u4", 2))
 HOMING_ACCELERATION: Final = Entry(0x609A, "u4")
+INTERPOLATION_PERIOD: Final = (Entry(0x60C2, "u1", 1), Entry(0x60C2, "i1", 2))
+"""In which a cyclic position is reached: so many times ten to the power of so many seconds."""
+TARGET_VELOCITY: Final = Entry(0x60FF, "i4")
 SUPPORTED_MODES: Final = Entry(0x6502, "u4")
+"""Bit ``mode - 1`` for each."""
 
 PROFILE_POSITION: Final = 1
+PROFILE_VELOCITY_MODE: Final = 3
 HOMING: Final = 6
-SUPPORTS_PROFILE_POSITION: Final = 1 << 0
-SUPPORTS_HOMING: Final = 1 << 5
+CYCLIC_POSITION: Final = 8
+CYCLIC_VELOCITY: Final = 9
+STANDING: Final = (5, 6, 7)
+"""Of 605Ah: what stands under torque after a quick stop."""
 DRIVE_PROFILE: Final = 402
 FULL_TORQUE: Final = 1000
 """Counts of the torque that mean the rated one."""
@@ -111,7 +118,11 @@ MOTION: Final = Pdo(0x1801, 0x280, (VELOCITY, MODE_DISPLAY, ERROR_CODE), struct.
 COMMAND: Final = Pdo(0x1400, 0x200, (CONTROLWORD, TARGET_POSITION), struct.Struct("<Hi"))
 PROFILE: Final = Pdo(0x1401, 0x300, (PROFILE_VELOCITY, ACCELERATION), struct.Struct("<II"))
 BRAKING: Final = Pdo(0x1402, 0x400, (DECELERATION,), struct.Struct("<I"))
-UNUSED: Final = (0x1403, 0x1802, 0x1803)
+TURNING: Final = Pdo(0x1402, 0x400, (DECELERATION, TARGET_VELOCITY), struct.Struct("<Ii"))
+"""In its place, where a drive has a velocity mode."""
+FOLLOWING: Final = Pdo(0x1403, 0x500, (TARGET_POSITION,), struct.Struct("<i"))
+UNUSED: Final = (0x1802, 0x1803)
+AT_NEXT_SYNC: Final = 1
 AT_ONCE: Final = 255
 INVALID: Final = 1 << 31
 NO_REMOTE: Final = 1 << 30

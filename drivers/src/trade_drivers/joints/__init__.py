@@ -4,7 +4,7 @@ from trade_drivers._bus_thread import BusThread, Port
 from trade_drivers._work import Gate, PortLost, Steps
 from trade_drivers.joints._axis import Axis, Goal, Grain, Sample
 from trade_drivers.joints._exchange import Exchange
-from trade_drivers.joints._jobs import Job
+from trade_drivers.joints._jobs import Job, Manner
 from trade_drivers.joints._motion import Motion
 from trade_drivers.joints._motor import AttachedJoints, BusMotor
 
@@ -18,6 +18,7 @@ __all__ = [
     "Goal",
     "Grain",
     "Job",
+    "Manner",
     "Motion",
     "Port",
     "PortLost",

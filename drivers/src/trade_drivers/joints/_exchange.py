@@ -22,9 +22,6 @@ __all__ = ["Exchange"]
 class Exchange(BusExchange[Axis]):
     """What happens on one bus of joints. ``stop`` is for any thread, too."""
 
-    cycles_a_goal = 1
-    """How many cycles it takes at most until a joint can take the next goal."""
-
     def __init__(self, bus: "Bus", axes: Sequence[Axis], clock: Callable[[], int] = time.monotonic_ns) -> None:
         super().__init__(bus, axes, clock)
         self.axes = tuple(axes)
@@ -38,6 +35,17 @@ class Exchange(BusExchange[Axis]):
     @abstractmethod
     def write_positions(self, positions: Mapping[Axis, int], gate: Gate) -> None:
         """The same for joints on their way, as fast as they are already; only if they ``can_take_goals``."""
+
+    def cycles_a_goal(self, axes: Sequence[Axis]) -> int:  # noqa: ARG002 - most devices take one in each
+        """How many cycles it takes at most until these joints can take the next position of a trajectory."""
+        return 1
+
+    def reached_ns(self, axes: Sequence[Axis]) -> int | None:  # noqa: ARG002 - as above
+        """When joints that go from position to position are at one that is written now.
+
+        None for joints that brake by themselves for each: theirs is to be where they would come to rest.
+        """
+        return None
 
     def can_take_goals(self, axes: Sequence[Axis]) -> bool:  # noqa: ARG002 - most devices take a goal at any time
         """Whether these joints can take new goals now, and nothing else is about to give them some."""
@@ -59,8 +67,8 @@ class Exchange(BusExchange[Axis]):
     def looking(self, axis: Axis) -> Steps:
         """How the joint is, asked now."""
 
-    def making_way(self, axes: Sequence[Axis]) -> Steps:  # noqa: ARG002 - as above
-        """Wait until these joints can take new goals."""
+    def making_way(self, job: Motion) -> Steps:  # noqa: ARG002 - as above
+        """Wait until its joints can take what it will tell them; ends what moves them, if that must rest first."""
         yield from ()
 
     @abstractmethod

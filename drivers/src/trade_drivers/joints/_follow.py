@@ -8,6 +8,7 @@ from trade.errors import ConfigurationError, MotionStopped, ToleranceExceeded, T
 from trade_drivers._plan import Plan
 from trade_drivers._work import Steps
 from trade_drivers.joints._axis import Axis, Goal
+from trade_drivers.joints._jobs import Manner
 from trade_drivers.joints._motion import Motion
 
 if TYPE_CHECKING:
@@ -23,9 +24,12 @@ _FOREVER_NS: Final = 2**63
 class Follow(Motion):
     """A plan for some joints of this bus.
 
-    The goal sent is where the joint would come to rest if it braked at that moment: so the device, which always
-    brakes in time for its goal, keeps the speed it should have, and comes to rest within its range if no goal follows.
+    A device that goes from position to position is sent where it should be when it gets there. Any other brakes in
+    time for its goal: so that is where the joint would come to rest if it braked at that moment; it keeps the speed it
+    should have, and comes to rest within its range if no goal follows.
     """
+
+    manner = Manner.POSITIONS
 
     def __init__(
         self,
@@ -79,7 +83,7 @@ class Follow(Motion):
             self.gate()
             if ending := self.trouble(now_ns, self._until_ns) or self._trouble(now_ns):
                 raise ending
-            if self._over(now_ns):
+            if self._over():
                 self.final_rad = [axis.scale.angle_rad(axis.sample.position) for axis in self.axes if axis.sample]
                 self.exchange.release(self, None)
                 return
@@ -90,10 +94,10 @@ class Follow(Motion):
 
     def _check_rate(self) -> None:
         """Raises ``ConfigurationError`` where goals cannot follow each other as fast as they must."""
-        exchange = self.exchange
-        if (every_ns := exchange.cycles_a_goal * exchange.period_ns) > _VALID_NS:
+        exchange, cycles = self.exchange, self.exchange.cycles_a_goal(self.axes)
+        if (every_ns := cycles * exchange.period_ns) > _VALID_NS:
             problem = f"its joints take a goal every {every_ns / 1e9:.2g} s; a trajectory needs one every 0.2 s"
-            needed = f"give the bus a rate_hz of {exchange.cycles_a_goal * 1e9 / _VALID_NS:g} or more"
+            needed = f"give the bus a rate_hz of {cycles * 1e9 / _VALID_NS:g} or more"
             raise ConfigurationError(where=f"bus {self.axes[0].bus}", problem=f"{problem}; {needed}")
 
     def _send(self, now_ns: int) -> None:
@@ -107,11 +111,12 @@ class Follow(Motion):
 
     def _due(self, now_ns: int) -> dict[Axis, int]:
         """The goals of this moment, in counts; within the range of each joint, or of where it comes in from."""
-        elapsed_s = self._plan.course.elapsed_s(now_ns)
+        reached_ns = self.exchange.reached_ns(self.axes)
+        elapsed_s = self._plan.course.elapsed_s(now_ns if reached_ns is None else reached_ns)
         goals: dict[Axis, int] = {}
         for axis, curve in self._curves.items():
             position, velocity = curve.at(elapsed_s)
-            braking = velocity * abs(velocity) / (2 * axis.joint.max_accel_rad_s2)
+            braking = velocity * abs(velocity) / (2 * axis.joint.max_accel_rad_s2) if reached_ns is None else 0.0
             start = round(axis.scale.counts(curve.at(0)[0]))
             goal = round(axis.scale.counts(position + braking))
             goals[axis] = max(min(axis.low, start), min(max(axis.high, start), goal))
@@ -124,9 +129,10 @@ class Follow(Motion):
         tolerance_rad = self._plan.tolerances.path_rad
         return next((problem for axis in self.axes if (problem := self._astray(axis, "path", tolerance_rad))), None)
 
-    def _over(self, now_ns: int) -> bool:
-        """Whether all are at rest at the end; raises if they had the time to be and are not."""
-        late_s = self._plan.course.elapsed_s(now_ns) - self._plan.course.duration_s
+    def _over(self) -> bool:
+        """Whether all were measured at rest at the end; raises if they had the time to be and were not."""
+        seen_ns = min(axis.sample.at_ns if axis.sample else 0 for axis in self.axes)
+        late_s = self._plan.course.elapsed_s(seen_ns) - self._plan.course.duration_s
         if late_s < 0:
             return False
         tolerances = self._plan.tolerances

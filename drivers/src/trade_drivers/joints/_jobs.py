@@ -1,6 +1,7 @@
 """What services ask of the bus thread: work of several exchanges, done one exchange at a time between the cycles."""
 
 from collections.abc import Sequence
+from enum import Enum
 from typing import TYPE_CHECKING
 
 from trade import Permit
@@ -11,11 +12,24 @@ from trade_drivers.joints._axis import Axis
 if TYPE_CHECKING:
     from trade_drivers.joints._exchange import Exchange
 
-__all__ = ["Command", "Enable", "Halt", "Job", "Leave", "Relax", "Steps"]
+__all__ = ["Command", "Enable", "Halt", "Job", "Leave", "Manner", "Relax", "Steps"]
+
+
+class Manner(Enum):
+    """What a job is going to tell its joints, for devices that have a mode for each."""
+
+    GOALS = "goals"
+    """Where to go, now and then."""
+    POSITIONS = "positions"
+    """Where to be, in every cycle."""
+    SPEEDS = "speeds"
+    """How fast to turn, and where to end at the latest."""
 
 
 class Job(Work[Axis]):
     """Something that is waited for. As it stands it needs no leave: it ends motion."""
+
+    manner = Manner.GOALS
 
     def __init__(self, exchange: "Exchange", axes: Sequence[Axis]) -> None:
         super().__init__(axes)

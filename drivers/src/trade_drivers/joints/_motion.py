@@ -27,8 +27,10 @@ class _Progress(Struct):
 
     goal: int
     closest: int
+    measured_ns: int
+    """When it was last looked at."""
     waiting_s: float = 0.0
-    """How long it has not come closer."""
+    """How long it was seen not to come closer."""
 
 
 class Motion(Command):
@@ -42,7 +44,7 @@ class Motion(Command):
         for axis in self.axes:
             if not axis.ready:
                 yield from exchange.enabling(self, axis)
-        yield from exchange.making_way(self.axes)
+        yield from exchange.making_way(self)
         self.launch()
 
     def launch(self) -> None:
@@ -92,7 +94,7 @@ class Move(Motion):
         self._speeds = tuple(speeds)
         self._until_ns = until_ns
         self._progress: dict[Axis, _Progress] = {}
-        self._began_ns = self._watched_ns = 0
+        self._began_ns = 0
         self._patience_s = 0.0
         self.final_counts: tuple[int, ...] = ()
 
@@ -115,28 +117,31 @@ class Move(Motion):
         exchange.write_goals(goals, self.gate)
         exchange.take_over(self)
         self._progress = {
-            axis: _Progress(self._goals[axis], distance) for axis, distance in zip(self.axes, distances, strict=True)
+            axis: _Progress(self._goals[axis], distance, now_ns)
+            for axis, distance in zip(self.axes, distances, strict=True)
         }
-        self._began_ns = self._watched_ns = now_ns
+        self._began_ns = now_ns
         self._patience_s = 1.0 + 2 * max(profile.duration_s for profile in profiles)
 
     def watch(self, now_ns: int) -> None:
         ending = self.trouble(now_ns, self._until_ns)
         if ending is None:
-            elapsed_s = min((now_ns - self._watched_ns) / 1e9, _MOST_PER_CYCLE_S)
-            self._watched_ns = now_ns
-            arrived = [self._arrived(axis, elapsed_s) for axis in self.axes]
+            arrived = [self._arrived(axis) for axis in self.axes]
             if all(arrived):
                 self.final_counts = tuple(axis.sample.position for axis in self.axes if axis.sample is not None)
                 self.exchange.release(self, None)
                 return
-            ending = self._stuck(now_ns)
+            ending = self._stuck()
         if ending is not None:
             self.exchange.release(self, ending)
 
-    def _arrived(self, axis: Axis, elapsed_s: float) -> bool:
+    def _arrived(self, axis: Axis) -> bool:
         progress, sample = self._progress[axis], axis.sample
-        distance = abs(progress.goal - sample.position) if sample is not None else progress.closest
+        if sample is None:
+            return False
+        elapsed_s = min(max(0, sample.at_ns - progress.measured_ns) / 1e9, _MOST_PER_CYCLE_S)
+        progress.measured_ns = max(sample.at_ns, progress.measured_ns)
+        distance = abs(progress.goal - sample.position)
         if distance < progress.closest:
             progress.closest, progress.waiting_s = distance, 0.0
         else:
@@ -145,9 +150,10 @@ class Move(Motion):
             return False
         return distance <= axis.grain.arrived or (distance <= axis.grain.near and progress.waiting_s > _SETTLING_S)
 
-    def _stuck(self, now_ns: int) -> TradeError | None:
-        late = (now_ns - self._began_ns) / 1e9 > self._patience_s
+    def _stuck(self) -> TradeError | None:
+        """Why it does not arrive, as far as that was measured: silence is another matter."""
         for axis, progress in self._progress.items():
+            late = (progress.measured_ns - self._began_ns) / 1e9 > self._patience_s
             blocked = progress.closest > axis.grain.near and progress.waiting_s > _STUCK_S
             if late or blocked:
                 short_rad = progress.closest * axis.grain.rad

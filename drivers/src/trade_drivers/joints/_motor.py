@@ -13,7 +13,7 @@ from trade_drivers._plan import Plan
 from trade_drivers.joints._axis import Axis
 from trade_drivers.joints._exchange import Exchange
 from trade_drivers.joints._follow import Follow
-from trade_drivers.joints._jobs import Command, Enable, Halt, Relax
+from trade_drivers.joints._jobs import Command, Enable, Halt, Manner, Relax
 from trade_drivers.joints._motion import Move
 from trade_drivers.joints._setpoint import SetPoint
 
@@ -72,7 +72,9 @@ class _Joints:
             self._finish(move)
         return [axis.scale.angle_rad(counts) for axis, counts in zip(self._axes, move.final_counts, strict=True)]
 
-    def _set(self, goals: Sequence[int], speeds: Sequence[int], service: str, valid_s: float) -> None:
+    def _set(
+        self, goals: Sequence[int], speeds: Sequence[int], service: str, valid_s: float, manner: Manner = Manner.GOALS
+    ) -> None:
         """Begin a set-point, or take over from the one before; returns once it is on the wire."""
         until_ns = self._exchange.clock() + int(valid_s * 1e9)
         expires_ns, _ = expiry(self._exchange.clock)
@@ -87,6 +89,7 @@ class _Joints:
                     expires_ns=expires_ns,
                     until_ns=until_ns,
                     permit=permitted,
+                    manner=manner,
                 )
             )
 
@@ -138,7 +141,8 @@ class BusMotor(_Joints, Motor):
             self._do(Halt, "set_velocity")
             return
         [axis] = self._axes
-        self._set([_end_counts(axis, velocity)], [_speed_counts(axis, abs(velocity))], service, valid_s)
+        ends, speeds = [_end_counts(axis, velocity)], [_speed_counts(axis, abs(velocity))]
+        self._set(ends, speeds, service, valid_s, Manner.SPEEDS)
 
 
 class BusGroup(_Joints, JointGroup):

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 from trade import Permit
 from trade.errors import TradeError
 from trade_drivers.joints._axis import Axis, Goal
+from trade_drivers.joints._jobs import Manner
 from trade_drivers.joints._motion import Motion
 
 if TYPE_CHECKING:
@@ -31,11 +32,13 @@ class SetPoint(Motion):
         expires_ns: int,
         until_ns: int,
         permit: Permit,
+        manner: Manner = Manner.GOALS,
     ) -> None:
         super().__init__(exchange, axes, service=service, expires_ns=min(expires_ns, until_ns), permit=permit)
         self._goals = dict(zip(axes, goals, strict=True))
         self._speeds = dict(zip(axes, speeds, strict=True))
         self._until_ns = until_ns
+        self.manner = manner
 
     def goal_of(self, axis: Axis) -> int:
         return self._goals[axis]

@@ -9,6 +9,7 @@ from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import replace
 from math import inf
+from operator import attrgetter
 from typing import Final, TypeVar
 
 import msgspec
@@ -35,6 +36,7 @@ BUS_ERROR: Final = 0x88
 BUS_OFF: Final = 0x40
 RESTARTED: Final = 0x100
 
+_DUE: Final = attrgetter("due")
 _T = TypeVar("_T")
 
 
@@ -187,7 +189,7 @@ class CanBus:
     def _pass_time(self, now: float) -> None:
         """Let happen what is due on the wire and in devices, in order and at its own time."""
         while True:
-            device = min(self._devices, key=lambda d: d.due, default=None)
+            device = min(self._devices, key=_DUE, default=None)
             own, wire = inf if device is None else device.due, self._wire.next_due()
             if min(own, wire) > now:
                 return
@@ -282,6 +284,8 @@ class CanBus:
 
     def _struck(self, station: Station, frame: Frame) -> tuple[str, tuple[int, ...] | None]:
         """A frame's name, and whose faults concern it; a client's frame only suffers from those that name it."""
+        if self._script.empty:
+            return "", None
         name, node = self._label(frame)
         if station.device_id is not None:
             return name, (station.device_id,)

@@ -124,8 +124,8 @@ class Wire:
         """When `advance` should be called next; infinity while nothing is to be sent."""
         if self._under_way is not None:
             return self._under_way[2]
-        ready = min((station.queue[0].ready for station in self._competing()), default=inf)
-        return max(ready, self._free_at)
+        competing = self._competing()
+        return max(self._free_at, min(s.queue[0].ready for s in competing)) if competing else inf
 
     def advance(self, t: float) -> None:
         """Begin or end the frame that is due at `t`."""
@@ -135,7 +135,8 @@ class Wire:
             self._end(*self._under_way)
 
     def _competing(self) -> list[Station]:
-        return [s for s in self._stations if s.queue and s.hears and self._acknowledged(s)]
+        waiting = [s for s in self._stations if s.queue and s.hears]
+        return waiting if waiting and self._acknowledged(waiting[0]) else []
 
     def _acknowledged(self, station: Station) -> bool:
         return any(other is not station and other.hears for other in self._stations)

@@ -98,9 +98,11 @@ class Drive:
 
     def hear(self, frame: Frame, t: float) -> None:
         """A frame has come."""
-        self.advance(t)
-        self.node.hear(frame, t)
-        self._plan(t)
+        if self.node.accepts(frame.can_id):
+            if self.due <= t:
+                self.advance(t)
+            self.node.hear(frame, t)
+            self._plan(t)
 
     def advance(self, t: float) -> None:
         """Do what is due by itself."""
@@ -130,8 +132,8 @@ class Drive:
 
     def refresh(self, t: float) -> None:
         """Bring measured values up to date."""
-        position, speed = (self._shaft.position(t), self._shaft.speed(t)) if self._frozen is None else self._frozen
         wanted, wanted_speed, acceleration = self._shaft.demand.at(t)
+        position, speed = self._shaft.actual.at(t)[:2] if self._frozen is None else self._frozen
         torque = self._torque(acceleration)
         self.store.set("position_actual", round(position - self.modes.zero))
         self.store.set("velocity_actual", round(speed))

@@ -47,6 +47,9 @@ SET_POINT: Final = {
 }
 """What takes effect by being written; profile position and homing wait for bit 4 of the controlword."""
 
+NO_HALT: Final = frozenset({Mode.CYCLIC_POSITION, Mode.CYCLIC_VELOCITY, Mode.CYCLIC_TORQUE})
+"""Bit 8 of the controlword means nothing in these (CiA 402-2, 12 to 14: set-points alone decide)."""
+
 
 class Modes:
     """Turns set-points into motion while operation is enabled.
@@ -185,7 +188,7 @@ class Modes:
 
     def _heed_halt(self, now: int, t: float) -> None:
         halt = bool(now & HALT)
-        if halt == self._halted:
+        if halt == self._halted or self.mode in NO_HALT:
             return
         self._halted = halt
         if halt:

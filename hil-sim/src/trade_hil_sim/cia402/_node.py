@@ -86,6 +86,7 @@ class Node:
         self.node_id, self.state = node_id, NodeState.BOOTING
         self._store, self._app = store, application
         self._sdo, self._pdos = SdoServer(self), Pdos(store, self)
+        self._served = frozenset({0x000, 0x600 + node_id})
         self._boots_at = inf
         self._beats_at = inf
         self._lost_at = dict[int, float]()
@@ -111,6 +112,15 @@ class Node:
         self._pdos.advance(t)
 
     # what comes over the bus
+
+    def accepts(self, can_id: int) -> bool:
+        """Whether frames of this identifier may concern it: the acceptance filter of its controller."""
+        return (
+            can_id in self._pdos.heard
+            or can_id in self._served
+            or can_id == self._store.get("sync_cob_id") & 0x7FF
+            or 0x700 < can_id <= 0x77F
+        )
 
     def hear(self, frame: Frame, t: float) -> None:
         """Take a frame that concerns this node."""

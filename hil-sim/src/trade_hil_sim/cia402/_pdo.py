@@ -1,5 +1,6 @@
 """Process data objects: which values travel in which frames, and when (CiA 301, 7.2.2). Pure: time is an argument."""
 
+import struct
 from collections.abc import Sequence
 from math import inf
 from typing import Final, Protocol
@@ -11,6 +12,8 @@ from ._store import Abort, AbortCode, Store
 
 __all__ = ["Pdos", "Process"]
 
+FIRST_OBJECT: Final = 0x1000
+"""Below are data types, which a map may name to skip bytes."""
 FIRST_SENT: Final = 0x1800
 """Objects of transmit PDOs begin here; those of receive PDOs come before."""
 NUMBER: Final = 0x1FF
@@ -22,6 +25,7 @@ MOST_BITS: Final = 64
 INHIBIT_S: Final = 1e-4
 TOO_SHORT: Final = 0x8210
 TOO_LONG: Final = 0x8220
+FORMATS: Final = {"u8": "B", "i8": "b", "u16": "H", "i16": "h", "u32": "I", "i32": "i"}
 
 
 class Process(Protocol):
@@ -57,7 +61,9 @@ class _Pdo:
         self.event_s = store.get(f"{name}_event_ms") / 1e3
         count = store.get(f"{name}_count")
         self.carries = [_mapped(store, kind, store.get(f"{name}_entry_{k}")) for k in range(1, count + 1)]
-        self.size = sum(entry.size for entry in self.carries)
+        self.layout = struct.Struct("<" + "".join(FORMATS[entry.kind] for entry in self.carries))
+        self.names = tuple(entry.name for entry in self.carries)
+        self.events = tuple(entry.name for entry in self.carries if not entry.measured)
         self.sent_at = -inf
         self.last: tuple[int, ...] | None = None
         """Values sent last that are not measured."""
@@ -99,12 +105,18 @@ class Pdos:
     def _load(self) -> None:
         self._received = [_Pdo(self._store, "r", k) for k in range(1, PDOS + 1)]
         self._sent = [_Pdo(self._store, "t", k) for k in range(1, PDOS + 1)]
+        self._tune()
+
+    def _tune(self) -> None:
+        self.heard = frozenset(pdo.can_id for pdo in self._received if pdo.valid)
+        """Identifiers of the PDOs it receives."""
 
     def reload(self, index: int) -> None:
         """An object of a PDO has been written: that PDO begins anew."""
         kind, pdos = ("r", self._received) if index < FIRST_SENT else ("t", self._sent)
         number = index & NUMBER
         pdos[number] = _Pdo(self._store, kind, number + 1)
+        self._tune()
 
     def start(self, t: float) -> None:
         """The node is operational: event-driven PDOs are sent once."""
@@ -187,10 +199,10 @@ class Pdos:
     # inside
 
     def _hear(self, pdo: _Pdo, data: bytes, t: float) -> None:
-        if len(data) < pdo.size:
+        if len(data) < pdo.layout.size:
             self._process.complain(TOO_SHORT, t)
             return
-        if len(data) > pdo.size:
+        if len(data) > pdo.layout.size:
             self._process.complain(TOO_LONG, t)
         if pdo.synchronous:
             pdo.held = data
@@ -198,12 +210,8 @@ class Pdos:
             self._apply(pdo, data, t)
 
     def _apply(self, pdo: _Pdo, data: bytes, t: float) -> None:
-        values, at = list[tuple[Object, int]](), 0
-        for entry in pdo.carries:
-            if entry not in DUMMIES:
-                values.append((entry, entry.decode(data[at : at + entry.size])))
-            at += entry.size
-        self._process.take(pdo.name, values, t)
+        values = zip(pdo.carries, pdo.layout.unpack_from(data), strict=True)
+        self._process.take(pdo.name, [(entry, value) for entry, value in values if entry.index >= FIRST_OBJECT], t)
 
     def _sync(self, pdo: _Pdo, t: float) -> None:
         pdo.syncs += 1
@@ -218,15 +226,15 @@ class Pdos:
     def _send(self, pdo: _Pdo, t: float) -> None:
         self._process.refresh(t)
         pdo.sent_at, pdo.waits = t, False
-        pdo.last = self._values(pdo) if pdo.synchronous else self._events(pdo)
-        data = b"".join(self._store.read(entry) for entry in pdo.carries)
-        self._process.transmit(Frame(pdo.can_id, data), t)
+        values = self._values(pdo)
+        pdo.last = values if pdo.synchronous else self._events(pdo)
+        self._process.transmit(Frame(pdo.can_id, pdo.layout.pack(*values)), t)
 
     def _values(self, pdo: _Pdo) -> tuple[int, ...]:
-        return tuple(self._store.get(entry.name) for entry in pdo.carries)
+        return tuple(map(self._store.get, pdo.names))
 
     def _events(self, pdo: _Pdo) -> tuple[int, ...]:
-        return tuple(self._store.get(entry.name) for entry in pdo.carries if not entry.measured)
+        return tuple(map(self._store.get, pdo.events))
 
 
 def _mapped(store: Store, kind: str, value: int) -> Object:

@@ -45,7 +45,7 @@ class Store:
     def __init__(self, objects: Iterable[Object]) -> None:
         self._objects = {(entry.index, entry.sub): entry for entry in objects}
         self._indexes = {index for index, _ in self._objects}
-        self._by_name = {entry.name: entry for entry in self._objects.values()}
+        self._ranges = {entry.name: _range(entry) for entry in self._objects.values()}
         self._values: dict[str, int] = {}
         self.reset()
 
@@ -72,10 +72,8 @@ class Store:
 
     def set(self, name: str, value: int) -> None:
         """Change the value of a number, whatever its access; what does not fit is cut to the nearest that does."""
-        entry = self._by_name[name]
-        bits = 8 * entry.size
-        low, high = (-(1 << bits - 1), (1 << bits - 1) - 1) if entry.signed else (0, (1 << bits) - 1)
-        self._values[name] = min(high, max(low, value))
+        low, high = self._ranges[name]
+        self._values[name] = value if low <= value <= high else min(high, max(low, value))
 
     def read(self, entry: Object) -> bytes:
         """The bytes of an object."""
@@ -91,3 +89,8 @@ class Store:
         if (entry.low is not None and value < entry.low) or (entry.high is not None and value > entry.high):
             raise Abort(AbortCode.VALUE)
         return value
+
+
+def _range(entry: Object) -> tuple[int, int]:
+    bits = 8 * entry.size
+    return (-(1 << bits - 1), (1 << bits - 1) - 1) if entry.signed else (0, (1 << bits) - 1)

@@ -1,0 +1,17 @@
+"""A client of socketcand that sends several frames in one write."""
+
+from collections.abc import Iterable
+
+import can
+from can.interfaces.socketcand import SocketCanDaemonBus
+from can.interfaces.socketcand.socketcand import convert_can_message_to_ascii_message
+
+__all__ = ["ServerBus"]
+
+
+class ServerBus(SocketCanDaemonBus):
+    """python-can's own; each write of its wakes the server, and is acknowledged."""
+
+    def send_all(self, messages: Iterable[can.Message]) -> None:
+        """Frames out, in this order."""
+        self._tcp_send("".join(map(convert_can_message_to_ascii_message, messages)))
