@@ -13,6 +13,7 @@ import msgspec
 from trade import _process
 from trade._access import Access
 from trade._announcing import Announcer
+from trade._arriving import Arriving
 from trade._bordering import Bordering
 from trade._borrowed import Borrowed
 from trade._calls import Caller
@@ -21,8 +22,10 @@ from trade._codec import Codec
 from trade._constraints import where
 from trade._context import handed_down
 from trade._coroutines import AsyncLoop
+from trade._departing import Departing
 from trade._dispatch import Dispatcher
 from trade._estopping import Estopping
+from trade._freezing import Freezing
 from trade._guarding import Guarding
 from trade._handle import Handle, Run
 from trade._hooks import Hooks
@@ -35,11 +38,12 @@ from trade._load import Load
 from trade._locking import Locking
 from trade._locks import LockTable
 from trade._making import Making
+from trade._moving import Moving
 from trade._notifications import Notifier
 from trade._own_services import OwnServices
 from trade._providers import Providers
 from trade._reach import Reach
-from trade._registry import Change, Record, Registry
+from trade._registry import Change, Record, Registry, gone_to
 from trade._request import new_request
 from trade._resources import Holder
 from trade._session import Session
@@ -63,7 +67,7 @@ _PATIENCE_S: Final = 1.0
 """How long a call waits for the registry to hear of a handle that came by message before its registry entry did."""
 
 
-class Container(Hosting, Streaming, Tracing, Guarding, Bordering):
+class Container(Hosting, Moving, Streaming, Tracing, Guarding, Bordering):
     """A participant of a system; most programs use the default one through the functions of ``trade``.
 
     Joins on construction. A context manager; ``close()`` leaves and is idempotent.
@@ -165,6 +169,10 @@ class Container(Hosting, Streaming, Tracing, Guarding, Bordering):
             self.making = Making(self, self._providers, self.withdrawn, self._settings.instantiable)
             """What it made for others."""
             leaving.callback(self.making.close)
+            freezing = Freezing(self._table, self.address)
+            departing = Departing(self, self._providers, freezing, self.access, self._codec)
+            arriving = Arriving(self, self._providers, freezing, self.access, self._codec, clockwork)
+            leaving.callback(arriving.close)
             self._dispatcher = Dispatcher(
                 self._transport, self.address, self._providers.lookup, coroutines, self.access, self.access.callers()
             )
@@ -192,6 +200,8 @@ class Container(Hosting, Streaming, Tracing, Guarding, Bordering):
                 self._spans,
                 self._trace_here,
                 self._streams,
+                departing,
+                arriving,
             )
             self._providers.add(own, (DOMAIN,), name=PROVIDER)
             self._estopping.begin(own)
@@ -359,6 +369,8 @@ class Container(Hosting, Streaming, Tracing, Guarding, Bordering):
 
     def _gone(self, handle: Handle) -> ServiceGone:
         address = handle.key.address
+        if moved_to := self._registry.moved_to(handle.key):
+            return gone_to(handle.label, moved_to)
         if self._registry.is_alive(address):
             reason = "its provider was deregistered" if self._registry.removed(handle.key) else "it is not known here"
         else:

@@ -10,7 +10,8 @@ from trade._deadman import Deadman
 from trade._handle import Handle
 from trade._invoke import container_closed
 from trade._member import Member
-from trade._providers import Providers, checked_groups, checked_health
+from trade._offerable import checked_groups, checked_health
+from trade._providers import Providers
 from trade._transport import ChannelClosed
 from trade._wire import HEALTHY, ProviderInfo, Scalar
 from trade._withdrawn import Withdrawn

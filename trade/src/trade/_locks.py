@@ -97,6 +97,8 @@ class LockTable:
             resource = known or (named if isinstance(named, Resource) else Resource(name))
             if isinstance(named, Resource) and resource is not named:
                 raise ValueError(f"resource {name} is another object already; share one trade.Resource")
+            if known is None and resource.pending is not _STOPPING:  # what is offered anew is kept for nobody
+                resource.pending = None
             resource.epoch, resource.over, resource.gone = self._epoch, self.over, self.gone
             resource.estop = self._estop
             resource.on_rest(self._rested)

@@ -1,8 +1,10 @@
 """The one provider of the middleware's own functions: what is in group ``trade`` of every container."""
 
 from trade._access import Access
+from trade._arriving import Arriving
 from trade._borrowed import Borrowed
 from trade._context import current_call
+from trade._departing import Departing
 from trade._estop_line import EstopReport
 from trade._estopping import LIMIT_S, Estopping
 from trade._hook_services import HookServices
@@ -10,6 +12,7 @@ from trade._hooks import Hooks
 from trade._lock_services import Ask, Asked, GroupsOf, LockServices
 from trade._locks import LockTable
 from trade._making_services import MakingServices
+from trade._migration_services import MigrationServices
 from trade._notification_services import Home, NotificationServices
 from trade._notifications import Notifier
 from trade._registry import Registry
@@ -23,7 +26,14 @@ from trade._wire import Address, Estop
 
 
 class OwnServices(
-    SystemServices, LockServices, NotificationServices, HookServices, TraceServices, MakingServices, StreamServices
+    SystemServices,
+    LockServices,
+    NotificationServices,
+    HookServices,
+    TraceServices,
+    MakingServices,
+    MigrationServices,
+    StreamServices,
 ):
     """One provider, so that one registry entry tells of all its container's own functions."""
 
@@ -45,6 +55,8 @@ class OwnServices(
         spans: Spans,
         trace_here: Switch,
         streams: Streams,
+        departing: Departing,
+        arriving: Arriving,
     ) -> None:
         SystemServices.__init__(self, system)
         LockServices.__init__(self, locks, own, ask, asked, access, groups, borrowed)
@@ -52,6 +64,7 @@ class OwnServices(
         HookServices.__init__(self, hooks, home, access)
         TraceServices.__init__(self, own.container, spans, trace_here)
         MakingServices.__init__(self, system)
+        MigrationServices.__init__(self, departing, arriving)
         StreamServices.__init__(self, streams)
         self._estopping = estopping
 

@@ -272,6 +272,7 @@ class ProviderInfo(Struct, frozen=True, kw_only=True):
     """What the robot's groups consist of: group -> resources, whether or not they are there."""
     estops: tuple[Estop, ...] = ()
     """Of the middleware's own provider: what is open in its container; who hears it takes the union."""
+    moved_to: Annotated[str, Meta(max_length=500)] = ""  # where one that was deregistered goes on: see ServiceGone
 
 
 class _ProviderMessage(ProviderInfo, frozen=True, kw_only=True):
