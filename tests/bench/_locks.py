@@ -64,7 +64,7 @@ def _serve(pipe: Connection, host: str) -> None:
     with Container(Settings.read(container=host, system=_SYSTEM)) as container:
         for name in ("pan", "tilt"):
             for handle in container.register(Joint(f"{host}.{name}"), f"{_GROUP}.{host}.{name}"):
-                local = container._providers.lookup(f"{handle.key.domain}/{handle.key.provider}", handle.name)
+                local = container._parts.providers.lookup(f"{handle.key.domain}/{handle.key.provider}", handle.name)
                 if handle.name == "move_unchecked" and local is not None:
                     local.resources = ()
         pipe.send("ready")

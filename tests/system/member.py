@@ -131,7 +131,7 @@ class Member:
         """Host and label of the group's echo services once their containers are as expected, or after half a minute."""
         wanted = where(group=group, name="echo")
         there = lambda: sorted(handle.container for handle in self.up.services(wanted))  # noqa: E731
-        self.up._registry.wait_for(lambda: there() == sorted(expected), 30)
+        self.up._parts.registry.wait_for(lambda: there() == sorted(expected), 30)
         return [[handle.host, handle.label] for handle in self.up.services(wanted)]
 
     def call_group(self, group: str) -> list[int]:
@@ -218,7 +218,7 @@ class Member:
     def sees(self, count: str) -> list[str]:
         """The echo services once there are so many; whatever there is after half a minute."""
         wanted = where(name="echo")
-        self.up._registry.wait_for(lambda: len(self.up.services(wanted)) == int(count), 30)
+        self.up._parts.registry.wait_for(lambda: len(self.up.services(wanted)) == int(count), 30)
         return [handle.label for handle in self.up.services(wanted)]
 
     def call_all(self) -> int:
@@ -321,7 +321,7 @@ class Member:
 
     def waits(self) -> list[Any]:
         """Of the call that was begun: the reply channel, and its number."""
-        caller = self.up._caller
+        caller = self.up._parts.caller
         [number] = caller._pending
         assert caller._shared is not None
         return [caller._shared.name, number]
@@ -351,7 +351,9 @@ class Member:
         return {
             "own": links._own[:6],
             "peers": [str(peer)[:6] for peer in links._session.info.peers_zid()],
-            "containers": {str(s.address): [s.alive, len(s.providers)] for s in self.up._registry._containers.values()},
+            "containers": {
+                str(s.address): [s.alive, len(s.providers)] for s in self.up._parts.registry._containers.values()
+            },
             "refused": self.up.reach._refused,
         }
 

@@ -205,7 +205,7 @@ def _tried(stage: Stage, action: Action, who: str, *, honest: bool) -> bool:
 def _told_of_sending(actor: Container) -> Iterator[list[str]]:
     """Names of the services that its calls go out to."""
     sent: list[str] = []
-    caller: Any = actor._caller
+    caller: Any = actor._parts.caller
     ask, start = caller.ask, caller.start
 
     def noted(send: Callable[..., Any], *told: Any, **more: Any) -> Any:

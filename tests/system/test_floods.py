@@ -88,4 +88,4 @@ def test_who_comes_with_another_policy_is_heard(lab: Lab) -> None:
     guest = lab.join("guest")
     assert guest.services(where(group="lab")) == []  # the robot's rules are those it began with
     lab.robot.load_policy(lab.policy)
-    assert "guest" in lab.robot._dispatcher.callers
+    assert "guest" in lab.robot._parts.dispatcher.callers

@@ -136,7 +136,7 @@ def test_S07_a_stop_needs_no_role_but_one_must_not_be_revoked(member: Member, ne
 def test_a_denied_call_sends_nothing(member: Member, neck: Neck, monkeypatch: pytest.MonkeyPatch) -> None:
     dash = member("dash")
     move = find(dash, "move")
-    monkeypatch.setattr(dash._caller, "ask", lambda *_: pytest.fail("it was sent"))
+    monkeypatch.setattr(dash._parts.caller, "ask", lambda *_: pytest.fail("it was sent"))
     with pytest.raises(AccessDenied):
         move(0.1)
 

@@ -119,13 +119,13 @@ def test_progress_is_sent_at_most_every_fifty_milliseconds(
 ) -> None:
     there.register(walk, "robot")
     sent: list[int] = []
-    answer = there._dispatcher._answer
+    answer = there._parts.dispatcher._answer
 
     def note(*args: Any) -> None:
         sent.append(args[3])
         answer(*args)
 
-    monkeypatch.setattr(there._dispatcher, "_answer", note)
+    monkeypatch.setattr(there._parts.dispatcher, "_answer", note)
     began = time.monotonic()
     run = here.find(trade.where(name="tell"), wait_s=20).start(list(range(20_000)))
     assert eventually(lambda: run.progress() == {"share": 19_999})

@@ -25,8 +25,8 @@ class Echo:
 
 
 def peers(container: Container) -> int:
-    assert isinstance(container._transport, ZenohTransport)
-    return len(container._transport._session.info.peers_zid())
+    assert isinstance(container._parts.transport, ZenohTransport)
+    return len(container._parts.transport._session.info.peers_zid())
 
 
 @pytest.mark.parametrize("first", [0, 1], ids=["dialling", "dialled"])

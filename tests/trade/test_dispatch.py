@@ -275,16 +275,16 @@ def test_only_so_many_reply_keys_are_kept_and_evicted_ones_work_again(
     for thread in threads:
         thread.join(20)
         assert not thread.is_alive()
-    assert len(there._dispatcher._repliers) <= 2
+    assert len(there._parts.dispatcher._repliers) <= 2
 
 
 def test_a_reply_key_let_go_while_answering_is_declared_again(here: Container, there: Container) -> None:
     class Evicting:
         @service
         def answer(self) -> str:
-            for replier in there._dispatcher._repliers.values():
+            for replier in there._parts.dispatcher._repliers.values():
                 replier.close()
-            there._dispatcher._repliers.clear()
+            there._parts.dispatcher._repliers.clear()
             return "still here"
 
     there.register(Evicting(), "robot")

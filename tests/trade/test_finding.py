@@ -108,7 +108,7 @@ def test_services_of_two_containers_of_one_name_are_told_apart(here: Container, 
     twins = [start_container("twin"), start_container("twin")]
     for twin in twins:
         twin.register(Arm(), "rosie")
-    assert here._registry.wait_for(lambda: len(here.services(where(name="angle"))) == 2, 20)
+    assert here._parts.registry.wait_for(lambda: len(here.services(where(name="angle"))) == 2, 20)
     with pytest.raises(TooManyServices) as many:
         here.find(where(name="angle"))
     assert sorted(many.value.matches) == sorted(f"rosie.angle of Arm-1 in {twin.address}" for twin in twins)
@@ -134,7 +134,7 @@ def test_the_containers_of_the_system_are_listed(here: Container, there: Contain
 def test_a_closed_container_is_no_longer_listed(here: Container, there: Container) -> None:
     assert {info.name for info in here.containers()} >= {"here"}
     there.close()
-    assert here._registry.wait_for(lambda: [info.name for info in here.containers()] == ["here"], 20)
+    assert here._parts.registry.wait_for(lambda: [info.name for info in here.containers()] == ["here"], 20)
 
 
 def test_systems_on_one_host_do_not_see_each_other(here: Container) -> None:

@@ -274,7 +274,7 @@ def test_a_handle_is_dead_after_its_container_closed(here: Container, there: Con
     there.close()
     with pytest.raises((ServiceGone, ConnectionError)):
         add()
-    here._registry.wait_for(lambda: not add.alive, 20)
+    here._parts.registry.wait_for(lambda: not add.alive, 20)
     with pytest.raises(ServiceGone, match="container there has ended, restarted or cannot be reached"):
         add()
 
@@ -287,7 +287,7 @@ def test_a_handle_of_an_earlier_boot_never_reaches_the_next_one(start_container:
     new = start_container("robot")
     fresh_counter = Counter()
     new.register(fresh_counter, "a")
-    here._registry.wait_for(lambda: not stale.alive, 20)
+    here._parts.registry.wait_for(lambda: not stale.alive, 20)
     with pytest.raises(ServiceGone):
         stale()
     fresh = found(here, "add")

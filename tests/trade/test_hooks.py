@@ -410,7 +410,7 @@ def test_a_call_goes_on_when_the_last_hook_is_detached_as_it_begins(
 ) -> None:
     [plan, *_] = here.register(planner, "mind")
     here.before_service(plan, watch("see"))
-    hooked = here._providers.service(plan.key)
+    hooked = here._parts.providers.service(plan.key)
     assert hooked is not None
 
     class Detached(LocalService):

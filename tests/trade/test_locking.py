@@ -134,7 +134,7 @@ def test_S15_the_first_started_call_under_a_lock_of_elsewhere_carries_it(robot: 
     fresh = robot.system.container("fresh")
     handle, unasked = robot.find("a", whose=fresh), robot.find("b", whose=fresh)
     with fresh.lock([handle, unasked]):
-        peer = fresh._caller.peer(unasked.key.address)
+        peer = fresh._parts.caller.peer(unasked.key.address)
         peer._low_ns, peer._high_ns = -math.inf, math.inf  # as if it had never been heard
         assert unasked.start(0.5).result(20) == 0.5
 

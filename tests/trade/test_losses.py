@@ -98,7 +98,7 @@ def test_a_restarted_callee_is_found_again_without_restarting_the_caller(
     driver.kill()
     again = start_program(DRIVER)
     again.heard()
-    assert here._registry.wait_for(lambda: not first.alive, 20)
+    assert here._parts.registry.wait_for(lambda: not first.alive, 20)
     second = found(here, "pid")
     assert second != first
     assert second() == again.process.pid
@@ -112,11 +112,11 @@ def test_a_frozen_callee_is_lost_after_its_lease_and_back_when_it_wakes(here: Co
     driver.heard()
     driver.freeze()
     assert isinstance(run.exception(), ContainerLost)
-    assert here._registry.wait_for(lambda: not pid.alive, 20)
+    assert here._parts.registry.wait_for(lambda: not pid.alive, 20)
     with pytest.raises(ServiceGone):
         pid()
     driver.thaw()
-    assert here._registry.wait_for(lambda: pid.alive, 20)
+    assert here._parts.registry.wait_for(lambda: pid.alive, 20)
     assert pid() == driver.process.pid
     assert found(here, "pid") == pid
 
@@ -125,13 +125,13 @@ def test_what_is_known_of_a_clock_is_void_once_its_container_was_out_of_sight(he
     """A computer that sleeps stops its clock: an expiry reckoned by the old offset would be too late."""
     hang = found(here, "hang")
     assert found(here, "pid")() == driver.process.pid
-    caller, address = here._caller, hang.key.address
+    caller, address = here._parts.caller, hang.key.address
     assert caller.peer(address).clock_known
     caller.lost(address)
     assert caller.peer(address).expiry_ns(10**12) is None
     caller.lost(address, back=True)
     assert not caller.peer(address).clock_known
-    here._targets.clear()
+    here._parts.targets.known.clear()
     assert found(here, "pid")() == driver.process.pid
     assert caller.peer(address).clock_known
 

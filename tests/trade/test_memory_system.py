@@ -326,7 +326,7 @@ def test_what_is_lost_with_a_whole_storm_is_one_question() -> None:
 @contextlib.contextmanager
 def held(container: Container) -> Iterator[None]:
     """While this lasts a container asks nobody: whatever it misses comes together."""
-    asker, unlocked = container._watch._asker, threading.Event()
+    asker, unlocked = container._parts.watch._asker, threading.Event()
     asker._beat, asker._next_beat = lambda: unlocked.wait(20), 0.0
     with asker._changed:
         asker._changed.notify_all()
@@ -346,10 +346,11 @@ def test_a_container_that_says_nothing_of_itself_is_asked_again_less_and_less_of
         questions = ghost.questions("registry/*/it/ghost/e1/*")
         ghost.appear("alive/it/ghost/e1")
         pauses = list[float]()
+        known, silent = a._parts.watch._asker._pauses, Address("it", "ghost", "e1")
         for _ in range(5):
             questions.receive().close()
-            assert eventually(lambda: a._watch._asker._pauses.get(Address("it", "ghost", "e1"), 0) not in [0, *pauses])
-            pauses.append(a._watch._asker._pauses[Address("it", "ghost", "e1")])
+            assert eventually(lambda: known.get(silent, 0) not in [0, *pauses])
+            pauses.append(known[silent])
         assert pauses == [0.001 * 2**turn for turn in range(5)]
         system.container("b").register(Lamp(), "robot")
         assert found(a)(0.5) == 0.5
@@ -407,11 +408,11 @@ def test_more_containers_than_ever_end_and_one_of_them_returns_with_all_its_serv
             ghost = MemoryTransport(system.network, f"ghost-{number}")
             ghost.appear(f"alive/it/ghost/e{number}")
             ghost.close()
-        assert eventually(lambda: not a._watch.busy)
+        assert eventually(lambda: not a._parts.watch.busy)
         system.heal()
         system.settle()
         assert labels(a) == ["b/robot.dim"]
-        assert len(a._registry._containers) == len(a._caller._peers) + 1 == 2
+        assert len(a._parts.registry._containers) == len(a._parts.caller._peers) + 1 == 2
 
 
 # --- deaths, at every message

@@ -361,7 +361,7 @@ def ask(scene: Scene, name: str) -> Handle:
 
 def prepare(scene: Scene) -> Any:
     kind = scene.module.Counter
-    print_of = _arriving.fingerprint(kind, (), scene.old._codec)
+    print_of = _arriving.fingerprint(kind, (), scene.old._parts.codec)
     luggage = _arriving.Luggage(class_path=path_of(kind), fingerprint=print_of, groups=("hall",))
     return ask(scene, "prepare_arrival")(luggage)
 

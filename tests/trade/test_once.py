@@ -140,7 +140,7 @@ def test_what_expired_is_said_to_have_expired_however_often_it_comes(line: Line,
 def test_answers_of_what_reads_are_not_kept(here: Container, line: Line) -> None:
     line.put(call(name="look"))
     line.answer()
-    assert here._dispatcher._once._calls == {}
+    assert here._parts.dispatcher._once._calls == {}
 
 
 # --- the bounds
@@ -212,7 +212,7 @@ def test_S02_what_waits_is_sent_again_when_the_link_to_the_same_epoch_is_back(
     thread.start()
     assert motor.entered.wait(20)
     sent: list[Call] = []
-    once = there._dispatcher._once
+    once = there._parts.dispatcher._once
     attach = once.attach
     again = threading.Event()
 
@@ -223,7 +223,7 @@ def test_S02_what_waits_is_sent_again_when_the_link_to_the_same_epoch_is_back(
         return answer
 
     once.attach = note  # type: ignore[method-assign]
-    here._caller.lost(there.address, back=True)
+    here._parts.caller.lost(there.address, back=True)
     assert again.wait(20)
     motor.open.set()
     thread.join(20)
@@ -233,6 +233,6 @@ def test_S02_what_waits_is_sent_again_when_the_link_to_the_same_epoch_is_back(
 
 
 def test_a_container_that_returns_is_sent_nothing_if_nothing_waits(here: Container, there: Container) -> None:
-    here._caller.lost(there.address, back=True)
-    assert here._caller._pending == {}
-    assert here._caller.peer(Address("a", "b", "c")).clock_known is False
+    here._parts.caller.lost(there.address, back=True)
+    assert here._parts.caller._pending == {}
+    assert here._parts.caller.peer(Address("a", "b", "c")).clock_known is False

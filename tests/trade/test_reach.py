@@ -205,4 +205,4 @@ def test_a_container_reached_at_its_endpoint_is_reached_again_after_its_restart(
                 clock = client.find(where(name="clock", container="server", local=False), wait_s=30)
                 assert clock.key.address == server.address
                 assert clock() > 0
-            assert client._registry.wait_for(lambda clock=clock: not clock.alive, 20)
+            assert client._parts.registry.wait_for(lambda clock=clock: not clock.alive, 20)

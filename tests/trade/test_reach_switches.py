@@ -89,9 +89,9 @@ def test_containers_of_other_systems_are_not_linked(start_container: Any) -> Non
     other.system.set_discovery(True)
     with pytest.raises(NoSuchService):
         clock_of(other, "a", wait_s=1.5)
-    assert isinstance(other._transport, ZenohTransport)
-    assert isinstance(one._transport, ZenohTransport)
-    assert not other._transport.links.linked(str(one._transport._session.zid()))
+    assert isinstance(other._parts.transport, ZenohTransport)
+    assert isinstance(one._parts.transport, ZenohTransport)
+    assert not other._parts.transport.links.linked(str(one._parts.transport._session.zid()))
 
 
 def test_a_container_is_connected_while_it_runs(apart: tuple[Container, Container]) -> None:
@@ -141,7 +141,7 @@ def test_what_was_connected_is_linked_again_after_its_restart(start_container: A
         here.system.connect(endpoint)
         assert clock_of(here, "there").key.address == there.address
         first = clock_of(here, "there")
-    assert here._registry.wait_for(lambda: not first.alive, 20)
+    assert here._parts.registry.wait_for(lambda: not first.alive, 20)
     again = start_container("there", **settings)
     assert clock_of(here, "there").key.address == again.address
 
@@ -164,7 +164,7 @@ def test_what_was_disconnected_is_dialled_no_more(start_container: Any, here: Co
     with start_container("there", **settings):
         here.system.connect(endpoint)
         first = clock_of(here, "there")
-    assert here._registry.wait_for(lambda: not first.alive, 20)
+    assert here._parts.registry.wait_for(lambda: not first.alive, 20)
 
     def disconnected() -> bool:  # its sign of life falls a moment before its link does
         try:

@@ -168,4 +168,4 @@ def test_a_result_with_a_description_that_makes_no_sense_stays_plain_data(
     here: Container, broken: dict[str, Any]
 ) -> None:
     info = ServiceInfo(name="go", signature="go()", result_schema=schema_message(broken, {}))
-    assert result_decoder(here._codec, info)(msgspec.msgpack.encode([1])) == [1]
+    assert result_decoder(here._parts.codec, info)(msgspec.msgpack.encode([1])) == [1]

@@ -25,7 +25,7 @@ def twins(start_container: Any) -> tuple[Container, Container]:
 
 def clocks(looking: Container, name: str, count: int) -> list[Handle]:
     wanted = where(name="clock", container=name)
-    assert looking._registry.wait_for(lambda: len(looking.services(wanted)) == count, 20)
+    assert looking._parts.registry.wait_for(lambda: len(looking.services(wanted)) == count, 20)
     return looking.services(wanted)
 
 
@@ -48,7 +48,7 @@ def test_when_one_of_two_of_a_name_ends_the_other_stays(twins: tuple[Container, 
     one, other = twins
     handles = {handle.key.address: handle for handle in clocks(here, "twin", 2)}
     one.close()
-    assert here._registry.wait_for(lambda: not handles[one.address].alive, 20)
+    assert here._parts.registry.wait_for(lambda: not handles[one.address].alive, 20)
     assert handles[other.address]() > 0
 
 

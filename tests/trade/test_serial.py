@@ -69,7 +69,7 @@ def test_serial_calls_run_one_at_a_time_in_order_of_arrival(offer: Any, bench: B
 def work_serial(work: Handle) -> Any:
     """The queue behind a handle, wherever its provider lives."""
     [home] = [one for one in _process.live if one.address == work.key.address]
-    service = home._providers.lookup(f"{work.key.domain}/{work.key.provider}", work.name)
+    service = home._parts.providers.lookup(f"{work.key.domain}/{work.key.provider}", work.name)
     assert service is not None
     return service.serial
 
@@ -81,7 +81,7 @@ def test_waiting_takes_no_threads_and_neither_stops_nor_others_wait(
     work, beside, stop = (here.find(where(name=name), wait_s=20) for name in ("work", "beside", "stop"))
     runs = [work.start(i) for i in range(200)]
     assert eventually(lambda: len(work_serial(work)._queue) == 199)
-    assert len(there._dispatcher._crews[0]._threads) < 50  # 199 wait; taking calls in may itself need several
+    assert len(there._parts.dispatcher._crews[0]._threads) < 50  # 199 wait; taking calls in may itself need several
     assert (beside(), stop()) == ("beside", "stopped")
     bench.open.set()
     assert sorted(run.result(30) for run in runs) == list(range(200))

@@ -72,7 +72,7 @@ def test_S03_a_call_that_comes_after_the_end_of_its_session_is_refused(robot: Ro
     with session.use():
         move(1.0)
     home = robot.system.container("a")
-    home._session_ended(session.name)
+    home._parts.session_ended(session.name)
     with session.use(), pytest.raises(SessionEnded):
         move(2.0)
     assert robot.joints["a"].written == [1.0]

@@ -576,7 +576,7 @@ class Quiet(Publisher):
 def test_who_does_not_say_again_that_it_listens_is_let_go_of(here: Container) -> None:
     battery = Battery()
     [count] = [handle for handle in here.register(battery, "rosie") if handle.name == "count"]
-    local = here._providers.service(count.key)
+    local = here._parts.providers.service(count.key)
     source = Source(count.key, lambda: local, Quiet(), itertools.count(1).__next__)
     now = time.monotonic_ns()
     source.wish(("session", "kept"), Wish("tester", 1, on_change=False, until_ns=now + 10**12))

@@ -46,8 +46,8 @@ def strangers(tmp_path: Path) -> Papers:
 
 def links(container: Container) -> list[tuple[str, str]]:
     """Where its links lead, and who is there."""
-    assert isinstance(container._transport, ZenohTransport)
-    found = container._transport._session.info.links()
+    assert isinstance(container._parts.transport, ZenohTransport)
+    found = container._parts.transport._session.info.links()
     return sorted((str(link.dst).partition("/")[0], str(link.auth_identifier)) for link in found)
 
 

@@ -94,7 +94,7 @@ def _last(container: Container, name: str) -> int:
 
 
 def _served(container: Container, handle: Handle) -> LocalService:
-    service = container._providers.service(handle.key)
+    service = container._parts.providers.service(handle.key)
     assert service is not None
     return service
 
@@ -108,13 +108,13 @@ def test_untraced_nothing_stands_around_a_service_and_nothing_is_noted(
     reach = _served(there, here.find(where(name="reach"), wait_s=20))
     here.call(where(name="reach"), 0.1)
     assert reach.around is None
-    assert here._caller.spans is None
+    assert here._parts.caller.spans is None
     assert here.spans() == []
     here.set_tracing(True)
     assert reach.around is not None
     here.set_tracing(False)
     assert reach.around is None
-    assert here._caller.spans is None
+    assert here._parts.caller.spans is None
 
 
 def test_the_notes_are_bounded(here: Container, monkeypatch: pytest.MonkeyPatch, start_container: Any) -> None:

@@ -23,7 +23,7 @@ def host(here: Container, open_raw: Any) -> Iterator[Announcer]:
     raw = open_raw(here)
     announcer = Announcer(raw, HOST)
     sign = raw.appear(alive_key(HOST))
-    assert here._registry.wait_for(lambda: here._registry.is_alive(HOST), 20)
+    assert here._parts.registry.wait_for(lambda: here._parts.registry.is_alive(HOST), 20)
     yield announcer
     sign.close()
     announcer.close()

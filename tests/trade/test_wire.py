@@ -386,7 +386,7 @@ def test_entries_count_only_while_their_container_shows_itself(
     assert here.find(where(group="forged"), wait_s=20).container == "ghost"
     sign.close()
     assert eventually(lambda: here.services(where(group="forged")) == [])
-    assert FORGED not in here._registry._containers
+    assert FORGED not in here._parts.registry._containers
 
 
 def test_a_newer_revision_of_an_entry_replaces_it_and_an_older_one_does_not(
@@ -435,7 +435,7 @@ def test_a_flood_of_entries_ends_at_a_limit_and_disturbs_nobody(
     monkeypatch.setattr("trade._registry._MOST_PROVIDERS", 100)
     raw, _ = announcer
     _sign = raw.appear(alive_key(FORGED))
-    assert eventually(lambda: FORGED in here._registry._containers)
+    assert eventually(lambda: FORGED in here._parts.registry._containers)
     for number in range(2000):
         entry = msgspec.structs.replace(PROVIDER, revision=3 * number + 1)
         raw.announce(registry_key("robot", FORGED, f"P-{number}"), encode_message(entry))
@@ -474,7 +474,7 @@ class FakeCallee:
         self.handle: Handle = caller.find(where(group="forged"), wait_s=20)
 
     def describe(self, entry: ProviderInfo) -> None:
-        registry = self.caller._registry
+        registry = self.caller._parts.registry
         assert registry.wait_for(lambda: registry.is_alive(FORGED), 20)
         self.raw.announce(registry_key("robot", FORGED, "P-1"), encode_message(entry))
 

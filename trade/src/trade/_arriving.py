@@ -6,7 +6,7 @@ import secrets
 import threading
 import time
 from collections.abc import Sequence
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 from msgspec import Struct, structs
 
@@ -79,26 +79,21 @@ def fingerprint(kind: type, implements: Sequence[type], codec: Codec) -> str:
     return hashlib.sha256(encode_message((path_of(kind), version, is_stateful(kind), told))).hexdigest()
 
 
-class Home(Protocol):
-    """The container it comes to."""
-
-    address: Final[Address]
-    making: Making
-
-
 class Arriving:
     """Owns what was prepared here and is not offered yet."""
 
     def __init__(
         self,
-        home: Home,
+        own: Address,
         providers: Providers,
+        making: Making,
         freezing: Freezing,
         access: Access,
         codec: Codec,
         clockwork: Clockwork,
     ) -> None:
-        self._home = home
+        self._own = own
+        self._making = making
         self._providers = providers
         self._freezing = freezing
         self._access = access
@@ -122,7 +117,7 @@ class Arriving:
         """
         self._require(luggage, caller)
         if not self._places.acquire(blocking=False):
-            raise Busy(service="trade.prepare_arrival", container=self._home.address.container)
+            raise Busy(service="trade.prepare_arrival", container=self._own.container)
         ticket = secrets.token_hex(8)
         with contextlib.ExitStack() as undo:
             undo.callback(self._places.release)
@@ -141,13 +136,12 @@ class Arriving:
             self._access.require(caller, "register", group, f"{luggage.class_path} in {group}")
 
     def _make(self, luggage: Luggage, ending: contextlib.ExitStack) -> tuple[object, Built]:
-        making = self._home.making
-        kind = making.find(luggage.class_path)
+        kind = self._making.find(luggage.class_path)
         implements = [self._interface(path) for path in luggage.implements]
         if fingerprint(kind, implements, self._codec) != luggage.fingerprint:
             problem = "its class is another version there: other services, other arguments or another state_version"
             raise self._refusal(luggage, problem)
-        made = making.make(kind, luggage.args)
+        made = self._making.make(kind, luggage.args)
         ending.callback(end, made)
         groups = checked_groups(made, luggage.groups)
         built = self._providers.build(made, groups, implements, meta=luggage.meta)
@@ -157,7 +151,7 @@ class Arriving:
     def _interface(self, path: str) -> type:
         found = imported(path)
         if not isinstance(found, type):
-            here = self._home.address.container
+            here = self._own.container
             raise NoSuchClass(class_path=path, container=here, reason="nothing there has imported this interface")
         return found
 
@@ -187,7 +181,7 @@ class Arriving:
         with self._lock:
             ready = self._ready.get(ticket)
             if ready is None or ready.caller != caller:
-                here = self._home.address.container
+                here = self._own.container
                 problem = "what was prepared there is not there any more"
                 raise CannotMigrate(provider="it", to=here, problem=problem)
             del self._ready[ticket]
@@ -202,7 +196,7 @@ class Arriving:
             self._arrived.pop(ticket, None)
             ready.standing.close()
             raise
-        self._home.making.keep(ready.provider, ready.luggage.args)
+        self._making.keep(ready.provider, ready.luggage.args)
         ready.ending.pop_all()
         ready.standing.close()
 
@@ -232,4 +226,4 @@ class Arriving:
             self._over(ticket)
 
     def _refusal(self, luggage: Luggage, problem: str) -> CannotMigrate:
-        return CannotMigrate(provider=luggage.class_path, to=self._home.address.container, problem=problem)
+        return CannotMigrate(provider=luggage.class_path, to=self._own.container, problem=problem)

@@ -8,15 +8,12 @@ from msgspec import structs
 
 from trade._borrowed import Borrowed, SharedResource
 from trade._codec import Codec
-from trade._coroutines import AsyncLoop
 from trade._dispatch import LocalService
 from trade._estopping import Estopping
 from trade._handle import Handle
 from trade._locking import Locking
-from trade._locks import LockTable
 from trade._member import Member
 from trade._passing import Speaking, passed_on_service
-from trade._providers import Providers
 from trade._registry import Registry
 from trade._resources import Resource
 from trade._session import Session
@@ -56,12 +53,6 @@ class Bordering(Member):
 
     locking: Locking
     borrowed: Borrowed
-    _registry: Registry
-    _providers: Providers
-    _table: LockTable
-    _estopping: Estopping
-    _coroutines: AsyncLoop
-    _told_of_ends: list[Callable[[str], None]]
 
     # --- showing
 
@@ -73,7 +64,7 @@ class Bordering(Member):
         """Every provider of the system that may offer what it does, the middleware's own left out."""
         return {
             Place(state.address, entry.domain, name): entry.info
-            for state in self._registry.containers()
+            for state in self._parts.registry.containers()
             for name, entry in list(state.providers.items())
             if entry.records and entry.domain != DOMAIN
         }
@@ -81,23 +72,23 @@ class Bordering(Member):
     @property
     def registry(self) -> Registry:
         """What is offered in its system."""
-        return self._registry
+        return self._parts.registry
 
     @property
     def told_of_ends(self) -> list[Callable[[str], None]]:
         """Called with every session that ends; none of them keeps anybody waiting."""
-        return self._told_of_ends
+        return self._parts.told_of_ends
 
     @property
     def estopping(self) -> Estopping:
         """Its e-stops."""
-        return self._estopping
+        return self._parts.estopping
 
     def require_present(self, session: str) -> None:
         """Raises SessionEnded: its container is not there, or it has ended."""
         address = Address(*session.split("/")[:3])
-        there = self._registry.wait_for(lambda: self._registry.is_alive(address), _PATIENCE_S)
-        if (ended := self._table.gone((session,))) is not None:
+        there = self._parts.registry.wait_for(lambda: self._parts.registry.is_alive(address), _PATIENCE_S)
+        if (ended := self._parts.locks.gone((session,))) is not None:
             raise ended
         if not there:
             raise SessionEnded(session=session, reason="nobody of that name is here")
@@ -123,10 +114,10 @@ class Bordering(Member):
                 return {one.name: self._passed_on(place, one, info, home, adopted) for one in info.services}
             except ValueError as twice:
                 for one in adopted:
-                    self._table.drop(one)
+                    self._parts.locks.drop(one)
                 raise ConfigurationError(where=place, problem=str(twice)) from None
 
-        return Place(self.address, *self._providers.pass_on(provider, info, make))
+        return Place(self.address, *self._parts.providers.pass_on(provider, info, make))
 
     def _passed_on(
         self, place: str, service: ServiceInfo, info: ProviderInfo, home: Home, adopted: list[Resource]
@@ -134,17 +125,17 @@ class Bordering(Member):
         label = f"{info.groups[0] if info.groups else info.kind}.{service.name}"
         handle, first = home.handle(home.place.service(service.name)), len(adopted)
         for here, there in _lockable(place, service, home.place).items():
-            adopted.append(self._table.adopt(home.adopt(here, there)))
+            adopted.append(self._parts.locks.adopt(home.adopt(here, there)))
         resources = tuple(adopted[first:])
-        return passed_on_service(label, service, handle, home.speaking, home.codec, resources, self._coroutines)
+        return passed_on_service(label, service, handle, home.speaking, home.codec, resources, self._parts.coroutines)
 
     def tell_anew(self, provider: object, info: ProviderInfo) -> None:
         """Tell something else about what is passed on; its services are the same."""
-        self._providers.alter(provider, lambda known: structs.replace(info, revision=known.revision))
+        self._parts.providers.alter(provider, lambda known: structs.replace(info, revision=known.revision))
 
     def withdraw(self, provider: object) -> None:
         """Pass it on no more. Raises ConfigurationError: it was withdrawn already."""
-        self._providers.remove(provider)
+        self._parts.providers.remove(provider)
 
     def function(self, address: Address, name: str) -> Handle:
         """A function of the middleware of one container."""

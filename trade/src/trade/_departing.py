@@ -47,10 +47,8 @@ _ASK_S: Final = 2.0
 class Home(Protocol):
     """The container it leaves."""
 
-    address: Final[Address]
-    making: Making
-    withdrawn: Withdrawn
-
+    @property
+    def address(self) -> Address: ...
     def handle(self, key: ServiceKey) -> Handle: ...
     def has(self, key: ServiceKey) -> bool: ...
     def find(self, constraint: Constraint, *, wait_s: float = ...) -> Handle: ...
@@ -60,9 +58,20 @@ class Home(Protocol):
 class Departing:
     """Sends providers of one container to another one, and takes or gives their state."""
 
-    def __init__(self, home: Home, providers: Providers, freezing: Freezing, access: Access, codec: Codec) -> None:
+    def __init__(
+        self,
+        home: Home,
+        providers: Providers,
+        making: Making,
+        withdrawn: Withdrawn,
+        freezing: Freezing,
+        access: Access,
+        codec: Codec,
+    ) -> None:
         self._home = home
         self._providers = providers
+        self._making = making
+        self._withdrawn = withdrawn
         self._freezing = freezing
         self._access = access
         self._codec = codec
@@ -145,7 +154,7 @@ class Departing:
                 _require_time(service, there)
                 still.check()
                 still.seal()
-                name = self._home.withdrawn.take_off(service.key, moved_to=_moved_to(keys[0]))
+                name = self._withdrawn.take_off(service.key, moved_to=_moved_to(keys[0]))
             except BaseException:
                 still.unseal()
                 with contextlib.suppress(TradeError):  # it ends there by itself then
@@ -187,7 +196,7 @@ class Departing:
         except Exception as error:
             problem = f"save_state: {type(error).__name__}: {error}"
             raise CannotMigrate(provider=service.label, to=there.container, problem=problem) from error
-        given = self._home.making.arguments_of(offer.provider) if args is None else args
+        given = self._making.arguments_of(offer.provider) if args is None else args
         return Luggage(
             class_path=path_of(kind),
             fingerprint=fingerprint(kind, offer.implements, self._codec),
@@ -216,9 +225,9 @@ class Departing:
         except TradeError as error:
             problem = str(error)
         if problem:
-            self._home.withdrawn.put_back(name, None)
+            self._withdrawn.put_back(name, None)
             raise CannotMigrate(provider=service.label, to=there.container, problem=problem, withdrawn=True)
-        self._home.making.let_go(offer.provider)
+        self._making.let_go(offer.provider)
 
     def _came(self, keys: list[ServiceKey], ticket: str) -> bool:
         """Whether it is offered there; if not, it never will be. Raises TradeError if nobody can say."""

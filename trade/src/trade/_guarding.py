@@ -4,7 +4,7 @@ from collections.abc import Iterable, Sequence
 
 from trade._constraints import Constraint
 from trade._estop_line import EstopReport
-from trade._estopping import LIMIT_S, Estopping
+from trade._estopping import LIMIT_S
 from trade._handle import Handle
 from trade._lock import Lock, OnLost, OnRequest
 from trade._locking import LEASE_S, Locking
@@ -17,8 +17,6 @@ class Guarding(Member):
     """Who may use what, and who may not move at all."""
 
     locking: Locking
-    """Its locks on what others offer, and on what it offers itself."""
-    _estopping: Estopping
 
     # --- locks
 
@@ -122,12 +120,12 @@ class Guarding(Member):
             limit_s: how long to try, in seconds; also if nobody is found.
         """
         self._check_open()
-        return self._estopping.estop(reason, limit_s)
+        return self._parts.estopping.estop(reason, limit_s)
 
     def estops(self) -> list[Estop]:
         """The e-stops that are open anywhere in the system, oldest first."""
         self._check_open()
-        return self._estopping.open()
+        return self._parts.estopping.open()
 
     def estop_clear(self, ids: Sequence[str], *, limit_s: float = LIMIT_S) -> EstopReport:
         """Clear e-stops by their ids; once none is open, calls are let through again. Nothing moves by itself.
@@ -144,4 +142,4 @@ class Guarding(Member):
             AccessDenied: the policy does not let this container administer the system.
         """
         self._check_open()
-        return self._estopping.clear(ids, limit_s)
+        return self._parts.estopping.clear(ids, limit_s)

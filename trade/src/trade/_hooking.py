@@ -1,11 +1,9 @@
 """The part of a container that attaches hooks: call this before that service, or after it, wherever that runs."""
 
 import contextlib
-import itertools
 import logging
 from typing import Final
 
-from trade._access import Access
 from trade._constraints import Constraint, where
 from trade._handle import Bound, Handle, Run
 from trade._hooks import HookInfo, Side
@@ -80,9 +78,6 @@ class Hook:
 class Hooking(Notifying):
     """Hooks of this container on services anywhere."""
 
-    _hook_numbers: "itertools.count[int]"
-    access: Access
-
     def before_service(self, target: Handle | Constraint, call: Handle) -> Hook:
         """Have a service called before each call of another one, with what that is called with.
 
@@ -115,7 +110,7 @@ class Hooking(Notifying):
             rest = "without arguments of its own" if isinstance(call, Bound) else "as it runs where the service does"
             raise ConfigurationError(where=named, problem=f"call must be a handle, {rest}, not {call!r}")
         self._require_instrument(target)
-        hook = Hook(self, f"{self.address.epoch}.h{next(self._hook_numbers)}", side, target, call)
+        hook = Hook(self, f"{self.address.epoch}.h{next(self._parts.hook_numbers)}", side, target, call)
         hook.begin()
         return hook
 

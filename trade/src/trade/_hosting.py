@@ -6,25 +6,18 @@ from collections.abc import Callable, Mapping, Sequence
 from msgspec import structs
 
 from trade._constraints import checked_meta
-from trade._deadman import Deadman
 from trade._handle import Handle
 from trade._invoke import container_closed
 from trade._member import Member
 from trade._offerable import checked_groups, checked_health
-from trade._providers import Providers
 from trade._transport import ChannelClosed
 from trade._wire import HEALTHY, ProviderInfo, Scalar
-from trade._withdrawn import Withdrawn
 
 _logger = logging.getLogger("trade")
 
 
 class Hosting(Member):
     """Offers objects to the whole system."""
-
-    _providers: Providers
-    _deadman: Deadman
-    withdrawn: Withdrawn
 
     def register(
         self,
@@ -52,10 +45,10 @@ class Hosting(Member):
         """
         self._check_open()
         try:
-            keys = self._providers.add(provider, checked_groups(provider, groups), implements, meta=meta)
+            keys = self._parts.providers.add(provider, checked_groups(provider, groups), implements, meta=meta)
         except ChannelClosed:  # closed by another thread meanwhile
             raise container_closed(self.address) from None
-        self.withdrawn.forget(provider)
+        self._parts.withdrawn.forget(provider)
         return tuple(self.handle(key) for key in keys)
 
     def deregister(self, provider: object) -> None:
@@ -67,10 +60,11 @@ class Hosting(Member):
             ConfigurationError: it is not registered here.
         """
         self._check_open()
-        if not self.withdrawn.forget(provider):
-            for problem in self._deadman.rest(self._providers.alone_with(provider), "its services are withdrawn"):
+        parts = self._parts
+        if not parts.withdrawn.forget(provider):
+            for problem in parts.deadman.rest(parts.providers.alone_with(provider), "its services are withdrawn"):
                 _logger.error("withdrawn without having been stopped: %s", problem)
-            self._providers.remove(provider)
+            parts.providers.remove(provider)
 
     def set_groups(self, provider: object, groups: str | Sequence[str]) -> None:
         """Put a live provider into other groups. Handles stay valid: its place was settled when it was registered.
@@ -119,6 +113,6 @@ class Hosting(Member):
     def _alter(self, provider: object, change: Callable[[ProviderInfo], ProviderInfo], *, reread: bool = False) -> None:
         self._check_open()
         try:
-            self._providers.alter(provider, change, reread=reread)
+            self._parts.providers.alter(provider, change, reread=reread)
         except ChannelClosed:  # closed by another thread meanwhile
             raise container_closed(self.address) from None

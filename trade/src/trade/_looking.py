@@ -9,7 +9,7 @@ from trade._constraints import Constraint, where
 from trade._handle import Bound, Handle
 from trade._hints import no_such_service, too_many_services
 from trade._member import Member
-from trade._registry import Record, Registry
+from trade._registry import Record
 from trade._system import DOMAIN
 from trade.errors import AccessDenied
 
@@ -17,15 +17,13 @@ from trade.errors import AccessDenied
 class Looking(Member):
     """Finds services here and elsewhere."""
 
-    _registry: Registry
-
     # --- looking up
 
     def services(self, constraint: Constraint | None = None) -> list[Handle]:
         """Handles of all services that match, ordered by group and name; without a constraint, of everything."""
         self._check_open()
         wanted = where() if constraint is None else constraint
-        return [Handle(self, record.key, record) for record in self._registry.select(wanted)]
+        return [Handle(self, record.key, record) for record in self._parts.registry.select(wanted)]
 
     def find(self, constraint: Constraint, *, wait_s: float = 2.0) -> Handle:
         """The only service that matches; waits for it to appear.
@@ -38,11 +36,11 @@ class Looking(Member):
         matches: list[Record] = []
 
         def found() -> bool:
-            matches[:] = self._registry.select(constraint)
+            matches[:] = self._parts.registry.select(constraint)
             return bool(matches)
 
-        if not self._registry.wait_for(found, wait_s):
-            raise no_such_service(constraint, self._registry.select(where()), wait_s)
+        if not self._parts.registry.wait_for(found, wait_s):
+            raise no_such_service(constraint, self._parts.registry.select(where()), wait_s)
         if len(matches) > 1:
             raise too_many_services(constraint, matches)
         return Handle(self, matches[0].key, matches[0])

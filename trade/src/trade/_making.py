@@ -29,8 +29,8 @@ class _Made(NamedTuple):
 class Home(Protocol):
     """The container they are registered in."""
 
-    address: Final[Address]
-
+    @property
+    def address(self) -> Address: ...
     def register(self, provider: object, groups: str | Sequence[str] = ()) -> tuple[Handle, ...]: ...
 
 

@@ -3,7 +3,9 @@
 from abc import ABC, abstractmethod
 from typing import Any
 
+from trade._access import Access
 from trade._handle import Handle, Run
+from trade._parts import Parts
 from trade._registry import Record
 from trade._wire import Address, ServiceKey
 
@@ -12,6 +14,9 @@ class Member(ABC):
     """A container, as its parts see it: one part hosts, one looks up and calls, one guards."""
 
     address: Address
+    session: str
+    access: Access
+    _parts: Parts
 
     @abstractmethod
     def _check_open(self) -> None:

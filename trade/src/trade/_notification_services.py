@@ -4,7 +4,7 @@ import contextlib
 import logging
 import threading
 from collections.abc import Callable
-from typing import Final, Protocol
+from typing import Protocol
 
 from trade._access import Access
 from trade._context import served_call
@@ -24,8 +24,8 @@ _logger = logging.getLogger("trade")
 class Home(Protocol):
     """The container they belong to."""
 
-    address: Final[Address]
-
+    @property
+    def address(self) -> Address: ...
     @property
     def name(self) -> str: ...
     def handle(self, key: ServiceKey) -> Handle: ...

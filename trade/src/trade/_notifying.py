@@ -7,7 +7,7 @@ from typing import Final
 from trade._constraints import Constraint, where
 from trade._looking import Looking
 from trade._notification_services import Hosted, placed
-from trade._notifications import Notification, NotificationInfo, Notifier, Owner
+from trade._notifications import Notification, NotificationInfo, Owner
 from trade._occasions import Terms, What, deed_of, epoch_s, target_of
 from trade._session import speaking
 from trade._system import DOMAIN
@@ -18,9 +18,6 @@ POLL_S: Final = 1.0
 
 class Notifying(Looking):
     """Standing requests of this container, and those that others keep for it."""
-
-    _notifier: Notifier
-    session: str
 
     # --- of services
 
@@ -172,7 +169,9 @@ class Notifying(Looking):
             client = speaking.get()
             mine = client if client is not None and client.owner == self.address else None
             owner = Owner(self.session if mine is None else mine.name, acts_as=mine)
-            return placed(self._notifier, self._registry, terms, target, conditions[0], conditions[1], owner)
+            return placed(
+                self._parts.notifier, self._parts.registry, terms, target, conditions[0], conditions[1], owner
+            )
         notify = self.find(where(name="notify", group=DOMAIN, container=host))
         deeds = [None if one is None else deed_of(one, host, named) for one in conditions]
         name = notify(terms, deed_of(target, host, named), *deeds)

@@ -1,28 +1,30 @@
 """The one provider of the middleware's own functions: what is in group ``trade`` of every container."""
 
+from typing import Final, Protocol
+
 from trade._access import Access
-from trade._arriving import Arriving
-from trade._borrowed import Borrowed
 from trade._context import current_call
-from trade._departing import Departing
 from trade._estop_line import EstopReport
-from trade._estopping import LIMIT_S, Estopping
+from trade._estopping import LIMIT_S
 from trade._hook_services import HookServices
-from trade._hooks import Hooks
-from trade._lock_services import Ask, Asked, GroupsOf, LockServices
-from trade._locks import LockTable
+from trade._lock_services import LockServices
 from trade._making_services import MakingServices
 from trade._migration_services import MigrationServices
-from trade._notification_services import Home, NotificationServices
-from trade._notifications import Notifier
-from trade._registry import Registry
+from trade._notification_services import Home as Member
+from trade._notification_services import NotificationServices
+from trade._parts import Parts
 from trade._service import service
-from trade._spans import Spans
 from trade._stream_services import StreamServices
-from trade._streams import Streams
 from trade._system import System, SystemServices
-from trade._trace_services import Switch, TraceServices
-from trade._wire import Address, Estop
+from trade._trace_services import TraceServices
+from trade._wire import Estop
+
+
+class Home(Member, Protocol):
+    """The container they belong to."""
+
+    access: Final[Access]
+    system: Final[System]
 
 
 class OwnServices(
@@ -37,36 +39,26 @@ class OwnServices(
 ):
     """One provider, so that one registry entry tells of all its container's own functions."""
 
-    def __init__(
-        self,
-        system: System,
-        locks: LockTable,
-        own: Address,
-        ask: Ask,
-        asked: Asked,
-        estopping: Estopping,
-        access: Access,
-        groups: GroupsOf,
-        borrowed: Borrowed,
-        notifier: Notifier,
-        registry: Registry,
-        hooks: Hooks,
-        home: Home,
-        spans: Spans,
-        trace_here: Switch,
-        streams: Streams,
-        departing: Departing,
-        arriving: Arriving,
-    ) -> None:
-        SystemServices.__init__(self, system)
-        LockServices.__init__(self, locks, own, ask, asked, access, groups, borrowed)
-        NotificationServices.__init__(self, notifier, registry, home, access)
-        HookServices.__init__(self, hooks, home, access)
-        TraceServices.__init__(self, own.container, spans, trace_here)
-        MakingServices.__init__(self, system)
-        MigrationServices.__init__(self, departing, arriving)
-        StreamServices.__init__(self, streams)
-        self._estopping = estopping
+    def __init__(self, parts: Parts, home: Home) -> None:
+        access, locks = home.access, parts.locks
+        SystemServices.__init__(self, home.system)
+        LockServices.__init__(
+            self,
+            locks,
+            home.address,
+            parts.ask_for_release,
+            parts.locking.keeper.asked,
+            access,
+            parts.providers.groups_of,
+            parts.borrowed,
+        )
+        NotificationServices.__init__(self, parts.notifier, parts.registry, home, access)
+        HookServices.__init__(self, parts.hooks, home, access)
+        TraceServices.__init__(self, home.name, parts.spans, parts.trace)
+        MakingServices.__init__(self, home.system)
+        MigrationServices.__init__(self, parts.departing, parts.arriving)
+        StreamServices.__init__(self, parts.streams)
+        self._estopping = parts.estopping
 
     @property
     def open_estops(self) -> tuple[Estop, ...]:

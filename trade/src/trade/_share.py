@@ -14,11 +14,11 @@ from msgspec import structs
 
 from trade._bordering import Bordering, Home, Place, inside, shown
 from trade._borrowed import SharedResource, Wanted
-from trade._codec import Codec
-from trade._container import HANDLE_EXT, Container
+from trade._container import Container
 from trade._context import CallContext, holding, running
 from trade._deadman import NOBODYS
 from trade._handle import Handle
+from trade._handle_codec import handle_codec
 from trade._lock import Lock, OnLost, OnRequest
 from trade._locking import LEASE_S
 from trade._registry import Change
@@ -26,7 +26,7 @@ from trade._session import speaking
 from trade._terms import Terms
 from trade._transport import ChannelClosed
 from trade._visitors import Visitors
-from trade._wire import Address, Behalf, Estop, ProviderInfo, ServiceKey, encode_message
+from trade._wire import Address, Behalf, Estop, ProviderInfo, ServiceKey
 from trade.errors import ConfigurationError, TradeError
 
 __all__ = ["SHARED_FROM", "Border"]
@@ -102,7 +102,7 @@ class Passage:
         """Places abroad -> at home."""
         self._resources: WeakValueDictionary[tuple[Address, str], SharedResource] = WeakValueDictionary()
         self._refused: dict[Place, str] = {}
-        self._codec = Codec(self._handle_out, self._handle_in)
+        self._codec = handle_codec(self._handle_out, self._handle_in)
         self._changed = threading.Event()
         self._leaving = ExitStack()
         self._closed = False
@@ -204,20 +204,15 @@ class Passage:
 
     # --- handles
 
-    def _handle_out(self, value: Any) -> Any:
+    def _handle_out(self, handle: Handle) -> ServiceKey:
         """A handle of a service of home, as the other system knows it."""
-        if isinstance(value, Handle):
-            key = self._abroad_of(value.key) or self.reverse.home_of(value.key)
-            if key is not None:
-                return msgspec.msgpack.Ext(HANDLE_EXT, encode_message(key))
-            raise TypeError(f"{value.label} is not shared with system {self._names[1]}")
-        raise TypeError(f"a {type(value).__qualname__} is no plain data")
+        key = self._abroad_of(handle.key) or self.reverse.home_of(handle.key)
+        if key is None:
+            raise TypeError(f"{handle.label} is not shared with system {self._names[1]}")
+        return key
 
-    def _handle_in(self, code: int, data: memoryview) -> Any:
+    def _handle_in(self, given: ServiceKey) -> Handle:
         """A handle of the other system, as home knows it."""
-        if code != HANDLE_EXT:
-            raise msgspec.ValidationError(f"Unknown extension {code}")
-        given = msgspec.msgpack.decode(data, type=ServiceKey)
         key = self.home_of(given) or self.reverse._abroad_of(given)
         if key is None:
             raise msgspec.ValidationError(f"{given.domain}.{given.name} is not shared with system {self._names[0]}")

@@ -9,12 +9,14 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 from msgspec import Struct, structs
 
 from trade._context import CallContext
+from trade._logbook import listen
 from trade._request import Request
 from trade._system import DOMAIN
-from trade._wire import ServiceKey, Token
+from trade._wire import Address, ServiceKey, Token
 
 if TYPE_CHECKING:
     from trade._dispatch import Around, LocalService
+    from trade._locks import LockTable
 
 MOST: Final = 10_000
 """So many spans a container keeps: the newest."""
@@ -165,3 +167,14 @@ def ancestors(context: CallContext) -> tuple[int, ...]:
 
 def _outcome(error: BaseException | None) -> str:
     return "ok" if error is None else type(error).__name__
+
+
+def new_spans(own: Address, session: str, table: "LockTable") -> Spans:
+    """For a container; its process keeps what it logs from now on."""
+    listen()
+
+    def purposes(tokens: Sequence[Token]) -> list[str]:
+        held = (info.holder for info in table.infos() if info.token in tokens)
+        return [f"{holder.purpose} ({holder.owner})" if holder.purpose else holder.owner for holder in held]
+
+    return Spans(own.container, own.identity, session, purposes)

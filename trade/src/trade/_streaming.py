@@ -9,7 +9,6 @@ from trade._clockwork import Clockwork
 from trade._constraints import Constraint
 from trade._handle import Handle
 from trade._hooking import Hooking
-from trade._listening import Listening
 from trade._occasions import Deed, Target, What, target_of
 from trade._session import speaking
 from trade._stream import If, Stream
@@ -23,9 +22,6 @@ _MOST_KEPT = 100_000
 
 class Streaming(Hooking):
     """Streams that this container has opened."""
-
-    _listening: Listening
-    _clockwork: Clockwork
 
     def stream(
         self,
@@ -72,9 +68,9 @@ class Streaming(Hooking):
         check_sampled(source)
         client = speaking.get()
         opened_by = client if client is not None and client.owner == self.address else None
-        stream = self._listening.open(source, hz, on_change=on_change, if_=if_, keep=keep, opened_by=opened_by)
+        stream = self._parts.listening.open(source, hz, on_change=on_change, if_=if_, keep=keep, opened_by=opened_by)
         if pushed is not None:
-            _Push(self, stream, pushed, self._clockwork)
+            _Push(self, stream, pushed, self._parts.clockwork)
         return stream
 
 

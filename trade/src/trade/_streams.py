@@ -42,8 +42,8 @@ Listener = tuple[str, str]
 class Home(Protocol):
     """What streams need of their container."""
 
-    address: Final[Address]
-
+    @property
+    def address(self) -> Address: ...
     @property
     def name(self) -> str: ...
     def handle(self, key: ServiceKey) -> Handle: ...

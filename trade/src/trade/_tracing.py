@@ -6,16 +6,13 @@ from typing import Final
 
 from msgspec import Struct
 
-from trade._calls import Caller
 from trade._constraints import where
-from trade._hooks import Hooks
-from trade._locks import LockTable
-from trade._logbook import LogLine, listen
+from trade._logbook import LogLine
 from trade._looking import Looking
 from trade._many import Outcome
-from trade._spans import Span, Spans
+from trade._spans import Span
 from trade._system import DOMAIN
-from trade._wire import Address, ServiceKey, Token
+from trade._wire import ServiceKey
 from trade.errors import AccessDenied, NoSuchCall
 
 NOT_TRACED: Final = "(not traced)"
@@ -84,11 +81,6 @@ class LogReader:
 class Tracing(Looking):
     """Notes of calls and log lines, from everywhere."""
 
-    session: str
-    _caller: Caller
-    _hooks: Hooks
-    _spans: Spans
-
     def set_tracing(self, on: bool, *, container: str = "*") -> list[str]:
         """Have containers note every call they make and serve, or no more; what was noted stays.
 
@@ -146,23 +138,6 @@ class Tracing(Looking):
     def _spans_of(self, calls: Sequence[int] | None, container: str) -> list[Span]:
         outcomes = self.call_all(where(name="spans", group=DOMAIN, container=container), calls)
         return sorted(itertools.chain.from_iterable(one.result for one in granted(outcomes)), key=_when)
-
-    def _trace_here(self, on: bool) -> None:
-        """Told by the services, and by the settings."""
-        spans = self._spans if on else None
-        self._hooks.trace(spans)
-        self._caller.spans = spans
-
-
-def new_spans(own: Address, session: str, table: LockTable) -> Spans:
-    """For a container; its process keeps what it logs from now on."""
-    listen()
-
-    def purposes(tokens: Sequence[Token]) -> list[str]:
-        held = (info.holder for info in table.infos() if info.token in tokens)
-        return [f"{holder.purpose} ({holder.owner})" if holder.purpose else holder.owner for holder in held]
-
-    return Spans(own.container, own.identity, session, purposes)
 
 
 def granted(outcomes: Iterable[Outcome]) -> list[Outcome]:

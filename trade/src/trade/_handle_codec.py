@@ -1,0 +1,34 @@
+"""How handles travel among values: as the key of their service, in a MessagePack extension of their own."""
+
+from collections.abc import Callable
+from typing import Any, Final
+
+import msgspec
+
+from trade._codec import Codec
+from trade._handle import Handle
+from trade._wire import ServiceKey, encode_message
+
+HANDLE_EXT: Final = 1
+"""The number of the extension."""
+
+
+def handle_codec(key_of: Callable[[Handle], ServiceKey], handle_of: Callable[[ServiceKey], Handle]) -> Codec:
+    """What turns values into bytes and back.
+
+    Args:
+        key_of: what is written of a handle; raises TypeError if it must not leave.
+        handle_of: the handle that a key means here; raises msgspec.ValidationError if it means none.
+    """
+
+    def to_data(value: Any) -> Any:
+        if isinstance(value, Handle):
+            return msgspec.msgpack.Ext(HANDLE_EXT, encode_message(key_of(value)))
+        raise TypeError(f"a {type(value).__qualname__} is no plain data")
+
+    def from_data(code: int, data: memoryview) -> Any:
+        if code != HANDLE_EXT:
+            raise msgspec.ValidationError(f"Unknown extension {code}")
+        return handle_of(msgspec.msgpack.decode(data, type=ServiceKey))
+
+    return Codec(to_data, from_data, (Handle,))

@@ -1,0 +1,233 @@
+"""What a container is made of: made in order, each from those before it; ended in the reverse order."""
+
+import contextlib
+import itertools
+from collections.abc import Callable
+from typing import Final, Protocol
+
+from trade import _hooks, _locking, _making, _notifications, _streams
+from trade._announcing import Announcer
+from trade._arriving import Arriving
+from trade._borrowed import Borrowed
+from trade._calls import Caller
+from trade._clockwork import Clockwork
+from trade._constraints import where
+from trade._context import handed_down
+from trade._coroutines import AsyncLoop
+from trade._departing import Departing
+from trade._dispatch import Dispatcher
+from trade._estopping import Estopping
+from trade._freezing import Freezing
+from trade._handle import Handle
+from trade._handle import Home as HandleHome
+from trade._handle_codec import handle_codec
+from trade._hooks import Hooks
+from trade._inherited import InheritedLock
+from trade._joining import join
+from trade._listening import Listening
+from trade._load import Load
+from trade._locking import Locking
+from trade._locks import LockTable
+from trade._making import Making
+from trade._notifications import Notifier
+from trade._providers import Providers
+from trade._reach import Reach
+from trade._registry import Record, Registry
+from trade._resources import Holder
+from trade._settings import Settings
+from trade._spans import Spans, new_spans
+from trade._streams import Streams
+from trade._system import DOMAIN, PROVIDER
+from trade._targets import Targets
+from trade._terminating import Terminating
+from trade._transport import Transport
+from trade._watch import Watch
+from trade._wire import Address, Estop, ServiceKey, Token, alive_key
+from trade._withdrawn import Withdrawn
+from trade._zenoh import ZenohTransport
+from trade.errors import AccessDenied
+
+
+class Home(_hooks.Home, _locking.Home, _making.Home, _notifications.Home, _streams.Home, HandleHome, Protocol):
+    """The container, as what it is made of sees it."""
+
+    def close(self) -> None: ...
+
+
+class Own(Protocol):
+    """The provider of the middleware's own functions."""
+
+    @property
+    def open_estops(self) -> tuple[Estop, ...]: ...
+
+
+class Parts:
+    """One of each. Data has one owner, and here one sees which."""
+
+    def __init__(self, home: Home, settings: Settings, transport: Transport | None) -> None:
+        self._home = home
+        address, access = home.address, home.access
+        epoch, session = address.epoch, str(address)
+        self.told_of_ends: Final[list[Callable[[str], None]]] = []
+        """Told of every session that ends."""
+        with contextlib.ExitStack() as leaving:  # what has begun ends again if the rest cannot begin
+            self.transport = transport or join(settings, leaving)
+            leaving.callback(self.transport.close)
+            self.reach: Reach | None = None
+            """Its links; None on a transport that has no such switches."""
+            if isinstance(self.transport, ZenohTransport):
+                self.reach = Reach(self.transport.links, settings.check_may_dial, settings.connect)
+                leaving.callback(self.reach.close)
+            self.codec = handle_codec(lambda handle: handle.key, home.handle)
+            self.registry = Registry(address, access.may_offer)
+            self.caller = Caller(self.transport, address, session)
+            leaving.callback(self.caller.close)
+            self.clockwork = Clockwork("trade-clock")
+            leaving.callback(self.clockwork.close)
+            self.notifier = Notifier(home, self.clockwork, epoch, lambda record: Handle(home, record.key, record))
+            leaving.callback(self.notifier.close)
+            self.inherited = InheritedLock(settings.lock, address) if settings.lock else None
+            if self.inherited is not None:
+                handed_down[address] = self.inherited
+                leaving.callback(handed_down.pop, address)
+            self.coroutines = AsyncLoop()
+            leaving.callback(self.coroutines.close)
+            self.locking = Locking(home)
+            self.locks = LockTable(epoch, home.name)
+            leaving.callback(self.locks.close)
+            self.borrowed = Borrowed(self.locks, epoch)
+            self.announcer = Announcer(self.transport, address)
+            leaving.callback(self.announcer.close)
+            self.providers = Providers(
+                self.announcer, self.registry, address, self.codec, self.coroutines, self.locks, access
+            )
+            self.targets = Targets(address, session, access, self.registry, self.providers, self.caller, self.codec)
+            self.registry.listen(self.targets.changed)  # before anybody is told: who is told may call
+            self.registry.listen(self.notifier.changed)
+            self.told_of_ends.append(self.notifier.session_ended)
+            self.hooks = Hooks(
+                home,
+                self.codec,
+                self.clockwork,
+                self.providers.service,
+                lambda: self.registry.select(where.local),
+                self._denied_hook,
+            )
+            self.registry.listen(self.hooks.changed)
+            self.told_of_ends.append(self.hooks.session_ended)
+            self.hook_numbers = itertools.count(1)
+            self.spans = new_spans(address, session, self.locks)
+            self.trace(settings.trace)
+            self.streams = Streams(home, self.transport, self.providers.service, self.clockwork, self.caller.new_id)
+            self.registry.listen(self.streams.changed)
+            self.told_of_ends.append(self.streams.session_ended)
+            leaving.callback(self.streams.close)
+            self.listening = Listening(home, self.transport, self.clockwork, self.codec, self.registry.removed)
+            self.registry.listen(self.listening.changed)
+            self.told_of_ends.append(self.listening.session_ended)
+            leaving.callback(self.listening.close)
+            kept = None if settings.state_dir is None else settings.state_dir / settings.system / "estop"
+            self.estopping = Estopping(self.transport, address, self.registry, self.locks, self.providers, kept, access)
+            leaving.callback(self.estopping.close)
+            self.deadman = self.estopping.deadman
+            self.locks.stop_with(self.deadman.stop)
+            self.withdrawn = Withdrawn(self.providers, self.deadman.rest)
+            self.making = Making(home, self.providers, self.withdrawn, settings.instantiable)
+            leaving.callback(self.making.close)
+            freezing = Freezing(self.locks, address)
+            self.departing = Departing(home, self.providers, self.making, self.withdrawn, freezing, access, self.codec)
+            self.arriving = Arriving(address, self.providers, self.making, freezing, access, self.codec, self.clockwork)
+            leaving.callback(self.arriving.close)
+            self.dispatcher = Dispatcher(
+                self.transport, address, self.providers.lookup, self.coroutines, access, access.callers()
+            )
+            leaving.callback(self.dispatcher.close)
+            self.meter = Load(home.name, lambda: list(self.dispatcher._crews), self.providers.waiting)
+            self.terminating = Terminating(
+                home.name, self.deadman.rest, self.locks.resources, lambda: self.meter.running, home.close
+            )
+            self._leaving = leaving.pop_all()
+
+    def appear(self, own: Own) -> None:
+        """Be there for others, who find these functions of the middleware's own. Ends everything if it cannot."""
+        with contextlib.ExitStack() as undone:
+            undone.callback(self.close)
+            self.providers.add(own, (DOMAIN,), name=PROVIDER)
+            self.estopping.begin(own)
+            self._leaving.callback(self.transport.appear(alive_key(self._home.address)).close)
+            self.watch = Watch(
+                self.transport,
+                self.registry,
+                self._home.address,
+                self._lost,
+                self.session_ended,
+                self.announcer.beat,
+            )
+            self._leaving.callback(self.watch.close)
+            undone.pop_all()
+
+    # --- being told
+
+    def _lost(self, address: Address, *, back: bool = False) -> None:
+        """Told by the watch: a container is out of sight, or there again."""
+        self.caller.lost(address, back=back)
+        if back:
+            self.locks.session_back(str(address))
+            return
+        self.locking.keeper.lost(address)
+        if self.inherited is not None:
+            self.inherited.lost(address)
+        self.session_ended(str(address), f"its container {address.container} has ended or cannot be reached")
+
+    def session_ended(self, session: str, reason: str = "it was closed") -> None:
+        """Nobody of it is there any more: nothing more is let in for it, its locks fall, what it moves stops."""
+        self.locks.session_ended(session, reason)
+        self.deadman.session_ended(session)
+        for tell in list(self.told_of_ends):
+            tell(session)
+
+    def ask_for_release(self, holder: Holder, token: Token, who: str, reason: str) -> None:
+        """Told by the lock services: somebody would like to have what another one holds."""
+        owner = Address(*holder.session.split("/")[:3])
+        self._home.handle(ServiceKey(owner, DOMAIN, PROVIDER, "release_requested")).start(token, who, reason)
+
+    def trace(self, on: bool) -> None:
+        """Told by the settings, and by the trace services: note calls, or no more."""
+        spans: Spans | None = self.spans if on else None
+        self.hooks.trace(spans)
+        self.caller.spans = spans
+
+    def _denied_hook(self, who: str, record: Record) -> AccessDenied | None:
+        return self._home.access.denied(who, "instrument", record.key.domain, record.label)
+
+    def judge_anew(self) -> None:
+        """Told by the container: the policy is another one; locks that may no longer be held are lost."""
+        access = self._home.access
+        self.targets.judge_anew()
+        self.dispatcher.hear(access.callers())
+        self.registry.judge_anew()
+        self.hooks.judge_anew()
+        self.streams.judge_anew()
+        for info in self.locks.infos():
+            held = [(name, self.providers.groups_of(name)) for name in info.resources]
+            denied = access.denied_lock(info.holder.identity, held)
+            if denied is not None:
+                self.locks.lose(info.token.number, str(denied))
+
+    # --- ending
+
+    @property
+    def dropped_messages(self) -> int:
+        """Messages that were malformed or of another protocol version."""
+        readers = (self.dispatcher, self.caller, self.watch, self.estopping, self.listening)
+        return sum(reader.malformed for reader in readers)
+
+    def close(self) -> None:
+        """End all of it."""
+        self.targets.close()
+        self._leaving.close()
+
+    def abandon(self) -> None:
+        """In a forked child: end nothing."""
+        self.targets.close()
+        self._leaving.pop_all()

@@ -1,0 +1,108 @@
+"""Where calls lead: what was looked up once for a handle is kept until something about it changes."""
+
+from typing import Final
+
+from trade._access import Access
+from trade._calls import Caller
+from trade._codec import Codec
+from trade._handle import Handle
+from trade._invoke import LocalTarget, RemoteTarget, container_closed
+from trade._providers import Providers
+from trade._registry import Change, Record, Registry, gone_to
+from trade._transport import ChannelClosed
+from trade._wire import Address, ServiceKey
+from trade.errors import ServiceGone
+
+Target = LocalTarget | RemoteTarget
+
+_PATIENCE_S: Final = 1.0
+"""How long a call waits for the registry to hear of a handle that came by message before its registry entry did."""
+
+
+class Targets:
+    """What a container may call, and how, by service."""
+
+    def __init__(
+        self,
+        own: Address,
+        session: str,
+        access: Access,
+        registry: Registry,
+        providers: Providers,
+        caller: Caller,
+        codec: Codec,
+    ) -> None:
+        self._own = own
+        self._session = session
+        self._access = access
+        self._registry = registry
+        self._providers = providers
+        self._caller = caller
+        self._codec = codec
+        self._closed = False
+        self.known: Final[dict[ServiceKey, Target]] = {}
+        """Looked up already, and allowed."""
+
+    def look_up(self, handle: Handle) -> Target:
+        """The target of a handle, known from now on.
+
+        Raises:
+            ServiceGone: it is not there, or not any more.
+            AccessDenied: the policy does not let this container call it.
+            ConfigurationError: the container is closed.
+        """
+        key, policy = handle.key, self._access.policy
+        known = self._registry.get(key) is not None or handle.last_record is not None or self._registry.removed(key)
+        if not known:
+            self._registry.wait_for(lambda: self._registry.get(key) is not None, _PATIENCE_S)
+        record = self._registry.get(key)
+        if record is not None:
+            self._access.require_call(self._own.identity, key.domain, key.name, record.info.effect, record.label)
+        target = None if record is None else self._make(record)
+        if target is None:
+            raise self.gone(handle)
+        self.known[key] = target
+        changed = self._registry.get(key) is not record or self._access.policy is not policy
+        if self._closed or changed:  # it left, or is another one, since we looked
+            self.known.pop(key, None)
+        return target
+
+    def _make(self, record: Record) -> Target | None:
+        if not record.local:
+            try:
+                return RemoteTarget(record, self._caller, self._codec)
+            except ChannelClosed:  # closed meanwhile
+                raise container_closed(self._own) from None
+        service = self._providers.lookup(f"{record.key.domain}/{record.key.provider}", record.key.name)
+        if service is None:  # deregistered since we looked
+            return None
+        return LocalTarget(service, self._codec, self._own, self._session, self._caller.new_id)
+
+    def gone(self, handle: Handle) -> ServiceGone:
+        """Why a handle leads nowhere."""
+        address = handle.key.address
+        if moved_to := self._registry.moved_to(handle.key):
+            return gone_to(handle.label, moved_to)
+        if self._registry.is_alive(address):
+            reason = "its provider was deregistered" if self._registry.removed(handle.key) else "it is not known here"
+        else:
+            reason = f"container {address.container} has ended, restarted or cannot be reached"
+        return ServiceGone(service=handle.label, reason=reason)
+
+    def changed(self, change: Change) -> None:
+        """Told by the registry: calls to what left must fail at once."""
+        for record in (*change.left, *change.replaced):
+            self.known.pop(record.key, None)
+        for record in change.left:
+            key = record.key
+            if not record.local and (self._registry.removed(key) or not self._registry.is_alive(key.address)):
+                self._caller.forget(key.address, key.domain, key.provider)
+
+    def judge_anew(self) -> None:
+        """The policy is another one."""
+        self.known.clear()
+
+    def close(self) -> None:
+        """Keep none from now on."""
+        self._closed = True
+        self.known.clear()
