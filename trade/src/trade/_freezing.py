@@ -21,32 +21,43 @@ LONGEST_S: Final = 60.0
 class Frozen:
     """The resources of one provider, which nobody may use."""
 
-    def __init__(self, resources: tuple[Resource, ...], holder: Holder, over: Callable[[], str]) -> None:
-        self.resources: Final = resources
-        self._holder = holder
-        self._over = over
+    def __init__(self, table: LockTable, number: int, resources: tuple[Resource, ...]) -> None:
+        self._table = table
+        self._number = number
+        """Of the grant that holds it still; 0 if nothing of it actuates."""
+        self._resources = resources
+        self._free: Callable[[], None] | None = None
 
     def check(self) -> None:
         """Whether it is still.
 
         Raises:
-            LockedByOther: somebody broke the lock that holds it, or that outlived its lease; or it moves.
+            LockedByOther: the lock that holds it was broken or has outlived its lease, or it moves.
             Stopped: somebody stopped it meanwhile.
         """
-        if why := self._over():
-            raise LockedByOther(resources=_names(self.resources), owner=f"nobody any more: {why}", purpose="migrating")
-        require_rest(self.resources)
+        if self._number and (why := self._table.over(self._number)):
+            raise self._lost(why)
+        require_rest(self._resources)
 
     def seal(self) -> None:
-        """Let nobody in any more, also who has found it before it is withdrawn and gets to it after that."""
-        for resource in self.resources:
-            resource.pending = self._holder
+        """Let nobody in any more, also who has found it before it is withdrawn and gets to it after that.
+
+        Raises:
+            LockedByOther: see `check`.
+        """
+        if self._number:
+            self._free = self._table.retire(self._number, "its provider has moved")
+            if self._free is None:
+                raise self._lost(self._table.over(self._number))
 
     def unseal(self) -> None:
         """It goes on."""
-        for resource in self.resources:
-            if resource.pending is self._holder:
-                resource.pending = None
+        if self._free is not None:
+            self._free()
+
+    def _lost(self, why: str) -> LockedByOther:
+        names = tuple(resource.name for resource in self._resources)
+        return LockedByOther(resources=names, owner=f"nobody any more: {why}", purpose="migrating")
 
 
 class Freezing:
@@ -89,7 +100,7 @@ class Freezing:
         granted = self._table.acquire([resource.name for resource in moved], holder, terms)
         number = 0 if granted.token is None else granted.token.number
         try:
-            yield Frozen(resources, holder, lambda: self._table.over(number) if number else "")
+            yield Frozen(self._table, number, resources)
         finally:
             self._table.release(number, own.identity)
 
@@ -102,7 +113,3 @@ def require_rest(resources: tuple[Resource, ...]) -> None:
         if resource.moving:
             owner, purpose = ", ".join(resource.movers) or "somebody", "a motion that has not ended"
             raise LockedByOther(resources=(resource.name,), owner=owner, purpose=purpose)
-
-
-def _names(resources: tuple[Resource, ...]) -> tuple[str, ...]:
-    return tuple(resource.name for resource in resources)
