@@ -11,6 +11,8 @@ from trade._wire import ServiceKey
 from trade.errors import NoSuchService, TooManyServices
 
 _LONGEST_S: Final = 45.0
+_HEARD_S: Final = 1.0
+"""How long to wait until its new place is known here."""
 
 
 class Moving(Looking):
@@ -47,7 +49,9 @@ class Moving(Looking):
 
             With all but the last it is offered as before.
         """
-        return tuple(self._of(which, "migrate", to, args))
+        moved: tuple[Handle, ...] = tuple(self._of(which, "migrate", to, args))
+        self._parts.registry.wait_for(lambda: all(self.has(one.key) for one in moved), _HEARD_S)
+        return moved
 
     def save_state(self, which: Handle | Constraint) -> Any:
         """What a provider gives with ``save_state()``, while nothing of it runs or moves: plain data.
