@@ -147,8 +147,7 @@ class Departing:
         with self._still(service, offer, f"migrating to container {there.container}") as still:
             luggage = self._packed(service, offer, there, args)
             prepared: Prepared = there.with_(deadline_s=_PREPARE_S)(luggage)
-            address, domain, provider = there.key.address, prepared.domain, prepared.provider
-            keys = [ServiceKey(address, domain, provider, name) for name in prepared.services]
+            keys = _keys(there.key.address, prepared)
             try:
                 self._require(who, service.key, offer)  # once more: it took its time
                 _require_time(service, there)
@@ -158,7 +157,7 @@ class Departing:
             except BaseException:
                 still.unseal()
                 with contextlib.suppress(TradeError):  # it ends there by itself then
-                    self._ask(address, "arrived", _ASK_S, prepared.ticket)
+                    self._ask(there.key.address, "arrived", _ASK_S, prepared.ticket)
                 raise
             free = running.set(None)  # whoever asked for it may be gone: it is brought to its end
             try:
@@ -251,6 +250,10 @@ def _require_time(service: Handle, there: Handle) -> None:
 
 def _place(key: ServiceKey) -> str:
     return f"{key.domain}/{key.provider}"
+
+
+def _keys(there: Address, prepared: Prepared) -> list[ServiceKey]:
+    return [ServiceKey(there, prepared.domain, prepared.provider, name) for name in prepared.services]
 
 
 def _moved_to(key: ServiceKey) -> str:
