@@ -185,6 +185,24 @@ def test_S18_what_is_commanded_while_state_is_restored_is_refused(scene: Scene) 
         scene.asker.restore_state(services["turn"], None)
 
 
+def test_S18_who_is_given_up_may_not_command_later_either(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_state, "BUDGET_S", 0.05)
+    leave, outcomes = threading.Event(), list[Exception]()
+
+    def linger(wheel: Any, _state: object) -> None:
+        leave.wait(30)
+        try:
+            wheel.turn()
+        except LockedByOther as error:
+            outcomes.append(error)
+
+    scene.module.Wheel.restore_state = linger
+    error = refused(scene, scene.offer(scene.module.Wheel())["turn"])
+    assert "restore_state has not ended" in str(error)
+    leave.set()
+    wait_until(lambda: outcomes)
+
+
 def test_S18_who_sets_it_moving_past_all_permits_is_closed(scene: Scene) -> None:
     def move(self: Any, _state: object) -> None:
         self.resources[0].moving = True

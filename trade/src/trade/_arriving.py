@@ -23,7 +23,7 @@ from trade._service import marked_methods
 from trade._signature import Signature
 from trade._state import is_stateful, restore
 from trade._wire import Address, Scalar, domain_of, encode_message
-from trade.errors import Busy, CannotMigrate, NoSuchClass
+from trade.errors import Busy, CannotMigrate, LockedByOther, NoSuchClass
 
 TICKET_S: Final = 20.0
 """What was prepared and is not fetched in this time is closed again."""
@@ -169,6 +169,8 @@ class Arriving:
                 restore(made, luggage.state)
                 still.check()
             except Exception as error:
+                with contextlib.suppress(LockedByOther):
+                    still.seal()  # it may go on for all we know, and is still not to move anything
                 raise self._refusal(luggage, f"restore_state there: {type(error).__name__}: {error}") from error
 
     def arrive(self, ticket: str, caller: str) -> None:

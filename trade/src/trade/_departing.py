@@ -222,7 +222,7 @@ class Departing:
                     provider=service.label, container=here, to=there.container, withdrawn=name
                 ) from error
         except TradeError as error:
-            problem = str(error)
+            problem = error.problem if isinstance(error, CannotMigrate) else str(error)
         if problem:
             self._withdrawn.put_back(name, None)
             raise CannotMigrate(provider=service.label, to=there.container, problem=problem, withdrawn=True)
