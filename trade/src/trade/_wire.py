@@ -305,8 +305,7 @@ class CancelArguments(Struct, array_like=True, gc=False):
 MOST_BYTES: Final = 64 << 20
 """The largest arguments and the largest result, encoded."""
 
-_MOST_MESSAGE_BYTES: Final = MOST_BYTES + (1 << 20)
-"""What more is not even decoded."""
+_MOST_MESSAGE_BYTES: Final = MOST_BYTES + (1 << 20)  # what is larger is not even decoded
 
 EMPTY: Final = Raw(msgspec.msgpack.encode(None))
 EMPTY_ARGUMENTS: Final = Raw(msgspec.msgpack.encode(()))
