@@ -8,12 +8,14 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from textwrap import dedent
 from typing import Any
 
 import hypothesis
 import pytest
 
+from migrants import Scene, migration_scene
 from trade import Container, Handle, service, where
 from trade._credentials import user_secret
 from trade._endpoints import free_endpoint
@@ -133,6 +135,13 @@ def offer(request: pytest.FixtureRequest, here: Container) -> Offer:
         return lambda name: here.find(where(name=name, group=group), wait_s=20)
 
     return register
+
+
+@pytest.fixture
+def scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Scene]:
+    """What moves, from where, and where to."""
+    with migration_scene(tmp_path, monkeypatch) as made:
+        yield made
 
 
 class Gate:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from trade import Container, service, where
+from trade import Container, _departing, service, where
 from trade import _rules as rules_module
 from trade._endpoints import free_endpoint
 from trade.errors import NoSuchService
@@ -33,6 +33,12 @@ class Planner:
     @service
     def plan(self, goal: str) -> str:
         return goal
+
+    def save_state(self) -> float:
+        return self.load
+
+    def restore_state(self, state: float) -> None:
+        self.load = state
 
 
 @pytest.fixture
@@ -74,7 +80,7 @@ def seers(looking: Container) -> list[str]:
 
 def test_the_file_is_right_and_is_rehearsed_in_an_empty_system(here: Container) -> None:
     told = {rehearsal.rule: rehearsal.fires for rehearsal in rehearse(here, read_rules(SHIPPED))}
-    assert told == {"bootstrap": True, "elsewhere": True, "degraded": False, "balance": False}
+    assert told == {"bootstrap": True, "elsewhere": True, "degraded": False, "balance": False, "relocate": False}
 
 
 def test_bootstrap_lets_itself_be_found_until_somebody_who_can_see_has_joined(
@@ -164,3 +170,38 @@ def test_all_of_them_together_do_not_run_in_circles_when_a_camera_is_replaced(
         wait_until(rules.rule_firings)
         assert [(firing.rule, firing.ok) for firing in rules.rule_firings()] == [("degraded", True)]
         assert {info.state for info in rules.rules()} == {"standing"}
+
+
+def test_a_planner_that_is_not_well_goes_on_elsewhere_with_what_it_knows(
+    start_container: StartContainer, only: Only, here: Container, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    busy = {"worker-1": 70.0, "worker-2": 20.0}
+    monkeypatch.setattr(_departing, "busyness", lambda load: (busy[load.container], 0.0))
+    mind, planner = start_container("mind"), Planner()
+    for name in busy:
+        start_container(name, instantiable=[f"{__name__}:Planner"])
+    planner.load = 0.75
+    mind.register(planner, "mind.planner")
+    for name in (*busy, "mind"):
+        here.find(where(name="migrate", container=name), wait_s=30)
+    here.find(where(name="plan"), wait_s=30)
+    rules = only("relocate")
+    mind.set_health(planner, "degraded: the host is too hot")
+    firing = first(rules)
+    assert firing.ok
+    assert [did.service for did in firing.steps] == ["trade.migrate"]
+    wait_until(lambda: [one.container for one in here.services(where(name="plan"))] == ["worker-2"])
+    assert here.call(where(name="busy")) == 0.75
+
+
+def test_a_dry_run_of_relocating_says_whom_it_would_ask_and_moves_nothing(
+    start_container: StartContainer, here: Container
+) -> None:
+    mind, planner = start_container("mind"), Planner()
+    mind.register(planner, "mind.planner")
+    mind.set_health(planner, "degraded: the host is too hot")
+    wait_until(lambda: here.services(where(name="plan", healthy=False)))
+    [rehearsal] = rehearse(here, {"relocate": read_rules(SHIPPED)["relocate"]})
+    [step] = rehearsal.steps
+    assert (step.service, step.container, step.result) == ("trade.migrate", "mind", "would be called")
+    assert here.find(where(name="plan")).container == "mind"

@@ -15,6 +15,7 @@ from trade_gateway import (
     _lock,
     _locks,
     _logs,
+    _migrate,
     _pki_commands,
     _policy,
     _profile,
@@ -45,6 +46,7 @@ app.command("gateway")(_gateway.gateway)
 app.command("services")(_list.services)
 app.command("container")(_empty_container.container)
 app.command("start")(_start.start)
+app.command("migrate")(_migrate.migrate)
 app.command("containers")(_list.containers)
 app.command("call", context_settings={"ignore_unknown_options": True})(_call.call)
 app.command("stream")(_stream.stream)

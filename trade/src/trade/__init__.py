@@ -106,6 +106,7 @@ __all__ = [
     "lock",
     "locks",
     "logs",
+    "migrate",
     "notifications",
     "once",
     "open_session",
@@ -114,7 +115,9 @@ __all__ = [
     "register",
     "remove_group",
     "request_release",
+    "restore_state",
     "resume",
+    "save_state",
     "service",
     "services",
     "set_groups",
@@ -213,6 +216,23 @@ def set_health(provider: object, health: str = HEALTHY) -> None:
 def alter(provider: object, *, meta: Mapping[str, Scalar] | None = None) -> None:
     """Read a live provider again, as if registered anew; see `Container.alter`."""
     container().alter(provider, meta=meta)
+
+
+def migrate(
+    which: Handle | Constraint, *, to: str, args: Sequence[Any] | Mapping[str, Any] | None = None
+) -> tuple[Handle, ...]:
+    """Have a provider go on in another container, with its state; see `Container.migrate`."""
+    return container().migrate(which, to=to, args=args)
+
+
+def save_state(which: Handle | Constraint) -> Any:
+    """What a provider remembers, as plain data; see `Container.save_state`."""
+    return container().save_state(which)
+
+
+def restore_state(which: Handle | Constraint, state: Any) -> None:
+    """Give a provider what it remembered; see `Container.restore_state`."""
+    container().restore_state(which, state)
 
 
 def services(constraint: Constraint | None = None) -> list[Handle]:

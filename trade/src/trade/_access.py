@@ -44,6 +44,12 @@ FUNCTIONS: Final = {
     "acquire": _ALL,  # asks itself for lock over the groups of the resources
     "break_lock": _ALL,  # asks itself for administer over them
     "resume": _ALL,  # asks itself for administer over those whose lock is not one's own
+    "migrate": _ALL,  # asks itself for administer over the groups of the provider
+    "save_state": _ALL,  # likewise
+    "restore_state": _ALL,  # likewise
+    "prepare_arrival": _ALL,  # asks itself for register over the groups of the provider
+    "arrive": _ALL,  # only what is one's own; likewise
+    "arrived": _ALL,  # only what is one's own
     "deregister": "administer",
     "register": "administer",
     "instantiate": "administer",

@@ -13,6 +13,7 @@ from trade._guarding import Guarding
 from trade._handle import Handle, Run
 from trade._hosting import Hosting
 from trade._invoke import container_closed
+from trade._moving import Moving
 from trade._own_services import OwnServices
 from trade._parts import Parts
 from trade._reach import Reach
@@ -31,7 +32,7 @@ from trade.errors import ConfigurationError
 __all__ = ["Container"]
 
 
-class Container(Hosting, Streaming, Tracing, Guarding, Bordering):
+class Container(Hosting, Moving, Streaming, Tracing, Guarding, Bordering):
     """A participant of a system; most programs use the default one through the functions of ``trade``.
 
     Joins on construction. A context manager; ``close()`` leaves and is idempotent.

@@ -47,7 +47,7 @@ from trade._wire import (
     is_chunk,
     reply_key,
 )
-from trade.errors import AccessDenied, InvalidResult, NotSerialisable, RemoteError, TradeError
+from trade.errors import AccessDenied, InvalidResult, NotSerialisable, RemoteError, ServiceGone, TradeError
 
 _logger = logging.getLogger("trade")
 
@@ -174,7 +174,7 @@ class LocalService:
 
 
 Lookup = Callable[[str, str], LocalService | None]
-"""From ``domain/provider`` and the service's name to the service."""
+"""From ``domain/provider`` and the service's name to the service; raises ServiceGone if that has moved."""
 
 
 class Dispatcher:
@@ -238,7 +238,11 @@ class Dispatcher:
         if taken is None:
             return
         call, caller, provider, replier = taken
-        service = self._lookup(provider, call.service)
+        try:
+            service = self._lookup(provider, call.service)
+        except ServiceGone as gone:  # it has moved
+            self._refuse(replier, caller, call, Status.ERROR, Raw(encode_message(pack_error(gone))))
+            return
         urgent = message.key.startswith("stop/")
         if service is None or (service.effect == "stop") is not urgent:
             if urgent and call.service == CANCEL and provider == _SYSTEM:

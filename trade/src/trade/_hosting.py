@@ -9,7 +9,7 @@ from trade._constraints import checked_meta
 from trade._handle import Handle
 from trade._invoke import container_closed
 from trade._member import Member
-from trade._providers import checked_groups, checked_health
+from trade._offerable import checked_groups, checked_health
 from trade._transport import ChannelClosed
 from trade._wire import HEALTHY, ProviderInfo, Scalar
 

@@ -97,6 +97,8 @@ class LockTable:
             resource = known or (named if isinstance(named, Resource) else Resource(name))
             if isinstance(named, Resource) and resource is not named:
                 raise ValueError(f"resource {name} is another object already; share one trade.Resource")
+            if known is None:  # what is offered anew is nobody's
+                resource.live, resource.holder = 0, None
             resource.epoch, resource.over, resource.gone = self._epoch, self.over, self.gone
             resource.estop = self._estop
             resource.on_rest(self._rested)
@@ -294,6 +296,26 @@ class LockTable:
                 return False
             self._end(grant, "it was given back")
             return True
+
+    def retire(self, number: int, reason: str) -> Callable[[], None] | None:
+        """End a grant so that nobody is let in any more to what it holds; None if it has ended.
+
+        For what is about to be dropped: there is no moment in which it is free. Returns what frees it after all.
+        """
+        with self._changed:
+            grant = self._grants.pop(number, None)
+            if grant is None:
+                return None
+            self._ended[number] = reason
+
+        def free() -> None:
+            with self._changed:
+                for resource in grant.resources:
+                    if resource.live == number:
+                        resource.live, resource.holder = 0, None
+                self._changed.notify_all()
+
+        return free
 
     def lose(self, number: int, reason: str) -> bool:
         """Take it away: what moves under it stops, and only then it is given on. Returns whether it held."""

@@ -6,7 +6,7 @@ import re
 import threading
 from collections.abc import Mapping, Sequence
 from fnmatch import fnmatchcase
-from typing import Any, Final, Protocol
+from typing import Any, Final, NamedTuple, Protocol
 
 from trade._handle import Handle
 from trade._providers import Providers
@@ -16,6 +16,14 @@ from trade.errors import CannotInstantiate, ConfigurationError, NoSuchClass, Not
 
 _logger = logging.getLogger("trade")
 _PATH: Final = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*")
+
+
+Arguments = Sequence[Any] | Mapping[str, Any]
+
+
+class _Made(NamedTuple):
+    provider: object
+    args: Arguments
 
 
 class Home(Protocol):
@@ -35,7 +43,7 @@ class Making:
         self._withdrawn = withdrawn
         self._allowed = tuple(allowed)
         self._lock = threading.Lock()
-        self._made: dict[int, object] = {}
+        self._made: dict[int, _Made] = {}
 
     def find(self, class_path: str) -> type:
         """The class of a path; it stands in the module that defines it, and only modules of allowed ones are imported.
@@ -65,7 +73,7 @@ class Making:
             raise NoSuchClass(class_path=class_path, container=where, reason=f"it is defined as {path_of(found)}")
         return found
 
-    def make(self, kind: type, args: Sequence[Any] | Mapping[str, Any]) -> object:
+    def make(self, kind: type, args: Arguments) -> object:
         """An object of a class that `find` gave. Raises CannotInstantiate."""
         try:
             return kind(**args) if isinstance(args, Mapping) else kind(*args)
@@ -73,16 +81,33 @@ class Making:
             where = self._home.address.container
             raise CannotInstantiate(class_path=path_of(kind), container=where, problem=_told(error)) from error
 
-    def offer(self, made: object, groups: Sequence[str]) -> tuple[Handle, ...]:
+    def offer(self, made: object, groups: Sequence[str], args: Arguments = ()) -> tuple[Handle, ...]:
         """Register what was made; it is closed if that cannot be."""
         try:
             handles = self._home.register(made, groups)
         except BaseException:
             end(made)
             raise
-        with self._lock:
-            self._made[id(made)] = made
+        self.keep(made, args)
         return handles
+
+    def keep(self, made: object, args: Arguments) -> None:
+        """Something was made here with these arguments."""
+        with self._lock:
+            self._made[id(made)] = _Made(made, args)
+
+    def arguments_of(self, provider: object) -> Arguments:
+        """What it was made with; nothing if it was not made here."""
+        with self._lock:
+            made = self._made.get(id(provider))
+        return () if made is None else made.args
+
+    def let_go(self, provider: object) -> None:
+        """It has moved away: it is not offered again, and is closed, whoever made it."""
+        self._withdrawn.forget(provider)
+        with self._lock:
+            self._made.pop(id(provider), None)
+        end(provider)
 
     def terminate(self, service: Handle) -> None:
         """See `System.terminate`."""
@@ -95,17 +120,14 @@ class Making:
             raise ConfigurationError(where=service.label, problem=problem)
         if self._withdrawn.offer(key.provider) is None:
             self._withdrawn.take_off(key)
-        self._withdrawn.forget(made)
-        with self._lock:
-            self._made.pop(id(made), None)
-        end(made)
+        self.let_go(made.provider)
 
     def close(self) -> None:
         """Close all that was made here. Idempotent."""
         with self._lock:
             made, self._made = list(self._made.values()), {}
         for one in reversed(made):
-            end(one)
+            end(one.provider)
 
 
 def path_of(kind: type) -> str:

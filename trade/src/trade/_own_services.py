@@ -9,6 +9,7 @@ from trade._estopping import LIMIT_S
 from trade._hook_services import HookServices
 from trade._lock_services import LockServices
 from trade._making_services import MakingServices
+from trade._migration_services import MigrationServices
 from trade._notification_services import Home as Member
 from trade._notification_services import NotificationServices
 from trade._parts import Parts
@@ -27,7 +28,14 @@ class Home(Member, Protocol):
 
 
 class OwnServices(
-    SystemServices, LockServices, NotificationServices, HookServices, TraceServices, MakingServices, StreamServices
+    SystemServices,
+    LockServices,
+    NotificationServices,
+    HookServices,
+    TraceServices,
+    MakingServices,
+    MigrationServices,
+    StreamServices,
 ):
     """One provider, so that one registry entry tells of all its container's own functions."""
 
@@ -48,6 +56,7 @@ class OwnServices(
         HookServices.__init__(self, parts.hooks, home, access)
         TraceServices.__init__(self, home.name, parts.spans, parts.trace)
         MakingServices.__init__(self, home.system)
+        MigrationServices.__init__(self, parts.departing, parts.arriving)
         StreamServices.__init__(self, parts.streams)
         self._estopping = parts.estopping
 

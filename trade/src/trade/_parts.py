@@ -7,14 +7,17 @@ from typing import Final, Protocol
 
 from trade import _hooks, _locking, _making, _notifications, _streams
 from trade._announcing import Announcer
+from trade._arriving import Arriving
 from trade._borrowed import Borrowed
 from trade._calls import Caller
 from trade._clockwork import Clockwork
 from trade._constraints import where
 from trade._context import handed_down
 from trade._coroutines import AsyncLoop
+from trade._departing import Departing
 from trade._dispatch import Dispatcher
 from trade._estopping import Estopping
+from trade._freezing import Freezing
 from trade._handle import Handle
 from trade._handle import Home as HandleHome
 from trade._handle_codec import handle_codec
@@ -132,6 +135,10 @@ class Parts:
             self.withdrawn = Withdrawn(self.providers, self.deadman.rest)
             self.making = Making(home, self.providers, self.withdrawn, settings.instantiable)
             leaving.callback(self.making.close)
+            freezing = Freezing(self.locks, address)
+            self.departing = Departing(home, self.providers, self.making, self.withdrawn, freezing, access, self.codec)
+            self.arriving = Arriving(address, self.providers, self.making, freezing, access, self.codec, self.clockwork)
+            leaving.callback(self.arriving.close)
             self.dispatcher = Dispatcher(
                 self.transport, address, self.providers.lookup, self.coroutines, access, access.callers()
             )

@@ -4,19 +4,21 @@ import os
 import socket
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Final, NamedTuple, cast
+from typing import Any, Final, cast
 from weakref import WeakValueDictionary
 
-from msgspec import Struct, structs
+from msgspec import structs
 
 from trade._access import Access
 from trade._announcing import Announcer
 from trade._codec import Codec
-from trade._constraints import GROUP, checked_meta
+from trade._constraints import checked_meta
 from trade._coroutines import AsyncLoop
 from trade._dispatch import LocalService
 from trade._locks import LockTable
-from trade._registry import Registry
+from trade._offerable import require_stop
+from trade._offers import Built, Offer, Registered
+from trade._registry import Registry, gone_to
 from trade._resources import Resource
 from trade._serial import Serial
 from trade._service import ServiceMark, kinds_of, marked_methods
@@ -30,32 +32,12 @@ from trade._wire import (
     ServiceKey,
     as_chunk,
     domain_of,
-    is_chunk,
 )
 from trade.errors import ConfigurationError
 
-_LONGEST_HEALTH: Final = 500
+_MOST_MOVED: Final = 4096
 
 _Method = tuple[str, ServiceMark, Callable[..., Any]]
-
-
-class _Registered(Struct, frozen=True):
-    """A provider of this container."""
-
-    provider: Any
-    services: dict[str, LocalService]
-    implements: tuple[type, ...]
-    info: ProviderInfo
-    """As it was announced last."""
-
-
-class Offer(NamedTuple):
-    """An object, and how it is registered."""
-
-    provider: Any
-    groups: tuple[str, ...]
-    implements: tuple[type, ...]
-    meta: Mapping[str, Scalar]
 
 
 class Providers:
@@ -82,8 +64,10 @@ class Providers:
         self._announcing = threading.RLock()
         """Revisions go out in order, one at a time."""
         self._revision = 0
-        self._hosted: dict[str, _Registered] = {}
+        self._hosted: dict[str, Registered] = {}
         self._names: dict[int, str] = {}
+        self._moved: dict[str, str] = {}
+        """Where the last ones are that moved away, by place."""
         self._counter = 0
         self._signatures: WeakValueDictionary[_Method, Signature] = WeakValueDictionary()
         """What objects of one class share, as long as one of them is hosted."""
@@ -109,6 +93,20 @@ class Providers:
         Raises:
             ConfigurationError, AccessDenied: see `Container.register`.
         """
+        built = self.build(provider, groups, implements, meta=meta, name=name)
+        self.host(built)
+        return list(built.keys)
+
+    def build(
+        self,
+        provider: object,
+        groups: tuple[str, ...],
+        implements: Sequence[type] = (),
+        *,
+        meta: Mapping[str, Scalar] | None = None,
+        name: str | None = None,
+    ) -> Built:
+        """All of `add` that can go wrong: `host` offers it then, or `discard` gives its resources back."""
         kind, domain = type(provider).__qualname__, domain_of(groups)
         if name != PROVIDER:
             self._access.require_offer(self._own.identity, groups, kind)
@@ -127,8 +125,16 @@ class Providers:
             members={group: tuple(names) for group, names in getattr(provider, "members", {}).items()},
             estops=getattr(provider, "open_estops", ()) if domain == DOMAIN else (),
         )
-        self._host(place, _Registered(provider, services, tuple(implements), info))
-        return [ServiceKey(self._own, domain, chunk, service) for service in services]
+        keys = tuple(ServiceKey(self._own, domain, chunk, service) for service in services)
+        return Built(place, Registered(provider, services, tuple(implements), info), keys)
+
+    def host(self, built: Built) -> None:
+        """Offer what was built: callable first, announced then."""
+        self._host(built.place, built.registered)
+
+    def discard(self, built: Built) -> None:
+        """It is not offered after all."""
+        self._drop(built.services)
 
     def pass_on(
         self, provider: object, info: ProviderInfo, make: Callable[[str], dict[str, LocalService]]
@@ -147,7 +153,7 @@ class Providers:
         self._access.require_offer(self._own.identity, info.groups, info.kind)
         domain, chunk = domain_of(info.groups), self._new_chunk(provider, info.kind)
         place = f"{domain}/{chunk}"
-        self._host(place, _Registered(provider, make(place), (), info))
+        self._host(place, Registered(provider, make(place), (), info))
         return domain, chunk
 
     def _new_chunk(self, provider: object, kind: str) -> str:
@@ -156,7 +162,7 @@ class Providers:
             self._counter += 1
             return f"{as_chunk(kind)[:60]}-{self._counter}"
 
-    def _host(self, place: str, registered: _Registered) -> None:
+    def _host(self, place: str, registered: Registered) -> None:
         with self._announcing:
             with self._lock:
                 self._require_new(registered.provider)
@@ -200,7 +206,7 @@ class Providers:
                 self._drop(known.services)
             self._announce(place, info)
 
-    def _known(self, provider: object) -> tuple[str, _Registered]:
+    def _known(self, provider: object) -> tuple[str, Registered]:
         with self._lock:
             place = self._names.get(id(provider))
             if place is None:
@@ -215,8 +221,12 @@ class Providers:
         self._registry.put(self._own, domain, chunk, info)
         self._announcer.announce(domain, chunk, info)
 
-    def remove(self, provider: object) -> None:
+    def remove(self, provider: object, moved_to: str = "") -> None:
         """Stop hosting an object: gone from the registry first, uncallable then.
+
+        Args:
+            provider: the object.
+            moved_to: where what took it over is offered, if it did: ``identity/container/epoch/domain/provider``.
 
         Raises:
             ConfigurationError: it is not registered here.
@@ -227,7 +237,11 @@ class Providers:
                 if place is None:
                     raise _not_registered(provider)
                 registered = self._hosted.pop(place)
-            self._announce(place, structs.replace(registered.info, services=()))
+                if moved_to:
+                    self._moved[place] = moved_to
+                    for forgotten in list(self._moved)[:-_MOST_MOVED]:
+                        del self._moved[forgotten]
+            self._announce(place, structs.replace(registered.info, services=(), moved_to=moved_to))
             self._drop(registered.services)
 
     def _drop(self, services: Mapping[str, LocalService]) -> None:
@@ -288,13 +302,25 @@ class Providers:
         Args:
             place: ``domain/provider``. The domain must be the provider's own: access rules go by it.
             service: its name.
+
+        Raises:
+            ServiceGone: its provider has moved, and where to.
         """
         registered = self._hosted.get(place)
-        return None if registered is None else registered.services.get(service)
+        if registered is None:
+            if (moved_to := self._moved.get(place)) is not None:
+                raise gone_to(f"{place.partition('/')[0]}.{service}", moved_to)
+            return None
+        return registered.services.get(service)
+
+    def services_at(self, place: str) -> Mapping[str, LocalService]:
+        """What is offered at a place, by name."""
+        registered = self._hosted.get(place)
+        return {} if registered is None else registered.services
 
     def service(self, key: ServiceKey) -> LocalService | None:
         """A service of this container by its key."""
-        return self.lookup(f"{key.domain}/{key.provider}", key.name)
+        return self.services_at(f"{key.domain}/{key.provider}").get(key.name)
 
     def _services_of(
         self, provider: object, groups: tuple[str, ...], implements: Sequence[type], place: str
@@ -305,7 +331,7 @@ class Providers:
             problem = "it has no services; mark methods of its class with @trade.service"
             raise ConfigurationError(where=kind, problem=problem)
         resources = cast("tuple[Resource | str, ...]", tuple(getattr(provider, "resources", ())))
-        _require_stop(kind, resources, [mark for mark, _ in marked.values()])
+        require_stop(kind, resources, [mark for mark, _ in marked.values()])
         serial = Serial()
         services: dict[str, LocalService] = {}
         for name, (mark, function) in marked.items():
@@ -356,34 +382,3 @@ def _infos(services: Mapping[str, LocalService]) -> tuple[ServiceInfo, ...]:
 
 def _not_registered(provider: object) -> ConfigurationError:
     return ConfigurationError(where=type(provider).__qualname__, problem="it is not registered in this container")
-
-
-def _require_stop(kind: str, resources: Sequence[object], marks: Sequence[ServiceMark]) -> None:
-    """S17: what moves something physical is not offered without a way to stop it."""
-    physical = resources or any(mark.uses for mark in marks)
-    effects = {mark.effect for mark in marks}
-    if physical and "actuate" in effects and "stop" not in effects:
-        problem = 'it moves something but cannot be stopped; give it a method marked @service(effect="stop")'
-        raise ConfigurationError(where=kind, problem=problem)
-
-
-def checked_groups(provider: object, groups: str | Sequence[str]) -> tuple[str, ...]:
-    """Groups as a tuple; raises ConfigurationError for one that is malformed or the middleware's own."""
-    named = (groups,) if isinstance(groups, str) else tuple(groups)
-    for group in named:
-        is_text = isinstance(group, str)  # pyright: ignore[reportUnnecessaryIsInstance] - callers may not check types
-        if not is_text or not GROUP.fullmatch(group) or not is_chunk(group) or group.split(".")[0] == DOMAIN:
-            problem = (
-                f"{group!r} is no group; use words joined by dots, such as rosie.head, 80 characters at most "
-                f"({DOMAIN!r} is reserved)"
-            )
-            raise ConfigurationError(where=type(provider).__qualname__, problem=problem)
-    return named
-
-
-def checked_health(provider: object, health: str) -> str:
-    """A health text; raises ConfigurationError for what is none."""
-    if not isinstance(health, str) or not 0 < len(health) <= _LONGEST_HEALTH:  # pyright: ignore[reportUnnecessaryIsInstance]
-        problem = f"health must be a text of 1 to {_LONGEST_HEALTH} characters that says what is wrong, or 'healthy'"
-        raise ConfigurationError(where=type(provider).__qualname__, problem=problem)
-    return health

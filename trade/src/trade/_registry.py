@@ -10,6 +10,7 @@ from trade._constraints import Constraint
 from trade._heard import Heard
 from trade._index import Index
 from trade._wire import HEALTHY, Address, Estop, ProviderInfo, Scalar, ServiceInfo, ServiceKey
+from trade.errors import ServiceGone
 
 __all__ = ["ContainerState", "Record", "Registry"]
 
@@ -73,8 +74,8 @@ class ContainerState:
     address: Address
     providers: dict[str, "Entry"] = field(default_factory=dict)
     """By name."""
-    removed: dict[str, None] = field(default_factory=dict)
-    """Deregistered, in this order: a name is never used twice in one boot."""
+    removed: dict[str, str] = field(default_factory=dict)
+    """Deregistered, in this order, and where they moved, if they did: a name is never used twice in one boot."""
     heard: Heard = field(default_factory=Heard)
 
 
@@ -89,6 +90,8 @@ class Change(NamedTuple):
     """What was known of those, in the same order."""
 
 
+_SLASHES: Final = 4
+"""In what says where a provider moved."""
 _MOST_PROVIDERS: Final = 65_536
 """Of one container: what it announces beyond that is ignored, and of more no withdrawal is remembered."""
 
@@ -188,7 +191,7 @@ class Registry:
         before, after = list[Record](), list[Record]()
         for provider in gone:
             before += _records(state.providers.pop(provider, None))
-        state.removed.update(dict.fromkeys(gone))
+        state.removed.update((name, entries[name][1].moved_to if name in entries else "") for name in gone)
         for provider in list(state.removed)[: max(0, len(state.removed) - _MOST_PROVIDERS)]:
             del state.removed[provider]
         for provider, (domain, info) in entries.items():
@@ -299,6 +302,17 @@ class Registry:
         """Whether the provider was deregistered in a boot that still lives."""
         state = self._containers.get(key.address)
         return state is not None and key.provider in state.removed
+
+    def moved_to(self, key: ServiceKey) -> str:
+        """Where its provider moved, if it was deregistered for that: ``identity/container/epoch/domain/provider``."""
+        state = self._containers.get(key.address)
+        return "" if state is None else state.removed.get(key.provider, "")
+
+
+def gone_to(label: str, moved_to: str) -> ServiceGone:
+    """The error of who calls a service that has moved."""
+    container = moved_to.split("/")[1] if moved_to.count("/") == _SLASHES else "another one"
+    return ServiceGone(service=label, reason=f"its provider has moved to container {container}", moved_to=moved_to)
 
 
 def _all(state: ContainerState) -> list[Record]:

@@ -52,7 +52,9 @@ class _Withdrawn(Protocol):
 class _Making(Protocol):
     def find(self, class_path: str) -> type: ...
     def make(self, kind: type, args: Sequence[Any] | Mapping[str, Any]) -> object: ...
-    def offer(self, made: object, groups: Sequence[str]) -> tuple[Handle, ...]: ...
+    def offer(
+        self, made: object, groups: Sequence[str], args: Sequence[Any] | Mapping[str, Any]
+    ) -> tuple[Handle, ...]: ...
     def terminate(self, service: Handle) -> None: ...
 
 
@@ -192,7 +194,7 @@ class System:
         """
         making = self._member().making
         named = (groups,) if isinstance(groups, str) else tuple(groups)
-        return making.offer(making.make(making.find(class_path), args), named)
+        return making.offer(making.make(making.find(class_path), args), named, args)
 
     def start_container(
         self,

@@ -8,7 +8,7 @@ from trade._codec import Codec
 from trade._handle import Handle
 from trade._invoke import LocalTarget, RemoteTarget, container_closed
 from trade._providers import Providers
-from trade._registry import Change, Record, Registry
+from trade._registry import Change, Record, Registry, gone_to
 from trade._transport import ChannelClosed
 from trade._wire import Address, ServiceKey
 from trade.errors import ServiceGone
@@ -81,6 +81,8 @@ class Targets:
     def gone(self, handle: Handle) -> ServiceGone:
         """Why a handle leads nowhere."""
         address = handle.key.address
+        if moved_to := self._registry.moved_to(handle.key):
+            return gone_to(handle.label, moved_to)
         if self._registry.is_alive(address):
             reason = "its provider was deregistered" if self._registry.removed(handle.key) else "it is not known here"
         else:

@@ -272,6 +272,7 @@ class ProviderInfo(Struct, frozen=True, kw_only=True):
     """What the robot's groups consist of: group -> resources, whether or not they are there."""
     estops: tuple[Estop, ...] = ()
     """Of the middleware's own provider: what is open in its container; who hears it takes the union."""
+    moved_to: Annotated[str, Meta(max_length=500)] = ""  # where one that was deregistered goes on: see ServiceGone
 
 
 class _ProviderMessage(ProviderInfo, frozen=True, kw_only=True):
@@ -304,8 +305,7 @@ class CancelArguments(Struct, array_like=True, gc=False):
 MOST_BYTES: Final = 64 << 20
 """The largest arguments and the largest result, encoded."""
 
-_MOST_MESSAGE_BYTES: Final = MOST_BYTES + (1 << 20)
-"""What more is not even decoded."""
+_MOST_MESSAGE_BYTES: Final = MOST_BYTES + (1 << 20)  # what is larger is not even decoded
 
 EMPTY: Final = Raw(msgspec.msgpack.encode(None))
 EMPTY_ARGUMENTS: Final = Raw(msgspec.msgpack.encode(()))

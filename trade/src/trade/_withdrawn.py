@@ -4,7 +4,9 @@ import threading
 from collections.abc import Callable, Sequence
 from typing import Final
 
-from trade._providers import Offer, Providers, checked_groups
+from trade._offerable import checked_groups
+from trade._offers import Offer
+from trade._providers import Providers
 from trade._resources import Resource
 from trade._system import DOMAIN, WithdrawnInfo
 from trade._wire import ServiceKey
@@ -20,10 +22,10 @@ class Withdrawn:
         self._lock = threading.Lock()
         self._kept: dict[str, Offer] = {}
 
-    def take_off(self, key: ServiceKey) -> str:
+    def take_off(self, key: ServiceKey, moved_to: str = "") -> str:
         """Stop offering the provider of a service; returns the name it is put back by.
 
-        What it moves is stopped first: afterwards nobody could.
+        What it moves is stopped first: afterwards nobody could. ``moved_to`` is where it is offered instead, if it is.
 
         Raises:
             ConfigurationError: it is not offered here, or is the middleware's own.
@@ -39,7 +41,7 @@ class Withdrawn:
         with self._lock:
             self._kept[key.provider] = offer
         try:
-            self._providers.remove(offer.provider)
+            self._providers.remove(offer.provider, moved_to)
         except ConfigurationError:  # somebody was quicker; its owner perhaps, who has the last word
             self.forget(offer.provider)
             raise

@@ -19,6 +19,7 @@ __all__ = [
     "Cancelled",
     "CannotConnect",
     "CannotInstantiate",
+    "CannotMigrate",
     "CannotStart",
     "ConfigurationError",
     "ContainerLost",
@@ -34,6 +35,7 @@ __all__ = [
     "LinkStays",
     "LockLost",
     "LockedByOther",
+    "MigrationUnknown",
     "MotionStopped",
     "NoSuchCall",
     "NoSuchClass",
@@ -134,6 +136,8 @@ class ServiceGone(CallerError, LookupError):
 
     service: str
     reason: str = "its provider was deregistered"
+    moved_to: str = ""
+    """Where its provider goes on, if it moved: ``identity/container/epoch/domain/provider``. Handles do not follow."""
 
     def describe(self) -> str:
         return f"{self.service} is gone: {self.reason}; look it up again with trade.find(...)"
@@ -481,6 +485,40 @@ class CannotInstantiate(CallError, RuntimeError):
 
     def describe(self) -> str:
         return f"{self.class_path} could not be made in container {self.container}: {self.problem}"
+
+
+@dataclass(kw_only=True, eq=False)
+class CannotMigrate(CallError, RuntimeError):
+    """A provider did not move to another container; it goes on where it was."""
+
+    provider: str
+    to: str
+    problem: str
+    withdrawn: bool = False
+    """It was withdrawn for a moment: handles from before are dead."""
+
+    def describe(self) -> str:
+        after = "it is offered again where it was, under new handles" if self.withdrawn else "it goes on where it was"
+        return f"{self.provider} did not move to container {self.to}: {self.problem}; {after}"
+
+
+@dataclass(kw_only=True, eq=False)
+class MigrationUnknown(CallError, ConnectionError):
+    """Contact was lost at the moment a provider moved; it is offered there, or nowhere, and never twice."""
+
+    provider: str
+    container: str
+    """Where it was."""
+    to: str
+    withdrawn: str
+    """The name by which `System.register` offers it again where it was."""
+
+    def describe(self) -> str:
+        remedy = f"`trade call trade.register '\"{self.withdrawn}\"' --container {self.container}`"
+        return (
+            f"container {self.to} was lost when {self.provider} moved there: it may be alive and offer it. If it has "
+            f"ended for good, {remedy} offers it again"
+        )
 
 
 @dataclass(kw_only=True, eq=False)
