@@ -22,3 +22,11 @@ class Lamp:
     def level(self) -> Level:
         """How bright it is."""
         return self._level
+
+    def save_state(self) -> float:
+        """For when it moves to another container."""
+        return self._level
+
+    def restore_state(self, level: float) -> None:
+        """It has moved, and goes on as bright as it was."""
+        self._level = level

@@ -49,6 +49,8 @@ STEPS: Final = (
     Step("They stand:", "trade rules list"),
     Step("Who may do what, by a policy?", "trade policy check planner call rosie.head --policy examples/policy.toml"),
     Step("", "trade policy check ann call rosie.head --policy examples/policy.toml"),
+    Step("The lamp of the hall goes on in the attic, as bright as it was.", "trade migrate home.hall --to attic"),
+    Step("", "trade call home.hall.level"),
     Step("The end; what was started last is ended first.", "trade system down examples/system.toml"),
 )
 

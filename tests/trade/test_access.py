@@ -125,6 +125,19 @@ def test_a_denied_call_tells_who_what_and_why_and_nothing_runs(member: Member, n
     assert neck.moved == []
 
 
+def test_a_handle_tells_what_it_asks_of_its_callers(member: Member, neck: Neck) -> None:
+    dash = member("dash")
+    asked = {name: (find(dash, name).verb, find(dash, name).roles) for name in ("move", "angle", "stop")}
+    assert asked == {"move": ("call", ("operator",)), "angle": ("read", ("operator", "viewer")), "stop": ("", ())}
+    clear = find(dash, "estop_clear", "trade")
+    assert (clear.verb, clear.roles) == ("administer", ("chief",))
+
+
+def test_without_a_policy_a_service_asks_for_no_role(memory: MemorySystem) -> None:
+    [move, *_] = memory.container("open").register(Neck(), "rosie.neck")
+    assert (move.verb, move.roles) == ("call", ())
+
+
 def test_S07_a_stop_needs_no_role_but_one_must_not_be_revoked(member: Member, neck: Neck) -> None:
     find(member("nobody"), "stop")()
     assert neck.stops == 1

@@ -12,7 +12,8 @@ from trade.errors import NoSuchService
 from trade.rules import Firing, Rules, read_rules, rehearse
 from waiting import wait_until
 
-SHIPPED = Path(__file__).parents[2] / "examples" / "rules.toml"
+EXAMPLES = Path(__file__).parents[2] / "examples"
+SHIPPED, CARE = EXAMPLES / "rules.toml", EXAMPLES / "care.toml"
 StartContainer = Callable[..., Container]
 Only = Callable[..., Rules]
 
@@ -47,8 +48,8 @@ def only(here: Container, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> It
     monkeypatch.setattr(rules_module, "LOOK_S", 0.02)
     begun: list[Rules] = []
 
-    def begin(name: str, **instead: str) -> Rules:
-        text = SHIPPED.read_text(encoding="utf-8")
+    def begin(name: str, shipped: Path = SHIPPED, **instead: str) -> Rules:
+        text = shipped.read_text(encoding="utf-8")
         [part] = [part for part in text.split("\n\n") if part.startswith(f"[rule.{name}]")]
         for old, new in instead.items():
             assert old in part
@@ -133,6 +134,20 @@ def test_a_degraded_camera_is_replaced_and_withdrawn(
     assert (firing.service, firing.ok) == ("rosie.eyes.check_for", True)
     wait_until(lambda: seers(here) == ["spare"])
     assert [info.provider for info in eyes.system.withdrawn()] == ["Camera-1"]
+
+
+def test_a_lamp_that_is_missing_is_made(
+    start_container: StartContainer, only: Only, here: Container, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    lamps = start_container("lamps", instantiable=("lamp:Lamp",))
+    wait_until(lambda: here.services(where(name="instantiate", container="lamps")))
+    firing = first(only("porch", CARE))
+    assert (firing.ok, [did.service for did in firing.steps]) == (True, ["trade.instantiate"])
+    wait_until(lambda: here.services(where(name="shine")))
+    [shine] = here.services(where(name="shine"))
+    assert (shine.container, shine.groups) == (lamps.name, ("home.porch",))
+    shine(0.5)
 
 
 def test_work_is_spread_once_there_is_too_much_of_it(

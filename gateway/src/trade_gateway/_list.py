@@ -75,6 +75,8 @@ def describe(handle: Handle) -> dict[str, Any]:
         "groups": handle.groups,
         "signature": handle.signature,
         "effect": handle.effect,
+        "verb": handle.verb,
+        "roles": handle.roles,
         "resources": handle.resources,
         "doc": handle.doc,
         "container": handle.container,

@@ -69,9 +69,14 @@ _NEEDS: Final = {"read": "read", "actuate": "call", "stop": _ALL}
 """What other services need over their group, by effect; a stop is open to everybody (S07)."""
 
 
+def verb_of(domain: str, name: str, effect: str) -> str:
+    """What a service of a group asks of its callers over that group; empty: nothing but not to be revoked."""
+    return FUNCTIONS.get(name, "administer") if domain == DOMAIN else _NEEDS.get(effect, "call")
+
+
 def decide_call(policy: Policy, who: str, domain: str, name: str, effect: str) -> tuple[str, Decision]:
     """Whether somebody may call a service of a group. Returns the verb that it needs, and the decision."""
-    verb = FUNCTIONS.get(name, "administer") if domain == DOMAIN else _NEEDS.get(effect, "call")
+    verb = verb_of(domain, name, effect)
     return (verb, policy.decide(who, verb, domain)) if verb else ("call", policy.authenticated(who))
 
 

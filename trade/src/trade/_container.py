@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from trade import _process
-from trade._access import Access
+from trade._access import Access, verb_of
 from trade._bordering import Bordering
 from trade._guarding import Guarding
 from trade._handle import Handle, Run
@@ -183,6 +183,12 @@ class Container(Hosting, Moving, Streaming, Tracing, Guarding, Bordering):
     def name(self) -> str:
         """The container's name."""
         return self.address.container
+
+    def asked_for(self, handle: Handle) -> tuple[str, tuple[str, ...]]:
+        """The verb that callers of a service need over its group, and the roles of the policy here that have it."""
+        key, policy = handle.key, self.access.policy
+        verb = verb_of(key.domain, key.name, handle.record.info.effect)
+        return verb, policy.roles_with(verb, key.domain) if policy is not None and verb else ()
 
     def require_call(self, who: str, handle: Handle) -> None:
         """Raises AccessDenied: somebody for whom this container acts may not call that service."""

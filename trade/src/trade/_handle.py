@@ -35,6 +35,7 @@ class Home(Protocol):
     ) -> "Run": ...
     def record(self, handle: "Handle") -> Record: ...
     def has(self, key: ServiceKey) -> bool: ...
+    def asked_for(self, handle: "Handle") -> tuple[str, tuple[str, ...]]: ...
 
 
 class Run:
@@ -326,9 +327,14 @@ class Handle:
         return self.record.health
 
     @property
+    def verb(self) -> str:
+        """What a policy must allow a caller over its first group: ``call``, ``read``...; empty: everybody may call."""
+        return self._home.asked_for(self)[0]
+
+    @property
     def roles(self) -> tuple[str, ...]:
-        """Roles a caller needs; none are asked for until a policy is loaded."""
-        return ()
+        """The roles whose identities may call it, by the policy of this container; none if that asks for none."""
+        return self._home.asked_for(self)[1]
 
     @property
     def schema(self) -> Mapping[str, Mapping[str, Any]]:

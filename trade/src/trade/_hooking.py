@@ -11,7 +11,7 @@ from trade._notifications import Notification
 from trade._notifying import Notifying
 from trade._system import DOMAIN, PROVIDER
 from trade._wire import ServiceKey
-from trade.errors import AccessDenied, ConfigurationError, NoSuchHook, TradeError
+from trade.errors import AccessDenied, ConfigurationError, ContainerLost, NoSuchHook, ServiceGone, TradeError
 
 _logger = logging.getLogger("trade")
 
@@ -22,6 +22,7 @@ class Hook:
     def __init__(self, home: "Hooking", name: str, side: Side, target: Handle | Constraint, call: Handle) -> None:
         self.id: Final = name
         """Names it in the whole system."""
+        self.told_as: Final = f"hook {name}"
         self.side: Final[Side] = side
         self.target: Final = target
         self.call: Final = call
@@ -55,6 +56,8 @@ class Hook:
             return
         try:
             self._attach(handle).result()
+        except (ContainerLost, ServiceGone):  # it has left already
+            _logger.debug("hook %s is not attached in %s, which has ended", self.call.label, handle.container)
         except TradeError as error:
             _logger.warning("hook %s is not attached in %s: %s", self.call.label, handle.container, error)
 

@@ -35,6 +35,10 @@ class Member(ABC):
         """What is known of a service; raises ServiceGone if nothing ever was."""
 
     @abstractmethod
+    def asked_for(self, handle: Handle) -> tuple[str, tuple[str, ...]]:
+        """The verb that callers of a service need over its group, and the roles of the policy here that have it."""
+
+    @abstractmethod
     def invoke(self, handle: Handle, args: tuple[Any, ...], kwargs: dict[str, Any], deadline_s: float | None) -> Any:
         """Call a service and wait; what ``handle(...)`` does."""
 

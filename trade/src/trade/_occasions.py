@@ -128,8 +128,11 @@ def deed_of(target: Target, host: str, where: str) -> Deed:
 
 
 def text_of(target: Target) -> str:
-    """For people."""
+    """For people. An object of the middleware's own says of its methods what they are, as ``told_as``."""
     if isinstance(target, Deed):
         return str(target)
+    told_as: str = getattr(getattr(target, "__self__", None), "told_as", "")
+    if told_as:
+        return told_as
     owner: Mapping[str, Any] | Any = getattr(target, "__qualname__", None)
     return f"{owner or repr(target)} (a function)"

@@ -106,6 +106,12 @@ class Policy:
         found = (names for pattern, names in self.identities.items() if fnmatch.fnmatchcase(who, pattern))
         return tuple(dict.fromkeys(name for names in found for name in names))
 
+    def roles_with(self, verb: str, group: str) -> tuple[str, ...]:
+        """The roles that have a verb over a whole dotted group, in the order of the policy."""
+        words = group.split(".")
+        covering = [EVERYTHING, *(".".join(words[:count]) for count in range(1, len(words) + 1))]
+        return tuple(name for name, rights in self._of_role.items() if any((verb, one) in rights for one in covering))
+
     def groups_of(self, who: str, verbs: Iterable[str]) -> list[str]:
         """The groups an identity has one of these verbs over, as the rules name them, sorted; ``*`` alone if all."""
         wanted = set(verbs)

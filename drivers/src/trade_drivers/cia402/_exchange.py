@@ -245,7 +245,9 @@ class DriveExchange(Exchange):
                 self.command(axis, axis.controlword & ~machine.NEW_SET_POINT)
 
     def _admit(self) -> None:
-        """Go on with those that are not here; it never waits for them."""
+        """Go on with those that are not here; it never waits for them. An unhealthy process admits nobody (S06)."""
+        if self.refusing is not None:
+            return
         for admission in self.admissions:
             if admission.axis.stage is not Stage.HERE:
                 admission.advance()
