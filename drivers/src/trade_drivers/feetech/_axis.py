@@ -68,7 +68,8 @@ class FeetechAxis(ServoAxis[FeetechHealth]):
         self.unload = 0
         """Which complaints have it cut its torque by itself, as it is set up."""
         self.aim: Goal | None = None
-        self.sent = 0
+        self.sent, self.sent_ns = 0, 0
+        self._at_rest_ns = int((lead_s + joint.max_speed_rad_s / joint.max_accel_rad_s2) * 1e9)
 
     def sampled(self, data: bytes, at_ns: int) -> Sample:
         at = CYCLIC[0]
@@ -97,9 +98,16 @@ class FeetechAxis(ServoAxis[FeetechHealth]):
         return Goal(max(here - lead, min(here + lead, aim.position)), aim.accel, aim.speed)
 
     def hold_counts(self, now_ns: int) -> int | None:
-        """As every joint, but it cannot have got farther than it was sent."""
+        """As every joint, but it cannot have got farther than it was sent, and rests there soon.
+
+        Not heard since, and surely at rest, it is told nothing: whether it heard the last goal, nobody knows.
+        """
         counts, sample = super().hold_counts(now_ns), self.sample
-        if counts is None or sample is None or self.motion is None:
+        if counts is None or sample is None:
+            return None
+        if sample.at_ns <= self.sent_ns < now_ns - self._at_rest_ns:
+            return None
+        if self.motion is None:
             return counts
         low, high = sorted((sample.position, self.sent))
         return max(low, min(high, counts))

@@ -117,8 +117,9 @@ class FeetechExchange(ServoExchange):
     def _send(self, goals: Mapping[FeetechAxis, Goal], gate: Gate | None = None) -> None:
         data = {axis.id: jobs.goal_block(goal) for axis, goal in goals.items()}
         self.wire.sync_write(jobs.GOAL_BLOCK[0], data, gate)
+        sent_ns = self.clock()
         for axis, goal in goals.items():
-            axis.sent = goal.position
+            axis.sent, axis.sent_ns = goal.position, sent_ns
 
 
 def _due(motion: Motion) -> dict[FeetechAxis, Goal]:

@@ -94,6 +94,7 @@ class ServoExchange(Exchange):
             found = self.name_of(number)
             axis.fault = f"another model answers with its id: {found}, not {axis.joint.model}"
             axis.ready = False
+            axis.sample = None  # what was measured of ours means nothing to this one: it is told nothing
             return
         self._refresh_health(axis)
         if axis.silent:
@@ -154,7 +155,7 @@ class ServoExchange(Exchange):
                     self.readmit(axis)
                 else:
                     self.wire.ping(axis.id)
-                    axis.doubted = False
+                    axis.doubted, axis.health_due_ns = False, 0  # it may have restarted
             except NoAnswer:
                 self.missed(axis)
                 return
