@@ -135,18 +135,20 @@ class Wire(ServoWire):
         if result != COMM_SUCCESS:
             raise PortLost("the packet could not be written as a whole")
 
-    def sync_read(self, address: int, size: int, ids: Sequence[int]) -> dict[int, Answer]:
+    def sync_read(self, address: int, size: int, ids: Sequence[int]) -> Iterator[tuple[int, Answer]]:
         self._settle()
+        heard: set[int] = set()
         with self._use():
             self._port.expected = len(ids) * (size + 4) - 3 if self._fast else size
             result = self._packets.syncReadTx(self._port, address, size, ids, len(ids), self._fast)
             if result != COMM_SUCCESS:
                 raise PortLost("the packet could not be written as a whole")
-            found = self._joined(size, len(ids)) if self._fast else self._single(len(ids))
-            answers = {device_id: answer for device_id, answer in found if device_id in ids}
-        if len(answers) < len(ids):
+            for device_id, answer in self._joined(size, len(ids)) if self._fast else self._single(len(ids)):
+                if device_id in ids:
+                    heard.add(device_id)
+                    yield device_id, answer
+        if len(heard) < len(ids):
             self._unsettle()
-        return answers
 
     def _single(self, count: int) -> Iterator[tuple[int, Answer]]:
         for _ in range(count):

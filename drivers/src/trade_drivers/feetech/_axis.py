@@ -1,5 +1,6 @@
 """One servo as the bus thread knows it: what is read of it, how far ahead it is sent, what speaks against moving on."""
 
+import struct
 from collections.abc import Sequence
 from typing import Final
 
@@ -25,6 +26,8 @@ GRAIN: Final = Grain(
     near=20,
 )
 """Arrived within 0.35 degrees, or 1.8 if it comes no closer."""
+
+_CYCLIC_LAYOUT: Final = struct.Struct("<HHH")
 
 
 class FeetechHealth(Health, frozen=True, gc=False, kw_only=True):
@@ -72,9 +75,13 @@ class FeetechAxis(ServoAxis[FeetechHealth]):
         self._at_rest_ns = int((lead_s + joint.max_speed_rad_s / joint.max_accel_rad_s2) * 1e9)
 
     def sampled(self, data: bytes, at_ns: int) -> Sample:
-        at = CYCLIC[0]
-        speed = round(table.PRESENT_SPEED.decode(data, at) / table.STEPS_PER_SPEED)
-        return Sample(table.PRESENT_POSITION.decode(data, at), speed, table.PRESENT_LOAD.decode(data, at), at_ns)
+        position, speed, load = _CYCLIC_LAYOUT.unpack_from(data)
+        return Sample(
+            table.PRESENT_POSITION.signed(position),
+            round(table.PRESENT_SPEED.signed(speed) / table.STEPS_PER_SPEED),
+            table.PRESENT_LOAD.signed(load),
+            at_ns,
+        )
 
     def examined(self, data: bytes, at_ns: int) -> FeetechHealth:
         return FeetechHealth.decode(data, at_ns)

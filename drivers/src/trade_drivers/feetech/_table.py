@@ -43,13 +43,16 @@ class Register(Struct, frozen=True):
         """The address behind it."""
         return self.address + self.size
 
+    def signed(self, raw: int) -> int:
+        """Counts, out of the number that its bytes are."""
+        if self.sign_bit is None or raw < 1 << self.sign_bit:
+            return raw
+        return -(raw & (1 << self.sign_bit) - 1)
+
     def decode(self, data: bytes, start: int = 0) -> int:
         """Counts, out of a block of bytes read from address ``start``."""
         at = self.address - start
-        raw = int.from_bytes(data[at : at + self.size], "little")
-        if self.sign_bit is None or not raw >> self.sign_bit & 1:
-            return raw
-        return -(raw & (1 << self.sign_bit) - 1)
+        return self.signed(int.from_bytes(data[at : at + self.size], "little"))
 
     def encode(self, counts: int) -> bytes:
         """The bytes of a number of counts; OverflowError if they do not fit."""

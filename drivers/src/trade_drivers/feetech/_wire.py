@@ -1,6 +1,6 @@
 """The only place of this folder that needs pyserial: packets of STS servos over a serial line."""
 
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from typing import Final
 
 from trade.errors import ConfigurationError
@@ -48,9 +48,9 @@ class Wire(ServoWire):
         with self._use(gate):
             self._send(packet(BROADCAST, Instruction.SYNC_WRITE, bytes((address, size)) + values))
 
-    def sync_read(self, address: int, size: int, ids: Sequence[int]) -> dict[int, Answer]:
+    def sync_read(self, address: int, size: int, ids: Sequence[int]) -> Iterator[tuple[int, Answer]]:
         self._settle()
-        answers: dict[int, Answer] = {}
+        heard: set[int] = set()
         with self._use():
             self._line.flush()
             self._send(packet(BROADCAST, Instruction.SYNC_READ, bytes((address, size, *ids))))
@@ -62,10 +62,10 @@ class Wire(ServoWire):
                     continue
                 if status is None:
                     break
-                answers[status.device_id] = Answer(status.data, bool(status.status))
-        if len(answers) < len(ids):
+                heard.add(status.device_id)
+                yield status.device_id, Answer(status.data, bool(status.status))
+        if len(heard) < len(ids):
             self._unsettle()
-        return answers
 
     def _ask(self, device_id: int, instruction: int, parameters: bytes, size: int, gate: Gate | None = None) -> Answer:
         """One question to one device, and its answer with so many bytes of data."""

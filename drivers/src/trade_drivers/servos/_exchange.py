@@ -127,15 +127,14 @@ class ServoExchange(Exchange):
         for at in range(0, len(asked), self._chunk):
             part = asked[at : at + self._chunk]
             asked_ns = self.clock()  # not when it came: a frozen process would take old values for new
-            answers = self.wire.sync_read(part[0].cyclic[0], size, [axis.id for axis in part])
-            for axis in part:
-                answer = answers.get(axis.id)
-                if answer is None:
-                    self.missed(axis)
-                    continue
-                axis.take_sample(answer.data, asked_ns)
-                if answer.alert and not axis.fault:
-                    axis.health_due_ns = 0
+            silent = {axis.id: axis for axis in part}
+            for device_id, answer in self.wire.sync_read(part[0].cyclic[0], size, list(silent)):
+                if (axis := silent.pop(device_id, None)) is not None:
+                    axis.take_sample(answer.data, asked_ns)
+                    if answer.alert and not axis.fault:
+                        axis.health_due_ns = 0
+            for axis in silent.values():
+                self.missed(axis)
             self.serve_stops()
 
     def missed(self, device: Axis) -> None:

@@ -2,7 +2,7 @@
 
 import time
 from abc import abstractmethod
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Final
 
@@ -39,8 +39,8 @@ class ServoWire(SerialWire):
         """The same registers of several devices, in one packet that nobody answers. Never waits, not even to settle."""
 
     @abstractmethod
-    def sync_read(self, address: int, size: int, ids: Sequence[int]) -> dict[int, Answer]:
-        """The same registers of several devices; those that did not answer properly are left out."""
+    def sync_read(self, address: int, size: int, ids: Sequence[int]) -> Iterator[tuple[int, Answer]]:
+        """The same registers of several devices, as their answers come; who does not answer properly is left out."""
 
     def answers_twice(self) -> bool:
         """Whether anything follows the answer just received, as it does when two devices share an id."""
