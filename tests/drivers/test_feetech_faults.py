@@ -112,6 +112,21 @@ def test_a_joint_that_fell_silent_on_its_way_is_told_to_hold_no_farther_than_it_
     assert tail.truth().position_rad < 1.2
 
 
+def test_a_joint_that_is_another_device_by_now_is_not_even_told_to_hold(tail: TailRig, robot: AttachedRobot) -> None:
+    root = robot.motor("tail.root")
+    root.enable()
+    tail.sim.do(sim.Absent(ids=(1,)))
+    wait_until(lambda: state(robot) is None, "it is silent")
+    tail.sim.do(sim.WrongModel(ids=(1,), number=1285))
+    tail.sim.do(sim.Absent(ids=(1,), on=False))
+    [axis] = root._axes  # type: ignore[attr-defined]
+    wait_until(lambda: "another model" in axis.fault, "it is found out")
+    found = written_now()
+    with pytest.raises(DeviceSilent):
+        root.stop()
+    assert not tail.moves(1, found)
+
+
 # --- its own protection
 
 
