@@ -1,16 +1,16 @@
 """What a bus of Feetech servos is refused for, and by which words; nothing is written on the way."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 import trade_hil_sim
+from drivers.conftest import written_now
 from drivers.tail_rig import TailRig, tail_rig
 from trade.errors import ConfigurationError
 from trade_drivers import load
 from trade_hil_sim.feetech import Servo
-from waiting import wait_until
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "arm.toml"
 
@@ -97,12 +97,16 @@ def test_a_slow_bus_is_refused_a_fast_cycle(rig: TailRig) -> None:
     assert "2 joints at 115200 baud need" in refused(rig)
 
 
-def test_the_arm_of_the_examples_attaches_and_its_six_joints_arrive_together(
-    rig: TailRig, wait: Callable[..., None] = wait_until
-) -> None:
+def test_the_arm_of_the_examples_attaches_and_its_six_joints_arrive_together(rig: TailRig) -> None:
     rig.robot = load(EXAMPLE)
     rig.plug()
     arm = rig.attach(ports={"arm": str(rig.sim.port)}).group("arm")
+    arm.enable()
     goals = [0.3, -0.2, 0.25, 0.1, -0.3, 0.4]
+    mark = written_now()
     assert arm.move_to(goals) == pytest.approx(goals, abs=0.03)
-    wait(lambda: not any(device.moving for device in rig.sim.state().devices), "all rest")
+    told = rig.goals(since=mark)
+    assert [entry.device_id for entry in told if entry.t == told[0].t] == [1, 2, 3, 4, 5, 6]  # in one packet
+    arrived = [rig.events("at_rest", i, mark)[-1].t for i in range(1, 7)]
+    started = [rig.events("motion_started", i, mark)[0].t for i in range(1, 7)]
+    assert max(arrived) - min(arrived) < 0.3 * (max(arrived) - min(started))

@@ -154,7 +154,7 @@ def test_a_step_leads_towards_the_aim_and_far_enough_to_keep_its_speed(
 ) -> None:
     axis = FeetechAxis("rosie.a", "/dev/x", joint(), 0.3)
     axis.note(Sample(here, 0, 0, 0))
-    step = axis.step(Goal(there, accel, speed))
+    step = axis.step(Goal(there, accel, speed), 0)
     assert (step.accel, step.speed) == (accel, speed)
     assert min(here, there) <= step.position <= max(here, there)
     if step.position != there:

@@ -94,10 +94,14 @@ class FeetechAxis(ServoAxis[FeetechHealth]):
             return "its torque went off: it lost power, or somebody else switched it off"
         return ""
 
-    def step(self, aim: Goal) -> Goal:
-        """What it is sent on its way there: as far as it may get before it has to be heard again."""
+    def step(self, aim: Goal, now_ns: int) -> Goal:
+        """What it is sent on its way there: as far as it may get before it has to be heard again.
+
+        Raises:
+            DeviceSilent: it was never measured.
+        """
         if self.sample is None:
-            return aim
+            raise self.deaf(now_ns)
         here, grain = self.sample.position, self.grain
         speed_rad_s = aim.speed * grain.rad_s
         lead_rad = speed_rad_s * self._lead_s + speed_rad_s**2 / (2 * aim.accel * grain.rad_s2)

@@ -44,7 +44,8 @@ class FeetechExchange(ServoExchange):
 
     def write_goals(self, goals: Mapping[Axis, Goal], gate: Gate) -> None:
         aims = {cast("FeetechAxis", axis): goal for axis, goal in goals.items()}
-        self._send({axis: axis.step(aim) for axis, aim in aims.items()}, gate)
+        now_ns = self.clock()
+        self._send({axis: axis.step(aim, now_ns) for axis, aim in aims.items()}, gate)
         for axis, aim in aims.items():
             axis.aim = aim
 
@@ -103,14 +104,14 @@ class FeetechExchange(ServoExchange):
     def _lead_on(self) -> None:
         """Send joints on that are on their way, as far ahead of where they were measured as they may be."""
         steps: dict[FeetechAxis, Goal] = {}
+        now_ns = self.clock()
         for motion in dict.fromkeys(axis.motion for axis in self.axes if axis.motion is not None):
-            if due := _due(motion):
-                try:
+            try:
+                if due := _due(motion, now_ns):
                     motion.permit.gate()
-                except TradeError as ending:
-                    self.release(motion, ending)
-                else:
                     steps.update(due)
+            except TradeError as ending:
+                self.release(motion, ending)
         if steps:
             self._send(steps)
 
@@ -122,11 +123,11 @@ class FeetechExchange(ServoExchange):
             axis.sent, axis.sent_ns = goal.position, sent_ns
 
 
-def _due(motion: Motion) -> dict[FeetechAxis, Goal]:
+def _due(motion: Motion, now_ns: int) -> dict[FeetechAxis, Goal]:
     """Where its joints are to be sent now, if that is not where they were sent last."""
     due: dict[FeetechAxis, Goal] = {}
     for axis in motion.axes:
         servo = cast("FeetechAxis", axis)
-        if servo.aim is not None and (step := servo.step(servo.aim)).position != servo.sent:
+        if servo.aim is not None and (step := servo.step(servo.aim, now_ns)).position != servo.sent:
             due[servo] = step
     return due
