@@ -67,3 +67,34 @@ max_width_m = 0.085
 max_speed_m_s = 0.15
 max_force_n = 200.0
 """
+
+TAIL = """
+[robot]
+name = "rosie"
+
+[bus.tail]
+driver = "feetech"
+port = "/dev/ttyNOTAIL"
+
+[joint."tail.root"]
+bus = "tail"
+id = 1
+model = "STS3215"
+min_rad = -1.4
+max_rad = 1.4
+max_speed_rad_s = 2.5
+max_accel_rad_s2 = 20.0
+
+[joint."tail.tip"]
+bus = "tail"
+id = 2
+model = "STS3215"
+reversed = true
+min_rad = -0.6
+max_rad = 0.6
+max_speed_rad_s = 2.5
+max_accel_rad_s2 = 20.0
+
+[group.tail]
+joints = ["tail.root", "tail.tip"]
+"""

@@ -11,6 +11,7 @@ parts:
   gateway    calls through one gateway and two, certificates and policy on; floods; an idle one (root, iproute2)
   streams    what five listeners to a joint-state stream at 200 Hz cost its source, beside one
   servo      the Dynamixel driver against what a bus of 1 Mbaud can carry
+  feetech    the same of the Feetech driver
   can        cycles of six CiA 402 drives near what 1 Mbit/s can carry: how many are late
   rosie      what all drivers of a robot take of a core, at the rates it is meant for
 
@@ -24,6 +25,7 @@ from tests.bench import (
     _calls,
     _cans,
     _deadman,
+    _feetech,
     _gateway,
     _local,
     _locks,
@@ -54,6 +56,7 @@ _PARTS: Mapping[str, Callable[[argparse.Namespace], None]] = {
     "gateway": lambda options: _gateway.run(options.n, options.rounds, options.idle),
     "streams": lambda options: _streams.run(max(1, options.rounds // 2), 2 * options.seconds),
     "servo": lambda options: _servo.run(options.n, options.rounds, options.seconds),
+    "feetech": lambda options: _feetech.run(options.n, options.rounds, options.seconds),
     "can": lambda options: _cans.run(max(1, options.rounds // 2), options.seconds),
     "rosie": lambda options: _rosie.run(max(1, options.rounds // 2), options.seconds),
 }

@@ -99,6 +99,12 @@ def test_the_bench_of_the_servo_bus_prints_its_targets() -> None:
     assert printed.count("target") == 3
 
 
+def test_the_bench_of_the_Feetech_bus_prints_its_targets() -> None:
+    printed = bench("feetech", "-n", "3", "--rounds", "1", "--seconds", "0.05")
+    assert "142 bytes a cycle" in printed
+    assert targets(printed) == ["Feetech sync / limit", "CPU at 100 Hz, Feetech"]
+
+
 @pytest.mark.timeout(300)
 def test_the_bench_of_gateways_prints_every_pair_every_flood_and_every_target() -> None:
     if reason := why_not():

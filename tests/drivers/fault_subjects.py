@@ -9,6 +9,7 @@ from drivers.conftest import Outcome, Rig, goal_counts
 from drivers.fault_table import Order, Recovery, Sick
 from drivers.gripper_rig import HandRig
 from drivers.legs import HALT, HIP, Leg
+from drivers.tail_rig import TailRig, goal_of
 from trade.errors import DeviceError
 from trade_drivers import Motor
 from trade_hil_sim import BrownOut, Entry, events, instructions, motion_writes, writes
@@ -213,6 +214,34 @@ class Hand(Subject):
             self.provider.activate()
 
 
+class TailServo(_Joint):
+    """A Feetech servo of a tail."""
+
+    full_speed = 1620
+    """In steps/s: the move is slower, and a joint that is told to hold is told so with its full speed."""
+
+    def get(self) -> Motor:
+        return self.robot.motor("tail.root")
+
+    def holds(self, since: float) -> list[Entry]:
+        told = writes(self.log, device_id=self.device_id, register="goal_speed", since=since)
+        return [entry for entry in told if int.from_bytes(entry.data[5:7], "little") == self.full_speed]
+
+    def exchanges(self, since: float) -> list[Entry]:
+        asked = instructions(self.log, "sync_read", since=since)
+        return [entry for entry in asked if self.device_id in entry.ids]
+
+    def moves(self, since: float) -> list[Entry]:
+        """To be told to hold where it stands does not count."""
+        here = self.truth.position_counts
+        found = super().moves(since)
+        return [
+            entry
+            for entry in found
+            if "goal_position" not in entry.registers or abs(goal_of(entry) - here) > _HERE_COUNTS
+        ]
+
+
 def _servo(tmp_path: Path, undo: ExitStack) -> Subject:
     rig = Rig(tmp_path, undo)
     rig.configure(('driver = "dynamixel"', f'driver = "dynamixel"\n{_PATIENT}\nwatchdog_s = 0.4'))
@@ -234,5 +263,12 @@ def _hand(tmp_path: Path, undo: ExitStack) -> Subject:
     return Hand(rig)
 
 
-SUBJECTS = {"dynamixel": _servo, "cia402": _drive, "robotiq": _hand}
+def _tail(tmp_path: Path, undo: ExitStack) -> Subject:
+    rig = TailRig(tmp_path, undo)
+    rig.configure(('driver = "feetech"', f'driver = "feetech"\n{_PATIENT}\nwatchdog_s = 0.4'))
+    rig.plug()
+    return TailServo(rig)
+
+
+SUBJECTS = {"dynamixel": _servo, "cia402": _drive, "robotiq": _hand, "feetech": _tail}
 """What makes one of each kind."""

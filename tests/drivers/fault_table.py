@@ -33,8 +33,8 @@ from trade_hil_sim import (
 
 __all__ = ["TABLE", "Device", "Order", "Recovery", "Row", "Sick", "Stop", "page"]
 
-Device = Literal["dynamixel", "cia402", "robotiq"]
-STRUCK: Final = {"dynamixel": (1,), "cia402": (1,), "robotiq": (9,)}
+Device = Literal["dynamixel", "cia402", "robotiq", "feetech"]
+STRUCK: Final = {"dynamixel": (1,), "cia402": (1,), "robotiq": (9,), "feetech": (1,)}
 """The ids of the devices that are struck."""
 ONE: Final = STRUCK["dynamixel"]
 
@@ -57,6 +57,7 @@ class Stop(Enum):
     BOTH = "the driver has it hold and falls silent; then its own watchdog"
     ITSELF = "the device itself"
     BLOCKED = "what blocks it; the driver has it hold, or its own overload protection lets go, whichever is first"
+    NEAR = "nothing can reach it, and it has no watchdog: its last goal, which is never far ahead"
     GOAL = "nothing can reach it, and it has no watchdog: it ends the move it was told"
 
 
@@ -107,8 +108,9 @@ _AFTER_SILENCE: Final = {
     "dynamixel": Recovery.NOTHING,
     "cia402": Recovery.ENABLE,
     "robotiq": Recovery.ACTIVATE,
+    "feetech": Recovery.NOTHING,
 }
-_AFTER_FAULT: Final = _AFTER_SILENCE | {"dynamixel": Recovery.ENABLE}
+_AFTER_FAULT: Final = _AFTER_SILENCE | {"dynamixel": Recovery.ENABLE, "feetech": Recovery.ENABLE}
 _SICK: Final = "its driver's process is not healthy"
 _REPLUG: Final = "plug its adapter in again"
 
@@ -232,12 +234,37 @@ _ROBOTIQ: Final = (
     Row("robotiq", "restart", (BrownOut(),), DeviceFault, "activat", "", Stop.ITSELF, None, Recovery.ACTIVATE),
     _sick("robotiq", "sick driver", Stop.HOLD)._replace(recovery=Recovery.NOTHING),
 )
-TABLE: Final = (*_DYNAMIXEL, *_CIA402, *_ROBOTIQ)
+_FEETECH: Final = (
+    _silent("feetech", "silence", Mute(ids=ONE)),
+    _silent("feetech", "late, always", Late(ids=ONE, s=1.0)),
+    _forgiven("feetech", "late, once", Late(ids=ONE, s=0.04, count=1)),
+    _silent("feetech", "corrupt, always", BadCrc(ids=ONE)),
+    _forgiven("feetech", "corrupt, once", BadCrc(ids=ONE, count=1)),
+    _silent("feetech", "cut short", Truncate(ids=ONE)),
+    _forgiven("feetech", "garbage before answers", Garbage(ids=ONE, hex="ffff0108", count=30)),
+    _silent("feetech", "garbage for answers", Garbage(ids=ONE), Truncate(ids=ONE, missing=999)),
+    _faulty("feetech", "frozen value", Freeze(ids=ONE), "it makes no progress", Stop.HOLD),
+    _faulty("feetech", "blocked", Jam(ids=ONE), "it makes no progress", Stop.HOLD),
+    _silent("feetech", "cable off", Absent(ids=ONE), stop=Stop.NEAR),
+    _gone("feetech", _REPLUG, Stop.NEAR, Recovery.NOTHING),
+    _faulty("feetech", "fault latched", HardwareFault(ids=ONE, bits=0x20), "overload", Stop.ITSELF),
+    _faulty("feetech", "over-temperature", Supply(ids=ONE, temperature_c=80), "overheating", Stop.ITSELF)._replace(
+        cure=(Supply(ids=ONE, temperature_c=30),)
+    ),
+    _faulty("feetech", "over-voltage", Supply(ids=ONE, voltage_v=9.0), "input voltage", Stop.HOLD)._replace(
+        cure=(Supply(ids=ONE, voltage_v=7.4),)
+    ),
+    _swapped("feetech", 1285, "another model answers with its id", Stop.NEAR),
+    Row("feetech", "restart", (BrownOut(ids=ONE),), DeviceError, "", "its torque went off", Stop.ITSELF),
+    _sick("feetech", "sick driver", Stop.HOLD)._replace(recovery=Recovery.NOTHING),
+)
+TABLE: Final = (*_DYNAMIXEL, *_CIA402, *_ROBOTIQ, *_FEETECH)
 
 _TITLES: Final = {
     "dynamixel": "Dynamixel servos",
     "cia402": "CiA 402 drives",
     "robotiq": "2F-85 grippers",
+    "feetech": "Feetech servos",
 }
 _HEAD: Final = """# Faults
 

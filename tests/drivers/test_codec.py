@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 import trade_drivers
 from trade_drivers.dynamixel import _table as table
-from trade_drivers.dynamixel._axis import CYCLIC, GRAIN, SLOW, ServoAxis
+from trade_drivers.dynamixel._axis import CYCLIC, GRAIN, SLOW, DynamixelAxis
 from trade_drivers.dynamixel._frames import Corrupt, crc16, take_status, unstuffed
 from trade_drivers.joints._axis import Scale
 from trade_drivers.joints._profile import Leg, together
@@ -146,7 +146,7 @@ def test_counts_and_angles_convert_back_and_forth(counts: int, reversed_: bool, 
 
 def test_the_range_of_a_joint_in_counts_holds_every_allowed_angle() -> None:
     for reversed_ in (False, True):
-        axis = ServoAxis("rosie.neck.pan", "/dev/x", joint(reversed=reversed_, offset_rad=0.1))
+        axis = DynamixelAxis("rosie.neck.pan", "/dev/x", joint(reversed=reversed_, offset_rad=0.1))
         ends = sorted(round(axis.scale.counts(angle)) for angle in (-1.0, 1.0))
         assert axis.low <= ends[0] < ends[1] <= axis.high
         assert axis.high - axis.low <= ends[1] - ends[0] + 2

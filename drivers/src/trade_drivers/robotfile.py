@@ -49,7 +49,7 @@ class Bus(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     stale_after_s: Annotated[float, Meta(gt=0, le=2)] = 0.25
     """A measured value older than this is an error, not a number."""
     watchdog_s: Annotated[float, Meta(ge=0.1, le=2)] = 0.3
-    """The device's own watchdog: silent this long, it stops by itself."""
+    """The device's own watchdog: silent this long, it stops by itself. Who has none is never sent farther ahead."""
     leave: Literal["hold", "relax"] = "hold"
     """What to do with enabled devices when the driver leaves: hold the position, or switch torque off."""
 

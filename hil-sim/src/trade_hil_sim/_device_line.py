@@ -4,6 +4,7 @@ import threading
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
@@ -15,7 +16,7 @@ from ._line import SerialLine
 from ._log import ByteLog
 from ._state import BusState, DeviceState, GripperTruth
 
-__all__ = ["DeviceLine"]
+__all__ = ["DeviceLine", "interleaved"]
 
 
 class Device(Protocol):
@@ -197,3 +198,8 @@ class DeviceLine(ABC, Generic[_Device]):
         for piece, late_s in self._script.shape(data, ids, instruction):
             self._line.send(piece, after_s=after_s, late_s=late_s, name=instruction, device_id=device_id)
             after_s = 0.0
+
+
+def interleaved(answers: Sequence[bytes]) -> bytes:
+    """What comes of answers on top of each other: the bytes of all, none of them where it belongs."""
+    return bytes(byte for column in zip_longest(*answers) for byte in column if byte is not None)

@@ -4,14 +4,12 @@ import struct
 from collections.abc import Sequence
 from typing import Final
 
-from msgspec import Struct
-
-from trade_drivers._interfaces import MotorState
 from trade_drivers.dynamixel import _table as table
-from trade_drivers.joints import Axis, Grain, Sample
+from trade_drivers.joints import Grain, Sample
 from trade_drivers.robotfile import Joint
+from trade_drivers.servos import Health, ServoAxis
 
-__all__ = ["CYCLIC", "GRAIN", "SLOW", "Health", "ServoAxis"]
+__all__ = ["CYCLIC", "GRAIN", "SLOW", "DynamixelAxis", "DynamixelHealth"]
 
 CYCLIC: Final = (table.PRESENT_LOAD.address, table.PRESENT_POSITION.end - table.PRESENT_LOAD.address)
 """Address and size of what is read of every joint in every cycle: effort, velocity, position."""
@@ -29,42 +27,34 @@ GRAIN: Final = Grain(
 )
 """Arrived within 0.35 degrees, or 1.8 if it comes no closer."""
 _CYCLIC_LAYOUT: Final = struct.Struct("<hii")
-_HEALTH_STALE_NS: Final = 2_000_000_000
-_POWER_CYCLE: Final = "let it cool down or free it, switch its power off and on, then call enable()"
 _TICK_TOLERANCE_MS: Final = 250
 _TICK_AMBIGUOUS_MS: Final = 16_000
 
 
-class Health(Struct, frozen=True, gc=False):
-    """One slow measurement, in counts."""
+class DynamixelHealth(Health, frozen=True, gc=False, kw_only=True):
+    """One slow measurement."""
 
-    torque: bool
     status_level: int
-    error: int
     watchdog: int
     tick: int
-    moving: bool
-    voltage: int
-    temperature: int
-    at_ns: int
 
     @classmethod
-    def decode(cls, data: bytes, at_ns: int) -> "Health":
+    def decode(cls, data: bytes, at_ns: int) -> "DynamixelHealth":
         """Out of the bytes of the SLOW block."""
         at = SLOW[0]
         return cls(
             torque=table.TORQUE_ENABLE.decode(data, at) == 1,
-            status_level=table.STATUS_RETURN_LEVEL.decode(data, at),
             error=table.HARDWARE_ERROR.decode(data, at),
+            moving=table.MOVING.decode(data, at) == 1,
+            voltage_v=table.INPUT_VOLTAGE.decode(data, at) * table.INPUT_VOLTAGE.si_per_count,
+            temperature_c=table.TEMPERATURE.decode(data, at) * table.TEMPERATURE.si_per_count,
+            at_ns=at_ns,
+            status_level=table.STATUS_RETURN_LEVEL.decode(data, at),
             watchdog=table.BUS_WATCHDOG.decode(data, at),
             tick=table.REALTIME_TICK.decode(data, at),
-            moving=table.MOVING.decode(data, at) == 1,
-            voltage=table.INPUT_VOLTAGE.decode(data, at),
-            temperature=table.TEMPERATURE.decode(data, at),
-            at_ns=at_ns,
         )
 
-    def restarted_since(self, earlier: "Health") -> bool:
+    def restarted_since(self, earlier: "DynamixelHealth") -> bool:
         """Whether the device's own clock jumped: it went through a reset in between."""
         elapsed_ms = (self.at_ns - earlier.at_ns) / 1e6
         if elapsed_ms > _TICK_AMBIGUOUS_MS:
@@ -73,28 +63,27 @@ class Health(Struct, frozen=True, gc=False):
         return min(ahead, table.TICK_WRAPS_AT - ahead) > _TICK_TOLERANCE_MS
 
 
-class ServoAxis(Axis):
+class DynamixelAxis(ServoAxis[DynamixelHealth]):
     """One servo."""
 
+    cyclic = CYCLIC
+    slow = SLOW
+    error_remedy = "let it cool down or free it, switch its power off and on, then call enable()"
+
     def __init__(self, name: str, bus: str, joint: Joint, coupled: Sequence[str] = ()) -> None:
-        super().__init__(name, bus, joint, GRAIN, coupled)
-        self.model = table.BY_MODEL_NAME[joint.model]
-        self.health: Health | None = None
-        self.health_due_ns = 0
+        model = table.BY_MODEL_NAME[joint.model]
+        super().__init__(
+            name, bus, joint, GRAIN, coupled, model_number=model.number, full_effort_counts=model.full_effort_counts
+        )
 
-    def take_sample(self, data: bytes, at_ns: int) -> None:
-        """Note a cyclic measurement."""
+    def sampled(self, data: bytes, at_ns: int) -> Sample:
         effort, velocity, position = _CYCLIC_LAYOUT.unpack_from(data)
-        self.note(Sample(position, velocity, effort, at_ns))
+        return Sample(position, velocity, effort, at_ns)
 
-    def take_health(self, health: Health) -> None:
-        """Note a slow measurement, and latch what speaks against moving on."""
-        before, self.health = self.health, health
-        self.remedy = _POWER_CYCLE if health.error else ""
-        if problem := self._problem(before, health):
-            self.fault, self.ready = problem, False
+    def examined(self, data: bytes, at_ns: int) -> DynamixelHealth:
+        return DynamixelHealth.decode(data, at_ns)
 
-    def _problem(self, before: Health | None, now: Health) -> str:
+    def problem(self, before: DynamixelHealth | None, now: DynamixelHealth) -> str:
         if now.error:
             bits = [text for bit, text in table.HARDWARE_ERRORS.items() if now.error & bit]
             return f"hardware error: {', '.join(bits) or hex(now.error)}"
@@ -105,21 +94,3 @@ class ServoAxis(Axis):
         if self.ready and not now.torque:
             return "its torque went off: it lost power, or its protection switched it off"
         return ""
-
-    @property
-    def may_hold_torque(self) -> bool:
-        """Torque is on, or nobody knows."""
-        return self.health is None or self.health.torque
-
-    def state(self, now_ns: int, stale_after_ns: int) -> MotorState:
-        sample, health = self.fresh(now_ns, stale_after_ns), self.health
-        if health is None or now_ns - health.at_ns > _HEALTH_STALE_NS:
-            raise self.deaf(now_ns)
-        return self.measured(
-            sample,
-            now_ns,
-            load=self.scale.load(sample.effort, self.model.full_effort_counts),
-            enabled=health.torque,
-            temperature_c=health.temperature * table.TEMPERATURE.si_per_count,
-            voltage_v=health.voltage * table.INPUT_VOLTAGE.si_per_count,
-        )

@@ -7,24 +7,22 @@ and does not look at the length of an answer. All this is mended here by overrid
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
 # pyright: reportUntypedBaseClass=false, reportUnknownParameterType=false, reportIncompatibleMethodOverride=false
 
-import time
-from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Final
 
 from dynamixel_sdk import COMM_RX_CORRUPT, COMM_RX_TIMEOUT, COMM_SUCCESS, PortHandler, Protocol2PacketHandler
 
 from trade.errors import ConfigurationError
-from trade_drivers._serial import SerialLine, SerialWire
+from trade_drivers._serial import SerialLine
 from trade_drivers.dynamixel._frames import HEADER, OVERHEAD, Corrupt, crc16, take_status, unstuffed
-from trade_drivers.dynamixel._wire import Answer, BadAnswer, NoAnswer, Refused
+from trade_drivers.dynamixel._table import STATUS_ERRORS
 from trade_drivers.joints import Gate, PortLost
+from trade_drivers.servos import Answer, BadAnswer, NoAnswer, Refused
+from trade_drivers.servos._wire import BROADCAST, ServoWire
 
 __all__ = ["Wire"]
 
-_BROADCAST: Final = 254
 _ALERT: Final = 0x80
-_WHOLE_SECOND_ANSWER_S: Final = 0.005
 _BAUDS: Final = (9600, 57600, 115200, 1_000_000, 2_000_000, 3_000_000, 4_000_000)
 """XL430 e-Manual, register 8, without 4.5 Mbaud, which the library does not know."""
 
@@ -66,7 +64,7 @@ class _QuietPort(PortHandler):
                 if self._line.received:
                     raise Corrupt
                 return None
-            frame = frame if frame[4] == _BROADCAST else unstuffed(frame)
+            frame = frame if frame[4] == BROADCAST else unstuffed(frame)
             if self.expected is None or len(frame) == OVERHEAD + self.expected or frame[8] & ~_ALERT:
                 return frame
 
@@ -93,12 +91,13 @@ class _Packets(Protocol2PacketHandler):
         return (b"", COMM_RX_TIMEOUT) if frame is None else (frame, COMM_SUCCESS)
 
 
-class Wire(SerialWire):
-    """One serial port and the packets on it. All but a sync write may wait until the line is settled."""
+class Wire(ServoWire):
+    """One serial port and the packets on it; ``fast``: sync reads are answered by one joined packet."""
 
-    def __init__(self, path: str, baud: int, where: str = "bus") -> None:
+    def __init__(self, path: str, baud: int, where: str = "bus", *, fast: bool = False) -> None:
         super().__init__(path, baud, where)
         self._baud = baud
+        self._fast = fast
         self._port = _QuietPort(self._line, path)
         self._packets = _Packets()
 
@@ -109,32 +108,26 @@ class Wire(SerialWire):
         super().open()
 
     def ping(self, device_id: int) -> int:
-        """The model number of a device."""
-        with self._exchange(device_id, expected=3):
+        with self._exchange(device_id):
+            self._port.expected = 3
             model, result, _ = self._packets.ping(self._port, device_id)
             self._require(result, device_id)
         return int(model)
 
-    def answers_twice(self) -> bool:
-        """Whether anything follows the answer just received, as it does when two devices share an id."""
-        with self._use():
-            return bool(self._line.received) or self._line.more(_WHOLE_SECOND_ANSWER_S)
-
     def read(self, device_id: int, address: int, size: int) -> Answer:
-        """Bytes of one device's control table."""
-        with self._exchange(device_id, expected=size):
+        with self._exchange(device_id):
+            self._port.expected = size
             data, result, error = self._packets.readTxRx(self._port, device_id, address, size)
             self._require(result, device_id, error)
         return Answer(bytes(data), bool(error & _ALERT))
 
     def write(self, device_id: int, address: int, data: bytes, gate: Gate | None = None) -> None:
-        """Change one device's control table, and hear that it did."""
-        with self._exchange(device_id, expected=0, gate=gate):
+        with self._exchange(device_id, gate):
+            self._port.expected = 0
             result, error = self._packets.writeTxRx(self._port, device_id, address, len(data), data)
             self._require(result, device_id, error)
 
     def sync_write(self, address: int, data: Mapping[int, bytes], gate: Gate | None = None) -> None:
-        """The same registers of several devices, in one packet that nobody answers. Never waits, not even to settle."""
         size = len(next(iter(data.values())))
         parameters = [byte for device_id, value in data.items() for byte in (device_id, *value)]
         with self._use(gate):
@@ -142,19 +135,20 @@ class Wire(SerialWire):
         if result != COMM_SUCCESS:
             raise PortLost("the packet could not be written as a whole")
 
-    def sync_read(self, address: int, size: int, ids: Sequence[int], *, fast: bool = False) -> dict[int, Answer]:
-        """The same registers of several devices; those that did not answer properly are left out."""
+    def sync_read(self, address: int, size: int, ids: Sequence[int]) -> Iterator[tuple[int, Answer]]:
         self._settle()
+        heard: set[int] = set()
         with self._use():
-            self._port.expected = len(ids) * (size + 4) - 3 if fast else size
-            result = self._packets.syncReadTx(self._port, address, size, ids, len(ids), fast)
+            self._port.expected = len(ids) * (size + 4) - 3 if self._fast else size
+            result = self._packets.syncReadTx(self._port, address, size, ids, len(ids), self._fast)
             if result != COMM_SUCCESS:
                 raise PortLost("the packet could not be written as a whole")
-            found = self._joined(size, len(ids)) if fast else self._single(len(ids))
-            answers = {device_id: answer for device_id, answer in found if device_id in ids}
-        if len(answers) < len(ids):
+            for device_id, answer in self._joined(size, len(ids)) if self._fast else self._single(len(ids)):
+                if device_id in ids:
+                    heard.add(device_id)
+                    yield device_id, answer
+        if len(heard) < len(ids):
             self._unsettle()
-        return answers
 
     def _single(self, count: int) -> Iterator[tuple[int, Answer]]:
         for _ in range(count):
@@ -176,23 +170,11 @@ class Wire(SerialWire):
         starts = range(8, 8 + count * (size + 4), size + 4)
         return [(frame[at + 1], Answer(frame[at + 2 : at + 2 + size], bool(frame[at] & _ALERT))) for at in starts]
 
-    @contextmanager
-    def _exchange(self, device_id: int, *, expected: int, gate: Gate | None = None) -> Generator[None, None, None]:
-        self._settle()
-        self._port.expected = expected
-        began = time.monotonic()
-        with self._use(gate):
-            try:
-                yield
-            except NoAnswer as silent:
-                self._unsettle()
-                raise type(silent)(device_id, time.monotonic() - began) from None
-
     def _require(self, result: int, device_id: int, error: int = 0) -> None:
         match result:
             case 0:
                 if number := error & ~_ALERT:
-                    raise Refused(device_id, number)
+                    raise Refused(device_id, STATUS_ERRORS.get(number, f"error number {number}"))
             case -3001:
                 raise NoAnswer(device_id, 0.0)
             case -3002:

@@ -10,7 +10,16 @@ from typing import Final, Literal
 
 from msgspec import Struct
 
-__all__ = ["BY_MODEL_NAME", "BY_MODEL_NUMBER", "HARDWARE_ERRORS", "Access", "Model", "Register"]
+__all__ = [
+    "BY_MODEL_NAME",
+    "BY_MODEL_NUMBER",
+    "HARDWARE_ERRORS",
+    "STATUS_ERRORS",
+    "Access",
+    "Model",
+    "Register",
+    "name_of",
+]
 
 RAD_PER_COUNT: Final = tau / 4096
 RAD_S_PER_COUNT: Final = 0.229 * tau / 60
@@ -101,6 +110,16 @@ HARDWARE_ERRORS: Final = {
     0x20: "overload",
 }
 """Bits of register 70."""
+STATUS_ERRORS: Final = {
+    1: "could not carry it out",
+    2: "does not know the instruction",
+    3: "received a damaged packet",
+    4: "data range: the value is out of range, or its watchdog has locked the goal registers",
+    5: "data length: too few bytes for the register",
+    6: "data limit: the value is outside the device's own limit register",
+    7: "access: the register is read-only, or kept without power and torque is on",
+}
+"""Numbers in a status packet's error field (e-Manual, "DYNAMIXEL Protocol 2.0", "Error")."""
 
 
 class Model(Struct, frozen=True):
@@ -120,3 +139,9 @@ MODELS: Final = (
 )
 BY_MODEL_NAME: Final = {model.name: model for model in MODELS}
 BY_MODEL_NUMBER: Final = {model.number: model for model in MODELS}
+
+
+def name_of(model_number: int, otherwise: str) -> str:
+    """What a model is called."""
+    model = BY_MODEL_NUMBER.get(model_number)
+    return model.name if model else otherwise

@@ -2,8 +2,9 @@
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from itertools import zip_longest
 from typing import Final, TypeVar
+
+from trade_hil_sim._device_line import interleaved
 
 from ._memory import Refusal
 from ._protocol import BROADCAST, ErrorCode, Instruction, JoinedStatus, Packet, status
@@ -157,7 +158,7 @@ def _collided(answers: list[Answer]) -> list[Answer]:
     """Devices with one id answer on top of each other: the bytes of all come, none of them where it belongs."""
     if len(answers) < 2:
         return answers
-    mixed = bytes(byte for bytes_ in zip_longest(*(a.data for a in answers)) for byte in bytes_ if byte is not None)
+    mixed = interleaved([answer.data for answer in answers])
     return [Answer(answers[0].ids, mixed, min(a.delay_s for a in answers))]
 
 

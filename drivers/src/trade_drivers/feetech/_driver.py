@@ -1,0 +1,52 @@
+"""Bringing a Feetech bus up."""
+
+from typing import TYPE_CHECKING, Any, cast
+
+from trade.errors import ConfigurationError
+from trade_drivers.feetech import _table as table
+from trade_drivers.feetech._attach import check_bus, look_over
+from trade_drivers.feetech._axis import FeetechAxis
+from trade_drivers.feetech._exchange import FeetechExchange
+from trade_drivers.robotfile import Joint, Robot, SerialBus
+from trade_drivers.servos import ServoAxis, ServoDriver, ServoExchange
+
+if TYPE_CHECKING:
+    from trade_drivers.feetech._wire import Wire
+
+__all__ = ["FeetechDriver", "open_exchange"]
+
+
+class FeetechDriver(ServoDriver):
+    """STS servos in position control on a serial bus."""
+
+    name = "feetech"
+    models = table.BY_MODEL_NAME
+
+    def exchange(self, robot: Robot, bus: SerialBus, port: str, joints: list[Joint]) -> ServoExchange:
+        axes = [
+            FeetechAxis(f"{robot.name}.{joint.name}", port, joint, bus.watchdog_s, robot.coupled_to(joint.name))
+            for joint in joints
+        ]
+        check_bus(robot, bus, axes)
+        return FeetechExchange(_wire(port, bus.baud, f"{robot.where}: bus.{bus.name}"), bus, axes)
+
+    def look_over(self, exchange: ServoExchange, bus: SerialBus, axis: ServoAxis[Any], where: str) -> None:
+        look_over(exchange.wire, bus, cast("FeetechAxis", axis), exchange.clock, where)
+
+
+def open_exchange(robot: Robot, bus: SerialBus, port: str) -> ServoExchange:
+    """Open the port and look every joint over, without a thread: ``cycle()`` is the caller's to call.
+
+    Raises:
+        ConfigurationError: the port cannot be had, or a device is absent, another, or set wrongly.
+    """
+    return FeetechDriver().open_exchange(robot, bus, port)
+
+
+def _wire(port: str, baud: int, where: str) -> "Wire":
+    try:
+        from trade_drivers.feetech._wire import Wire  # noqa: PLC0415 - pyserial is optional
+    except ImportError as missing:
+        problem = f'needs pyserial ({missing}); pip install "trade-drivers[feetech]"'
+        raise ConfigurationError(where="driver feetech", problem=problem) from None
+    return Wire(port, baud, where)

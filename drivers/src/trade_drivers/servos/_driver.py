@@ -1,0 +1,83 @@
+"""Bringing a bus of servos up, and handing out its motors."""
+
+from abc import abstractmethod
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from trade.errors import ConfigurationError
+from trade_drivers._driver import AttachedBus, Driver
+from trade_drivers.joints import AttachedJoints, BusThread, PortLost
+from trade_drivers.robotfile import Bus, Joint, Robot, SerialBus
+from trade_drivers.servos._answers import WireError
+from trade_drivers.servos._exchange import ServoExchange
+
+if TYPE_CHECKING:
+    from trade_drivers.servos._axis import ServoAxis
+
+__all__ = ["ServoDriver"]
+
+
+class ServoDriver(Driver):
+    """One vendor's servos in position control on a serial bus."""
+
+    name: ClassVar[str]
+    models: ClassVar[Mapping[str, object]]
+    """Those it knows, by the name printed on them."""
+
+    @abstractmethod
+    def exchange(self, robot: Robot, bus: SerialBus, port: str, joints: list[Joint]) -> ServoExchange:
+        """What the file alone can tell is checked; the port is not open yet. Raises ``ConfigurationError``."""
+
+    @abstractmethod
+    def look_over(self, exchange: ServoExchange, bus: SerialBus, axis: "ServoAxis[Any]", where: str) -> None:
+        """Check one joint's device and take its first measurements. Raises ``ConfigurationError``."""
+
+    def attach(self, robot: Robot, bus: Bus, port: str, healthy: Callable[[], bool]) -> AttachedBus:
+        if not isinstance(bus, SerialBus):
+            problem = f"driver {self.name} needs a serial bus: port instead of interface and channel"
+            raise ConfigurationError(where=f"{robot.where}: bus.{bus.name}", problem=problem)
+        with ExitStack() as undo:
+            exchange = self.open_exchange(robot, bus, port)
+            undo.callback(exchange.wire.close)
+            thread = BusThread(exchange, exchange.wire, bus, healthy, name=f"bus {robot.name}.{bus.name}")
+            thread.start()
+            undo.pop_all()
+        return AttachedJoints(thread)
+
+    def open_exchange(self, robot: Robot, bus: SerialBus, port: str) -> ServoExchange:
+        """Open the port and look every joint over, without a thread: ``cycle()`` is the caller's to call.
+
+        Raises:
+            ConfigurationError: the port cannot be had, or a device is absent, another, or set wrongly.
+        """
+        exchange = self.exchange(robot, bus, port, self._known(robot, bus))
+        where = f"{robot.where}: bus.{bus.name}.port"
+        with ExitStack() as undo:
+            undo.callback(exchange.wire.close)
+            try:
+                exchange.wire.open()
+                for axis in exchange.servos:
+                    self.look_over(exchange, bus, axis, robot.where)
+                for axis in exchange.servos:
+                    exchange.admit(axis)
+                exchange.cycle()
+            except PortLost as lost:
+                problem = f"{port}: {lost}; `ls -l /dev/serial/by-id` shows those that are"
+                raise ConfigurationError(where=where, problem=problem) from None
+            except WireError as bad:
+                problem = f"the bus does not work reliably: {bad}; check cable and power"
+                raise ConfigurationError(where=where, problem=problem) from bad
+            undo.pop_all()
+        return exchange
+
+    def _known(self, robot: Robot, bus: SerialBus) -> list[Joint]:
+        joints = robot.joints_on(bus.name)
+        for joint in joints:
+            if joint.model not in self.models:
+                problem = f"{joint.model!r} is unknown to the driver {self.name}; it knows {', '.join(self.models)}"
+                raise ConfigurationError(where=f'{robot.where}: joint."{joint.name}".model', problem=problem)
+            if joint.counts_per_rev is not None or joint.gear != 1:
+                problem = "counts_per_rev and gear are for other devices: a servo's angle is that of its joint"
+                raise ConfigurationError(where=f'{robot.where}: joint."{joint.name}"', problem=problem)
+        return joints
