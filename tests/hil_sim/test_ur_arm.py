@@ -97,6 +97,15 @@ def test_braking_ends_a_motion_and_a_target_that_jumps_is_followed_within_the_li
     assert seen[-1][0] < arm.q[0] < seen[-1][0] + MAX_SPEED_RAD_S**2 / 8.0
 
 
+def test_a_target_that_jumps_is_reached_without_going_beyond_it() -> None:
+    arm = Arm()
+    target = (HOME[0] + 0.05, *HOME[1:])
+    arm.servo(target)
+    seen = let_pass(arm, 1.0)
+    assert max(q[0] for q in seen) <= target[0] + 40.0 * STEP_S**2
+    assert seen[-1] == target
+
+
 def test_a_joint_at_its_limit_is_a_protective_stop() -> None:
     arm = Arm(q=(6.2, *HOME[1:]))
     arm.turn((1.0, *(0.0,) * 5), 10.0, 0.0)

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from trade_hil_sim import UrBus, events, instructions
+from trade_hil_sim import UrBus, events, instructions, motion_writes
 from trade_hil_sim.ur import HOME
 
 pytest.importorskip("rtde_control", reason="ur-rtde has no wheel for this platform")
@@ -142,6 +142,9 @@ print(json.dumps({"ok": ok, "off": after[0] - goal[0], "pose": pose, "end": r.ge
     assert abs(told["off"]) < 1e-6
     assert told["end"] == pytest.approx(told["line"], abs=1e-4)
     assert len(events(controller.log.entries, "at_rest")) == 2
+    assert all(
+        "until it ends" in entry.detail for entry in motion_writes(controller.log.entries) if entry.name != "upload"
+    )
 
 
 def test_an_asynchronous_move_tells_its_progress_and_is_stopped(controller: UrBus) -> None:

@@ -265,7 +265,8 @@ class UrBus:
                 for line in _lines(client.held):
                     answer = self._dashboard.answer(line)
                     detail = f"{line} -> {answer}"
-                    self._emit(Entry(self.arm.t, "", "instruction", "dashboard", source=client.name, detail=detail))
+                    t = time.monotonic()
+                    self._emit(Entry(t, "", "instruction", "dashboard", source=client.name, detail=detail))
                     self._say(client, answer.encode() + b"\n", "dashboard")
             case _:
                 if (whole := client.held.rfind(b"\nend\n")) >= 0:

@@ -5,6 +5,7 @@ Steps of a fixed time; angles in rad, times in s.
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from math import copysign, sqrt
 from typing import Final
 
 from trade_hil_sim._motion import to_position
@@ -88,14 +89,19 @@ class Servo(Motion):
 
     def step(self, q: Six, qd: Six, dt: float) -> tuple[Six, Six]:
         """As far as speed and acceleration allow."""
-        most = _SERVO_ACCEL_RAD_S2 * dt
-        speeds: list[float] = []
-        for angle, speed, target in zip(q, qd, self.target, strict=True):
-            wanted = _within((target - angle) / dt, MAX_SPEED_RAD_S)
-            brakes_from = (2 * _SERVO_ACCEL_RAD_S2 * abs(target - angle)) ** 0.5
-            wanted = _within(wanted, max(brakes_from, abs(target - angle) / (2 * dt)))
-            speeds.append(speed + _within(wanted - speed, most))
-        return tuple(angle + speed * dt for angle, speed in zip(q, speeds, strict=True)), tuple(speeds)
+        after = [self._joint(*joint, dt) for joint in zip(q, qd, self.target, strict=True)]
+        return tuple(angle for angle, _ in after), tuple(speed for _, speed in after)
+
+    @staticmethod
+    def _joint(angle: float, speed: float, target: float, dt: float) -> tuple[float, float]:
+        most, way = _SERVO_ACCEL_RAD_S2 * dt, target - angle
+        if abs(way) <= most * dt and abs(speed) <= most:
+            return target, 0.0
+        # what it covers in this step is not there for braking any more
+        braking = sqrt(most * most / 4 + 2 * _SERVO_ACCEL_RAD_S2 * abs(way)) - most / 2
+        wanted = copysign(min(MAX_SPEED_RAD_S, braking, abs(way) / dt), way)
+        speed += _within(wanted - speed, most)
+        return angle + speed * dt, speed
 
 
 class Speed(Motion):

@@ -4,6 +4,7 @@ The numbers in the registers, and when the script reads and writes them, were ob
 and a controller; the script itself is the library's.
 """
 
+import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Final
 
@@ -25,6 +26,8 @@ _DONE: Final = 2
 _RUNNING_BIT: Final = 1 << 15
 _EVERY_CYCLE: Final = frozenset({Command.SERVO_J, Command.SERVO_L, Command.SPEED_J, Command.STEP_TIME})
 """Commands that are obeyed again in every cycle, and not answered."""
+_ENDING: Final = frozenset({Command.MOVE_J, Command.MOVE_J_IK, Command.MOVE_L, Command.MOVE_L_FK})
+"""Moves with an end: asynchronous, or the script hears nothing until they have ended."""
 _MOVES: Final = frozenset(
     {
         *(Command.MOVE_J, Command.MOVE_J_IK, Command.MOVE_L, Command.MOVE_L_FK, Command.SPEED_J),
@@ -230,8 +233,10 @@ class Program:
         if again or number == Command.NOTHING:
             return
         name = Command(number).name.lower() if number in set(Command) else f"command_{number}"
-        values = [round(self.doubles.get(k, 0.0), 6) for k in range(11)]
-        self._log(name, detail=msgspec.json.encode(values).decode(), moves=number in _MOVES)
+        values = msgspec.json.encode([round(self.doubles.get(k, 0.0), 6) for k in range(11)]).decode()
+        waits = number in _ENDING and not self.ints.get(1, 0)
+        self._log(name, detail=f"{values} until it ends" if waits else values, moves=number in _MOVES)
 
     def _log(self, name: str, *, detail: str, moves: bool) -> None:
-        self._emit(Entry(self.arm.t, "", "instruction", name, joint=self.arm.name, detail=detail, moves=moves))
+        t = time.monotonic()  # when it came: the arm's own time may lag behind
+        self._emit(Entry(t, "", "instruction", name, joint=self.arm.name, detail=detail, moves=moves))
