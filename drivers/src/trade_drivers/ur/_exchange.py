@@ -25,6 +25,8 @@ _STOPPED_NS: Final = 200_000_000
 """Who does not answer a stop for so long is killed; then the robot's watchdog stops it (S10)."""
 _ANSWER_NS: Final = 1_000_000_000
 _TAKEN_NS: Final = 10_000_000_000
+_SHOWN_NS: Final = 100_000_000
+"""So long after the script has begun every measurement shows it."""
 _SERVO_NS: Final = 50_000_000
 """So late a set-point of a stream is none any more."""
 
@@ -38,6 +40,7 @@ class Exchange(BusExchange[Limb]):
         self.limb = limb
         self.taken = False
         """The control script runs, as far as is known."""
+        self._taken_ns = 0
         self._watchdog_hz = 1 / bus.watchdog_s
         self._beaten_ns = 0
         self._halt_number = 0
@@ -145,7 +148,7 @@ class Exchange(BusExchange[Limb]):
         if done.problem:
             self.drop_control(done.problem)
             raise self.limb.faulty("" if self.limb.fault else f"control was not granted: {done.problem}")
-        self.taken = True
+        self.taken, self._taken_ns = True, self.clock()
         self._feed()
 
     def making_way(self) -> Steps:
@@ -245,6 +248,8 @@ class Exchange(BusExchange[Limb]):
             self._watch_halt(now_ns)
         if limb.motion is not None:
             limb.motion.watch(now_ns)
+        if self.taken and not self._halt_number and limb.ended_since(self._taken_ns + _SHOWN_NS):
+            self.drop_control("its program was ended")
         if limb.halting_since_ns and limb.at_rest(now_ns, self.stale_after_ns):
             limb.halting_since_ns = 0
         limb.tell_moving()

@@ -20,6 +20,8 @@ IDLE: Final = 5
 RUNNING: Final = 7
 """``robot_mode`` of an arm whose brakes are off."""
 _POWERED: Final = 1
+"""Bits of ``robot_status``."""
+_PROGRAM: Final = 2
 _PROTECTIVE_STOP: Final = 3
 _SAFETY: Final[dict[int, Safety]] = {
     1: "normal",
@@ -65,6 +67,11 @@ class Limb:
     def tell_moving(self) -> None:
         """Let the resource know whether it moves: as last measured or commanded."""
         self.resource.moving = self.motion is not None or self.halting_since_ns > 0 or self.still == 0
+
+    def ended_since(self, since_ns: int) -> bool:
+        """A measurement made later shows that no program runs on the controller."""
+        sample = self.sample
+        return sample is not None and sample.at_ns > since_ns and not sample.robot_status & _PROGRAM
 
     def at_rest(self, now_ns: int, stale_after_ns: int) -> bool:
         """Seen at rest, now, with nothing of ours under way."""
