@@ -11,6 +11,7 @@ parts:
   gateway    calls through one gateway and two, certificates and policy on; floods; an idle one (root, iproute2)
   streams    what five listeners to a joint-state stream at 200 Hz cost its source, beside one
   servo      the Dynamixel driver against what a bus of 1 Mbaud can carry
+  arm        set-points a second that reach the controller of an arm, beside a bare loop of the vendor's library
 
 Progress goes to stderr, tables and targets (met or missed) to stdout. Peers that are not installed are skipped.
 """
@@ -18,7 +19,7 @@ Progress goes to stderr, tables and targets (met or missed) to stdout. Peers tha
 import argparse
 from collections.abc import Callable, Mapping
 
-from tests.bench import _calls, _deadman, _gateway, _local, _locks, _registry, _servo, _streams, _watching
+from tests.bench import _arm, _calls, _deadman, _gateway, _local, _locks, _registry, _servo, _streams, _watching
 
 _SERVICES_EACH = 10
 
@@ -40,6 +41,7 @@ _PARTS: Mapping[str, Callable[[argparse.Namespace], None]] = {
     "gateway": lambda options: _gateway.run(options.n, options.rounds, options.idle),
     "streams": lambda options: _streams.run(max(1, options.rounds // 2), 2 * options.seconds),
     "servo": lambda options: _servo.run(options.n, options.rounds, options.seconds),
+    "arm": lambda options: _arm.run(max(1, options.rounds // 2), 2 * options.seconds),
 }
 _QUICK = {"n": 200, "rounds": 8, "seconds": 1.5, "idle": 20.0}
 _FULL = {"n": 500, "rounds": 20, "seconds": 3.0, "idle": 60.0}

@@ -86,6 +86,12 @@ def test_the_bench_of_the_servo_bus_prints_its_targets() -> None:
     assert printed.count("target") == 3
 
 
+def test_the_bench_of_arms_prints_its_targets() -> None:
+    pytest.importorskip("rtde_control", reason="ur-rtde has no wheel for this platform")
+    printed = bench("arm", "--rounds", "1", "--seconds", "0.5")
+    assert targets(printed) == ["set-points/s, driver", "set-points/s, bare library", "CPU of the driver, cores"]
+
+
 @pytest.mark.timeout(300)
 def test_the_bench_of_gateways_prints_every_pair_every_flood_and_every_target() -> None:
     if reason := why_not():

@@ -37,6 +37,8 @@ class ArmState(Struct, frozen=True, kw_only=True):
     """The fraction of their speed at which motions are carried out."""
     fault: str = ""
     """Why it refuses to move; empty if it does not."""
+    remedy: str = ""
+    """What to do about that."""
     measured_at: float
     """When all this was read: ``time.monotonic()`` of the driver's process."""
     age_s: float

@@ -166,6 +166,7 @@ class Limb:
             safety=self.safety,
             speed_scaling=sample.speed_fraction,
             fault=self.fault,
+            remedy=self.remedy if self.fault else "",
             measured_at=time.monotonic() - age_s,
             age_s=age_s,
         )
