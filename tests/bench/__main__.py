@@ -14,6 +14,7 @@ parts:
   feetech    the same of the Feetech driver
   can        cycles of six CiA 402 drives near what 1 Mbit/s can carry: how many are late
   rosie      what all drivers of a robot take of a core, at the rates it is meant for
+  arm        set-points a second that reach the controller of an arm, beside a bare loop of the vendor's library
 
 Progress goes to stderr, tables and targets (met or missed) to stdout. Peers that are not installed are skipped.
 """
@@ -22,6 +23,7 @@ import argparse
 from collections.abc import Callable, Mapping
 
 from tests.bench import (
+    _arm,
     _calls,
     _cans,
     _deadman,
@@ -59,6 +61,7 @@ _PARTS: Mapping[str, Callable[[argparse.Namespace], None]] = {
     "feetech": lambda options: _feetech.run(options.n, options.rounds, options.seconds),
     "can": lambda options: _cans.run(max(1, options.rounds // 2), options.seconds),
     "rosie": lambda options: _rosie.run(max(1, options.rounds // 2), options.seconds),
+    "arm": lambda options: _arm.run(max(1, options.rounds // 2), 2 * options.seconds),
 }
 _QUICK = {"n": 200, "rounds": 8, "seconds": 1.5, "idle": 20.0}
 _FULL = {"n": 500, "rounds": 20, "seconds": 3.0, "idle": 60.0}

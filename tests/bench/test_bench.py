@@ -105,6 +105,12 @@ def test_the_bench_of_the_Feetech_bus_prints_its_targets() -> None:
     assert targets(printed) == ["Feetech sync / limit", "CPU at 100 Hz, Feetech"]
 
 
+def test_the_bench_of_arms_prints_its_targets() -> None:
+    pytest.importorskip("rtde_control", reason="ur-rtde has no wheel for this platform")
+    printed = bench("arm", "--rounds", "1", "--seconds", "0.5")
+    assert targets(printed) == ["set-points/s, driver", "set-points/s, bare library", "CPU of the driver, cores"]
+
+
 @pytest.mark.timeout(300)
 def test_the_bench_of_gateways_prints_every_pair_every_flood_and_every_target() -> None:
     if reason := why_not():

@@ -12,7 +12,7 @@ from trade.errors import ConfigurationError
 from trade_drivers import load
 from trade_hil_sim.feetech import Servo
 
-EXAMPLE = Path(__file__).parents[2] / "examples" / "arm.toml"
+EXAMPLE = Path(__file__).parents[2] / "examples" / "servo_arm.toml"
 
 
 @pytest.fixture

@@ -43,8 +43,8 @@ def test_a_baud_rate_the_servo_has_not_got_is_named(robot_file: Path, tmp_path: 
 
 def test_simulators_are_found_by_entry_point() -> None:
     assert find_simulator("dynamixel") is DynamixelBus
-    with pytest.raises(SimulationError, match=r"nothing simulates driver 'ur'; simulated are: .*dynamixel"):
-        find_simulator("ur")
+    with pytest.raises(SimulationError, match=r"nothing simulates driver 'acme'; simulated are: .*dynamixel"):
+        find_simulator("acme")
 
 
 def test_two_simulators_of_one_name_are_an_error_that_names_both() -> None:

@@ -1,5 +1,6 @@
 """Motors, grippers and arms as TRADE services: interfaces in SI units, the robot file, and drivers by vendor."""
 
+from trade_drivers._arm import Arm, ArmLimits, ArmState
 from trade_drivers._attach import AttachedRobot, attach
 from trade_drivers._can_monitor import CanBusState, CanMonitor
 from trade_drivers._driver import AttachedBus, Driver, drivers
@@ -7,9 +8,12 @@ from trade_drivers._interfaces import Gripper, GripperLimits, GripperState, Join
 from trade_drivers._load import load
 from trade_drivers._plan import FollowProgress, JointLimits, Plan, Tolerances
 from trade_drivers._trajectory import Trajectory, TrajectoryPoint
-from trade_drivers.robotfile import Bus, CanBus, Coupled, Group, Joint, Robot, SerialBus, parse
+from trade_drivers.robotfile import Bus, CanBus, Coupled, Group, Joint, Robot, SerialBus, UrBus, parse
 
 __all__ = [
+    "Arm",
+    "ArmLimits",
+    "ArmState",
     "AttachedBus",
     "AttachedRobot",
     "Bus",
@@ -34,6 +38,7 @@ __all__ = [
     "Tolerances",
     "Trajectory",
     "TrajectoryPoint",
+    "UrBus",
     "attach",
     "drivers",
     "load",

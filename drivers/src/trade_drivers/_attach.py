@@ -9,6 +9,7 @@ from contextlib import ExitStack
 import trade
 from trade.errors import ConfigurationError, TradeError
 from trade_drivers._across import AcrossGroup
+from trade_drivers._arm import Arm
 from trade_drivers._can_monitor import CanMonitor, HealthTeller
 from trade_drivers._driver import AttachedBus, load_driver
 from trade_drivers._interfaces import Gripper, JointGroup, Motor
@@ -18,7 +19,7 @@ __all__ = ["AttachedRobot", "attach"]
 
 _log = logging.getLogger("trade")
 
-Provider = Motor | JointGroup | Gripper | CanMonitor
+Provider = Motor | JointGroup | Gripper | Arm | CanMonitor
 Register = Callable[[object, Sequence[str]], object]
 Deregister = Callable[[object], object]
 SetHealth = Callable[[object, str], object]
@@ -31,6 +32,7 @@ class AttachedRobot:
         self.robot = robot
         self.providers = dict(providers)
         """By group: ``rosie.neck.pan`` -> a Motor, ``rosie.head`` -> a JointGroup, ``rosie.left.hand`` -> a Gripper,
+        ``rosie.right`` -> an Arm,
         ``rosie.bus.legs`` -> a CanMonitor."""
         self._undo = undo
         self._lock = threading.Lock()
@@ -54,6 +56,13 @@ class AttachedRobot:
         """The provider of a gripper, named as in the robot file; KeyError if there is none."""
         provider = self.providers[f"{self.robot.name}.{name}"]
         if not isinstance(provider, Gripper):
+            raise KeyError(name)
+        return provider
+
+    def arm(self, name: str) -> Arm:
+        """The provider of an arm, named as in the robot file; KeyError if there is none."""
+        provider = self.providers[f"{self.robot.name}.{name}"]
+        if not isinstance(provider, Arm):
             raise KeyError(name)
         return provider
 
@@ -97,8 +106,9 @@ def attach(
     """Attach all devices of a robot, then announce their services. Nothing is moved or enabled; what moves is stopped.
 
     Joint ``neck.pan`` of robot ``rosie`` becomes a Motor in group ``rosie.neck.pan``, group ``head`` a JointGroup in
-    ``rosie.head``, whether its joints share a bus or not, gripper ``left.hand`` a Gripper in ``rosie.left.hand``, CAN
-    bus ``legs`` a CanMonitor in ``rosie.bus.legs``. If anything is wrong, nothing is announced and no port is kept.
+    ``rosie.head``, whether its joints share a bus or not, gripper ``left.hand`` a Gripper in ``rosie.left.hand``, arm
+    ``right`` an Arm in ``rosie.right``, CAN bus ``legs`` a CanMonitor in ``rosie.bus.legs``. If anything is wrong,
+    nothing is announced and no port is kept.
 
     Args:
         robot: what ``load`` read.
@@ -131,7 +141,7 @@ def _attach_buses(
     if unknown := sorted(set(ports) - set(names)):
         problem = f"there is no bus {unknown[0]!r} to give a port to; there is {', '.join(names)}"
         raise ConfigurationError(where=robot.where, problem=problem)
-    used = {device.bus for device in (*robot.joints, *robot.grippers)}
+    used = {device.bus for device in (*robot.joints, *robot.grippers, *robot.arms)}
     buses: dict[str, AttachedBus] = {}
     for bus in robot.buses:
         driver = load_driver(bus.driver, f"{robot.where}: bus.{bus.name}.driver")
@@ -142,11 +152,13 @@ def _attach_buses(
 
 
 def _providers(robot: Robot, buses: Mapping[str, AttachedBus]) -> dict[str, Provider]:
-    providers: dict[str, Motor | JointGroup | Gripper] = {
+    providers: dict[str, Motor | JointGroup | Gripper | Arm] = {
         f"{robot.name}.{joint.name}": buses[joint.bus].motor(joint.name) for joint in robot.joints
     }
     for gripper in robot.grippers:
         providers[f"{robot.name}.{gripper.name}"] = buses[gripper.bus].gripper(gripper.name)
+    for arm in robot.arms:
+        providers[f"{robot.name}.{arm.name}"] = buses[arm.bus].arm(arm.name)
     for group in robot.groups:
         providers[f"{robot.name}.{group.name}"] = _group(robot, group, buses)
     members = robot.members()

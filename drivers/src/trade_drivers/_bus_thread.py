@@ -110,7 +110,8 @@ class BusThread(Generic[_Exchange_co]):
                 self._guarded(partial(exchange.idle, left_s))
             if self._leaving:
                 break
-        return max(next_at, time.monotonic())
+        now = time.monotonic()
+        return next_at if now - next_at < 1 / self._bus.rate_hz else now  # a little late, the next one is not
 
     def _beat(self) -> None:
         if self._lost_at:

@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from importlib.metadata import EntryPoint, entry_points
 
 from trade.errors import ConfigurationError
+from trade_drivers._arm import Arm
 from trade_drivers._can_monitor import CanMonitor
 from trade_drivers._interfaces import Gripper, JointGroup, Motor
 from trade_drivers.robotfile import Bus, Robot
@@ -33,6 +34,14 @@ class AttachedBus(ABC):
         """
         problem = "the driver of its bus has no grippers; one that has is robotiq"
         raise ConfigurationError(where=f'gripper."{name}"', problem=problem)
+
+    def arm(self, name: str) -> Arm:
+        """The provider of the arm on this bus, named as in the robot file.
+
+        Raises:
+            ConfigurationError: the driver of this bus has no arms.
+        """
+        raise ConfigurationError(where=f'arm."{name}"', problem="the driver of its bus has no arms; one that has is ur")
 
     def monitor(self, name: str) -> CanMonitor | None:  # noqa: ARG002 - most have none
         """The bus itself, to look at; ``name`` has the robot's before it. None if there is nothing to tell of it."""

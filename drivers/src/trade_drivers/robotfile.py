@@ -10,13 +10,14 @@ import msgspec
 from msgspec import Meta, Struct
 
 from trade.errors import ConfigurationError
+from trade_drivers._records import Arm, Coupled, Gripper, Group, Positive, arm_problem
 
 if sys.version_info >= (3, 11):
     import tomllib
 else:
     import tomli as tomllib  # pyright: ignore[reportMissingImports]
 
-__all__ = ["Bus", "CanBus", "Coupled", "Gripper", "Group", "Joint", "Robot", "SerialBus", "parse"]
+__all__ = ["Arm", "Bus", "CanBus", "Coupled", "Gripper", "Group", "Joint", "Robot", "SerialBus", "UrBus", "parse"]
 
 _SEGMENTS = re.compile(r"[a-z][a-z0-9_]*(\.[a-z][a-z0-9_]*)*")
 _AT = re.compile(r" - at `\$\.?([^`]*)`$")
@@ -32,9 +33,9 @@ _EXAMPLES = {
 }
 _SERIAL_KEYS = ("port", "baud", "fast_sync")
 _CAN_KEYS = ("interface", "channel", "bitrate")
+_UR_KEYS = ("host",)
 _LOSSY = "udp_multicast"
 
-Positive = Annotated[float, Meta(gt=0)]
 Text = Annotated[str, Meta(min_length=1)]
 
 
@@ -80,6 +81,20 @@ class CanBus(Bus, frozen=True, kw_only=True):
         return f"{self.interface}:{self.channel}"
 
 
+class UrBus(Bus, frozen=True, kw_only=True):
+    """The controller of a Universal Robots arm, reached over the network."""
+
+    host: Text
+    """Its name or address; the ports are fixed."""
+    rate_hz: Annotated[float, Meta(gt=0, le=500)] = 500.0
+    """Set-points per second."""
+
+    @property
+    def port(self) -> str:
+        """The same as the host."""
+        return self.host
+
+
 class Joint(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """One joint: its device on a bus, its zero and its limits."""
 
@@ -101,45 +116,18 @@ class Joint(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     max_accel_rad_s2: Positive
 
 
-class Gripper(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """One gripper: its device on a bus, and its limits."""
-
-    name: str
-    bus: str
-    id: Annotated[int, Meta(ge=1, le=247)]
-    """Modbus slave id; a 2F-85 leaves the factory with 9."""
-    model: str
-    """Model as printed on the device: ``2F-85``."""
-    min_width_m: Annotated[float, Meta(ge=0)] = 0.0
-    max_width_m: Positive
-    max_speed_m_s: Positive
-    max_force_n: Positive
-
-
-class Group(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Joints that move together, in the order their values are given."""
-
-    name: str
-    joints: Annotated[list[str], Meta(min_length=1)]
-
-
-class Coupled(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Joints that hinder each other, so that none is locked without the others."""
-
-    joints: Annotated[list[str], Meta(min_length=2)]
-
-
 class Robot(Struct, frozen=True, kw_only=True):
     """A robot file, read and checked."""
 
     name: str
-    buses: list[SerialBus | CanBus]
+    buses: list[SerialBus | CanBus | UrBus]
     joints: list[Joint]
     groups: list[Group]
     coupled: list[Coupled]
     where: str
     """The file the robot was read from."""
     grippers: list[Gripper] = []
+    arms: list[Arm] = []
     given: dict[str, list[str]] = {}
     """By bus: the keys that its table has, so that a driver can refuse those that mean nothing to it."""
 
@@ -151,18 +139,22 @@ class Robot(Struct, frozen=True, kw_only=True):
         """The grippers on one bus, in file order."""
         return [gripper for gripper in self.grippers if gripper.bus == bus]
 
+    def arms_on(self, bus: str) -> list[Arm]:
+        """The arms on one bus, in file order."""
+        return [arm for arm in self.arms if arm.bus == bus]
+
     def coupled_to(self, joint: str) -> list[str]:
         """The joints that are only locked together with this one, with the robot's name before them."""
         names = dict.fromkeys(name for pair in self.coupled if joint in pair.joints for name in pair.joints)
         return [f"{self.name}.{name}" for name in names if name != joint]
 
     def members(self) -> dict[str, list[str]]:
-        """The joints and grippers of the robot, of its groups and of every part they are named after, with full names.
+        """The devices of the robot, of its groups and of every part they are named after, with full names.
 
         A lock over one of these is a lock over all of its members, or over none.
         """
         found: dict[str, dict[str, None]] = {}
-        for device in (*self.joints, *self.grippers):
+        for device in (*self.joints, *self.grippers, *self.arms):
             full = f"{self.name}.{device.name}"
             for end, letter in enumerate(full):
                 if letter == ".":
@@ -173,7 +165,7 @@ class Robot(Struct, frozen=True, kw_only=True):
         return {group: list(joints) for group, joints in found.items()}
 
 
-_Record = TypeVar("_Record", SerialBus, CanBus, Joint, Gripper, Group)
+_Record = TypeVar("_Record", SerialBus, CanBus, UrBus, Joint, Gripper, Arm, Group)
 
 
 def parse(text: str, where: str) -> Robot:
@@ -198,6 +190,7 @@ def parse(text: str, where: str) -> Robot:
         buses=[_bus(*entry, where) for entry in buses],
         joints=[_record(*entry, Joint, where) for entry in _tables(raw, "joint", where)],
         grippers=[_record(*entry, Gripper, where) for entry in _tables(raw, "gripper", where)],
+        arms=[_record(*entry, Arm, where) for entry in _tables(raw, "arm", where)],
         groups=[_record(*entry, Group, where) for entry in _tables(raw, "group", where)],
         coupled=_coupled(raw.get("coupled", []), where),
         where=where,
@@ -212,7 +205,9 @@ def _wrong(where: str, key: str, problem: str) -> ConfigurationError:
 
 
 def _only_known(raw: Mapping[str, object], where: str) -> None:
-    known = {key: f"[{key}]" for key in ("robot", "bus", "joint", "gripper", "group")} | {"coupled": "[[coupled]]"}
+    known = {key: f"[{key}]" for key in ("robot", "bus", "joint", "gripper", "arm", "group")} | {
+        "coupled": "[[coupled]]"
+    }
     for key in raw:
         if key not in known:
             raise _wrong(where, f"[{key}]", f"unknown table; a robot file has {', '.join(known.values())}")
@@ -250,13 +245,15 @@ def _table(section: str, name: str, table: object, where: str) -> tuple[str, str
     _check_name(name, f"{where}: {key}")
     if not isinstance(table, dict):
         raise _wrong(where, key, f"must be a table: [{key}]")
-    if any(isinstance(value, dict) for value in table.values()):  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]
+    if any(isinstance(value, dict) and key != "poses" for key, value in table.items()):  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]
         raise _wrong(where, key, f'a dotted name needs quotes: [{section}."{name}.{next(iter(table))}"]')  # pyright: ignore[reportUnknownArgumentType]
     return key, name, cast("dict[str, object]", table)
 
 
-def _bus(key: str, name: str, table: Mapping[str, object], where: str) -> SerialBus | CanBus:
+def _bus(key: str, name: str, table: Mapping[str, object], where: str) -> SerialBus | CanBus | UrBus:
     """A bus of the kind its keys tell."""
+    if any(word in table for word in _UR_KEYS):
+        return _record(key, name, table, UrBus, where)
     can = [word for word in _CAN_KEYS if word in table]
     serial = [word for word in _SERIAL_KEYS if word in table]
     if can and serial:
@@ -332,26 +329,33 @@ def _check_links(robot: Robot) -> None:
         if not gripper.min_width_m < gripper.max_width_m:
             problem = f"must be greater than min_width_m, but {gripper.max_width_m} <= {gripper.min_width_m}"
             raise _wrong(robot.where, f'gripper."{gripper.name}".max_width_m', problem)
+    for arm in robot.arms:
+        if (wrong := arm_problem(arm)) is not None:
+            raise _wrong(robot.where, f'arm."{arm.name}".{wrong[0]}', wrong[1])
     _check_groups(robot)
 
 
 def _check_devices(robot: Robot) -> None:
     """There is a device, and each is on a bus there is, under an id and a name of its own."""
-    if not robot.joints and not robot.grippers:
-        raise _wrong(robot.where, "[joint.NAME]", "missing; a robot needs at least one joint or gripper")
+    devices = (*robot.joints, *robot.grippers, *robot.arms)
+    if not devices:
+        raise _wrong(robot.where, "[joint.NAME]", "missing; a robot needs at least one joint, gripper or arm")
     buses, names, seen = {bus.name for bus in robot.buses}, set[str](), dict[tuple[str, int], str]()
-    for device in (*robot.joints, *robot.grippers):
+    for device in devices:
         kind = type(device).__name__.lower()
         key = f'{kind}."{device.name}"'
         if device.bus not in buses:
             problem = f"there is no bus {device.bus!r}; there is {', '.join(sorted(buses))}"
             raise _wrong(robot.where, f"{key}.bus", problem)
-        if other := seen.get((device.bus, device.id)):
-            raise _wrong(robot.where, f"{key}.id", f"{device.id} is taken on bus {device.bus!r} by {other}")
+        number = -1 if isinstance(device, Arm) else device.id
+        if other := seen.get((device.bus, number)):
+            if number < 0:
+                raise _wrong(robot.where, f"{key}.bus", f"controller {device.bus!r} has its one arm: {other}")
+            raise _wrong(robot.where, f"{key}.id", f"{number} is taken on bus {device.bus!r} by {other}")
         if device.name in names:
             raise _wrong(robot.where, key, "a joint has this name already")
         names.add(device.name)
-        seen[device.bus, device.id] = f"{kind} {device.name!r}"
+        seen[device.bus, number] = f"{kind} {device.name!r}"
 
 
 def _check_ports(robot: Robot) -> None:
@@ -366,8 +370,8 @@ def _check_groups(robot: Robot) -> None:
     names = {joint.name for joint in robot.joints}
     for group in robot.groups:
         _check_joints(robot, group.joints, f"group.{group.name}.joints", names)
-        if group.name in names or group.name in {gripper.name for gripper in robot.grippers}:
-            raise _wrong(robot.where, f"group.{group.name}", "a joint or gripper has this name already")
+        if group.name in names or group.name in {device.name for device in (*robot.grippers, *robot.arms)}:
+            raise _wrong(robot.where, f"group.{group.name}", "a joint, gripper or arm has this name already")
     for number, coupled in enumerate(robot.coupled, 1):
         _check_joints(robot, coupled.joints, f"coupled {number}.joints", names)
 

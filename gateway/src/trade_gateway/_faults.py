@@ -8,7 +8,7 @@ from msgspec import Struct
 from rich.markup import escape
 
 from trade.errors import DeviceError
-from trade_drivers import Gripper, Motor
+from trade_drivers import Arm, ArmState, Gripper, Motor
 from trade_gateway._output import Output
 
 __all__ = ["FaultWatch"]
@@ -18,7 +18,9 @@ class FaultWatch:
     """Compares what devices say of themselves with what they said before. Looking asks no device anything."""
 
     def __init__(self, providers: Mapping[str, Any]) -> None:
-        self._devices = {name: device for name, device in providers.items() if isinstance(device, Motor | Gripper)}
+        self._devices = {
+            name: device for name, device in providers.items() if isinstance(device, Motor | Gripper | Arm)
+        }
         self._known: dict[str, _Trouble] = dict.fromkeys(self._devices, _WELL)
 
     def begin(self, out: Output) -> None:
@@ -61,15 +63,17 @@ def _now() -> datetime:
     return datetime.now().astimezone()
 
 
-def _trouble(joint: str, device: Motor | Gripper) -> _Trouble:
+def _trouble(joint: str, device: Motor | Gripper | Arm) -> _Trouble:
     try:
-        fault = device.state().fault
+        state = device.state()
     except DeviceError as silent:
         return _Trouble(type(silent).__name__, str(silent))
     except Exception as defect:  # noqa: BLE001 - a mistake of the driver's is told, and ends nothing
         return _Trouble(type(defect).__name__, f"{joint}: its state cannot be read: {defect!r}")
-    if not fault:
+    if not (fault := state.fault):
         return _WELL
+    if isinstance(state, ArmState):
+        return _Trouble(fault, f"{joint}: {fault}; {state.remedy}")
     sentence = fault if fault.endswith("?") else f"{fault}."
     remedy = "enable" if isinstance(device, Motor) else "clear_fault"
     return _Trouble(fault, f"{joint}: {sentence} When you have looked: trade call {joint}.{remedy}")

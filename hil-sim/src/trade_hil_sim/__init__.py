@@ -37,10 +37,11 @@ from ._judge import events, frames, instructions, motion_writes, read_log, recei
 from ._line import Peer, SerialLine
 from ._log import ByteLog, Entry
 from ._process import SimProcess, remove_leftovers
-from ._state import BusState, DeviceState, GripperTruth
+from ._state import ArmTruth, BusState, DeviceState, GripperTruth
 from .can import CanBus, Frame
 from .dynamixel import MODELS, XL430_W250, XM430_W350, DynamixelBus, Servo
 from .robotiq import Gripper, RobotiqBus
+from .ur import Arm, UrBus
 
 __all__ = [
     "MODELS",
@@ -48,6 +49,8 @@ __all__ = [
     "XM430_W350",
     "Absent",
     "AnswerFault",
+    "Arm",
+    "ArmTruth",
     "BadCrc",
     "BrownOut",
     "BusOff",
@@ -86,6 +89,7 @@ __all__ = [
     "Truncate",
     "Unmute",
     "Unplug",
+    "UrBus",
     "WrongModel",
     "events",
     "frames",

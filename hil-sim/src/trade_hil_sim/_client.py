@@ -11,7 +11,7 @@ import msgspec
 from . import _faults as faults
 from ._control import Answer, State
 from ._errors import SimulationError
-from ._state import BusState, DeviceState, GripperTruth
+from ._state import ArmTruth, BusState, DeviceState, GripperTruth
 
 __all__ = ["SimControl"]
 
@@ -84,6 +84,17 @@ class SimControl:
             known = ", ".join(f"{gripper.gripper} ({gripper.bus} {gripper.device_id})" for gripper in grippers)
             raise SimulationError(f"{len(found)} grippers are called {which!r}; there is {known or 'none'}")
         return found[0]
+
+    def arm(self, which: str) -> ArmTruth:
+        """The truth about one arm, by its name.
+
+        Raises:
+            SimulationError: no such arm; names those there are.
+        """
+        arms = {arm.arm: arm for bus in self.state() for arm in bus.arms}
+        if which not in arms:
+            raise SimulationError(f"no arm is called {which!r}; there is {', '.join(arms) or 'none'}")
+        return arms[which]
 
     # faults of answers
 

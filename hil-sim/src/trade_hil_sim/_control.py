@@ -128,7 +128,7 @@ class ControlServer:
 
     def _by_bus(self, command: Command, ids: tuple[int, ...]) -> list[tuple[Steered, Command]]:
         states = {name: bus.state() for name, bus in self._buses.items()}
-        here = {name: {device.device_id for device in (*s.devices, *s.grippers)} for name, s in states.items()}
+        here = {name: {device.device_id for device in (*s.devices, *s.grippers, *s.arms)} for name, s in states.items()}
         if unknown := set(ids).difference(*here.values()):
             raise SimulationError(f"no bus has a device {sorted(unknown)}; there is {here}")
         mine = {name: tuple(i for i in ids if i in there) for name, there in here.items()}

@@ -15,6 +15,8 @@ WRITING: Final = frozenset(
     {
         *("write", "write_one", "read_write", "reg_write", "action", "sync_write", "bulk_write"),
         *("sdo_write", "rpdo1", "rpdo2", "rpdo3", "rpdo4"),
+        *("move_j", "move_j_ik", "move_l", "move_l_fk", "servo_j", "servo_l", "speed_j", "upload"),
+        *("teach_on", "freedrive_on"),
     }
 )
 EVERYBODY: Final = 254
@@ -138,7 +140,7 @@ def motion_writes(
 ) -> list[Entry]:
     """The writes that could move something: those that touch torque or goal registers; arguments as `writes`.
 
-    Of CAN drives: those that change controlword, mode or a target.
+    Of CAN drives: those that change controlword, mode or a target. Of arms: commands to move, set-points, freedrive.
 
     A registered write counts, and so does the action that lets it loose. Switching torque off counts, too.
     """

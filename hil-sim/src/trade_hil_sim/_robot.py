@@ -5,7 +5,7 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Final, Protocol, cast
 
-from trade_drivers.robotfile import Bus, Gripper, Joint, Robot, parse
+from trade_drivers.robotfile import Arm, Bus, Gripper, Joint, Robot, parse
 
 from ._errors import SimulationError
 from ._faults import Command
@@ -54,7 +54,7 @@ class SimulatedBusClass(Protocol):
     def from_robot(
         self,
         bus: Bus,
-        devices: Sequence[Joint | Gripper],
+        devices: Sequence[Joint | Gripper | Arm],
         port: Path,
         *,
         log: ByteLog | None = None,
@@ -88,7 +88,7 @@ def buses_of(
     return [
         find_simulator(bus.driver).from_robot(
             bus,
-            [*robot.joints_on(bus.name), *robot.grippers_on(bus.name)],
+            [*robot.joints_on(bus.name), *robot.grippers_on(bus.name), *robot.arms_on(bus.name)],
             directory / bus.name,
             log=log,
             paced=paced,

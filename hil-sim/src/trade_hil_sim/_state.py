@@ -2,7 +2,7 @@
 
 import msgspec
 
-__all__ = ["BusState", "DeviceState", "GripperTruth"]
+__all__ = ["ArmTruth", "BusState", "DeviceState", "GripperTruth"]
 
 
 class DeviceState(msgspec.Struct, frozen=True, kw_only=True):
@@ -47,6 +47,29 @@ class GripperTruth(msgspec.Struct, frozen=True, kw_only=True):
     absent: bool
 
 
+class ArmTruth(msgspec.Struct, frozen=True, kw_only=True):
+    """One simulated arm with its controller."""
+
+    bus: str = ""
+    device_id: int
+    arm: str
+    model: str
+    positions_rad: list[float]
+    velocities_rad_s: list[float]
+    pose: list[float]
+    """Of its flange: x, y, z in m, and a rotation vector in rad."""
+    moving: bool
+    robot_mode: str
+    safety_mode: str
+    program: str
+    """``control``: the script of its driver runs; ``played``: one of its own; empty: none."""
+    freedrive: bool
+    speed_fraction: float
+    watchdog_hz: float
+    """How often it has to hear from the host; 0: not armed."""
+    absent: bool
+
+
 class BusState(msgspec.Struct, frozen=True, kw_only=True):
     """One simulated bus."""
 
@@ -56,3 +79,4 @@ class BusState(msgspec.Struct, frozen=True, kw_only=True):
     plugged: bool
     devices: list[DeviceState] = []
     grippers: list[GripperTruth] = []
+    arms: list[ArmTruth] = []

@@ -4,8 +4,9 @@ The contracts are plain classes with ``test_`` methods, run in a subclass that s
 ``python -m trade_drivers.testing --hil ROBOT.toml`` runs them on the devices of a robot file.
 """
 
+from trade_drivers.testing._arms import ArmContract
 from trade_drivers.testing._grippers import GripperContract
 from trade_drivers.testing._groups import JointGroupContract
 from trade_drivers.testing._motors import MotorContract
 
-__all__ = ["GripperContract", "JointGroupContract", "MotorContract"]
+__all__ = ["ArmContract", "GripperContract", "JointGroupContract", "MotorContract"]

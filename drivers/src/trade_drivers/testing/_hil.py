@@ -12,6 +12,7 @@ import pytest
 import trade
 from trade import where
 from trade.errors import ConfigurationError, TradeError
+from trade_drivers._arm import Arm
 from trade_drivers._attach import AttachedRobot, attach
 from trade_drivers._interfaces import Gripper, JointGroup, Motor
 from trade_drivers._load import load
@@ -21,7 +22,7 @@ from trade_drivers.testing._asking import REACH_RAD, SPEED_RAD_S
 __all__ = ["main"]
 
 _SUITE: Final = Path(__file__).with_name("_suite.py")
-_KINDS: Final[Mapping[str, type[object]]] = {"motor": Motor, "group": JointGroup, "gripper": Gripper}
+_KINDS: Final[Mapping[str, type[object]]] = {"motor": Motor, "group": JointGroup, "gripper": Gripper, "arm": Arm}
 """Fixtures of the contracts, and what of the robot each of them goes through."""
 _REFUSED: Final = 2
 
@@ -76,7 +77,7 @@ def _refuse_if_in_use(robot: Robot) -> None:
     if not offered:
         return
     places = sorted({f"{handle.container} on {handle.host}" for handle in offered})
-    devices = {f"{robot.name}.{device.name}" for device in (*robot.joints, *robot.grippers)}
+    devices = {f"{robot.name}.{device.name}" for device in (*robot.joints, *robot.grippers, *robot.arms)}
     owners = sorted(
         {
             f"{lock.holder.identity}/{lock.holder.container} ({lock.holder.purpose or 'no purpose given'})"
@@ -100,6 +101,11 @@ def _agreed(robot: Robot) -> bool:
             f"{len(robot.grippers)} grippers of {robot.name} will be activated, OPENED and CLOSED all the way again "
             "and again, as fast and as hard as the file allows:\nwhat they hold falls; nothing may be between their "
             "fingers.\n"
+        )
+    if robot.arms:
+        sys.stderr.write(
+            f"{len(robot.arms)} arms of {robot.name}, which must be powered, their brakes released, will be moved by\n"
+            f"up to {REACH_RAD} rad at {SPEED_RAD_S} rad/s, along short lines, and be put into FREEDRIVE at times.\n"
         )
     sys.stderr.write("Type yes to go on: ")
     sys.stderr.flush()
@@ -134,6 +140,13 @@ class _Devices:
         gripper.open()
         yield gripper
         gripper.stop()
+
+    @pytest.fixture
+    def arm(self, request: pytest.FixtureRequest) -> Iterator[object]:
+        arm = self._providers[request.param]
+        assert isinstance(arm, Arm)  # noqa: S101 - pytest_generate_tests gave no other name
+        yield arm
+        arm.stop()
 
     def _device(self, name: str) -> Iterator[object]:
         device = self._providers[name]

@@ -1,5 +1,6 @@
 """What `_hil` has pytest collect: the contracts, for all devices of the robot file."""
 
+from trade_drivers.testing._arms import ArmContract
 from trade_drivers.testing._grippers import GripperContract
 from trade_drivers.testing._groups import JointGroupContract
 from trade_drivers.testing._motors import MotorContract
@@ -15,3 +16,7 @@ class TestJointGroup(JointGroupContract):
 
 class TestGripper(GripperContract):
     """Each gripper."""
+
+
+class TestArm(ArmContract):
+    """Each arm."""

@@ -1,0 +1,81 @@
+"""The dashboard server of a controller: one connection a question, each with a deadline. Plain sockets, no library."""
+
+import socket
+import time
+from typing import Final
+
+__all__ = ["DashboardError", "ask", "probe"]
+
+_PORT: Final = 29999
+_RTDE: Final = 30004
+_SCRIPT: Final = 30003
+_GREETING: Final = "Universal Robots Dashboard Server"
+_HELLO: Final = bytes.fromhex("0005560002")
+"""RTDE: protocol version 2, please."""
+_WELCOME: Final = bytes.fromhex("00045601")
+_LONGEST: Final = 4096
+
+
+class DashboardError(Exception):
+    """The controller is not there, does not answer in time, or is none."""
+
+
+def ask(host: str, line: str, timeout_s: float) -> str:
+    """What the dashboard answers to a line.
+
+    Raises:
+        DashboardError: nothing in time.
+    """
+    until = time.monotonic() + timeout_s
+    try:
+        with socket.create_connection((host, _PORT), timeout_s) as connection:
+            if _GREETING not in (greeting := _line(connection, until)):
+                raise DashboardError(f"{host}:{_PORT} greets with {greeting!r}; is it a controller?")
+            connection.sendall(line.encode() + b"\n")
+            return _line(connection, until)
+    except OSError as problem:
+        raise DashboardError(f"{host}:{_PORT}: {problem or 'no answer'}") from None
+
+
+def probe(host: str, timeout_s: float) -> None:
+    """See that all ports of the controller answer, so that the library, which waits for ever, need not find out.
+
+    Raises:
+        DashboardError: one does not.
+    """
+    ask(host, "robotmode", timeout_s)
+    until = time.monotonic() + timeout_s
+    try:
+        with socket.create_connection((host, _RTDE), timeout_s) as connection:
+            connection.sendall(_HELLO)
+            answer = _bytes(connection, len(_WELCOME), until)
+    except OSError as problem:
+        raise DashboardError(f"{host}:{_RTDE}: {problem or 'no answer'}") from None
+    if answer != _WELCOME:
+        raise DashboardError(f"{host}:{_RTDE} answers {answer.hex()}; RTDE of version 2 is needed")
+    try:
+        socket.create_connection((host, _SCRIPT), timeout_s).close()
+    except OSError as problem:
+        raise DashboardError(f"{host}:{_SCRIPT}: {problem or 'no answer'}") from None
+
+
+def _line(connection: socket.socket, until: float) -> str:
+    data = b""
+    while not data.endswith(b"\n"):
+        data += _some(connection, _LONGEST - len(data), until)
+    return data.decode(errors="replace").strip()
+
+
+def _bytes(connection: socket.socket, count: int, until: float) -> bytes:
+    data = b""
+    while len(data) < count:
+        data += _some(connection, count - len(data), until)
+    return data
+
+
+def _some(connection: socket.socket, most: int, until: float) -> bytes:
+    connection.settimeout(max(0.001, until - time.monotonic()))
+    data = connection.recv(most)
+    if not data:
+        raise ConnectionResetError("it hung up")
+    return data

@@ -1,0 +1,104 @@
+"""Bringing a controller's arm up, and handing it out."""
+
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from importlib.util import find_spec
+from typing import Final, NoReturn
+
+from trade.errors import ConfigurationError
+from trade_drivers._arm import Arm
+from trade_drivers._bus_thread import BusThread
+from trade_drivers._driver import AttachedBus, Driver
+from trade_drivers._interfaces import JointGroup, Motor
+from trade_drivers._work import PortLost
+from trade_drivers.robotfile import Bus, Robot, UrBus
+from trade_drivers.ur._dashboard import DashboardError, ask
+from trade_drivers.ur._exchange import Exchange
+from trade_drivers.ur._limb import Limb
+from trade_drivers.ur._link import Link
+from trade_drivers.ur._ur_arm import UrArm
+
+__all__ = ["UrDriver"]
+
+_MODELS: Final = ("UR3", "UR3e", "UR5", "UR5e", "UR10", "UR10e", "UR16e")
+_MODULES: Final = ("rtde_control", "rtde_receive", "rtde_io")
+_ASK_S: Final = 1.0
+
+
+class AttachedController(AttachedBus):
+    """A controller with its arm, and the thread that owns it."""
+
+    def __init__(self, thread: BusThread[Exchange]) -> None:
+        self._thread = thread
+
+    def motor(self, joint: str) -> Motor:
+        raise ConfigurationError(where=f'joint."{joint}"', problem="driver ur has no joints, only an arm: [arm.NAME]")
+
+    def group(self, name: str, joints: Sequence[str]) -> JointGroup:
+        raise ConfigurationError(where=name, problem=f"driver ur has no joints such as {', '.join(joints)}")
+
+    def arm(self, name: str) -> Arm:  # noqa: ARG002 - there is one
+        return UrArm(self._thread, self._thread.exchange.limb)
+
+    def close(self) -> None:
+        self._thread.close()
+
+
+class UrDriver(Driver):
+    """Arms of Universal Robots, through ur-rtde."""
+
+    def attach(self, robot: Robot, bus: Bus, port: str, healthy: Callable[[], bool]) -> AttachedBus:
+        where = f"{robot.where}: bus.{bus.name}"
+        if not isinstance(bus, UrBus):
+            _wrong(where, 'driver ur needs a controller: host = "192.168.0.10"')
+        if missing := [name for name in _MODULES if find_spec(name) is None]:
+            problem = (
+                f'needs ur-rtde ({missing[0]} is missing); pip install "trade-drivers[ur]", or on platforms without'
+            )
+            _wrong("driver ur", f"{problem} its wheel (all but Linux x86_64 with Python 3.10-3.12) build ur-rtde 1.6.5")
+        limb = _limb(robot, bus, port)
+        link = Link(port)
+        with ExitStack() as undo:
+            undo.callback(link.close)
+            try:
+                link.open()
+                _look_over(limb, f"{robot.where}: arm.{limb.arm.name}")
+            except (PortLost, DashboardError) as problem:
+                _wrong(f"{where}.host", f"{problem}; is it switched on, and is this its address?")
+            exchange = Exchange(link, bus, limb)
+            exchange.listen()
+            _stop_if_moving(exchange)
+            thread = BusThread(exchange, link, bus, healthy, name=f"bus {robot.name}.{bus.name}")
+            thread.start()
+            undo.pop_all()
+        return AttachedController(thread)
+
+
+def _limb(robot: Robot, bus: UrBus, port: str) -> Limb:
+    arms = robot.arms_on(bus.name)
+    if len(arms) != 1 or robot.joints_on(bus.name) or robot.grippers_on(bus.name):
+        _wrong(f"{robot.where}: bus.{bus.name}", "a controller has one arm, and nothing else: [arm.NAME]")
+    [arm] = arms
+    if arm.model not in _MODELS:
+        problem = f"{arm.model!r} is unknown to the driver ur; it knows {', '.join(_MODELS)}"
+        _wrong(f"{robot.where}: arm.{arm.name}.model", problem)
+    if bus.leave != "hold":
+        _wrong(f"{robot.where}: bus.{bus.name}.leave", '"relax" is nothing an arm can: it would fall; use "hold"')
+    return Limb(f"{robot.name}.{arm.name}", port, arm)
+
+
+def _look_over(limb: Limb, where: str) -> None:
+    """See that it is the arm of the robot file; nothing is commanded."""
+    answer = ask(limb.bus, "get robot model", _ASK_S)
+    if answer.rstrip("e").upper() != limb.arm.model.rstrip("e").upper():
+        _wrong(f"{where}.model", f"the controller at {limb.bus} has a {answer}, not a {limb.arm.model}")
+
+
+def _stop_if_moving(exchange: Exchange) -> None:
+    """Found moving and owned by nobody, it is stopped (S18)."""
+    if exchange.limb.still == 0:
+        ask(exchange.limb.bus, "stop", _ASK_S)
+
+
+def _wrong(where: str, problem: str) -> NoReturn:
+    raise ConfigurationError(where=where, problem=problem)

@@ -1,0 +1,23 @@
+"""A Universal Robots arm and its controller: RTDE, dashboard and script port, with the motion of six joints."""
+
+from ._arm import HOME, JOINTS, Arm
+from ._bus import PORTS, UrBus
+from ._packets import Packet, PacketType, Recipe
+from ._table import INPUTS, MODELS, OUTPUTS, Command, RobotMode, SafetyMode
+
+__all__ = [
+    "HOME",
+    "INPUTS",
+    "JOINTS",
+    "MODELS",
+    "OUTPUTS",
+    "PORTS",
+    "Arm",
+    "Command",
+    "Packet",
+    "PacketType",
+    "Recipe",
+    "RobotMode",
+    "SafetyMode",
+    "UrBus",
+]

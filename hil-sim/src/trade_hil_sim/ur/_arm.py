@@ -1,0 +1,245 @@
+"""A simulated arm: six joints, brakes, safety modes. It is told what to do and moves when time passes."""
+
+from collections.abc import Callable, Sequence
+from math import pi
+from typing import Final
+
+import msgspec
+
+from trade_hil_sim._errors import SimulationError
+from trade_hil_sim._log import Entry
+
+from ._kinematics import flange, joints_for, pose_between, pose_of, way_of
+from ._motions import Braking, Free, Held, Motion, Servo, Speed, Way
+from ._table import MODELS, RobotMode, SafetyMode
+
+__all__ = ["HOME", "JOINTS", "Arm"]
+
+JOINTS: Final = ("base", "shoulder", "elbow", "wrist_1", "wrist_2", "wrist_3")
+HOME: Final = (0.0, -pi / 2, pi / 2, -pi / 2, -pi / 2, 0.0)
+"""The elbow up, the tool pointing down: where a simulated arm begins."""
+_LIMIT_RAD: Final = 2 * pi
+_HALT_RAD_S2: Final = 15.0
+"""How it brakes when its program ends or safety stops it."""
+_POWER_S: Final = 0.2
+_UNLOCK_S: Final = 5.0
+_JAMMED_S: Final = 0.3
+_EVERY_RAD: Final = 0.02
+_EVERY_M: Final = 0.01
+Six = tuple[float, ...]
+
+
+class Arm:
+    """Six joints behind a controller.
+
+    Args:
+        model: such as ``UR5e``.
+        name: of the arm in the robot file.
+        q: where it stands, in rad.
+        running: powered, brakes released; else it is off.
+        t: when, on the clock that `advance` is called with.
+        unlock_s: how long after a protective stop it can be unlocked at the earliest.
+    """
+
+    def __init__(
+        self,
+        model: str = "UR5e",
+        *,
+        name: str = "",
+        q: Six = HOME,
+        running: bool = True,
+        t: float = 0.0,
+        unlock_s: float = _UNLOCK_S,
+    ) -> None:
+        if model not in MODELS:
+            raise SimulationError(f"{model!r} is not simulated; there is {', '.join(MODELS)}")
+        self.model, self.name = model, name
+        self.q, self.qd = tuple(q), (0.0,) * 6
+        self.robot_mode = RobotMode.RUNNING if running else RobotMode.POWER_OFF
+        self.safety_mode = SafetyMode.NORMAL
+        self.speed_fraction = 1.0
+        self.emit: Callable[[Entry], None] = lambda _: None
+        self.stopped: Callable[[], None] = lambda: None
+        """Called when safety ends whatever program runs."""
+        self.t = t
+        self.jammed = False
+        self._motion: Motion = Held()
+        self._moving = False
+        self._unlock_s, self._locked_at = unlock_s, t
+        self._jammed_s = 0.0
+        self._modes: list[tuple[float, RobotMode]] = []
+
+    # --- what it is
+
+    @property
+    def ready(self) -> bool:
+        """Powered, brakes off, and no safety stop."""
+        return self.robot_mode is RobotMode.RUNNING and self.safety_mode.moves
+
+    @property
+    def moving(self) -> bool:
+        """Whether any joint turns."""
+        return self._moving
+
+    @property
+    def motion(self) -> Motion:
+        """What it is about."""
+        return self._motion
+
+    @property
+    def freedrive(self) -> bool:
+        """Whether it can be moved by hand."""
+        return isinstance(self._motion, Free)
+
+    def pose(self, q: Sequence[float] | None = None) -> Six:
+        """Of the flange: x, y, z in m, and a rotation vector in rad."""
+        return pose_of(flange(MODELS[self.model], self.q if q is None else q))
+
+    def joints_for(self, pose: Sequence[float]) -> Six | None:
+        """The joint angles for a pose nearest to where it is; None if there are none."""
+        return joints_for(MODELS[self.model], pose, self.q)
+
+    # --- time
+
+    def advance(self, dt: float) -> None:
+        """Let a step of time pass."""
+        self.t += dt
+        while self._modes and self.t >= self._modes[0][0]:
+            self._enter(self._modes.pop(0)[1])
+        if self.jammed and not self._motion.done:
+            self._strain(dt)
+            return
+        q, self.qd = self._motion.step(self.q, self.qd, dt * self.speed_fraction if self.ready else dt)
+        if self._motion.done:
+            self._motion = Free() if self.freedrive else Held()
+            self.qd = (0.0,) * 6
+        if any(abs(angle) > _LIMIT_RAD for angle in q):
+            self.protective_stop("a joint is at its limit")
+            q = tuple(max(-_LIMIT_RAD, min(_LIMIT_RAD, angle)) for angle in q)
+        turned = max(abs(a - b) for a, b in zip(q, self.q, strict=True)) > 1e-9
+        if turned and not self._moving:
+            self.note("motion_started")
+        self.q, was, self._moving = q, self._moving, turned or any(abs(speed) > 1e-6 for speed in self.qd)
+        if was and not self._moving:
+            self.note("at_rest")
+
+    def _strain(self, dt: float) -> None:
+        if self._moving:
+            self._moving = False
+            self.note("at_rest", detail="jammed")
+        self.qd = (0.0,) * 6
+        self._jammed_s += dt
+        if self._jammed_s >= _JAMMED_S:
+            self.protective_stop("it is where it should not be: is something in its way?")
+
+    # --- commands
+
+    def move_joints(self, goal: Sequence[float], speed: float, accel: float) -> bool:
+        """Straight in joint space: speed in rad/s and acceleration of the joint that turns most."""
+        length = max(abs(b - a) for a, b in zip(self.q, goal, strict=True))
+        return self._begin(Way([self.q, tuple(goal)], length, speed, accel))
+
+    def move_line(self, pose: Sequence[float], speed: float, accel: float) -> bool:
+        """Straight in space: speed in m/s; False, and a protective stop, if the way leads out of reach."""
+        start = self.pose()
+        metres, turn = way_of(start, pose)
+        count = max(2, int(metres / _EVERY_M) + 1, int(turn / _EVERY_RAD / 2) + 1)
+        points, near = [self.q], self.q
+        for k in range(1, count + 1):
+            found = joints_for(MODELS[self.model], pose_between(start, pose, k / count), near)
+            if found is None or max(abs(a - b) for a, b in zip(found, near, strict=True)) > 0.5:
+                self.protective_stop("the way leads out of reach")
+                return False
+            points.append(found)
+            near = found
+        return self._begin(Way(points, metres or turn, speed, accel))
+
+    def servo(self, target: Sequence[float]) -> bool:
+        """After this target, at once."""
+        if isinstance(self._motion, Servo):
+            self._motion.target = tuple(target)
+            return self.ready
+        return self._begin(Servo(tuple(target)))
+
+    def turn(self, speeds: Sequence[float], accel: float, lasts_s: float) -> bool:
+        """At these speeds; asking for the same again changes nothing, so it can be asked in every cycle."""
+        asked = (tuple(speeds), accel, lasts_s)
+        if isinstance(self._motion, Speed) and self._motion.asked == asked and lasts_s <= 0:
+            return self.ready
+        return self._begin(Speed(tuple(speeds), accel, lasts_s))
+
+    def free(self, on: bool) -> bool:
+        """Switch freedrive."""
+        return self._begin(Free() if on else Held())
+
+    def halt(self, decel_rad_s2: float = _HALT_RAD_S2) -> None:
+        """Brake, and hold."""
+        self._motion = Braking(decel_rad_s2) if self._moving else Held()
+
+    def _begin(self, motion: Motion) -> bool:
+        if not self.ready:
+            return False
+        self._jammed_s = 0.0
+        self._motion = motion
+        return True
+
+    # --- power and safety
+
+    def power(self, on: bool) -> bool:
+        """Switch the arm's power; the brakes stay on."""
+        if not on:
+            self._modes.clear()
+            self.halt()
+            self._enter(RobotMode.POWER_OFF)
+            self.stopped()
+        elif self.robot_mode is RobotMode.POWER_OFF:
+            self._modes = [(self.t + _POWER_S / 2, RobotMode.POWER_ON), (self.t + _POWER_S, RobotMode.IDLE)]
+        return True
+
+    def release_brakes(self) -> bool:
+        """Let the arm carry itself; powers it on first if need be."""
+        self.power(True)
+        if self.robot_mode is not RobotMode.RUNNING:
+            after = self._modes[-1][0] if self._modes else self.t
+            self._modes.append((after + _POWER_S, RobotMode.RUNNING))
+        return True
+
+    def protective_stop(self, why: str) -> None:
+        """Stop, and do not move until it is unlocked."""
+        self.safety(SafetyMode.PROTECTIVE_STOP, why)
+
+    def safety(self, mode: SafetyMode, why: str = "") -> None:
+        """Enter a safety mode."""
+        if mode is self.safety_mode:
+            return
+        self.safety_mode, self._locked_at = mode, self.t
+        self.note(mode.name.lower(), detail=why)
+        if not mode.moves:
+            self.halt()
+            self.stopped()
+
+    def unlock(self) -> bool:
+        """End a protective stop; not within the first seconds."""
+        if self.safety_mode is SafetyMode.PROTECTIVE_STOP and self.t - self._locked_at < self._unlock_s:
+            return False
+        if self.safety_mode is SafetyMode.PROTECTIVE_STOP:
+            self._jammed_s = 0.0
+            self.safety(SafetyMode.NORMAL)
+        return True
+
+    def reboot(self) -> None:
+        """As after a loss of power: off, its brakes on, everything forgotten."""
+        self._motion, self._moving, self.qd = Held(), False, (0.0,) * 6
+        self._modes.clear()
+        self.safety_mode, self.speed_fraction = SafetyMode.NORMAL, 1.0
+        self._enter(RobotMode.POWER_OFF)
+
+    def _enter(self, mode: RobotMode) -> None:
+        if mode is not self.robot_mode:
+            self.robot_mode = mode
+            self.note(mode.name.lower())
+
+    def note(self, name: str, *, detail: str = "") -> None:
+        """Log an event, with where the joints are."""
+        where = msgspec.json.encode([round(angle, 6) for angle in self.q]).decode()
+        self.emit(Entry(self.t, "", "event", name, joint=self.name, detail=detail or where))

@@ -1,0 +1,393 @@
+"""A simulated controller with its arm: the three ports clients know, one thread, faults, and the log."""
+
+import os
+import random
+import socket
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, TypeVar
+
+import msgspec
+
+from trade_hil_sim import _faults as faults
+from trade_hil_sim._errors import SimulationError
+from trade_hil_sim._log import ByteLog, Entry
+from trade_hil_sim._ready import ready
+from trade_hil_sim._state import ArmTruth, BusState
+
+from ._arm import HOME, Arm
+from ._client import Client
+from ._dashboard import GREETING, Dashboard
+from ._packets import Packet
+from ._program import Program
+from ._rtde import Rtde, RtdeSession, measured
+from ._table import SafetyMode
+
+if TYPE_CHECKING:
+    from trade_drivers.robotfile import Arm as ArmRecord
+    from trade_drivers.robotfile import Bus
+
+__all__ = ["PORTS", "UrBus"]
+
+PORTS: Final = {"rtde": 30004, "dashboard": 29999, "script": 30003}
+ANSWER_S: Final = 10.0
+_ARM: Final = 0
+"""The id of the arm in faults: it is the only one of its controller."""
+_REBOOT_S: Final = 0.5
+_TRIES: Final = 100
+_CATCH_UP: Final = 25
+"""Cycles made up for when this thread was held up; more are skipped, as if the controller had stood still."""
+_MOVING: Final = ("actual_q", "actual_qd", "target_q", "target_qd", "actual_TCP_pose", "target_TCP_pose")
+_T = TypeVar("_T")
+
+
+class UrBus:
+    """One controller on a loopback address of its own; its ports are those of a real one.
+
+    Args:
+        arm: what it moves.
+        host: a loopback address; default: one whose ports are free.
+        name: of the bus, in the log.
+        rate_hz: cycles a second: 500, or 125 on older controllers.
+        remote: whether it is in remote control.
+        log: where to record; default: a log in memory, at `log`.
+    """
+
+    def __init__(
+        self,
+        arm: Arm | None = None,
+        *,
+        host: str = "",
+        name: str = "bus",
+        rate_hz: float = 500.0,
+        remote: bool = True,
+        log: ByteLog | None = None,
+    ) -> None:
+        self.name, self.port = name, host
+        self.arm = Arm() if arm is None else arm
+        self.log = ByteLog() if log is None else log
+        self.arm.emit = self._emit
+        self.arm.t = time.monotonic()
+        self._program = Program(self.arm, self._emit)
+        self._rtde = Rtde(self._program, rate_hz)
+        self._dashboard = Dashboard(self._program, remote=remote)
+        self._period_s = 1 / rate_hz
+        self._script = faults.Script()
+        self._absent = False
+        self._listeners: dict[str, socket.socket] = {}
+        self._clients: dict[Client, str] = {}
+        self._sessions: dict[Client, RtdeSession] = {}
+        self._count = 0
+        self._boots_at: float | None = None
+        self._asked: deque[Callable[[], None]] = deque()
+        self._closing = False
+        self._thread: threading.Thread | None = None
+
+    @classmethod
+    def from_robot(
+        cls,
+        bus: "Bus",
+        devices: "Sequence[ArmRecord]",
+        port: Path,  # noqa: ARG003 - a controller is no path; its address is known when it is open
+        *,
+        log: ByteLog | None = None,
+        paced: bool = True,  # noqa: ARG003 - a controller has a clock of its own
+    ) -> "UrBus":
+        """The controller a robot file describes. Where that names no loopback address, one is chosen.
+
+        Raises:
+            SimulationError: there is not exactly one arm, or of a model that is not simulated.
+        """
+        if len(devices) != 1:
+            raise SimulationError(f"bus.{bus.name}: a controller has one arm, but there are {len(devices)}")
+        record = devices[0]
+        host = str(getattr(bus, "host", ""))
+        arm = Arm(record.model, name=record.name, q=tuple(record.poses.get("home", HOME)))
+        return cls(arm, host=host if host.startswith("127.") else "", name=bus.name, log=log)
+
+    # --- what anybody uses
+
+    def open(self) -> "UrBus":
+        """Switch it on: its ports can be connected to."""
+        if self._thread is not None:
+            raise SimulationError(f"bus {self.name} is open, or was; make a new one")
+        self._listen()
+        self._bell, self._rope = os.pipe()
+        os.set_blocking(self._rope, False)
+        self.arm.t = time.monotonic()
+        self._thread = threading.Thread(target=self._run, name=f"sim-{self.name}", daemon=True)
+        self._thread.start()
+        return self
+
+    def close(self) -> None:
+        """Hang up and end the thread. Idempotent; a log passed in stays open."""
+        if self._thread is None or self._closing:
+            return
+        self._closing = True
+        self._ring()
+        self._thread.join(ANSWER_S)
+
+    def __enter__(self) -> "UrBus":
+        return self.open()
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    def state(self) -> BusState:
+        """The truth, now."""
+        return self._in_thread(self._state)
+
+    def do(self, command: faults.Command) -> None:
+        """Carry out one fault or order; raises `SimulationError` for what is not here."""
+        self._in_thread(lambda: self._do(command))
+
+    # --- the thread
+
+    def _in_thread(self, act: Callable[[], _T]) -> _T:
+        if self._closing:
+            raise SimulationError(f"bus {self.name} is closed")
+        if self._thread is None or threading.current_thread() is self._thread:
+            return act()
+        done: Future[_T] = Future()
+
+        def obey() -> None:
+            try:
+                done.set_result(act())
+            except Exception as problem:  # noqa: BLE001  # handed to the thread that asked
+                done.set_exception(problem)
+
+        self._asked.append(obey)
+        self._ring()
+        return done.result(ANSWER_S)
+
+    def _ring(self) -> None:
+        with suppress(OSError):
+            os.write(self._rope, b"!")
+
+    def _run(self) -> None:
+        try:
+            while not self._closing:
+                self._serve()
+                self._pass_time(time.monotonic())
+                for client in tuple(self._clients):
+                    if not client.flush():
+                        self._drop(client)
+        finally:
+            self._closing = True
+            self._hang_up()
+            os.close(self._bell)
+            os.close(self._rope)
+
+    def _serve(self) -> None:
+        watched: list[int | Client | socket.socket] = [self._bell, *self._listeners.values()]
+        watched += [] if self._absent else list(self._clients)
+        readable = ready(watched, [client for client in self._clients if client.unsent], self._patience_s())
+        names = {listener: name for name, listener in self._listeners.items()}
+        for thing in readable:
+            if isinstance(thing, socket.socket):
+                self._accept(names[thing], thing)
+            elif isinstance(thing, Client):
+                self._hear(thing)
+        if self._bell in readable:
+            os.read(self._bell, 4096)
+            while self._asked:
+                self._asked.popleft()()
+
+    def _patience_s(self) -> float:
+        times = [self.arm.t + self._period_s, *(due for client in self._clients if (due := client.due) is not None)]
+        return max(0.0, min(times) - time.monotonic())
+
+    def _pass_time(self, now: float) -> None:
+        """Every cycle that is due: the joints, the script, and what clients are sent."""
+        behind = int((now - self.arm.t) / self._period_s)
+        if behind > _CATCH_UP:
+            self.arm.t += (behind - _CATCH_UP) * self._period_s
+        while self.arm.t + self._period_s <= now:
+            self.arm.advance(self._period_s)
+            self._program.cycle()
+            if not self._absent:
+                self._rtde.cycle()
+        if self._boots_at is not None and now >= self._boots_at:
+            self._boots_at = None
+            self._note("booted")
+            self._listen()
+
+    # --- connections
+
+    def _listen(self) -> None:
+        """Take the three ports; where no address is given, of the first address where all are free."""
+        for _ in range(_TRIES):
+            host = self.port or f"127.{random.randint(64, 254)}.{random.randint(0, 254)}.{random.randint(1, 254)}"  # noqa: S311 - no secret
+            try:
+                self._listeners = _listeners(host)
+            except OSError as problem:
+                if self.port:
+                    raise SimulationError(f"cannot listen on {host}: {problem}; is another simulator there?") from None
+                continue
+            self.port = host
+            return
+        raise SimulationError("found no loopback address with free ports")
+
+    def _accept(self, kind: str, listener: socket.socket) -> None:
+        with suppress(OSError):
+            connection, _ = listener.accept()
+            self._count += 1
+            client = Client(connection, f"{kind}{self._count}")
+            self._clients[client] = kind
+            self._note("joined", source=client.name)
+            if kind == "dashboard":
+                self._say(client, GREETING.encode() + b"\n", "dashboard")
+            elif kind == "rtde":
+                self._sessions[client] = self._rtde.joined(lambda packet, name: self._say_packet(client, packet, name))
+
+    def _hear(self, client: Client) -> None:
+        if client not in self._clients:
+            return
+        alive = client.read()
+        try:
+            self._understand(client)
+        except ValueError as problem:
+            self._note("misunderstood", source=client.name, detail=str(problem))
+            alive = False
+        if not alive:
+            self._drop(client)
+
+    def _understand(self, client: Client) -> None:
+        match self._clients[client]:
+            case "rtde":
+                self._rtde.said(self._sessions[client], client.held)
+            case "dashboard":
+                for line in _lines(client.held):
+                    answer = self._dashboard.answer(line)
+                    detail = f"{line} -> {answer}"
+                    t = time.monotonic()
+                    self._emit(Entry(t, "", "instruction", "dashboard", source=client.name, detail=detail))
+                    self._say(client, answer.encode() + b"\n", "dashboard")
+            case _:
+                if (whole := client.held.rfind(b"\nend\n")) >= 0:
+                    self._program.upload(client.held[: whole + 5].decode(errors="replace"))
+                    del client.held[: whole + 5]
+
+    def _say_packet(self, client: Client, packet: Packet, name: str) -> None:
+        self._say(client, packet.encode(), name)
+
+    def _say(self, client: Client, data: bytes, name: str) -> None:
+        if not self._absent and not self._script.strikes(faults.Mute, (_ARM,), name):
+            client.tell(self._script.shape(data, (_ARM,), name))
+
+    def _drop(self, client: Client) -> None:
+        if self._clients.pop(client, None) is None:
+            return
+        if (session := self._sessions.pop(client, None)) is not None:
+            self._rtde.left(session)
+        client.close()
+        self._note("left", source=client.name)
+
+    def _hang_up(self) -> None:
+        for listener in self._listeners.values():
+            listener.close()
+        self._listeners = {}
+        for client in tuple(self._clients):
+            self._drop(client)
+
+    # --- faults and orders
+
+    def _state(self) -> BusState:
+        arm, program = self.arm, self._program
+        truth = ArmTruth(
+            bus=self.name,
+            device_id=_ARM,
+            arm=arm.name,
+            model=arm.model,
+            positions_rad=list(arm.q),
+            velocities_rad_s=list(arm.qd),
+            pose=list(arm.pose()),
+            moving=arm.moving,
+            robot_mode=arm.robot_mode.name,
+            safety_mode=arm.safety_mode.name,
+            program=program.kind,
+            freedrive=arm.freedrive,
+            speed_fraction=arm.speed_fraction,
+            watchdog_hz=program.watchdog_hz,
+            absent=self._absent,
+        )
+        return BusState(name=self.name, port=self.port, plugged=bool(self._listeners), arms=[truth])
+
+    def _do(self, command: faults.Command) -> None:
+        if unknown := set(getattr(command, "ids", None) or ()) - {_ARM}:
+            raise SimulationError(f"bus {self.name} has no device {sorted(unknown)}; its arm is {_ARM}")
+        match command:
+            case faults.Unplug():
+                self._hang_up()
+                self._note("unplugged")
+            case faults.Replug():
+                if not self._listeners:
+                    self._listen()
+                self._note("plugged")
+            case faults.Heal():
+                self._script.heal()
+                self._rtde.frozen, self._absent, self.arm.jammed = {}, False, False
+            case faults.AnswerFault():
+                self._script.add(command)
+            case faults.Unmute():
+                self._script.unmute(command.ids)
+            case faults.Absent():
+                self._absent = command.on
+            case _:
+                self._do_to_arm(command)
+
+    def _do_to_arm(self, command: faults.Command) -> None:
+        arm = self.arm
+        match command:
+            case faults.Freeze():
+                names = (*_MOVING, *(("timestamp",) if command.tick else ())) if command.on else ()
+                now = measured(arm, self._program)
+                self._rtde.frozen = {name: now[name] for name in names}
+            case faults.Jam():
+                arm.jammed = command.on
+            case faults.HardwareFault():
+                if command.bits not in set(SafetyMode):
+                    known = ", ".join(f"{int(mode)} {mode.name.lower()}" for mode in SafetyMode)
+                    raise SimulationError(f"bits of an arm's fault are a safety mode: {known}")
+                arm.safety(SafetyMode(command.bits), "by order")
+            case faults.BrownOut():
+                self._program.stop()
+                arm.reboot()
+                self._hang_up()
+                self._note("rebooted")
+                self._boots_at = time.monotonic() + _REBOOT_S
+            case _:
+                raise SimulationError(f"an arm has nothing like {type(command).__name__}")
+
+    def _note(self, name: str, *, source: str = "", detail: str = "") -> None:
+        self._emit(Entry(time.monotonic(), "", "event", name, source=source, detail=detail))
+
+    def _emit(self, entry: Entry) -> None:
+        self.log.add(msgspec.structs.replace(entry, bus=self.name, device_id=_ARM))
+
+
+def _listeners(host: str) -> dict[str, socket.socket]:
+    made: dict[str, socket.socket] = {}
+    try:
+        for name, number in PORTS.items():
+            made[name] = socket.socket()
+            made[name].setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            made[name].bind((host, number))
+            made[name].listen()
+            made[name].setblocking(False)
+    except OSError:
+        for listener in made.values():
+            listener.close()
+        raise
+    return made
+
+
+def _lines(held: bytearray) -> list[str]:
+    whole, found, rest = bytes(held).rpartition(b"\n")
+    held[:] = rest
+    return [line.decode(errors="replace").strip() for line in whole.split(b"\n")] if found else []

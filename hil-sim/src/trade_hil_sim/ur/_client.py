@@ -1,0 +1,88 @@
+"""One TCP connection to a controller: bytes in, answers out, each when it is due."""
+
+import heapq
+import socket
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from itertools import count
+from typing import Final
+
+from trade_hil_sim._faults import Piece
+
+__all__ = ["Client"]
+
+MOST_UNSENT: Final = 65_536
+"""Bytes kept for a client that does not read; then it is hung up on."""
+SEND_BUFFER: Final = 32_768
+"""Bytes the system may keep for a client: one that lay frozen wakes to little that is old."""
+MOST_READ: Final = 65_536
+
+
+class Client:
+    """A connection.
+
+    Args:
+        connection: accepted.
+        name: for the log.
+    """
+
+    def __init__(self, connection: socket.socket, name: str) -> None:
+        connection.setblocking(False)
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
+        self.connection = connection
+        self.name = name
+        self.held = bytearray()
+        """What has come in and is not whole yet."""
+        self._waiting: list[tuple[float, int, bytes]] = []
+        self._order = count()
+        self._unsent = bytearray()
+
+    def fileno(self) -> int:
+        """For poll."""
+        return self.connection.fileno()
+
+    @property
+    def due(self) -> float | None:
+        """When its next answer may leave, on CLOCK_MONOTONIC; None if there is none."""
+        return self._waiting[0][0] if self._waiting else None
+
+    @property
+    def unsent(self) -> bool:
+        """Whether the system did not take all of it."""
+        return bool(self._unsent)
+
+    def read(self) -> bool:
+        """Take in what has come; False when it has hung up."""
+        try:
+            data = self.connection.recv(MOST_READ)
+        except BlockingIOError:
+            return True
+        except OSError:
+            return False
+        self.held += data
+        return bool(data)
+
+    def tell(self, pieces: Sequence[Piece]) -> None:
+        """Queue an answer."""
+        now = time.monotonic()
+        for data, late_s in pieces:
+            heapq.heappush(self._waiting, (now + late_s, next(self._order), data))
+
+    def flush(self) -> bool:
+        """Write what is due and can be written without waiting; False when it is gone, or does not read."""
+        now = time.monotonic()
+        while self._waiting and self._waiting[0][0] <= now:
+            self._unsent += heapq.heappop(self._waiting)[2]
+        try:
+            with suppress(BlockingIOError):
+                if self._unsent:
+                    del self._unsent[: self.connection.send(self._unsent)]
+        except OSError:
+            return False
+        return len(self._unsent) <= MOST_UNSENT
+
+    def close(self) -> None:
+        """Hang up."""
+        self.connection.close()
