@@ -108,6 +108,7 @@ def test_stopping_a_silent_joint_once_more_does_not_turn_it_back(head: Rig, robo
     mark = written_now()
     head.sim.do(sim.Mute(ids=(1,)))
     assert isinstance(moving.wait().error, DeviceSilent)
+    wait_until(lambda: head.goals(1, mark), "it is told to hold")
     held = [goal_counts(entry) for entry in head.goals(1, mark)]
     with pytest.raises(DeviceSilent):
         robot.motor("neck.pan").stop()

@@ -1,8 +1,11 @@
-"""Waiting for files, whatever their numbers: ``select`` knows those below 1024 only."""
+"""Waiting for files, whatever their numbers, and for times that are told in less than milliseconds."""
 
 import select
 from collections.abc import Sequence
-from typing import Protocol, TypeVar
+from typing import Final, Protocol, TypeVar
+
+_FEW: Final = 1024
+"""``select`` knows files of lower numbers only, and waits as briefly as it is told; ``poll`` rounds up to a millisecond."""
 
 
 class _HasFile(Protocol):
@@ -25,6 +28,10 @@ def ready(reading: Sequence[File], writing: Sequence[File] = (), timeout_s: floa
     for thing in writing:
         number = _number(thing)
         wanted[number] = wanted.get(number, 0) | select.POLLOUT
+    if timeout_s is not None and all(number < _FEW for number in wanted):
+        to_write = [number for number, events in wanted.items() if events & select.POLLOUT]
+        got = set(select.select(list(numbers), to_write, (), max(0.0, timeout_s))[0])
+        return [thing for number, thing in numbers.items() if number in got]
     poll = select.poll()
     for number, events in wanted.items():
         poll.register(number, events)
