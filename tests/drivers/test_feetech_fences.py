@@ -7,10 +7,10 @@ from types import SimpleNamespace
 import pytest
 
 from drivers.conftest import Outcome, written_now
+from drivers.gate import Gate
 from drivers.tail_rig import COUNTS_PER_RAD, TailRig, goal_of, tail_rig
-from drivers.test_feetech_safety import Gate
 from trade import Container, where
-from trade.errors import LockedByOther, LockLost, MotionStopped, TradeError
+from trade.errors import ConfigurationError, LockedByOther, LockLost, MotionStopped, TradeError
 from trade_drivers import Motor, attach
 from waiting import wait_until
 
@@ -110,3 +110,27 @@ def test_S11_who_has_no_lock_writes_nothing(
     with planner.lock(ROOT), pytest.raises(LockedByOther):
         move(0.5)
     assert not tail.moves()
+
+
+# --- S05, S20
+
+
+def test_S05_a_motion_ends_with_its_session_whoever_else_used_the_joint_meanwhile(
+    tail: TailRig, root: Motor, planner: Container, operator: Container
+) -> None:
+    planner.find(where(name="move_to", group="rosie.tail.root"), wait_s=20).start(1.3, 0.2)
+    began = tail.wait_for("motion_started", 1)
+    operator.find(where(name="enable", group="rosie.tail.root"), wait_s=20)()  # disturbs nothing
+    planner.close()
+    tail.wait_for("at_rest", 1, began.t)
+    assert all(goal_of(entry) < 2048 + 1.2 * COUNTS_PER_RAD for entry in tail.goals(1))
+
+
+def test_S20_a_second_driver_on_the_port_is_refused_and_sends_not_one_byte(tail: TailRig, gate: Gate) -> None:
+    tail.attach(healthy=gate)
+    gate.hold_up()
+    mark = written_now()
+    with pytest.raises(ConfigurationError, match="another driver owns this port") as refused:
+        tail.attach()
+    assert str(tail.sim.port) in str(refused.value)
+    assert not [entry for entry in tail.log if entry.direction == "in" and entry.t >= mark]

@@ -16,6 +16,7 @@ import pytest
 
 import trade_hil_sim
 from drivers.conftest import Outcome, call, sleep_past, written_now
+from drivers.gate import Gate
 from drivers.tail_rig import COUNTS_PER_RAD, TailRig, goal_of, tail_rig
 from robots import TAIL
 from trade.errors import DeadlineExceeded, DeviceFault, DeviceSilent, InvalidArgument, LimitExceeded, MotionStopped
@@ -28,29 +29,6 @@ LEAD_S = 0.3
 SLOWLY_RAD_S = 0.3
 NEAR = 20
 """Counts that a joint is sent ahead at least."""
-
-
-class Gate:
-    """A health check that can hold the bus thread up."""
-
-    def __init__(self) -> None:
-        self._open, self._reached = threading.Event(), threading.Event()
-        self._open.set()
-        self.says = True
-
-    def __call__(self) -> bool:
-        if not self._open.is_set():
-            self._reached.set()
-            self._open.wait(20)
-        return self.says
-
-    def hold_up(self) -> None:
-        self._reached.clear()
-        self._open.clear()
-        assert self._reached.wait(20)
-
-    def let_go(self) -> None:
-        self._open.set()
 
 
 @pytest.fixture

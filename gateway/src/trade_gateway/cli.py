@@ -1,7 +1,7 @@
 """The command ``trade``: bring a robot up, look at a system, call its services."""
 
 import sys
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
 
@@ -32,6 +32,12 @@ from trade_gateway._system_choice import SystemChoice
 
 __all__ = ["app", "main"]
 
+_SERVICES: Final = "Services"
+_MOTION: Final = "Locks and stops"
+_ROBOTS: Final = "Robots, containers and networks"
+_WATCHING: Final = "Watching and rules"
+_RIGHTS: Final = "Identities and rights"
+
 app = typer.Typer(
     name="trade",
     no_args_is_help=True,
@@ -41,30 +47,30 @@ app = typer.Typer(
     epilog="Without hardware: trade up examples/rosie.toml --sim, then in another terminal: trade services",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-app.command("up")(_up.up)
-app.command("gateway")(_gateway.gateway)
-app.command("services")(_list.services)
-app.command("container")(_empty_container.container)
-app.command("start")(_start.start)
-app.command("migrate")(_migrate.migrate)
-app.command("containers")(_list.containers)
-app.command("call", context_settings={"ignore_unknown_options": True})(_call.call)
-app.command("stream")(_stream.stream)
-app.command("lock", cls=_lock.WithCommand)(_lock.lock)
-app.command("locks")(_locks.locks)
-app.command("unlock")(_locks.unlock)
-app.command("resume")(_locks.resume)
-app.command("estop")(_estop.estop)
-app.command("notifications")(_watchers.notifications)
-app.command("hooks")(_watchers.hooks)
-app.command("tracing")(_trace.tracing)
-app.command("trace")(_trace.trace)
-app.command("logs")(_logs.logs)
-app.command("profile")(_profile.profile)
-app.add_typer(_pki_commands.app, name="pki")
-app.add_typer(_policy.app, name="policy")
-app.add_typer(_rules.app, name="rules")
-app.add_typer(_system_commands.app, name="system")
+app.command("up", rich_help_panel=_ROBOTS)(_up.up)
+app.command("gateway", rich_help_panel=_ROBOTS)(_gateway.gateway)
+app.command("container", rich_help_panel=_ROBOTS)(_empty_container.container)
+app.command("start", rich_help_panel=_ROBOTS)(_start.start)
+app.command("migrate", rich_help_panel=_ROBOTS)(_migrate.migrate)
+app.add_typer(_system_commands.app, name="system", rich_help_panel=_ROBOTS)
+app.command("services", rich_help_panel=_SERVICES)(_list.services)
+app.command("containers", rich_help_panel=_SERVICES)(_list.containers)
+app.command("call", context_settings={"ignore_unknown_options": True}, rich_help_panel=_SERVICES)(_call.call)
+app.command("stream", rich_help_panel=_SERVICES)(_stream.stream)
+app.command("lock", cls=_lock.WithCommand, rich_help_panel=_MOTION)(_lock.lock)
+app.command("locks", rich_help_panel=_MOTION)(_locks.locks)
+app.command("unlock", rich_help_panel=_MOTION)(_locks.unlock)
+app.command("resume", rich_help_panel=_MOTION)(_locks.resume)
+app.command("estop", rich_help_panel=_MOTION)(_estop.estop)
+app.command("notifications", rich_help_panel=_WATCHING)(_watchers.notifications)
+app.command("hooks", rich_help_panel=_WATCHING)(_watchers.hooks)
+app.command("tracing", rich_help_panel=_WATCHING)(_trace.tracing)
+app.command("trace", rich_help_panel=_WATCHING)(_trace.trace)
+app.command("logs", rich_help_panel=_WATCHING)(_logs.logs)
+app.command("profile", rich_help_panel=_WATCHING)(_profile.profile)
+app.add_typer(_rules.app, name="rules", rich_help_panel=_WATCHING)
+app.add_typer(_pki_commands.app, name="pki", rich_help_panel=_RIGHTS)
+app.add_typer(_policy.app, name="policy", rich_help_panel=_RIGHTS)
 
 
 def _version(wanted: bool) -> None:

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from typing import Final, Protocol, TypeVar
 
 _FEW: Final = 1024
-"""``select`` knows files of lower numbers only, and waits as briefly as it is told; ``poll`` rounds up to a millisecond."""
+"""``select`` knows lower numbers only, and waits as briefly as it is told; ``poll`` rounds up to a millisecond."""
 
 
 class _HasFile(Protocol):
