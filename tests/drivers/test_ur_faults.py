@@ -11,6 +11,7 @@ from drivers.conftest import written_now
 from drivers.test_ur_safety import Rig
 from trade.errors import DeviceError, DeviceFault, DeviceSilent, LimitExceeded, MotionStopped
 from trade_drivers import Tolerances, Trajectory, TrajectoryPoint
+from trade_drivers.ur._dashboard import ask
 from trade_hil_sim import Absent, BrownOut, Command, Freeze, Garbage, HardwareFault, Heal, Jam, Mute, Replug, Unplug
 from trade_hil_sim import Arm as SimArm
 from waiting import wait_until
@@ -139,6 +140,14 @@ def test_a_blocked_arm_leaves_its_trajectory_and_the_caller_hears_of_it(rig: Rig
     assert errors
     rig.sim.do(Heal())
     rig.stands()
+
+
+def test_a_program_that_somebody_else_ends_is_a_fault_and_the_next_move_takes_control_again(rig: Rig) -> None:
+    moving = rig.set_off()
+    assert ask(rig.sim.port, "stop", 20.0) == "Stopped"
+    assert isinstance(moving.wait().error, DeviceFault)
+    rig.stands()
+    assert rig.arm.move_to_pose("home")[0] == pytest.approx(0.0, abs=0.01)
 
 
 def test_another_move_takes_over_and_the_one_before_hears_of_it(rig: Rig) -> None:

@@ -160,7 +160,10 @@ class Arm(ABC):
     @service(effect="actuate", cancel="stop")
     @abstractmethod
     def set_speed_scaling(self, fraction: Fraction) -> None:
-        """Have motions carried out slower, also the one under way; streamed set-points are slowed by nothing."""
+        """Have motions carried out slower, also the one under way.
+
+        A trajectory does not wait for the arm: it ends with ``ToleranceExceeded`` if the arm falls behind too far.
+        """
 
     @service(effect="actuate", cancel="stop")
     @abstractmethod

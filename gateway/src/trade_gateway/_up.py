@@ -110,7 +110,12 @@ def refuse_twice(container: Container, command: str) -> None:
 def _say_attaching(out: Output, robot: Robot, ports: dict[str, str] | None) -> None:
     for bus in robot.buses:
         devices = (*robot.joints_on(bus.name), *robot.grippers_on(bus.name))
-        named = ", ".join(f"{device.name} ({device.model}, id {device.id})" for device in devices)
+        named = ", ".join(
+            [
+                *(f"{device.name} ({device.model}, id {device.id})" for device in devices),
+                *(f"{arm.name} ({arm.model})" for arm in robot.arms_on(bus.name)),
+            ]
+        )
         out.say(f"[bold]{robot.name}[/]: attaching bus {bus.name} on {(ports or {}).get(bus.name, bus.port)}: {named}")
 
 

@@ -30,6 +30,7 @@ from trade_drivers.ur._messages import (
 
 _QUIET_S: Final = 0.15
 """So long without a word, whoever started it is held up: what it set moving stops."""
+_IDLE_S: Final = 60.0
 _STUCK_S: Final = 1.0
 _TAKING_S: Final = 8.0
 """The library waits 5 s for its script to start."""
@@ -55,8 +56,11 @@ class Child:
         """Until the driver is gone or silent, or the connection is lost."""
         self._channel.send(Hello())
         while True:
-            order = self._channel.receive(_QUIET_S if self._robot is not None else 3600.0)
+            order = self._channel.receive(_IDLE_S if self._robot is None else _QUIET_S)
             signal.setitimer(signal.ITIMER_REAL, _TAKING_S if isinstance(order, Take) else _STUCK_S)
+            if order is None and self._robot is None:
+                signal.setitimer(signal.ITIMER_REAL, 0.0)
+                continue
             if order is None:
                 return
             if self._robot is not None and not self._robot.isConnected():

@@ -140,6 +140,7 @@ class Exchange(BusExchange[Limb]):
             return
         until_ns = self.clock() + _TAKEN_NS
         while not self._control.ready:
+            job.gate()
             if self.clock() > until_ns:
                 raise self.limb.faulty("the process that commands it does not start")
             yield
@@ -206,6 +207,7 @@ class Exchange(BusExchange[Limb]):
         self._tell(control, make(number))
         while (done := control.answer(number)) is None:
             if control is not self.link.control:
+                job.gate()  # a stop is why
                 raise self.limb.faulty("the process that commands it has ended")
             if self.clock() > until_ns:
                 self.drop_control("the process that commands it is stuck")
