@@ -32,7 +32,7 @@ class Step(NamedTuple):
 
 
 STEPS: Final = (
-    Step("A system of three containers comes up from one file.", "trade system up examples/system.toml"),
+    Step("A system of four containers comes up from one file.", "trade system up examples/system.toml"),
     Step("It is as the file says:", "trade system status examples/system.toml", numbers=False),
     Step("How busy is each?", "trade containers --load", numbers=False),
     Step("In another terminal a program begins to watch her.", "python examples/watch.py &"),
