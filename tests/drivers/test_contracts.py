@@ -12,7 +12,7 @@ import pytest
 
 from drivers.legs import LEG
 from drivers.test_across import LEGS
-from robots import HAND, HEAD, TAIL
+from robots import HAND, HEAD
 from trade import where
 from trade_drivers import AttachedRobot, JointGroup, Motor, Robot, attach, parse
 from trade_drivers.robotfile import Bus
@@ -24,18 +24,13 @@ FILES = {
     "head": HEAD,
     "fast": HEAD.replace('driver = "dynamixel"', 'driver = "dynamixel"\nfast_sync = true'),
     "legs": LEGS,
-    "tail": TAIL,
     "body": HEAD
     + "".join(text[text.index("[bus.") :] for text in (LEG, HAND))
     + '\n[group.body]\njoints = ["neck.tilt", "leg.hip", "neck.pan", "leg.knee"]\n',
 }
 """Robot files by name."""
-MOTORS = [
-    *(("head", "neck.pan"), ("head", "neck.tilt"), ("fast", "neck.pan")),
-    *(("tail", "tail.root"), ("tail", "tail.tip")),
-    *(("body", "leg.hip"), ("body", "leg.knee")),
-]
-GROUPS = [("head", "head"), ("tail", "tail"), ("legs", "legs"), ("body", "leg"), ("body", "body")]
+MOTORS = [("head", "neck.pan"), ("head", "neck.tilt"), ("fast", "neck.pan"), ("body", "leg.hip"), ("body", "leg.knee")]
+GROUPS = [("head", "head"), ("legs", "legs"), ("body", "leg"), ("body", "body")]
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -94,16 +94,17 @@ def _check_stop(row: Row, subject: Subject, struck: float) -> None:
     wait_until(lambda: not subject.truth.moving, "it is at rest")
     assert (subject.travelled > _ARRIVED) == (row.stop is Stop.GOAL)
     if row.stop in {Stop.HOLD, Stop.BOTH}:
-        wait_until(lambda: subject.holds(struck), "it has read that it is to hold")  # nobody confirms that
+        wait_until(lambda: subject.holds(struck), "it has heard that it is to hold")
     if row.stop is Stop.BLOCKED:
-        wait_until(
-            lambda: subject.holds(struck) or any(subject.events(name, struck) for name in subject.ends),
-            "it has read that it is to hold, or let go",
-        )
+        wait_until(lambda: subject.holds(struck) or _ended_itself(subject, struck), "it holds, or has let go")
     if row.stop is Stop.HOLD:
         assert not subject.events("watchdog_expired", struck)
     if row.stop is Stop.ITSELF:
-        assert any(subject.events(name, struck) for name in subject.ends)
+        assert _ended_itself(subject, struck)
+
+
+def _ended_itself(subject: Subject, since: float) -> bool:
+    return any(subject.events(name, since) for name in subject.ends)
 
 
 def _check_refused(row: Row, subject: Subject) -> None:

@@ -154,7 +154,8 @@ class ServoExchange(Exchange):
                     self.readmit(axis)
                 else:
                     self.wire.ping(axis.id)
-                    axis.doubted, axis.health_due_ns = False, 0  # it may have restarted
+                    axis.doubted = False
+                    axis.health_due_ns = self.clock() + self.period_ns  # it may have restarted; measured comes first
             except NoAnswer:
                 self.missed(axis)
                 return

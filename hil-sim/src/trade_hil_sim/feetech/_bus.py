@@ -150,7 +150,8 @@ class FeetechBus(DeviceLine[Servo]):
             if params is not None and wanted and not silenced and not _unanswered(packet):
                 answers.append(status(device_id, complaints, params))
         if answers:
-            self._answer(interleaved(answers), (device_id,), packet.name, after_s=delay_s, device_id=device_id)
+            data = answers[0] if len(answers) == 1 else interleaved(answers)
+            self._answer(data, (device_id,), packet.name, after_s=delay_s, device_id=device_id)
 
     # --- the log
 

@@ -33,10 +33,7 @@ class Instruction(IntEnum):
 
 def checksum(body: bytes) -> int:
     """The last byte of a packet whose other bytes, without the header, are these."""
-    total = 0
-    for byte in body:
-        total += byte
-    return 0xFF - total % 256
+    return 0xFF - sum(body) % 256
 
 
 def encode(device_id: int, instruction: int, params: bytes = b"") -> bytes:

@@ -169,8 +169,8 @@ class Servo:
 
     def advance(self, t: float) -> None:
         """Let happen what is due by time `t`, in order."""
-        while due := min((due for due in self._dues() if due[0] <= t), key=lambda due: due[0], default=None):
-            when, happen = due
+        while due := [due for due in self._dues() if due[0] <= t]:
+            when, happen = min(due, key=lambda due: due[0])
             happen(when)
 
     def _dues(self) -> Iterator[tuple[float, Callable[[float], None]]]:
