@@ -10,6 +10,8 @@ from trade_hil_sim import Arm, UrBus
 from trade_hil_sim.ur import HOME
 
 ARM = (Path(__file__).parent.parent / "examples" / "arm.toml").read_text()
+# so that a loaded machine does not look like a fault
+ARM = ARM.replace('driver = "ur"', 'driver = "ur"\nstale_after_s = 0.8')
 AT_HOME = list(HOME)
 
 

@@ -6,7 +6,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import psutil
@@ -65,7 +65,12 @@ def rig() -> Iterator[Rig]:
 
 
 def children(role: str) -> list[int]:
-    return [c.pid for c in psutil.Process().children() if f"trade_drivers.ur._{role}_child" in c.cmdline()]
+    found: list[int] = []
+    for child in psutil.Process().children():
+        with suppress(psutil.NoSuchProcess):  # it has just ended
+            if f"trade_drivers.ur._{role}_child" in child.cmdline():
+                found.append(child.pid)
+    return found
 
 
 # --- S01, S04
@@ -77,6 +82,19 @@ def test_S01_a_command_whose_time_has_passed_is_never_sent(rig: Rig) -> None:
         with pytest.raises(DeadlineExceeded):
             rig.arm.move_joints(FAR)
     assert not rig.moves()
+
+
+def test_S01_what_waits_in_the_process_that_commands_expires_there(rig: Rig) -> None:
+    rig.arm.move_joints([0.05, *AT_HOME[1:]])  # control is taken
+    [pid] = children("control")
+    os.kill(pid, signal.SIGSTOP)
+    mark = written_now()
+    late = Outcome(lambda: rig.arm.move_joints(FAR), deadline_s=0.1)
+    sleep_past(int((mark + 0.15) * 1e9))
+    os.kill(pid, signal.SIGCONT)
+    assert isinstance(late.wait().error, DeadlineExceeded | MotionStopped | DeviceFault)
+    wait_until(lambda: _answers(rig.arm, mark + 0.5), "time has passed")
+    assert not rig.moves(mark)
 
 
 def test_S04_a_set_point_that_is_not_renewed_ends_in_a_stop(rig: Rig) -> None:

@@ -82,10 +82,10 @@ class Child:
         if isinstance(order, Beat):
             self._beat()
             return
-        late = order.expires_ns and time.monotonic_ns() >= order.expires_ns
-        problem = "it came too late" if late else self._carry_out(order)
+        late = 0 < order.expires_ns <= time.monotonic_ns()
+        problem = "" if late else self._carry_out(order)
         if order.number:
-            self._channel.send(Done(order.number, problem))
+            self._channel.send(Done(order.number, problem, late))
 
     def _beat(self) -> None:
         if self._robot is None:

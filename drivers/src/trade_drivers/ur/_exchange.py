@@ -169,8 +169,11 @@ class Exchange(BusExchange[Limb]):
 
         Raises:
             DeviceFault: it was refused, or not answered; then the process that commands is replaced.
+            DeadlineExceeded: it came too late, and was not carried out.
         """
         done = yield from self._answered(job, make, self.clock() + _ANSWER_NS)
+        if done.late:
+            raise job.expired()
         if done.problem:
             self.drop_control(done.problem)
             raise self.limb.faulty("" if self.limb.fault else done.problem)
@@ -187,6 +190,8 @@ class Exchange(BusExchange[Limb]):
             if self.clock() > until_ns:
                 raise self.limb.faulty("the speed slider was not set: no answer")
             yield
+        if done.late:
+            raise job.expired()
         if done.problem:
             raise self.limb.faulty(f"the speed slider was not set: {done.problem}")
 

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
 
 from trade import Permit
-from trade.errors import LimitExceeded, MotionStopped, ToleranceExceeded, TradeError
+from trade.errors import DeadlineExceeded, LimitExceeded, MotionStopped, ToleranceExceeded, TradeError
 from trade_drivers._plan import Plan
 from trade_drivers._work import Steps, Work, check_admitted
 from trade_drivers.ur._chase import Chase
@@ -46,6 +46,10 @@ class Command(Work[Limb]):
         check_admitted(
             self.service, self._permit, admitted_ns=self._admitted_ns, expires_ns=self.expires_ns, now_ns=now_ns
         )
+
+    def expired(self) -> DeadlineExceeded:
+        """The error of a command that came too late to be carried out."""
+        return DeadlineExceeded(service=self.service, deadline_s=(self.expires_ns - self._admitted_ns) / 1e9)
 
     def usable(self) -> Sample:
         """The newest measurement of an arm that may be commanded; raises as ``Limb.check_usable``."""

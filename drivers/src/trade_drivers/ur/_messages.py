@@ -99,6 +99,8 @@ class Done(Struct, frozen=True, tag=True, array_like=True):
 
     number: int
     problem: str = ""
+    late: bool = False
+    """It had expired, so it was not."""
 
 
 class Pulse(Struct, frozen=True, tag=True, array_like=True):

@@ -45,7 +45,8 @@ class Child:
             self._measure()
             order = self._channel.receive(1 / (2 * RATE_HZ))
             if isinstance(order, Scale):
-                self._channel.send(Done(order.number, self._scale(order)))
+                late = time.monotonic_ns() >= order.expires_ns
+                self._channel.send(Done(order.number, "" if late else self._scale(order), late))
 
     def _measure(self) -> None:
         robot = self._robot
@@ -68,8 +69,6 @@ class Child:
         )
 
     def _scale(self, order: Scale) -> str:
-        if time.monotonic_ns() >= order.expires_ns:
-            return "it came too late"
         try:
             self._io = self._io or self._io_library.RTDEIOInterface(self._host)
         except RuntimeError as problem:
