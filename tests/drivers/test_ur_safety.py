@@ -200,7 +200,7 @@ def test_S10_a_process_that_does_not_answer_a_stop_is_killed_and_the_arm_stands(
     assert rig.arm.move_to_pose("home")[0] == pytest.approx(0.0, abs=0.01)
 
 
-def test_S10_without_the_dashboard_the_process_that_commands_stops_it(rig: Rig) -> None:
+def test_S10_a_dashboard_that_does_not_answer_does_not_hinder_a_stop(rig: Rig) -> None:
     moving = rig.set_off()
     rig.sim.do(Mute(instruction="dashboard"))
     rig.arm.stop()
