@@ -37,6 +37,7 @@ def test_the_example_gives_each_container_its_words_in_order(folder: Path) -> No
     assert words == {
         "rosie": f"--system home up {folder}/rosie.toml --name rosie --sim",
         "lamps": "--system home container --name lamps --allow lamp:Lamp",
+        "attic": "--system home container --name attic --allow lamp:Lamp",
         "care": f"--system home rules run {folder}/care.toml --name care",
     }
 
