@@ -45,6 +45,20 @@ def say(server: ControlServer, line: str) -> dict[str, Any]:
         return json.loads(client.makefile().readline())
 
 
+def test_it_closes_also_if_its_last_client_woke_it_up_before_the_bell(path: Path, buses: list[DynamixelBus]) -> None:
+    server = ControlServer(path, buses).open()
+    assert say(server, '{"do": "state"}')["ok"]
+    thread = server._thread
+    assert thread is not None
+    with socket.socket(socket.AF_UNIX) as client:
+        client.connect(str(server.path))
+        server._closing = True
+    thread.join(20)
+    server.close()
+    assert not path.exists()
+    assert server._rope.fileno() == -1
+
+
 def test_state_tells_the_truth_about_every_device(control: SimControl, buses: list[DynamixelBus]) -> None:
     neck, arm = control.state()
     assert (neck.name, neck.port, neck.plugged) == ("neck", str(buses[0].port), True)

@@ -91,7 +91,8 @@ class ControlServer:
         if thread is None:
             return
         self._closing = True
-        self._rope.send(b"!")
+        with suppress(BrokenPipeError):  # a client that hung up has woken it, and it has ended
+            self._rope.send(b"!")
         thread.join(5.0)
         self._rope.close()
 
