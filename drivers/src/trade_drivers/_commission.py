@@ -6,7 +6,7 @@ Nothing here moves anything. Only ``set_id`` and ``set_baud`` write, to one devi
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
-from typing import ClassVar, Literal
+from typing import ClassVar, Final, Literal
 
 from msgspec import Struct
 
@@ -14,6 +14,8 @@ from trade.errors import ConfigurationError
 from trade_drivers._work import PortLost, WireError
 
 __all__ = ["Bench", "Commissioner", "Found", "scan"]
+
+_ATTEMPTS: Final = 3
 
 
 class Found(Struct, frozen=True, kw_only=True):
@@ -43,6 +45,27 @@ class Bench(ABC):
     @abstractmethod
     def look(self, device_id: int) -> Found | None:
         """Who answers to an id; None if nobody does."""
+
+    def alone(self, device_id: int, where: str) -> Found:
+        """The device behind an id, if somebody may write to it or turn it by hand.
+
+        Raises:
+            ConfigurationError: it is absent, not alone, or has torque on; ``where`` is for the message.
+        """
+        found = self.answering(device_id)
+        if found is None:
+            problem = "nobody answers; `trade scan` shows who does, and at which rate"
+            raise ConfigurationError(where=where, problem=problem)
+        if found.problem:
+            raise ConfigurationError(where=where, problem=found.problem)
+        if found.torque:
+            problem = f"its torque is on ({found.model}); end what drives it, or switch off its power for a moment"
+            raise ConfigurationError(where=where, problem=problem)
+        return found
+
+    def answering(self, device_id: int) -> Found | None:
+        """Who answers to an id, asked three times; None if nobody does."""
+        return next((found for _ in range(_ATTEMPTS) if (found := self.look(device_id)) is not None), None)
 
     @abstractmethod
     def angle_rad(self, device_id: int) -> float:
@@ -94,6 +117,23 @@ class Commissioner(ABC):
             PortLost: there is no such port.
         """
 
+    @contextmanager
+    def at(self, port: str, baud: int) -> Iterator[Bench]:
+        """A bench, closed in the end.
+
+        Raises:
+            ConfigurationError: the port cannot be had, or was unplugged meanwhile.
+        """
+        try:
+            bench = self.open(port, baud)
+            try:
+                yield bench
+            finally:
+                bench.close()
+        except PortLost as lost:
+            problem = f"{lost}; `ls -l /dev/serial/by-id` shows those there are"
+            raise ConfigurationError(where=port, problem=problem) from None
+
     def set_id(self, port: str, baud: int, device_id: int, to: int) -> Found:
         """Give the one device behind an id another one, which it keeps without power.
 
@@ -107,15 +147,15 @@ class Commissioner(ABC):
         if to not in self.ids:
             problem = f"{to} is no id; {self.ids.start} to {self.ids.stop - 1} are"
             raise ConfigurationError(where=where, problem=problem)
-        with self._at(port, baud, where) as bench:
-            before = _alone(bench, device_id, where)
+        with self._changing(port, baud, where) as bench:
+            before = bench.alone(device_id, where)
             if to == device_id:
                 return before
-            if _anyone(bench, to):
+            if bench.answering(to) is not None:
                 problem = f"id {to} is taken on this line; choose another, `trade scan` shows those that are"
                 raise ConfigurationError(where=where, problem=problem)
             bench.write_id(device_id, to)
-            now, stayed = _answering(bench, to), _answering(bench, device_id)
+            now, stayed = bench.answering(to), bench.answering(device_id)
             for one in (now, stayed):
                 if one is not None:
                     bench.seal(one.id)
@@ -136,47 +176,29 @@ class Commissioner(ABC):
             problem = f"{to} is no rate of these devices; {', '.join(map(str, self.bauds))} are"
             raise ConfigurationError(where=where, problem=problem)
         if to != baud:
-            with self._at(port, to, where) as bench:
-                if _anyone(bench, device_id):
+            with self._changing(port, to, where) as bench:
+                if bench.answering(device_id) is not None:
                     problem = f"id {device_id} is taken at {to} baud; give one of the two another id first"
                     raise ConfigurationError(where=where, problem=problem)
-        with self._at(port, baud, where) as bench:
-            before = _alone(bench, device_id, where)
+        with self._changing(port, baud, where) as bench:
+            before = bench.alone(device_id, where)
             if to == baud:
                 return before
             bench.write_baud(device_id, to)
-            if (stayed := _answering(bench, device_id)) is not None:
+            if (stayed := bench.answering(device_id)) is not None:
                 bench.seal(device_id)
-        with self._at(port, to, where) as bench:
-            if (now := _answering(bench, device_id)) is not None:
+        with self._changing(port, to, where) as bench:
+            if (now := bench.answering(device_id)) is not None:
                 bench.seal(device_id)
         return _changed(before, now, stayed, where, f"{to} baud")
 
     @contextmanager
-    def _at(self, port: str, baud: int, where: str) -> Iterator[Bench]:
-        with at(self, port, baud) as bench:
+    def _changing(self, port: str, baud: int, where: str) -> Iterator[Bench]:
+        with self.at(port, baud) as bench:
             try:
                 yield bench
             except WireError as bad:
                 raise ConfigurationError(where=where, problem=f"nothing was changed: {bad}") from None
-
-
-@contextmanager
-def at(commissioner: Commissioner, port: str, baud: int) -> Iterator[Bench]:
-    """A bench, closed in the end.
-
-    Raises:
-        ConfigurationError: the port cannot be had, or was unplugged meanwhile.
-    """
-    try:
-        bench = commissioner.open(port, baud)
-        try:
-            yield bench
-        finally:
-            bench.close()
-    except PortLost as lost:
-        problem = f"{lost}; `ls -l /dev/serial/by-id` shows those there are"
-        raise ConfigurationError(where=port, problem=problem) from None
 
 
 def scan(
@@ -200,7 +222,7 @@ def scan(
     """
     found: list[Found] = []
     for baud in bauds or commissioner.bauds:
-        with at(commissioner, port, baud) as bench:
+        with commissioner.at(port, baud) as bench:
             here = list(_looking(bench, ids or commissioner.ids, port)) if ids or bench.anybody() else []
         found += here
         told(baud, len(here))
@@ -218,31 +240,6 @@ def _looking(bench: Bench, ids: Collection[int], port: str) -> Iterator[Found]:
                 "end what drives it, or switch off its power for a moment",
             )
         yield found
-
-
-_ATTEMPTS = 3
-
-
-def _answering(bench: Bench, device_id: int) -> Found | None:
-    return next((found for _ in range(_ATTEMPTS) if (found := bench.look(device_id)) is not None), None)
-
-
-def _anyone(bench: Bench, device_id: int) -> bool:
-    return _answering(bench, device_id) is not None
-
-
-def _alone(bench: Bench, device_id: int, where: str) -> Found:
-    """The device behind an id, if it may be written to."""
-    found = _answering(bench, device_id)
-    if found is None:
-        problem = "nobody answers; `trade scan` shows who does, and at which rate"
-        raise ConfigurationError(where=where, problem=problem)
-    if found.problem:
-        raise ConfigurationError(where=where, problem=found.problem)
-    if found.torque:
-        problem = f"its torque is on ({found.model}); end what drives it, or switch off its power for a moment"
-        raise ConfigurationError(where=where, problem=problem)
-    return found
 
 
 def _changed(before: Found, now: Found | None, stayed: Found | None, where: str, what: str) -> Found:

@@ -63,6 +63,10 @@ class Driver(ABC):
 
     commissioner: ClassVar[type[Commissioner] | None] = None
     """What finds its devices and sets them up; None if they are set up otherwise."""
+    modules: ClassVar[tuple[str, ...]] = ()
+    """What of others it imports; installed with the extra of its name."""
+    without_watchdog: ClassVar[str] = ""
+    """What its devices do when their driver is gone, if they have no watchdog; empty if they have one."""
 
     @abstractmethod
     def attach(self, robot: Robot, bus: Bus, port: str, healthy: Callable[[], bool]) -> AttachedBus:

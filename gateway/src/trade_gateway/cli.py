@@ -7,7 +7,9 @@ import typer
 
 from trade.errors import TradeError
 from trade_gateway import (
+    _calibrate,
     _call,
+    _doctor,
     _empty_container,
     _estop,
     _gateway,
@@ -58,6 +60,8 @@ app.add_typer(_system_commands.app, name="system", rich_help_panel=_ROBOTS)
 app.command("scan", rich_help_panel=_HARDWARE)(_scan.scan)
 app.command("set-id", rich_help_panel=_HARDWARE)(_scan.set_id)
 app.command("set-baud", rich_help_panel=_HARDWARE)(_scan.set_baud)
+app.command("calibrate", rich_help_panel=_HARDWARE)(_calibrate.calibrate)
+app.command("doctor", rich_help_panel=_HARDWARE)(_doctor.doctor)
 app.command("services", rich_help_panel=_SERVICES)(_list.services)
 app.command("containers", rich_help_panel=_SERVICES)(_list.containers)
 app.command("call", context_settings={"ignore_unknown_options": True}, rich_help_panel=_SERVICES)(_call.call)

@@ -25,6 +25,8 @@ _FIRST_CYCLES: Final = 3
 class Cia402Driver(Driver):
     """Drives in profile position mode on a CAN bus, through python-can and canopen."""
 
+    modules = ("can", "canopen")
+
     def attach(self, robot: Robot, bus: Bus, port: str, healthy: Callable[[], bool]) -> AttachedBus:
         if not isinstance(bus, CanBus):
             problem = "driver cia402 needs a CAN bus: interface and channel instead of port"

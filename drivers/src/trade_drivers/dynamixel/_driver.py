@@ -26,6 +26,7 @@ class DynamixelDriver(ServoDriver):
 
     name = "dynamixel"
     models = table.BY_MODEL_NAME
+    modules = ("dynamixel_sdk", "serial")
     commissioner = DynamixelCommissioner
 
     def exchange(self, robot: Robot, bus: SerialBus, port: str, joints: list[Joint]) -> ServoExchange:

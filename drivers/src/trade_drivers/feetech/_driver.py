@@ -22,6 +22,8 @@ class FeetechDriver(ServoDriver):
 
     name = "feetech"
     models = table.BY_MODEL_NAME
+    modules = ("serial",)
+    without_watchdog = "no watchdog: without its driver it goes on to the goal it has, which is never far ahead"
     commissioner = FeetechCommissioner
 
     def exchange(self, robot: Robot, bus: SerialBus, port: str, joints: list[Joint]) -> ServoExchange:

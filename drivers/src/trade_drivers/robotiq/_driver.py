@@ -56,6 +56,8 @@ class AttachedGrippers(AttachedBus):
 class RobotiqDriver(Driver):
     """2F-85 grippers on a serial bus, through pymodbus."""
 
+    modules = ("pymodbus", "serial")
+    without_watchdog = "no watchdog: without its driver it ends the stroke it was told"
     commissioner = RobotiqCommissioner
 
     def attach(self, robot: Robot, bus: Bus, port: str, healthy: Callable[[], bool]) -> AttachedBus:
