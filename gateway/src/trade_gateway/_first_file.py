@@ -66,7 +66,7 @@ def first_file(found: Sequence[tuple[str, Found]], path: Path) -> str:
             )
             raise ConfigurationError(where=port, problem=f"{problem}. No robot file was written")
         bus = f"line{number}"
-        quoted = msgspec.json.encode(port).decode()
+        quoted = msgspec.json.encode(str(Path(port).absolute())).decode()
         text += _BUS.format(bus=bus, driver=here[0].driver, port=quoted, baud=rates[0])
         for one in here:
             stub = _GRIPPER if one.kind == "gripper" else _JOINT
