@@ -29,6 +29,8 @@ class Found(Struct, frozen=True, kw_only=True):
     model: str = ""
     """As printed on it, or what number it tells if that is not known; empty if it cannot be asked."""
     firmware: str = ""
+    serial_number: int | None = None
+    """None if it tells none."""
     torque: bool | None = None
     """None if it cannot be asked, or has none."""
     problem: str = ""
@@ -104,6 +106,10 @@ class Commissioner(ABC):
     """What a driver knows of setting up its devices. Made without arguments, and harmless to make."""
 
     driver: ClassVar[str]
+    wire: ClassVar[Literal["serial", "can"]] = "serial"
+    """What its ports are: serial devices, or ``INTERFACE:CHANNEL``."""
+    ports: ClassVar[str] = "`ls -l /dev/serial/by-id` shows those there are"
+    """Where to look when a port is not there."""
     bauds: ClassVar[Sequence[int]]
     """Rates its devices can be set to, those they leave the factory with first."""
     ids: ClassVar[range]
@@ -131,8 +137,7 @@ class Commissioner(ABC):
             finally:
                 bench.close()
         except PortLost as lost:
-            problem = f"{lost}; `ls -l /dev/serial/by-id` shows those there are"
-            raise ConfigurationError(where=port, problem=problem) from None
+            raise ConfigurationError(where=port, problem=f"{lost}; {self.ports}") from None
 
     def set_id(self, port: str, baud: int, device_id: int, to: int) -> Found:
         """Give the one device behind an id another one, which it keeps without power.

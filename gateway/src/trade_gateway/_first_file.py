@@ -1,6 +1,6 @@
 """A robot file to begin with, out of what a scan found."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -18,33 +18,6 @@ _HEAD: Final = """\
 [robot]
 name = "robot"
 """
-_BUS: Final = """
-[bus.{bus}]
-driver = "{driver}"
-port = {port}
-baud = {baud}
-"""
-_JOINT: Final = """
-[joint.{name}]
-bus = "{bus}"
-id = {id}
-model = "{model}"
-firmware = "{firmware}"      # another one is refused when the robot comes up: is it another device?
-offset_rad = 0.0
-min_rad = -0.1           # `trade calibrate` measures both
-max_rad = 0.1
-max_speed_rad_s = 1.0
-max_accel_rad_s2 = 10.0
-"""
-_GRIPPER: Final = """
-[gripper.{name}]
-bus = "{bus}"
-id = {id}
-model = "{model}"
-max_width_m = 0.085
-max_speed_m_s = 0.05
-max_force_n = 40.0
-"""
 
 
 def first_file(found: Sequence[tuple[str, Found]], path: Path) -> str:
@@ -61,16 +34,61 @@ def first_file(found: Sequence[tuple[str, Found]], path: Path) -> str:
         here = [one for at, one in found if at == port]
         rates = sorted({one.baud for one in here})
         if len(rates) > 1:
-            problem = (
-                f"its devices speak at {' and '.join(map(str, rates))} baud; have all speak at one (`trade set-baud`)"
-            )
+            several = " and ".join(map(str, rates))
+            problem = f"its devices speak at {several} baud; have all speak at one (`trade set-baud`)"
             raise ConfigurationError(where=port, problem=f"{problem}. No robot file was written")
-        bus = f"line{number}"
-        quoted = msgspec.json.encode(str(Path(port).absolute())).decode()
-        text += _BUS.format(bus=bus, driver=here[0].driver, port=quoted, baud=rates[0])
+        text += _table(f"bus.line{number}", _bus(port, here[0]))
         for one in here:
-            stub = _GRIPPER if one.kind == "gripper" else _JOINT
-            name = f"{one.kind}{number}_{one.id}"
-            text += stub.format(name=name, bus=bus, id=one.id, model=one.model, firmware=one.firmware)
+            keys = _gripper(one) if one.kind == "gripper" else _joint(one)
+            text += _table(f"{one.kind}.{one.kind}{number}_{one.id}", [f'bus = "line{number}"', *keys])
     parse(text, str(path))
     return text
+
+
+def _table(name: str, keys: Iterable[str]) -> str:
+    return "\n".join(["", f"[{name}]", *keys, ""])
+
+
+def _bus(port: str, one: Found) -> list[str]:
+    if one.driver == "cia402":
+        interface, _, channel = port.partition(":")
+        keys = [f"interface = {_text(interface)}", f"channel = {_text(channel)}", f"bitrate = {one.baud}"]
+    else:
+        keys = [f"port = {_text(str(Path(port).absolute()))}", f"baud = {one.baud}"]
+    return [f"driver = {_text(one.driver)}", *keys]
+
+
+def _joint(one: Found) -> list[str]:
+    keys = [f"id = {one.id}", f"model = {_text(one.model)}"]
+    if one.firmware:
+        keys.append(f"firmware = {_text(one.firmware)}      # another one is refused: it would be another device")
+    if one.serial_number is not None:
+        keys.append(f"serial_number = {one.serial_number}    # another one is refused: it would be another device")
+    if one.driver == "cia402":
+        keys.append("counts_per_rev = 4096   # of its encoder, for one turn of the motor: see its data sheet")
+        keys.append("gear = 1.0              # turns of the motor for one of the joint")
+        measures = "to be measured"
+    else:
+        measures = "`trade calibrate` measures both"
+    return [
+        *keys,
+        "offset_rad = 0.0",
+        f"min_rad = -0.1          # {measures}",
+        "max_rad = 0.1",
+        "max_speed_rad_s = 1.0",
+        "max_accel_rad_s2 = 10.0",
+    ]
+
+
+def _gripper(one: Found) -> list[str]:
+    return [
+        f"id = {one.id}",
+        f"model = {_text(one.model)}",
+        "max_width_m = 0.085",
+        "max_speed_m_s = 0.05",
+        "max_force_n = 40.0",
+    ]
+
+
+def _text(value: str) -> str:
+    return msgspec.json.encode(value).decode()

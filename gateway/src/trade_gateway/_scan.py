@@ -1,5 +1,6 @@
 """``trade scan``, ``trade set-id``, ``trade set-baud``: who is on a line, and giving each its own id and rate."""
 
+import re
 from collections.abc import Sequence
 from glob import glob
 from pathlib import Path
@@ -19,6 +20,10 @@ from trade_gateway._output import Output, UsageError, complain
 __all__ = ["scan", "serial_ports", "set_baud", "set_id"]
 
 _PORTS: Final = ("/dev/serial/by-id/*", "/dev/ttyUSB*", "/dev/ttyACM*", "/dev/cu.usb*")
+_CAN: Final = re.compile(r"[a-z0-9_]+:.+")
+"""How python-can's buses are named here: ``socketcan:can0``."""
+_CAN_KIND: Final = "280"
+"""ARPHRD_CAN of linux/if_arp.h."""
 _COLUMNS: Final = ("PORT", "BAUD", "ID", "MODEL", "FIRMWARE", "DRIVER", "PROBLEM")
 
 Port = Annotated[str, typer.Option(help="The serial device.")]
@@ -35,7 +40,7 @@ class Here(Found, frozen=True, kw_only=True):
 
 def scan(
     port: Annotated[
-        list[str] | None, typer.Option(help="A serial device; repeatable. Without one: lists them.")
+        list[str] | None, typer.Option(help="A serial device, or socketcan:can0; repeatable. Without one: lists them.")
     ] = None,
     driver: DriverName = None,
     bauds: Annotated[str | None, typer.Option(help="Rates to try, as in 57600,1000000; by default all.")] = None,
@@ -43,7 +48,7 @@ def scan(
     write: Annotated[Path | None, typer.Option(metavar="ROBOT.toml", help="Write a robot file to begin with.")] = None,
     as_json: Json = False,
 ) -> None:
-    """Find out who is on a serial line: ids, models, baud rates. Nothing is written to any device.
+    """Find out who is on a serial line or a CAN bus: ids, models, rates. Nothing is written to any device.
 
     It needs the line for itself, and ends at the first device whose torque is on. One driver asks after the
     other, until one finds something; --driver, --bauds and --ids make it faster.
@@ -121,8 +126,14 @@ def serial_ports() -> list[str]:
     return [path for pattern in _PORTS for path in sorted(glob(pattern))]  # noqa: PTH207 - the names as they are
 
 
+def can_ports(folder: Path = Path("/sys/class/net")) -> list[str]:
+    """The CAN interfaces of this host, as python-can is told of them."""
+    kinds = {path.parent.name: path.read_text(encoding="ascii").strip() for path in sorted(folder.glob("*/type"))}
+    return [f"socketcan:{name}" for name, kind in kinds.items() if kind == _CAN_KIND]
+
+
 def _list_ports(out: Output) -> None:
-    ports = serial_ports()
+    ports = [*serial_ports(), *can_ports()]
     if out.as_json:
         out.data(ports)
     for one in ports if not out.as_json else ():
@@ -130,7 +141,7 @@ def _list_ports(out: Output) -> None:
     if ports:
         out.say("a scan sends bytes, so say where to: [bold]trade scan --port PORT[/]")
     else:
-        out.say("there is no serial port; is the adapter plugged in? [bold]trade doctor[/] looks further")
+        out.say("there is no serial port and no CAN interface; is the adapter plugged in?")
 
 
 def commissioners(name: str | None) -> dict[str, Commissioner]:
@@ -152,7 +163,10 @@ def commissioners(name: str | None) -> dict[str, Commissioner]:
 
 def _scan_port(out: Output, port: str, driver: str | None, bauds: Sequence[int], ids: Sequence[int]) -> list[Found]:
     """What the first driver finds that finds anything."""
+    wire = "can" if _CAN.fullmatch(port) and not Path(port).exists() else "serial"
     for name, commissioner in commissioners(driver).items():
+        if commissioner.wire != wire:
+            continue
 
         def told(baud: int, count: int, name: str = name) -> None:
             out.say(f"{escape(port)}: {name} at {baud} baud: {count or 'nobody'}")

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 from trade.errors import ConfigurationError, WrongDevice
 from trade_drivers._driver import AttachedBus, Driver
+from trade_drivers.cia402._commission import Cia402Commissioner
 from trade_drivers.joints import BusThread, PortLost
 from trade_drivers.robotfile import Bus, CanBus, Robot
 
@@ -26,6 +27,7 @@ class Cia402Driver(Driver):
     """Drives in profile position mode on a CAN bus, through python-can and canopen."""
 
     modules = ("can", "canopen")
+    commissioner = Cia402Commissioner
 
     def attach(self, robot: Robot, bus: Bus, port: str, healthy: Callable[[], bool]) -> AttachedBus:
         if not isinstance(bus, CanBus):
