@@ -12,7 +12,7 @@ from trade_drivers import Commissioner, Found, scan
 from trade_drivers.dynamixel import DynamixelDriver
 from trade_drivers.feetech import FeetechDriver
 from trade_drivers.robotiq import RobotiqDriver
-from trade_hil_sim import DynamixelBus, Gripper, Mute, RobotiqBus, Servo, motion_writes, writes
+from trade_hil_sim import DynamixelBus, Gripper, Mute, RobotiqBus, Servo, WrongModel, motion_writes, writes
 from trade_hil_sim.feetech import FeetechBus
 from trade_hil_sim.feetech import Servo as FeetechServo
 
@@ -101,7 +101,7 @@ def test_two_of_one_id_are_one_finding_with_its_remedy(line: Line) -> None:
     assert "Unplug all devices but one" in found.problem
 
 
-def test_a_scan_ends_at_the_first_device_whose_torque_is_on(line: Line) -> None:
+def test_S07_a_scan_ends_at_the_first_device_whose_torque_is_on(line: Line) -> None:
     line.plug(1, 2)
     line.switch_on()
     with pytest.raises(ConfigurationError, match=f"id 1 .{line.make.model}.*torque on") as error:
@@ -162,6 +162,16 @@ def test_what_cannot_be_is_refused_before_anything_is_written(
     line.plug(1, 2)
     with pytest.raises(ConfigurationError, match=complaint):
         line.set_id(device_id, to)
+    assert not line.written
+
+
+def test_a_model_that_is_not_known_is_named_and_left_alone(line: Line) -> None:
+    line.plug(1)
+    line.sim.do(WrongModel(ids=(1,), number=999))
+    [found] = line.scan()
+    assert (found.model, found.torque) == ("model number 999", None)
+    with pytest.raises(ConfigurationError, match="does not know that model"):
+        line.set_id(1, 2)
     assert not line.written
 
 

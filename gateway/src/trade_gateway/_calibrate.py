@@ -19,7 +19,7 @@ from rich.markup import escape
 
 from trade.errors import ConfigurationError, WrongDevice
 from trade_drivers import Bench, Joint, Robot, SerialBus, load, load_driver, parse
-from trade_drivers.servos import NoAnswer
+from trade_drivers.servos import WireError
 from trade_gateway._output import Output, UsageError
 
 __all__ = ["Sweep", "calibrate", "measured", "with_values"]
@@ -95,15 +95,13 @@ class Sweep:
 
     def read(self) -> float:
         """Where it stands, from its own centre, in rad."""
-        for _ in range(_ATTEMPTS - 1):
+        trouble = ""
+        for _ in range(_ATTEMPTS):
             try:
                 return self._bench.angle_rad(self._id)
-            except NoAnswer:
-                continue
-        try:
-            return self._bench.angle_rad(self._id)
-        except NoAnswer as silent:
-            raise ConfigurationError(where=f"id {self._id}", problem=f"{silent}; check its cable") from None
+            except WireError as bad:
+                trouble = str(bad)
+        raise ConfigurationError(where=f"id {self._id}", problem=f"{trouble}; check its cable")
 
 
 def measured(joint: Joint, zero: float | None, ends: Ends | None) -> dict[str, float]:
@@ -209,6 +207,8 @@ def _measure(
         zero = sweep.until(asked, _LONGEST_S).last
         out.say(f"Now move [bold]{name}[/] slowly from one end to the other, and press Enter")
         ends = sweep.until(asked, _LONGEST_S)
+    if zero is not None and ends is None:
+        out.say("its range keeps its numbers, counted from the new zero")
     return measured(joint, zero, ends)
 
 

@@ -38,7 +38,7 @@ class DynamixelBench(ServoBench):
         return cast("Wire", self.wire).anybody()
 
     def model_of(self, number: int) -> str:
-        return table.name_of(number, f"model number {number}")
+        return table.name_of(number, "")
 
     def firmware_of(self, device_id: int) -> str:
         return str(self._read(device_id, table.FIRMWARE))

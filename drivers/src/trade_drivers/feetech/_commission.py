@@ -32,7 +32,7 @@ class FeetechBench(ServoBench):
     mute = "it tells its model and nothing else; check its cable"
 
     def model_of(self, number: int) -> str:
-        return table.name_of(number, f"model number {number}")
+        return table.name_of(number, "")
 
     def firmware_of(self, device_id: int) -> str:
         return table.firmware(self.wire.read(device_id, table.MAJOR.address, table.MINOR.end).data)

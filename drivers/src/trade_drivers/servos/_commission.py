@@ -5,7 +5,7 @@ from contextlib import suppress
 from typing import ClassVar, Final
 
 from trade_drivers._commission import Bench, Found
-from trade_drivers.servos._answers import BadAnswer, NoAnswer
+from trade_drivers.servos._answers import BadAnswer, NoAnswer, Refused
 from trade_drivers.servos._wire import ServoWire
 
 __all__ = ["ServoBench"]
@@ -15,6 +15,8 @@ _SHARED: Final = (
     "what answers is garbled or comes twice: two devices may share this id, or there is noise. Unplug all devices "
     "but one, give it an id of its own, then plug in the next"
 )
+
+_UNKNOWN: Final = "this driver does not know that model; look at it with the vendor's tool"
 
 
 class ServoBench(Bench):
@@ -32,7 +34,7 @@ class ServoBench(Bench):
 
     @abstractmethod
     def model_of(self, number: int) -> str:
-        """What a model is called."""
+        """What a model is called; empty if this driver does not know it."""
 
     @abstractmethod
     def firmware_of(self, device_id: int) -> str:
@@ -54,6 +56,8 @@ class ServoBench(Bench):
             self.wire.settled_at = 0.0  # an answer that comes now is not taken for that of the next id
             return None
         model = self.model_of(number)
+        if not model:  # its registers may mean anything
+            return self._found(device_id, f"model number {number}", problem=_UNKNOWN)
         try:
             shared = self.wire.answers_twice()
             for _ in range(_LOOKS):
@@ -64,6 +68,8 @@ class ServoBench(Bench):
             return self._found(device_id, problem=_SHARED)
         except NoAnswer:
             return self._found(device_id, model, problem=self.mute)
+        except Refused as refused:
+            return self._found(device_id, model, problem=f"it refuses to be read: {refused}")
         return self._found(device_id, model, firmware, torque, _SHARED if shared else "")
 
     def _found(
