@@ -14,7 +14,7 @@ from trade_gateway._first_file import first_file
 from trade_gateway._output import UsageError
 from trade_gateway._scan import _numbers
 from trade_gateway.cli import app
-from trade_hil_sim import DynamixelBus, Servo
+from trade_hil_sim import Arm, DynamixelBus, Servo, UrBus
 
 
 @pytest.fixture
@@ -102,7 +102,22 @@ def test_a_rate_is_set_where_the_device_is_found(line: DynamixelBus) -> None:
     assert [servo.baud for servo in line.devices] == [1_000_000, 115_200]
 
 
+def test_an_arm_is_asked_for_by_its_host(tmp_path: Path) -> None:
+    with UrBus(Arm(name="right"), name="ur") as sim:
+        said = trade("scan", "--host", sim.port, "--write", tmp_path / "arm.toml")
+    assert said.exit_code == 0, said.output
+    robot = parse((tmp_path / "arm.toml").read_text(encoding="utf-8"), "arm.toml")
+    assert [(arm.model, arm.bus) for arm in robot.arms] == [("UR5e", robot.buses[0].name)]
+    assert robot.buses[0].port == sim.port
+
+
+def test_a_host_without_a_controller_is_named() -> None:
+    error = trade("scan", "--host", "127.255.255.1").exception
+    assert isinstance(error, ConfigurationError)
+    assert "127.255.255.1: no controller of an arm answers" in str(error)
+
+
 def test_a_driver_whose_devices_are_set_up_otherwise_says_so(line: DynamixelBus) -> None:
-    error = trade("scan", "--port", line.port, "--driver", "cia402").exception
+    error = trade("scan", "--port", line.port, "--driver", "ur").exception
     assert isinstance(error, ConfigurationError)
     assert "it has no scan" in str(error)

@@ -22,10 +22,11 @@ class Found(Struct, frozen=True, kw_only=True):
     """A device that answers."""
 
     driver: str
-    kind: Literal["joint", "gripper"] = "joint"
+    kind: Literal["joint", "gripper", "arm"] = "joint"
     """What it is in a robot file."""
-    baud: int
-    id: int
+    baud: int = 0
+    """Bits per second; 0 where there is no such thing: the controller of an arm."""
+    id: int = 0
     model: str = ""
     """As printed on it, or what number it tells if that is not known; empty if it cannot be asked."""
     firmware: str = ""

@@ -39,7 +39,7 @@ def first_file(found: Sequence[tuple[str, Found]], path: Path) -> str:
             raise ConfigurationError(where=port, problem=f"{problem}. No robot file was written")
         text += _table(f"bus.line{number}", _bus(port, here[0]))
         for one in here:
-            keys = _gripper(one) if one.kind == "gripper" else _joint(one)
+            keys = {"joint": _joint, "gripper": _gripper, "arm": _arm}[one.kind](one)
             text += _table(f"{one.kind}.{one.kind}{number}_{one.id}", [f'bus = "line{number}"', *keys])
     parse(text, str(path))
     return text
@@ -50,6 +50,8 @@ def _table(name: str, keys: Iterable[str]) -> str:
 
 
 def _bus(port: str, one: Found) -> list[str]:
+    if one.kind == "arm":
+        return [f"driver = {_text(one.driver)}", f"host = {_text(port)}    # set it to remote control"]
     if one.driver == "cia402":
         interface, _, channel = port.partition(":")
         keys = [f"interface = {_text(interface)}", f"channel = {_text(channel)}", f"bitrate = {one.baud}"]
@@ -87,6 +89,18 @@ def _gripper(one: Found) -> list[str]:
         "max_width_m = 0.085",
         "max_speed_m_s = 0.05",
         "max_force_n = 40.0",
+    ]
+
+
+def _arm(one: Found) -> list[str]:
+    return [
+        f"model = {_text(one.model)}",
+        "min_rad = [-3.1, -3.1, -2.8, -3.1, -3.1, -3.1]    # from the base to the tool",
+        "max_rad = [3.1, 3.1, 2.8, 3.1, 3.1, 3.1]",
+        "max_speed_rad_s = 0.5",
+        "max_accel_rad_s2 = 1.5",
+        "max_speed_m_s = 0.25",
+        "max_accel_m_s2 = 0.8",
     ]
 
 

@@ -13,6 +13,7 @@ from rich.markup import escape
 from trade.errors import ConfigurationError
 from trade_drivers import Commissioner, Found, drivers, load_driver
 from trade_drivers import scan as scan_line
+from trade_drivers.ur import identify
 from trade_gateway._first_file import first_file
 from trade_gateway._list import Json
 from trade_gateway._output import Output, UsageError, complain
@@ -42,6 +43,7 @@ def scan(
     port: Annotated[
         list[str] | None, typer.Option(help="A serial device, or socketcan:can0; repeatable. Without one: lists them.")
     ] = None,
+    host: Annotated[list[str] | None, typer.Option(help="The controller of an arm; repeatable.")] = None,
     driver: DriverName = None,
     bauds: Annotated[str | None, typer.Option(help="Rates to try, as in 57600,1000000; by default all.")] = None,
     ids: Annotated[str | None, typer.Option(help="Whom to ask, as in 1-20,100; by default everybody.")] = None,
@@ -56,16 +58,17 @@ def scan(
     For example: trade scan --port /dev/ttyUSB0 --write rosie.toml
     """
     out = Output(as_json=as_json)
-    if not port:
+    if not port and not host:
         _list_ports(out)
         return
     if write is not None and write.exists():
         raise UsageError(where=str(write), problem="is there already; choose another name, or remove it")
     rates, wanted = _numbers(bauds, "--bauds"), _numbers(ids, "--ids")
     found: list[Here] = []
-    for line in port:
+    for line in port or []:
         here = _scan_port(out, line, driver, rates, wanted)
         found += [Here(**msgspec.structs.asdict(one), port=line) for one in here]
+    found += [Here(**msgspec.structs.asdict(identify(one)), port=one) for one in host or []]
     if as_json:
         out.data(found)
     elif found:
@@ -210,7 +213,8 @@ def _tell(out: Output, now: Found, text: str) -> None:
 
 
 def _row(one: Here) -> tuple[str, ...]:
-    return one.port, str(one.baud), str(one.id), one.model, one.firmware, one.driver, one.problem
+    baud, device_id = ("", "") if one.kind == "arm" else (str(one.baud), str(one.id))
+    return one.port, baud, device_id, one.model, one.firmware, one.driver, one.problem
 
 
 def _numbers(words: str | None, option: str) -> list[int]:
