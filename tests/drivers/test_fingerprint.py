@@ -7,13 +7,9 @@ from typing import Any
 import pytest
 
 from drivers.conftest import Rig
-from drivers.legs import HIP, Leg, leg
-from drivers.legs import rig as leg_rig
 from drivers.tail_rig import TailRig, tail_rig
 from trade.errors import ConfigurationError, WrongDevice
 from trade_hil_sim import motion_writes
-
-__all__ = ["leg", "leg_rig"]
 
 
 @pytest.fixture
@@ -55,17 +51,3 @@ def test_servos_have_no_serial_number(rig: Rig) -> None:
     rig.plug()
     with pytest.raises(ConfigurationError, match="tell no serial number; leave this key out"):
         rig.attach()
-
-
-def test_another_drive_of_the_same_model_is_refused_and_both_are_named(leg: Leg) -> None:
-    leg.configure(("id = 1\n", "id = 1\nserial_number = 4711\n"))
-    next(device for device in leg.sim.devices if device.device_id == HIP).store.set("serial_number", 4712)
-    wrong = refused(leg)
-    assert (wrong.key, wrong.expected, wrong.found) == ("serial_number", "4711", "4712")
-    assert not leg.announced
-
-
-def test_a_drive_that_tells_no_firmware_is_not_asked_for_one(leg: Leg) -> None:
-    leg.configure(("id = 1\n", 'id = 1\nfirmware = "1.0"\n'))
-    with pytest.raises(ConfigurationError, match="tells no firmware version"):
-        leg.attach()

@@ -4,7 +4,7 @@ Nothing here moves anything. Only ``set_id`` and ``set_baud`` write, to one devi
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Generator, Iterator, Sequence
 from contextlib import contextmanager
 from typing import ClassVar, Final, Literal
 
@@ -125,7 +125,7 @@ class Commissioner(ABC):
         """
 
     @contextmanager
-    def at(self, port: str, baud: int) -> Iterator[Bench]:
+    def at(self, port: str, baud: int) -> Generator[Bench, None, None]:
         """A bench, closed in the end.
 
         Raises:
@@ -199,7 +199,7 @@ class Commissioner(ABC):
         return _changed(before, now, stayed, where, f"{to} baud")
 
     @contextmanager
-    def _changing(self, port: str, baud: int, where: str) -> Iterator[Bench]:
+    def _changing(self, port: str, baud: int, where: str) -> Generator[Bench, None, None]:
         with self.at(port, baud) as bench:
             try:
                 yield bench

@@ -6,7 +6,7 @@ import select
 import shutil
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
 from math import pi
 from pathlib import Path
@@ -174,7 +174,7 @@ def _joint(robot: Robot, name: str) -> tuple[Joint, SerialBus]:
 
 
 @contextmanager
-def _slack(bus: SerialBus, joint: Joint) -> Iterator[Bench]:
+def _slack(bus: SerialBus, joint: Joint) -> Generator[Bench, None, None]:
     """The line of a joint whose torque is off."""
     commissioner = load_driver(bus.driver, f"bus.{bus.name}.driver").commissioner
     if commissioner is None:

@@ -135,13 +135,13 @@ def _check_identity(net: Net, axis: DriveAxis) -> Steps:
         name = axis.joint.model  # it does not say, and need not
     if name != axis.joint.model:
         raise Unfit(f"is {axis.joint.model!r}, but node {axis.id} says it is {name!r} (1008h)", ".model")
-    yield from _check_fingerprint(net, axis, identity[3])
+    yield from _check_fingerprint(net, axis, identity)
     axis.identity = identity
 
 
-def _check_fingerprint(net: Net, axis: DriveAxis, serial_number: int) -> Steps:
+def _check_fingerprint(net: Net, axis: DriveAxis, identity: Sequence[int]) -> Steps:
     """Whether it is the very drive that the robot file names, as far as it names one."""
-    joint = axis.joint
+    joint, (_, _, _, serial_number) = axis.joint, identity
     if joint.serial_number is not None and serial_number != joint.serial_number:
         raise Another("serial_number", str(joint.serial_number), str(serial_number))
     if joint.firmware is None:
