@@ -9,6 +9,7 @@ from trade_drivers._interfaces import Gripper, GripperLimits, GripperState, Join
 from trade_drivers._load import load
 from trade_drivers._plan import FollowProgress, JointLimits, Plan, Tolerances
 from trade_drivers._trajectory import Trajectory, TrajectoryPoint
+from trade_drivers._work import WireError
 from trade_drivers.robotfile import Bus, CanBus, Coupled, Group, Joint, Robot, SerialBus, UrBus, parse
 
 __all__ = [
@@ -43,6 +44,7 @@ __all__ = [
     "Trajectory",
     "TrajectoryPoint",
     "UrBus",
+    "WireError",
     "attach",
     "drivers",
     "load",

@@ -10,17 +10,18 @@ from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
 from math import pi
 from pathlib import Path
-from typing import Annotated, Final, cast
+from typing import TYPE_CHECKING, Annotated, Final, cast
 
-import tomlkit
 import typer
 from msgspec import Struct
 from rich.markup import escape
 
 from trade.errors import ConfigurationError, WrongDevice
-from trade_drivers import Bench, Joint, Robot, SerialBus, load, load_driver, parse
-from trade_drivers.servos import WireError
+from trade_drivers import Bench, Joint, Robot, SerialBus, WireError, load, load_driver, parse
 from trade_gateway._output import Output, UsageError
+
+if TYPE_CHECKING:
+    import tomlkit
 
 __all__ = ["Sweep", "calibrate", "measured", "with_values"]
 
@@ -129,6 +130,8 @@ def measured(joint: Joint, zero: float | None, ends: Ends | None) -> dict[str, f
 
 def with_values(text: str, joint: str, values: Mapping[str, float]) -> str:
     """The text of a robot file with other values for some keys of a joint; everything else stays as it is."""
+    import tomlkit  # noqa: PLC0415 - takes its time, and other commands do without
+
     for key in values:
         text = _with_key(text, joint, key)
     document = tomlkit.parse(text)
@@ -140,6 +143,8 @@ def with_values(text: str, joint: str, values: Mapping[str, float]) -> str:
 
 def _with_key(text: str, joint: str, key: str) -> str:
     """The text with a line for a key that a joint has not got, above its ``min_rad``."""
+    import tomlkit  # noqa: PLC0415 - takes its time, and other commands do without
+
     document = tomlkit.parse(text)
     table = _table(document, joint)
     if key in table:
@@ -156,7 +161,7 @@ def _with_key(text: str, joint: str, key: str) -> str:
     return more
 
 
-def _table(document: tomlkit.TOMLDocument, joint: str) -> dict[str, object]:
+def _table(document: "tomlkit.TOMLDocument", joint: str) -> dict[str, object]:
     return cast("dict[str, dict[str, object]]", document["joint"])[joint]
 
 

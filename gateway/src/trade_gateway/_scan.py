@@ -13,7 +13,6 @@ from rich.markup import escape
 from trade.errors import ConfigurationError
 from trade_drivers import Commissioner, Found, drivers, load_driver
 from trade_drivers import scan as scan_line
-from trade_drivers.ur import identify
 from trade_gateway._first_file import first_file
 from trade_gateway._list import Json
 from trade_gateway._output import Output, UsageError, complain
@@ -68,7 +67,7 @@ def scan(
     for line in port or []:
         here = _scan_port(out, line, driver, rates, wanted)
         found += [Here(**msgspec.structs.asdict(one), port=line) for one in here]
-    found += [Here(**msgspec.structs.asdict(identify(one)), port=one) for one in host or []]
+    found += [Here(**msgspec.structs.asdict(_arm(one)), port=one) for one in host or []]
     if as_json:
         out.data(found)
     elif found:
@@ -188,6 +187,12 @@ def _scan_port(out: Output, port: str, driver: str | None, bauds: Sequence[int],
         if found:
             return found
     return []
+
+
+def _arm(host: str) -> Found:
+    from trade_drivers.ur import identify  # noqa: PLC0415 - loads what other commands do not need
+
+    return identify(host)
 
 
 def _one(

@@ -2,11 +2,13 @@
 
 from abc import abstractmethod
 from contextlib import suppress
-from typing import ClassVar, Final
+from typing import TYPE_CHECKING, ClassVar, Final
 
 from trade_drivers._commission import Bench, Found
 from trade_drivers.servos._answers import BadAnswer, NoAnswer, Refused
-from trade_drivers.servos._wire import ServoWire
+
+if TYPE_CHECKING:
+    from trade_drivers.servos._wire import ServoWire
 
 __all__ = ["ServoBench"]
 
@@ -28,7 +30,7 @@ class ServoBench(Bench):
     mute: ClassVar[str]
     """What is wrong with a servo that tells its model and nothing else."""
 
-    def __init__(self, wire: ServoWire, baud: int) -> None:
+    def __init__(self, wire: "ServoWire", baud: int) -> None:
         self.wire = wire
         self._baud = baud
 
