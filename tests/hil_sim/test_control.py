@@ -12,6 +12,7 @@ import pytest
 
 from trade_hil_sim import DynamixelBus, Late, Servo, SimControl, SimulationError
 from trade_hil_sim._control import ControlServer
+from waiting import PATIENCE_S
 
 
 @pytest.fixture
@@ -152,3 +153,16 @@ def test_the_socket_goes_with_the_server_and_a_stale_one_is_replaced(path: Path,
 def test_a_path_too_long_for_a_socket_is_refused_with_advice(tmp_path: Path, buses: list[DynamixelBus]) -> None:
     with pytest.raises(SimulationError, match="give a shorter path"):
         ControlServer(tmp_path / ("x" * 120), buses).open()
+
+
+def test_a_server_whose_thread_went_before_it_was_told_to_is_closed_all_the_same(path: Path) -> None:
+    server = ControlServer(path, []).open()
+    thread = server._thread
+    assert thread is not None
+    server._closing = True  # as in close(), and a client comes before the bell is rung
+    with socket.socket(socket.AF_UNIX) as client:
+        client.connect(str(server.path))
+        thread.join(PATIENCE_S)
+    assert not thread.is_alive()
+    server.close()
+    assert not server.path.exists()

@@ -91,7 +91,8 @@ class ControlServer:
         if thread is None:
             return
         self._closing = True
-        self._rope.send(b"!")
+        with suppress(OSError):  # it may have seen that already, when a client came or went
+            self._rope.send(b"!")
         thread.join(5.0)
         self._rope.close()
 
