@@ -90,6 +90,8 @@ def vendor_table(model: str) -> dict[str, tuple[int, int]]:
 
 
 VENDOR_NAMES = {
+    "ID": "ID",
+    "BAUD": "Baud Rate",
     "FIRMWARE": "Firmware Version",
     "RETURN_DELAY": "Return Delay Time",
     "SHADOW_ID": "Secondary(Shadow) ID",

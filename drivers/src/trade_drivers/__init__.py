@@ -3,11 +3,13 @@
 from trade_drivers._arm import Arm, ArmLimits, ArmState
 from trade_drivers._attach import AttachedRobot, attach
 from trade_drivers._can_monitor import CanBusState, CanMonitor
-from trade_drivers._driver import AttachedBus, Driver, drivers
+from trade_drivers._commission import Bench, Commissioner, Found, scan
+from trade_drivers._driver import AttachedBus, Driver, drivers, load_driver
 from trade_drivers._interfaces import Gripper, GripperLimits, GripperState, JointGroup, Motor, MotorState
 from trade_drivers._load import load
 from trade_drivers._plan import FollowProgress, JointLimits, Plan, Tolerances
 from trade_drivers._trajectory import Trajectory, TrajectoryPoint
+from trade_drivers._work import WireError
 from trade_drivers.robotfile import Bus, CanBus, Coupled, Group, Joint, Robot, SerialBus, UrBus, parse
 
 __all__ = [
@@ -16,13 +18,16 @@ __all__ = [
     "ArmState",
     "AttachedBus",
     "AttachedRobot",
+    "Bench",
     "Bus",
     "CanBus",
     "CanBusState",
     "CanMonitor",
+    "Commissioner",
     "Coupled",
     "Driver",
     "FollowProgress",
+    "Found",
     "Gripper",
     "GripperLimits",
     "GripperState",
@@ -39,8 +44,11 @@ __all__ = [
     "Trajectory",
     "TrajectoryPoint",
     "UrBus",
+    "WireError",
     "attach",
     "drivers",
     "load",
+    "load_driver",
     "parse",
+    "scan",
 ]

@@ -3,10 +3,12 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from importlib.metadata import EntryPoint, entry_points
+from typing import ClassVar
 
 from trade.errors import ConfigurationError
 from trade_drivers._arm import Arm
 from trade_drivers._can_monitor import CanMonitor
+from trade_drivers._commission import Commissioner
 from trade_drivers._interfaces import Gripper, JointGroup, Motor
 from trade_drivers.robotfile import Bus, Robot
 
@@ -58,6 +60,13 @@ class AttachedBus(ABC):
 
 class Driver(ABC):
     """One vendor's devices; made without arguments, and harmless to make."""
+
+    commissioner: ClassVar[type[Commissioner] | None] = None
+    """What finds its devices and sets them up; None if they are set up otherwise."""
+    modules: ClassVar[tuple[str, ...]] = ()
+    """What of others it imports; installed with the extra of its name."""
+    without_watchdog: ClassVar[str] = ""
+    """What its devices do when their driver is gone, if they have no watchdog; empty if they have one."""
 
     @abstractmethod
     def attach(self, robot: Robot, bus: Bus, port: str, healthy: Callable[[], bool]) -> AttachedBus:

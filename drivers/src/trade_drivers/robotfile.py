@@ -103,6 +103,10 @@ class Joint(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     id: Annotated[int, Meta(ge=0, le=252)]
     model: str
     """Model as printed on the device: ``XL430-W250``."""
+    firmware: str | None = None
+    """Version of the program in the device, as it tells it; another one is refused. Not checked if left out."""
+    serial_number: Annotated[int, Meta(ge=0)] | None = None
+    """Of the device, as it tells it; another one is refused. Not checked if left out."""
     reversed: bool = False
     offset_rad: float = 0.0
     """Joint angle when the device reads its centre, or 0 where counts have no centre."""

@@ -7,7 +7,9 @@ import typer
 
 from trade.errors import TradeError
 from trade_gateway import (
+    _calibrate,
     _call,
+    _doctor,
     _empty_container,
     _estop,
     _gateway,
@@ -20,6 +22,7 @@ from trade_gateway import (
     _policy,
     _profile,
     _rules,
+    _scan,
     _start,
     _stream,
     _system_commands,
@@ -35,6 +38,7 @@ __all__ = ["app", "main"]
 _SERVICES: Final = "Services"
 _MOTION: Final = "Locks and stops"
 _ROBOTS: Final = "Robots, containers and networks"
+_HARDWARE: Final = "Setting hardware up"
 _WATCHING: Final = "Watching and rules"
 _RIGHTS: Final = "Identities and rights"
 
@@ -53,6 +57,11 @@ app.command("container", rich_help_panel=_ROBOTS)(_empty_container.container)
 app.command("start", rich_help_panel=_ROBOTS)(_start.start)
 app.command("migrate", rich_help_panel=_ROBOTS)(_migrate.migrate)
 app.add_typer(_system_commands.app, name="system", rich_help_panel=_ROBOTS)
+app.command("scan", rich_help_panel=_HARDWARE)(_scan.scan)
+app.command("set-id", rich_help_panel=_HARDWARE)(_scan.set_id)
+app.command("set-baud", rich_help_panel=_HARDWARE)(_scan.set_baud)
+app.command("calibrate", rich_help_panel=_HARDWARE)(_calibrate.calibrate)
+app.command("doctor", rich_help_panel=_HARDWARE)(_doctor.doctor)
 app.command("services", rich_help_panel=_SERVICES)(_list.services)
 app.command("containers", rich_help_panel=_SERVICES)(_list.containers)
 app.command("call", context_settings={"ignore_unknown_options": True}, rich_help_panel=_SERVICES)(_call.call)

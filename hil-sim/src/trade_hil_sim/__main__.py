@@ -15,6 +15,7 @@ import msgspec
 
 from ._control import ControlServer
 from ._errors import SimulationError
+from ._fresh import fresh_bus
 from ._log import ByteLog
 from ._process import Ready
 from ._ready import ready
@@ -50,7 +51,14 @@ def _parser() -> argparse.ArgumentParser:
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("robot", type=Path, metavar="ROBOT.toml", help="the robot file")
+    parser.add_argument("robot", type=Path, metavar="ROBOT.toml", nargs="?", help="the robot file")
+    parser.add_argument(
+        "--fresh",
+        action="append",
+        default=[],
+        metavar="NAME=DRIVER:MODEL,...",
+        help="a bus with devices as they leave the factory, all of one id; repeatable",
+    )
     parser.add_argument("--bus", action="append", default=[], metavar="NAME", help="simulate only this bus; repeatable")
     parser.add_argument("--log", type=Path, metavar="FILE", help="append every byte and event to FILE, as JSON lines")
     parser.add_argument("--dir", type=Path, metavar="DIR", help="put the ports here (default: a temporary directory)")
@@ -62,10 +70,14 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _run(options: argparse.Namespace, stack: ExitStack, stop: "_Stop") -> None:
-    robot = read_robot(options.robot)
+    if options.robot is None and not options.fresh:
+        raise SimulationError("nothing to simulate; name a robot file, or buses with --fresh")
     directory = _directory(options.dir, stack)
     log = stack.enter_context(ByteLog(options.log, keep=False))
-    buses = buses_of(robot, directory, names=options.bus, log=log, paced=not options.unpaced)
+    paced = not options.unpaced
+    buses = [fresh_bus(words, directory, log=log, paced=paced) for words in options.fresh]
+    if options.robot is not None:
+        buses += buses_of(read_robot(options.robot), directory, names=options.bus, log=log, paced=paced)
     for bus in buses:
         stack.callback(bus.close)
         bus.open()

@@ -143,9 +143,11 @@ class SimControl:
         """Plug the serial adapter in again; clients must open the port anew."""
         self.do(faults.Replug(bus=bus))
 
-    def absent(self, ids: Iterable[int], *, on: bool = True, bus: str | None = None) -> None:
-        """Take devices off the bus, or with `on` false put them back."""
-        self.do(faults.Absent(ids=_ids(ids), on=on, bus=bus))
+    def absent(
+        self, ids: Iterable[int] | None = None, *, nth: int | None = None, on: bool = True, bus: str | None = None
+    ) -> None:
+        """Take devices off the bus, or only its `nth` one; with `on` false put them back."""
+        self.do(faults.Absent(ids=_ids(ids), nth=nth, on=on, bus=bus))
 
     def brown_out(self, ids: Iterable[int] | None = None, *, bus: str | None = None) -> None:
         """Let the supply dip: RAM at its defaults, torque off."""

@@ -142,6 +142,10 @@ class DeviceLine(ABC, Generic[_Device]):
                 self._echo = command.on
             case faults.Unplug() | faults.Replug():
                 pass
+            case faults.Absent(nth=int(nth)) if nth > len(self._devices):
+                raise SimulationError(f"bus {self.name} has {len(self._devices)} devices, no number {nth}")
+            case faults.Absent(nth=int(nth)):
+                self._do_to(self._devices[nth - 1], command, t)
             case _:
                 for device in self._named(command.ids):
                     device.advance(t)

@@ -190,6 +190,8 @@ class Absent(_Devices, frozen=True, kw_only=True, tag="absent"):
     """Devices are off the bus: they neither hear nor answer. With ``on`` false they are back."""
 
     on: bool = True
+    nth: Annotated[int, Meta(ge=1)] | None = None
+    """Only the first, second, ... device of the bus, which tells two of one id apart."""
 
 
 class Freeze(_Devices, frozen=True, kw_only=True, tag="freeze"):

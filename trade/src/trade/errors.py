@@ -56,6 +56,7 @@ __all__ = [
     "TooLarge",
     "TooManyServices",
     "TradeError",
+    "WrongDevice",
 ]
 
 
@@ -629,6 +630,22 @@ class ConfigurationError(SetupError, ValueError):
 
     def describe(self) -> str:
         return f"{self.where}: {self.problem}" if self.where else self.problem
+
+
+@dataclass(kw_only=True, eq=False)
+class WrongDevice(ConfigurationError):
+    """A device answers that is not the one the robot file means."""
+
+    problem: str = ""
+    key: str
+    """Of the robot file: ``model``, ``firmware`` or ``serial_number``."""
+    expected: str
+    found: str
+
+    def describe(self) -> str:
+        says = self.problem or f"the robot file says {self.expected}, but the device says {self.found}"
+        remedy = f"attach that one, or correct {self.key} if this one has taken its place, and calibrate it"
+        return f"{self.where}.{self.key}: {says}; {remedy}"
 
 
 @dataclass(kw_only=True, eq=False)

@@ -21,6 +21,9 @@ _REQUEST: Final = 1
 _UP: Final = 1
 _LINK_INFO: Final = 18
 _INFO_DATA: Final = 2
+_CAN_BIT_TIMING: Final = 1
+_BITRATE_SIZE: Final = 4
+"""The bit rate comes first in it."""
 _CAN_STATE: Final = 4
 _KIND_MASK: Final = 0x3FFF
 """The two bits above it are flags."""
@@ -34,6 +37,8 @@ class Link(NamedTuple):
     up: bool
     state: ErrorState | None
     """None: it has no controller (``vcan``), or it is stopped."""
+    bitrate: int | None = None
+    """Bits per second; None: it has no controller, or none was set."""
 
 
 def look_at(channel: str) -> Link:
@@ -57,7 +62,8 @@ def parse_link(answer: bytes) -> Link:
     *_, flags, _ = _LINK.unpack_from(answer, _HEADER.size)
     data = _within(_within(answer[_HEADER.size + _LINK.size :], _LINK_INFO), _INFO_DATA)
     number = int.from_bytes(_within(data, _CAN_STATE) or b"\xff", "little")
-    return Link(bool(flags & _UP), ErrorState(number) if number in set(ErrorState) else None)
+    bitrate = int.from_bytes(_within(data, _CAN_BIT_TIMING)[:_BITRATE_SIZE], "little")
+    return Link(bool(flags & _UP), ErrorState(number) if number in set(ErrorState) else None, bitrate or None)
 
 
 def _within(data: bytes, kind: int) -> bytes:

@@ -17,7 +17,7 @@ from trade_drivers.joints import Steps
 if TYPE_CHECKING:
     from trade_drivers.robotfile import CanBus
 
-__all__ = ["Unfit", "check_bus", "heartbeat_ms", "motion_every", "set_up"]
+__all__ = ["Another", "Unfit", "check_bus", "heartbeat_ms", "motion_every", "set_up"]
 
 _BRAKING_S: Final = 1.5
 _QUICK_STOP: Final = 3
@@ -35,6 +35,14 @@ class Unfit(Exception):
     def __init__(self, problem: str, key: str = "") -> None:
         super().__init__(problem)
         self.key = key
+
+
+class Another(Unfit):
+    """Another drive than the one the robot file names."""
+
+    def __init__(self, key: str, expected: str, found: str) -> None:
+        super().__init__(f"its {key} is {found}, not {expected}: it is another drive", f".{key}")
+        self.expected, self.found = expected, found
 
 
 def check_bus(bus: "CanBus", axes: Sequence[DriveAxis], where: str) -> None:
@@ -127,7 +135,23 @@ def _check_identity(net: Net, axis: DriveAxis) -> Steps:
         name = axis.joint.model  # it does not say, and need not
     if name != axis.joint.model:
         raise Unfit(f"is {axis.joint.model!r}, but node {axis.id} says it is {name!r} (1008h)", ".model")
+    yield from _check_fingerprint(net, axis, identity)
     axis.identity = identity
+
+
+def _check_fingerprint(net: Net, axis: DriveAxis, identity: Sequence[int]) -> Steps:
+    """Whether it is the very drive that the robot file names, as far as it names one."""
+    joint, (_, _, _, serial_number) = axis.joint, identity
+    if joint.serial_number is not None and serial_number != joint.serial_number:
+        raise Another("serial_number", str(joint.serial_number), str(serial_number))
+    if joint.firmware is None:
+        return
+    try:
+        firmware = yield from net.read_text(axis.id, table.SOFTWARE_VERSION)
+    except Refused:
+        raise Unfit("it tells no firmware version (100Ah); leave this key out", ".firmware") from None
+    if firmware != joint.firmware:
+        raise Another("firmware", joint.firmware, firmware)
 
 
 def _named(identity: Sequence[int]) -> str:

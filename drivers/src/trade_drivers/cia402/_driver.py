@@ -5,8 +5,9 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Final
 
-from trade.errors import ConfigurationError
+from trade.errors import ConfigurationError, WrongDevice
 from trade_drivers._driver import AttachedBus, Driver
+from trade_drivers.cia402._commission import Cia402Commissioner
 from trade_drivers.joints import BusThread, PortLost
 from trade_drivers.robotfile import Bus, CanBus, Robot
 
@@ -24,6 +25,9 @@ _FIRST_CYCLES: Final = 3
 
 class Cia402Driver(Driver):
     """Drives in profile position mode on a CAN bus, through python-can and canopen."""
+
+    modules = ("can", "canopen")
+    commissioner = Cia402Commissioner
 
     def attach(self, robot: Robot, bus: Bus, port: str, healthy: Callable[[], bool]) -> AttachedBus:
         if not isinstance(bus, CanBus):
@@ -95,13 +99,16 @@ def _bring_in(exchange: "DriveExchange", where: str) -> None:
 
 
 def _check(admission: "Admission", where: str, *, last: bool) -> None:
-    from trade_drivers.cia402._attach import Unfit  # noqa: PLC0415 - the libraries are optional
+    from trade_drivers.cia402._attach import Another, Unfit  # noqa: PLC0415 - the libraries are optional
     from trade_drivers.cia402._axis import Stage  # noqa: PLC0415
     from trade_drivers.cia402._net import NoAnswer, Refused  # noqa: PLC0415
 
     axis = admission.axis
     key = f'{where}: joint."{axis.joint.name}"'
     match admission.problem:
+        case Another() as other:
+            name = other.key.removeprefix(".")
+            raise WrongDevice(where=key, key=name, expected=other.expected, found=other.found)
         case Unfit() as unfit:
             raise ConfigurationError(where=f"{key}{unfit.key}", problem=str(unfit))
         case Refused() as refused:

@@ -39,6 +39,7 @@ class Entry(Struct, frozen=True):
 
 DEVICE_TYPE: Final = Entry(0x1000, "u4")
 DEVICE_NAME: Final = 0x1008
+SOFTWARE_VERSION: Final = 0x100A
 CONSUMER_HEARTBEAT: Final = Entry(0x1016, "u4", 1)
 """Whose heartbeat it wants, ``node << 16``, and for how many milliseconds it does without."""
 PRODUCER_HEARTBEAT: Final = Entry(0x1017, "u2")

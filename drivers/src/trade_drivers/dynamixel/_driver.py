@@ -7,6 +7,7 @@ from trade.errors import ConfigurationError
 from trade_drivers.dynamixel import _table as table
 from trade_drivers.dynamixel._attach import check_bus, look_over
 from trade_drivers.dynamixel._axis import DynamixelAxis
+from trade_drivers.dynamixel._commission import DynamixelCommissioner
 from trade_drivers.dynamixel._exchange import DynamixelExchange
 from trade_drivers.robotfile import Joint, Robot, SerialBus
 from trade_drivers.servos import ServoAxis, ServoDriver, ServoExchange
@@ -25,13 +26,16 @@ class DynamixelDriver(ServoDriver):
 
     name = "dynamixel"
     models = table.BY_MODEL_NAME
+    modules = ("dynamixel_sdk", "serial")
+    commissioner = DynamixelCommissioner
 
     def exchange(self, robot: Robot, bus: SerialBus, port: str, joints: list[Joint]) -> ServoExchange:
         axes = [
             DynamixelAxis(f"{robot.name}.{joint.name}", port, joint, robot.coupled_to(joint.name)) for joint in joints
         ]
         check_bus(bus, axes, robot.where)
-        return DynamixelExchange(_wire(port, bus, f"{robot.where}: bus.{bus.name}"), bus, axes)
+        wire = wire_at(port, bus.baud, f"{robot.where}: bus.{bus.name}", fast=bus.fast_sync)
+        return DynamixelExchange(wire, bus, axes)
 
     def look_over(self, exchange: ServoExchange, bus: SerialBus, axis: ServoAxis[Any], where: str) -> None:
         wire = cast("Wire", exchange.wire)
@@ -49,10 +53,11 @@ def open_exchange(robot: Robot, bus: SerialBus, port: str) -> ServoExchange:
     return DynamixelDriver().open_exchange(robot, bus, port)
 
 
-def _wire(port: str, bus: SerialBus, where: str) -> "Wire":
+def wire_at(port: str, baud: int, where: str, *, fast: bool = False) -> "Wire":
+    """A line, not open yet. Raises ``ConfigurationError`` without the vendor library."""
     try:
         from trade_drivers.dynamixel._sdk import Wire  # noqa: PLC0415 - the vendor library is optional
     except ImportError as missing:
         problem = f'needs dynamixel-sdk ({missing}); pip install "trade-drivers[dynamixel]"'
         raise ConfigurationError(where="driver dynamixel", problem=problem) from None
-    return Wire(port, bus.baud, where, fast=bus.fast_sync)
+    return Wire(port, baud, where, fast=fast)

@@ -7,6 +7,7 @@ and does not look at the length of an answer. All this is mended here by overrid
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
 # pyright: reportUntypedBaseClass=false, reportUnknownParameterType=false, reportIncompatibleMethodOverride=false
 
+import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Final
 
@@ -15,7 +16,7 @@ from dynamixel_sdk import COMM_RX_CORRUPT, COMM_RX_TIMEOUT, COMM_SUCCESS, PortHa
 from trade.errors import ConfigurationError
 from trade_drivers._serial import SerialLine
 from trade_drivers.dynamixel._frames import HEADER, OVERHEAD, Corrupt, crc16, take_status, unstuffed
-from trade_drivers.dynamixel._table import STATUS_ERRORS
+from trade_drivers.dynamixel._table import BAUD_CODES, STATUS_ERRORS
 from trade_drivers.joints import Gate, PortLost
 from trade_drivers.servos import Answer, BadAnswer, NoAnswer, Refused
 from trade_drivers.servos._wire import BROADCAST, ServoWire
@@ -23,8 +24,10 @@ from trade_drivers.servos._wire import BROADCAST, ServoWire
 __all__ = ["Wire"]
 
 _ALERT: Final = 0x80
-_BAUDS: Final = (9600, 57600, 115200, 1_000_000, 2_000_000, 3_000_000, 4_000_000)
-"""XL430 e-Manual, register 8, without 4.5 Mbaud, which the library does not know."""
+_PING_ALL: Final = b"\xff\xff\xfd\x00\xfe\x03\x00\x01"
+_EACH_S: Final = 0.003
+"""Within which each servo answers a ping of all, the next id after the one before it."""
+_SILENT_S: Final = 0.050
 
 
 class _QuietPort(PortHandler):
@@ -103,7 +106,7 @@ class Wire(ServoWire):
 
     def open(self) -> None:
         if self._port.getCFlagBaud(self._baud) <= 0:
-            problem = f"{self._baud} cannot be set; the servos know {', '.join(map(str, _BAUDS))}"
+            problem = f"{self._baud} cannot be set; the servos know {', '.join(map(str, BAUD_CODES))}"
             raise ConfigurationError(where=f"{self._where}.baud", problem=problem)
         super().open()
 
@@ -113,6 +116,21 @@ class Wire(ServoWire):
             model, result, _ = self._packets.ping(self._port, device_id)
             self._require(result, device_id)
         return int(model)
+
+    def anybody(self) -> bool:
+        """Whether anything comes back to a ping of everybody; returns when it is over."""
+        self._settle()
+        crc = crc16(_PING_ALL)
+        window_s = 252 * (_EACH_S + (OVERHEAD + 3) * 10 / self._baud)
+        until = time.monotonic() + window_s
+        with self._use():
+            self._line.flush()
+            self._line.write(_PING_ALL + bytes((crc & 0xFF, crc >> 8)))
+            heard = self._line.more(window_s)
+            while heard and self._line.more(min(_SILENT_S, until - time.monotonic())):
+                pass
+        self._unsettle()
+        return heard
 
     def read(self, device_id: int, address: int, size: int) -> Answer:
         with self._exchange(device_id):

@@ -70,6 +70,8 @@ _EEPROM, _RAM = Access.EEPROM, Access.RAM
 
 MODEL_NUMBER: Final = Register(0, "u2")
 FIRMWARE: Final = Register(6, "u1")
+ID: Final = Register(7, "u1", access=_EEPROM)
+BAUD: Final = Register(8, "u1", access=_EEPROM)
 RETURN_DELAY: Final = Register(9, "u1", si_per_count=2e-6, unit="s", access=_EEPROM)
 DRIVE_MODE: Final = Register(10, "u1", access=_EEPROM)
 OPERATING_MODE: Final = Register(11, "u1", access=_EEPROM)
@@ -96,6 +98,8 @@ POSITION_TRAJECTORY: Final = Register(140, "i4", si_per_count=RAD_PER_COUNT, uni
 INPUT_VOLTAGE: Final = Register(144, "u2", si_per_count=0.1, unit="V")
 TEMPERATURE: Final = Register(146, "u1", si_per_count=1.0, unit="degC")
 
+BAUD_CODES: Final = {9_600: 0, 57_600: 1, 115_200: 2, 1_000_000: 3, 2_000_000: 4, 3_000_000: 5, 4_000_000: 6}
+"""What register 8 reads at each rate; 7 is 4.5 Mbaud, which the library does not know."""
 POSITION_MODE: Final = 3
 CENTRE_COUNTS: Final = 2048
 TICK_WRAPS_AT: Final = 32768

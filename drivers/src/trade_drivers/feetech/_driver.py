@@ -6,6 +6,7 @@ from trade.errors import ConfigurationError
 from trade_drivers.feetech import _table as table
 from trade_drivers.feetech._attach import check_bus, look_over
 from trade_drivers.feetech._axis import FeetechAxis
+from trade_drivers.feetech._commission import FeetechCommissioner
 from trade_drivers.feetech._exchange import FeetechExchange
 from trade_drivers.robotfile import Joint, Robot, SerialBus
 from trade_drivers.servos import ServoAxis, ServoDriver, ServoExchange
@@ -21,6 +22,9 @@ class FeetechDriver(ServoDriver):
 
     name = "feetech"
     models = table.BY_MODEL_NAME
+    modules = ("serial",)
+    without_watchdog = "no watchdog: without its driver it goes on to the goal it has, which is never far ahead"
+    commissioner = FeetechCommissioner
 
     def exchange(self, robot: Robot, bus: SerialBus, port: str, joints: list[Joint]) -> ServoExchange:
         axes = [
@@ -28,7 +32,7 @@ class FeetechDriver(ServoDriver):
             for joint in joints
         ]
         check_bus(robot, bus, axes)
-        return FeetechExchange(_wire(port, bus.baud, f"{robot.where}: bus.{bus.name}"), bus, axes)
+        return FeetechExchange(wire_at(port, bus.baud, f"{robot.where}: bus.{bus.name}"), bus, axes)
 
     def look_over(self, exchange: ServoExchange, bus: SerialBus, axis: ServoAxis[Any], where: str) -> None:
         look_over(exchange.wire, bus, cast("FeetechAxis", axis), exchange.clock, where)
@@ -43,7 +47,8 @@ def open_exchange(robot: Robot, bus: SerialBus, port: str) -> ServoExchange:
     return FeetechDriver().open_exchange(robot, bus, port)
 
 
-def _wire(port: str, baud: int, where: str) -> "Wire":
+def wire_at(port: str, baud: int, where: str) -> "Wire":
+    """A line, not open yet. Raises ``ConfigurationError`` without pyserial."""
     try:
         from trade_drivers.feetech._wire import Wire  # noqa: PLC0415 - pyserial is optional
     except ImportError as missing:

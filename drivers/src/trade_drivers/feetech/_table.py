@@ -10,7 +10,7 @@ from typing import Final
 
 from msgspec import Struct
 
-__all__ = ["BY_MODEL_NAME", "BY_MODEL_NUMBER", "STATUS_BITS", "Access", "Model", "Register", "name_of"]
+__all__ = ["BY_MODEL_NAME", "BY_MODEL_NUMBER", "STATUS_BITS", "Access", "Model", "Register", "firmware", "name_of"]
 
 RAD_PER_COUNT: Final = tau / 4096
 STEPS_PER_SPEED: Final = 10
@@ -65,8 +65,13 @@ class Register(Struct, frozen=True):
 
 _EEPROM, _RAM = Access.EEPROM, Access.RAM
 
+MAJOR: Final = Register(0, 1)
+MINOR: Final = Register(1, 1)
+"""Both of the firmware."""
 END: Final = Register(2, 1)
 MODEL_NUMBER: Final = Register(3, 2)
+ID: Final = Register(5, 1, access=_EEPROM)
+BAUD: Final = Register(6, 1, access=_EEPROM)
 STATUS_LEVEL: Final = Register(8, 1, access=_EEPROM)
 MIN_ANGLE: Final = Register(9, 2, si_per_count=RAD_PER_COUNT, unit="rad", access=_EEPROM)
 MAX_ANGLE: Final = Register(11, 2, si_per_count=RAD_PER_COUNT, unit="rad", access=_EEPROM)
@@ -91,6 +96,8 @@ WRITE_FLAG: Final = Register(64, 1)
 STATUS: Final = Register(65, 1)
 MOVING: Final = Register(66, 1)
 
+BAUD_CODES: Final = {1_000_000: 0, 500_000: 1, 250_000: 2, 128_000: 3, 115_200: 4}
+"""What register 6 reads at each rate; of the slower ones, sources disagree."""
 POSITION_MODE: Final = 0
 CENTRE_COUNTS: Final = 2048
 FULL_LOAD: Final = 1000
@@ -127,3 +134,8 @@ def name_of(model_number: int, otherwise: str) -> str:
     """What a model is called."""
     model = BY_MODEL_NUMBER.get(model_number)
     return model.name if model else otherwise
+
+
+def firmware(data: bytes) -> str:
+    """The version of its program, out of the bytes from address 0 on."""
+    return f"{MAJOR.decode(data)}.{MINOR.decode(data)}"

@@ -1,19 +1,15 @@
 """The only place of this folder that needs pyserial: packets of STS servos over a serial line."""
 
 from collections.abc import Container, Iterator, Mapping, Sequence
-from typing import Final
 
 from trade.errors import ConfigurationError
 from trade_drivers.feetech._frames import OVERHEAD, Corrupt, Instruction, Status, packet, take_status
-from trade_drivers.feetech._table import MODEL_NUMBER
+from trade_drivers.feetech._table import BAUD_CODES, MODEL_NUMBER
 from trade_drivers.joints import Gate, PortLost
 from trade_drivers.servos import Answer, BadAnswer, NoAnswer
 from trade_drivers.servos._wire import BROADCAST, ServoWire
 
 __all__ = ["Wire"]
-
-_BAUDS: Final = (115_200, 128_000, 250_000, 500_000, 1_000_000)
-"""Codes 4 to 0 of register 6; of the slower ones, sources disagree."""
 
 
 class Wire(ServoWire):
@@ -25,8 +21,8 @@ class Wire(ServoWire):
         self._sent = b""
 
     def open(self) -> None:
-        if self._baud not in _BAUDS:
-            problem = f"{self._baud} is no rate of these servos; they know {', '.join(map(str, _BAUDS))}"
+        if self._baud not in BAUD_CODES:
+            problem = f"{self._baud} is no rate of these servos; they know {', '.join(map(str, sorted(BAUD_CODES)))}"
             raise ConfigurationError(where=f"{self._where}.baud", problem=problem)
         super().open()
 

@@ -11,6 +11,7 @@ from trade_drivers._interfaces import Gripper, JointGroup, Motor
 from trade_drivers._work import PortLost
 from trade_drivers.robotfile import Bus, Robot, SerialBus
 from trade_drivers.robotiq import _table as table
+from trade_drivers.robotiq._commission import RobotiqCommissioner
 from trade_drivers.robotiq._exchange import Exchange
 from trade_drivers.robotiq._gripper import RobotiqGripper
 from trade_drivers.robotiq._hand import Hand
@@ -55,6 +56,10 @@ class AttachedGrippers(AttachedBus):
 class RobotiqDriver(Driver):
     """2F-85 grippers on a serial bus, through pymodbus."""
 
+    modules = ("pymodbus", "serial")
+    without_watchdog = "no watchdog: without its driver it ends the stroke it was told"
+    commissioner = RobotiqCommissioner
+
     def attach(self, robot: Robot, bus: Bus, port: str, healthy: Callable[[], bool]) -> AttachedBus:
         if not isinstance(bus, SerialBus):
             _wrong(f"{robot.where}: bus.{bus.name}", "driver robotiq needs a serial bus: a port, no channel")
@@ -76,7 +81,7 @@ def open_exchange(robot: Robot, bus: SerialBus, port: str) -> Exchange:
     _check(robot, bus)
     hands = [Hand(f"{robot.name}.{gripper.name}", port, gripper) for gripper in robot.grippers_on(bus.name)]
     where = f"{robot.where}: bus.{bus.name}"
-    wire = _wire(port, bus.baud, where)
+    wire = wire_at(port, bus.baud, where)
     try:
         wire.open()
         exchange = Exchange(wire, bus, hands)
@@ -152,7 +157,8 @@ def _look_over(exchange: Exchange, hand: Hand, bus: SerialBus, where: str) -> No
     )
 
 
-def _wire(port: str, baud: int, where: str) -> "Wire":
+def wire_at(port: str, baud: int, where: str) -> "Wire":
+    """A line, not open yet. Raises ``ConfigurationError`` without the vendor library."""
     try:
         from trade_drivers.robotiq._modbus import Wire  # noqa: PLC0415 - the vendor library is optional
     except ImportError as missing:

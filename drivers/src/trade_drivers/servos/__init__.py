@@ -5,7 +5,7 @@ Nothing here knows a vendor's registers or packets; ``_wire`` alone needs pyseri
 
 from trade_drivers.servos._answers import Answer, BadAnswer, NoAnswer, Refused, WireError
 from trade_drivers.servos._asking import health_of, told, tried
-from trade_drivers.servos._attach import again, check_model, check_ranges, check_rate, first_ping
+from trade_drivers.servos._attach import again, check_firmware, check_model, check_ranges, check_rate, first_ping
 from trade_drivers.servos._axis import Health, ServoAxis
 from trade_drivers.servos._driver import ServoDriver
 from trade_drivers.servos._exchange import ServoExchange
@@ -21,6 +21,7 @@ __all__ = [
     "ServoExchange",
     "WireError",
     "again",
+    "check_firmware",
     "check_model",
     "check_ranges",
     "check_rate",

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
-from trade.errors import ConfigurationError
+from trade.errors import ConfigurationError, WrongDevice
 from trade_drivers.servos._answers import BadAnswer, NoAnswer, Refused
 from trade_drivers.servos._axis import ServoAxis
 
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from trade_drivers.robotfile import SerialBus
     from trade_drivers.servos._wire import ServoWire
 
-__all__ = ["again", "check_model", "check_ranges", "check_rate", "first_ping"]
+__all__ = ["again", "check_firmware", "check_model", "check_ranges", "check_rate", "first_ping"]
 
 _ATTEMPTS: Final = 3
 _BRAKING_S: Final = 1.5
@@ -108,7 +108,14 @@ def again(wire: "ServoWire", axis: ServoAxis[Any], act: Callable[[], _Result]) -
 
 
 def check_model(axis: ServoAxis[Any], number: int, name: str, key: str) -> None:
-    """Raises ``ConfigurationError`` for a device of another model than the robot file's."""
+    """Raises ``WrongDevice`` for a device of another model than the robot file's."""
     if number != axis.model_number:
         problem = f"is {axis.joint.model!r}, but id {axis.id} is {name} (model number {number})"
-        raise ConfigurationError(where=f"{key}.model", problem=problem)
+        raise WrongDevice(where=key, key="model", expected=axis.joint.model, found=name, problem=problem)
+
+
+def check_firmware(axis: ServoAxis[Any], firmware: str, key: str) -> None:
+    """Raises ``WrongDevice`` for a device with another firmware than the robot file names, if it names one."""
+    expected = axis.joint.firmware
+    if expected is not None and firmware != expected:
+        raise WrongDevice(where=key, key="firmware", expected=expected, found=firmware)

@@ -80,4 +80,7 @@ class ServoDriver(Driver):
             if joint.counts_per_rev is not None or joint.gear != 1:
                 problem = "counts_per_rev and gear are for other devices: a servo's angle is that of its joint"
                 raise ConfigurationError(where=f'{robot.where}: joint."{joint.name}"', problem=problem)
+            if joint.serial_number is not None:
+                problem = "these servos tell no serial number; leave this key out"
+                raise ConfigurationError(where=f'{robot.where}: joint."{joint.name}".serial_number', problem=problem)
         return joints

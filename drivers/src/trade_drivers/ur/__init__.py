@@ -1,5 +1,6 @@
 """Arms of Universal Robots, through ur-rtde."""
 
 from trade_drivers.ur._driver import UrDriver
+from trade_drivers.ur._identify import identify
 
-__all__ = ["UrDriver"]
+__all__ = ["UrDriver", "identify"]

@@ -47,6 +47,8 @@ class AttachedController(AttachedBus):
 class UrDriver(Driver):
     """Arms of Universal Robots, through ur-rtde."""
 
+    modules = _MODULES
+
     def attach(self, robot: Robot, bus: Bus, port: str, healthy: Callable[[], bool]) -> AttachedBus:
         where = f"{robot.where}: bus.{bus.name}"
         if not isinstance(bus, UrBus):

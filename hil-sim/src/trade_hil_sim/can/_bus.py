@@ -231,6 +231,8 @@ class CanBus:
             case faults.Unmute():
                 self._named(command.ids)
                 self._script.unmute(command.ids)
+            case faults.Absent(nth=int()):
+                raise SimulationError(f"nodes of bus {self.name} have ids of their own; name them by ids, not by nth")
             case faults.BusOff(ids=None):
                 self._switch_adapter(command.on, t)
             case _:

@@ -336,6 +336,8 @@ class UrBus:
                 self._script.add(command)
             case faults.Unmute():
                 self._script.unmute(command.ids)
+            case faults.Absent(nth=int()):
+                raise SimulationError(f"controller {self.name} has its one arm; leave nth out")
             case faults.Absent():
                 self._absent = command.on
             case _:

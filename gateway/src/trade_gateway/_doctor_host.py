@@ -1,0 +1,153 @@
+"""What ``trade doctor`` looks at on the host. Each check is given the places it looks in."""
+
+import grp
+import os
+import socket
+import subprocess
+from collections.abc import Iterator, Sequence
+from datetime import datetime, timedelta, timezone
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Final, Literal
+
+from msgspec import Struct
+
+from trade import Container
+from trade_drivers import load_driver
+
+__all__ = ["Finding", "certificate", "clock", "in_sight", "latencies", "libraries", "multicast", "ports"]
+
+_LATENCIES: Final = Path("/sys/bus/usb-serial/devices")
+_LATEST_MS: Final = 2
+_CLOCK: Final = ("timedatectl", "show", "--property=NTPSynchronized", "--value")
+_SOON: Final = timedelta(days=2)
+_PATIENCE_S: Final = 5.0
+_MULTICAST: Final = "239.255.71.68"
+"""An address of the site's own scope; nobody but this check listens there."""
+
+
+class Finding(Struct, frozen=True, kw_only=True):
+    """One thing that was looked at."""
+
+    level: Literal["ok", "warning", "error"]
+    about: str
+    text: str
+    fix: str = ""
+    """What to do, where something is wrong."""
+
+
+def ports(paths: Sequence[str]) -> Iterator[Finding]:
+    """Whether this user may open the serial devices there are."""
+    if not paths:
+        yield Finding(level="ok", about="serial ports", text="there is none")
+    for path in paths:
+        if os.access(path, os.R_OK | os.W_OK):
+            yield Finding(level="ok", about=path, text="may be opened")
+        else:
+            group = _group(path)
+            fix = f"sudo usermod -aG {group} $USER, then log out and in again"
+            yield Finding(level="error", about=path, text=f"may be opened by root and group {group} alone", fix=fix)
+
+
+def _group(path: str) -> str:
+    number = Path(path).stat().st_gid
+    try:
+        return grp.getgrgid(number).gr_name
+    except KeyError:
+        return str(number)
+
+
+def latencies(folder: Path = _LATENCIES) -> Iterator[Finding]:
+    """How long USB adapters sit on what has come."""
+    for timer in sorted(folder.glob("*/latency_timer")):
+        about, ms = timer.parent.name, int(timer.read_text(encoding="ascii"))
+        if ms <= _LATEST_MS:
+            yield Finding(level="ok", about=about, text=f"hands on what has come within {ms} ms")
+            continue
+        text = f"sits on what has come for up to {ms} ms, so that a cycle takes that long"
+        fix = f'echo 1 | sudo tee {timer}; for good, by a udev rule: ATTR{{latency_timer}}="1"'
+        yield Finding(level="warning", about=about, text=text, fix=fix)
+
+
+def libraries(names: Sequence[str], *, needed: bool) -> Iterator[Finding]:
+    """Whether the vendor libraries of drivers are installed."""
+    for name in names:
+        missing = [module for module in load_driver(name, "driver").modules if find_spec(module) is None]
+        if not missing:
+            yield Finding(level="ok", about=f"driver {name}", text="its libraries are installed")
+            continue
+        text, fix = f"needs {', '.join(missing)}", f'pip install "trade-drivers[{name}]"'
+        yield Finding(level="error" if needed else "warning", about=f"driver {name}", text=text, fix=fix)
+
+
+def clock(command: Sequence[str] = _CLOCK) -> Iterator[Finding]:
+    """Whether the clock is set by others; certificates, logs and traces need it, motion does not."""
+    try:
+        said = subprocess.run(command, capture_output=True, text=True, timeout=_PATIENCE_S, check=False).stdout.strip()  # noqa: S603 - ours
+    except (OSError, subprocess.TimeoutExpired):
+        said = ""
+    fix = "sudo timedatectl set-ntp true; without a network, let one host serve the time to the others (chrony)"
+    if said == "yes":
+        yield Finding(level="ok", about="clock", text="is synchronised")
+    elif said == "no":
+        text = "is not synchronised: certificates may not be valid yet, or any more, and logs of hosts do not match"
+        yield Finding(level="warning", about="clock", text=text, fix=fix)
+    else:
+        text = "nobody here can tell whether it is synchronised"
+        yield Finding(level="warning", about="clock", text=text, fix="compare `date -u` on all hosts")
+
+
+def certificate(folder: Path, now: datetime | None = None) -> Iterator[Finding]:
+    """Whether the certificate of this user's containers is valid, and for how long."""
+    from cryptography import x509  # noqa: PLC0415 - loads what others do not need
+
+    path, now = folder / "cert.pem", now or datetime.now(timezone.utc)
+    fix = f"trade pki issue NAME where the authority is, and copy what it made to {folder}"
+    try:
+        found = x509.load_pem_x509_certificate(path.read_bytes())
+    except (OSError, ValueError) as bad:
+        yield Finding(level="error", about=str(path), text=f"cannot be read: {bad}", fix=fix)
+        return
+    begins, ends = found.not_valid_before_utc, found.not_valid_after_utc
+    if now < begins:
+        text = f"is valid only from {begins:%Y-%m-%d %H:%M} UTC on"
+        yield Finding(level="error", about=str(path), text=text, fix="set the clock of this host")
+    elif now > ends:
+        yield Finding(level="error", about=str(path), text=f"has expired on {ends:%Y-%m-%d %H:%M} UTC", fix=fix)
+    elif ends - now < _SOON:
+        yield Finding(level="warning", about=str(path), text=f"expires on {ends:%Y-%m-%d %H:%M} UTC", fix=fix)
+    else:
+        yield Finding(level="ok", about=str(path), text=f"is valid until {ends:%Y-%m-%d}")
+
+
+def multicast(group: str = _MULTICAST, patience_s: float = 1.0) -> Iterator[Finding]:
+    """Whether what is sent to a group of hosts goes out and comes in here, which discovery on a network needs."""
+    fix = "allow UDP multicast in the firewall, or do without: TRADE_CONNECT names whom to dial"
+    try:
+        with _datagrams() as ear, _datagrams() as mouth:
+            ear.bind(("", 0))
+            ear.settimeout(patience_s)
+            anywhere = socket.inet_aton(group) + socket.inet_aton("0.0.0.0")  # noqa: S104 - joins, does not listen
+            ear.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, anywhere)
+            mouth.sendto(b"trade doctor", (group, ear.getsockname()[1]))
+            ear.recv(64)
+    except OSError as bad:
+        text = f"what is sent to a group of hosts does not come back ({bad}); discovery on a network needs that"
+        yield Finding(level="warning", about="multicast", text=text, fix=fix)
+    else:
+        yield Finding(level="ok", about="multicast", text="goes out and comes in")
+
+
+def _datagrams() -> socket.socket:
+    return socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+
+
+def in_sight(member: Container, system: str) -> Iterator[Finding]:
+    """Which containers of the system are seen from here."""
+    others = sorted(one.name for one in member.containers() if one.epoch != member.address.epoch)
+    about = f"system {system}"
+    if others:
+        yield Finding(level="ok", about=about, text=f"in sight: {', '.join(others)}")
+        return
+    fix = "`trade up ROBOT.toml` starts one; elsewhere, the same TRADE_SYSTEM, and TRADE_CONNECT or discovery"
+    yield Finding(level="ok", about=about, text="no container is in sight", fix=fix)

@@ -1,0 +1,108 @@
+"""A robot file to begin with, out of what a scan found."""
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Final
+
+import msgspec
+
+from trade.errors import ConfigurationError
+from trade_drivers import Found, parse
+
+__all__ = ["first_file"]
+
+_HEAD: Final = """\
+# Written by `trade scan`. Give the robot, its buses and its devices names of your own, as in [joint."neck.pan"].
+# `trade calibrate FILE JOINT` measures zero and range of a joint and writes them here; docs/commissioning.md.
+
+[robot]
+name = "robot"
+"""
+
+
+def first_file(found: Sequence[tuple[str, Found]], path: Path) -> str:
+    """The text of a robot file with these devices, each with the port it was found on.
+
+    Raises:
+        ConfigurationError: a device has a problem, or those of one port speak at different rates.
+    """
+    for port, one in found:
+        if one.problem:
+            raise ConfigurationError(where=f"{port}, id {one.id}", problem=f"{one.problem}. No robot file was written")
+    text = _HEAD
+    for number, port in enumerate(dict.fromkeys(port for port, _ in found), 1):
+        here = [one for at, one in found if at == port]
+        rates = sorted({one.baud for one in here})
+        if len(rates) > 1:
+            several = " and ".join(map(str, rates))
+            problem = f"its devices speak at {several} baud; have all speak at one (`trade set-baud`)"
+            raise ConfigurationError(where=port, problem=f"{problem}. No robot file was written")
+        text += _table(f"bus.line{number}", _bus(port, here[0]))
+        for one in here:
+            keys = {"joint": _joint, "gripper": _gripper, "arm": _arm}[one.kind](one)
+            text += _table(f"{one.kind}.{one.kind}{number}_{one.id}", [f'bus = "line{number}"', *keys])
+    parse(text, str(path))
+    return text
+
+
+def _table(name: str, keys: Iterable[str]) -> str:
+    return "\n".join(["", f"[{name}]", *keys, ""])
+
+
+def _bus(port: str, one: Found) -> list[str]:
+    if one.kind == "arm":
+        return [f"driver = {_text(one.driver)}", f"host = {_text(port)}    # set it to remote control"]
+    if one.driver == "cia402":
+        interface, _, channel = port.partition(":")
+        keys = [f"interface = {_text(interface)}", f"channel = {_text(channel)}", f"bitrate = {one.baud}"]
+    else:
+        keys = [f"port = {_text(str(Path(port).absolute()))}", f"baud = {one.baud}"]
+    return [f"driver = {_text(one.driver)}", *keys]
+
+
+def _joint(one: Found) -> list[str]:
+    keys = [f"id = {one.id}", f"model = {_text(one.model)}"]
+    if one.firmware:
+        keys.append(f"firmware = {_text(one.firmware)}      # another one is refused: it would be another device")
+    if one.serial_number is not None:
+        keys.append(f"serial_number = {one.serial_number}    # another one is refused: it would be another device")
+    if one.driver == "cia402":
+        keys.append("counts_per_rev = 4096   # of its encoder, for one turn of the motor: see its data sheet")
+        keys.append("gear = 1.0              # turns of the motor for one of the joint")
+        measures = "to be measured"
+    else:
+        measures = "`trade calibrate` measures both"
+    return [
+        *keys,
+        "offset_rad = 0.0",
+        f"min_rad = -0.1          # {measures}",
+        "max_rad = 0.1",
+        "max_speed_rad_s = 1.0",
+        "max_accel_rad_s2 = 10.0",
+    ]
+
+
+def _gripper(one: Found) -> list[str]:
+    return [
+        f"id = {one.id}",
+        f"model = {_text(one.model)}",
+        "max_width_m = 0.085",
+        "max_speed_m_s = 0.05",
+        "max_force_n = 40.0",
+    ]
+
+
+def _arm(one: Found) -> list[str]:
+    return [
+        f"model = {_text(one.model)}",
+        "min_rad = [-3.1, -3.1, -2.8, -3.1, -3.1, -3.1]    # from the base to the tool",
+        "max_rad = [3.1, 3.1, 2.8, 3.1, 3.1, 3.1]",
+        "max_speed_rad_s = 0.5",
+        "max_accel_rad_s2 = 1.5",
+        "max_speed_m_s = 0.25",
+        "max_accel_m_s2 = 0.8",
+    ]
+
+
+def _text(value: str) -> str:
+    return msgspec.json.encode(value).decode()

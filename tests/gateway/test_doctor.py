@@ -1,0 +1,186 @@
+"""What ``trade doctor`` finds, and the fix that comes with it."""
+
+import json
+import sys
+from collections.abc import Iterable
+from datetime import datetime, timedelta, timezone
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from robots import HAND, HEAD
+from trade_drivers import CanBus, parse
+from trade_drivers.can import ErrorState, Link
+from trade_gateway import _doctor_host as host
+from trade_gateway import _doctor_robot as robots
+from trade_gateway._doctor_host import Finding
+from trade_gateway._pki import Authority
+from trade_gateway.cli import app
+from trade_hil_sim import DynamixelBus, Mute
+
+
+def only(found: Iterable[Finding]) -> Finding:
+    [one] = found
+    assert one.level == "ok" or one.fix
+    return one
+
+
+def test_a_port_that_may_not_be_opened_names_the_group_to_join(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    port = tmp_path / "ttyUSB0"
+    port.touch()
+    assert only(host.ports([str(port)])).level == "ok"
+    monkeypatch.setattr("os.access", lambda *_: False)
+    found = only(host.ports([str(port)]))
+    assert (found.level, found.about) == ("error", str(port))
+    assert "usermod -aG" in found.fix
+
+
+@pytest.mark.parametrize(("ms", "level"), [(16, "warning"), (1, "ok")])
+def test_an_adapter_that_waits_long_is_told_of(tmp_path: Path, ms: int, level: str) -> None:
+    timer = tmp_path / "ttyUSB0" / "latency_timer"
+    timer.parent.mkdir()
+    timer.write_text(f"{ms}\n", encoding="ascii")
+    found = only(host.latencies(tmp_path))
+    assert (found.level, found.about) == (level, "ttyUSB0")
+    assert str(timer) in found.fix or level == "ok"
+
+
+@pytest.mark.parametrize(("needed", "level"), [(True, "error"), (False, "warning")])
+def test_a_library_that_is_missing_is_named_with_what_installs_it(
+    monkeypatch: pytest.MonkeyPatch, needed: bool, level: str
+) -> None:
+    assert only(host.libraries(["dynamixel"], needed=needed)).level == "ok"
+    monkeypatch.setattr(host, "find_spec", lambda name: None if name == "dynamixel_sdk" else object())
+    found = only(host.libraries(["dynamixel"], needed=needed))
+    assert (found.level, found.text) == (level, "needs dynamixel_sdk")
+    assert found.fix == 'pip install "trade-drivers[dynamixel]"'
+
+
+@pytest.mark.parametrize(
+    ("said", "level", "text"), [("yes", "ok", "is sync"), ("no", "warning", "is not"), ("", "warning", "nobody")]
+)
+def test_the_clock_is_synchronised_or_not_or_nobody_knows(said: str, level: str, text: str) -> None:
+    found = only(host.clock([sys.executable, "-c", f"print({said!r})"]))
+    assert (found.level, found.text.startswith(text)) == (level, True)
+
+
+def test_a_host_without_the_tool_does_not_know() -> None:
+    assert only(host.clock(["/no/such/tool"])).text.startswith("nobody")
+
+
+@pytest.mark.parametrize(
+    ("later", "level", "text"),
+    [
+        (timedelta(hours=1), "ok", "is valid until"),
+        (timedelta(days=6), "warning", "expires on"),
+        (timedelta(days=8), "error", "has expired"),
+        (timedelta(days=-2), "error", "is valid only from"),
+    ],
+)
+def test_a_certificate_is_told_of_before_it_ends(tmp_path: Path, later: timedelta, level: str, text: str) -> None:
+    issued = Authority.create(tmp_path / "pki").issue("arm")
+    found = only(host.certificate(issued.folder, datetime.now(timezone.utc) + later))
+    assert (found.level, found.text.startswith(text)) == (level, True), found
+
+
+def test_a_certificate_that_is_not_there_is_an_error(tmp_path: Path) -> None:
+    assert only(host.certificate(tmp_path)).level == "error"
+
+
+def test_devices_without_a_watchdog_are_named_and_those_with_one_are_not() -> None:
+    found = only(robots.unwatched(parse(HAND, "hand.toml")))
+    assert (found.level, "hand" in found.about) == ("warning", True)
+    assert not list(robots.unwatched(parse(HEAD, "head.toml")))
+
+
+LEGS = CanBus(name="legs", driver="cia402", interface="socketcan", channel="can0", bitrate=500_000)
+
+
+@pytest.mark.parametrize(
+    ("link", "level", "fix"),
+    [
+        (Link(False, None), "error", "ip link set can0 up type can bitrate 500000"),
+        (Link(True, ErrorState.ACTIVE, 1_000_000), "error", "ip link set can0 down"),
+        (Link(True, ErrorState.PASSIVE, 500_000), "error", "120 ohm"),
+        (Link(True, ErrorState.ACTIVE, 500_000), "ok", ""),
+        (Link(True, None), "ok", ""),
+    ],
+)
+def test_a_can_interface_is_up_at_the_rate_of_the_file_and_well(link: Link, level: str, fix: str) -> None:
+    found = robots.judged(LEGS, link)
+    assert (found.level, fix in found.fix) == (level, True)
+
+
+@pytest.fixture
+def robot_file(tmp_path: Path) -> Path:
+    path = tmp_path / "head.toml"
+    path.write_text(HEAD.replace("/dev/ttyNOWHERE", str(tmp_path / "neck")), encoding="utf-8")
+    return path
+
+
+def simulated(robot_file: Path) -> DynamixelBus:
+    robot = parse(robot_file.read_text(encoding="utf-8"), "head.toml")
+    [bus] = robot.buses
+    return DynamixelBus.from_robot(bus, robot.joints, robot_file.with_name("neck"), paced=False)  # type: ignore[arg-type]
+
+
+def of_devices(robot_file: Path) -> list[Finding]:
+    return list(robots.devices(parse(robot_file.read_text(encoding="utf-8"), "head.toml")))
+
+
+def test_a_port_that_is_not_there_is_told_of(robot_file: Path) -> None:
+    found = only(of_devices(robot_file))
+    assert (found.level, found.about) == ("error", "bus neck")
+
+
+def test_devices_that_answer_are_named(robot_file: Path) -> None:
+    with simulated(robot_file):
+        assert [found.level for found in of_devices(robot_file)] == ["ok", "ok"]
+
+
+def test_who_does_not_answer_is_an_error(robot_file: Path) -> None:
+    with simulated(robot_file) as sim:
+        sim.devices[0].absent = True
+        pan, tilt = of_devices(robot_file)
+    assert (pan.level, pan.text, tilt.level) == ("error", "does not answer at 1000000 baud", "ok")
+
+
+def test_who_answers_now_and_then_has_a_bad_line(robot_file: Path) -> None:
+    with simulated(robot_file) as sim:
+        sim.do(Mute(ids=(1,), instruction="ping", skip=3, count=2))
+        pan, _ = of_devices(robot_file)
+    assert (pan.level, pan.text) == ("error", "answered 8 of 10 questions as it should")
+    assert "termination" in pan.fix
+
+
+def test_another_device_than_the_file_says_is_an_error(robot_file: Path) -> None:
+    with simulated(robot_file):
+        text = robot_file.read_text(encoding="utf-8").replace("id = 1\n", 'id = 1\nfirmware = "44"\n')
+        robot_file.write_text(text, encoding="utf-8")
+        pan, tilt = of_devices(robot_file)
+    assert (pan.level, tilt.level) == ("error", "ok")
+    assert pan.text == "its firmware is 45, and the robot file says 44"
+
+
+def test_a_line_in_use_is_left_alone(robot_file: Path) -> None:
+    with simulated(robot_file) as sim:
+        from trade_drivers.dynamixel import DynamixelDriver
+
+        bench = DynamixelDriver.commissioner().open(str(sim.port), 1_000_000)
+        try:
+            found = only(of_devices(robot_file))
+        finally:
+            bench.close()
+    assert (found.level, "another driver owns this port" in found.text) == ("warning", True)
+
+
+def test_the_exit_code_tells_of_errors(system: str, robot_file: Path) -> None:
+    said = CliRunner().invoke(app, ["doctor", str(robot_file), "--json"])
+    assert said.exit_code == 1
+    found = json.loads(said.stdout)
+    assert [one["about"] for one in found if one["level"] == "error"] == ["bus neck"]
+    with simulated(robot_file):
+        well = CliRunner().invoke(app, ["doctor", str(robot_file)])
+    assert well.exit_code == 0, well.output
+    assert "0 errors" in well.output

@@ -1,0 +1,123 @@
+"""``trade scan`` and its kind: their words, what they show, and the robot file to begin with."""
+
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from trade.errors import ConfigurationError
+from trade_drivers import Found, parse
+from trade_gateway._first_file import first_file
+from trade_gateway._output import UsageError
+from trade_gateway._scan import _numbers
+from trade_gateway.cli import app
+from trade_hil_sim import Arm, DynamixelBus, Servo, UrBus
+
+
+@pytest.fixture
+def line(tmp_path: Path) -> Iterator[DynamixelBus]:
+    with DynamixelBus([Servo(1), Servo(2, position_counts=2100)], tmp_path / "line", paced=False) as sim:
+        yield sim
+
+
+def trade(*words: object) -> Result:
+    return CliRunner().invoke(app, [str(word) for word in words])
+
+
+@pytest.mark.parametrize("command", ["scan", "set-id", "set-baud", "calibrate", "doctor"])
+def test_help_has_an_example(command: str) -> None:
+    said = trade(command, "--help")
+    assert said.exit_code == 0
+    assert f"For example: trade {command}" in re.sub(r"\s+", " ", said.stdout)
+
+
+def test_ids_are_numbers_and_ranges() -> None:
+    assert _numbers("1-3,9", "--ids") == [1, 2, 3, 9]
+    assert _numbers(None, "--ids") == []
+    with pytest.raises(UsageError, match="no number and no range"):
+        _numbers("1-x", "--ids")
+
+
+def test_a_scan_shows_a_line_for_each_device(line: DynamixelBus) -> None:
+    said = trade("scan", "--port", line.port, "--bauds", 1_000_000, "--ids", "1-3")
+    assert said.exit_code == 0, said.output
+    assert "dynamixel at 1000000 baud: 2" in said.output
+    assert [row.split()[1:4] for row in said.output.splitlines()[-2:]] == [
+        ["1000000", "1", "XL430-W250"],
+        ["1000000", "2", "XL430-W250"],
+    ]
+
+
+def test_a_program_gets_them_as_json(line: DynamixelBus) -> None:
+    said = trade("scan", "--port", line.port, "--bauds", 1_000_000, "--ids", "2", "--json")
+    [found] = json.loads(said.stdout)
+    assert (found["port"], found["id"], found["torque"], found["problem"]) == (str(line.port), 2, False, "")
+
+
+def test_nobody_is_an_exit_code_of_its_own(line: DynamixelBus) -> None:
+    said = trade("scan", "--port", line.port, "--bauds", 1_000_000, "--ids", "7", "--driver", "dynamixel")
+    assert said.exit_code == 1
+    assert "nobody answers" in said.output
+
+
+def test_what_was_found_becomes_a_robot_file_that_is_not_written_over(line: DynamixelBus, tmp_path: Path) -> None:
+    words = ("scan", "--port", line.port, "--bauds", 1_000_000, "--ids", "1-2", "--write", tmp_path / "new.toml")
+    assert trade(*words).exit_code == 0
+    robot = parse((tmp_path / "new.toml").read_text(encoding="utf-8"), "new.toml")
+    assert [(joint.id, joint.firmware) for joint in robot.joints] == [(1, "45"), (2, "45")]
+    assert robot.buses[0].port == str(line.port)
+    assert isinstance(trade(*words).exception, UsageError)
+
+
+@pytest.mark.parametrize(
+    ("second", "complaint"),
+    [({"problem": "two share it"}, "two share it"), ({"baud": 57_600}, "57600 and 1000000 baud")],
+)
+def test_what_cannot_be_in_one_robot_file_is_told(second: dict[str, object], complaint: str) -> None:
+    one = Found(driver="dynamixel", baud=1_000_000, id=1, model="XL430-W250")
+    other = Found(**{"driver": "dynamixel", "baud": 1_000_000, "id": 2, "model": "XL430-W250"} | second)  # type: ignore[arg-type]
+    with pytest.raises(ConfigurationError, match=complaint):
+        first_file([("/dev/a", one), ("/dev/a", other)], Path("new.toml"))
+
+
+def test_an_id_is_set_where_the_device_is_found(line: DynamixelBus) -> None:
+    said = trade("set-id", "--port", line.port, "--from", 2, "--to", 5)
+    assert said.exit_code == 0, said.output
+    assert "XL430-W250 has id 5 now (it had 2)" in said.output
+    assert [servo.device_id for servo in line.devices] == [1, 5]
+
+
+def test_another_model_than_the_one_meant_is_left_alone(line: DynamixelBus) -> None:
+    error = trade("set-id", "--port", line.port, "--from", 2, "--to", 5, "--model", "XM430-W350").exception
+    assert "is XL430-W250, not XM430-W350" in str(error)
+    assert [servo.device_id for servo in line.devices] == [1, 2]
+
+
+def test_a_rate_is_set_where_the_device_is_found(line: DynamixelBus) -> None:
+    said = trade("set-baud", "--port", line.port, "--id", 2, "--to", 115_200, "--baud", 1_000_000)
+    assert said.exit_code == 0, said.output
+    assert [servo.baud for servo in line.devices] == [1_000_000, 115_200]
+
+
+def test_an_arm_is_asked_for_by_its_host(tmp_path: Path) -> None:
+    with UrBus(Arm(name="right"), name="ur") as sim:
+        said = trade("scan", "--host", sim.port, "--write", tmp_path / "arm.toml")
+    assert said.exit_code == 0, said.output
+    robot = parse((tmp_path / "arm.toml").read_text(encoding="utf-8"), "arm.toml")
+    assert [(arm.model, arm.bus) for arm in robot.arms] == [("UR5e", robot.buses[0].name)]
+    assert robot.buses[0].port == sim.port
+
+
+def test_a_host_without_a_controller_is_named() -> None:
+    error = trade("scan", "--host", "127.255.255.1").exception
+    assert isinstance(error, ConfigurationError)
+    assert "127.255.255.1: no controller of an arm answers" in str(error)
+
+
+def test_a_driver_whose_devices_are_set_up_otherwise_says_so(line: DynamixelBus) -> None:
+    error = trade("scan", "--port", line.port, "--driver", "ur").exception
+    assert isinstance(error, ConfigurationError)
+    assert "it has no scan" in str(error)

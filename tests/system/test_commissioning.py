@@ -1,0 +1,205 @@
+"""From a box of new devices to a robot that moves, by commands alone, as the docs show it."""
+
+import json
+import os
+import re
+import shlex
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import pytest
+
+from system.conftest import ROOT
+from trade_hil_sim import SimControl, read_log
+from waiting import PATIENCE_S, wait_until
+
+PAGE: Final = ROOT / "docs" / "commissioning.md"
+MARKS: Final = ("<!-- transcript: made by test_new_devices_become_a_robot -->\n", "<!-- end of transcript -->\n")
+POSITION: Final = 132
+
+
+class Step(NamedTuple):
+    """A command, what it is good for, and what happens meanwhile."""
+
+    why: str
+    command: str
+    kind: str = "run"
+    """``run``, ``up`` (goes on in the background), or ``calibrate`` (a joint is moved by hand)."""
+    counts: tuple[int, int, int] = (0, 0, 0)
+    """Where a joint is moved to: its zero, and both ends."""
+
+
+STEPS: Final = (
+    Step(
+        "No hardware at hand? This is a box of new devices: two servos on one line, a gripper on another.",
+        "trade-hil-sim --fresh neck=dynamixel:XL430-W250,XL430-W250 --fresh hand=robotiq:2F-85 --dir lines &",
+        "up",
+    ),
+    Step("Who is on the line of the servos?", "trade scan --port lines/neck"),
+    Step(
+        "Both have id 1, as all that come from the factory. Unplug the second one (the simulated one: by this line).",
+        """python -c 'import sys; from trade_hil_sim import SimControl; """
+        """SimControl(sys.argv[1]).absent(nth=2, bus="neck")' lines/_control""",
+    ),
+    Step("The one that is left gets an id of its own.", "trade set-id --port lines/neck --from 1 --to 2"),
+    Step(
+        "Plug the other one in again.",
+        """python -c 'import sys; from trade_hil_sim import SimControl; """
+        """SimControl(sys.argv[1]).absent(nth=2, on=False, bus="neck")' lines/_control""",
+    ),
+    Step(
+        "At 57600 baud there is no time for a hundred cycles a second, so both are to speak faster.",
+        "trade set-baud --port lines/neck --id 1 --to 1000000",
+    ),
+    Step("", "trade set-baud --port lines/neck --id 2 --to 1000000"),
+    Step(
+        "All that is there becomes a robot file to begin with. Ids that are known make it quick.",
+        "trade scan --port lines/neck --port lines/hand --ids 1-9 --write rosie.toml",
+    ),
+    Step(
+        "Devices get names, by an editor or by this line.",
+        """sed -i 's/joint1_1/"neck.pan"/; s/joint1_2/"neck.tilt"/; s/gripper2_9/"left.hand"/; s/"robot"/"rosie"/' """
+        "rosie.toml",
+    ),
+    Step(
+        "Where are zero and ends of each joint? It is moved by hand; its torque stays off.",
+        "trade calibrate rosie.toml neck.pan",
+        "calibrate",
+        (2100, 1500, 2700),
+    ),
+    Step("", "trade calibrate rosie.toml neck.tilt", "calibrate", (2048, 1800, 2300)),
+    Step("Is all of it well?", "trade doctor rosie.toml | grep 'neck\\|hand'"),
+    Step("She comes up, and looks to the left.", "trade up rosie.toml &", "up"),
+    Step("", "trade call rosie.neck.pan.enable"),
+    Step("", "trade call rosie.neck.pan.move_to 0.3"),
+)
+
+
+class Bench:
+    """A terminal in an empty folder, and two hands."""
+
+    def __init__(self, folder: Path, undo: ExitStack) -> None:
+        self._folder, self._undo = folder, undo
+        self._log = folder / "bytes.jsonl"
+        words = [os.fspath(Path(sys.executable).parent), os.environ["PATH"]]
+        self._environment = {**os.environ, "PATH": os.pathsep.join(words), "COLUMNS": "200"}
+
+    def type(self, step: Step) -> str:
+        """A step as the page has it."""
+        said = {"run": self._run, "up": self._up, "calibrate": self._calibrate}[step.kind](step)
+        said = said.replace(str(self._folder), "/home/you")
+        said = re.sub(r"^\d\d:\d\d:\d\d ", "", said, flags=re.MULTILINE)
+        said = re.sub(r"-?\d+\.\d{5,}", lambda found: f"{float(found[0]):.1f}", said)
+        return f"{step.why}\n\n" * bool(step.why) + f"```console\n$ {step.command}\n{said}```\n\n"
+
+    def _run(self, step: Step) -> str:
+        ended = subprocess.run(
+            step.command,
+            shell=True,
+            check=False,
+            cwd=self._folder,
+            env=self._environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            timeout=PATIENCE_S,
+        )
+        assert ended.returncode == 0, f"{step.command}: {ended.stdout}"
+        return ended.stdout
+
+    def _start(self, words: list[str]) -> "subprocess.Popen[str]":
+        process = subprocess.Popen(
+            words,
+            cwd=self._folder,
+            env=self._environment,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            bufsize=1,
+        )
+        self._undo.callback(self._end, process)
+        return process
+
+    @staticmethod
+    def _end(process: "subprocess.Popen[str]") -> None:
+        process.terminate()
+        process.communicate(timeout=PATIENCE_S)
+
+    def _up(self, step: Step) -> str:
+        words = shlex.split(step.command)[:-1]
+        simulator = words[0] == "trade-hil-sim"
+        process = self._start([*words, "--log", str(self._log)] if simulator else words)
+        said, last = "", '"ready":true' if simulator else "Ctrl-C leaves"
+        while last not in said:
+            said += self._line(process)
+        if simulator:
+            ready = json.loads(said)
+            said = json.dumps({**ready, "log": None}, separators=(",", ":")) + "\n"
+        return said
+
+    @staticmethod
+    def _line(process: "subprocess.Popen[str]") -> str:
+        assert process.stdout is not None
+        line = process.stdout.readline()
+        assert line, f"{process.args} has ended"
+        return line
+
+    def _calibrate(self, step: Step) -> str:
+        process = self._start(shlex.split(step.command))
+        device_id = 1 if step.command.endswith("pan") else 2
+        zero, low, high = step.counts
+        said = self._line(process)
+        self._move(device_id, zero)
+        self._press(process, "\n")
+        said += self._line(process)
+        self._move(device_id, low)
+        self._move(device_id, high)
+        self._press(process, "\n")
+        self._press(process, "y\n")
+        assert process.stdout is not None
+        said += process.stdout.read()
+        assert process.wait(PATIENCE_S) == 0
+        return said.replace("[y/N]: ", "[y/N]: y\n")
+
+    @staticmethod
+    def _press(process: "subprocess.Popen[str]", keys: str) -> None:
+        assert process.stdin is not None
+        process.stdin.write(keys)
+        process.stdin.flush()
+
+    def _move(self, device_id: int, counts: int) -> None:
+        """Turn a shaft by hand, and hold it there until it was looked at."""
+        with SimControl(self._folder / "lines" / "_control") as control:
+            control.place(counts, [device_id], bus="neck")
+        before = self._looks(device_id)
+        wait_until(lambda: self._looks(device_id) > before + 2, "the position is read")
+
+    def _looks(self, device_id: int) -> int:
+        return sum(
+            one.kind == "instruction" and one.name == "read" and one.address == POSITION
+            for one in read_log(self._log)
+            if one.device_id == device_id
+        )
+
+
+@pytest.fixture
+def bench(system: str, tmp_path: Path) -> Iterator[Bench]:
+    with ExitStack() as undo:
+        yield Bench(tmp_path, undo)
+
+
+@pytest.mark.timeout(300)  # it asks every id at every rate
+def test_new_devices_become_a_robot(bench: Bench) -> None:
+    """With WRITE_TABLES=1 in the environment the page's transcript is written anew."""
+    told = "\n" + "".join(bench.type(step) for step in STEPS)
+    before, mark, rest = PAGE.read_text(encoding="utf-8").partition(MARKS[0])
+    shown, end, after = rest.partition(MARKS[1])
+    if os.environ.get("WRITE_TABLES"):
+        PAGE.write_text(before + mark + told + end + after, encoding="utf-8")
+        return
+    assert told == shown
