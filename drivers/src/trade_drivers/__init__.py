@@ -1,22 +1,27 @@
-"""Motors, grippers and arms as TRADE services: interfaces in SI units, the robot file, and drivers by vendor."""
+"""Motors, grippers, arms, cameras and sensors as TRADE services: interfaces in SI units, robot file, drivers."""
 
 from trade_drivers._arm import Arm, ArmLimits, ArmState
 from trade_drivers._attach import AttachedRobot, attach
 from trade_drivers._can_monitor import CanBusState, CanMonitor
-from trade_drivers._driver import AttachedBus, Driver, drivers
+from trade_drivers._driver import AttachedBus, Driver, SenseDriver, drivers
 from trade_drivers._interfaces import Gripper, GripperLimits, GripperState, JointGroup, Motor, MotorState
 from trade_drivers._load import load
 from trade_drivers._plan import FollowProgress, JointLimits, Plan, Tolerances
+from trade_drivers._polled import Measured, PolledSensor
+from trade_drivers._senses import UNITS, Camera, CameraInfo, Image, Reading, Sensor, SensorInfo
 from trade_drivers._trajectory import Trajectory, TrajectoryPoint
 from trade_drivers.robotfile import Bus, CanBus, Coupled, Group, Joint, Robot, SerialBus, UrBus, parse
 
 __all__ = [
+    "UNITS",
     "Arm",
     "ArmLimits",
     "ArmState",
     "AttachedBus",
     "AttachedRobot",
     "Bus",
+    "Camera",
+    "CameraInfo",
     "CanBus",
     "CanBusState",
     "CanMonitor",
@@ -27,13 +32,20 @@ __all__ = [
     "GripperLimits",
     "GripperState",
     "Group",
+    "Image",
     "Joint",
     "JointGroup",
     "JointLimits",
+    "Measured",
     "Motor",
     "MotorState",
     "Plan",
+    "PolledSensor",
+    "Reading",
     "Robot",
+    "SenseDriver",
+    "Sensor",
+    "SensorInfo",
     "SerialBus",
     "Tolerances",
     "Trajectory",

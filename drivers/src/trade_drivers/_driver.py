@@ -3,14 +3,17 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from importlib.metadata import EntryPoint, entry_points
+from typing import TypeVar
 
 from trade.errors import ConfigurationError
+from trade_drivers import robotfile
 from trade_drivers._arm import Arm
 from trade_drivers._can_monitor import CanMonitor
 from trade_drivers._interfaces import Gripper, JointGroup, Motor
+from trade_drivers._senses import Camera, Sensor
 from trade_drivers.robotfile import Bus, Robot
 
-__all__ = ["AttachedBus", "Driver", "drivers", "load_driver"]
+__all__ = ["AttachedBus", "Driver", "SenseDriver", "drivers", "load_driver"]
 
 _GROUP = "trade.drivers"
 
@@ -76,6 +79,26 @@ class Driver(ABC):
         """
 
 
+class SenseDriver(ABC):
+    """Cameras or sensors of one kind, each with a table of its own; made without arguments, and harmless to make."""
+
+    @abstractmethod
+    def attach(self, name: str, device: robotfile.Camera | robotfile.Sensor, port: str | None) -> Camera | Sensor:
+        """Look whether the device is there and is what the file says; nothing of it is moved, reset or set.
+
+        Args:
+            name: of the device, with the robot's before it.
+            device: its table; ``device.options_as(Options)`` reads its options.
+            port: where it is, instead of where its options say; None: there.
+
+        Raises:
+            ConfigurationError: an option is wrong, or the device is absent, another, or set wrongly.
+        """
+
+
+_Kind = TypeVar("_Kind", Driver, SenseDriver)
+
+
 def drivers() -> dict[str, list[EntryPoint]]:
     """The installed drivers by name; more than one under a name is a mistake of the installation."""
     found: dict[str, list[EntryPoint]] = {}
@@ -84,15 +107,16 @@ def drivers() -> dict[str, list[EntryPoint]]:
     return found
 
 
-def load_driver(name: str, where: str) -> Driver:
+def load_driver(name: str, where: str, wanted: type[_Kind]) -> _Kind:
     """The driver of that name.
 
     Args:
         name: as in the robot file's ``driver``.
         where: the key that names it, for messages.
+        wanted: ``Driver`` for a bus, ``SenseDriver`` for a camera or sensor.
 
     Raises:
-        ConfigurationError: there is none, there are two, or it cannot be imported.
+        ConfigurationError: there is none, there are two, it cannot be imported, or it is of the other kind.
     """
     found = drivers()
     points = found.get(name, [])
@@ -107,8 +131,8 @@ def load_driver(name: str, where: str) -> Driver:
     except (ImportError, AttributeError) as broken:
         problem = f"driver {name!r} ({_origin(points[0])}) cannot be imported: {broken}"
         raise ConfigurationError(where=where, problem=problem) from broken
-    if not (isinstance(kind, type) and issubclass(kind, Driver)):
-        problem = f"driver {name!r} ({_origin(points[0])}) is no subclass of trade_drivers.Driver"
+    if not (isinstance(kind, type) and issubclass(kind, wanted)):
+        problem = f"driver {name!r} ({_origin(points[0])}) is no subclass of trade_drivers.{wanted.__name__}"
         raise ConfigurationError(where=where, problem=problem)
     return kind()
 
