@@ -30,6 +30,13 @@ FILES = {
 }
 """Robot files by name."""
 MOTORS = [("head", "neck.pan"), ("head", "neck.tilt"), ("fast", "neck.pan"), ("body", "leg.hip"), ("body", "leg.knee")]
+ELSEWHERE = {
+    "feetech": "test_feetech_contracts.py",
+    "robotiq": "test_robotiq_gripper.py",
+    "snapshot": "test_senses.py",
+    "ur": "test_ur_contract.py",
+}
+"""Drivers whose contracts are run in modules of their own."""
 GROUPS = [("head", "head"), ("legs", "legs"), ("body", "leg"), ("body", "body")]
 
 
@@ -76,11 +83,9 @@ class TestJointGroup(JointGroupContract):
 def test_every_simulator_has_its_contracts() -> None:
     files = {name: parse(text, f"{name}.toml") for name, text in FILES.items()}
     drivers = {bus.driver for file, joint in MOTORS for bus in files[file].buses if _is_on(files[file], bus, joint)}
-    drivers.add("robotiq")  # test_grippers_are_opened_and_closed_only_after_a_word_of_their_own
-    apart = {"feetech": "test_feetech_contracts.py", "ur": "test_ur_contract.py"}
-    for module in apart.values():
-        assert "Contract):" in (Path(__file__).parent / module).read_text(encoding="utf-8")
-    assert drivers | set(apart) == {simulator.name for simulator in entry_points(group="trade.sims")}
+    assert drivers | ELSEWHERE.keys() == {simulator.name for simulator in entry_points(group="trade.sims")}
+    for module in ELSEWHERE.values():
+        assert "Contract):" in Path(__file__).with_name(module).read_text(), module
 
 
 def _is_on(robot: Robot, bus: Bus, joint: str) -> bool:

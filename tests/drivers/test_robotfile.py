@@ -98,7 +98,7 @@ MISTAKES = [
         "name",
         (
             "head.toml: [name]: unknown table; "
-            "a robot file has [robot], [bus], [joint], [gripper], [arm], [group], [[coupled]]"
+            "a robot file has [robot], [bus], [joint], [gripper], [arm], [camera], [sensor], [group], [[coupled]]"
         ),
     ),
     ('name = "rosie"', "", 'head.toml: [robot]: missing; write [robot] and name = "rosie"'),
@@ -139,7 +139,7 @@ MISTAKES = [
     ("max_speed_rad_s = 2.5", "max_speed_rad_s = -1", "max_speed_rad_s: Expected `float` > 0"),
     ("max_accel_rad_s2 = 20.0", "max_accel_rad_s2 = true", "max_accel_rad_s2: Expected `float`, got `bool`"),
     ("reversed = true", "offset_rad = inf", "offset_rad: must be a finite number"),
-    ("[group.head]", '[group."neck.pan"]', "a joint, gripper or arm has this name already"),
+    ("[group.head]", '[group."neck.pan"]', "a device has this name already"),
     (
         '"neck.pan", "neck.tilt"]',
         '"neck.pan", "neck.nod"]',
@@ -246,7 +246,7 @@ def test_a_gripper_and_a_joint_share_neither_id_nor_name_and_a_robot_has_one_of_
     for text, complaint in (
         (HAND + second.replace("left", "right"), "9 is taken on bus 'hand' by gripper 'left.hand'"),
         (HEAD + second.replace("left.hand", "neck.pan").replace('"hand"', '"neck"'), "a joint has this name already"),
-        (HAND.replace(second, ""), "a robot needs at least one joint, gripper or arm"),
+        (HAND.replace(second, ""), "a robot needs at least one joint, gripper, arm, camera or sensor"),
     ):
         with pytest.raises(ConfigurationError) as error:
             parse(text, "hand.toml")

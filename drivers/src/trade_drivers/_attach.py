@@ -5,21 +5,26 @@ import logging
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
+from typing import TypeVar
 
 import trade
 from trade.errors import ConfigurationError, TradeError
+from trade_drivers import robotfile
 from trade_drivers._across import AcrossGroup
 from trade_drivers._arm import Arm
 from trade_drivers._can_monitor import CanMonitor, HealthTeller
-from trade_drivers._driver import AttachedBus, load_driver
+from trade_drivers._driver import AttachedBus, Driver, SenseDriver, load_driver
 from trade_drivers._interfaces import Gripper, JointGroup, Motor
+from trade_drivers._senses import Camera, Sensor
 from trade_drivers.robotfile import Group, Robot
 
 __all__ = ["AttachedRobot", "attach"]
 
 _log = logging.getLogger("trade")
 
-Provider = Motor | JointGroup | Gripper | Arm | CanMonitor
+Provider = Motor | JointGroup | Gripper | Arm | Camera | Sensor | CanMonitor
+_Sense = TypeVar("_Sense", Camera, Sensor)
+_Provider = TypeVar("_Provider", Motor, JointGroup, Gripper, Arm, Camera, Sensor)
 Register = Callable[[object, Sequence[str]], object]
 Deregister = Callable[[object], object]
 SetHealth = Callable[[object, str], object]
@@ -32,45 +37,47 @@ class AttachedRobot:
         self.robot = robot
         self.providers = dict(providers)
         """By group: ``rosie.neck.pan`` -> a Motor, ``rosie.head`` -> a JointGroup, ``rosie.left.hand`` -> a Gripper,
-        ``rosie.right`` -> an Arm,
-        ``rosie.bus.legs`` -> a CanMonitor."""
+        ``rosie.right`` -> an Arm, ``rosie.eye`` -> a Camera, ``rosie.wrist`` -> a Sensor, ``rosie.bus.legs`` -> a
+        CanMonitor."""
         self._undo = undo
         self._lock = threading.Lock()
         atexit.register(self.close)
 
     def motor(self, joint: str) -> Motor:
         """The provider of a joint, named as in the robot file; KeyError if there is none."""
-        provider = self.providers[f"{self.robot.name}.{joint}"]
-        if not isinstance(provider, Motor):
-            raise KeyError(joint)
-        return provider
+        return self._provider(joint, Motor)
 
     def group(self, name: str) -> JointGroup:
         """The provider of a group, named as in the robot file; KeyError if there is none."""
-        provider = self.providers[f"{self.robot.name}.{name}"]
-        if not isinstance(provider, JointGroup):
-            raise KeyError(name)
-        return provider
+        return self._provider(name, JointGroup)
 
     def gripper(self, name: str) -> Gripper:
         """The provider of a gripper, named as in the robot file; KeyError if there is none."""
-        provider = self.providers[f"{self.robot.name}.{name}"]
-        if not isinstance(provider, Gripper):
-            raise KeyError(name)
-        return provider
+        return self._provider(name, Gripper)
 
     def arm(self, name: str) -> Arm:
         """The provider of an arm, named as in the robot file; KeyError if there is none."""
-        provider = self.providers[f"{self.robot.name}.{name}"]
-        if not isinstance(provider, Arm):
-            raise KeyError(name)
-        return provider
+        return self._provider(name, Arm)
+
+    def camera(self, name: str) -> Camera:
+        """The provider of a camera, named as in the robot file; KeyError if there is none."""
+        return self._provider(name, Camera)
+
+    def sensor(self, name: str) -> Sensor:
+        """The provider of a sensor, named as in the robot file; KeyError if there is none."""
+        return self._provider(name, Sensor)
 
     def monitor(self, bus: str) -> CanMonitor:
         """The provider of a CAN bus, named as in the robot file; KeyError if there is none."""
         provider = self.providers[_bus_group(self.robot, bus)]
         if not isinstance(provider, CanMonitor):
             raise KeyError(bus)
+        return provider
+
+    def _provider(self, name: str, kind: type[_Provider]) -> _Provider:
+        provider = self.providers[f"{self.robot.name}.{name}"]
+        if not isinstance(provider, kind):
+            raise KeyError(name)
         return provider
 
     def close(self) -> None:
@@ -107,16 +114,17 @@ def attach(
 
     Joint ``neck.pan`` of robot ``rosie`` becomes a Motor in group ``rosie.neck.pan``, group ``head`` a JointGroup in
     ``rosie.head``, whether its joints share a bus or not, gripper ``left.hand`` a Gripper in ``rosie.left.hand``, arm
-    ``right`` an Arm in ``rosie.right``, CAN bus ``legs`` a CanMonitor in ``rosie.bus.legs``. If anything is wrong,
-    nothing is announced and no port is kept.
+    ``right`` an Arm in ``rosie.right``, camera ``eye`` a Camera in ``rosie.eye``, sensor ``wrist`` a Sensor in
+    ``rosie.wrist``, CAN bus ``legs`` a CanMonitor in ``rosie.bus.legs``. If anything is wrong, nothing is announced and
+    no port is kept.
 
     Args:
         robot: what ``load`` read.
         register: what announces a provider in its groups; ``trade.register`` by default.
         deregister: its opposite; ``trade.deregister`` by default.
         set_health: what says how a provider is; ``trade.set_health`` by default, nothing if ``register`` is given.
-        ports: bus name -> serial device, or ``INTERFACE:CHANNEL`` of a CAN bus, instead of the file's: for simulated
-            devices.
+        ports: bus name -> serial device, or ``INTERFACE:CHANNEL`` of a CAN bus, instead of the file's, and name of a
+            camera or sensor -> what its driver calls its port: for simulated devices.
         healthy: asked by every bus thread in every cycle; while it says no, devices are told to hold once and the bus
             falls silent, so that their own watchdogs stop them.
 
@@ -124,8 +132,9 @@ def attach(
         ConfigurationError: a driver is missing, a port cannot be had, a device is absent, another, or set wrongly.
     """
     with ExitStack() as undo:
-        buses = _attach_buses(robot, ports or {}, healthy, undo)
-        providers = _providers(robot, buses)
+        _check_ports(robot, ports or {})
+        senses = _attach_senses(robot, ports or {}, undo)  # first: if one is missing, what moves is not even touched
+        providers = _providers(robot, _attach_buses(robot, ports or {}, healthy, undo), senses)
         for name, provider in providers.items():
             (register or trade.register)(provider, (name,))
             undo.callback(_withdraw, deregister or trade.deregister, provider)
@@ -134,24 +143,52 @@ def attach(
         return AttachedRobot(robot, providers, undo.pop_all())
 
 
-def _attach_buses(
-    robot: Robot, ports: Mapping[str, str], healthy: Callable[[], bool], undo: ExitStack
-) -> dict[str, AttachedBus]:
-    names = [bus.name for bus in robot.buses]
+def _check_ports(robot: Robot, ports: Mapping[str, str]) -> None:
+    names = [device.name for device in (*robot.buses, *robot.cameras, *robot.sensors)]
     if unknown := sorted(set(ports) - set(names)):
         problem = f"there is no bus {unknown[0]!r} to give a port to; there is {', '.join(names)}"
         raise ConfigurationError(where=robot.where, problem=problem)
+
+
+def _attach_senses(robot: Robot, ports: Mapping[str, str], undo: ExitStack) -> dict[str, Camera | Sensor]:
+    return {
+        **{f"{robot.name}.{each.name}": _sense(robot, each, Camera, ports, undo) for each in robot.cameras},
+        **{f"{robot.name}.{each.name}": _sense(robot, each, Sensor, ports, undo) for each in robot.sensors},
+    }
+
+
+def _sense(
+    robot: Robot,
+    device: robotfile.Camera | robotfile.Sensor,
+    wanted: type[_Sense],
+    ports: Mapping[str, str],
+    undo: ExitStack,
+) -> _Sense:
+    where = f"{robot.where}: {device.key}.driver"
+    driver = load_driver(device.driver, where, SenseDriver)
+    sense = driver.attach(f"{robot.name}.{device.name}", device, ports.get(device.name))
+    undo.callback(sense.close)
+    if not isinstance(sense, wanted):
+        raise ConfigurationError(where=where, problem=f"driver {device.driver!r} has no {wanted.__name__.lower()}s")
+    return sense
+
+
+def _attach_buses(
+    robot: Robot, ports: Mapping[str, str], healthy: Callable[[], bool], undo: ExitStack
+) -> dict[str, AttachedBus]:
     used = {device.bus for device in (*robot.joints, *robot.grippers, *robot.arms)}
     buses: dict[str, AttachedBus] = {}
     for bus in robot.buses:
-        driver = load_driver(bus.driver, f"{robot.where}: bus.{bus.name}.driver")
+        driver = load_driver(bus.driver, f"{robot.where}: bus.{bus.name}.driver", Driver)
         if bus.name in used:
             buses[bus.name] = driver.attach(robot, bus, ports.get(bus.name, bus.port), healthy)
             undo.callback(buses[bus.name].close)
     return buses
 
 
-def _providers(robot: Robot, buses: Mapping[str, AttachedBus]) -> dict[str, Provider]:
+def _providers(
+    robot: Robot, buses: Mapping[str, AttachedBus], senses: Mapping[str, Camera | Sensor]
+) -> dict[str, Provider]:
     providers: dict[str, Motor | JointGroup | Gripper | Arm] = {
         f"{robot.name}.{joint.name}": buses[joint.bus].motor(joint.name) for joint in robot.joints
     }
@@ -164,7 +201,8 @@ def _providers(robot: Robot, buses: Mapping[str, AttachedBus]) -> dict[str, Prov
     members = robot.members()
     for provider in providers.values():
         provider.members = members
-    return providers | _monitors(robot, buses, providers)
+    named: dict[str, Provider] = {**providers, **senses}
+    return named | _monitors(robot, buses, named)
 
 
 def _bus_group(robot: Robot, bus: str) -> str:

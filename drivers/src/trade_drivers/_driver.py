@@ -3,16 +3,18 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from importlib.metadata import EntryPoint, entry_points
-from typing import ClassVar
+from typing import ClassVar, TypeVar
 
 from trade.errors import ConfigurationError
+from trade_drivers import robotfile
 from trade_drivers._arm import Arm
 from trade_drivers._can_monitor import CanMonitor
 from trade_drivers._commission import Commissioner
 from trade_drivers._interfaces import Gripper, JointGroup, Motor
+from trade_drivers._senses import Camera, Sensor
 from trade_drivers.robotfile import Bus, Robot
 
-__all__ = ["AttachedBus", "Driver", "drivers", "load_driver"]
+__all__ = ["AnyDriver", "AttachedBus", "Driver", "SenseDriver", "drivers", "load_driver"]
 
 _GROUP = "trade.drivers"
 
@@ -58,13 +60,18 @@ class AttachedBus(ABC):
         """
 
 
-class Driver(ABC):
-    """One vendor's devices; made without arguments, and harmless to make."""
+class AnyDriver:
+    """What every driver says of itself."""
 
     commissioner: ClassVar[type[Commissioner] | None] = None
     """What finds its devices and sets them up; None if they are set up otherwise."""
     modules: ClassVar[tuple[str, ...]] = ()
     """What of others it imports; installed with the extra of its name."""
+
+
+class Driver(AnyDriver, ABC):
+    """One vendor's devices; made without arguments, and harmless to make."""
+
     without_watchdog: ClassVar[str] = ""
     """What its devices do when their driver is gone, if they have no watchdog; empty if they have one."""
 
@@ -85,6 +92,26 @@ class Driver(ABC):
         """
 
 
+class SenseDriver(AnyDriver, ABC):
+    """Cameras or sensors of one kind, each with a table of its own; made without arguments, and harmless to make."""
+
+    @abstractmethod
+    def attach(self, name: str, device: robotfile.Camera | robotfile.Sensor, port: str | None) -> Camera | Sensor:
+        """Look whether the device is there and is what the file says; nothing of it is moved, reset or set.
+
+        Args:
+            name: of the device, with the robot's before it.
+            device: its table; ``device.options_as(Options)`` reads its options.
+            port: where it is, instead of where its options say; None: there.
+
+        Raises:
+            ConfigurationError: an option is wrong, or the device is absent, another, or set wrongly.
+        """
+
+
+_Kind = TypeVar("_Kind", bound=AnyDriver)
+
+
 def drivers() -> dict[str, list[EntryPoint]]:
     """The installed drivers by name; more than one under a name is a mistake of the installation."""
     found: dict[str, list[EntryPoint]] = {}
@@ -93,15 +120,16 @@ def drivers() -> dict[str, list[EntryPoint]]:
     return found
 
 
-def load_driver(name: str, where: str) -> Driver:
+def load_driver(name: str, where: str, wanted: type[_Kind]) -> _Kind:
     """The driver of that name.
 
     Args:
         name: as in the robot file's ``driver``.
         where: the key that names it, for messages.
+        wanted: ``Driver`` for a bus, ``SenseDriver`` for a camera or sensor, ``AnyDriver`` for either.
 
     Raises:
-        ConfigurationError: there is none, there are two, or it cannot be imported.
+        ConfigurationError: there is none, there are two, it cannot be imported, or it is of the other kind.
     """
     found = drivers()
     points = found.get(name, [])
@@ -116,8 +144,8 @@ def load_driver(name: str, where: str) -> Driver:
     except (ImportError, AttributeError) as broken:
         problem = f"driver {name!r} ({_origin(points[0])}) cannot be imported: {broken}"
         raise ConfigurationError(where=where, problem=problem) from broken
-    if not (isinstance(kind, type) and issubclass(kind, Driver)):
-        problem = f"driver {name!r} ({_origin(points[0])}) is no subclass of trade_drivers.Driver"
+    if not (isinstance(kind, type) and issubclass(kind, wanted)):
+        problem = f"driver {name!r} ({_origin(points[0])}) is no subclass of trade_drivers.{wanted.__name__}"
         raise ConfigurationError(where=where, problem=problem)
     return kind()
 

@@ -1,11 +1,14 @@
-"""What the robot file says of grippers, arms and groups. Pure records, no I/O."""
+"""What the robot file says of grippers, arms, cameras, sensors and groups. Pure records, no I/O."""
 
+from collections.abc import Mapping
 from math import isfinite
-from typing import Annotated
+from typing import Annotated, TypeVar
 
 from msgspec import Meta, Struct
 
-__all__ = ["Arm", "Coupled", "Gripper", "Group", "Positive", "arm_problem"]
+from trade_drivers._tables import record_of
+
+__all__ = ["Arm", "Camera", "Coupled", "Gripper", "Group", "Positive", "Sensor", "arm_problem"]
 
 Positive = Annotated[float, Meta(gt=0)]
 Angles = Annotated[list[float], Meta(min_length=6, max_length=6)]
@@ -44,6 +47,39 @@ class Arm(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     max_accel_m_s2: Positive
     poses: dict[str, Angles] = {}
     """Joint angles in rad by name, such as ``home``."""
+
+
+_Options = TypeVar("_Options", bound=Struct)
+
+
+class _Sense(Struct, frozen=True, kw_only=True):
+    """A device that only looks or measures: its driver, and what that wants to know."""
+
+    name: str
+    driver: str
+    """Entry point of the group ``trade.drivers``: ``snapshot``."""
+    options: Mapping[str, object]
+    """The other keys of its table: what they may be is for the driver to say."""
+    key: str
+    """Its table: ``camera.eye``."""
+    where: str
+    """The file it was read from."""
+
+    def options_as(self, record: type[_Options]) -> _Options:
+        """The options as a record of the driver's, which should forbid unknown fields.
+
+        Raises:
+            ConfigurationError: a key is missing, unknown or wrong; names file, key, value and what would be right.
+        """
+        return record_of(self.key, None, self.options, record, self.where)
+
+
+class Camera(_Sense, frozen=True, kw_only=True):
+    """One camera."""
+
+
+class Sensor(_Sense, frozen=True, kw_only=True):
+    """One sensor."""
 
 
 class Group(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -3,37 +3,41 @@
 import re
 import sys
 from collections.abc import Mapping
-from math import isfinite
 from typing import Annotated, Literal, TypeVar, cast
 
 import msgspec
 from msgspec import Meta, Struct
 
 from trade.errors import ConfigurationError
-from trade_drivers._records import Arm, Coupled, Gripper, Group, Positive, arm_problem
+from trade_drivers._records import Arm, Camera, Coupled, Gripper, Group, Positive, Sensor, arm_problem
+from trade_drivers._tables import explain, record_of, wrong
 
 if sys.version_info >= (3, 11):
     import tomllib
 else:
     import tomli as tomllib  # pyright: ignore[reportMissingImports]
 
-__all__ = ["Arm", "Bus", "CanBus", "Coupled", "Gripper", "Group", "Joint", "Robot", "SerialBus", "UrBus", "parse"]
+__all__ = [
+    "Arm",
+    "Bus",
+    "Camera",
+    "CanBus",
+    "Coupled",
+    "Gripper",
+    "Group",
+    "Joint",
+    "Robot",
+    "Sensor",
+    "SerialBus",
+    "UrBus",
+    "parse",
+]
 
 _SEGMENTS = re.compile(r"[a-z][a-z0-9_]*(\.[a-z][a-z0-9_]*)*")
-_AT = re.compile(r" - at `\$\.?([^`]*)`$")
-_MISSING = re.compile(r"missing required field `([^`]*)`")
-_UNKNOWN = re.compile(r"contains unknown field `([^`]*)`")
-_CHOICES = {"leave": '"hold" or "relax"'}
-
-_EXAMPLES = {
-    "port": '"/dev/serial/by-id/..." (`ls /dev/serial/by-id` shows those there are); on CAN, interface and channel',
-    "driver": '"dynamixel"',
-    "interface": '"socketcan"',
-    "channel": '"can0"',
-}
 _SERIAL_KEYS = ("port", "baud", "fast_sync")
 _CAN_KEYS = ("interface", "channel", "bitrate")
 _UR_KEYS = ("host",)
+_BUSLESS = ("camera", "sensor")
 _LOSSY = "udp_multicast"
 
 Text = Annotated[str, Meta(min_length=1)]
@@ -132,6 +136,8 @@ class Robot(Struct, frozen=True, kw_only=True):
     """The file the robot was read from."""
     grippers: list[Gripper] = []
     arms: list[Arm] = []
+    cameras: list[Camera] = []
+    sensors: list[Sensor] = []
     given: dict[str, list[str]] = {}
     """By bus: the keys that its table has, so that a driver can refuse those that mean nothing to it."""
 
@@ -169,9 +175,6 @@ class Robot(Struct, frozen=True, kw_only=True):
         return {group: list(joints) for group, joints in found.items()}
 
 
-_Record = TypeVar("_Record", SerialBus, CanBus, UrBus, Joint, Gripper, Arm, Group)
-
-
 def parse(text: str, where: str) -> Robot:
     """Read a robot file's text.
 
@@ -192,10 +195,12 @@ def parse(text: str, where: str) -> Robot:
     robot = Robot(
         name=name,
         buses=[_bus(*entry, where) for entry in buses],
-        joints=[_record(*entry, Joint, where) for entry in _tables(raw, "joint", where)],
-        grippers=[_record(*entry, Gripper, where) for entry in _tables(raw, "gripper", where)],
-        arms=[_record(*entry, Arm, where) for entry in _tables(raw, "arm", where)],
-        groups=[_record(*entry, Group, where) for entry in _tables(raw, "group", where)],
+        joints=[record_of(*entry, Joint, where) for entry in _tables(raw, "joint", where)],
+        grippers=[record_of(*entry, Gripper, where) for entry in _tables(raw, "gripper", where)],
+        arms=[record_of(*entry, Arm, where) for entry in _tables(raw, "arm", where)],
+        cameras=[_sense(*entry, Camera, where) for entry in _tables(raw, "camera", where)],
+        sensors=[_sense(*entry, Sensor, where) for entry in _tables(raw, "sensor", where)],
+        groups=[record_of(*entry, Group, where) for entry in _tables(raw, "group", where)],
         coupled=_coupled(raw.get("coupled", []), where),
         where=where,
         given={name: list(table) for _, name, table in buses},
@@ -204,25 +209,20 @@ def parse(text: str, where: str) -> Robot:
     return robot
 
 
-def _wrong(where: str, key: str, problem: str) -> ConfigurationError:
-    return ConfigurationError(where=f"{where}: {key}", problem=problem)
-
-
 def _only_known(raw: Mapping[str, object], where: str) -> None:
-    known = {key: f"[{key}]" for key in ("robot", "bus", "joint", "gripper", "arm", "group")} | {
-        "coupled": "[[coupled]]"
-    }
+    sections = ("robot", "bus", "joint", "gripper", "arm", "camera", "sensor", "group")
+    known = {key: f"[{key}]" for key in sections} | {"coupled": "[[coupled]]"}
     for key in raw:
         if key not in known:
-            raise _wrong(where, f"[{key}]", f"unknown table; a robot file has {', '.join(known.values())}")
+            raise wrong(where, f"[{key}]", f"unknown table; a robot file has {', '.join(known.values())}")
 
 
 def _robot_name(table: object, where: str) -> str:
     if not isinstance(table, dict) or not isinstance(table.get("name"), str):  # pyright: ignore[reportUnknownMemberType]
-        raise _wrong(where, "[robot]", 'missing; write [robot] and name = "rosie"')
+        raise wrong(where, "[robot]", 'missing; write [robot] and name = "rosie"')
     extra: list[str] = [str(key) for key in table if key != "name"]  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]
     if extra:
-        raise _wrong(where, f"robot.{extra[0]}", "unknown key; [robot] has only name")
+        raise wrong(where, f"robot.{extra[0]}", "unknown key; [robot] has only name")
     name = str(table["name"])  # pyright: ignore[reportUnknownArgumentType]
     _check_name(name, f"{where}: robot.name")
     return name
@@ -238,9 +238,9 @@ def _tables(raw: Mapping[str, object], section: str, where: str) -> list[tuple[s
     """The tables of a section: its key for messages, its name and its contents."""
     tables = raw.get(section, {})
     if not isinstance(tables, dict):
-        raise _wrong(where, section, f"must be tables: [{section}.NAME]")
-    if not tables and section == "bus":
-        raise _wrong(where, f"[{section}.NAME]", "missing; a robot needs at least one")
+        raise wrong(where, section, f"must be tables: [{section}.NAME]")
+    if not tables and section == "bus" and raw.keys().isdisjoint(_BUSLESS):
+        raise wrong(where, f"[{section}.NAME]", "missing; a robot needs at least one")
     return [_table(section, str(name), table, where) for name, table in tables.items()]  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]
 
 
@@ -248,78 +248,53 @@ def _table(section: str, name: str, table: object, where: str) -> tuple[str, str
     key = f'{section}."{name}"' if "." in name else f"{section}.{name}"
     _check_name(name, f"{where}: {key}")
     if not isinstance(table, dict):
-        raise _wrong(where, key, f"must be a table: [{key}]")
+        raise wrong(where, key, f"must be a table: [{key}]")
     if any(isinstance(value, dict) and key != "poses" for key, value in table.items()):  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]
-        raise _wrong(where, key, f'a dotted name needs quotes: [{section}."{name}.{next(iter(table))}"]')  # pyright: ignore[reportUnknownArgumentType]
+        raise wrong(where, key, f'a dotted name needs quotes: [{section}."{name}.{next(iter(table))}"]')  # pyright: ignore[reportUnknownArgumentType]
     return key, name, cast("dict[str, object]", table)
 
 
 def _bus(key: str, name: str, table: Mapping[str, object], where: str) -> SerialBus | CanBus | UrBus:
     """A bus of the kind its keys tell."""
     if any(word in table for word in _UR_KEYS):
-        return _record(key, name, table, UrBus, where)
+        return record_of(key, name, table, UrBus, where)
     can = [word for word in _CAN_KEYS if word in table]
     serial = [word for word in _SERIAL_KEYS if word in table]
     if can and serial:
         problem = f"{serial[0]!r} is a key of a serial bus and {can[0]!r} one of a CAN bus; a bus is one of them"
-        raise _wrong(where, key, problem)
+        raise wrong(where, key, problem)
     if not can:
-        return _record(key, name, table, SerialBus, where)
-    bus = _record(key, name, table, CanBus, where)
+        return record_of(key, name, table, SerialBus, where)
+    bus = record_of(key, name, table, CanBus, where)
     if bus.interface == _LOSSY:
         problem = f"{_LOSSY!r} loses frames and hands everyone their own, which drives cannot be told from; use another"
-        raise _wrong(where, f"{key}.interface", problem)
+        raise wrong(where, f"{key}.interface", problem)
     return bus
 
 
-def _record(key: str, name: str, table: Mapping[str, object], record: type[_Record], where: str) -> _Record:
-    try:
-        made = msgspec.convert({**table, "name": name}, record)
-    except msgspec.ValidationError as bad:
-        raise _explain(bad, table, key, record, where) from None
-    _check_finite(made, key, where)
-    return made
+_Sense = TypeVar("_Sense", Camera, Sensor)
+
+
+def _sense(key: str, name: str, table: Mapping[str, object], record: type[_Sense], where: str) -> _Sense:
+    """A camera or a sensor: what its driver wants to know is for that to look at."""
+    driver = table.get("driver")
+    if not isinstance(driver, str) or not driver:
+        raise wrong(where, f"{key}.driver", 'must name its driver, such as driver = "snapshot"')
+    options = {option: value for option, value in table.items() if option != "driver"}
+    return record(name=name, driver=driver, options=options, key=key, where=where)
 
 
 def _coupled(tables: object, where: str) -> list[Coupled]:
     if not isinstance(tables, list):
-        raise _wrong(where, "coupled", "must be a list of tables, each with a heading of its own: [[coupled]]")
+        raise wrong(where, "coupled", "must be a list of tables, each with a heading of its own: [[coupled]]")
     made: list[Coupled] = []
     for number, table in enumerate(tables, 1):  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]
         try:
             made.append(msgspec.convert(table, Coupled))
         except msgspec.ValidationError as bad:
             values = table if isinstance(table, dict) else {}  # pyright: ignore[reportUnknownVariableType]
-            raise _explain(bad, values, f"coupled {number}", Coupled, where) from None  # pyright: ignore[reportUnknownArgumentType]
+            raise explain(bad, values, f"coupled {number}", Coupled, where) from None  # pyright: ignore[reportUnknownArgumentType]
     return made
-
-
-def _explain(
-    bad: Exception, table: Mapping[str, object], key: str, record: type[Struct], where: str
-) -> ConfigurationError:
-    text = str(bad)
-    keys = ", ".join(name for name in record.__struct_fields__ if name != "name")
-    if missing := _MISSING.search(text):
-        example = _EXAMPLES.get(missing.group(1))
-        hint = f"write {missing.group(1)} = {example}" if example else f"the keys are {keys}"
-        return _wrong(where, key, f"missing required key {missing.group(1)!r}; {hint}")
-    if unknown := _UNKNOWN.search(text):
-        return _wrong(where, f"{key}.{unknown.group(1)}", f"unknown key; the keys are {keys}")
-    at = _AT.search(text)
-    field = re.split(r"[.\[]", at.group(1))[0] if at else ""
-    value = table.get(field)
-    if (choices := _CHOICES.get(field)) and isinstance(value, str):
-        return _wrong(where, f"{key}.{field}", f"must be {choices}, but it is {value!r}")
-    problem = text[: at.start()] if at else text
-    return _wrong(where, f"{key}.{field}", f"{problem}, but it is {value!r}")
-
-
-def _check_finite(record: Struct, key: str, where: str) -> None:
-    """TOML knows inf and nan; no limit may be one."""
-    for field in record.__struct_fields__:
-        value = getattr(record, field)
-        if isinstance(value, float) and not isfinite(value):
-            raise _wrong(where, f"{key}.{field}", f"must be a finite number, but it is {value}")
 
 
 def _check_links(robot: Robot) -> None:
@@ -328,54 +303,60 @@ def _check_links(robot: Robot) -> None:
     for joint in robot.joints:
         if not joint.min_rad < joint.max_rad:
             problem = f"must be greater than min_rad, but {joint.max_rad} <= {joint.min_rad}"
-            raise _wrong(robot.where, f'joint."{joint.name}".max_rad', problem)
+            raise wrong(robot.where, f'joint."{joint.name}".max_rad', problem)
     for gripper in robot.grippers:
         if not gripper.min_width_m < gripper.max_width_m:
             problem = f"must be greater than min_width_m, but {gripper.max_width_m} <= {gripper.min_width_m}"
-            raise _wrong(robot.where, f'gripper."{gripper.name}".max_width_m', problem)
+            raise wrong(robot.where, f'gripper."{gripper.name}".max_width_m', problem)
     for arm in robot.arms:
-        if (wrong := arm_problem(arm)) is not None:
-            raise _wrong(robot.where, f'arm."{arm.name}".{wrong[0]}', wrong[1])
+        if (bad := arm_problem(arm)) is not None:
+            raise wrong(robot.where, f'arm."{arm.name}".{bad[0]}', bad[1])
     _check_groups(robot)
 
 
 def _check_devices(robot: Robot) -> None:
     """There is a device, and each is on a bus there is, under an id and a name of its own."""
     devices = (*robot.joints, *robot.grippers, *robot.arms)
-    if not devices:
-        raise _wrong(robot.where, "[joint.NAME]", "missing; a robot needs at least one joint, gripper or arm")
+    if not (devices or robot.cameras or robot.sensors):
+        problem = "missing; a robot needs at least one joint, gripper, arm, camera or sensor"
+        raise wrong(robot.where, "[joint.NAME]", problem)
     buses, names, seen = {bus.name for bus in robot.buses}, set[str](), dict[tuple[str, int], str]()
     for device in devices:
         kind = type(device).__name__.lower()
         key = f'{kind}."{device.name}"'
         if device.bus not in buses:
-            problem = f"there is no bus {device.bus!r}; there is {', '.join(sorted(buses))}"
-            raise _wrong(robot.where, f"{key}.bus", problem)
+            problem = f"there is no bus {device.bus!r}; there is {', '.join(sorted(buses)) or 'none'}"
+            raise wrong(robot.where, f"{key}.bus", problem)
         number = -1 if isinstance(device, Arm) else device.id
         if other := seen.get((device.bus, number)):
             if number < 0:
-                raise _wrong(robot.where, f"{key}.bus", f"controller {device.bus!r} has its one arm: {other}")
-            raise _wrong(robot.where, f"{key}.id", f"{number} is taken on bus {device.bus!r} by {other}")
+                raise wrong(robot.where, f"{key}.bus", f"controller {device.bus!r} has its one arm: {other}")
+            raise wrong(robot.where, f"{key}.id", f"{number} is taken on bus {device.bus!r} by {other}")
         if device.name in names:
-            raise _wrong(robot.where, key, "a joint has this name already")
+            raise wrong(robot.where, key, "a joint has this name already")
         names.add(device.name)
         seen[device.bus, number] = f"{kind} {device.name!r}"
+    for sense in (*robot.cameras, *robot.sensors):
+        if sense.name in names | buses:
+            raise wrong(robot.where, sense.key, "a device or a bus has this name already")
+        names.add(sense.name)
 
 
 def _check_ports(robot: Robot) -> None:
     owners = dict[str, str]()
     for bus in robot.buses:
         if other := owners.get(bus.port):
-            raise _wrong(robot.where, f"bus.{bus.name}.port", f"{bus.port} is the port of bus {other!r} already")
+            raise wrong(robot.where, f"bus.{bus.name}.port", f"{bus.port} is the port of bus {other!r} already")
         owners[bus.port] = bus.name
 
 
 def _check_groups(robot: Robot) -> None:
     names = {joint.name for joint in robot.joints}
+    others = (*robot.grippers, *robot.arms, *robot.cameras, *robot.sensors)
     for group in robot.groups:
         _check_joints(robot, group.joints, f"group.{group.name}.joints", names)
-        if group.name in names or group.name in {device.name for device in (*robot.grippers, *robot.arms)}:
-            raise _wrong(robot.where, f"group.{group.name}", "a joint, gripper or arm has this name already")
+        if group.name in names | {device.name for device in others}:
+            raise wrong(robot.where, f"group.{group.name}", "a device has this name already")
     for number, coupled in enumerate(robot.coupled, 1):
         _check_joints(robot, coupled.joints, f"coupled {number}.joints", names)
 
@@ -383,6 +364,6 @@ def _check_groups(robot: Robot) -> None:
 def _check_joints(robot: Robot, joints: list[str], key: str, names: set[str]) -> None:
     for joint in joints:
         if joint not in names:
-            raise _wrong(robot.where, key, f"there is no joint {joint!r}; there is {', '.join(sorted(names))}")
+            raise wrong(robot.where, key, f"there is no joint {joint!r}; there is {', '.join(sorted(names))}")
     if len(set(joints)) < len(joints):
-        raise _wrong(robot.where, key, f"names a joint twice: {joints}")
+        raise wrong(robot.where, key, f"names a joint twice: {joints}")

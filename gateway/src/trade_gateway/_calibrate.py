@@ -17,7 +17,7 @@ from msgspec import Struct
 from rich.markup import escape
 
 from trade.errors import ConfigurationError, WrongDevice
-from trade_drivers import Bench, Joint, Robot, SerialBus, WireError, load, load_driver, parse
+from trade_drivers import Bench, Driver, Joint, Robot, SerialBus, WireError, load, load_driver, parse
 from trade_gateway._output import Output, UsageError
 
 if TYPE_CHECKING:
@@ -181,7 +181,7 @@ def _joint(robot: Robot, name: str) -> tuple[Joint, SerialBus]:
 @contextmanager
 def _slack(bus: SerialBus, joint: Joint) -> Generator[Bench, None, None]:
     """The line of a joint whose torque is off."""
-    commissioner = load_driver(bus.driver, f"bus.{bus.name}.driver").commissioner
+    commissioner = load_driver(bus.driver, f"bus.{bus.name}.driver", Driver).commissioner
     if commissioner is None:
         raise ConfigurationError(where=joint.name, problem=f"driver {bus.driver} has nothing to calibrate by hand")
     with commissioner().at(bus.port, bus.baud) as bench:

@@ -13,7 +13,7 @@ from typing import Final, Literal
 from msgspec import Struct
 
 from trade import Container
-from trade_drivers import load_driver
+from trade_drivers import AnyDriver, load_driver
 
 __all__ = ["Finding", "certificate", "clock", "in_sight", "latencies", "libraries", "multicast", "ports"]
 
@@ -72,7 +72,7 @@ def latencies(folder: Path = _LATENCIES) -> Iterator[Finding]:
 def libraries(names: Sequence[str], *, needed: bool) -> Iterator[Finding]:
     """Whether the vendor libraries of drivers are installed."""
     for name in names:
-        missing = [module for module in load_driver(name, "driver").modules if find_spec(module) is None]
+        missing = [module for module in load_driver(name, "driver", AnyDriver).modules if find_spec(module) is None]
         if not missing:
             yield Finding(level="ok", about=f"driver {name}", text="its libraries are installed")
             continue

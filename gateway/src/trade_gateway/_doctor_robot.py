@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from trade.errors import ConfigurationError
-from trade_drivers import Bench, CanBus, Commissioner, Found, Joint, Robot, SerialBus, UrBus, load_driver
+from trade_drivers import Bench, CanBus, Commissioner, Driver, Found, Joint, Robot, SerialBus, UrBus, load_driver
 from trade_drivers.robotfile import Gripper
 from trade_gateway._doctor_host import Finding
 
@@ -29,7 +29,7 @@ _BAD_LINE: Final = (
 def unwatched(robot: Robot) -> Iterator[Finding]:
     """Devices that nothing in themselves stops when their driver is gone."""
     for bus in robot.buses:
-        without = load_driver(bus.driver, bus.name).without_watchdog
+        without = load_driver(bus.driver, bus.name, Driver).without_watchdog
         named = [device.name for device in (*robot.joints_on(bus.name), *robot.grippers_on(bus.name))]
         if without and named:
             fix = "give the robot an emergency stop that cuts their power; docs/safety.md, S06"
@@ -73,7 +73,7 @@ def judged(bus: CanBus, link: "Link") -> Finding:
 def devices(robot: Robot) -> Iterator[Finding]:
     """Whether the devices on serial lines answer, reliably, and are those of the file. Nothing is written to them."""
     for bus in robot.buses:
-        commissioner = load_driver(bus.driver, bus.name).commissioner
+        commissioner = load_driver(bus.driver, bus.name, Driver).commissioner
         if not isinstance(bus, SerialBus) or commissioner is None:
             continue
         made = commissioner()

@@ -8,7 +8,7 @@ from msgspec import Struct
 from rich.markup import escape
 
 from trade.errors import DeviceError
-from trade_drivers import Arm, ArmState, Gripper, Motor
+from trade_drivers import Arm, ArmState, Gripper, Motor, Sensor
 from trade_gateway._output import Output
 
 __all__ = ["FaultWatch"]
@@ -19,7 +19,7 @@ class FaultWatch:
 
     def __init__(self, providers: Mapping[str, Any]) -> None:
         self._devices = {
-            name: device for name, device in providers.items() if isinstance(device, Motor | Gripper | Arm)
+            name: device for name, device in providers.items() if isinstance(device, Motor | Gripper | Arm | Sensor)
         }
         self._known: dict[str, _Trouble] = dict.fromkeys(self._devices, _WELL)
 
@@ -63,8 +63,11 @@ def _now() -> datetime:
     return datetime.now().astimezone()
 
 
-def _trouble(joint: str, device: Motor | Gripper | Arm) -> _Trouble:
+def _trouble(joint: str, device: Motor | Gripper | Arm | Sensor) -> _Trouble:
     try:
+        if isinstance(device, Sensor):
+            device.read()
+            return _WELL
         state = device.state()
     except DeviceError as silent:
         return _Trouble(type(silent).__name__, str(silent))

@@ -11,7 +11,7 @@ import typer
 from rich.markup import escape
 
 from trade.errors import ConfigurationError
-from trade_drivers import Commissioner, Found, drivers, load_driver
+from trade_drivers import AnyDriver, Commissioner, Found, drivers, load_driver
 from trade_drivers import scan as scan_line
 from trade_gateway._first_file import first_file
 from trade_gateway._list import Json
@@ -154,7 +154,7 @@ def commissioners(name: str | None) -> dict[str, Commissioner]:
     """
     found: dict[str, Commissioner] = {}
     for one in sorted(drivers()) if name is None else [name]:
-        made = load_driver(one, "--driver").commissioner
+        made = load_driver(one, "--driver", AnyDriver).commissioner
         if made is not None:
             found[one] = made()
     if name is not None and not found:

@@ -117,6 +117,9 @@ def _say_attaching(out: Output, robot: Robot, ports: dict[str, str] | None) -> N
             ]
         )
         out.say(f"[bold]{robot.name}[/]: attaching bus {bus.name} on {(ports or {}).get(bus.name, bus.port)}: {named}")
+    for sense in (*robot.cameras, *robot.sensors):
+        place = f" on {ports[sense.name]}" if ports else ""
+        out.say(f"[bold]{robot.name}[/]: attaching {type(sense).__name__.lower()} {sense.name} ({sense.driver}){place}")
 
 
 def _say_ready(out: Output, robot: Robot, container: Container, simulation: Any) -> None:
@@ -126,7 +129,7 @@ def _say_ready(out: Output, robot: Robot, container: Container, simulation: Any)
         out.data({**ready(container), "robot": robot.name, **extra, "services": [handle.label for handle in mine]})
         return
     out.say(f"[bold green]{robot.name} is up[/]: {len(mine)} services in container {container.name}")
-    example = next((handle.label for handle in mine if handle.name == "state"), None)
+    example = next((handle.label for handle in mine if handle.name in {"state", "read"}), None)
     if example:
         out.say(f"in another terminal: [bold]trade services --group {robot.name}[/] or [bold]trade call {example}[/]")
     if simulation:

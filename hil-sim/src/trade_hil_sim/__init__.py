@@ -41,6 +41,7 @@ from ._state import ArmTruth, BusState, DeviceState, GripperTruth
 from .can import CanBus, Frame
 from .dynamixel import MODELS, XL430_W250, XM430_W350, DynamixelBus, Servo
 from .robotiq import Gripper, RobotiqBus
+from .scene import SceneCamera
 from .ur import Arm, UrBus
 
 __all__ = [
@@ -80,6 +81,7 @@ __all__ = [
     "Put",
     "Replug",
     "RobotiqBus",
+    "SceneCamera",
     "SerialLine",
     "Servo",
     "SimControl",

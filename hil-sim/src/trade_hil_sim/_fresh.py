@@ -8,7 +8,7 @@ from trade_drivers.robotfile import Gripper, Joint, SerialBus
 
 from ._errors import SimulationError
 from ._log import ByteLog
-from ._robot import SimulatedBus, find_simulator
+from ._robot import SimulatedBus, bus_class
 
 __all__ = ["fresh_bus"]
 
@@ -48,7 +48,7 @@ def fresh_bus(words: str, directory: Path, *, log: ByteLog | None = None, paced:
     baud, device_id = _FACTORY[driver]
     bus = SerialBus(name=name, driver=driver, port=str(directory / name), baud=baud)
     devices = [_device(driver, name, number, model, device_id) for number, model in enumerate(models.split(","))]
-    return find_simulator(driver).from_robot(bus, devices, directory / name, log=log, paced=paced)
+    return bus_class(driver).from_robot(bus, devices, directory / name, log=log, paced=paced)
 
 
 def _device(driver: str, bus: str, number: int, model: str, device_id: int) -> Joint | Gripper:

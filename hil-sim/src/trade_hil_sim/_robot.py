@@ -1,25 +1,37 @@
 """From a robot file to simulated buses: which class simulates which driver. The only module that reads robot files."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Final, Protocol, cast
 
-from trade_drivers.robotfile import Arm, Bus, Gripper, Joint, Robot, parse
+from trade_drivers.robotfile import Arm, Bus, Camera, Gripper, Joint, Robot, Sensor, parse
 
 from ._errors import SimulationError
 from ._faults import Command
 from ._log import ByteLog
 from ._state import BusState
 
-__all__ = ["SimulatedBus", "SimulatedBusClass", "buses_of", "find_simulator", "read_robot"]
+__all__ = [
+    "SimulatedBus",
+    "SimulatedBusClass",
+    "SimulatedSenseClass",
+    "bus_class",
+    "buses_of",
+    "find_simulator",
+    "read_robot",
+]
 
 GROUP: Final = "trade.sims"
-"""Entry points of this group are `SimulatedBusClass`es; their names are those of the drivers they stand in for."""
+"""Entry points of this group are `SimulatedBusClass`es, or for cameras and sensors `SimulatedSenseClass`es; their names
+are those of the drivers they stand in for."""
+
+Truth = Callable[[], Sequence[BusState]]
+"""What all buses of the robot do at this moment."""
 
 
 class SimulatedBus(Protocol):
-    """One bus with its devices, behind one port."""
+    """One bus with its devices, or a camera, or a sensor: whatever is behind one port."""
 
     @property
     def name(self) -> str:
@@ -64,6 +76,22 @@ class SimulatedBusClass(Protocol):
         ...
 
 
+class SimulatedSenseClass(Protocol):
+    """What such an entry point names for a driver of cameras or sensors."""
+
+    def from_record(
+        self,
+        device: Camera | Sensor,
+        port: Path,
+        *,
+        truth: Truth,
+        log: ByteLog | None = None,
+        paced: bool = True,
+    ) -> SimulatedBus:
+        """Make the device a robot file describes, not yet open; raises `SimulationError` naming what it cannot do."""
+        ...
+
+
 def read_robot(path: Path) -> Robot:
     """Read a robot file; raises what `trade_drivers.robotfile.parse` raises, and `OSError`."""
     return parse(path.read_text(encoding="utf-8"), str(path))
@@ -72,21 +100,22 @@ def read_robot(path: Path) -> Robot:
 def buses_of(
     robot: Robot, directory: Path, *, names: Sequence[str] = (), log: ByteLog | None = None, paced: bool = True
 ) -> list[SimulatedBus]:
-    """Simulate the buses of a robot, not yet open; each gets the port ``directory / name``.
+    """Simulate the buses, cameras and sensors of a robot, not yet open; each gets the port ``directory / name``.
 
     Args:
         robot: from `read_robot`.
         directory: where the ports go.
-        names: which buses; default: all.
+        names: which of them; default: all.
         log: where all of them record.
         paced: take as long as the real wires.
     """
-    known = {bus.name for bus in robot.buses}
+    senses = (*robot.cameras, *robot.sensors)
+    known = {device.name for device in (*robot.buses, *senses)}
     for name in names:
         if name not in known:
             raise SimulationError(f"{robot.where} has no bus {name!r}; it has {', '.join(sorted(known))}")
-    return [
-        find_simulator(bus.driver).from_robot(
+    buses = [
+        bus_class(bus.driver).from_robot(
             bus,
             [*robot.joints_on(bus.name), *robot.grippers_on(bus.name), *robot.arms_on(bus.name)],
             directory / bus.name,
@@ -97,8 +126,38 @@ def buses_of(
         if not names or bus.name in names
     ]
 
+    def truth() -> list[BusState]:
+        return [bus.state() for bus in buses]
 
-def find_simulator(driver: str, installed: Sequence[EntryPoint] | None = None) -> SimulatedBusClass:
+    return buses + [
+        _sense_class(device.driver).from_record(device, directory / device.name, truth=truth, log=log, paced=paced)
+        for device in senses
+        if not names or device.name in names
+    ]
+
+
+def bus_class(driver: str) -> SimulatedBusClass:
+    """The class that simulates the buses of a driver.
+
+    Raises:
+        SimulationError: there is none.
+    """
+    found = find_simulator(driver)
+    if not hasattr(found, "from_robot"):
+        raise SimulationError(f"driver {driver!r} is one of cameras or sensors; a bus needs another")
+    return cast("SimulatedBusClass", found)
+
+
+def _sense_class(driver: str) -> SimulatedSenseClass:
+    found = find_simulator(driver)
+    if not hasattr(found, "from_record"):
+        raise SimulationError(f"driver {driver!r} is one of buses; a camera or sensor needs another")
+    return cast("SimulatedSenseClass", found)
+
+
+def find_simulator(
+    driver: str, installed: Sequence[EntryPoint] | None = None
+) -> SimulatedBusClass | SimulatedSenseClass:
     """The class that simulates what a driver talks to.
 
     Args:
@@ -116,4 +175,4 @@ def find_simulator(driver: str, installed: Sequence[EntryPoint] | None = None) -
         known = ", ".join(sorted({point.name for point in offered})) or "none"
         raise SimulationError(f"nothing simulates driver {driver!r}; simulated are: {known}")
     point = next(point for point in offered if point.name == driver)
-    return cast("SimulatedBusClass", point.load())
+    return cast("SimulatedBusClass | SimulatedSenseClass", point.load())

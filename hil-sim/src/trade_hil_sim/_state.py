@@ -40,6 +40,8 @@ class GripperTruth(msgspec.Struct, frozen=True, kw_only=True):
     moving: bool
     holding: bool
     """It presses on something on its way to the goal."""
+    object_m: float | None = None
+    """How wide the object is that was put between its fingers; None: there is none."""
     force_n: float
     """The force it was told to press with."""
     fault: int

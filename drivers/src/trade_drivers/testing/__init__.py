@@ -5,8 +5,17 @@ The contracts are plain classes with ``test_`` methods, run in a subclass that s
 """
 
 from trade_drivers.testing._arms import ArmContract
+from trade_drivers.testing._cameras import CameraContract
 from trade_drivers.testing._grippers import GripperContract
 from trade_drivers.testing._groups import JointGroupContract
 from trade_drivers.testing._motors import MotorContract
+from trade_drivers.testing._sensors import SensorContract
 
-__all__ = ["ArmContract", "GripperContract", "JointGroupContract", "MotorContract"]
+__all__ = [
+    "ArmContract",
+    "CameraContract",
+    "GripperContract",
+    "JointGroupContract",
+    "MotorContract",
+    "SensorContract",
+]

@@ -1,4 +1,4 @@
-"""How the contracts ask: refusals, waits with a deadline, calls in threads of their own, short and slow ways."""
+"""How the contracts ask: refusals, waits with a deadline, calls in threads of their own, streams, short ways."""
 
 # ruff: noqa: S101 - these are tests
 
@@ -6,13 +6,15 @@ import threading
 import time
 from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
-from typing import Final, Generic, TypeVar
+from typing import Any, Final, Generic, TypeVar
 
+from trade import where
 from trade.errors import TradeError
+from trade.testing import memory_system
 from trade_drivers._interfaces import MotorState
 from trade_drivers._plan import JointLimits
 
-__all__ = ["NEAR_RAD", "REACH_RAD", "SPEED_RAD_S", "Caller", "ahead", "refused", "until"]
+__all__ = ["NEAR_RAD", "REACH_RAD", "SPEED_RAD_S", "Caller", "ahead", "at_once", "refused", "streamed", "until"]
 
 REACH_RAD: Final = 0.12
 """No joint is sent farther from where it is found."""
@@ -49,12 +51,13 @@ class Caller(Generic[_Result]):
     def __init__(self, act: Callable[[], _Result]) -> None:
         self._act = act
         self._error: TradeError | None = None
+        self._results: list[_Result] = []
         self._thread = threading.Thread(target=self._run, name="caller", daemon=True)
         self._thread.start()
 
     def _run(self) -> None:
         try:
-            self._act()
+            self._results.append(self._act())
         except TradeError as error:
             self._error = error
 
@@ -63,6 +66,29 @@ class Caller(Generic[_Result]):
         self._thread.join(_PATIENCE_S)
         assert not self._thread.is_alive(), "the call does not end"
         return self._error
+
+    def result(self) -> _Result:
+        """What it returned; raises what it raised."""
+        if (error := self.error()) is not None:
+            raise error
+        return self._results[0]
+
+
+def at_once(act: Callable[[], _Result], callers: int) -> list[_Result]:
+    """What as many calls at the same time return."""
+    return [caller.result() for caller in [Caller(act) for _ in range(callers)]]
+
+
+def streamed(provider: object, group: str, service: str) -> tuple[Any, Any]:
+    """Two samples of a service, as they reach another container."""
+    with memory_system() as system:
+        driver, listener = system.container("driver"), system.container("listener")
+        driver.register(provider, group)
+        system.settle()
+        with listener.stream(where(name=service, group=group), hz=20) as stream:
+            first, second = stream.next(_PATIENCE_S), stream.next(_PATIENCE_S)
+        driver.deregister(provider)
+    return first.value, second.value
 
 
 def ahead(states: Sequence[MotorState], limits: Sequence[JointLimits], part: float = 1.0) -> list[float]:

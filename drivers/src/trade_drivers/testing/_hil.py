@@ -16,13 +16,21 @@ from trade_drivers._arm import Arm
 from trade_drivers._attach import AttachedRobot, attach
 from trade_drivers._interfaces import Gripper, JointGroup, Motor
 from trade_drivers._load import load
+from trade_drivers._senses import Camera, Sensor
 from trade_drivers.robotfile import Robot
 from trade_drivers.testing._asking import REACH_RAD, SPEED_RAD_S
 
 __all__ = ["main"]
 
 _SUITE: Final = Path(__file__).with_name("_suite.py")
-_KINDS: Final[Mapping[str, type[object]]] = {"motor": Motor, "group": JointGroup, "gripper": Gripper, "arm": Arm}
+_KINDS: Final[Mapping[str, type[object]]] = {
+    "motor": Motor,
+    "group": JointGroup,
+    "gripper": Gripper,
+    "arm": Arm,
+    "camera": Camera,
+    "sensor": Sensor,
+}
 """Fixtures of the contracts, and what of the robot each of them goes through."""
 _REFUSED: Final = 2
 
@@ -91,6 +99,8 @@ def _refuse_if_in_use(robot: Robot) -> None:
 
 
 def _agreed(robot: Robot) -> bool:
+    if not (robot.joints or robot.grippers or robot.arms):
+        return True  # nothing of it moves
     if robot.joints:
         sys.stderr.write(
             f"{len(robot.joints)} joints of {robot.name} will be enabled, moved by up to {REACH_RAD} rad at "
@@ -147,6 +157,14 @@ class _Devices:
         assert isinstance(arm, Arm)  # noqa: S101 - pytest_generate_tests gave no other name
         yield arm
         arm.stop()
+
+    @pytest.fixture
+    def camera(self, request: pytest.FixtureRequest) -> object:
+        return self._providers[request.param]
+
+    @pytest.fixture
+    def sensor(self, request: pytest.FixtureRequest) -> object:
+        return self._providers[request.param]
 
     def _device(self, name: str) -> Iterator[object]:
         device = self._providers[name]

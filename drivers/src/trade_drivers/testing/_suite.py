@@ -1,9 +1,11 @@
 """What `_hil` has pytest collect: the contracts, for all devices of the robot file."""
 
 from trade_drivers.testing._arms import ArmContract
+from trade_drivers.testing._cameras import CameraContract
 from trade_drivers.testing._grippers import GripperContract
 from trade_drivers.testing._groups import JointGroupContract
 from trade_drivers.testing._motors import MotorContract
+from trade_drivers.testing._sensors import SensorContract
 
 
 class TestMotor(MotorContract):
@@ -20,3 +22,11 @@ class TestGripper(GripperContract):
 
 class TestArm(ArmContract):
     """Each arm."""
+
+
+class TestCamera(CameraContract):
+    """Each camera."""
+
+
+class TestSensor(SensorContract):
+    """Each sensor."""

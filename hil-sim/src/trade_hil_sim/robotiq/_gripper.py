@@ -364,6 +364,7 @@ class Gripper:
             activated=self._activated,
             moving=self._moving,
             holding=going and self._contact in {Contact.OPENING, Contact.CLOSING},
+            object_m=None if self._put is None else self._put.width_m,
             force_n=table.force_of(self._taken[2] & 0xFF),
             fault=self._shown_fault,
             absent=self.absent,

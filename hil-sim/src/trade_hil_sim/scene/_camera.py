@@ -1,0 +1,235 @@
+"""The camera: an HTTP server on the loopback interface that answers each request with what is seen at that moment."""
+
+import os
+import socket
+import threading
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from trade_hil_sim import _faults as faults
+from trade_hil_sim._errors import SimulationError
+from trade_hil_sim._log import ByteLog, Entry
+from trade_hil_sim._ready import ready
+from trade_hil_sim._state import BusState
+
+from ._drawing import draw
+from ._png import png
+
+if TYPE_CHECKING:
+    from trade_drivers.robotfile import Camera, Sensor
+
+__all__ = ["SceneCamera"]
+
+_SIZE_PX: Final = (320, 240)
+_ANSWER_S: Final = 5.0
+_CLIENT_S: Final = 1.0
+"""How long a client may take over its request, and over taking the answer."""
+_LONGEST_MUTE_S: Final = 60.0
+_LONGEST_REQUEST: Final = 8192
+_TARGET: Final = "/scene.png"
+
+
+class SceneCamera:
+    """A network camera: ``GET /scene.png`` is a picture of the robot. One client is answered after the other.
+
+    Args:
+        truth: what the robot's buses do.
+        name: of the camera in the robot file.
+        width_px: how wide its pictures are.
+        height_px: how high.
+        log: where to record requests and answers; default: a log in memory, at `log`.
+    """
+
+    def __init__(
+        self,
+        truth: Callable[[], Sequence[BusState]],
+        *,
+        name: str = "camera",
+        width_px: int = _SIZE_PX[0],
+        height_px: int = _SIZE_PX[1],
+        log: ByteLog | None = None,
+    ) -> None:
+        self.name = name
+        self.log = ByteLog() if log is None else log
+        self._truth, self._size = truth, (width_px, height_px)
+        self._lock = threading.Lock()
+        self._script = faults.Script()
+        self._frozen: bytes | None = None
+        self._number = 0
+        self._listener: socket.socket | None = None
+        self._wants_plug, self._settled, self._closing = True, threading.Event(), threading.Event()
+        self._thread: threading.Thread | None = None
+
+    @classmethod
+    def from_record(
+        cls,
+        device: "Camera | Sensor",
+        port: Path,  # noqa: ARG003 - it is reached over the network
+        *,
+        truth: Callable[[], Sequence[BusState]],
+        log: ByteLog | None = None,
+        paced: bool = True,  # noqa: ARG003 - a picture takes as long as drawing it takes
+    ) -> "SceneCamera":
+        """The camera of a robot file, as large as that says.
+
+        Raises:
+            SimulationError: it is no camera, or a size that is none.
+        """
+        sizes = [device.options.get(key, usual) for key, usual in zip(("width_px", "height_px"), _SIZE_PX, strict=True)]
+        width, height = (size if isinstance(size, int) else 0 for size in sizes)
+        if not device.key.startswith("camera") or not (0 < width <= 4096 and 0 < height <= 4096):
+            raise SimulationError(f"{device.key}: simulated is a camera of 1 to 4096 pixels either way")
+        return cls(truth, name=device.name, width_px=width, height_px=height, log=log)
+
+    @property
+    def port(self) -> str:
+        """Where its pictures are; final from `open` on."""
+        return f"http://127.0.0.1:{self._number}{_TARGET}"
+
+    def open(self) -> "SceneCamera":
+        """From now on it can be asked."""
+        if self._thread is not None:
+            raise SimulationError(f"camera {self.name} is open, or was; make a new one")
+        self._listener = _listen(0)
+        self._number = self._listener.getsockname()[1]
+        self._bell, self._rope = os.pipe()
+        self._thread = threading.Thread(target=self._run, name=f"sim-{self.name}", daemon=True)
+        self._thread.start()
+        return self
+
+    def close(self) -> None:
+        """Hang up. Idempotent; a log passed in stays open."""
+        if self._thread is None or self._closing.is_set():
+            return
+        self._closing.set()
+        os.write(self._rope, b"!")
+        self._thread.join(_ANSWER_S)
+        os.close(self._bell)
+        os.close(self._rope)
+
+    def __enter__(self) -> "SceneCamera":
+        return self.open()
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    def state(self) -> BusState:
+        """Whether it can be reached; it has no devices."""
+        return BusState(name=self.name, port=self.port, plugged=self._listener is not None)
+
+    def do(self, command: faults.Command) -> None:
+        """Carry out a fault or an order: those of answers, ``unplug``, ``replug``, ``freeze`` and ``heal``.
+
+        Raises:
+            SimulationError: it is another.
+        """
+        match command:
+            case faults.Unplug() | faults.Replug():
+                self._plug(isinstance(command, faults.Replug))
+            case faults.AnswerFault():
+                with self._lock:
+                    self._script.add(command)
+            case faults.Unmute():
+                with self._lock:
+                    self._script.unmute(None)
+            case faults.Freeze():
+                picture = self._picture() if command.on else None
+                with self._lock:
+                    self._frozen = picture
+            case faults.Heal():
+                with self._lock:
+                    self._script.heal()
+                    self._frozen = None
+            case _:
+                raise SimulationError(f"camera {self.name} has no such thing as {type(command).__name__}")
+
+    def _plug(self, on: bool) -> None:
+        if self._thread is None or self._closing.is_set():
+            raise SimulationError(f"camera {self.name} is closed")
+        self._settled.clear()
+        self._wants_plug = on
+        os.write(self._rope, b"!")
+        if not self._settled.wait(_ANSWER_S):
+            raise SimulationError(f"camera {self.name} is stuck")
+
+    def _picture(self) -> bytes:
+        return png(draw(self._truth(), *self._size), *self._size)
+
+    # the thread
+
+    def _run(self) -> None:
+        while not self._closing.is_set():
+            listener = self._listener
+            told = ready([self._bell] if listener is None else [self._bell, listener.fileno()])
+            if self._bell in told:
+                os.read(self._bell, 64)
+                self._settle()
+            elif listener is not None:
+                with suppress(OSError):
+                    client, _ = listener.accept()
+                    with client:
+                        client.settimeout(_CLIENT_S)
+                        self._serve(client)
+        self._wants_plug = False
+        self._settle()
+
+    def _settle(self) -> None:
+        if self._wants_plug and self._listener is None:
+            self._listener = _listen(self._number)
+        elif not self._wants_plug and self._listener is not None:
+            self._listener.close()
+            self._listener = None
+        self._settled.set()
+
+    def _serve(self, client: socket.socket) -> None:
+        request = b""
+        while b"\r\n\r\n" not in request:
+            data = client.recv(_LONGEST_REQUEST)
+            if not data or len(request) > _LONGEST_REQUEST:
+                return
+            request += data
+        line = request.split(b"\r\n")[0].decode("latin-1")
+        self._note("received", line)
+        answer = self._answer(line)
+        with self._lock:
+            muted = self._script.silences(0, "get")
+            pieces = [] if muted else self._script.shape(answer, (0,), "get")
+        began = time.monotonic()
+        for data, late_s in pieces:
+            if not self._patient(client, began + late_s):
+                return
+            client.sendall(data)
+        if muted:
+            self._patient(client, began + _LONGEST_MUTE_S)
+        self._note("sent", f"{sum(len(piece.data) for piece in pieces)} bytes")
+
+    def _patient(self, client: socket.socket, until: float) -> bool:
+        """Wait; False if the client gave up before, or the camera has other things to do."""
+        left_s = until - time.monotonic()
+        return left_s <= 0 or not ready([client.fileno(), self._bell], timeout_s=left_s)
+
+    def _answer(self, line: str) -> bytes:
+        if line.split(" ")[:2] != ["GET", _TARGET]:
+            return b"HTTP/1.0 404 Not Found\r\nContent-Length: 0\r\n\r\n"
+        picture = self._frozen or self._picture()
+        head = f"HTTP/1.0 200 OK\r\nContent-Type: image/png\r\nContent-Length: {len(picture)}\r\n\r\n"
+        return head.encode("ascii") + picture
+
+    def _note(self, name: str, detail: str) -> None:
+        self.log.add(Entry(t=time.monotonic(), bus=self.name, kind="event", name=name, detail=detail))
+
+
+def _listen(number: int) -> socket.socket:
+    listener = socket.socket()
+    try:
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind(("127.0.0.1", number))
+        listener.listen()
+        listener.setblocking(False)
+    except OSError:
+        listener.close()
+        raise
+    return listener
