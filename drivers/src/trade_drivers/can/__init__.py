@@ -1,7 +1,8 @@
 """CAN buses through python-can: one port, used by one thread; its load, its errors, its loss."""
 
 from trade_drivers.can._errors import ErrorState, error_state
+from trade_drivers.can._listeners import Listeners
 from trade_drivers.can._load import LoadMeter, frame_bits
 from trade_drivers.can._port import CanPort, Frame, split_port
 
-__all__ = ["CanPort", "ErrorState", "Frame", "LoadMeter", "error_state", "frame_bits", "split_port"]
+__all__ = ["CanPort", "ErrorState", "Frame", "Listeners", "LoadMeter", "error_state", "frame_bits", "split_port"]
