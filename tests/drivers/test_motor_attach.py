@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import ExitStack
+from pathlib import Path
 
 import can
 import pytest
@@ -9,6 +10,7 @@ import pytest
 from drivers.conftest import written_now
 from drivers.motor_rig import KINDS, ROOT, TIP, MotorRig, motor_rig, wag
 from trade.errors import ConfigurationError, DeviceFault
+from trade_drivers import load
 from trade_drivers.odrive import _frames as frames
 from trade_drivers.odrive._frames import Command, Control, Input, State, frame_id
 from trade_hil_sim import Absent, WrongModel
@@ -143,3 +145,9 @@ def test_a_damiao_is_watched_from_attaching_on(damiaos: MotorRig) -> None:
     damiaos.attach()
     for joint in (ROOT, TIP):
         assert damiaos.truth(joint).watchdog == 8000  # 0.4 s in steps of 50 us
+
+
+def test_the_example_of_a_tail_moves_on_the_simulator(odrives: MotorRig) -> None:
+    odrives.robot = load(Path(__file__).parents[2] / "examples" / "tail.toml")
+    odrives.plug()
+    assert odrives.attach().group("tail").move_to([0.3, -0.3]) == pytest.approx([0.3, -0.3], abs=0.01)
