@@ -1,5 +1,6 @@
 """The devices that the table of faults strikes: one of each kind, in the same words."""
 
+import struct
 from abc import ABC, abstractmethod
 from contextlib import ExitStack
 from pathlib import Path
@@ -9,6 +10,7 @@ from drivers.conftest import Outcome, Rig, goal_counts
 from drivers.fault_table import Order, Recovery, Sick
 from drivers.gripper_rig import HandRig
 from drivers.legs import HALT, HIP, Leg
+from drivers.motor_rig import KINDS, ROOT
 from drivers.tail_rig import TailRig, goal_of
 from trade.errors import DeviceError
 from trade_drivers import Motor
@@ -242,6 +244,32 @@ class TailServo(_Joint):
         ]
 
 
+class TailMotor(_Joint):
+    """An ODrive, or a Damiao motor, of a tail."""
+
+    goal_rad = 0.9
+
+    def get(self) -> Motor:
+        return self.robot.motor("tail.root")
+
+    def holds(self, since: float) -> list[Entry]:
+        return self.rig.frames(self.rig.target, ROOT, since)
+
+    def exchanges(self, since: float) -> list[Entry]:
+        return [entry for entry in self.rig.frames(device_id=ROOT, since=since) if entry.direction == "out"]
+
+    def moves(self, since: float) -> list[Entry]:
+        """To be told to hold where it stands does not count."""
+        here_rad = self.truth.position_rad * self.rig.robot.joints[0].gear
+        return [entry for entry in super().moves(since) if not self._holds_at(entry, here_rad)]
+
+    def _holds_at(self, entry: Entry, here_rad: float) -> bool:
+        if entry.name != self.rig.target:
+            return False
+        [target] = struct.unpack("<f", entry.data[:4])
+        return bool(abs(target * self.rig.unit_rad - here_rad) < 0.05)
+
+
 def _servo(tmp_path: Path, undo: ExitStack) -> Subject:
     rig = Rig(tmp_path, undo)
     rig.configure(('driver = "dynamixel"', f'driver = "dynamixel"\n{_PATIENT}\nwatchdog_s = 0.4'))
@@ -270,5 +298,18 @@ def _tail(tmp_path: Path, undo: ExitStack) -> Subject:
     return TailServo(rig)
 
 
-SUBJECTS = {"dynamixel": _servo, "cia402": _drive, "robotiq": _hand, "feetech": _tail}
+def _motor(kind: str, undo: ExitStack) -> Subject:
+    rig = KINDS[kind](undo)
+    rig.plug()
+    return TailMotor(rig)
+
+
+SUBJECTS = {
+    "dynamixel": _servo,
+    "cia402": _drive,
+    "robotiq": _hand,
+    "feetech": _tail,
+    "odrive": lambda _, undo: _motor("odrive", undo),
+    "damiao": lambda _, undo: _motor("damiao", undo),
+}
 """What makes one of each kind."""

@@ -33,8 +33,8 @@ from trade_hil_sim import (
 
 __all__ = ["TABLE", "Device", "Order", "Recovery", "Row", "Sick", "Stop", "page"]
 
-Device = Literal["dynamixel", "cia402", "robotiq", "feetech"]
-STRUCK: Final = {"dynamixel": (1,), "cia402": (1,), "robotiq": (9,), "feetech": (1,)}
+Device = Literal["dynamixel", "cia402", "robotiq", "feetech", "odrive", "damiao"]
+STRUCK: Final = {"dynamixel": (1,), "cia402": (1,), "robotiq": (9,), "feetech": (1,), "odrive": (1,), "damiao": (1,)}
 """The ids of the devices that are struck."""
 ONE: Final = STRUCK["dynamixel"]
 
@@ -109,6 +109,8 @@ _AFTER_SILENCE: Final = {
     "cia402": Recovery.ENABLE,
     "robotiq": Recovery.ACTIVATE,
     "feetech": Recovery.NOTHING,
+    "odrive": Recovery.ENABLE,
+    "damiao": Recovery.ENABLE,
 }
 _AFTER_FAULT: Final = _AFTER_SILENCE | {"dynamixel": Recovery.ENABLE, "feetech": Recovery.ENABLE}
 _SICK: Final = "its driver's process is not healthy"
@@ -258,13 +260,51 @@ _FEETECH: Final = (
     Row("feetech", "restart", (BrownOut(ids=ONE),), DeviceError, "", "its torque went off", Stop.ITSELF),
     _sick("feetech", "sick driver", Stop.HOLD)._replace(recovery=Recovery.NOTHING),
 )
-TABLE: Final = (*_DYNAMIXEL, *_CIA402, *_ROBOTIQ, *_FEETECH)
+_ODRIVE: Final = (
+    _silent("odrive", "silence", Mute(ids=ONE)),
+    _silent("odrive", "no measurements", Mute(ids=ONE, instruction="get_encoder_estimates")),
+    _silent("odrive", "heartbeat lost", Mute(ids=ONE, instruction="heartbeat")),
+    _silent("odrive", "late, always", Late(ids=ONE, s=1.0)),
+    _silent("odrive", "corrupt, always", BadCrc(ids=ONE), stop=Stop.WATCHDOG),
+    _silent("odrive", "cut short", Truncate(ids=ONE, instruction="get_encoder_estimates")),
+    _faulty("odrive", "frozen value", Freeze(ids=ONE), "it makes no progress", Stop.HOLD),
+    _faulty("odrive", "blocked", Jam(ids=ONE), "it makes no progress", Stop.HOLD),
+    _silent("odrive", "cable off", Absent(ids=ONE), stop=Stop.WATCHDOG),
+    _gone("odrive", "", Stop.WATCHDOG, Recovery.ENABLE, "degraded: CAN bus gone"),
+    _silent("odrive", "bus-off of the axis", BusOff(ids=ONE), stop=Stop.WATCHDOG),
+    _faulty("odrive", "error", Emergency(ids=ONE, code=0x1000), "current limit", Stop.ITSELF),
+    _faulty("odrive", "under-voltage", Supply(ids=ONE, voltage_v=9.0), "under voltage", Stop.ITSELF),
+    _faulty("odrive", "over-temperature", Supply(ids=ONE, temperature_c=120), "inverter too hot", Stop.ITSELF),
+    _swapped("odrive", 4, "product line 4", Stop.WATCHDOG),
+    Row("odrive", "restart", (BrownOut(ids=ONE),), DeviceError, "", "torque went off", Stop.ITSELF),
+    _sick("odrive", "watchdog", Stop.BOTH),
+)
+_DAMIAO: Final = (
+    _silent("damiao", "silence", Mute(ids=ONE)),
+    _silent("damiao", "late, always", Late(ids=ONE, s=1.0)),
+    _silent("damiao", "corrupt, always", BadCrc(ids=ONE), stop=Stop.WATCHDOG),
+    _silent("damiao", "cut short", Truncate(ids=ONE)),
+    _faulty("damiao", "frozen value", Freeze(ids=ONE), "it makes no progress", Stop.HOLD),
+    _faulty("damiao", "blocked", Jam(ids=ONE), "it makes no progress", Stop.HOLD),
+    _silent("damiao", "cable off", Absent(ids=ONE), stop=Stop.WATCHDOG),
+    _gone("damiao", "", Stop.WATCHDOG, Recovery.ENABLE, "degraded: CAN bus gone"),
+    _silent("damiao", "bus-off of the motor", BusOff(ids=ONE), stop=Stop.WATCHDOG),
+    _faulty("damiao", "fault latched", HardwareFault(ids=ONE, bits=0xE), "overload", Stop.ITSELF),
+    _faulty("damiao", "under-voltage", Supply(ids=ONE, voltage_v=9.0), "under voltage", Stop.ITSELF),
+    _faulty("damiao", "over-temperature", Supply(ids=ONE, temperature_c=130), "rotor too hot", Stop.ITSELF),
+    _swapped("damiao", 30, "the position of a DM4310", Stop.WATCHDOG),
+    Row("damiao", "restart", (BrownOut(ids=ONE),), DeviceError, "", "torque went off", Stop.ITSELF),
+    _sick("damiao", "watchdog", Stop.BOTH),
+)
+TABLE: Final = (*_DYNAMIXEL, *_CIA402, *_ROBOTIQ, *_FEETECH, *_ODRIVE, *_DAMIAO)
 
 _TITLES: Final = {
     "dynamixel": "Dynamixel servos",
     "cia402": "CiA 402 drives",
     "robotiq": "2F-85 grippers",
     "feetech": "Feetech servos",
+    "odrive": "ODrives",
+    "damiao": "Damiao motors",
 }
 _HEAD: Final = """# Faults
 

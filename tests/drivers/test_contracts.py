@@ -31,7 +31,9 @@ FILES = {
 """Robot files by name."""
 MOTORS = [("head", "neck.pan"), ("head", "neck.tilt"), ("fast", "neck.pan"), ("body", "leg.hip"), ("body", "leg.knee")]
 ELSEWHERE = {
+    "damiao": "test_motor_contracts.py",
     "feetech": "test_feetech_contracts.py",
+    "odrive": "test_motor_contracts.py",
     "robotiq": "test_robotiq_gripper.py",
     "snapshot": "test_senses.py",
     "ur": "test_ur_contract.py",

@@ -15,6 +15,8 @@ WRITING: Final = frozenset(
     {
         *("write", "write_one", "read_write", "reg_write", "action", "sync_write", "bulk_write"),
         *("sdo_write", "rpdo1", "rpdo2", "rpdo3", "rpdo4"),
+        *("set_axis_state", "set_controller_mode", "set_input_pos", "set_input_vel", "set_input_torque"),
+        *("enable", "disable", "write_register", "mit", "pos_vel", "vel", "force_pos"),
         *("move_j", "move_j_ik", "move_l", "move_l_fk", "servo_j", "servo_l", "speed_j", "upload"),
         *("teach_on", "freedrive_on"),
     }

@@ -16,7 +16,7 @@ from trade_drivers.cia402._axis import DriveAxis, Stage
 from trade_drivers.cia402._machine import State
 from trade_drivers.cia402._net import Net
 from trade_drivers.cia402._stream import Following, Turning
-from trade_drivers.joints import Axis, Exchange, Gate, Goal, Job, Manner, Motion, Steps
+from trade_drivers.joints import Axis, Exchange, Gate, Goal, Job, Manner, Motion, Steps, until
 
 if TYPE_CHECKING:
     from trade_drivers.can import CanPort
@@ -173,7 +173,7 @@ class DriveExchange(Exchange):
                 yield from jobs.resting(self, job, drive)
                 yield from self.enabling(job, drive)
             elif drive.stream is None:
-                yield from jobs.until(self, drive, lambda: drive.can_take_goal, "it does not end its last handshake")  # noqa: B023 - over before the next
+                yield from until(self, drive, lambda: drive.can_take_goal, "it does not end its last handshake")  # noqa: B023 - over before the next
 
     def leaving(self, job: Job, axis: Axis, *, relax: bool) -> Steps:
         return jobs.leaving(self, job, cast("DriveAxis", axis), relax=relax)

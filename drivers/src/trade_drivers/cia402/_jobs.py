@@ -1,6 +1,5 @@
 """What enabling, relaxing, homing and leaving a drive are made of: one exchange on the wire after the other."""
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Final
 
 from trade.errors import DeviceSilent
@@ -12,15 +11,13 @@ from trade_drivers.cia402._machine import State
 from trade_drivers.cia402._net import NoAnswer, Refused
 from trade_drivers.cia402._stream import Following
 from trade_drivers.cia402._table import Entry
-from trade_drivers.joints import Job, Steps
+from trade_drivers.joints import Job, Steps, next_measurement, until
 
 if TYPE_CHECKING:
     from trade_drivers.cia402._exchange import DriveExchange
 
-__all__ = ["enabling", "leaving", "looking", "relaxing", "resting", "set_mode", "until", "write"]
+__all__ = ["enabling", "leaving", "looking", "relaxing", "resting", "set_mode", "write"]
 
-_CHANGE_NS: Final = 600_000_000
-"""How long a drive may take to go from one state to the next."""
 _WAIT_S: Final = 0.001
 _AT_REST: Final = 2
 """Measurements in a row in which it did not move."""
@@ -104,7 +101,7 @@ def _reset(bus: "DriveExchange", job: Job, axis: DriveAxis) -> Steps:
     for word in (machine.DISABLE_VOLTAGE, machine.RESET_FAULT):
         job.gate()
         bus.command(axis, word)
-        yield from _next_measurement(bus, axis)
+        yield from next_measurement(bus, axis)
     yield from until(
         bus, axis, lambda: axis.state_now is not State.FAULT, f"its fault cannot be cleared: {axis.fault or 'it stays'}"
     )
@@ -138,34 +135,7 @@ def leaving(bus: "DriveExchange", job: Job, axis: DriveAxis, *, relax: bool) -> 
 def looking(bus: "DriveExchange", axis: DriveAxis) -> Steps:
     """How it is now: what the SYNC after this one says."""
     bus.require_answering(axis)
-    yield from _next_measurement(bus, axis)
-
-
-def _next_measurement(bus: "DriveExchange", axis: DriveAxis) -> Steps:
-    since_ns = bus.clock()
-    yield from until(bus, axis, lambda: axis.sample is not None and axis.sample.at_ns > since_ns, "it says nothing")
-
-
-def until(
-    bus: "DriveExchange",
-    axis: DriveAxis,
-    condition: Callable[[], bool],
-    otherwise: str,
-    patience_ns: int = _CHANGE_NS,
-) -> Steps:
-    """Wait for what the drive's frames are to say.
-
-    Raises:
-        DeviceFault: it did not come; ``otherwise`` says what is wrong then.
-        DeviceSilent: the drive fell silent.
-    """
-    give_up_ns = bus.clock() + patience_ns
-    while not condition():
-        bus.require_answering(axis)
-        if axis.sample is not None and axis.sample.at_ns > give_up_ns:  # what it did not say is another matter
-            raise axis.faulty(otherwise)
-        bus.net.take_in(_WAIT_S)
-        yield
+    yield from next_measurement(bus, axis)
 
 
 def write(bus: "DriveExchange", job: Job, axis: DriveAxis, entry: Entry, value: int) -> Steps:

@@ -8,7 +8,7 @@ from typing import Final, TypeVar
 from canopen.emcy import EmcyError
 from canopen.sdo.exceptions import SdoAbortedError
 
-from trade_drivers.can import CanPort
+from trade_drivers.can import CanPort, Listeners
 from trade_drivers.cia402 import _sdo as sdo
 from trade_drivers.cia402 import _table as table
 from trade_drivers.cia402._sdo import Aborted, Transfer
@@ -22,8 +22,6 @@ _ANSWER_S: Final = 0.25
 """Patience for one answer: drives take milliseconds, and nobody is held up, but a busy host takes its time."""
 _KEPT: Final = 8
 """Frames of a server that are looked at; one of them at most is the answer."""
-_SLICE_S: Final = 0.004
-"""Longest wait for a frame before stops are looked for."""
 
 _T = TypeVar("_T")
 Answer = Generator[None, None, _T]
@@ -63,46 +61,13 @@ _CODES: Final = {
 }
 
 
-class Net:
-    """One CAN bus with its nodes. Everything belongs to the thread that owns the port."""
+class Net(Listeners):
+    """One CAN bus with its nodes."""
 
     def __init__(self, port: CanPort, between: Callable[[], None], meanwhile: Callable[[], None]) -> None:
-        self.port = port
-        self._between = between
-        """Called between frames: it may send, but not wait."""
-        self._meanwhile = meanwhile
-        """The same, but only where there is time left."""
-        self._listeners: dict[int, Callable[[bytes], None]] = {}
+        super().__init__(port, between, meanwhile)
         self._answers: dict[int, deque[bytes]] = {}
         """What came from the SDO server of a node."""
-        self._heard_at = 0.0
-        """All that had come by then has been taken in."""
-
-    def hear(self, can_id: int, listener: Callable[[bytes], None]) -> None:
-        """Have frames of an identifier given to a listener."""
-        self._listeners[can_id] = listener
-
-    def take_in(self, seconds: float, enough: Callable[[], bool] = lambda: False) -> None:
-        """Take frames in for that long, or until it is enough; 0 takes in what has come already.
-
-        Raises:
-            PortLost: the bus is gone.
-        """
-        until = time.monotonic() + seconds
-        while True:
-            self._between()
-            if enough():
-                return
-            now = time.monotonic()
-            if now < until:
-                self._meanwhile()
-            frame = self.port.receive(max(0.0, min(until - now, _SLICE_S)))
-            if frame is None:
-                self._heard_at = now
-                if now >= until:
-                    return
-            elif (listener := self._listeners.get(frame.id)) is not None:
-                listener(frame.data)
 
     def command(self, node: int, word: int) -> None:
         """Network management: start a node, and so on. Nobody confirms it."""
@@ -152,7 +117,7 @@ class Net:
             self.port.send(table.SDO_REQUEST + node, request.data)
             give_up_at = time.monotonic() + _ANSWER_S
             while (answer := next(filter(request.is_answered_by, answers), None)) is None:
-                if self._heard_at > give_up_at:
+                if self.heard_until(give_up_at):
                     self.port.send(table.SDO_REQUEST + node, sdo.abort(request, sdo.TIMED_OUT))
                     return None
                 yield

@@ -3,16 +3,19 @@
 from trade_drivers._bus_thread import BusThread, Port
 from trade_drivers._work import Gate, PortLost, Steps
 from trade_drivers.joints._axis import Axis, Goal, Grain, Sample
+from trade_drivers.joints._course import Course, towards
 from trade_drivers.joints._exchange import Exchange
 from trade_drivers.joints._jobs import Job, Manner
 from trade_drivers.joints._motion import Motion
 from trade_drivers.joints._motor import AttachedJoints, BusMotor
+from trade_drivers.joints._waiting import next_measurement, until
 
 __all__ = [
     "AttachedJoints",
     "Axis",
     "BusMotor",
     "BusThread",
+    "Course",
     "Exchange",
     "Gate",
     "Goal",
@@ -24,4 +27,7 @@ __all__ = [
     "PortLost",
     "Sample",
     "Steps",
+    "next_measurement",
+    "towards",
+    "until",
 ]

@@ -8,6 +8,7 @@ from typing import Final
 from trade_hil_sim import _faults as faults
 from trade_hil_sim._errors import SimulationError
 from trade_hil_sim._log import Entry
+from trade_hil_sim._shaft import Shaft
 from trade_hil_sim._state import DeviceState
 from trade_hil_sim.can import Frame
 
@@ -15,7 +16,6 @@ from ._machine import Machine
 from ._modes import MOTION, Mode, Modes
 from ._node import Node
 from ._objects import OBJECTS, SUPPORTED_MODES, Object, pdo_objects
-from ._shaft import Shaft
 from ._states import Command, State
 from ._store import Abort, AbortCode, Store
 

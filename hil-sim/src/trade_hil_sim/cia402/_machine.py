@@ -4,8 +4,9 @@ from collections.abc import Callable
 from math import inf
 from typing import Final
 
+from trade_hil_sim._shaft import Shaft
+
 from ._modes import Modes
-from ._shaft import Shaft
 from ._states import Command, State, command, next_state
 from ._store import Store
 

@@ -5,8 +5,9 @@ from enum import IntEnum
 from math import inf
 from typing import Final
 
+from trade_hil_sim._shaft import STILL, Shaft
+
 from ._homing import Homing
-from ._shaft import STILL, Shaft
 from ._store import Store
 
 __all__ = ["MOTION", "Mode", "Modes"]

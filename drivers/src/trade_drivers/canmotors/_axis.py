@@ -1,0 +1,70 @@
+"""One motor as the bus thread knows it: whether it is here, what was asked of it, what speaks against moving on."""
+
+from abc import abstractmethod
+from math import isfinite
+
+from trade_drivers.joints import Axis, Sample
+
+__all__ = ["MotorAxis", "Unfit"]
+
+
+class Unfit(Exception):
+    """A motor cannot be used as it is; what is wrong, and of which key of the joint."""
+
+    def __init__(self, problem: str, key: str = "") -> None:
+        super().__init__(problem)
+        self.key = key
+
+
+class MotorAxis(Axis):
+    """One motor. While it is ``silent`` it is left out; it comes back only after it was looked over."""
+
+    beat_ns = 0
+    """When it last said anything by itself, or answered."""
+    asked_ns = 0
+    """When it was last asked for a measurement that has not come; 0 if it has."""
+    since_ns = 0
+    """When it was taken on."""
+    stranger = False
+    """It was taken on just now, and may be moving."""
+    hushed = False
+    """It is not asked: whether its watchdog notices that is being tried."""
+
+    @property
+    @abstractmethod
+    def torque(self) -> bool | None:
+        """Whether its motor is powered; None while nobody knows."""
+
+    @property
+    def may_hold_torque(self) -> bool:
+        return self.torque is not False
+
+    def measured_at(self, position: float, velocity: float, effort: float, now_ns: int) -> None:
+        """It has told where it is, in counts: the answer to what it was asked last, if it was asked.
+
+        Dated when it was asked, not when it came: a frozen process would take old values for new.
+        """
+        asked_ns, self.asked_ns = self.asked_ns, 0
+        at_ns = now_ns if self.hushed else asked_ns
+        if self.silent or not at_ns or not all(map(isfinite, (position, velocity, effort))):
+            return
+        self.note(Sample(round(position), round(velocity), round(effort), at_ns))
+
+    def latch(self, fault: str) -> None:
+        """Note what speaks against moving on, until it is enabled again; the first that says something is kept."""
+        self.fault = self.fault or fault
+        self.ready = False
+
+    def forget(self, now_ns: int) -> None:
+        """Leave it out until it was looked over again."""
+        if not self.silent:
+            self.silent, self.silent_since_ns = True, now_ns
+        self.asked_ns, self.hushed = 0, False
+
+    def welcome(self, now_ns: int) -> None:
+        """It is fit and heard."""
+        if self.ready:
+            self.latch("it was away")
+        self.silent, self.silent_since_ns, self.sample = False, now_ns, None
+        self.beat_ns = self.since_ns = now_ns
+        self.asked_ns, self.stranger = 0, True

@@ -1,0 +1,47 @@
+"""Bringing a bus of Damiao motors up."""
+
+from typing import TYPE_CHECKING, Any
+
+from trade.errors import ConfigurationError
+from trade_drivers.canmotors import CanMotorDriver
+from trade_drivers.damiao._axis import DamiaoAxis
+from trade_drivers.damiao._frames import MODELS
+from trade_drivers.robotfile import CanBus, Robot
+
+if TYPE_CHECKING:
+    from trade_drivers.can import CanPort
+    from trade_drivers.canmotors._exchange import MotorExchange
+    from trade_drivers.damiao._exchange import DamiaoExchange
+
+__all__ = ["DamiaoDriver", "open_exchange"]
+
+
+class DamiaoDriver(CanMotorDriver):
+    """Damiao motors on a CAN bus."""
+
+    name = "damiao"
+
+    def exchange(self, robot: Robot, bus: CanBus, wire: "CanPort", port: str) -> "DamiaoExchange":
+        from trade_drivers.damiao._attach import check_bus  # noqa: PLC0415 - python-can is optional
+        from trade_drivers.damiao._exchange import DamiaoExchange  # noqa: PLC0415
+
+        joints = robot.joints_on(bus.name)
+        for joint in joints:
+            if joint.model not in MODELS:
+                problem = f"{joint.model!r} is none of {', '.join(MODELS)}"
+                raise ConfigurationError(where=f'{robot.where}: joint."{joint.name}".model', problem=problem)
+        axes = [
+            DamiaoAxis(f"{robot.name}.{joint.name}", port, joint, bus.rate_hz, robot.coupled_to(joint.name))
+            for joint in joints
+        ]
+        check_bus(bus, axes, robot.where)
+        return DamiaoExchange(wire, bus, axes)
+
+
+def open_exchange(robot: Robot, bus: CanBus, port: str) -> "MotorExchange[Any]":
+    """Open the port and look every motor over, without a thread: ``cycle()`` is the caller's to call.
+
+    Raises:
+        ConfigurationError: the port cannot be had, or a motor is absent, another, or cannot be used as it is.
+    """
+    return DamiaoDriver().open_exchange(robot, bus, port)

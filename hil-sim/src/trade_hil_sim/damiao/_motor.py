@@ -1,0 +1,409 @@
+"""A Damiao motor: registers, modes, status and time-out behind its two identifiers. Time is an argument."""
+
+import struct
+from collections.abc import Callable
+from math import copysign, inf
+from typing import Final
+
+from trade_hil_sim import _faults as faults
+from trade_hil_sim._errors import SimulationError
+from trade_hil_sim._log import Entry
+from trade_hil_sim._shaft import Shaft
+from trade_hil_sim._state import DeviceState
+from trade_hil_sim.can import Frame
+
+from . import _table as table
+from ._codec import Impedance, decode_mit, encode_feedback
+from ._names import ORDERS, TARGETS
+from ._table import MODELS, Mode, Register, Status
+
+__all__ = ["COUNTS_PER_RAD", "Motor"]
+
+COUNTS_PER_RAD: Final = 1000
+"""In the log and in orders: a motor itself tells radians."""
+QUICK: Final = 400.0
+"""The most it accelerates, in rad/s^2: an assumption, as are the two below."""
+COAST: Final = 60.0
+"""What friction slows it down by without torque, in rad/s^2."""
+INERTIA: Final = 0.02
+"""Newton metres for one rad/s^2."""
+FOLLOW_S: Final = 0.02
+"""In which a near set-point is reached, if they come often: an assumption."""
+SLOWEST_S: Final = 0.2
+HARDLY_RAD: Final = 5e-4
+"""Nearer than it can tell."""
+VOLTS: Final = (15.0, 52.0)
+HOTTEST_C: Final = 120
+WARM_C: Final = 30
+
+
+class Motor:
+    """One motor; it is disabled when made.
+
+    Args:
+        device_id: what it listens to, 1 to 15; it answers as that and 16.
+        joint: name of the joint, for the log.
+        model: ``DM4310`` or another of `MODELS`.
+        gear: turns of the motor's own shaft for one turn of the joint.
+        position_rad: where its shaft is at first.
+        reversed_: whether the joint turns against the motor.
+        offset_rad: the joint's angle at 0.
+        t: now, in seconds.
+    """
+
+    def __init__(
+        self,
+        device_id: int,
+        *,
+        joint: str = "",
+        model: str = "DM4310",
+        gear: float = 1.0,
+        position_rad: float = 0.0,
+        reversed_: bool = False,
+        offset_rad: float = 0.0,
+        t: float = 0.0,
+    ) -> None:
+        self.device_id, self.joint, self.model = device_id, joint, model
+        self.send: Callable[[Frame, float], None] = lambda frame, t: None  # noqa: ARG005 - the bus sets it
+        self.emit: Callable[[Entry], None] = lambda entry: None  # noqa: ARG005 - the bus sets it
+        self._joint_rad = (-1 if reversed_ else 1) / gear
+        self._offset_rad = offset_rad
+        self._shaft = Shaft(position_rad, t)
+        self._zero = 0.0
+        """Where its shaft was when it was told to call that 0."""
+        self._goal = position_rad
+        self._registers: dict[int, float] = {}
+        self._power_on()
+        self._status = Status.DISABLED
+        self._lasting: Status | None = None
+        """What it complains of again when it is cleared."""
+        self._frozen: tuple[float, float] | None = None
+        self._celsius = WARM_C
+        self._fed = t
+        self._followed = t
+        self._underway: bool = False
+        self._plan(t)
+
+    def _power_on(self) -> None:
+        ranges = MODELS[self.model]
+        self._registers = dict.fromkeys(sorted(table.KNOWN), 0.0) | {
+            Register.ACCELERATION: QUICK,
+            Register.DECELERATION: -QUICK,
+            Register.MASTER_ID: self.device_id + table.MASTER,
+            Register.ESC_ID: self.device_id,
+            Register.CONTROL_MODE: Mode.MIT,
+            Register.SOFTWARE: 5014,
+            Register.POSITION_MAX: ranges.position_rad,
+            Register.VELOCITY_MAX: ranges.velocity_rad_s,
+            Register.TORQUE_MAX: ranges.torque_nm,
+        }
+
+    @property
+    def ranges(self) -> table.Ranges:
+        """What its numbers mean, as it is set now."""
+        most = (Register.POSITION_MAX, Register.VELOCITY_MAX, Register.TORQUE_MAX)
+        return table.Ranges(*(self._registers[number] for number in most))
+
+    @property
+    def mode(self) -> int:
+        """Which commands it obeys."""
+        return int(self._registers[Register.CONTROL_MODE])
+
+    @property
+    def _enabled(self) -> bool:
+        return self._status is Status.ENABLED
+
+    # the bus
+
+    def hear(self, frame: Frame, t: float) -> None:
+        """A frame has come."""
+        if frame.extended or frame.remote or len(frame.data) < 4:
+            return
+        base, motor = frame.can_id & 0x700, frame.can_id & 0xFF
+        about = frame.can_id == table.EVERYBODY
+        if about and frame.data[:2] != bytes((self.device_id, 0)):
+            return
+        if not about and (motor != self.device_id or base not in {0, *TARGETS}):
+            return
+        self.advance(t)
+        self._fed = t
+        if about:
+            self._asked(frame.data, t)
+        else:
+            self._told(base, frame.data, t)
+        self._plan(t)
+
+    def advance(self, t: float) -> None:
+        """Do what is due by itself."""
+        if self._expires() <= t:
+            self._log("watchdog_expired", t)
+            self._fail(Status.LOST_COMMUNICATION, t)
+        if self._shaft.settles_at is not None and self._shaft.settles_at <= t:
+            self._shaft.settle(t, self.ranges.velocity_rad_s, self._registers[Register.ACCELERATION])
+        self._plan(t)
+
+    def _plan(self, t: float) -> None:
+        moving = self._shaft.moving(t)
+        if moving != self._underway:
+            self._underway = moving
+            self._log("motion_started" if moving else "at_rest", t)
+        ends = self._shaft.actual.ends
+        rests = ends if moving and ends > t and not self._shaft.actual.final_speed else inf
+        settles_at = self._shaft.settles_at
+        self.due = min(self._expires(), rests, inf if settles_at is None else settles_at)
+
+    def _expires(self) -> float:
+        ticks = self._registers[Register.TIMEOUT]
+        return self._fed + ticks / table.TICKS_PER_S if self._enabled and ticks else inf
+
+    # what it is asked
+
+    def _asked(self, data: bytes, t: float) -> None:
+        kind, number = data[2], data[3]
+        match kind:
+            case table.READ if number in self._registers:
+                self._answer(kind, number, t)
+            case table.WRITE if number in self._registers and len(data) == 8:
+                self._write(number, data[4:], t)
+                self._answer(kind, number, t)
+            case table.REFRESH:
+                self._feed_back(t)
+            case _:
+                pass
+
+    def _answer(self, kind: int, number: int, t: float) -> None:
+        value = self._registers[number]
+        body = struct.pack("<I", int(value)) if number in table.WHOLE else struct.pack("<f", value)
+        data = bytes((self.device_id, 0, kind, number)) + body
+        self.send(Frame(int(self._registers[Register.MASTER_ID]), data), t)
+
+    def _write(self, number: int, data: bytes, t: float) -> None:
+        self._journal("write_register", data, number == Register.CONTROL_MODE, t, number)
+        if number not in table.READ_ONLY:
+            [self._registers[number]] = struct.unpack("<I" if number in table.WHOLE else "<f", data)
+
+    def _feed_back(self, t: float) -> None:
+        place = (self._place(t), self._shaft.speed(t)) if self._frozen is None else self._frozen
+        data = encode_feedback(
+            self._status, self.device_id, (*place, self._torque(t)), self.ranges, (self._celsius, self._celsius)
+        )
+        self.send(Frame(int(self._registers[Register.MASTER_ID]), data), t)
+
+    def _torque(self, t: float) -> float:
+        if not self._enabled:
+            return 0.0
+        if self._shaft.jammed and self._shaft.parted:
+            return copysign(self.ranges.torque_nm, self._shaft.behind(t))
+        return self._shaft.actual.at(t)[2] * INERTIA
+
+    # what it is told
+
+    def _told(self, base: int, data: bytes, t: float) -> None:
+        if base == 0 and len(data) == 8 and data[:7] == b"\xff" * 7 and data[7] in ORDERS:
+            self._ordered(data, t)
+        elif base == 0 and len(data) == 8:
+            self._target("mit", Mode.MIT, data, t)
+        elif base in TARGETS:
+            modes = {
+                table.POSITION_VELOCITY: Mode.POSITION_VELOCITY,
+                table.VELOCITY: Mode.VELOCITY,
+                table.FORCE_POSITION: Mode.FORCE_POSITION,
+            }
+            self._target(TARGETS[base], modes[base], data, t)
+        self._feed_back(t)
+
+    def _ordered(self, data: bytes, t: float) -> None:
+        name = ORDERS[data[7]]
+        self._journal(name, data, name in {"enable", "disable"}, t)
+        match name:
+            case "enable":
+                self._enable(t)
+            case "disable":
+                self._let_go(t, Status.DISABLED)
+            case "set_zero":
+                self._zero = self._shaft.position(t)
+                self._goal = 0.0
+            case _:
+                if self._status not in {Status.DISABLED, Status.ENABLED}:
+                    self._status = self._lasting or Status.DISABLED
+
+    def _enable(self, t: float) -> None:
+        if self._status not in {Status.DISABLED, Status.LOST_COMMUNICATION}:
+            self._log("refused", t, self._status.name)
+        elif not self._enabled:
+            self._status = Status.ENABLED
+            self._log("torque_on", t)
+            if self.mode in {Mode.POSITION_VELOCITY, Mode.FORCE_POSITION}:
+                self._go(self._goal, self.ranges.velocity_rad_s, t)
+
+    def _let_go(self, t: float, status: Status) -> None:
+        if self._enabled:
+            self._log("torque_off", t)
+            self._shaft.forget(t)
+            self._shaft.spin(t, 0.0, COAST)
+        self._status = status
+
+    def _fail(self, status: Status, t: float) -> None:
+        self._log("error", t, status.name)
+        self._let_go(t, status)
+
+    def _target(self, name: str, mode: Mode, data: bytes, t: float) -> None:
+        if self.mode != mode:
+            return
+        before = self._goal
+        match mode:
+            case Mode.MIT:
+                self._impede(decode_mit(data, self.ranges), t)
+            case Mode.VELOCITY:
+                [speed] = struct.unpack("<f", data[:4])
+                if self._enabled:
+                    self._shaft.spin(t, speed, self._registers[Register.ACCELERATION])
+            case Mode.POSITION_VELOCITY:
+                self._goal, most = struct.unpack("<ff", data[:8])
+                self._follow(abs(most), before, t)
+            case _:
+                self._goal, speed, _ = struct.unpack("<fHH", data[:8])
+                self._follow(speed / 100, before, t)
+        if self._goal != before or mode is not Mode.POSITION_VELOCITY:
+            self._journal(name, data, True, t)
+
+    def _follow(self, most: float, before: float, t: float) -> None:
+        """Near set-points that come one after the other are run through, not stopped at."""
+        period_s, self._followed = max(FOLLOW_S, 2 * (t - self._followed)), t
+        if not self._enabled or (self._goal == before and not self._shaft.parted):
+            return
+        if period_s > SLOWEST_S or abs(self._goal - self._place(t)) > most * period_s:
+            self._go(self._goal, most, t)
+        else:
+            quick = self._registers[Register.ACCELERATION]
+            self._shaft.track(t, self._goal + self._zero, period_s, most, quick)
+
+    def _impede(self, wanted: Impedance, t: float) -> None:
+        """A spring pulls it to its end at once; without one a damper has it turn, or a torque speeds it up."""
+        if not self._enabled:
+            return
+        most = self.ranges.velocity_rad_s
+        if wanted.stiffness > 0:
+            self._goal = wanted.position_rad
+            self._go(self._goal, most, t)
+        elif wanted.damping > 0:
+            self._shaft.spin(t, wanted.velocity_rad_s, QUICK)
+        else:
+            pull = wanted.torque_nm if abs(wanted.torque_nm) > self.ranges.torque_nm / 1000 else 0.0
+            self._shaft.spin(t, copysign(most, pull) if pull else 0.0, abs(pull) / INERTIA or COAST)
+
+    def _go(self, goal: float, most: float, t: float) -> None:
+        if abs(goal - self._place(t)) < HARDLY_RAD and not self._shaft.moving(t) and not self._shaft.parted:
+            return  # friction holds it
+        self._shaft.go(t, goal + self._zero, most, self._registers[Register.ACCELERATION])
+
+    # faults
+
+    def do(self, command: faults.Command, t: float) -> None:
+        """Carry out a fault or an order; raises `SimulationError` for what it has not got."""
+        self.advance(t)
+        match command:
+            case faults.Freeze():
+                self._frozen = (self._place(t), 0.0) if command.on else None
+            case faults.Jam():
+                self._shaft.jam(command.on, t)
+            case faults.Place():
+                self._shaft.place(command.counts / COUNTS_PER_RAD + self._zero, t)
+                self._shaft.forget(t)
+                self._log("placed", t)
+            case faults.WrongModel():
+                self._registers[Register.POSITION_MAX] = float(command.number)
+            case faults.BrownOut():
+                self._log("brown_out", t)
+                self._let_go(t, Status.DISABLED)
+                self._power_on()
+            case faults.HardwareFault():
+                self._fail(Status(command.bits), t)
+            case faults.Supply():
+                self._supply(command, t)
+            case faults.BusOff():
+                self._log("bus_off" if command.on else "restarted", t)
+            case _:
+                raise SimulationError(f"{type(command).__name__} is nothing a Damiao motor can have")
+        self._plan(t)
+
+    def _supply(self, command: faults.Supply, t: float) -> None:
+        self._lasting = None
+        if command.temperature_c is not None:
+            self._celsius = command.temperature_c
+            self._lasting = Status.ROTOR_TOO_HOT if self._celsius > HOTTEST_C else None
+        if command.voltage_v is not None and not VOLTS[0] <= command.voltage_v <= VOLTS[1]:
+            self._lasting = Status.UNDER_VOLTAGE if command.voltage_v < VOLTS[0] else Status.OVER_VOLTAGE
+        if self._lasting is not None:
+            self._fail(self._lasting, t)
+
+    def heal(self, t: float) -> None:
+        """End every fault of sensors and shaft; errors stay until they are cleared."""
+        self.advance(t)
+        self._frozen, self._lasting, self._celsius = None, None, WARM_C
+        self._registers[Register.POSITION_MAX] = MODELS[self.model].position_rad
+        if self._shaft.jammed:
+            self._shaft.jam(False, t)
+            if self._enabled and self.mode == Mode.POSITION_VELOCITY:
+                self._go(self._goal, self.ranges.velocity_rad_s, t)
+        self._plan(t)
+
+    # the truth
+
+    def _place(self, t: float) -> float:
+        return self._shaft.position(t) - self._zero
+
+    def _truth(self, t: float) -> tuple[int, float]:
+        place = self._place(t)
+        return round(place * COUNTS_PER_RAD), self._offset_rad + place * self._joint_rad
+
+    def _log(self, name: str, t: float, detail: str = "") -> None:
+        counts, angle_rad = self._truth(t)
+        self.emit(
+            Entry(
+                t,
+                "",
+                "event",
+                name,
+                self.device_id,
+                joint=self.joint,
+                position_counts=counts,
+                position_rad=angle_rad,
+                detail=detail,
+            )
+        )
+
+    def _journal(self, name: str, data: bytes, moves: bool, t: float, address: int | None = None) -> None:
+        self.emit(
+            Entry(
+                t,
+                "",
+                "instruction",
+                name,
+                self.device_id,
+                joint=self.joint,
+                hex=data.hex(),
+                address=address,
+                moves=moves,
+            )
+        )
+
+    def state(self, t: float) -> DeviceState:
+        """The truth about it."""
+        self.advance(t)
+        counts, angle_rad = self._truth(t)
+        return DeviceState(
+            device_id=self.device_id,
+            joint=self.joint,
+            model=self.model,
+            position_counts=counts,
+            position_rad=angle_rad,
+            velocity_rad_s=self._shaft.speed(t) * self._joint_rad,
+            goal_counts=round(self._goal * COUNTS_PER_RAD),
+            torque=self._enabled,
+            moving=self._shaft.moving(t),
+            operating_mode=self.mode,
+            hardware_error=int(self._status) if self._status >= Status.OVER_VOLTAGE else 0,
+            watchdog=round(self._registers[Register.TIMEOUT]),
+            absent=False,
+        )
