@@ -88,8 +88,17 @@ def walk(scene: Stage, judge: Judge) -> None:
     judge.walked(began_s, stood_s)
 
 
+def greet(scene: Stage, judge: Judge, control: SimControl) -> None:
+    title(5, "Rosie greets", "Two arms and a tail by three vendors, on three kinds of wire, move under one lock.")
+    began_s = time.monotonic()
+    with scene.behaviour("greet.py") as greeting:
+        greeting.hear("one lock")
+        greeting.hear_out()
+    judge.greeted(began_s, control, with_left="left_arm" not in scene.left_out)
+
+
 def grip(scene: Stage, control: SimControl) -> None:
-    title(5, "The left hand grips", "A gripper is a service like any other; it is never activated by itself.")
+    title(6, "The left hand grips", "A gripper is a service like any other; it is never activated by itself.")
     control.put(OBJECT_M, bus="hand")
     with scene.behaviour("grip.py") as gripping:
         gripping.hear("holding")
@@ -101,7 +110,7 @@ def grip(scene: Stage, control: SimControl) -> None:
 
 
 def stop_everything(judge: Judge) -> None:
-    title(6, "Everything stops", "An e-stop reaches every container and holds until it is cleared. Not safety-rated.")
+    title(7, "Everything stops", "An e-stop reaches every container and holds until it is cleared. Not safety-rated.")
     look = trade.find(HEAD & where(name="move_to"))
     look([-ALL_THE_WAY_RAD, 0.0])
     began_s = time.monotonic()
@@ -119,7 +128,7 @@ def stop_everything(judge: Judge) -> None:
 
 
 def come_back(scene: Stage, look: trade.Handle) -> None:
-    title(7, "The robot leaves and comes back", "A handle is of one boot: no call reaches who came after it.")
+    title(8, "The robot leaves and comes back", "A handle is of one boot: no call reaches who came after it.")
     expect((errors.ServiceGone, errors.ContainerLost), lambda: look([0.0, 0.0]))
     with scene.robot(scene.folder / "again.jsonl"):
         again = trade.find(HEAD & where(name="move_to"), wait_s=PATIENCE_S)
@@ -139,7 +148,9 @@ def expect(kind: type[Exception] | tuple[type[Exception], ...], act: Callable[[]
 def tell(scene: Stage, *, mute: bool, stay: bool) -> None:
     log = scene.folder / "bytes.jsonl"
     with scene.robot(log) as ready, SimControl(ready["control"]) as control:
-        print(f"\nRosie is up on her network: a head, a left hand, two legs; {len(ready['services'])} services.")
+        print(f"\nRosie is up on her network: head, arms, hand, legs and tail; {len(ready['services'])} services.")
+        for bus, missing in scene.left_out.items():
+            print(f"Left out: bus {bus}. Not installed: {missing}, of which there are no wheels for every platform.")
         if mute:
             control.mute(bus="neck")
             print("The simulator was muted: the servos of the head no longer answer.")
@@ -149,6 +160,7 @@ def tell(scene: Stage, *, mute: bool, stay: bool) -> None:
         visit(scene)
         arbitrate(scene, judge)
         walk(scene, judge)
+        greet(scene, judge, control)
         grip(scene, control)
         stop_everything(judge)
         look = trade.find(HEAD & where(name="move_to"))

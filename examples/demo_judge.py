@@ -6,12 +6,13 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TypeVar
 
+import greet
 import msgspec
 import walk
 from demo_stage import PATIENCE_S, ROBOT, DemoFailed
 
 import trade_drivers
-from trade_hil_sim import Entry, events, frames, motion_writes, read_log
+from trade_hil_sim import Entry, SimControl, events, frames, motion_writes, read_log
 
 AGREE_RAD = 0.02
 """A servo's own dead band is about a tenth of this."""
@@ -93,6 +94,29 @@ class Judge:
         print(f"    neck.pan        came to rest {len(meanwhile)} times meanwhile: the head's lock is another one")
         if not meanwhile:
             raise DemoFailed("the head did not look around during the walk")
+
+    def greeted(self, began_s: float, control: SimControl, *, with_left: bool) -> None:
+        """The tail wagged, the right arm rose and sank, and the left arm left its pose and came back to it."""
+        say("of three other wires:")
+        lift = greet.RAISED[1]
+        expected = {
+            "tail.root": [wag[0] for wag in greet.WAGS],
+            "right.shoulder.lift": [lift, greet.LOWERED[1]],
+        }
+        for joint, through in expected.items():
+            angles = [entry.position_rad or 0.0 for entry in self.rests(joint, began_s)]
+            if not _in_order(through, angles):
+                raise DemoFailed(f"{joint} should have come to rest at {through}, but was at {angles}")
+            print(f"    {joint:<19} came to rest at {', '.join(f'{angle:+.2f}' for angle in through)} rad")
+        if not with_left:
+            return
+        [arm] = self._robot.arms
+        bases = [msgspec.json.decode(entry.detail, type=list[float])[0] for entry in self.rests(arm.name, began_s)]
+        through = [arm.poses[name][0] for name in ("wave", "home")]
+        if not _in_order(through, bases):
+            raise DemoFailed(f"the left arm should have gone {through}, but was at {bases}")
+        truth = control.arm(arm.name)
+        print(f"    {arm.name:<19} base at {', '.join(f'{angle:+.2f}' for angle in through)} rad; {truth.robot_mode}")
 
     def _knee_targets(self, since: float) -> list[float]:
         """The angles of all frames that command the left knee."""

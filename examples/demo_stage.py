@@ -20,6 +20,7 @@ from collections.abc import Generator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any
 
+from trade_drivers import Bus, Driver, load, load_driver
 from trade_gateway._pki import Authority
 
 HERE = Path(__file__).parent
@@ -133,6 +134,8 @@ class Stage:
         self.places = places
         self.system = f"demo-{secrets.token_hex(3)}"
         self._complaints = folder / "complaints"
+        self.left_out = {bus.name: missing for bus in load(ROBOT).buses if (missing := _missing(bus))}
+        """Buses of the robot whose driver lacks a library, and which; not every vendor has one for every platform."""
 
     def complaints(self) -> list[str]:
         """What the robot and the gateway warned of last."""
@@ -153,6 +156,7 @@ class Stage:
     def robot(self, log: Path) -> Generator[dict[str, Any]]:
         """Rosie with simulated devices, on her own network; yields what she says when she is up."""
         words = [*_TRADE, "up", ROBOT, "--sim", "--sim-log", log, "--json"]
+        words += [word for bus in self.left_out for word in ("--without", bus)]
         with self._started("rosie", words, self.environment("robot", "rosie"), "robot") as rosie:
             yield rosie.ready()
 
@@ -221,6 +225,10 @@ def stage(folder: Path, *, loopback: bool) -> Generator[Stage]:
         undo.callback(_restore, before)
         os.environ.update(made.environment("lab", "anna"))
         yield made
+
+
+def _missing(bus: Bus) -> str:
+    return ", ".join(load_driver(bus.driver, bus.name, Driver).missing())
 
 
 def _restore(environment: Mapping[str, str]) -> None:

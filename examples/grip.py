@@ -10,7 +10,7 @@ import sys
 import trade
 from trade import errors, where
 
-HAND = where(kind="Gripper", group="rosie.left")
+HAND = where(group="rosie.left.hand")
 
 
 def grip() -> None:

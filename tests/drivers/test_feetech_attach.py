@@ -100,7 +100,7 @@ def test_a_slow_bus_is_refused_a_fast_cycle(rig: TailRig) -> None:
 def test_the_arm_of_the_examples_attaches_and_its_six_joints_arrive_together(rig: TailRig) -> None:
     rig.robot = load(EXAMPLE)
     rig.plug()
-    arm = rig.attach(ports={"arm": str(rig.sim.port)}).group("arm")
+    arm = rig.attach(ports={"right_arm": str(rig.sim.port)}).group("right.arm")
     arm.enable()
     goals = [0.3, -0.2, 0.25, 0.1, -0.3, 0.4]
     mark = written_now()

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from robots import HAND, HEAD
 from trade.errors import ConfigurationError
@@ -216,11 +217,14 @@ def test_grippers_are_records_and_members_like_joints() -> None:
 def test_rosie_is_her_parts() -> None:
     examples = Path(__file__).parents[2] / "examples"
     whole = load(examples / "rosie.toml")
-    parts = [load(examples / name) for name in ("head.toml", "hand.toml", "legs.toml")]
+    parts = [load(examples / name) for name in ("head.toml", "hand.toml", "servo_arm.toml", "legs.toml", "tail.toml")]
+    [left_arm], [arm] = whole.arms, load(examples / "arm.toml").arms
     assert whole.joints == [joint for part in parts for joint in part.joints]
     assert whole.grippers == [gripper for part in parts for gripper in part.grippers]
     assert whole.groups == [group for part in parts for group in part.groups]
-    assert [bus.name for bus in whole.buses] == [bus.name for part in parts for bus in part.buses]
+    named = [bus.name for part in parts for bus in part.buses]
+    assert [bus.name for bus in whole.buses if bus.name != left_arm.bus] == named
+    assert replace(left_arm, name=arm.name, bus=arm.bus, poses=arm.poses) == arm
 
 
 GRIPPER_MISTAKES = [

@@ -51,7 +51,7 @@ def test_a_library_that_is_missing_is_named_with_what_installs_it(
     monkeypatch: pytest.MonkeyPatch, needed: bool, level: str
 ) -> None:
     assert only(host.libraries(["dynamixel"], needed=needed)).level == "ok"
-    monkeypatch.setattr(host, "find_spec", lambda name: None if name == "dynamixel_sdk" else object())
+    monkeypatch.setattr("trade_drivers._driver.find_spec", lambda name: None if name == "dynamixel_sdk" else object())
     found = only(host.libraries(["dynamixel"], needed=needed))
     assert (found.level, found.text) == (level, "needs dynamixel_sdk")
     assert found.fix == 'pip install "trade-drivers[dynamixel]"'

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import trade
-from system.conftest import DORA, ROSIES_HEAD
+from system.conftest import DORA, ROOT, ROSIES_HEAD
 from trade import where
 from trade_hil_sim import SimControl, SimProcess, events, motion_writes, read_log
 from waiting import wait_until
@@ -265,3 +265,18 @@ def test_a_mistake_only_the_simulator_sees_is_one_line(trade_command: Command, t
 def test_documented_services_keep_their_types(rosie_up, trade_command: Command) -> None:
     rosie_up()
     assert "positions_rad: list[float]" in trade_command("services", "--group", "rosie.head", "--doc").stdout
+
+
+def test_what_is_left_out_of_a_robot_is_named_and_not_looked_for(run, trade_command: Command) -> None:
+    rosie = ROOT / "examples" / "rosie.toml"
+    out = [word for part in ("left_arm", "hand", "right_arm", "legs") for word in ("--without", part)]
+    up = run("-m", "trade_gateway", "up", rosie, "--sim", *out)
+    assert "left out: right.shoulder.pan, " in (said := up.line())
+    assert said.endswith(", left.hand, left.arm, right.arm, legs\n")
+    while up.line() != "Ctrl-C leaves\n":
+        pass
+    listed = json.loads(trade_command("services", "--group", "rosie", "--json").stdout)
+    stayed = ("neck.pan", "neck.tilt", "head", "tail.root", "tail.tip", "tail", "bus.tail")
+    assert {group for each in listed for group in each["groups"]} == {f"rosie.{name}" for name in stayed}
+    nothing = trade_command("up", rosie, *out, "--without", "neck", "--without", "tail")
+    assert "nothing would be left" in nothing.stderr

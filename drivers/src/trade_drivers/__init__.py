@@ -11,6 +11,7 @@ from trade_drivers._plan import FollowProgress, JointLimits, Plan, Tolerances
 from trade_drivers._polled import Measured, PolledSensor
 from trade_drivers._senses import UNITS, Camera, CameraInfo, Image, Reading, Sensor, SensorInfo
 from trade_drivers._trajectory import Trajectory, TrajectoryPoint
+from trade_drivers._without import without
 from trade_drivers._work import WireError
 from trade_drivers.robotfile import Bus, CanBus, Coupled, Group, Joint, Robot, SerialBus, UrBus, parse
 
@@ -64,4 +65,5 @@ __all__ = [
     "load_driver",
     "parse",
     "scan",
+    "without",
 ]

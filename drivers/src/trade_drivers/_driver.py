@@ -3,6 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from importlib.metadata import EntryPoint, entry_points
+from importlib.util import find_spec
 from typing import ClassVar, TypeVar
 
 from trade.errors import ConfigurationError
@@ -67,6 +68,11 @@ class AnyDriver:
     """What finds its devices and sets them up; None if they are set up otherwise."""
     modules: ClassVar[tuple[str, ...]] = ()
     """What of others it imports; installed with the extra of its name."""
+
+    @classmethod
+    def missing(cls) -> list[str]:
+        """Those of its modules that are not installed."""
+        return [module for module in cls.modules if find_spec(module) is None]
 
 
 class Driver(AnyDriver, ABC):

@@ -6,7 +6,6 @@ import socket
 import subprocess
 from collections.abc import Iterator, Sequence
 from datetime import datetime, timedelta, timezone
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Final, Literal
 
@@ -72,7 +71,7 @@ def latencies(folder: Path = _LATENCIES) -> Iterator[Finding]:
 def libraries(names: Sequence[str], *, needed: bool) -> Iterator[Finding]:
     """Whether the vendor libraries of drivers are installed."""
     for name in names:
-        missing = [module for module in load_driver(name, "driver", AnyDriver).modules if find_spec(module) is None]
+        missing = load_driver(name, "driver", AnyDriver).missing()
         if not missing:
             yield Finding(level="ok", about=f"driver {name}", text="its libraries are installed")
             continue

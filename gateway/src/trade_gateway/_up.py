@@ -12,7 +12,7 @@ import typer
 
 from trade import Container
 from trade.errors import ConfigurationError
-from trade_drivers import attach, load
+from trade_drivers import attach, load, without
 from trade_drivers.robotfile import Robot
 from trade_gateway._detached import Detach, detach_now, ready
 from trade_gateway._faults import FaultWatch
@@ -28,6 +28,10 @@ def up(
     robot_file: Annotated[Path, typer.Argument(metavar="ROBOT.toml", help="The robot file.")],
     sim: Annotated[bool, typer.Option("--sim", help="Simulate the devices: the same bytes, no hardware.")] = False,
     sim_log: Annotated[Path | None, typer.Option(help="With --sim: where to write the log of all bytes.")] = None,
+    leave_out: Annotated[
+        list[str] | None,
+        typer.Option("--without", metavar="PART", help="A bus, camera or sensor to leave out; again for another."),
+    ] = None,
     name: Annotated[str | None, typer.Option(help="Name of the container; by default the robot's.")] = None,
     detach: Detach = False,
     as_json: Json = False,
@@ -39,17 +43,19 @@ def up(
     if sim_log is not None and not sim:
         raise UsageError(where="--sim-log", problem="is the log of the simulator; it needs --sim")
     out = Output(as_json=as_json)
-    robot = load(robot_file)
+    robot, left_out = without(load(robot_file), leave_out or [])
     if detach:
         detach_now(out, choice_of(context).settings(name or robot.name))
         return
     with ExitStack() as stack:
         asked_to_leave = stack.enter_context(leaving())
-        simulation = stack.enter_context(_simulation(robot_file, sim_log)) if sim else None
+        simulation = stack.enter_context(_simulation(robot, sim_log)) if sim else None
         ports: dict[str, str] | None = simulation.ports if simulation else None
         container = stack.enter_context(Container(choice_of(context).settings(name or robot.name)))
         container.terminating.close = asked_to_leave.set
         refuse_twice(container, "trade up")
+        if left_out:
+            out.say(f"[bold]{robot.name}[/]: left out: {', '.join(left_out)}")
         _say_attaching(out, robot, ports)
         attached = stack.enter_context(
             attach(
@@ -87,16 +93,17 @@ def leaving() -> Generator[threading.Event]:
             signal.signal(number, handler)
 
 
-def _simulation(robot_file: Path, log: Path | None) -> Any:
+def _simulation(robot: Robot, log: Path | None) -> Any:
     try:
         from trade_hil_sim import SimProcess, SimulationError, remove_leftovers  # noqa: PLC0415 - only needed without hardware
     except ImportError:
         raise ConfigurationError(where="--sim", problem="needs trade-hil-sim; pip install trade-hil-sim") from None
     remove_leftovers()
     try:
-        return SimProcess(robot_file, log=log, logged=log is not None)
+        parts = [part.name for part in (*robot.buses, *robot.cameras, *robot.sensors)]
+        return SimProcess(robot.where, buses=parts, log=log, logged=log is not None)
     except SimulationError as problem:
-        raise ConfigurationError(where=str(robot_file), problem=str(problem)) from None
+        raise ConfigurationError(where=robot.where, problem=str(problem)) from None
 
 
 def refuse_twice(container: Container, command: str) -> None:

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from importlib.util import find_spec
 from typing import Final, NoReturn
 
 from trade.errors import ConfigurationError
@@ -21,7 +20,6 @@ from trade_drivers.ur._ur_arm import UrArm
 __all__ = ["UrDriver"]
 
 _MODELS: Final = ("UR3", "UR3e", "UR5", "UR5e", "UR10", "UR10e", "UR16e")
-_MODULES: Final = ("rtde_control", "rtde_receive", "rtde_io")
 _ASK_S: Final = 1.0
 
 
@@ -47,13 +45,13 @@ class AttachedController(AttachedBus):
 class UrDriver(Driver):
     """Arms of Universal Robots, through ur-rtde."""
 
-    modules = _MODULES
+    modules = ("rtde_control", "rtde_receive", "rtde_io")
 
     def attach(self, robot: Robot, bus: Bus, port: str, healthy: Callable[[], bool]) -> AttachedBus:
         where = f"{robot.where}: bus.{bus.name}"
         if not isinstance(bus, UrBus):
             _wrong(where, 'driver ur needs a controller: host = "192.168.0.10"')
-        if missing := [name for name in _MODULES if find_spec(name) is None]:
+        if missing := self.missing():
             problem = (
                 f'needs ur-rtde ({missing[0]} is missing); pip install "trade-drivers[ur]", or on platforms without'
             )
