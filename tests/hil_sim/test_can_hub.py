@@ -78,8 +78,10 @@ class Parrot:
         )
 
 
-def label(frame: Frame) -> tuple[str, int | None]:
-    return ("ask", None) if frame.can_id == 0x100 else ("answer", frame.can_id & 0xF)
+class Labelled(CanBus):
+    @staticmethod
+    def label(frame: Frame) -> tuple[str, int | None]:
+        return ("ask", None) if frame.can_id == 0x100 else ("answer", frame.can_id & 0xF)
 
 
 @pytest.fixture
@@ -87,7 +89,7 @@ def make_can() -> Iterator[Callable[..., CanBus]]:
     opened: list[CanBus] = []
 
     def make(*ids: int, paced: bool = False, **options: Any) -> CanBus:
-        bus = CanBus([Parrot(i) for i in ids], paced=paced, label=label, **options)
+        bus = Labelled([Parrot(i) for i in ids], paced=paced, **options)
         opened.append(bus.open())
         return bus
 

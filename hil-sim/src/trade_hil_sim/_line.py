@@ -8,13 +8,11 @@ import os
 import select
 import threading
 import time
-from collections import deque
 from collections.abc import Callable
-from concurrent.futures import Future
-from contextlib import suppress
 from pathlib import Path
 from typing import Final, NamedTuple, Protocol
 
+from ._errands import Errands
 from ._errors import SimulationError
 from ._log import ByteLog, Entry
 from ._terminal import Terminal
@@ -73,7 +71,7 @@ class SerialLine:
         self._order = 0
         self._wire_free_at = 0.0
         self._baud: int | None = None
-        self._asked: deque[tuple[Callable[[], None], Future[None]]] = deque()
+        self._errands = Errands(f"bus {name}", ANSWER_S)
         self._closing = False
         self._terminal: Terminal | None = None
         self._thread: threading.Thread | None = None
@@ -84,10 +82,8 @@ class SerialLine:
             raise SimulationError(f"bus {self.name} is open, or was; make a new one")
         self._terminal = Terminal(self.link)
         self._epoll = select.epoll()
-        self._bell, self._rope = os.pipe()
-        os.set_blocking(self._bell, False)
-        os.set_blocking(self._rope, False)
-        self._epoll.register(self._bell, select.EPOLLIN)
+        self._errands.open()
+        self._epoll.register(self._errands.bell, select.EPOLLIN)
         self._epoll.register(self._terminal.master, select.EPOLLIN)
         self._thread = threading.Thread(target=self._run, name=f"sim-{self.name}", daemon=True)
         self._thread.start()
@@ -136,8 +132,7 @@ class SerialLine:
 
     def nudge(self) -> None:
         """Ask the peer again when it wants to be woken; call this when it has changed its mind."""
-        if self._thread is not None and not self._closing:
-            self._ring()
+        self._errands.ring()
 
     def close(self) -> None:
         """Hang up, end the thread, remove the link. Idempotent."""
@@ -145,7 +140,7 @@ class SerialLine:
         if thread is None or self._closing:
             return
         self._closing = True
-        self._ring()
+        self._errands.ring()
         if threading.current_thread() is not thread:
             thread.join(ANSWER_S)
 
@@ -160,16 +155,7 @@ class SerialLine:
     def _in_thread(self, act: Callable[[], None]) -> None:
         if threading.current_thread() is self._thread:
             return act()
-        if self._closing or self._thread is None:
-            raise SimulationError(f"bus {self.name} is closed")
-        done: Future[None] = Future()
-        self._asked.append((act, done))
-        self._ring()
-        return done.result(ANSWER_S)
-
-    def _ring(self) -> None:
-        with suppress(OSError):
-            os.write(self._rope, b"!")
+        return self._errands.ask(act)
 
     def _run(self) -> None:
         try:
@@ -178,15 +164,13 @@ class SerialLine:
         finally:
             self._closing = True
             self._unplug("closed")
-            self._turn_away()
+            self._errands.close()
             self._epoll.close()
-            os.close(self._bell)
-            os.close(self._rope)
 
     def _step(self) -> None:
         for fd, _ in self._epoll.poll(self._patience_s()):
-            if fd == self._bell:
-                self._obey()
+            if fd == self._errands.bell:
+                self._errands.run()
             else:
                 self._read()
         wake_in_s = self._peer.wake_in_s()
@@ -249,22 +233,6 @@ class SerialLine:
 
     def _byte_s(self) -> float:
         return BITS_PER_BYTE / self._baud if self._baud else 0.0
-
-    def _obey(self) -> None:
-        with suppress(BlockingIOError):
-            os.read(self._bell, 4096)
-        while self._asked:
-            act, done = self._asked.popleft()
-            try:
-                act()
-            except Exception as problem:  # noqa: BLE001  # handed to the thread that asked
-                done.set_exception(problem)
-            else:
-                done.set_result(None)
-
-    def _turn_away(self) -> None:
-        while self._asked:
-            self._asked.popleft()[1].set_exception(SimulationError(f"bus {self.name} is closed"))
 
     def _unplug(self, event: str = "unplugged") -> None:
         terminal, self._terminal = self._terminal, None

@@ -1,8 +1,9 @@
 """A simulated CAN bus: a wire with arbitration and bit rate, and an adapter for several clients of socketcand."""
 
 from ._bus import CanBus
-from ._device import Device, Label
+from ._device import Device
 from ._frame import Frame
+from ._joint_bus import JointBus
 from ._text import Reader, error_text, frame_text, parse_send
 from ._wire import Referee, Station, Wire
 
@@ -10,7 +11,7 @@ __all__ = [
     "CanBus",
     "Device",
     "Frame",
-    "Label",
+    "JointBus",
     "Reader",
     "Referee",
     "Station",

@@ -1,12 +1,8 @@
 """A simulated CAN bus: devices on a wire that several clients reach through one adapter, with a log and faults."""
 
-import os
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import Future
-from contextlib import suppress
 from dataclasses import replace
 from math import inf
 from operator import attrgetter
@@ -15,12 +11,13 @@ from typing import Final, TypeVar
 import msgspec
 
 from trade_hil_sim import _faults as faults
+from trade_hil_sim._errands import Errands
 from trade_hil_sim._errors import SimulationError
 from trade_hil_sim._log import ByteLog, Entry
 from trade_hil_sim._state import BusState
 
 from ._adapter import Adapter, Client
-from ._device import Device, Label, plain
+from ._device import Device
 from ._frame import Frame
 from ._hub import Hub
 from ._interface import Interface
@@ -50,9 +47,13 @@ class CanBus:
         bitrate: bits a second, if paced.
         log: where to record; default: a log in memory, at `log`.
         paced: let frames take as long as on a real wire; else none takes time.
-        label: says what frames are.
         interface: a ``vcan`` of the system that the devices sit on, instead of a server of their own.
     """
+
+    @staticmethod
+    def label(frame: Frame) -> tuple[str, int | None]:  # noqa: ARG004 - without a protocol there is nothing to tell
+        """What a frame is, for the log and for faults: its name, and the id of the device it comes from or goes to."""
+        return "", None
 
     def __init__(
         self,
@@ -63,12 +64,10 @@ class CanBus:
         bitrate: int = 1_000_000,
         log: ByteLog | None = None,
         paced: bool = True,
-        label: Label = plain,
         interface: str = "",
     ) -> None:
         self.name = name
         self.log = ByteLog() if log is None else log
-        self._label = label
         self._devices = list(devices)
         self._script = faults.Script()
         self._echo = False
@@ -78,7 +77,7 @@ class CanBus:
         self._wall_offset_s = time.time() - time.monotonic()
         self._clients: dict[Client, Station] = {}
         self._stations = {device.device_id: self._attach(device) for device in self._devices}
-        self._asked: deque[Callable[[], None]] = deque()
+        self._errands = Errands(f"bus {name}", ANSWER_S)
         self._closing = False
         self._thread: threading.Thread | None = None
 
@@ -111,8 +110,7 @@ class CanBus:
         if self._thread is not None:
             raise SimulationError(f"bus {self.name} is open, or was; make a new one")
         self._adapter.open()
-        self._bell, self._rope = os.pipe()
-        os.set_blocking(self._rope, False)
+        self._errands.open()
         self._thread = threading.Thread(target=self._run, name=f"sim-{self.name}", daemon=True)
         self._thread.start()
         return self
@@ -123,7 +121,7 @@ class CanBus:
         if thread is None or self._closing:
             return
         self._closing = True
-        self._ring()
+        self._errands.ring()
         thread.join(ANSWER_S)
 
     def __enter__(self) -> "CanBus":
@@ -151,36 +149,19 @@ class CanBus:
             raise SimulationError(f"bus {self.name} is closed")
         if self._thread is None or threading.current_thread() is self._thread:
             return act()
-        done: Future[_T] = Future()
-
-        def obey() -> None:
-            try:
-                done.set_result(act())
-            except Exception as problem:  # noqa: BLE001  # handed to the thread that asked
-                done.set_exception(problem)
-
-        self._asked.append(obey)
-        self._ring()
-        return done.result(ANSWER_S)
-
-    def _ring(self) -> None:
-        with suppress(OSError):
-            os.write(self._rope, b"!")
+        return self._errands.ask(act)
 
     def _run(self) -> None:
         try:
             while not self._closing:
-                if self._adapter.serve(self._bell, self._patience_s(), self._pass_time):
-                    os.read(self._bell, 4096)
-                    while self._asked:
-                        self._asked.popleft()()
+                if self._adapter.serve(self._errands.bell, self._patience_s(), self._pass_time):
+                    self._errands.run()
                 self._pass_time(time.monotonic())
                 self._adapter.flush()
         finally:
             self._closing = True
             self._adapter.close()
-            os.close(self._bell)
-            os.close(self._rope)
+            self._errands.close()
 
     def _patience_s(self) -> float:
         due = min((device.due for device in self._devices), default=inf)
@@ -288,7 +269,7 @@ class CanBus:
         """A frame's name, and whose faults concern it; a client's frame only suffers from those that name it."""
         if self._script.empty:
             return "", None
-        name, node = self._label(frame)
+        name, node = self.label(frame)
         if station.device_id is not None:
             return name, (station.device_id,)
         if not self._script.names(name):
@@ -354,7 +335,7 @@ class CanBus:
 
     def _frame(self, name: str, sender: Station, frame: Frame, t: float) -> None:
         """A frame that got through has its own name; one that did not is an event."""
-        label, node = self._label(frame)
+        label, node = self.label(frame)
         entry = Entry(
             t,
             self.name,

@@ -9,10 +9,7 @@ from trade_hil_sim._state import DeviceState
 
 from ._frame import Frame
 
-__all__ = ["Device", "Label", "plain"]
-
-Label = Callable[[Frame], "tuple[str, int | None]"]
-"""Says what a frame is, for the log and for faults: its name, and the id of the device it comes from or goes to."""
+__all__ = ["Device"]
 
 
 class Device(Protocol):
@@ -46,8 +43,3 @@ class Device(Protocol):
     def state(self, t: float) -> DeviceState:
         """The truth about it."""
         ...
-
-
-def plain(frame: Frame) -> tuple[str, int | None]:  # noqa: ARG001 - a label is asked about a frame
-    """The label of a bus without a protocol: no frame has a name or a device."""
-    return "", None

@@ -1,13 +1,10 @@
 """A simulated controller with its arm: the three ports clients know, one thread, faults, and the log."""
 
-import os
 import random
 import socket
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, TypeVar
@@ -15,6 +12,7 @@ from typing import TYPE_CHECKING, Final, TypeVar
 import msgspec
 
 from trade_hil_sim import _faults as faults
+from trade_hil_sim._errands import Errands
 from trade_hil_sim._errors import SimulationError
 from trade_hil_sim._log import ByteLog, Entry
 from trade_hil_sim._ready import ready
@@ -84,7 +82,7 @@ class UrBus:
         self._sessions: dict[Client, RtdeSession] = {}
         self._count = 0
         self._boots_at: float | None = None
-        self._asked: deque[Callable[[], None]] = deque()
+        self._errands = Errands(f"bus {name}", ANSWER_S)
         self._closing = False
         self._thread: threading.Thread | None = None
 
@@ -117,8 +115,7 @@ class UrBus:
         if self._thread is not None:
             raise SimulationError(f"bus {self.name} is open, or was; make a new one")
         self._listen()
-        self._bell, self._rope = os.pipe()
-        os.set_blocking(self._rope, False)
+        self._errands.open()
         self.arm.t = time.monotonic()
         self._thread = threading.Thread(target=self._run, name=f"sim-{self.name}", daemon=True)
         self._thread.start()
@@ -129,7 +126,7 @@ class UrBus:
         if self._thread is None or self._closing:
             return
         self._closing = True
-        self._ring()
+        self._errands.ring()
         self._thread.join(ANSWER_S)
 
     def __enter__(self) -> "UrBus":
@@ -153,21 +150,7 @@ class UrBus:
             raise SimulationError(f"bus {self.name} is closed")
         if self._thread is None or threading.current_thread() is self._thread:
             return act()
-        done: Future[_T] = Future()
-
-        def obey() -> None:
-            try:
-                done.set_result(act())
-            except Exception as problem:  # noqa: BLE001  # handed to the thread that asked
-                done.set_exception(problem)
-
-        self._asked.append(obey)
-        self._ring()
-        return done.result(ANSWER_S)
-
-    def _ring(self) -> None:
-        with suppress(OSError):
-            os.write(self._rope, b"!")
+        return self._errands.ask(act)
 
     def _run(self) -> None:
         try:
@@ -180,11 +163,10 @@ class UrBus:
         finally:
             self._closing = True
             self._hang_up()
-            os.close(self._bell)
-            os.close(self._rope)
+            self._errands.close()
 
     def _serve(self) -> None:
-        watched: list[int | Client | socket.socket] = [self._bell, *self._listeners.values()]
+        watched: list[int | Client | socket.socket] = [self._errands.bell, *self._listeners.values()]
         watched += [] if self._absent else list(self._clients)
         readable = ready(watched, [client for client in self._clients if client.unsent], self._patience_s())
         names = {listener: name for name, listener in self._listeners.items()}
@@ -193,10 +175,8 @@ class UrBus:
                 self._accept(names[thing], thing)
             elif isinstance(thing, Client):
                 self._hear(thing)
-        if self._bell in readable:
-            os.read(self._bell, 4096)
-            while self._asked:
-                self._asked.popleft()()
+        if self._errands.bell in readable:
+            self._errands.run()
 
     def _patience_s(self) -> float:
         times = [self.arm.t + self._period_s, *(due for client in self._clients if (due := client.due) is not None)]

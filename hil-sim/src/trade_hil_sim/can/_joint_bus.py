@@ -1,0 +1,70 @@
+"""A simulated CAN bus with one vendor's devices on it, as a robot file describes it."""
+
+import time
+from abc import abstractmethod
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar, cast
+
+from trade_hil_sim._errors import SimulationError
+from trade_hil_sim._log import ByteLog
+
+from ._bus import CanBus
+from ._device import Device
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+    from trade_drivers.robotfile import Bus, Joint
+    from trade_drivers.robotfile import CanBus as CanRecord
+
+__all__ = ["JointBus"]
+
+
+class JointBus(CanBus):
+    """Devices that move a joint each."""
+
+    kind: ClassVar[str]
+    """What they are, for messages: ``ODrives``."""
+
+    @classmethod
+    @abstractmethod
+    def device_for(cls, joint: "Joint", record: "CanRecord", t: float) -> Device:
+        """The device of a joint, at its zero or as near as its limits allow; raises SimulationError: it cannot be."""
+
+    @classmethod
+    def from_robot(
+        cls,
+        bus: "Bus",
+        joints: "Sequence[Joint]",
+        port: Path,  # noqa: ARG003 - a CAN bus is no path; its port is known when it is open
+        *,
+        log: ByteLog | None = None,
+        paced: bool = True,
+        interface: str = "",
+    ) -> "Self":
+        """The bus a robot file describes, each joint at its zero (or as near as its limits allow).
+
+        Args:
+            bus: the bus's record.
+            joints: the joints on it.
+            port: not used; clients are given `port` instead.
+            log: where to record.
+            paced: take as long as the real wire.
+            interface: a ``vcan`` of the system to sit on.
+
+        Raises:
+            SimulationError: an id or a model there cannot be, or a key that is missing.
+        """
+        if not hasattr(bus, "channel"):
+            raise SimulationError(f"bus.{bus.name}: {cls.kind} are on CAN; write interface and channel, not port")
+        record = cast("CanRecord", bus)
+        return cls(
+            [cls.device_for(joint, record, time.monotonic()) for joint in joints],
+            name=bus.name,
+            channel=record.channel.rpartition("/")[2] if record.interface == "socketcand" else "can0",
+            bitrate=record.bitrate,
+            log=log,
+            paced=paced,
+            interface=interface,
+        )
