@@ -68,6 +68,7 @@ class DynamixelAxis(ServoAxis[DynamixelHealth]):
 
     cyclic = CYCLIC
     slow = SLOW
+    homing = table.HOMING_OFFSET
     error_remedy = "let it cool down or free it, switch its power off and on, then call enable()"
 
     def __init__(self, name: str, bus: str, joint: Joint, coupled: Sequence[str] = ()) -> None:

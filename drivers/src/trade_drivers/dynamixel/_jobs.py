@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Final
 from trade_drivers.dynamixel import _table as table
 from trade_drivers.dynamixel._axis import DynamixelAxis
 from trade_drivers.joints import Goal, Job, Steps
-from trade_drivers.servos import health_of, told, tried
+from trade_drivers.servos import health_of, still_homed, told, tried
 
 if TYPE_CHECKING:
     from trade_drivers.dynamixel._exchange import DynamixelExchange
@@ -58,6 +58,7 @@ def enabling(bus: "DynamixelExchange", job: Job, axis: DynamixelAxis) -> Steps:
     health = yield from health_of(bus, axis)
     if health.error:
         raise axis.faulty()
+    yield from still_homed(bus, axis)
     if health.watchdog:
         yield from _write(bus, job, axis, table.BUS_WATCHDOG, 0)
     register = table.PRESENT_POSITION
