@@ -16,7 +16,7 @@ from drivers.motor_rig import KINDS as MOTOR_KINDS
 from drivers.tail_rig import TailRig
 from trade.errors import ConfigurationError
 from trade_drivers import AttachedRobot, Motor
-from trade_hil_sim import BadCrc, BrownOut, Emergency, Entry, HardwareFault, Mute, Place, Servo, Truncate, WrongModel
+from trade_hil_sim import BadCrc, Emergency, Entry, HardwareFault, Mute, Place, Servo, Truncate, WrongModel
 
 __all__ = ["KINDS", "Body", "Call", "outcome"]
 
@@ -64,8 +64,6 @@ class Ways(NamedTuple):
     """Plug in what has a wrong id, or the same as another."""
     homing: tuple[int, int] = (0, 0)
     """Address and size of the register that shifts its zero."""
-    remedy: tuple[Any, ...] = ()
-    """What its own protection wants before it goes on."""
 
 
 class Body:
@@ -167,7 +165,6 @@ def _dynamixel(tmp_path: Path, undo: ExitStack) -> Body:
         overload=HardwareFault(ids=(1,), bits=0x20),
         confuse=_twins,
         homing=(20, 4),
-        remedy=(BrownOut(ids=(1,)),),
     )
     return Body(rig, ways)
 

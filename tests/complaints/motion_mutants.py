@@ -1,6 +1,6 @@
 """What naive code makes of ends and beginnings of motion. Each changes one function."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from typing import Any
 
 import pytest
@@ -32,6 +32,14 @@ def enabling_wants_no_fault(patch: pytest.MonkeyPatch) -> None:
         yield from steps(self)
 
     patch.setattr(Enable, "steps", strict)
+
+
+def enabling_starts_no_servo_anew(patch: pytest.MonkeyPatch) -> None:
+    def as_it_is(bus: Any, job: Any, axis: Any) -> Generator[None, None, Any]:
+        yield
+        return axis.health
+
+    patch.setattr("trade_drivers.dynamixel._jobs._restarted", as_it_is)
 
 
 def enabling_resets_no_fault_of_a_drive(patch: pytest.MonkeyPatch) -> None:
