@@ -14,7 +14,7 @@ from drivers.motor_rig import KINDS, ROOT
 from drivers.tail_rig import TailRig, goal_of
 from trade.errors import DeviceError
 from trade_drivers import Motor
-from trade_hil_sim import BrownOut, Entry, events, instructions, motion_writes, writes
+from trade_hil_sim import Entry, events, instructions, motion_writes, writes
 from waiting import wait_until
 
 __all__ = ["SUBJECTS", "Subject"]
@@ -116,10 +116,6 @@ class Subject(ABC):
             return None
 
     def recover(self, recovery: Recovery, since: float) -> None:
-        if recovery is Recovery.POWER:
-            self.rig.sim.do(BrownOut(ids=(self.device_id,)))
-            wait_until(lambda: self.events("booted", since), "it has booted")
-            wait_until(lambda: self.fault() is not None, "it answers")
         if recovery is not Recovery.NOTHING:
             self.provider.enable()
 

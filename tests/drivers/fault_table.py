@@ -66,7 +66,6 @@ class Recovery(Enum):
 
     NOTHING = "nothing"
     ENABLE = "`enable()`"
-    POWER = "power off and on, `enable()`"
     ACTIVATE = "`clear_fault()`, `activate()`"
 
 
@@ -162,10 +161,10 @@ _DYNAMIXEL: Final = (
     _faulty("dynamixel", "blocked", Jam(ids=ONE), "it makes no progress", Stop.BLOCKED)._replace(alone=True),
     _silent("dynamixel", "cable off", Absent(ids=ONE), stop=Stop.WATCHDOG, after=Recovery.ENABLE),
     _gone("dynamixel", _REPLUG, Stop.WATCHDOG, Recovery.ENABLE),
-    _faulty("dynamixel", "fault latched", HardwareFault(ids=ONE, bits=0x20), "overload", Stop.ITSELF, Recovery.POWER),
-    _faulty(
-        "dynamixel", "over-temperature", Supply(ids=ONE, temperature_c=80), "overheating", Stop.ITSELF, Recovery.POWER
-    )._replace(cure=(Supply(ids=ONE, temperature_c=30),)),
+    _faulty("dynamixel", "fault latched", HardwareFault(ids=ONE, bits=0x20), "overload", Stop.ITSELF),
+    _faulty("dynamixel", "over-temperature", Supply(ids=ONE, temperature_c=80), "overheating", Stop.ITSELF)._replace(
+        cure=(Supply(ids=ONE, temperature_c=30),)
+    ),
     _swapped("dynamixel", 1020, "another model answers with its id", Stop.WATCHDOG),
     Row("dynamixel", "restart", (BrownOut(ids=ONE),), DeviceError, "", "it has restarted", Stop.ITSELF),
     _sick("dynamixel", "watchdog", Stop.BOTH),

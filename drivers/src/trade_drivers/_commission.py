@@ -78,6 +78,14 @@ class Bench(ABC):
             WireError: it does not answer.
         """
 
+    def homing_counts(self, device_id: int) -> int:  # noqa: ARG002 - most devices have none
+        """By how much a device shifts its zero itself; 0 where that is not known.
+
+        Raises:
+            WireError: it does not answer.
+        """
+        return 0
+
     @abstractmethod
     def write_id(self, device_id: int, to: int) -> None:
         """Have it answer to another id from now on. Whether it does is for the caller to look.

@@ -52,6 +52,8 @@ def _check_joint(axis: DamiaoAxis) -> None:
         raise Unfit(f"{joint.id} is none; 1 to 15 can be told apart (it answers as that and 16)", ".id")
     if joint.counts_per_rev is not None:
         raise Unfit("a Damiao motor tells radians, not counts; leave this key out", ".counts_per_rev")
+    if joint.homing_counts:
+        raise Unfit("is for servos; leave this key out", ".homing_counts")
     if joint.max_speed_rad_s * joint.gear > ranges.velocity_rad_s:
         most = ranges.velocity_rad_s / joint.gear
         raise Unfit(

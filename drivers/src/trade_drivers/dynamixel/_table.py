@@ -76,6 +76,7 @@ RETURN_DELAY: Final = Register(9, "u1", si_per_count=2e-6, unit="s", access=_EEP
 DRIVE_MODE: Final = Register(10, "u1", access=_EEPROM)
 OPERATING_MODE: Final = Register(11, "u1", access=_EEPROM)
 SHADOW_ID: Final = Register(12, "u1", access=_EEPROM)
+HOMING_OFFSET: Final = Register(20, "i4", si_per_count=RAD_PER_COUNT, unit="rad", access=_EEPROM)
 VELOCITY_LIMIT: Final = Register(44, "u4", si_per_count=RAD_S_PER_COUNT, unit="rad/s", access=_EEPROM)
 MAX_POSITION: Final = Register(48, "u4", si_per_count=RAD_PER_COUNT, unit="rad", access=_EEPROM)
 MIN_POSITION: Final = Register(52, "u4", si_per_count=RAD_PER_COUNT, unit="rad", access=_EEPROM)

@@ -63,6 +63,8 @@ def _check_joint(axis: OdriveAxis) -> None:
         raise Unfit(f"{joint.id} is no node; 0 to 62 are", ".id")
     if joint.counts_per_rev is not None:
         raise Unfit("an ODrive tells turns, not counts; leave this key out", ".counts_per_rev")
+    if joint.homing_counts:
+        raise Unfit("is for servos; leave this key out", ".homing_counts")
     braking_s = joint.max_speed_rad_s / joint.max_accel_rad_s2
     if braking_s > _BRAKING_S:
         problem = f"a stop from max_speed_rad_s takes {braking_s:.2g} s with it; it must take {_BRAKING_S} s at most"
