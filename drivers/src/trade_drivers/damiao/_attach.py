@@ -87,6 +87,8 @@ def look_over(bus: "DamiaoExchange", axis: DamiaoAxis) -> Steps:
     if axis.software not in {None, axis.told}:
         raise Unfit(f"another motor answers as {axis.id}: its software is {axis.told}, not {axis.software}")
     axis.software = int(axis.told or 0)
+    if axis.joint.firmware not in {None, str(axis.software)}:
+        raise Unfit(f"the software of motor {axis.id} is {axis.software}, not {axis.joint.firmware}", ".firmware")
     yield from set_register(bus, axis, Register.TIMEOUT, bus.timeout)
     if axis.told != bus.timeout:
         raise Unfit(f"it does not keep its time-out (register 9): {axis.told}, not {bus.timeout}")
