@@ -87,7 +87,7 @@ def vendor_table(model: str) -> dict[str, tuple[int, int]]:
     file = f"{model.lower().replace('-', '_')}{'_fw52' if '330-' in model else ''}.model"
     text = (folder / file).read_text()
     rows = [line.split("\t") for line in text.split("[control table]")[1].splitlines()[2:] if line.strip()]
-    return {name.strip(): (int(address), int(size)) for address, size, name in rows}
+    return {name.strip().lower(): (int(address), int(size)) for address, size, name in rows}
 
 
 VENDOR_NAMES = {
@@ -111,7 +111,7 @@ def test_the_registers_are_where_the_vendor_library_has_them(model: table.Model)
     ours = {name: register for name, register in registers.items() if register.address != model.effort.address}
     ours["PRESENT_LOAD" if model.effort is table.PRESENT_LOAD else "PRESENT_CURRENT"] = model.effort
     for name, register in ours.items():
-        assert (register.address, register.size) == theirs[VENDOR_NAMES.get(name, name.replace("_", " ").title())]
+        assert (register.address, register.size) == theirs[VENDOR_NAMES.get(name, name.replace("_", " ")).lower()]
 
 
 def test_the_models_are_those_of_the_simulator() -> None:

@@ -1,4 +1,4 @@
-"""Every model of the X series, alone and with others on one line; the driver's bytes are the vendor library's own."""
+"""Every model the driver knows, alone and with others on one line; the driver's bytes are the vendor library's own."""
 
 import pytest
 

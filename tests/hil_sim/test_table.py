@@ -39,9 +39,9 @@ def test_the_vendor_files_the_model_number_under_this_name(model: Model) -> None
         assert rows[str(model.number)] == f"{_file(model.name)}.model"
 
 
-def test_the_vendor_knows_no_other_servo_of_this_series() -> None:
+def test_the_vendor_knows_no_other_servo_of_these_series() -> None:
     rows = dict(line.split() for line in (FILES / "dynamixel.model").read_text().splitlines()[1:])
-    theirs = {number for number, file in rows.items() if file.startswith(("x", "2x")) and file != "xl320.model"}
+    theirs = {number for number, file in rows.items() if file.startswith(("x", "2x", "mx")) and file != "xl320.model"}
     assert theirs | {"1280"} == {str(model.number) for model in MODELS.values()}
 
 

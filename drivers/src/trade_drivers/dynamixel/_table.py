@@ -1,4 +1,4 @@
-"""Control tables of the X series: registers as data, with their conversion to SI units.
+"""Control tables of X and MX servos on protocol 2.0: registers as data, with their conversion to SI units.
 
 Sources: ROBOTIS e-Manual, the models' pages, "Control Table of EEPROM Area" and "Control Table of RAM Area". All have
 the same addresses up to 147, which is all that is used here; behind that they differ: where indirect data begin on an
@@ -95,6 +95,7 @@ PRESENT_CURRENT: Final = Register(126, "i2", si_per_count=0.00269, unit="A")
 PRESENT_CURRENT_24V: Final = Register(126, "i2", si_per_count=0.00134, unit="A")
 """Of XH430-V."""
 PRESENT_CURRENT_330: Final = Register(126, "i2", si_per_count=0.001, unit="A")
+PRESENT_CURRENT_MX: Final = Register(126, "i2", si_per_count=0.00336, unit="A")
 PRESENT_VELOCITY: Final = Register(128, "i4", si_per_count=RAD_S_PER_COUNT, unit="rad/s")
 PRESENT_POSITION: Final = Register(132, "i4", si_per_count=RAD_PER_COUNT, unit="rad")
 VELOCITY_TRAJECTORY: Final = Register(136, "i4", si_per_count=RAD_S_PER_COUNT, unit="rad/s")
@@ -186,6 +187,9 @@ MODELS: Final = (
     _with_current(1170, "XW540-T260", 2047),
     _with_current(1180, "XW540-T140", 2047),
     _with_current(1310, "XW540-H260", 1188),
+    _with_load(30, "MX-28"),
+    _with_current(311, "MX-64", 1941, PRESENT_CURRENT_MX),
+    _with_current(321, "MX-106", 2047, PRESENT_CURRENT_MX),
 )
 BY_MODEL_NAME: Final = {model.name: model for model in MODELS}
 BY_MODEL_NUMBER: Final = {model.number: model for model in MODELS}

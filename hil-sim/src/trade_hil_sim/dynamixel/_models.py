@@ -1,4 +1,4 @@
-"""The models of the X series: what differs between them.
+"""The models of the X series, and MX with the firmware for protocol 2.0: what differs between them.
 
 Source: ROBOTIS e-Manual, the page of each model. Where no speed without load was found (XW430, XW540-H260), it is that
 of the velocity limit; XD430-T350 and XD540-T270 have the figures of the XH, whose control table they share.
@@ -36,6 +36,7 @@ class _Family:
     led: bool = True
     ports: bool = False
     """It has external ports."""
+    acceleration_limit: bool = False
     pwm_slope: int | None = None
     indirect: tuple[Indirect, ...] = (Indirect(1, 28, 168, 224), Indirect(29, 28, 578, 634))
 
@@ -51,6 +52,8 @@ class _Family:
         ]
         if self.led:
             found.append(Register(65, 1, "led", WRITE, 0, 0, 1))
+        if self.acceleration_limit:
+            found.append(Register(40, 4, "acceleration_limit", WRITE, 32_767, 0, 32_767))
         if self.pwm_slope is not None:
             found.append(Register(62, 1, "pwm_slope", WRITE, self.pwm_slope, 1, 255))
         if self.ports:
@@ -68,6 +71,7 @@ _X430_24V: Final = _Family(24.0, (110, 300))
 _X540: Final = _Family(12.0, (95, 160), ports=True)
 _X540_24V: Final = _Family(24.0, (110, 300), ports=True)
 _XW: Final = _Family(12.0, (95, 160), led=False)
+_MX: Final = _Family(12.0, (95, 160), acceleration_limit=True)
 _XW_24V: Final = _Family(24.0, (110, 300), led=False)
 
 
@@ -133,6 +137,7 @@ def _model(
     )
 
 
+_MX_GAINS: Final = (1920, 100, 0, 0, 850)
 _XH430_GAINS: Final = (1920, 100, 0, 0, 900)
 _ALL: Final = (
     _model(1060, "XL430-W250", _XL430, 265, 61, gains=(1000, 100, 4000, 0, 640)),
@@ -167,6 +172,9 @@ _ALL: Final = (
     _model(1170, "XW540-T260", _XW, 167, 40, 2047),
     _model(1180, "XW540-T140", _XW, 304, 72, 2047),
     _model(1310, "XW540-H260", _XW_24V, 145, 33.2, 1188),
+    _model(30, "MX-28", _MX, 380, 55, gains=_MX_GAINS),
+    _model(311, "MX-64", _MX, 435, 63, 1941, _MX_GAINS),
+    _model(321, "MX-106", _MX, 360, 45, 2047, _MX_GAINS),
 )
 MODELS: Final[Mapping[str, Model]] = {model.name: model for model in _ALL}
 """Simulated models, by the name printed on the device."""
