@@ -11,7 +11,7 @@ import can
 import pytest
 
 from drivers.motor_rig import ROOT, TIP, MotorRig, motor_rig, wag
-from trade.errors import ConfigurationError
+from trade.errors import ConfigurationError, WrongDevice
 from trade_drivers import Commissioner, Found, scan
 from trade_drivers.can import Talk
 from trade_drivers.cia402 import Cia402Driver
@@ -164,5 +164,7 @@ def test_one_frame_alone_proves_nothing() -> None:
 def test_another_firmware_than_the_files_is_refused(motor_rig: MotorRig) -> None:
     motor_rig.configure(("id = 1\n", 'id = 1\nfirmware = "9.9"\n'))
     motor_rig.plug()
-    with pytest.raises(ConfigurationError, match=rf"firmware: .* {MODELS[motor_rig.kind][1]}, not 9\.9"):
+    with pytest.raises(WrongDevice) as refused:
         motor_rig.attach()
+    assert (refused.value.key, refused.value.expected) == ("firmware", "9.9")
+    assert refused.value.found == MODELS[motor_rig.kind][1]
