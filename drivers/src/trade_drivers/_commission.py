@@ -24,6 +24,8 @@ class Found(Struct, frozen=True, kw_only=True):
     driver: str
     kind: Literal["joint", "gripper", "arm"] = "joint"
     """What it is in a robot file."""
+    wire: Literal["serial", "can"] = "serial"
+    """What it was found on."""
     baud: int = 0
     """Bits per second; 0 where there is no such thing: the controller of an arm."""
     id: int = 0

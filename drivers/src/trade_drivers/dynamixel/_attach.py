@@ -38,7 +38,7 @@ def check_bus(bus: "SerialBus", axes: Sequence[DynamixelAxis], where: str) -> No
     for axis in axes:
         check_ranges(axis, where)
     count = len(axes)
-    read = 14 + count + (18 + count * 14 if bus.fast_sync else count * (11 + CYCLIC[1]))
+    read = 14 + count + (8 + count * 14 if bus.fast_sync else count * (11 + CYCLIC[1]))
     check_rate(bus, count, read + 14 + count * 5, where)
 
 
