@@ -17,7 +17,8 @@ from trade import Container, ContainerInfo, Handle, where
 from trade.errors import CannotStart, ConfigurationError, NoSuchService, TooManyServices, TradeError
 from trade.starting import LONGEST_S, Started, end_there, launch, missing_there
 from trade_gateway._detached import detached
-from trade_gateway._system_file import Made, Part, SystemPlan
+from trade_gateway._parts import Made, Part
+from trade_gateway._system_file import SystemPlan
 
 _GROUP: Final = "trade"
 _LEFT_S: Final = 20.0
