@@ -101,7 +101,8 @@ class Around(Struct, frozen=True, kw_only=True):
     policy: str = ""
     connect: Sequence[str] = ()
     environment: Mapping[str, str] = {}
-    """Variables of containers of this host."""
+    """Variables of containers of this host, besides those they inherit."""
+    inherited: Mapping[str, str] = os.environ
 
 
 class Part(NamedTuple):
@@ -193,7 +194,7 @@ class Tables:
             system=self.around.system,
             container=name,
             connect=self._connect(entry),
-            environment={**os.environ, **environment},
+            environment={**self.around.inherited, **environment},
         )
 
     def _words(self, name: str, entry: Entry) -> list[str]:

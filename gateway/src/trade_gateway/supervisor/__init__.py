@@ -1,0 +1,5 @@
+"""Containers as child processes: started in order, asked whether they answer, started again, their state kept."""
+
+from trade_gateway.supervisor._tables import Child, read_children
+
+__all__ = ["Child", "read_children"]
