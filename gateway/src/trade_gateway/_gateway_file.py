@@ -220,9 +220,26 @@ def _of_children(file: GatewayFile) -> dict[str, str]:
 
 
 def _check(file: GatewayFile, where: str) -> None:
-    owners: dict[str, str] = {}
     if not (file.network or file.share or file.container):
         raise ConfigurationError(where=f"{where}: network", problem=f"missing; write {_EXAMPLES['network']}")
+    _check_networks(file, where)
+    if file.network or file.share or file.connect:
+        _check_proof(file, file, f"{where}: ", "NAME --for gateway")
+    for name, share in file.share.items():
+        at = f"{where}: share.{name}."
+        if share.system in (file.system, *(one.system for known, one in file.share.items() if known != name)):
+            problem = f"{share.system!r} is this system or that of another share; name another one, once"
+            raise ConfigurationError(where=f"{at}system", problem=problem)
+        _check_groups(share.export, f"{at}export")
+        _check_groups(share.import_, f"{at}import")
+        _check_proof(file, share, at, f"NAME, by the authority of {share.system}")
+        if not share.policy and not file.insecure_lan:
+            problem = f"missing; name the policy of {share.system}: without one all of it might call what is shared"
+            raise ConfigurationError(where=f"{at}policy", problem=problem)
+
+
+def _check_networks(file: GatewayFile, where: str) -> None:
+    owners: dict[str, str] = {}
     for name, network in file.network.items():
         if other := owners.get(network.interface):
             problem = f"{network.interface} is the interface of network {other!r} already"
@@ -237,19 +254,6 @@ def _check(file: GatewayFile, where: str) -> None:
         for key in [key for key, is_given in given.items() if is_given and file.alone]:
             problem = "there is no other network of this system; leave it out: what other systems see is in [share...]"
             raise ConfigurationError(where=f"{where}: network.{name}.{key}", problem=problem)
-    if file.network or file.share or file.connect:
-        _check_proof(file, file, f"{where}: ", "NAME --for gateway")
-    for name, share in file.share.items():
-        at = f"{where}: share.{name}."
-        if share.system in (file.system, *(one.system for known, one in file.share.items() if known != name)):
-            problem = f"{share.system!r} is this system or that of another share; name another one, once"
-            raise ConfigurationError(where=f"{at}system", problem=problem)
-        _check_groups(share.export, f"{at}export")
-        _check_groups(share.import_, f"{at}import")
-        _check_proof(file, share, at, f"NAME, by the authority of {share.system}")
-        if not share.policy and not file.insecure_lan:
-            problem = f"missing; name the policy of {share.system}: without one all of it might call what is shared"
-            raise ConfigurationError(where=f"{at}policy", problem=problem)
 
 
 def _check_groups(groups: Sequence[str], where: str) -> None:
