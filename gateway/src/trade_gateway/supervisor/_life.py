@@ -11,7 +11,7 @@ __all__ = ["GRACE_S", "Do", "Life", "State"]
 
 START_S: Final = 60.0
 """How long it may take from its first instruction until it is up."""
-SAVE_S: Final = 10.0
+SAVE_S: Final = 6.0
 """How long the state of one that is to end may take to be saved."""
 GRACE_S: Final = 20.0
 """How long it may take to leave: a robot is brought to rest before."""
@@ -91,6 +91,11 @@ class Life:
         """Whether it has a process."""
         return self.state in _ALIVE
 
+    @property
+    def _was_up(self) -> bool:
+        """Whether there may be a state to save, though it may not be told any more."""
+        return self.state in (State.UP, State.SILENT)
+
     # --- told by who wants it up or down
 
     def start(self, now: float) -> Do | None:
@@ -98,12 +103,12 @@ class Life:
         if not self.alive:
             self._failures.clear()
             return self._launch(now)
-        return self._end(now, "it is to start again", _After.START, save=self.state is State.UP)
+        return self._end(now, "it is to start again", _After.START, save=self._was_up)
 
     def stop(self, now: float, why: str) -> Do | None:
         """It is not wanted any more."""
         if self.alive:
-            return self._end(now, why, _After.STOPPED, save=self.state is State.UP)
+            return self._end(now, why, _After.STOPPED, save=self._was_up)
         self._rest(State.STOPPED)
         return None
 
@@ -134,7 +139,7 @@ class Life:
     def fail(self, now: float, why: str) -> Do | None:
         """Something is so wrong with it that it has to go; it is started again as after a crash."""
         if self.state in (State.STARTING, State.UP, State.SILENT):
-            return self._end(now, why, _After.FAILED, save=self.state is State.UP)
+            return self._end(now, why, _After.FAILED, save=self._was_up)
         return None
 
     def saved(self, now: float) -> Do | None:
