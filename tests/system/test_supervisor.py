@@ -210,7 +210,8 @@ def test_only_what_is_started_otherwise_than_before_starts_again(keeping: Callab
     before = {name: kept.become(name, "up").pid for name in "abc"}
     call("count")
     kept.go_by(
-        f"[container.a]\n{COUNTER}allow = ['tiny:*']\n[container.b]\nproviders = []\nrestarts = 1\n[container.d]\n{COUNTER}"
+        f"[container.a]\n{COUNTER}allow = ['tiny:*']\n[container.b]\nproviders = []\nrestarts = 1\n"
+        f"[container.d]\n{COUNTER}"
     )
     kept.become("a", "up", restarts=1)
     kept.become("d", "up")

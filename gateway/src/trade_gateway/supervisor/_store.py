@@ -68,13 +68,14 @@ class StateStore:
 
     def close(self) -> None:
         """End its thread. Idempotent."""
-        self._thread.submit(self._let_go)
+        with contextlib.suppress(RuntimeError):  # it has ended already
+            self._thread.submit(self._let_go)
         self._thread.shutdown()
 
     def _ask(self, what: Callable[[sqlite3.Connection], _Result], *, default: _Result) -> _Result:
         try:
             return self._thread.submit(self._do, what, default).result(_WAIT_S)
-        except TookTooLong:
+        except (TookTooLong, RuntimeError):  # the latter: it was closed meanwhile
             return default
 
     # --- on its thread
