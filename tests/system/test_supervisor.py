@@ -3,6 +3,7 @@
 import os
 import queue
 import signal
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -11,11 +12,12 @@ import psutil
 import pytest
 
 import trade
-from system.conftest import ROSIES_HEAD, Program
+from system.conftest import ROSIES_HEAD, Program, at_ports
 from trade import Container, where
 from trade.errors import ConfigurationError
 from trade_gateway._gateway_file import read_gateway_file
 from trade_gateway.supervisor import ChildInfo, News, Supervisor
+from trade_hil_sim import SimProcess, events, writes
 from waiting import wait_until
 
 MODULE = """
@@ -222,6 +224,26 @@ def test_only_what_is_started_otherwise_than_before_starts_again(keeping: Callab
     assert trade.find(where(name="shown", container="a"), wait_s=30)() == 1
 
 
+@pytest.fixture
+def sim() -> Iterator[SimProcess]:
+    with SimProcess(ROSIES_HEAD) as running:
+        yield running
+
+
+def test_S20_of_two_that_look_after_one_robot_the_second_is_refused_and_gives_up_with_the_reason(
+    keeping: Callable[..., Keeping], sim: SimProcess, tmp_path: Path
+) -> None:
+    robot = at_ports(ROSIES_HEAD, sim, tmp_path)
+    kept = keeping(f'[container.one]\nrobot = "{robot}"\n')
+    first = kept.become("one", "up")
+    torn = keeping(f'[container.two]\nrobot = "{robot}"\nrestarts = 1\n')
+    refused = torn.become("two", "given up")
+    assert "ended (exit code 1: ConfigurationError: " in refused.why
+    assert any(port in refused.why for port in sim.ports.values())
+    assert torn.news.qsize() == 2  # it was tried twice, and no more
+    assert kept.become("one", "up").pid == first.pid
+
+
 class Door:
     """``trade gateway`` with children."""
 
@@ -271,6 +293,36 @@ def test_children_end_with_their_gateway_however_that_ends(door: Callable[[str],
     pids = [info.pid for info in children()]
     there.program.signal(signal.SIGKILL)
     wait_until(lambda: not any(map(psutil.pid_exists, pids)), "they have left")
+
+
+def test_S19_a_driver_that_loses_its_gateway_stops_what_moves_and_leaves(
+    door: Callable[[str], Door], sim: SimProcess, tmp_path: Path
+) -> None:
+    there = door(f'[container.head]\nrobot = "{at_ports(ROSIES_HEAD, sim, tmp_path)}"\n')
+    there.until("up", "head")
+    [info] = children()
+    pan = trade.find(where(name="move_to", group="rosie.neck.pan"), wait_s=30)
+    pan.with_(deadline_s=120).start(1.0, 0.05)
+    wait_until(lambda: events(sim.entries(), "motion_started", device_id=1))
+    killed_at = time.monotonic()
+    there.program.signal(signal.SIGKILL)
+    wait_until(lambda: events(sim.entries(), "at_rest", device_id=1, since=killed_at))
+    wait_until(lambda: not psutil.pid_exists(info.pid), "it has left")
+    assert writes(sim.entries(), device_id=1, register="goal_position", since=killed_at)
+    assert not events(sim.entries(), "watchdog_expired")  # it was told to, before anything ran out
+
+
+def test_S18_a_driver_that_is_started_again_moves_and_enables_nothing(
+    door: Callable[[str], Door], sim: SimProcess, tmp_path: Path
+) -> None:
+    there = door(f'[container.head]\nrobot = "{at_ports(ROSIES_HEAD, sim, tmp_path)}"\n')
+    there.until("up", "head")
+    [info] = children()
+    killed_at = time.monotonic()
+    os.kill(info.pid, signal.SIGKILL)
+    there.until("up", "head")
+    for register in ("goal_position", "goal_velocity", "torque_enable"):
+        assert not writes(sim.entries(), register=register, since=killed_at)
 
 
 def test_P70_a_gateway_that_is_stopped_leaves_nobody_behind_and_all_is_known_when_it_is_back(
