@@ -72,6 +72,8 @@ def test_a_file_may_have_nothing_but_containers(tmp_path: Path, monkeypatch: pyt
     assert " ".join(eyes.part.words) == "--system lab container --name eyes --allow sight:Eye"
     assert "TRADE_CREDENTIALS" not in eyes.environment  # the file says it all
     assert (plan.settings.bridge, plan.settings.system) == ((), "lab")
+    said = CliRunner().invoke(app, ["gateway", str(file), "--check"]).stdout.splitlines()
+    assert said[1:] == ["  it keeps mind up: providers", "  it keeps eyes up: providers"]
 
 
 def test_containers_are_let_in_as_the_gateway_is(tmp_path: Path) -> None:

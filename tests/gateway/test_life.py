@@ -35,6 +35,29 @@ def test_one_that_is_up_is_asked_again_and_again_and_stays_up() -> None:
     assert child.state is State.UP
 
 
+def test_those_of_the_same_terms_are_asked_at_the_same_moments() -> None:
+    early, late = life(), life()
+    for child, now in ((early, 10.1), (late, 10.8)):
+        child.start(0.0)
+        child.up(now)
+    assert early.deadline == late.deadline == 11.0
+    early.due(11.0)
+    early.answered(11.4)
+    late.due(11.0)
+    late.answered(11.9)
+    assert early.deadline == late.deadline == 12.0
+
+
+def test_one_that_misses_a_question_is_asked_again_at_once_and_misses_all_in_the_time_given() -> None:
+    child, asked = up(), []
+    for _ in range(child.terms.misses):
+        asked.append(child.deadline)
+        assert child.due(child.deadline) is Do.ASK
+        child.missed(asked[-1] + 1)
+    assert asked == [11.0, 12.0, 13.0, 14.0]
+    assert child.state is State.STOPPING  # at 15 s: four after it was asked first
+
+
 def test_one_that_misses_a_question_is_silent_and_up_again_with_the_next_answer() -> None:
     child = up()
     for _ in range(10):

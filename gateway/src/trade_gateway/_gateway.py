@@ -48,6 +48,7 @@ def gateway(
     if check:
         out.say(f"{file} is right")
         _say_what_crosses(out, plan)
+        _say_children(out, plan)
         return
     if detach:
         detach_now(out, plan.settings)
@@ -199,11 +200,13 @@ def _say_ready(out: Output, running: Gateway, plan: Plan) -> None:
                 "listen": settings.listen,
                 "networks": networks,
                 "shares": {name: _share(plan, name) for name in plan.shares},
+                "children": [child.name for child in plan.children],
             }
         )
         return
     out.say(f"[bold green]{running.container.name} is up[/] in system {settings.system}, as {settings.identity}")
     _say_what_crosses(out, plan)
+    _say_children(out, plan)
     out.say("Ctrl-C leaves; the file is read again when it changes")
 
 
@@ -229,6 +232,11 @@ def _say_what_crosses(out: Output, plan: Plan) -> None:
         guest = plan.shares[name]
         out.say(f"  system {guest.system}, as {guest.identity}: it sees {_listed(share.export)} of {settings.system}")
         out.say(f"  and {settings.system} sees {_listed(share.import_)} of {guest.system}")
+
+
+def _say_children(out: Output, plan: Plan) -> None:
+    for child in plan.children:
+        out.say(f"  it keeps {escape(child.name)} up: {child.part.entry.kind}")
 
 
 def _listed(groups: Sequence[str]) -> str:

@@ -118,13 +118,13 @@ class Life:
         """All that it is to have in it is there."""
         if self.state is State.STARTING:
             self.state, self.why, self._missed = State.UP, "", 0
-            self.deadline = now + self.terms.question_s
+            self.deadline = self._tick(now)
 
     def answered(self, now: float) -> None:
         """It has answered the question asked last."""
         if self.state in (State.UP, State.SILENT):
             self.state, self._missed = State.UP, 0
-            self.deadline = max(now, self._asked + self.terms.question_s)
+            self.deadline = self._tick(now)
 
     def missed(self, now: float) -> Do | None:
         """It has not answered the question asked last, or cannot be reached."""
@@ -179,6 +179,10 @@ class Life:
             case State.STOPPED | State.GIVEN_UP:
                 self.deadline = math.inf
                 return None
+
+    def _tick(self, now: float) -> float:
+        """When to ask it next: at the same moments as others of its terms, so that one wake does for all."""
+        return (math.floor(now / self.terms.question_s) + 1) * self.terms.question_s
 
     # --- going on
 

@@ -284,8 +284,7 @@ class Supervisor:
         terms, furnished, now = unit.child.terms, unit.furnished, time.monotonic()
         if unit.process is None or furnished is None:
             return
-        took = rss_mb(unit.process.pid)
-        if terms.max_rss_mb is not None and took > terms.max_rss_mb:
+        if terms.max_rss_mb is not None and (took := rss_mb(unit.process.pid)) > terms.max_rss_mb:
             self._do(unit, unit.life.fail(now, f"it took {took:.0f} MB of memory"))
             return
         try:
@@ -322,7 +321,7 @@ class Supervisor:
     def _furnish(self, unit: _Unit, child: Child, started: Started) -> Callable[[], None]:
         try:
             furnished = furnish(self._member, child, started, self._store.load(child.name))
-        except TradeError as wrong:
+        except Exception as wrong:  # noqa: BLE001 - what an object raises may come as its own type
             why = f"it came up, but: {wrong}"
             return lambda: self._do(unit, unit.life.fail(time.monotonic(), why))
         return lambda: self._up(unit, furnished)
