@@ -187,7 +187,7 @@ def test_a_child_that_fails_for_ever_is_given_up_with_its_reason_and_comes_by_ha
 
 def test_a_child_that_leaks_is_saved_and_started_again(keeping: Callable[..., Keeping]) -> None:
     kept = keeping(
-        "[container.a]\nmax_rss_mb = 400\nanswers_within_s = 1\n"
+        "[container.a]\nmax_rss_mb = 400\n"
         'providers = [{ class = "tiny:Grows", groups = ["hall"] }, { class = "tiny:Counter", groups = ["hall"] }]\n'
     )
     kept.become("a", "up")
