@@ -14,6 +14,7 @@ parts:
   feetech    the same of the Feetech driver
   can        cycles of six CiA 402 drives near what 1 Mbit/s can carry: how many are late
   rosie      what all drivers of a robot take of a core, at the rates it is meant for
+  supervisor what ten children cost their gateway; a driver that crashed until it serves again, beside a plain start
   arm        set-points a second that reach the controller of an arm, beside a bare loop of the vendor's library
 
 Progress goes to stderr, tables and targets (met or missed) to stdout. Peers that are not installed are skipped.
@@ -35,6 +36,7 @@ from tests.bench import (
     _rosie,
     _servo,
     _streams,
+    _supervisor,
     _watching,
 )
 
@@ -61,6 +63,7 @@ _PARTS: Mapping[str, Callable[[argparse.Namespace], None]] = {
     "feetech": lambda options: _feetech.run(options.n, options.rounds, options.seconds),
     "can": lambda options: _cans.run(max(1, options.rounds // 2), options.seconds),
     "rosie": lambda options: _rosie.run(max(1, options.rounds // 2), options.seconds),
+    "supervisor": lambda options: _supervisor.run(max(1, options.rounds // 2), options.idle),
     "arm": lambda options: _arm.run(max(1, options.rounds // 2), 2 * options.seconds),
 }
 _QUICK = {"n": 200, "rounds": 8, "seconds": 1.5, "idle": 20.0}
@@ -79,7 +82,7 @@ def main() -> None:
         "--seconds", type=float, help="length of a round of the servo bus at 100 Hz, and of a trajectory on the CAN bus"
     )
     parser.add_argument(
-        "--idle", type=float, help=f"seconds for the idle gateway ({_QUICK['idle']}, full {_FULL['idle']})"
+        "--idle", type=float, help=f"seconds for an idle gateway ({_QUICK['idle']}, full {_FULL['idle']})"
     )
     parser.add_argument("--services", type=int, default=10_000, help="of the registry part (default: %(default)s)")
     options = parser.parse_args()

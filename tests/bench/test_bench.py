@@ -46,6 +46,11 @@ def test_the_bench_of_calls_in_flight_prints_every_peer_and_every_target() -> No
     assert targets(printed) == ["TRADE: rate / bare pair", "TRADE, threads: rate / bare pair"] * len(SIZES)
 
 
+def test_the_bench_of_the_supervisor_prints_its_targets() -> None:
+    printed = bench("supervisor", "--rounds", "1", "--idle", "1")
+    assert targets(printed) == ["supervisor: % of a core", "crash to serving, s", "crash to serving / plain start"]
+
+
 def test_a_peer_that_is_not_installed_is_named_and_skipped(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -8,7 +8,8 @@ from typer.testing import CliRunner
 
 from certificates import Papers
 from trade.errors import ConfigurationError
-from trade_gateway._system_file import line_of, read_system_file
+from trade_gateway._parts import line_of
+from trade_gateway._system_file import read_system_file
 from trade_gateway.cli import app
 
 EXAMPLES = Path(__file__).parents[2] / "examples"

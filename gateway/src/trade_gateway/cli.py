@@ -30,6 +30,7 @@ from trade_gateway import (
     _up,
     _watchers,
 )
+from trade_gateway._lifeline import end_with_stdin
 from trade_gateway._output import UsageError, say_error
 from trade_gateway._system_choice import SystemChoice
 
@@ -100,11 +101,16 @@ def options(
         list[str] | None,
         typer.Option(help="Endpoint of a container, such as tcp/127.0.0.1:7450; repeatable. \\[env: TRADE_CONNECT]"),
     ] = None,
+    with_stdin: Annotated[
+        bool, typer.Option("--with-stdin", hidden=True, help="End when standard input does.")
+    ] = False,
     version: Annotated[  # noqa: ARG001 - answered by its callback
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version.")
     ] = False,
 ) -> None:
     """Options of every command."""
+    if with_stdin:
+        end_with_stdin()
     context.obj = SystemChoice(system, connect)
 
 

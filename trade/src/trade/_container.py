@@ -66,6 +66,8 @@ class Container(Hosting, Moving, Streaming, Tracing, Guarding, Bordering):
         """What was taken off from elsewhere and can be offered again."""
         self.making: Final = self._parts.making
         """What it made for others."""
+        self.arriving: Final = self._parts.arriving
+        """What comes to it from elsewhere, or from before."""
         self.meter: Final = self._parts.meter
         """How busy it is."""
         self.terminating: Final = self._parts.terminating

@@ -23,7 +23,7 @@ from trade._resources import Resource
 from trade._serial import Serial
 from trade._service import ServiceMark, kinds_of, marked_methods
 from trade._signature import Signature
-from trade._system import DOMAIN, PROVIDER
+from trade._system import DOMAIN
 from trade._wire import (
     Address,
     ProviderInfo,
@@ -108,7 +108,7 @@ class Providers:
     ) -> Built:
         """All of `add` that can go wrong: `host` offers it then, or `discard` gives its resources back."""
         kind, domain = type(provider).__qualname__, domain_of(groups)
-        if name != PROVIDER:
+        if domain != DOMAIN:
             self._access.require_offer(self._own.identity, groups, kind)
         chunk = name or self._new_chunk(provider, type(provider).__name__)
         place = f"{domain}/{chunk}"
