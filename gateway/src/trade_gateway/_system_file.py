@@ -29,7 +29,7 @@ __all__ = ["LOCAL", "Entry", "Made", "Part", "SystemPlan", "line_of", "read_syst
 LOCAL: Final = "local"
 _KINDS: Final = ("robot", "gateway", "providers", "rules")
 _ONLY_WITH: Final = {"sim": "robot", "allow": "providers"}
-_TELLS_ITSELF: Final = ("tls", "policy", "connect", "listen")
+_TELLS_ITSELF: Final = ("tls", "policy", "audit", "connect", "listen")
 """What a gateway file says, and the system file does not."""
 _HEADER: Final = re.compile(r"\s*\[\s*([^\[\]]+?)\s*\]\s*(?:#.*)?$")
 _NAME: Final = re.compile(r"""["']([^"']*)["']|([\w-]+)""")
@@ -72,6 +72,8 @@ class Entry(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Containers that must be up before."""
     tls: str = ""
     policy: str = ""
+    audit: str = ""
+    """Folder for the record of what happens in it."""
     connect: list[_Text] | None = None
     """Endpoints it dials; none: those of the system."""
     listen: list[_Text] = []
@@ -100,6 +102,8 @@ class _System(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     tls: str = ""
     """Of `trade system` itself, and of containers of this host that name none."""
     policy: str = ""
+    audit: str = ""
+    """Of containers of this host that name none."""
     connect: list[_Text] = []
 
 
@@ -269,6 +273,8 @@ class _Reading:
     def _environment_of(self, entry: Entry) -> dict[str, str]:
         system = self._system if entry.is_local else _System(name=self._system.name)
         named = self._environment(entry.tls or system.tls, entry.policy or system.policy, entry.listen, entry.host)
+        if audit := entry.audit or system.audit:
+            named["TRADE_AUDIT"] = str(self._beside(audit)) if entry.is_local else audit
         if entry.providers is not None and entry.is_local:
             known = os.environ.get("PYTHONPATH")
             named["PYTHONPATH"] = os.pathsep.join([str(self._path.parent.absolute()), *([known] if known else [])])

@@ -9,6 +9,7 @@ from typing import Any, Final
 from trade import _process
 from trade._access import Access, verb_of
 from trade._bordering import Bordering
+from trade._context import running
 from trade._guarding import Guarding
 from trade._handle import Handle, Run
 from trade._hosting import Hosting
@@ -83,7 +84,17 @@ class Container(Hosting, Moving, Streaming, Tracing, Guarding, Bordering):
         """
         self._check_open()
         self.access.load(Path(path))
+        self._parts.audit.changed("policy loaded", str(path), running.get())
         self._parts.judge_anew()
+
+    def note_change(self, what: str, about: str = "") -> None:
+        """Have a change of configuration in the record of what happened here, if one is kept (`Settings.audit`).
+
+        Args:
+            what: in a few words.
+            about: which file, which device.
+        """
+        self._parts.audit.changed(what, about, running.get())
 
     # --- looking up
 

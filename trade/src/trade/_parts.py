@@ -8,6 +8,7 @@ from typing import Final, Protocol
 from trade import _hooks, _locking, _making, _notifications, _streams
 from trade._announcing import Announcer
 from trade._arriving import Arriving
+from trade._audit import open_audit
 from trade._borrowed import Borrowed
 from trade._calls import Caller
 from trade._clockwork import Clockwork
@@ -72,6 +73,7 @@ class Parts:
         self.told_of_ends: Final[list[Callable[[str], None]]] = []
         """Told of every session that ends."""
         with contextlib.ExitStack() as leaving:  # what has begun ends again if the rest cannot begin
+            self.audit = open_audit(settings, address, leaving)
             self.transport = transport or join(settings, leaving)
             leaving.callback(self.transport.close)
             self.reach: Reach | None = None
@@ -94,15 +96,17 @@ class Parts:
             self.coroutines = AsyncLoop()
             leaving.callback(self.coroutines.close)
             self.locking = Locking(home)
-            self.locks = LockTable(epoch, home.name)
+            self.locks = LockTable(epoch, home.name, audit=self.audit)
             leaving.callback(self.locks.close)
             self.borrowed = Borrowed(self.locks, epoch)
             self.announcer = Announcer(self.transport, address)
             leaving.callback(self.announcer.close)
             self.providers = Providers(
-                self.announcer, self.registry, address, self.codec, self.coroutines, self.locks, access
+                self.announcer, self.registry, address, self.codec, self.coroutines, self.locks, access, self.audit
             )
-            self.targets = Targets(address, session, access, self.registry, self.providers, self.caller, self.codec)
+            self.targets = Targets(
+                address, session, access, self.registry, self.providers, self.caller, self.codec, self.audit
+            )
             self.registry.listen(self.targets.changed)  # before anybody is told: who is told may call
             self.registry.listen(self.notifier.changed)
             self.told_of_ends.append(self.notifier.session_ended)
@@ -128,7 +132,9 @@ class Parts:
             self.told_of_ends.append(self.listening.session_ended)
             leaving.callback(self.listening.close)
             kept = None if settings.state_dir is None else settings.state_dir / settings.system / "estop"
-            self.estopping = Estopping(self.transport, address, self.registry, self.locks, self.providers, kept, access)
+            self.estopping = Estopping(
+                self.transport, address, self.registry, self.locks, self.providers, kept, access, self.audit
+            )
             leaving.callback(self.estopping.close)
             self.deadman = self.estopping.deadman
             self.locks.stop_with(self.deadman.stop)
@@ -140,7 +146,7 @@ class Parts:
             self.arriving = Arriving(address, self.providers, self.making, freezing, access, self.codec, self.clockwork)
             leaving.callback(self.arriving.close)
             self.dispatcher = Dispatcher(
-                self.transport, address, self.providers.lookup, self.coroutines, access, access.callers()
+                self.transport, address, self.providers.lookup, self.coroutines, access, self.audit, access.callers()
             )
             leaving.callback(self.dispatcher.close)
             self.meter = Load(home.name, lambda: list(self.dispatcher._crews), self.providers.waiting)
