@@ -108,6 +108,8 @@ class GatewayFile(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
     """The folder that `trade pki issue --for gateway` made."""
     policy: str = ""
     """The access policy."""
+    metrics: str = ""
+    """Where Prometheus finds its metrics: ``127.0.0.1:9464``."""
     audit: str = ""
     """The folder for the record of what happens in it, and in its guests in other systems."""
     connect: list[_Text] = []
@@ -151,6 +153,7 @@ class GatewayFile(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
             stream_hz={network.interface: network.limits for network in networks},
             policy=beside / self.policy if self.policy else None,
             audit=self.audit_folder(where),
+            metrics=self.metrics,
             environment=_without_system(),
         )
 

@@ -28,4 +28,4 @@ def choice_of(context: typer.Context) -> SystemChoice:
 
 def visitor(context: typer.Context) -> Container:
     """A short-lived container of this command's own; what it asks for is in the records of who is asked."""
-    return Container(replace(choice_of(context).settings(), audit=None))
+    return Container(replace(choice_of(context).settings(), audit=None, metrics=""))

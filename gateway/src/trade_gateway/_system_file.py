@@ -30,7 +30,7 @@ __all__ = ["LOCAL", "Entry", "Made", "Part", "SystemPlan", "line_of", "read_syst
 LOCAL: Final = "local"
 _KINDS: Final = ("robot", "gateway", "providers", "rules")
 _ONLY_WITH: Final = {"sim": "robot", "allow": "providers"}
-_TELLS_ITSELF: Final = ("tls", "policy", "audit", "connect", "listen")
+_TELLS_ITSELF: Final = ("tls", "policy", "audit", "metrics", "connect", "listen")
 """What a gateway file says, and the system file does not."""
 _HEADER: Final = re.compile(r"\s*\[\s*([^\[\]]+?)\s*\]\s*(?:#.*)?$")
 _NAME: Final = re.compile(r"""["']([^"']*)["']|([\w-]+)""")
@@ -75,6 +75,8 @@ class Entry(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     policy: str = ""
     audit: str = ""
     """Folder for the record of what happens in it."""
+    metrics: str = ""
+    """Where Prometheus finds its metrics: ``127.0.0.1:9464``."""
     connect: list[_Text] | None = None
     """Endpoints it dials; none: those of the system."""
     listen: list[_Text] = []
@@ -182,7 +184,9 @@ class _Reading:
             if self._system.policy:
                 read_policy(self._beside(self._system.policy))
             settings = Settings.read(system=self._system.name, connect=self._system.connect, environment=environment)
-            return replace(settings, audit=None)  # it comes and goes; what it asks for is in the records of others
+            return replace(
+                settings, audit=None, metrics=""
+            )  # it comes and goes; what it asks for is in the records of others
         except ConfigurationError as wrong:
             self._refuse(("system",), "", str(wrong))
 
@@ -275,6 +279,8 @@ class _Reading:
     def _environment_of(self, entry: Entry) -> dict[str, str]:
         system = self._system if entry.is_local else _System(name=self._system.name)
         named = self._environment(entry.tls or system.tls, entry.policy or system.policy, entry.listen, entry.host)
+        if entry.metrics:
+            named["TRADE_METRICS"] = entry.metrics
         if audit := entry.audit or system.audit:
             named["TRADE_AUDIT"] = str(self._beside(audit)) if entry.is_local else audit
         if entry.providers is not None and entry.is_local:

@@ -6,11 +6,12 @@ Off, nothing of it stands in the way of a call. On, a call puts one record into 
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, Protocol
 
 from msgspec import Struct
 
 from trade._context import CallContext
+from trade._measures import Calls
 from trade._session import foreign
 from trade._settings import Settings
 from trade._system import DOMAIN
@@ -81,6 +82,16 @@ Tell = Callable[[Event], None]
 """Takes an event; returns at once, whatever becomes of it."""
 
 
+class Record(Protocol):
+    """How far what writes a record is."""
+
+    written: int
+    lost: int
+
+    @property
+    def waiting(self) -> int: ...
+
+
 class Audit:
     """Where a container tells what happens in it; with nobody to tell, it does nothing.
 
@@ -88,10 +99,22 @@ class Audit:
         tell: told of each event.
         own: the container.
         reads: tell of services that only read, too.
+        calls: where calls and refusals are counted, if they are.
+        record: what writes the events down, for who wants to know how far it is.
     """
 
-    def __init__(self, tell: Tell | None = None, own: Address | None = None, *, reads: bool = False) -> None:
+    def __init__(
+        self,
+        tell: Tell | None = None,
+        own: Address | None = None,
+        *,
+        reads: bool = False,
+        calls: Calls | None = None,
+        record: Record | None = None,
+    ) -> None:
         self._tell = tell
+        self.calls = calls
+        self.record = record
         self._own = own
         self._reads = reads
 
@@ -115,8 +138,11 @@ class Audit:
 
     def refused(self, what: str, error: TradeError | str, *, who: str, session: str = "", call_id: int = 0) -> None:
         """Tell that somebody was refused something, and by which error or for what reason."""
+        outcome = "Malformed" if isinstance(error, str) else type(error).__name__
+        if self.calls is not None:
+            self.calls.refuse(outcome)
         if self._tell is not None:
-            outcome, why = ("Malformed", error) if isinstance(error, str) else (type(error).__name__, str(error))
+            why = str(error)
             self.note("refused", what, who=who, session=session, call_id=call_id, outcome=outcome, why=why)
 
     def changed(self, what: str, about: str, call: CallContext | None) -> None:
@@ -130,9 +156,11 @@ class Audit:
 
     def watch(self, domain: str, service: "LocalService") -> None:
         """From now on tell of calls of a service that is about to be offered."""
-        rule = None if self._tell is None else _rule(domain, service.info.name, service.effect, reads=self._reads)
-        if rule is not None and self._tell is not None:
-            service.around = service.audited = Audited(self._tell, rule, None)
+        if self._tell is None and self.calls is None:
+            return
+        rule = _rule(domain, service.info.name, service.effect, reads=self._reads)
+        if rule is not None:
+            service.around = service.audited = Audited(self._tell, rule, None, self.calls, service.label)
 
 
 class _Rule(NamedTuple):
@@ -155,13 +183,14 @@ _SILENT: Final = frozenset(
 
 def open_audit(settings: Settings, own: Address, leaving: ExitStack) -> Audit:
     """Where a container tells what happens in it; what writes it down, if anything does, ends with the stack."""
+    calls = Calls() if settings.metrics else None
     if settings.audit is None:
-        return Audit()
+        return Audit(calls=calls)
     from trade._audit_writer import start_writing  # noqa: PLC0415 - who keeps no record needs no database
 
     writer = start_writing(settings, settings.audit, own)
     leaving.callback(writer.close)
-    return Audit(writer.tell, own, reads=settings.audit_reads)
+    return Audit(writer.tell, own, reads=settings.audit_reads, calls=calls, record=writer)
 
 
 def _rule(domain: str, name: str, effect: str, *, reads: bool) -> _Rule | None:
@@ -181,16 +210,21 @@ def _rule(domain: str, name: str, effect: str, *, reads: bool) -> _Rule | None:
 class Audited:
     """What is around a service whose calls are told of: what was there without that, and an event at the end."""
 
-    __slots__ = ("_around", "_rule", "_tell")
+    __slots__ = ("_around", "_calls", "_label", "_rule", "_tell", "_timed")
 
-    def __init__(self, tell: Tell, rule: _Rule, around: "Around | None") -> None:
+    def __init__(
+        self, tell: Tell | None, rule: _Rule, around: "Around | None", calls: Calls | None, label: str
+    ) -> None:
         self._tell = tell
         self._rule = rule
         self._around = around
+        self._calls = calls
+        self._label = label
+        self._timed = None if calls is None else calls.of(label)
 
     def over(self, around: "Around | None") -> "Audited":
         """The same, with something else between it and the service."""
-        return Audited(self._tell, self._rule, around)
+        return Audited(self._tell, self._rule, around, self._calls, self._label)
 
     def run(self, service: "LocalService", args: Sequence[Any], kwargs: dict[str, Any], context: CallContext) -> Any:
         """Call the service and tell of that. Its errors pass."""
@@ -201,8 +235,12 @@ class Audited:
             else:
                 result = self._around.run(service, args, kwargs, context)
         except BaseException as error:
+            if self._timed is not None:
+                self._timed.add(time.monotonic_ns() - began_ns, failed=True)
             self.failed(service, context, error, began_ns, args, kwargs)
             raise
+        if self._timed is not None:
+            self._timed.add(time.monotonic_ns() - began_ns, failed=False)
         if self._rule.always:
             self._say(service, context, self._rule.kind, "ok", "", began_ns, args, kwargs)
         return result
@@ -218,6 +256,8 @@ class Audited:
     ) -> None:
         """Tell of a call that ended with an error, or never began."""
         refused = isinstance(error, _REFUSALS)
+        if refused and self._calls is not None:
+            self._calls.refuse(type(error).__name__)
         if refused or self._rule.always:
             kind: Kind = "refused" if refused else self._rule.kind
             told = isinstance(error, TradeError) and not service.signature.has_secrets
@@ -235,6 +275,8 @@ class Audited:
         args: Sequence[Any],
         kwargs: dict[str, Any],
     ) -> None:
+        if self._tell is None:
+            return
         about: Any = ""
         if self._rule.about and (args or kwargs):
             about = args[0] if args else next(iter(kwargs.values()))

@@ -3,6 +3,7 @@
 import itertools
 import secrets
 import threading
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, Final
 
@@ -14,6 +15,7 @@ from trade._guarding import Guarding
 from trade._handle import Handle, Run
 from trade._hosting import Hosting
 from trade._invoke import container_closed
+from trade._measures import Measure
 from trade._moving import Moving
 from trade._own_services import OwnServices
 from trade._parts import Parts
@@ -95,6 +97,19 @@ class Container(Hosting, Moving, Streaming, Tracing, Guarding, Bordering):
             about: which file, which device.
         """
         self._parts.audit.changed(what, about, running.get())
+
+    def measured_by(self, tell: Callable[[], Iterable[Measure]]) -> None:
+        """Have more in this container's metrics (`Settings.metrics`): it is called whenever somebody looks.
+
+        Args:
+            tell: gives numbers that are known already, without waiting for anything.
+        """
+        self._parts.measured.append(tell)
+
+    @property
+    def metrics_port(self) -> int:
+        """Where its metrics are; 0: nowhere."""
+        return self._parts.metrics_port
 
     # --- looking up
 

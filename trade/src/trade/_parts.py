@@ -2,7 +2,8 @@
 
 import contextlib
 import itertools
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterable, Iterator
 from typing import Final, Protocol
 
 from trade import _hooks, _locking, _making, _notifications, _streams
@@ -26,10 +27,12 @@ from trade._hooks import Hooks
 from trade._inherited import InheritedLock
 from trade._joining import join
 from trade._listening import Listening
-from trade._load import Load
+from trade._load import Load, resident_bytes
 from trade._locking import Locking
 from trade._locks import LockTable
 from trade._making import Making
+from trade._measures import Measure
+from trade._metrics import open_metrics
 from trade._notifications import Notifier
 from trade._otlp import open_export
 from trade._providers import Providers
@@ -153,6 +156,9 @@ class Parts:
             self.terminating = Terminating(
                 home.name, self.deadman.rest, self.locks.resources, lambda: self.meter.running, home.close
             )
+            self.measured: Final[list[Callable[[], Iterable[Measure]]]] = []
+            """What else there is to measure, as whoever drives something tells it."""
+            self.metrics_port = open_metrics(settings, self.audit.calls, self._measures, leaving)
             self._leaving = leaving.pop_all()
 
     def appear(self, own: Own) -> None:
@@ -203,6 +209,30 @@ class Parts:
         spans: Spans | None = self.spans if on else None
         self.hooks.trace(spans)
         self.caller.spans = spans
+
+    def _measures(self) -> Iterator[Measure]:
+        """Asked for by the metrics, on a thread of theirs."""
+        infos, record = self.locks.infos(), self.audit.record
+        yield Measure("calls", "Calls from other containers.", sum(self._taken()), kind="counter")
+        yield Measure("calls_in_flight", "Those of them that have a thread now.", self.meter.running)
+        yield Measure("calls_queued", "Calls of serial services whose turn has not come.", self.providers.waiting())
+        yield Measure("containers", "Containers that are seen, this one included.", len(self.registry.containers()))
+        yield Measure("dropped_messages", "Malformed, or of another version.", self.dropped_messages, kind="counter")
+        yield Measure("locks", "Locks that hold here.", len(infos))
+        yield Measure("lock_waiters", "Who waits for one of them.", sum(len(info.waiting) for info in infos))
+        yield Measure("estops_open", "E-stops that are open.", len(self.estopping.open_here()))
+        yield Measure("process_cpu_seconds", "Of the whole process.", time.process_time(), kind="counter")
+        if (resident := resident_bytes()) is not None:
+            yield Measure("process_resident_bytes", "Of the whole process.", resident)
+        if record is not None:
+            yield Measure("audit_rows", "Written to the audit record.", record.written, kind="counter")
+            yield Measure("audit_lost", "Events that were not written to it.", record.lost, kind="counter")
+            yield Measure("audit_queue", "Events that are not written yet.", record.waiting)
+        for tell in list(self.measured):
+            yield from tell()
+
+    def _taken(self) -> list[int]:
+        return [crew.taken for crew in list(self.dispatcher._crews)]
 
     def _denied_hook(self, who: str, record: Record) -> AccessDenied | None:
         return self._home.access.denied(who, "instrument", record.key.domain, record.label)

@@ -44,6 +44,7 @@ _VARIABLES: Final = (
     "TRADE_AUDIT_READS",
     "TRADE_AUDIT_KEEP_DAYS",
     "TRADE_AUDIT_KEEP_ROWS",
+    "TRADE_METRICS",
 )
 _KEEP_DAYS: Final = 90
 _KEEP_ROWS: Final = 10_000_000
@@ -109,6 +110,9 @@ class Settings:
     """How many days it is kept; the newest 10,000 rows stay in any case."""
     audit_keep_rows: int = _KEEP_ROWS
     """How many rows of it are kept, some 350 bytes each."""
+    metrics: str = ""
+    """Where Prometheus finds ``/metrics``, such as ``127.0.0.1:9464``; none: nowhere. Takes the extra
+    ``trade-core[metrics]``."""
 
     def __post_init__(self) -> None:
         for what, text in (("system", self.system), ("identity", self.identity), ("container", self.container)):
@@ -117,6 +121,7 @@ class Settings:
                 raise ConfigurationError(where=what, problem=problem)
         self._check_collector(urlsplit(self.otlp))
         self._check_kept()
+        self._check_metrics()
         certificate = self.certificate()
         for endpoint in self.listen:
             self._check_reach(f"listen {endpoint}", Endpoint.read(endpoint))
@@ -133,6 +138,21 @@ class Settings:
             problem = "joins networks, and this is only one; name a second interface, or connect to another bridge"
             raise ConfigurationError(where=f"bridge {self.bridge[0]}", problem=problem)
         self._check_exports()
+
+    def _check_metrics(self) -> None:
+        if not self.metrics:
+            return
+        try:
+            place = Endpoint.read(f"tcp/{self.metrics}")
+        except ConfigurationError:
+            problem = f"{self.metrics!r} is no HOST:PORT; write 127.0.0.1:9464"
+            raise ConfigurationError(where="TRADE_METRICS", problem=problem) from None
+        if not (place.loopback or self.insecure_lan):
+            problem = (
+                "anybody there could read who is refused what, as it asks for no proof and is not encrypted; write "
+                f"127.0.0.1:{place.port}, and put a proxy that does both in front"
+            )
+            raise ConfigurationError(where="TRADE_METRICS", problem=problem)
 
     def _check_kept(self) -> None:
         for name, value in (("DAYS", self.audit_keep_days), ("ROWS", self.audit_keep_rows)):
@@ -231,6 +251,7 @@ class Settings:
         policy: Path | None = None,
         instantiable: Sequence[str] | None = None,
         audit: Path | None = None,
+        metrics: str | None = None,
         environment: Mapping[str, str] = os.environ,
     ) -> "Settings":
         """Settings from arguments, else from the environment, else the defaults.
@@ -240,7 +261,8 @@ class Settings:
         ``TRADE_POLICY`` (a file), ``TRADE_INSECURE_LAN`` (``1``), ``TRADE_BRIDGE`` (comma-separated), ``TRADE_LOCK``
         (set by ``trade lock``), ``TRADE_INSTANTIABLE`` (comma-separated), ``TRADE_TRACE`` (``1``), ``TRADE_OTLP`` (a
         URL), ``TRADE_AUDIT`` (a folder), ``TRADE_AUDIT_READS`` (``1``), ``TRADE_AUDIT_KEEP_DAYS``,
-        ``TRADE_AUDIT_KEEP_ROWS``, ``TRADE_RUNTIME_DIR`` and ``TRADE_STATE_DIR`` (else the user's folder for state).
+        ``TRADE_AUDIT_KEEP_ROWS``, ``TRADE_METRICS`` (``HOST:PORT``), ``TRADE_RUNTIME_DIR`` and
+        ``TRADE_STATE_DIR`` (else the user's folder for state).
         Others that begin with ``TRADE_`` are warned of.
         """
         _warn_of_unknown(environment)
@@ -270,6 +292,7 @@ class Settings:
             audit_reads=environment.get("TRADE_AUDIT_READS") == "1",
             audit_keep_days=_number(environment, "TRADE_AUDIT_KEEP_DAYS", _KEEP_DAYS),
             audit_keep_rows=_number(environment, "TRADE_AUDIT_KEEP_ROWS", _KEEP_ROWS),
+            metrics=environment.get("TRADE_METRICS", "") if metrics is None else metrics,
         )
 
 
