@@ -184,9 +184,7 @@ class _Reading:
             if self._system.policy:
                 read_policy(self._beside(self._system.policy))
             settings = Settings.read(system=self._system.name, connect=self._system.connect, environment=environment)
-            return replace(
-                settings, audit=None, metrics=""
-            )  # it comes and goes; what it asks for is in the records of others
+            return replace(settings, audit=None, metrics="")  # it comes and goes
         except ConfigurationError as wrong:
             self._refuse(("system",), "", str(wrong))
 
