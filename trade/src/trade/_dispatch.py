@@ -454,5 +454,7 @@ def _run(caller: str, call: Call, service: LocalService, ongoing: Ongoing | None
         if not isinstance(error, TradeError) or isinstance(error, _DEFECTS):
             who = foreign(call.session) or caller
             text = info.traceback or info.message
-            _logger.warning("%s failed in a call of %s:\n%s", service.label, who, text, extra={"call_id": call.id})
+            outer_id = call.behalf.calls[-1] if call.behalf and call.behalf.calls else call.id
+            told = {"call_id": call.id, "outer_id": outer_id}
+            _logger.warning("%s failed in a call of %s:\n%s", service.label, who, text, extra=told)
         return Status.ERROR, Raw(encode_message(info))
