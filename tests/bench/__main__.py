@@ -8,6 +8,7 @@ parts:
   deadman    how long a joint moves on after its client was killed or frozen
   locks      taking and giving back four services of two containers; what the checks of resources add to a call
   watching   a thousand notifications every 0.1 s; what hooks cost a call that has none
+  audit      what an audit record costs a call; records a second
   gateway    calls through one gateway and two, certificates and policy on; floods; an idle one (root, iproute2)
   streams    what five listeners to a joint-state stream at 200 Hz cost its source, beside one
   servo      the Dynamixel driver against what a bus of 1 Mbaud can carry
@@ -25,6 +26,7 @@ from collections.abc import Callable, Mapping
 
 from tests.bench import (
     _arm,
+    _audit,
     _calls,
     _cans,
     _deadman,
@@ -57,6 +59,7 @@ _PARTS: Mapping[str, Callable[[argparse.Namespace], None]] = {
     "deadman": lambda options: _deadman.run(options.rounds),
     "locks": lambda options: _locks.run(options.n, options.rounds),
     "watching": lambda options: _watching.run(options.n, options.rounds, options.seconds),
+    "audit": lambda options: _audit.run(options.n, options.rounds, options.seconds),
     "gateway": lambda options: _gateway.run(options.n, options.rounds, options.idle),
     "streams": lambda options: _streams.run(max(1, options.rounds // 2), 2 * options.seconds),
     "servo": lambda options: _servo.run(options.n, options.rounds, options.seconds),

@@ -93,6 +93,11 @@ def test_the_bench_of_watching_prints_its_targets() -> None:
     assert targets(printed) == ["merged ticks, %", "another watched / none"]
 
 
+def test_the_bench_of_audit_records_prints_its_targets() -> None:
+    printed = bench("audit", "-n", "3", "--rounds", "1", "--seconds", "0.3")
+    assert targets(printed) == ["p50: audit on / off", "p99: audit on / off", "records/s written"]
+
+
 def test_the_bench_of_streams_prints_its_target() -> None:
     assert targets(bench("streams", "--rounds", "1", "--seconds", "0.1")) == ["five listeners / one"]
 

@@ -316,3 +316,12 @@ def test_a_change_of_what_a_share_names_is_seen(sharing: Path) -> None:
         beside.write_text(beside.read_text() + "\n")
         assert digest(sharing) not in seen
         seen.append(digest(sharing))
+
+
+def test_the_record_of_a_gateway_lies_beside_its_file(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TRADE_AUDIT", "/somewhere/else")
+    monkeypatch.setenv("TRADE_AUDIT_KEEP_DAYS", "7")
+    assert read_gateway_file(file).settings.audit is None
+    change(file, 'system = "lab"', 'system = "lab"\naudit = "audit"')
+    settings = read_gateway_file(file).settings
+    assert (settings.audit, settings.audit_keep_days) == (file.parent / "audit", 7)

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, Final, Generic, Protocol, TypeVar
 
+from trade import Measure
 from trade.errors import BusGone, TradeError
 from trade_drivers._exchange import BusExchange
 from trade_drivers._work import Device, PortLost
@@ -51,6 +52,10 @@ class BusThread(Generic[_Exchange_co]):
         self._reopen_at = 0.0
         self._reopen_s = _REOPEN_FIRST_S
         self._leaving = False
+        self.cycles = 0
+        """Since it started."""
+        self.late = 0
+        """Of those, how many ended so late that the next one began after its time by a whole period."""
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
 
     @property
@@ -65,6 +70,16 @@ class BusThread(Generic[_Exchange_co]):
     def alive(self) -> bool:
         """Whether the thread still runs."""
         return self._thread.is_alive()
+
+    def measures(self, bus: str) -> list[Measure]:
+        """How it fares; ``bus`` is its name with the robot's before it."""
+        of, missed = {"bus": bus}, self.exchange.missed_answers
+        return [
+            Measure("bus_cycles", "Cycles of a bus.", self.cycles, of, "counter"),
+            Measure("bus_late_cycles", "Cycles that ended too late by a period or more.", self.late, of, "counter"),
+            Measure("bus_missed_answers", "Exchanges not answered in time.", missed, of, "counter"),
+            Measure("bus_up", "1: its port is open; 0: gone, and looked for.", float(not self._lost_at), of),
+        ]
 
     def close(self) -> None:
         """Stop everything, hold or relax as the robot file says, let go of the port. More than once is fine.
@@ -111,12 +126,16 @@ class BusThread(Generic[_Exchange_co]):
             if self._leaving:
                 break
         now = time.monotonic()
-        return next_at if now - next_at < 1 / self._bus.rate_hz else now  # a little late, the next one is not
+        if now - next_at < 1 / self._bus.rate_hz:  # a little late, the next one is not
+            return next_at
+        self.late += 1
+        return now
 
     def _beat(self) -> None:
         if self._lost_at:
             self._reopen()
         elif self._is_healthy():
+            self.cycles += 1
             self._guarded(self.exchange.cycle)
 
     def _guarded(self, act: Callable[[], None]) -> None:

@@ -121,6 +121,7 @@ class Gateway:
             complain(f"{file} was changed and cannot be used; going on as before: {refused}")
             return False
         self._plan, self._named = plan, named
+        self._container.note_change("gateway file read", str(file))
         self._look_after(plan)
         out.say(f"read {file} again")
         if out.as_json:

@@ -80,13 +80,14 @@ class Share(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, renam
     credentials: str = ""
     """Laboratories only, instead of ``tls``: ``user:password``."""
 
-    def settings(self, where: Path, name: str, *, insecure_lan: bool) -> Settings:
+    def settings(self, where: Path, name: str, audit: Path | None, *, insecure_lan: bool) -> Settings:
         """What the guest is started with. Raises ConfigurationError."""
         if self.policy:
             read_policy(where.parent / self.policy)
         return Settings.read(
             system=self.system,
             container=name,
+            audit=audit,
             listen=self.listen,
             connect=self.connect,
             credentials=_pair(self.credentials),
@@ -109,6 +110,10 @@ class GatewayFile(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
     """The folder that `trade pki issue --for gateway` made."""
     policy: str = ""
     """The access policy."""
+    metrics: str = ""
+    """Where Prometheus finds its metrics: ``127.0.0.1:9464``."""
+    audit: str = ""
+    """The folder for the record of what happens in it, and in its guests in other systems."""
     connect: list[_Text] = []
     """Other gateways that it dials."""
     network: dict[str, Network] = {}
@@ -151,8 +156,14 @@ class GatewayFile(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
             exports=exports if limited else None,
             stream_hz={network.interface: network.limits for network in networks},
             policy=beside / self.policy if self.policy else None,
+            audit=self.audit_folder(where),
+            metrics=self.metrics,
             environment=_without_system(),
         )
+
+    def audit_folder(self, where: Path) -> Path | None:
+        """Beside the file."""
+        return where.parent / self.audit if self.audit else None
 
 
 def _pair(credentials: str) -> tuple[str, str] | None:
@@ -165,8 +176,13 @@ def _or_all(groups: Sequence[str] | None) -> Sequence[str]:
 
 
 def _without_system() -> dict[str, str]:
-    """The file says it all, and not whatever shell the gateway is started from; but for places on this host."""
-    return {name: value for name, value in os.environ.items() if not name.startswith("TRADE_") or name.endswith("_DIR")}
+    """The file says it all, and not whatever shell the gateway is started from; but for what concerns this host."""
+    kept = ("TRADE_AUDIT_READS", "TRADE_AUDIT_KEEP_DAYS", "TRADE_AUDIT_KEEP_ROWS")
+    return {
+        name: value
+        for name, value in os.environ.items()
+        if not name.startswith("TRADE_") or name.endswith("_DIR") or name in kept
+    }
 
 
 _KINDS: Final[Mapping[str, type[Struct]]] = {"network": Network, "share": Share}
@@ -205,10 +221,17 @@ def read_gateway_file(path: Path) -> Plan:
         raise _explained(str(bad), raw, where) from None
     _check(file, where)
     shares = {
-        name: share.settings(path, file.name, insecure_lan=file.insecure_lan) for name, share in file.share.items()
+        name: share.settings(path, file.name, file.audit_folder(path), insecure_lan=file.insecure_lan)
+        for name, share in file.share.items()
     }
     laboratory = _of_children(file)
-    around = Around(system=file.system, policy=file.policy, environment=laboratory, inherited=_without_system())
+    around = Around(
+        system=file.system,
+        policy=file.policy,
+        audit=file.audit,
+        environment=laboratory,
+        inherited=_without_system(),
+    )
     children = read_children(path, text, around, file.container, certified=bool(file.tls))
     return Plan(file, file.settings(path), shares, children)
 

@@ -16,7 +16,7 @@ from trade import Settings
 from trade.errors import ConfigurationError
 from trade.policies import read_policy
 from trade.rules import read_rules
-from trade_drivers import load
+from trade_drivers import load, without
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -27,7 +27,7 @@ __all__ = ["LOCAL", "Around", "Entry", "Made", "Part", "Tables", "at", "converte
 
 LOCAL: Final = "local"
 _KINDS: Final = ("robot", "gateway", "providers", "rules")
-_ONLY_WITH: Final = {"sim": "robot", "allow": "providers"}
+_ONLY_WITH: Final = {"sim": "robot", "without": "robot", "allow": "providers"}
 _HEADER: Final = re.compile(r"\s*\[\s*([^\[\]]+?)\s*\]\s*(?:#.*)?$")
 _NAME: Final = re.compile(r"""["']([^"']*)["']|([\w-]+)""")
 _AT: Final = re.compile(r" - at `\$\.?([^`]*)`$")
@@ -57,6 +57,8 @@ class Entry(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """A robot file."""
     sim: bool = False
     """Simulate the robot's devices."""
+    without: list[_Text] = []
+    """Buses, cameras and sensors of the robot that are left out."""
     gateway: str = ""
     """A gateway file."""
     providers: list[Made] | None = None
@@ -69,6 +71,10 @@ class Entry(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Containers that must be up before."""
     tls: str = ""
     policy: str = ""
+    audit: str = ""
+    """Folder for the record of what happens in it."""
+    metrics: str = ""
+    """Where Prometheus finds its metrics: ``127.0.0.1:9464``."""
     connect: list[_Text] | None = None
     """Endpoints it dials; none: those of the system."""
     listen: list[_Text] = []
@@ -97,8 +103,9 @@ class Around(Struct, frozen=True, kw_only=True):
     system: str
     """The system id."""
     tls: str = ""
-    """Of containers of this host that name none; so is the policy."""
+    """Of containers of this host that name none; so are the policy and the folder for records."""
     policy: str = ""
+    audit: str = ""
     connect: Sequence[str] = ()
     environment: Mapping[str, str] = {}
     """Variables of containers of this host, besides those they inherit."""
@@ -183,7 +190,7 @@ class Tables:
         """Raises ConfigurationError: what it needs of this host is not there, or is wrong."""
         file = self.beside(entry.file)
         if entry.robot:
-            load(file)
+            without(load(file), entry.without)
         if entry.sim and importlib.util.find_spec("trade_hil_sim") is None:
             self.refuse(name, "sim", "needs trade-hil-sim; pip install trade-hil-sim")
         if entry.rules:
@@ -203,7 +210,8 @@ class Tables:
         allowed = [pattern for made in entry.providers or () for pattern in (made.class_,)] + entry.allow
         match entry.kind:
             case "robot":
-                does = ["up", file, "--name", name, *(["--sim"] if entry.sim else [])]
+                left_out = [word for part in entry.without for word in ("--without", part)]
+                does = ["up", file, "--name", name, *(["--sim"] if entry.sim else []), *left_out]
             case "gateway":
                 does = ["gateway", file]
             case "rules":
@@ -221,6 +229,10 @@ class Tables:
         named = self.environment(entry.tls or around.tls, entry.policy or around.policy, entry.host)
         if entry.listen:
             named["TRADE_LISTEN"] = ",".join(entry.listen)
+        if entry.metrics:
+            named["TRADE_METRICS"] = entry.metrics
+        if audit := entry.audit or around.audit:
+            named["TRADE_AUDIT"] = str(self.beside(audit)) if entry.is_local else audit
         if entry.providers is not None and entry.is_local:
             known = os.environ.get("PYTHONPATH")
             named["PYTHONPATH"] = os.pathsep.join([str(self.path.parent.absolute()), *([known] if known else [])])

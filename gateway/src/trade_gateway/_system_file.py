@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Final, NamedTuple, cast
 
@@ -15,7 +16,7 @@ from trade_gateway._parts import Around, Entry, Part, Tables, at, converted, lin
 
 __all__ = ["SystemPlan", "read_system_file"]
 
-_TELLS_ITSELF: Final = ("tls", "policy", "connect", "listen")
+_TELLS_ITSELF: Final = ("tls", "policy", "audit", "metrics", "connect", "listen")
 """What a gateway file says, and the system file does not."""
 
 _Text = Annotated[str, Meta(min_length=1)]
@@ -27,6 +28,8 @@ class _System(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     tls: str = ""
     """Of `trade system` itself, and of containers of this host that name none."""
     policy: str = ""
+    audit: str = ""
+    """Of containers of this host that name none."""
     connect: list[_Text] = []
 
 
@@ -66,7 +69,9 @@ def read_system_file(path: Path) -> SystemPlan:
         name: converted(table, Entry, path, text, ("container", name))
         for name, table in cast("dict[str, object]", tables).items()
     }
-    around = Around(system=system.name, tls=system.tls, policy=system.policy, connect=system.connect)
+    around = Around(
+        system=system.name, tls=system.tls, policy=system.policy, audit=system.audit, connect=system.connect
+    )
     reading = _WithGateways(path, text, around, entries)
     settings = _own_settings(reading, text)
     return SystemPlan(path, settings, reading.parts(), text)
@@ -79,7 +84,8 @@ def _own_settings(reading: Tables, text: str) -> Settings:
     try:
         if system.policy:
             read_policy(reading.beside(system.policy))
-        return Settings.read(system=system.system, connect=system.connect, environment=environment)
+        settings = Settings.read(system=system.system, connect=system.connect, environment=environment)
+        return replace(settings, audit=None, metrics="")  # it comes and goes
     except ConfigurationError as wrong:
         raise ConfigurationError(where=at(reading.path, text, ("system",), ""), problem=str(wrong)) from None
 

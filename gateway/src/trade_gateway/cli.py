@@ -7,6 +7,7 @@ import typer
 
 from trade.errors import TradeError
 from trade_gateway import (
+    _audit,
     _calibrate,
     _call,
     _doctor,
@@ -77,6 +78,7 @@ app.command("hooks", rich_help_panel=_WATCHING)(_watchers.hooks)
 app.command("tracing", rich_help_panel=_WATCHING)(_trace.tracing)
 app.command("trace", rich_help_panel=_WATCHING)(_trace.trace)
 app.command("logs", rich_help_panel=_WATCHING)(_logs.logs)
+app.add_typer(_audit.app, name="audit", rich_help_panel=_WATCHING)
 app.command("profile", rich_help_panel=_WATCHING)(_profile.profile)
 app.add_typer(_rules.app, name="rules", rich_help_panel=_WATCHING)
 app.add_typer(_pki_commands.app, name="pki", rich_help_panel=_RIGHTS)

@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from typing import Final, NoReturn
 
+from trade import Measure
 from trade.errors import ConfigurationError
 from trade_drivers._arm import Arm
 from trade_drivers._bus_thread import BusThread
@@ -37,6 +38,9 @@ class AttachedController(AttachedBus):
 
     def arm(self, name: str) -> Arm:  # noqa: ARG002 - there is one
         return UrArm(self._thread, self._thread.exchange.limb)
+
+    def measures(self, bus: str) -> list[Measure]:
+        return self._thread.measures(bus)
 
     def close(self) -> None:
         self._thread.close()
