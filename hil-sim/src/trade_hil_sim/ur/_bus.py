@@ -386,4 +386,5 @@ class UrBus:
         self._emit(Entry(time.monotonic(), "", "event", name, source=source, detail=detail))
 
     def _emit(self, entry: Entry) -> None:
-        self.log.add(msgspec.structs.replace(entry, bus=self.name, device_id=_ARM))
+        """Log it as of now: the arm's own time may lag behind when this thread is held up."""
+        self.log.add(msgspec.structs.replace(entry, t=time.monotonic(), bus=self.name, device_id=_ARM))
