@@ -65,7 +65,7 @@ def test_an_address_where_nobody_is_or_answers_is_named() -> None:
     ("before", "after", "complaint"),
     [
         ('host = "192.168.0.10"', 'port = "/dev/ttyUSB0"', "driver ur needs a controller"),
-        ('model = "UR5e"', 'model = "PUMA"', "it knows UR3, UR3e"),
+        ('model = "UR5e"', 'model = "PUMA"', "it knows UR3, UR5, UR10, UR3e"),
         ('host = "192.168.0.10"', 'host = "192.168.0.10"\nleave = "relax"', "it would fall"),
         ('driver = "ur"', 'driver = "ur"\nrate_hz = 501', "rate_hz"),
         (
@@ -81,7 +81,7 @@ def test_an_address_where_nobody_is_or_answers_is_named() -> None:
     ],
 )
 def test_a_mistake_in_the_robot_file_is_answered_with_the_key(before: str, after: str, complaint: str) -> None:
-    text = OLDER if "UR10" in complaint else ARM
+    text = OLDER if "of a UR10" in complaint else ARM
     assert before in text
     with ExitStack() as undo, pytest.raises(ConfigurationError, match=complaint):
         attached(undo, "127.0.0.213", text.replace(before, after))
