@@ -10,7 +10,7 @@ from typing import Any, Final, Generic, Protocol, TypeVar
 from trade import Measure
 from trade.errors import BusGone, TradeError
 from trade_drivers._exchange import BusExchange
-from trade_drivers._work import Device, PortLost
+from trade_drivers._work import Device, PortLost, PortOpening
 from trade_drivers.robotfile import Bus
 
 __all__ = ["BusThread", "Port"]
@@ -27,7 +27,10 @@ class Port(Protocol):
     """For messages."""
 
     def open(self) -> None:
-        """Begin to use it; raises ``PortLost`` while it is not there."""
+        """Begin to use it; raises ``PortLost`` while it is not there, ``PortOpening`` if that is only a matter of time.
+
+        While it is waited for, services are answered: it must not block for long.
+        """
         ...
 
     def close(self) -> None:
@@ -146,10 +149,10 @@ class BusThread(Generic[_Exchange_co]):
             self._lost_at, self._lost_why = time.monotonic(), str(lost)
             self._reopen_s = _REOPEN_FIRST_S
             self._reopen_at = self._lost_at + self._reopen_s
-            self._wire.close()
             self.exchange.refusing = self._gone
             self.exchange.forget_measurements()
             self.exchange.fail_all(self._gone)
+            self._wire.close()
 
     def _gone(self, device: Device) -> TradeError:
         waited_s = time.monotonic() - self._lost_at
@@ -161,6 +164,9 @@ class BusThread(Generic[_Exchange_co]):
             return
         try:
             self._wire.open()
+        except PortOpening:
+            self._reopen_at = time.monotonic() + _REOPEN_FIRST_S
+            return
         except (PortLost, TradeError) as still:
             self._lost_why = str(still)
             self._reopen_s = min(_REOPEN_MOST_S, 2 * self._reopen_s)

@@ -90,8 +90,8 @@ class UrBus(Bus, frozen=True, kw_only=True):
 
     host: Text
     """Its name or address; the ports are fixed."""
-    rate_hz: Annotated[float, Meta(gt=0, le=500)] = 500.0
-    """Set-points per second."""
+    rate_hz: Annotated[float, Meta(ge=0, le=500)] = 0.0
+    """Set-points per second; 0: as many as the controller has cycles, 500 or (CB3) 125."""
 
     @property
     def port(self) -> str:
