@@ -19,7 +19,7 @@ LAMPS = '[container.lamps]\nproviders = [{ class = "lamp:Lamp", groups = ["hall"
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    for name in ("rosie.toml", "care.toml", "system.toml"):
+    for name in ("rosie.toml", "head.toml", "care.toml", "system.toml"):
         shutil.copy(EXAMPLES / name, tmp_path)
     return tmp_path
 
@@ -36,7 +36,7 @@ def test_the_example_gives_each_container_its_words_in_order(folder: Path) -> No
     assert [part.name for part in plan.parts][-1] == "care"
     words = {part.name: " ".join(part.words) for part in plan.parts}
     assert words == {
-        "rosie": f"--system home up {folder}/rosie.toml --name rosie --sim",
+        "rosie": f"--system home up {folder}/head.toml --name rosie --sim",
         "lamps": "--system home container --name lamps --allow lamp:Lamp",
         "attic": "--system home container --name attic --allow lamp:Lamp",
         "care": f"--system home rules run {folder}/care.toml --name care",

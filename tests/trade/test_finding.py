@@ -124,11 +124,15 @@ def test_find_waits_for_a_service_that_comes_late(here: Container, there: Contai
 def test_the_containers_of_the_system_are_listed(here: Container, there: Container) -> None:
     there.register(Arm(), "rosie")
     here.find(where(name="angle"), wait_s=20)
-    infos = {info.name: info for info in here.containers()}
-    assert set(infos) == {"here", "there"}
     own = len(there.services(where(group="trade", local=True)))
-    assert (infos["there"].providers, infos["there"].services) == (2, 2 + own)
-    assert infos["there"].epoch == there.address.epoch
+
+    def known() -> tuple[int, int, str]:
+        infos = {info.name: info for info in here.containers()}
+        assert set(infos) == {"here", "there"}
+        return (infos["there"].providers, infos["there"].services, infos["there"].epoch)
+
+    # what it offers comes one after the other
+    assert here._parts.registry.wait_for(lambda: known() == (2, 2 + own, there.address.epoch), 20), known()
 
 
 def test_a_closed_container_is_no_longer_listed(here: Container, there: Container) -> None:
