@@ -31,6 +31,7 @@ def run(site: Site, door: int, seconds: float) -> None:
         "up",
         str(_ROSIE),
         "--sim",
+        *(word for part in ("left_arm", "right_arm", "tail") for word in ("--without", part)),
         "--json",
         runtime="rosie",
         TRADE_SYSTEM=SYSTEM[SECURE],
