@@ -6,7 +6,7 @@ import signal
 from collections.abc import Generator
 from contextlib import contextmanager
 from types import FrameType
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
 import msgspec
 import typer
@@ -19,6 +19,8 @@ from trade_gateway._system_choice import visitor
 
 _NO_NUMBER = re.compile(r"(?<![\w\"])(nan|inf|infinity)(?![\w\"])", re.IGNORECASE)
 _WORD = re.compile(r"[^\W\d][\w ./-]*")
+COMMAND: Final = {"context_settings": {"ignore_unknown_options": True}}
+"""A negative number is no option."""
 _NAMED = re.compile(r"([A-Za-z_]\w*)=(.*)", re.DOTALL)
 
 

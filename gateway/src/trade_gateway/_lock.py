@@ -38,6 +38,10 @@ class WithCommand(TyperCommand):
         return [*super().collect_usage_pieces(ctx), "-- COMMAND [ARGUMENT]..."]
 
 
+COMMAND: Final = {"cls": WithCommand}
+"""How the command line is to take it."""
+
+
 def lock(
     context: typer.Context,
     group: Annotated[str | None, typer.Argument(help="This group and what is beneath it: rosie.head.")] = None,

@@ -1,41 +1,18 @@
 """The command ``trade``: bring a robot up, look at a system, call its services."""
 
 import sys
+from collections.abc import Sequence
+from importlib import import_module
 from typing import Annotated, Final
 
 import typer
 
 from trade.errors import TradeError
-from trade_gateway import (
-    _audit,
-    _calibrate,
-    _call,
-    _doctor,
-    _empty_container,
-    _estop,
-    _gateway,
-    _list,
-    _lock,
-    _locks,
-    _logs,
-    _migrate,
-    _pki_commands,
-    _policy,
-    _profile,
-    _rules,
-    _scan,
-    _start,
-    _stream,
-    _system_commands,
-    _trace,
-    _up,
-    _watchers,
-)
 from trade_gateway._lifeline import end_with_stdin
 from trade_gateway._output import UsageError, say_error
 from trade_gateway._system_choice import SystemChoice
 
-__all__ = ["app", "main"]
+__all__ = ["build", "main"]
 
 _SERVICES: Final = "Services"
 _MOTION: Final = "Locks and stops"
@@ -44,45 +21,87 @@ _HARDWARE: Final = "Setting hardware up"
 _WATCHING: Final = "Watching and rules"
 _RIGHTS: Final = "Identities and rights"
 
-app = typer.Typer(
-    name="trade",
-    no_args_is_help=True,
-    add_completion=False,
-    rich_markup_mode="rich",
-    help="Robots as services: bring one up, see what it offers, call it.",
-    epilog="Without hardware: trade up examples/rosie.toml --sim, then in another terminal: trade services",
-    context_settings={"help_option_names": ["-h", "--help"]},
-)
-app.command("up", rich_help_panel=_ROBOTS)(_up.up)
-app.command("gateway", rich_help_panel=_ROBOTS)(_gateway.gateway)
-app.command("container", rich_help_panel=_ROBOTS)(_empty_container.container)
-app.command("start", rich_help_panel=_ROBOTS)(_start.start)
-app.command("migrate", rich_help_panel=_ROBOTS)(_migrate.migrate)
-app.add_typer(_system_commands.app, name="system", rich_help_panel=_ROBOTS)
-app.command("scan", rich_help_panel=_HARDWARE)(_scan.scan)
-app.command("set-id", rich_help_panel=_HARDWARE)(_scan.set_id)
-app.command("set-baud", rich_help_panel=_HARDWARE)(_scan.set_baud)
-app.command("calibrate", rich_help_panel=_HARDWARE)(_calibrate.calibrate)
-app.command("doctor", rich_help_panel=_HARDWARE)(_doctor.doctor)
-app.command("services", rich_help_panel=_SERVICES)(_list.services)
-app.command("containers", rich_help_panel=_SERVICES)(_list.containers)
-app.command("call", context_settings={"ignore_unknown_options": True}, rich_help_panel=_SERVICES)(_call.call)
-app.command("stream", rich_help_panel=_SERVICES)(_stream.stream)
-app.command("lock", cls=_lock.WithCommand, rich_help_panel=_MOTION)(_lock.lock)
-app.command("locks", rich_help_panel=_MOTION)(_locks.locks)
-app.command("unlock", rich_help_panel=_MOTION)(_locks.unlock)
-app.command("resume", rich_help_panel=_MOTION)(_locks.resume)
-app.command("estop", rich_help_panel=_MOTION)(_estop.estop)
-app.command("notifications", rich_help_panel=_WATCHING)(_watchers.notifications)
-app.command("hooks", rich_help_panel=_WATCHING)(_watchers.hooks)
-app.command("tracing", rich_help_panel=_WATCHING)(_trace.tracing)
-app.command("trace", rich_help_panel=_WATCHING)(_trace.trace)
-app.command("logs", rich_help_panel=_WATCHING)(_logs.logs)
-app.add_typer(_audit.app, name="audit", rich_help_panel=_WATCHING)
-app.command("profile", rich_help_panel=_WATCHING)(_profile.profile)
-app.add_typer(_rules.app, name="rules", rich_help_panel=_WATCHING)
-app.add_typer(_pki_commands.app, name="pki", rich_help_panel=_RIGHTS)
-app.add_typer(_policy.app, name="policy", rich_help_panel=_RIGHTS)
+_COMMANDS: Final = {
+    "up": (_ROBOTS, "_up:up"),
+    "gateway": (_ROBOTS, "_gateway:gateway"),
+    "container": (_ROBOTS, "_empty_container:container"),
+    "start": (_ROBOTS, "_start:start"),
+    "migrate": (_ROBOTS, "_migrate:migrate"),
+    "system": (_ROBOTS, "_system_commands:app"),
+    "scan": (_HARDWARE, "_scan:scan"),
+    "set-id": (_HARDWARE, "_scan:set_id"),
+    "set-baud": (_HARDWARE, "_scan:set_baud"),
+    "calibrate": (_HARDWARE, "_calibrate:calibrate"),
+    "doctor": (_HARDWARE, "_doctor:doctor"),
+    "services": (_SERVICES, "_list:services"),
+    "containers": (_SERVICES, "_list:containers"),
+    "call": (_SERVICES, "_call:call"),
+    "stream": (_SERVICES, "_stream:stream"),
+    "lock": (_MOTION, "_lock:lock"),
+    "locks": (_MOTION, "_locks:locks"),
+    "unlock": (_MOTION, "_locks:unlock"),
+    "resume": (_MOTION, "_locks:resume"),
+    "estop": (_MOTION, "_estop:estop"),
+    "notifications": (_WATCHING, "_watchers:notifications"),
+    "hooks": (_WATCHING, "_watchers:hooks"),
+    "tracing": (_WATCHING, "_trace:tracing"),
+    "trace": (_WATCHING, "_trace:trace"),
+    "logs": (_WATCHING, "_logs:logs"),
+    "audit": (_WATCHING, "_audit:app"),
+    "profile": (_WATCHING, "_profile:profile"),
+    "rules": (_WATCHING, "_rules:app"),
+    "pki": (_RIGHTS, "_pki_commands:app"),
+    "policy": (_RIGHTS, "_policy:app"),
+}
+"""By name: where help shows it, and the function or the group of commands that does it."""
+_WITH_VALUE: Final = ("--system", "--connect")
+"""Options of every command that take another word."""
+
+
+def build(only: str | None = None) -> typer.Typer:
+    """The command line.
+
+    Args:
+        only: the one command that will be asked for: what the others need is not imported. None: all of them.
+    """
+    made = typer.Typer(
+        name="trade",
+        no_args_is_help=True,
+        add_completion=False,
+        rich_markup_mode="rich",
+        help="Robots as services: bring one up, see what it offers, call it.",
+        epilog="Without hardware: trade up examples/rosie.toml --sim, then in another terminal: trade services",
+        context_settings={"help_option_names": ["-h", "--help"]},
+    )
+    made.callback()(options)
+    for name, (panel, where) in _COMMANDS.items():
+        if only is not None and name != only:
+            continue
+        module, _, attribute = where.partition(":")
+        room = import_module(f"trade_gateway.{module}")
+        does = getattr(room, attribute)
+        if isinstance(does, typer.Typer):
+            made.add_typer(does, name=name, rich_help_panel=panel)
+        else:
+            made.command(name, rich_help_panel=panel, **getattr(room, "COMMAND", {}))(does)
+    return made
+
+
+def __getattr__(name: str) -> typer.Typer:
+    if name != "app":
+        raise AttributeError(name)
+    return build()
+
+
+def _asked_for(words: Sequence[str]) -> str | None:
+    """The command among the words of a command line; None if it is to be found out, or help is wanted about all."""
+    left = iter(words)
+    for word in left:
+        if word in _WITH_VALUE:
+            next(left, None)
+        elif not word.startswith("-"):
+            return word if word in _COMMANDS else None
+    return None
 
 
 def _version(wanted: bool) -> None:
@@ -93,7 +112,6 @@ def _version(wanted: bool) -> None:
         raise typer.Exit
 
 
-@app.callback()
 def options(
     context: typer.Context,
     system: Annotated[
@@ -119,7 +137,7 @@ def options(
 def main() -> None:
     """Run the command line; errors of ours are one line on stderr and exit code 1, or 2 if its words are wrong."""
     try:
-        app()
+        build(_asked_for(sys.argv[1:]))()
     except UsageError as error:
         say_error(error)
         sys.exit(2)
