@@ -14,6 +14,7 @@ class Command(IntEnum):
     HEARTBEAT = 0x01
     ESTOP = 0x02
     GET_ERROR = 0x03
+    ADDRESS = 0x06
     SET_AXIS_STATE = 0x07
     GET_ENCODER_ESTIMATES = 0x09
     SET_CONTROLLER_MODE = 0x0B
