@@ -17,15 +17,25 @@ WAGS = [0.4, 0.3], [-0.4, -0.3], [0.0, 0.0]
 
 
 def service(name: str, of: trade.Constraint) -> Handle:
-    return trade.find(of & where(name=name)).with_(deadline_s=30)
+    return trade.find(of & where(name=name), wait_s=10).with_(deadline_s=30)
 
 
 def joints(name: str, of: trade.Constraint) -> Handle:
     return service(name, of & where(kind="JointGroup"))
 
 
+def has_left_arm() -> bool:
+    """Asked once the rest of the robot is known."""
+    for part in (RIGHT, TAIL):
+        joints("move_to", part)
+    try:
+        return bool(trade.find(LEFT & where(name="move_to_pose"), wait_s=1))
+    except errors.NoSuchService:
+        return False
+
+
 def greet() -> None:
-    has_left = bool(trade.services(LEFT))
+    has_left = has_left_arm()
     with trade.lock(LEFT | RIGHT | TAIL, purpose="greet"):
         print("one lock over " + ("both arms and the tail" if has_left else "the right arm and the tail"), flush=True)
         for part in (RIGHT, TAIL):
