@@ -1,11 +1,10 @@
 """One TCP connection to a controller: bytes in, answers out, each when it is due."""
 
-import heapq
 import socket
 import time
+from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
-from itertools import count
 from typing import Final
 
 from trade_hil_sim._faults import Piece
@@ -35,8 +34,7 @@ class Client:
         self.name = name
         self.held = bytearray()
         """What has come in and is not whole yet."""
-        self._waiting: list[tuple[float, int, bytes]] = []
-        self._order = count()
+        self._waiting: deque[tuple[float, bytes]] = deque()
         self._unsent = bytearray()
 
     def fileno(self) -> int:
@@ -65,16 +63,17 @@ class Client:
         return bool(data)
 
     def tell(self, pieces: Sequence[Piece]) -> None:
-        """Queue an answer."""
+        """Queue an answer. What is late holds up what comes after it: a stream keeps its order."""
         now = time.monotonic()
         for data, late_s in pieces:
-            heapq.heappush(self._waiting, (now + late_s, next(self._order), data))
+            before = self._waiting[-1][0] if self._waiting else now
+            self._waiting.append((max(now + late_s, before), data))
 
     def flush(self) -> bool:
         """Write what is due and can be written without waiting; False when it is gone, or does not read."""
         now = time.monotonic()
         while self._waiting and self._waiting[0][0] <= now:
-            self._unsent += heapq.heappop(self._waiting)[2]
+            self._unsent += self._waiting.popleft()[1]
         try:
             with suppress(BlockingIOError):
                 if self._unsent:
