@@ -112,7 +112,7 @@ class MotorContract:
     def test_S04_a_velocity_that_is_not_renewed_ends_by_itself(self, motor: Motor) -> None:
         start = motor.state().position_rad
         motor.enable()  # on a slow bus that takes longer than the set-point holds
-        motor.set_velocity(_inwards(motor), 0.2)
+        motor.set_velocity(_inwards(motor) / 2, 0.4)
         until(lambda: motor.state().moving, "it turns")
         until(lambda: not motor.state().moving, "it has come to rest by itself")
         assert 0 < (motor.state().position_rad - start) / _inwards_sign(motor, start) < REACH_RAD
