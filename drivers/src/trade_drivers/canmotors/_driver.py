@@ -2,7 +2,7 @@
 
 import time
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from contextlib import ExitStack
 from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar, Final
@@ -32,6 +32,8 @@ class CanMotorDriver(Driver):
 
     modules = ("can",)
     name: ClassVar[str]
+    models: ClassVar[Collection[str]]
+    """What it knows, as printed on them."""
 
     @abstractmethod
     def exchange(self, robot: Robot, bus: CanBus, wire: "CanPort", port: str) -> "MotorExchange[Any]":
@@ -52,6 +54,12 @@ class CanMotorDriver(Driver):
             undo.pop_all()
         return _AttachedMotors(thread, exchange.port)
 
+    def _check_models(self, robot: Robot, bus: CanBus) -> None:
+        for joint in robot.joints_on(bus.name):
+            if joint.model not in self.models:
+                problem = f"{joint.model!r} is none of {', '.join(self.models)}"
+                raise ConfigurationError(where=f'{robot.where}: joint."{joint.name}".model', problem=problem)
+
     def open_exchange(self, robot: Robot, bus: CanBus, port: str) -> "MotorExchange[Any]":
         """Open the port and look every motor over, without a thread: ``cycle()`` is the caller's to call.
 
@@ -59,6 +67,7 @@ class CanMotorDriver(Driver):
             ConfigurationError: the port cannot be had, or a motor is absent, another, or cannot be used as it is.
         """
         where = f"{robot.where}: bus.{bus.name}"
+        self._check_models(robot, bus)
         wire = self._wire(port, bus, where)
         exchange = self.exchange(robot, bus, wire, port)
         with ExitStack() as undo:

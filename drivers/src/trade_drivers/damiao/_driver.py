@@ -2,7 +2,6 @@
 
 from typing import TYPE_CHECKING, Any
 
-from trade.errors import ConfigurationError
 from trade_drivers.canmotors import CanMotorDriver
 from trade_drivers.damiao._axis import DamiaoAxis
 from trade_drivers.damiao._commission import DamiaoCommissioner
@@ -21,20 +20,16 @@ class DamiaoDriver(CanMotorDriver):
     """Damiao motors on a CAN bus."""
 
     name = "damiao"
+    models = MODELS
     commissioner = DamiaoCommissioner
 
     def exchange(self, robot: Robot, bus: CanBus, wire: "CanPort", port: str) -> "DamiaoExchange":
         from trade_drivers.damiao._attach import check_bus  # noqa: PLC0415 - python-can is optional
         from trade_drivers.damiao._exchange import DamiaoExchange  # noqa: PLC0415
 
-        joints = robot.joints_on(bus.name)
-        for joint in joints:
-            if joint.model not in MODELS:
-                problem = f"{joint.model!r} is none of {', '.join(MODELS)}"
-                raise ConfigurationError(where=f'{robot.where}: joint."{joint.name}".model', problem=problem)
         axes = [
             DamiaoAxis(f"{robot.name}.{joint.name}", port, joint, bus.rate_hz, robot.coupled_to(joint.name))
-            for joint in joints
+            for joint in robot.joints_on(bus.name)
         ]
         check_bus(bus, axes, robot.where)
         return DamiaoExchange(wire, bus, axes)

@@ -20,20 +20,16 @@ class OdriveDriver(CanMotorDriver):
     """ODrives with firmware 0.6 on a CAN bus."""
 
     name = "odrive"
+    models = MODELS
     commissioner = OdriveCommissioner
 
     def exchange(self, robot: Robot, bus: CanBus, wire: "CanPort", port: str) -> "OdriveExchange":
         from trade_drivers.odrive._attach import check_bus  # noqa: PLC0415 - python-can is optional
         from trade_drivers.odrive._exchange import OdriveExchange  # noqa: PLC0415
 
-        joints = robot.joints_on(bus.name)
-        for joint in joints:
-            if joint.model not in MODELS:
-                problem = f"{joint.model!r} is none of {', '.join(MODELS)}"
-                raise ConfigurationError(where=f'{robot.where}: joint."{joint.name}".model', problem=problem)
         axes = [
             OdriveAxis(f"{robot.name}.{joint.name}", port, joint, bus.rate_hz, robot.coupled_to(joint.name))
-            for joint in joints
+            for joint in robot.joints_on(bus.name)
         ]
         check_bus(bus, axes, robot.where)
         return OdriveExchange(wire, bus, axes)

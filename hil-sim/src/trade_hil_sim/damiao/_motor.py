@@ -5,6 +5,8 @@ from collections.abc import Callable
 from math import copysign, inf
 from typing import Final
 
+from msgspec import structs
+
 from trade_hil_sim import _faults as faults
 from trade_hil_sim._errors import SimulationError
 from trade_hil_sim._log import Entry
@@ -359,34 +361,12 @@ class Motor:
 
     def _log(self, name: str, t: float, detail: str = "") -> None:
         counts, angle_rad = self._truth(t)
-        self.emit(
-            Entry(
-                t,
-                "",
-                "event",
-                name,
-                self.device_id,
-                joint=self.joint,
-                position_counts=counts,
-                position_rad=angle_rad,
-                detail=detail,
-            )
-        )
+        told = Entry(t, "", "event", name, self.device_id, joint=self.joint, detail=detail)
+        self.emit(structs.replace(told, position_counts=counts, position_rad=angle_rad))
 
     def _journal(self, name: str, data: bytes, moves: bool, t: float, address: int | None = None) -> None:
-        self.emit(
-            Entry(
-                t,
-                "",
-                "instruction",
-                name,
-                self.device_id,
-                joint=self.joint,
-                hex=data.hex(),
-                address=address,
-                moves=moves,
-            )
-        )
+        told = Entry(t, "", "instruction", name, self.device_id, joint=self.joint, hex=data.hex(), moves=moves)
+        self.emit(told if address is None else structs.replace(told, address=address))
 
     def state(self, t: float) -> DeviceState:
         """The truth about it."""
