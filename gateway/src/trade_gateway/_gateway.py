@@ -17,6 +17,7 @@ from trade_gateway._detached import Detach, detach_now, ready
 from trade_gateway._gateway_file import Plan, digest, named_digest, read_gateway_file
 from trade_gateway._guests import Guests, opened
 from trade_gateway._list import Json
+from trade_gateway._notify import Notifier
 from trade_gateway._output import Output, complain
 from trade_gateway._up import leaving
 
@@ -38,7 +39,7 @@ def gateway(
 
     For example: trade gateway /etc/trade/gateway.toml --check
     """
-    out = Output(as_json=as_json)
+    out, notifier = Output(as_json=as_json), Notifier()
     plan = read_gateway_file(file)
     if check:
         out.say(f"{file} is right")
@@ -47,18 +48,24 @@ def gateway(
     if detach:
         detach_now(out, plan.settings)
         return
-    with leaving() as asked_to_leave, hangups() as hangup:
+    with leaving() as asked_to_leave, hangups() as hangup, notifier:
         seen = digest(file)
         running = Gateway(plan, named_digest(file), asked_to_leave.set)
         try:
             _say_ready(out, running, plan)
+            notifier.ready(_status(running))
             while not asked_to_leave.wait(_LOOK_EVERY_S):
+                if running.container.healthy():
+                    notifier.alive()
                 now = digest(file)
                 if now != seen or hangup.is_set():
                     seen, anew = now, hangup.is_set()
                     hangup.clear()
-                    running.reload(file, out, anew=anew)
+                    notifier.reloading()
+                    good = running.reload(file, out, anew=anew)
+                    notifier.ready(_status(running) if good else f"{file} is wrong; going on as before")
         finally:
+            notifier.leaving()
             running.close()
         out.say("leaving")
 
@@ -144,6 +151,11 @@ def hangups() -> Generator[threading.Event]:
     finally:
         if number is not None:
             signal.signal(number, before)
+
+
+def _status(running: Gateway) -> str:
+    settings = running.container.settings
+    return f"{settings.container} is up in system {settings.system}, as {settings.identity}"
 
 
 def _say_ready(out: Output, running: Gateway, plan: Plan) -> None:

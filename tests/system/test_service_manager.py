@@ -1,0 +1,104 @@
+"""Commands as services of systemd: what they tell it while they come up, run, read their file again and leave."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+FILE = """
+system = "{system}"
+credentials = "lab:secret"
+insecure_lan = true
+connect = ["tcp/127.0.0.1:1"]
+
+[network.here]
+interface = "lo"
+listen = ["tcp/127.0.0.1:{port}"]
+"""
+
+
+@pytest.fixture
+def manager(tmp_path: Path) -> Iterator[socket.socket]:
+    """Where systemd listens."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as opened:
+        opened.settimeout(60)
+        opened.bind(str(tmp_path / "notify"))
+        yield opened
+
+
+@pytest.fixture
+def file(system: str, tmp_path: Path) -> Path:
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    made = tmp_path / "gateway.toml"
+    made.write_text(FILE.format(system=system, port=port))
+    return made
+
+
+class Service:
+    """A command, started as systemd starts it."""
+
+    def __init__(self, manager: socket.socket, *words: str) -> None:
+        self._manager = manager
+        asked = {"NOTIFY_SOCKET": manager.getsockname(), "WATCHDOG_USEC": "30000000"}
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "trade_gateway", *words],
+            env={**os.environ, **asked},
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+
+    def tells(self) -> dict[str, str]:
+        lines = self._manager.recv(4096).decode().splitlines()
+        return {name: value for name, _, value in (line.partition("=") for line in lines)}
+
+    def next_but_alive(self) -> dict[str, str]:
+        """What it tells next, besides that it is alive."""
+        while (told := self.tells()) == {"WATCHDOG": "1"}:
+            pass
+        return told
+
+    def leaves(self) -> None:
+        self.process.send_signal(signal.SIGTERM)
+        assert self.next_but_alive()["STOPPING"] == "1"
+        assert self.process.wait(60) == 0
+
+    def end(self) -> None:
+        self.process.kill()
+        self.process.wait(60)
+
+
+def test_a_gateway_tells_when_it_is_up_reads_its_file_and_leaves(
+    manager: socket.socket, file: Path, system: str
+) -> None:
+    service = Service(manager, "gateway", str(file))
+    try:
+        first = service.tells()
+        assert first["READY"] == "1"
+        assert f"is up in system {system}" in first["STATUS"]
+        assert [service.tells() for _ in range(2)] == [{"WATCHDOG": "1"}] * 2
+        file.write_text(file.read_text().replace("system =", "sytem ="))
+        assert service.next_but_alive()["RELOADING"] == "1"
+        assert "going on as before" in service.next_but_alive()["STATUS"]
+        file.write_text(file.read_text().replace("sytem =", "system ="))
+        assert service.next_but_alive()["RELOADING"] == "1"
+        assert service.next_but_alive() == first
+        service.leaves()
+    finally:
+        service.end()
+
+
+def test_a_robot_tells_when_it_is_up_and_leaves(manager: socket.socket, system: str) -> None:
+    service = Service(manager, "up", str(ROOT / "examples" / "head.toml"), "--sim")
+    try:
+        assert service.tells()["READY"] == "1"
+        assert service.tells() == {"WATCHDOG": "1"}
+        service.leaves()
+    finally:
+        service.end()
