@@ -13,6 +13,7 @@ from trade_gateway import (
     _empty_container,
     _estop,
     _gateway,
+    _install,
     _list,
     _lock,
     _locks,
@@ -38,6 +39,7 @@ __all__ = ["app", "main"]
 _SERVICES: Final = "Services"
 _MOTION: Final = "Locks and stops"
 _ROBOTS: Final = "Robots, containers and networks"
+_OPERATION: Final = "Keeping it up"
 _HARDWARE: Final = "Setting hardware up"
 _WATCHING: Final = "Watching and rules"
 _RIGHTS: Final = "Identities and rights"
@@ -57,6 +59,7 @@ app.command("container", rich_help_panel=_ROBOTS)(_empty_container.container)
 app.command("start", rich_help_panel=_ROBOTS)(_start.start)
 app.command("migrate", rich_help_panel=_ROBOTS)(_migrate.migrate)
 app.add_typer(_system_commands.app, name="system", rich_help_panel=_ROBOTS)
+app.command("install", rich_help_panel=_OPERATION)(_install.install)
 app.command("scan", rich_help_panel=_HARDWARE)(_scan.scan)
 app.command("set-id", rich_help_panel=_HARDWARE)(_scan.set_id)
 app.command("set-baud", rich_help_panel=_HARDWARE)(_scan.set_baud)
