@@ -1,9 +1,12 @@
 """Which files a gateway file or a system file names, with those that they name in turn."""
 
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Final, NamedTuple, cast
+from typing import Any, Final, NamedTuple, TypeVar, cast
+
+import msgspec
+from msgspec import Struct
 
 from trade.errors import ConfigurationError
 
@@ -16,6 +19,7 @@ __all__ = ["Named", "named_files"]
 
 _CERTIFICATE: Final = ("ca.pem", "cert.pem", "key.pem")
 _LOCAL: Final = "local"
+_Table = TypeVar("_Table", bound=Struct)
 
 
 class Named(NamedTuple):
@@ -25,53 +29,78 @@ class Named(NamedTuple):
     """The file itself first."""
     robots: tuple[Path, ...]
     """Those of them that are robot files."""
+    systems: tuple[str, ...]
+    """The ids of the systems that it is about, its own first."""
     containers: int
-    """How many containers of this host it names."""
+    """How many containers of this host there are besides the gateway."""
+
+
+class _Part(Struct, kw_only=True):
+    """A table that may name files; what else it says is for others to check."""
+
+    tls: str = ""
+    policy: str = ""
+    robot: str = ""
+    rules: str = ""
+    gateway: str = ""
+    host: str = _LOCAL
+
+    def files(self, folder: Path) -> Iterator[Path]:
+        """The files of this host that it names itself."""
+        for name in (self.robot, self.rules):
+            if name:
+                yield folder / name
+        if self.tls:
+            yield from (folder / self.tls / name for name in _CERTIFICATE)
+        if self.policy:
+            policy = folder / self.policy
+            yield policy
+            if revoked := _read(policy, _Policy).revoked_file:
+                yield policy.parent / revoked
+
+
+class _System(_Part, kw_only=True):
+    name: str
+
+
+class _Share(_Part, kw_only=True):
+    system: str
+
+
+class _File(_Part, kw_only=True):
+    system: str | _System
+    share: dict[str, _Share] = {}
+    container: dict[str, _Part] = {}
+
+
+class _Policy(Struct):
+    revoked_file: str = ""
 
 
 def named_files(path: Path) -> Named:
-    """Look through a file that has been found right.
+    """Look through a gateway file or a system file.
 
     Raises:
-        ConfigurationError: it cannot be read any more.
+        ConfigurationError: it, or a policy that it names, cannot be read.
     """
-    parts = [part for part in _parts(_read(path)) if part.get("host", _LOCAL) == _LOCAL]
-    files, robots = [path], list[Path]()
-    for part in parts:
-        files += _files(part, path.parent)
-        robots += [path.parent / part["robot"]] if part.get("robot") else []
-        if part.get("gateway"):
-            inner = named_files(path.parent / part["gateway"])
-            files += inner.files
-            robots += inner.robots
-    containers = sum(1 for part in parts if any(part.get(kind) is not None for kind in ("robot", "providers", "rules")))
-    return Named(tuple(dict.fromkeys(files)), tuple(dict.fromkeys(robots)), containers)
+    file = _read(path, _File)
+    own = file.system if isinstance(file.system, _System) else _System(name=file.system)
+    containers = [part for part in file.container.values() if part.host == _LOCAL]
+    files, robots, systems = [path], list[Path](), [own.name, *(share.system for share in file.share.values())]
+    for part in (file, own, *file.share.values(), *containers):
+        files += part.files(path.parent)
+        robots += [path.parent / part.robot] if part.robot else []
+        if part.gateway:
+            inner = named_files(path.parent / part.gateway)
+            files, systems = [*files, *inner.files], [*systems, *inner.systems]
+    return Named(tuple(dict.fromkeys(files)), tuple(robots), tuple(dict.fromkeys(systems)), len(containers))
 
 
-def _parts(raw: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
-    """The file itself, and the tables in it that name files."""
-    yield raw
-    if isinstance(raw.get("system"), dict):  # a system file
-        yield raw["system"]
-    for tables in (raw.get("share", {}), raw.get("container", {})):
-        yield from tables.values()
-
-
-def _files(part: Mapping[str, Any], folder: Path) -> Iterator[Path]:
-    for key in ("robot", "rules"):
-        if part.get(key):
-            yield folder / part[key]
-    if part.get("tls"):
-        yield from (folder / part["tls"] / name for name in _CERTIFICATE)
-    if part.get("policy"):
-        policy = folder / part["policy"]
-        yield policy
-        if revoked := _read(policy).get("revoked_file"):
-            yield policy.parent / revoked
-
-
-def _read(path: Path) -> dict[str, Any]:
+def _read(path: Path, kind: type[_Table]) -> _Table:
     try:
-        return cast("dict[str, Any]", tomllib.loads(path.read_text(encoding="utf-8")))  # pyright: ignore[reportUnknownMemberType]
-    except (OSError, ValueError) as bad:
+        raw = cast("dict[str, Any]", tomllib.loads(path.read_text(encoding="utf-8")))  # pyright: ignore[reportUnknownMemberType]
+        return msgspec.convert(raw, kind)
+    except FileNotFoundError:
+        raise ConfigurationError(where=str(path), problem="there is no such file") from None
+    except (OSError, ValueError) as bad:  # what is no TOML, no UTF-8 or of another shape is a ValueError
         raise ConfigurationError(where=str(path), problem=f"cannot be read: {bad}") from None

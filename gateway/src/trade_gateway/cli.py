@@ -7,6 +7,7 @@ import typer
 
 from trade.errors import TradeError
 from trade_gateway import (
+    _backup,
     _calibrate,
     _call,
     _doctor,
@@ -60,6 +61,8 @@ app.command("start", rich_help_panel=_ROBOTS)(_start.start)
 app.command("migrate", rich_help_panel=_ROBOTS)(_migrate.migrate)
 app.add_typer(_system_commands.app, name="system", rich_help_panel=_ROBOTS)
 app.command("install", rich_help_panel=_OPERATION)(_install.install)
+app.command("backup", rich_help_panel=_OPERATION)(_backup.backup)
+app.command("restore", rich_help_panel=_OPERATION)(_backup.restore)
 app.command("scan", rich_help_panel=_HARDWARE)(_scan.scan)
 app.command("set-id", rich_help_panel=_HARDWARE)(_scan.set_id)
 app.command("set-baud", rich_help_panel=_HARDWARE)(_scan.set_baud)
