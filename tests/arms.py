@@ -1,4 +1,4 @@
-"""A simulated arm in a thread of this process, and the driver attached to it."""
+"""The driver of an arm, attached to a simulated one."""
 
 from contextlib import ExitStack
 from pathlib import Path
@@ -6,7 +6,6 @@ from typing import Any
 
 from trade.errors import TradeError
 from trade_drivers import AttachedRobot, attach, parse
-from trade_hil_sim import Arm, UrBus
 from trade_hil_sim.ur import HOME
 
 ARM = (Path(__file__).parent.parent / "examples" / "arm.toml").read_text()
@@ -15,16 +14,12 @@ ARM = ARM.replace('driver = "ur"', 'driver = "ur"\nstale_after_s = 0.8')
 AT_HOME = list(HOME)
 
 
-def attached(
-    undo: ExitStack, arm: Arm | None = None, *, host: str = "", text: str = ARM, **options: Any
-) -> tuple[UrBus, AttachedRobot]:
-    """A controller with this arm, and the driver on it, or on another address; both end with the stack."""
-    robot = parse(text, "arm.toml")
-    sim = undo.enter_context(UrBus(arm or Arm(name="right", unlock_s=0.3), name="ur"))
+def attached(undo: ExitStack, host: str, text: str = ARM, **options: Any) -> AttachedRobot:
+    """The driver, attached to the controller at this address; it ends with the stack."""
     given = {"register": _ignored, "deregister": _ignored, **options}
-    driver = attach(robot, ports={"ur": host or sim.port}, **given)
+    driver = attach(parse(text, "arm.toml"), ports={"ur": host}, **given)
     undo.callback(_close, driver)
-    return sim, driver
+    return driver
 
 
 def _close(driver: AttachedRobot) -> None:

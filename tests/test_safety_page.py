@@ -10,7 +10,14 @@ PAGE = (ROOT / "docs" / "safety.md").read_text(encoding="utf-8")
 TABLE = PAGE.split("## On each kind of wire")[1]
 ROWS = [[cell.strip() for cell in line.strip("|").split("|")] for line in TABLE.splitlines() if line.startswith("| S")]
 REQUIRED = {"S01", "S06", "S08", "S11", "S18"}
-RIGS = {"Dynamixel": "Rig", "CAN": "Leg", "Modbus": "HandRig", "Feetech": "TailRig", "ODrive and Damiao": "MotorRig"}
+RIGS = {
+    "Dynamixel": "Rig",
+    "CAN": "Leg",
+    "Modbus": "HandRig",
+    "Feetech": "TailRig",
+    "ODrive and Damiao": "MotorRig",
+    "UR": "ArmRig",
+}
 """What a test of the wire is done with: the parameters of a test say which wire it is about."""
 
 

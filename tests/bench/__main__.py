@@ -8,12 +8,14 @@ parts:
   deadman    how long a joint moves on after its client was killed or frozen
   locks      taking and giving back four services of two containers; what the checks of resources add to a call
   watching   a thousand notifications every 0.1 s; what hooks cost a call that has none
+  audit      what an audit record costs a call; records a second
   gateway    calls through one gateway and two, certificates and policy on; floods; an idle one (root, iproute2)
   streams    what five listeners to a joint-state stream at 200 Hz cost its source, beside one
   servo      the Dynamixel driver against what a bus of 1 Mbaud can carry
   feetech    the same of the Feetech driver
   can        cycles of six CiA 402 drives near what 1 Mbit/s can carry: how many are late
   rosie      what all drivers of a robot take of a core, at the rates it is meant for
+  supervisor what ten children cost their gateway; a driver that crashed until it serves again, beside a plain start
   arm        set-points a second that reach the controller of an arm, beside a bare loop of the vendor's library
 
 Progress goes to stderr, tables and targets (met or missed) to stdout. Peers that are not installed are skipped.
@@ -24,6 +26,7 @@ from collections.abc import Callable, Mapping
 
 from tests.bench import (
     _arm,
+    _audit,
     _calls,
     _cans,
     _deadman,
@@ -35,6 +38,7 @@ from tests.bench import (
     _rosie,
     _servo,
     _streams,
+    _supervisor,
     _watching,
 )
 
@@ -55,12 +59,14 @@ _PARTS: Mapping[str, Callable[[argparse.Namespace], None]] = {
     "deadman": lambda options: _deadman.run(options.rounds),
     "locks": lambda options: _locks.run(options.n, options.rounds),
     "watching": lambda options: _watching.run(options.n, options.rounds, options.seconds),
+    "audit": lambda options: _audit.run(options.n, options.rounds, options.seconds),
     "gateway": lambda options: _gateway.run(options.n, options.rounds, options.idle),
     "streams": lambda options: _streams.run(max(1, options.rounds // 2), 2 * options.seconds),
     "servo": lambda options: _servo.run(options.n, options.rounds, options.seconds),
     "feetech": lambda options: _feetech.run(options.n, options.rounds, options.seconds),
     "can": lambda options: _cans.run(max(1, options.rounds // 2), options.seconds),
     "rosie": lambda options: _rosie.run(max(1, options.rounds // 2), options.seconds),
+    "supervisor": lambda options: _supervisor.run(max(1, options.rounds // 2), options.idle),
     "arm": lambda options: _arm.run(max(1, options.rounds // 2), 2 * options.seconds),
 }
 _QUICK = {"n": 200, "rounds": 8, "seconds": 1.5, "idle": 20.0}
@@ -79,7 +85,7 @@ def main() -> None:
         "--seconds", type=float, help="length of a round of the servo bus at 100 Hz, and of a trajectory on the CAN bus"
     )
     parser.add_argument(
-        "--idle", type=float, help=f"seconds for the idle gateway ({_QUICK['idle']}, full {_FULL['idle']})"
+        "--idle", type=float, help=f"seconds for an idle gateway ({_QUICK['idle']}, full {_FULL['idle']})"
     )
     parser.add_argument("--services", type=int, default=10_000, help="of the registry part (default: %(default)s)")
     options = parser.parse_args()

@@ -46,6 +46,11 @@ def test_the_bench_of_calls_in_flight_prints_every_peer_and_every_target() -> No
     assert targets(printed) == ["TRADE: rate / bare pair", "TRADE, threads: rate / bare pair"] * len(SIZES)
 
 
+def test_the_bench_of_the_supervisor_prints_its_targets() -> None:
+    printed = bench("supervisor", "--rounds", "1", "--idle", "1")
+    assert targets(printed) == ["supervisor: % of a core", "crash to serving, s", "crash to serving / plain start"]
+
+
 def test_a_peer_that_is_not_installed_is_named_and_skipped(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -86,6 +91,11 @@ def test_the_bench_of_a_whole_robot_prints_its_target() -> None:
 def test_the_bench_of_watching_prints_its_targets() -> None:
     printed = bench("watching", "-n", "3", "--rounds", "1", "--seconds", "0.3")
     assert targets(printed) == ["merged ticks, %", "another watched / none"]
+
+
+def test_the_bench_of_audit_records_prints_its_targets() -> None:
+    printed = bench("audit", "-n", "3", "--rounds", "1", "--seconds", "0.3")
+    assert targets(printed) == ["p50: audit on / off", "p99: audit on / off", "records/s written"]
 
 
 def test_the_bench_of_streams_prints_its_target() -> None:

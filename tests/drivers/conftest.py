@@ -94,9 +94,9 @@ class Rig:
     def attach(self, **options: Any) -> AttachedRobot:
         """Attach the driver; it is closed with the test, whatever that says."""
         options.setdefault("ports", {"neck": str(self.sim.port)})
-        robot = attach(
-            self.robot, register=lambda _, groups: self.announced.append(groups), deregister=lambda _: None, **options
-        )
+        options.setdefault("register", lambda _, groups: self.announced.append(groups))
+        options.setdefault("deregister", lambda _: None)
+        robot = attach(self.robot, **options)
         self._undo.callback(_close, robot)
         return robot
 

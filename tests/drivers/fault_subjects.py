@@ -1,23 +1,29 @@
 """The devices that the table of faults strikes: one of each kind, in the same words."""
 
+import json
+import os
+import signal
 import struct
 from abc import ABC, abstractmethod
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+from arms import AT_HOME
+from drivers.arm_rig import FAR, SLOW, ArmRig, children
 from drivers.conftest import Outcome, Rig, goal_counts
-from drivers.fault_table import Order, Recovery, Sick
+from drivers.fault_row import Dashboard, Order, Process, Recovery, Sick
 from drivers.gripper_rig import HandRig
 from drivers.legs import HALT, HIP, Leg
 from drivers.motor_rig import KINDS, ROOT
 from drivers.tail_rig import TailRig, goal_of
-from trade.errors import DeviceError
-from trade_drivers import Motor
-from trade_hil_sim import BrownOut, Entry, events, instructions, motion_writes, writes
-from waiting import wait_until
+from trade.errors import DeviceError, DeviceFault
+from trade_drivers import Arm, Motor
+from trade_drivers.ur._dashboard import ask
+from trade_hil_sim import Entry, events, instructions, motion_writes, writes
+from waiting import PATIENCE_S, wait_until
 
-__all__ = ["SUBJECTS", "Subject"]
+__all__ = ["ALONE", "SUBJECTS", "Subject"]
 
 _BEATS = 15
 """Exchanges with a device in which something would have begun to move."""
@@ -100,10 +106,20 @@ class Subject(ABC):
 
     def strike(self, *orders: Order) -> None:
         for order in orders:
-            if isinstance(order, Sick):
-                self.well = not order.on
-            else:
-                self.rig.sim.do(order)
+            match order:
+                case Sick():
+                    self.well = not order.on
+                case Process():
+                    [pid] = children("control")
+                    os.kill(pid, signal.Signals[f"SIG{order.signal}"])
+                case Dashboard():
+                    ask(self.rig.sim.port, order.line, PATIENCE_S)
+                case _:
+                    self.rig.sim.do(order)
+
+    def make_ready(self) -> None:
+        """What has to be done before it moves."""
+        self.provider.enable()
 
     def wait_for_exchanges(self, since: float) -> None:
         wait_until(lambda: len(self.exchanges(since)) >= _BEATS, "it is asked as usual")
@@ -116,10 +132,6 @@ class Subject(ABC):
             return None
 
     def recover(self, recovery: Recovery, since: float) -> None:
-        if recovery is Recovery.POWER:
-            self.rig.sim.do(BrownOut(ids=(self.device_id,)))
-            wait_until(lambda: self.events("booted", since), "it has booted")
-            wait_until(lambda: self.fault() is not None, "it answers")
         if recovery is not Recovery.NOTHING:
             self.provider.enable()
 
@@ -189,6 +201,9 @@ class Hand(Subject):
         gripper = self.robot.gripper("left.hand")
         gripper.activate()
         return gripper
+
+    def make_ready(self) -> None:
+        """It is activated."""
 
     def go(self) -> object:
         return self.provider.move_to(0.03, 0.02)
@@ -270,6 +285,68 @@ class TailMotor(_Joint):
         return bool(abs(target * self.rig.unit_rad - here_rad) < 0.05)
 
 
+class ArmSubject(Subject):
+    """An arm of Universal Robots: of its joints the first one moves."""
+
+    device_id = 0
+    ends = ("program_stopped", "program_paused")
+
+    def get(self) -> Arm:
+        return self.robot.arm("right")
+
+    def make_ready(self) -> None:
+        """Control is taken by its first move."""
+        self.use()
+
+    def go(self) -> object:
+        return self.provider.move_joints(FAR, SLOW)
+
+    def use(self) -> None:
+        for base_rad in (0.15, 0.0):
+            assert abs(self.provider.move_joints([base_rad, *AT_HOME[1:]])[0] - base_rad) < 0.03
+
+    def share(self, place: Any) -> float:
+        return float(place.positions_rad[0] / FAR[0])
+
+    @property
+    def truth(self) -> Any:
+        return self.rig.truth
+
+    def places(self, since: float) -> list[float]:
+        return [json.loads(e.detail)[0] / FAR[0] for e in events(self.log, since=since) if e.detail.startswith("[")]
+
+    def holds(self, since: float) -> list[Entry]:
+        return instructions(self.log, "stop_j", since=since)
+
+    def exchanges(self, since: float) -> list[Entry]:
+        raise NotImplementedError  # what it tells is not in the log
+
+    def wait_for_exchanges(self, since: float) -> None:
+        measured: set[float] = set()
+
+        def often() -> bool:
+            if self.fault() is not None and (at := self.provider.state().measured_at) > since:
+                measured.add(at)
+            return len(measured) >= _BEATS
+
+        wait_until(often, "it is read as usual")
+
+    def recover(self, recovery: Recovery, since: float) -> None:
+        if recovery is Recovery.UNLOCK:
+            wait_until(self._unlocked, "its controller takes it")
+        if recovery is Recovery.START:
+            self.provider.power_on()
+            self.provider.release_brakes()
+
+    def _unlocked(self) -> bool:
+        try:
+            self.provider.unlock_protective_stop()
+        except DeviceFault as refused:
+            assert "Cannot unlock" in str(refused)
+            return False
+        return True
+
+
 def _servo(tmp_path: Path, undo: ExitStack) -> Subject:
     rig = Rig(tmp_path, undo)
     rig.configure(('driver = "dynamixel"', f'driver = "dynamixel"\n{_PATIENT}\nwatchdog_s = 0.4'))
@@ -311,5 +388,8 @@ SUBJECTS = {
     "feetech": _tail,
     "odrive": lambda _, undo: _motor("odrive", undo),
     "damiao": lambda _, undo: _motor("damiao", undo),
+    "ur": lambda _, undo: ArmSubject(ArmRig(undo)),
 }
 """What makes one of each kind."""
+ALONE = frozenset({"ur"})
+"""Those that start processes: each test has its own, and leaves none behind."""

@@ -4,8 +4,7 @@
 """
 
 from collections.abc import Iterator
-from enum import Enum
-from typing import Final, Literal, NamedTuple
+from typing import Final
 
 import msgspec
 
@@ -15,14 +14,15 @@ from trade_hil_sim import (
     BadCrc,
     BrownOut,
     BusOff,
-    Command,
     Emergency,
     Freeze,
     Garbage,
+    HangUp,
     HardwareFault,
     Heal,
     Jam,
     Late,
+    Local,
     Mute,
     Replug,
     Supply,
@@ -31,79 +31,11 @@ from trade_hil_sim import (
     WrongModel,
 )
 
-__all__ = ["TABLE", "Device", "Order", "Recovery", "Row", "Sick", "Stop", "page"]
+from .fault_row import STRUCK, Dashboard, Device, Order, Process, Recovery, Row, Sick, Stop
 
-Device = Literal["dynamixel", "cia402", "robotiq", "feetech", "odrive", "damiao"]
-STRUCK: Final = {"dynamixel": (1,), "cia402": (1,), "robotiq": (9,), "feetech": (1,), "odrive": (1,), "damiao": (1,)}
-"""The ids of the devices that are struck."""
+__all__ = ["TABLE", "page"]
+
 ONE: Final = STRUCK["dynamixel"]
-
-
-class Sick(msgspec.Struct, frozen=True, tag_field="do", tag="sick"):
-    """The driver's own process says that it is not healthy: no fault of the simulator."""
-
-    on: bool = True
-
-
-Order = Command | Sick
-
-
-class Stop(Enum):
-    """What ends the motion that was under way."""
-
-    NOTHING = "it does not stop: the move ends as asked"
-    HOLD = "the driver has it hold"
-    WATCHDOG = "its own watchdog"
-    BOTH = "the driver has it hold and falls silent; then its own watchdog"
-    ITSELF = "the device itself"
-    BLOCKED = "what blocks it; the driver has it hold, or its own overload protection lets go, whichever is first"
-    NEAR = "nothing can reach it, and it has no watchdog: its last goal, which is never far ahead"
-    GOAL = "nothing can reach it, and it has no watchdog: it ends the move it was told"
-
-
-class Recovery(Enum):
-    """What somebody has to do, once the cause is gone, before it moves again."""
-
-    NOTHING = "nothing"
-    ENABLE = "`enable()`"
-    POWER = "power off and on, `enable()`"
-    ACTIVATE = "`clear_fault()`, `activate()`"
-
-
-class Row(NamedTuple):
-    """One fault that strikes one kind of device in the middle of a slow move."""
-
-    device: Device
-    fault: str
-    strike: tuple[Order, ...]
-    error: type[DeviceError] | None
-    """What the move ends with; None: it goes unnoticed."""
-    says: str = ""
-    """Part of its message."""
-    state: type[DeviceError] | str = ""
-    """What ``state()`` raises while it lasts, or part of the fault it tells."""
-    stop: Stop = Stop.HOLD
-    stop_error: type[DeviceError] | None = None
-    """What ``stop()`` raises while it lasts."""
-    recovery: Recovery = Recovery.ENABLE
-    then: tuple[Order, ...] = ()
-    """What happens once it has been noticed."""
-    found: str = ""
-    """The fault that is latched then."""
-    cure: tuple[Order, ...] = (Heal(),)
-    registry: str = "healthy"
-    """Its health in the registry while it lasts."""
-    reopens: bool = False
-    """The port is closed and opened again."""
-    alone: bool = False
-    """It is tried on a robot of its own: which of two signs is seen first depends on what was tried before."""
-
-    @property
-    def name(self) -> str:
-        """For the test's id."""
-        return f"{self.device}: {self.fault}"
-
-
 _AFTER_SILENCE: Final = {
     "dynamixel": Recovery.NOTHING,
     "cia402": Recovery.ENABLE,
@@ -111,6 +43,7 @@ _AFTER_SILENCE: Final = {
     "feetech": Recovery.NOTHING,
     "odrive": Recovery.ENABLE,
     "damiao": Recovery.ENABLE,
+    "ur": Recovery.NOTHING,
 }
 _AFTER_FAULT: Final = _AFTER_SILENCE | {"dynamixel": Recovery.ENABLE, "feetech": Recovery.ENABLE}
 _SICK: Final = "its driver's process is not healthy"
@@ -162,10 +95,10 @@ _DYNAMIXEL: Final = (
     _faulty("dynamixel", "blocked", Jam(ids=ONE), "it makes no progress", Stop.BLOCKED)._replace(alone=True),
     _silent("dynamixel", "cable off", Absent(ids=ONE), stop=Stop.WATCHDOG, after=Recovery.ENABLE),
     _gone("dynamixel", _REPLUG, Stop.WATCHDOG, Recovery.ENABLE),
-    _faulty("dynamixel", "fault latched", HardwareFault(ids=ONE, bits=0x20), "overload", Stop.ITSELF, Recovery.POWER),
-    _faulty(
-        "dynamixel", "over-temperature", Supply(ids=ONE, temperature_c=80), "overheating", Stop.ITSELF, Recovery.POWER
-    )._replace(cure=(Supply(ids=ONE, temperature_c=30),)),
+    _faulty("dynamixel", "fault latched", HardwareFault(ids=ONE, bits=0x20), "overload", Stop.ITSELF),
+    _faulty("dynamixel", "over-temperature", Supply(ids=ONE, temperature_c=80), "overheating", Stop.ITSELF)._replace(
+        cure=(Supply(ids=ONE, temperature_c=30),)
+    ),
     _swapped("dynamixel", 1020, "another model answers with its id", Stop.WATCHDOG),
     Row("dynamixel", "restart", (BrownOut(ids=ONE),), DeviceError, "", "it has restarted", Stop.ITSELF),
     _sick("dynamixel", "watchdog", Stop.BOTH),
@@ -296,7 +229,53 @@ _DAMIAO: Final = (
     Row("damiao", "restart", (BrownOut(ids=ONE),), DeviceError, "", "torque went off", Stop.ITSELF),
     _sick("damiao", "watchdog", Stop.BOTH),
 )
-TABLE: Final = (*_DYNAMIXEL, *_CIA402, *_ROBOTIQ, *_FEETECH, *_ODRIVE, *_DAMIAO)
+_MADE_NORMAL: Final = (HardwareFault(bits=1),)
+
+
+def _arm_stopped(fault: str, strike: Order, says: str, after: Recovery, cure: tuple[Order, ...] = (Heal(),)) -> Row:
+    return Row("ur", fault, (strike,), DeviceFault, says, says, Stop.ITSELF, None, after, cure=cure)
+
+
+def _arm_let_go(fault: str, *strike: Order, stop: Stop = Stop.PROGRAM, cure: tuple[Order, ...] = (Heal(),)) -> Row:
+    return Row("ur", fault, strike, DeviceError, "", "", stop, None, Recovery.NOTHING, cure=cure, refuses=False)
+
+
+def _arm_gone(fault: str, strike: Order, cure: Order, stop: Stop) -> Row:
+    row = Row("ur", fault, (strike,), DeviceError, "", DeviceSilent, stop, DeviceSilent, Recovery.NOTHING)
+    return row._replace(cure=(cure,), reopens=True)
+
+
+_UR: Final = (
+    _silent("ur", "silence", Mute(instruction="data"), stop=Stop.HOLD_OR_PROGRAM),
+    _silent("ur", "frozen clock", Freeze(tick=True)),
+    _silent("ur", "late, always", Late(s=1.0, instruction="data"), stop=Stop.HOLD_OR_PROGRAM),
+    _forgiven("ur", "late, a little", Late(s=0.02, instruction="data")),
+    _arm_let_go("frozen value", Freeze(), stop=Stop.HOLD)._replace(error=DeviceFault, says="it makes no progress"),
+    _arm_let_go("noise", Garbage(instruction="data", count=1)),
+    _arm_let_go("RTDE link lost", HangUp(kind="rtde")),
+    _arm_gone("network cut", Absent(), Absent(on=False), Stop.WATCHDOG),
+    _arm_gone("connections dropped", Unplug(), Replug(), Stop.WATCHDOG),
+    _forgiven("ur", "dashboard lost", Mute(instruction="dashboard")),
+    _arm_let_go("control process killed", Process("KILL")),
+    _arm_let_go("control process hung", Process("STOP")),
+    _arm_let_go("its program is ended by others", Dashboard("stop"), stop=Stop.ITSELF),
+    _arm_let_go("remote control off, then killed", Local(), Process("KILL"), stop=Stop.WATCHDOG)._replace(
+        refuses=True, cure=(Local(on=False),)
+    ),
+    _arm_let_go("script refused, then killed", Mute(instruction="script"), Process("KILL"))._replace(refuses=True),
+    _arm_stopped("protective stop", HardwareFault(bits=3), "protective stop", Recovery.UNLOCK),
+    _arm_stopped("blocked", Jam(), "protective stop", Recovery.UNLOCK),
+    _arm_stopped("safeguard stop", HardwareFault(bits=5), "safeguard stop", Recovery.NOTHING, _MADE_NORMAL),
+    _arm_stopped("emergency stop", HardwareFault(bits=7), "emergency stop", Recovery.START, _MADE_NORMAL),
+    _arm_stopped("emergency stop of its system", HardwareFault(bits=6), "emergency stop", Recovery.START, _MADE_NORMAL),
+    _arm_stopped("safety fault", HardwareFault(bits=9), "fault", Recovery.START, _MADE_NORMAL),
+    _arm_stopped("power off meanwhile", Dashboard("power off"), "its power is off", Recovery.START),
+    _arm_stopped("restart", BrownOut(), "", Recovery.START)._replace(
+        error=DeviceError, state="its power is off", reopens=True
+    ),
+    _sick("ur", "sick driver", Stop.HOLD)._replace(recovery=Recovery.NOTHING),
+)
+TABLE: Final = (*_DYNAMIXEL, *_CIA402, *_ROBOTIQ, *_FEETECH, *_ODRIVE, *_DAMIAO, *_UR)
 
 _TITLES: Final = {
     "dynamixel": "Dynamixel servos",
@@ -305,6 +284,7 @@ _TITLES: Final = {
     "feetech": "Feetech servos",
     "odrive": "ODrives",
     "damiao": "Damiao motors",
+    "ur": "Arms of Universal Robots",
 }
 _HEAD: Final = """# Faults
 
@@ -314,8 +294,10 @@ What is to come of a fault that strikes a device in the middle of a move. This p
 through, row by row, with the simulator's log as the judge.
 
 - *Struck by*: orders for the [simulator](simulators.md#faults), for the device that moves; `sick` is
-  `attach(healthy=...)` that says no.
-- *The move ends with* this error. While the fault lasts, further moves are refused.
+  `attach(healthy=...)` that says no. Of arms, `process signal` is sent to the process of the driver that commands,
+  and `dashboard` is a line that somebody else says to the controller.
+- *The move ends with* this error. While the fault lasts, further moves end in an error, too, unless it is
+  "over at once".
 - *state()* and *stop()*: what they tell while it lasts. A stop that raises was tried, or could not be: nobody knows
   that it was heard.
 - *Stopped by*: what ends the motion that was under way.
@@ -346,7 +328,9 @@ def _cells(row: Row) -> tuple[str, ...]:
     health = "" if row.registry == "healthy" else f'; in the registry "{row.registry}"'
     if row.error is None:
         return row.fault, _orders(row, row.strike), "nothing: it arrives", "no fault", "nothing", *_end(row)
-    error = f"`{row.error.__name__}`" + (f': "{row.says}"' if row.says else "")
+    error = (
+        f"`{row.error.__name__}`" + (f': "{row.says}"' if row.says else "") + ("" if row.refuses else "; over at once")
+    )
     stop = "nothing" if row.stop_error is None else f"`{row.stop_error.__name__}`"
     return row.fault, _orders(row, row.strike) + then, error, _state(row) + health, stop, *_end(row)
 

@@ -49,7 +49,9 @@ class TailRig:
     def attach(self, **options: Any) -> AttachedRobot:
         """Attach the driver; it is closed with the test, whatever that says."""
         options.setdefault("ports", {"tail": str(self.sim.port)})
-        robot = attach(self.robot, register=lambda *_: None, deregister=lambda _: None, **options)
+        options.setdefault("register", lambda *_: None)
+        options.setdefault("deregister", lambda _: None)
+        robot = attach(self.robot, **options)
         self._undo.callback(_close, robot)
         return robot
 

@@ -154,9 +154,9 @@ def test_a_gear_is_refused_where_it_would_not_be_heeded(head: Rig) -> None:
     [
         (
             ('driver = "dynamixel"', 'driver = "dynamixle"'),
-            "there is no driver 'dynamixle'; installed: cia402, dynamixel, feetech, robotiq",
+            "there is no driver 'dynamixle'; installed: cia402, damiao, dynamixel, ",
         ),
-        (("XL430-W250", "AX-12A"), "'AX-12A' is unknown to the driver dynamixel; it knows XL430-W250, XM430-W350"),
+        (("XL430-W250", "AX-12A"), "'AX-12A' is unknown to the driver dynamixel; it knows XL430-W250, XC430-W150, "),
         (('driver = "dynamixel"', 'driver = "dynamixel"\nrate_hz = 5'), "rate_hz: 5 is too slow"),
         (('driver = "dynamixel"', 'driver = "dynamixel"\nbaud = 57600\nrate_hz = 200'), "at most"),
         (

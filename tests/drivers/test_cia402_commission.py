@@ -36,5 +36,5 @@ def test_a_node_that_is_asked_for_alone(leg: Leg) -> None:
 
 def test_a_bus_whose_drives_are_commanded_is_left_alone(leg: Leg) -> None:
     leg.attach()
-    with pytest.raises(ConfigurationError, match="another driver commands the drives"):
+    with pytest.raises(ConfigurationError, match="another driver commands the cia402 devices"):
         looked(leg)

@@ -3,7 +3,7 @@
 import pytest
 
 from drivers.legs import HIP, Leg, leg, rig
-from trade.errors import WrongDevice
+from trade.errors import ConfigurationError, WrongDevice
 
 __all__ = ["leg", "rig"]
 
@@ -30,3 +30,9 @@ def test_the_drive_that_the_file_means_is_attached(leg: Leg) -> None:
     leg.configure(("id = 1\n", 'id = 1\nfirmware = "0.1.0"\nserial_number = 4711\n'))
     next(device for device in leg.sim.devices if device.device_id == HIP).store.set("serial_number", 4711)
     assert leg.attach().motor("leg.hip")
+
+
+def test_a_homing_offset_is_for_servos(leg: Leg) -> None:
+    leg.configure(("id = 1\n", "id = 1\nhoming_counts = 7\n"))
+    with pytest.raises(ConfigurationError, match="homing_counts: is for servos; leave this key out"):
+        leg.attach()

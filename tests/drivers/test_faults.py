@@ -3,6 +3,9 @@
 What comes of each fault by itself is in the table of faults.
 """
 
+import time
+from contextlib import suppress
+
 import pytest
 
 import trade_hil_sim as sim
@@ -248,7 +251,7 @@ def test_a_hardware_error_ends_the_move_and_is_named(head: Rig, robot: AttachedR
     head.sim.do(sim.HardwareFault(ids=(1,), bits=0x20))
     assert "overload" in str(moving.wait().error)
     with pytest.raises(DeviceFault, match="overload"):
-        robot.motor("neck.pan").enable()
+        robot.motor("neck.pan").move_to(1.3, 0.1)
 
 
 def test_health_that_is_read_while_a_joint_is_being_relaxed_is_no_fault(head: Rig) -> None:
@@ -268,3 +271,43 @@ def test_health_that_is_read_while_a_joint_is_being_relaxed_is_no_fault(head: Ri
         assert not any(axis.fault for axis in exchange.axes)
     finally:
         exchange.wire.close()
+
+
+def test_enabling_starts_a_servo_anew_that_has_shut_down_and_nothing_else_does(head: Rig, robot: AttachedRobot) -> None:
+    pan, tilt = robot.motor("neck.pan"), robot.motor("neck.tilt")
+    pan.move_to(0.2)
+    head.sim.do(sim.HardwareFault(ids=(1,), bits=0x20))
+    wait_until(lambda: "overload" in pan.state().fault, "its fault is told")
+    for act in (lambda: pan.move_to(0.1), pan.stop, pan.relax):
+        with suppress(DeviceFault):
+            act()
+    assert not sim.instructions(head.log, "reboot")
+    tilting = Outcome(lambda: tilt.move_to(0.5, 0.3))
+    wait_until(lambda: head.truth(2).moving, "the other one is under way")
+    pan.enable()
+    assert len(sim.instructions(head.log, "reboot")) == 1
+    assert pan.move_to(0.1) == pytest.approx(0.1, abs=0.03)
+    assert tilting.wait().error is None
+
+
+def test_a_servo_whose_fault_comes_back_at_once_is_not_enabled(head: Rig, robot: AttachedRobot) -> None:
+    pan = robot.motor("neck.pan")
+    head.sim.do(sim.Supply(ids=(1,), temperature_c=90))
+    wait_until(lambda: "overheating" in pan.state().fault, "its fault is told")
+    with pytest.raises(DeviceFault, match="overheating"):
+        pan.enable()
+    assert not head.truth(1).torque
+
+
+def test_a_servo_that_complains_and_has_not_let_go_is_not_started_anew(head: Rig, robot: AttachedRobot) -> None:
+    pan = robot.motor("neck.pan")
+    pan.relax()
+    head.sim.devices[0].write(63, b"\0", time.monotonic())  # shut down for nothing
+    pan.enable()
+    head.sim.do(sim.HardwareFault(ids=(1,), bits=0x20))
+    wait_until(lambda: "overload" in pan.state().fault, "its fault is told")
+    with pytest.raises(DeviceFault, match=r"it has not let go: call relax\(\)"):
+        pan.enable()
+    assert head.truth(1).torque
+    pan.relax()
+    pan.enable()

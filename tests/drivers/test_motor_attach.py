@@ -40,7 +40,9 @@ def send(bus: can.BusABC, node: int, command: Command, data: bytes) -> None:
     [
         (('leave = "relax"', 'leave = "hold"'), "lets go"),
         (('model = "ODrive S1"', 'model = "ODrive S1"\ncounts_per_rev = 4096'), "turns, not counts"),
+        (('model = "ODrive S1"', 'model = "ODrive S1"\nhoming_counts = 7'), "is for servos"),
         (('model = "ODrive S1"', 'model = "ODrive v3.6"'), "is none of"),
+        (('model = "ODrive S1"', 'model = "ODrive S1"\nserial_number = 7'), "no serial number here"),
         (("id = 2", "id = 63"), "is no node"),
         (("watchdog_s = 0.4", "watchdog_s = 0.6"), "enable.. waits"),
         (("watchdog_s = 0.4", "watchdog_s = 0.4\nrate_hz = 5"), "too slow"),
@@ -60,6 +62,8 @@ def test_an_odrive_is_refused_for_what_the_file_says(odrives: MotorRig, change: 
     ("change", "says"),
     [
         (('model = "DM4310"', 'model = "DM1"'), "is none of"),
+        (('model = "DM4310"', 'model = "DM4310"\nhoming_counts = 7'), "is for servos"),
+        (('model = "DM4310"', 'model = "DM4310"\nserial_number = 7'), "no serial number here"),
         (("id = 2", "id = 16"), "1 to 15"),
         (("max_rad = 1.0", "max_rad = 12.4"), "farther from its zero"),
         (("max_speed_rad_s = 2.0", "max_speed_rad_s = 31.0"), "the most a DM4310 tells"),

@@ -12,7 +12,7 @@ from typer.testing import CliRunner, Result
 from robots import HEAD
 from trade.errors import ConfigurationError, WrongDevice
 from trade_drivers import Joint, parse
-from trade_gateway._calibrate import Ends, Sweep, measured, with_values
+from trade_gateway._calibrate import Ends, Sweep, homed, measured, with_values
 from trade_gateway._output import UsageError
 from trade_gateway.cli import app
 from trade_hil_sim import DynamixelBus, writes
@@ -145,3 +145,18 @@ def test_a_joint_that_is_not_there_is_told_from_those_that_are(rosie: Rosie) -> 
     error = rosie.calibrate("neck.roll", "--zero-here").exception
     assert isinstance(error, UsageError)
     assert "there is neck.pan, neck.tilt" in str(error)
+
+
+def test_a_homing_offset_that_the_file_does_not_know_is_written_with_the_new_zero(rosie: Rosie) -> None:
+    rosie.sim.devices[0].write(20, (100).to_bytes(4, "little"), 0.0)
+    said = rosie.calibrate("neck.pan", "--zero-here", "--yes")
+    assert said.exit_code == 0, said.output
+    made = parse(rosie.file.read_text(encoding="utf-8"), "head.toml").joints[0]
+    assert (made.homing_counts, made.offset_rad) == (100, -0.1534)
+    assert "# the left shoulder" in rosie.file.read_text(encoding="utf-8")
+
+
+def test_a_range_is_not_measured_from_a_zero_that_has_moved() -> None:
+    with pytest.raises(WrongDevice, match="the robot file says 0, but the device says 100"):
+        homed(joint(), 100, zero_measured=False)
+    assert homed(joint(homing_counts=100), 100, zero_measured=False) == {}

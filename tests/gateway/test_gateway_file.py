@@ -9,6 +9,7 @@ from certificates import Papers
 from trade.errors import ConfigurationError
 from trade_gateway._gateway_file import digest, read_gateway_file
 from trade_gateway.cli import app
+from trade_gateway.supervisor import Child
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "gateway.toml"
 POLICY = """
@@ -54,6 +55,80 @@ def test_without_any_list_everything_crosses_and_with_one_the_rest_does(file: Pa
     assert read_gateway_file(file).settings.exports == {"eth0": ("*",), "eth1": ()}
     change(file, "export = []", "")
     assert read_gateway_file(file).settings.exports is None
+
+
+ALONE = 'system = "lab"\n'
+EYES = '[container.eyes]\nproviders = [{ class = "sight:Eye" }]\n'
+
+
+def test_a_file_may_have_nothing_but_containers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TRADE_CREDENTIALS", "an:other")
+    file = tmp_path / "gateway.toml"
+    file.write_text(f'{ALONE}{EYES}after = ["mind"]\n[container.mind]\nproviders = []\nrestarts = 2\n')
+    plan = read_gateway_file(file)
+    assert [child.name for child in plan.children] == ["mind", "eyes"]
+    mind, eyes = plan.children
+    assert (mind.terms.restarts, eyes.terms.restarts, eyes.terms.restart) == (2, 10, "always")
+    assert " ".join(eyes.part.words) == "--system lab container --name eyes --allow sight:Eye"
+    assert "TRADE_CREDENTIALS" not in eyes.environment  # the file says it all
+    assert (plan.settings.bridge, plan.settings.system) == ((), "lab")
+    said = CliRunner().invoke(app, ["gateway", str(file), "--check"]).stdout.splitlines()
+    assert said[1:] == ["  it keeps mind up: providers", "  it keeps eyes up: providers"]
+
+
+def test_containers_are_let_in_as_the_gateway_is(tmp_path: Path) -> None:
+    file = tmp_path / "gateway.toml"
+    file.write_text(f'{ALONE}insecure_lan = true\ncredentials = "a:b"\n{EYES}')
+    [eyes] = read_gateway_file(file).children
+    assert eyes.part.environment["TRADE_CREDENTIALS"] == "a:b"
+    assert eyes.part.environment["TRADE_INSECURE_LAN"] == "1"
+
+
+def test_a_container_starts_again_only_for_what_starts_it(tmp_path: Path) -> None:
+    file = tmp_path / "gateway.toml"
+
+    def read(more: str) -> Child:
+        file.write_text(f"{ALONE}{EYES}{more}")
+        return read_gateway_file(file).children[0]
+
+    before = read("")
+    assert before.starts_like(read("restarts = 3\nwindow_s = 5\nsave_every_s = 2\n"))
+    assert not before.starts_like(read('allow = ["a:*"]\n'))
+    assert not before.starts_like(read('connect = ["tcp/127.0.0.1:7450"]\n'))
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "said"),
+    [
+        ("hots = 1\n", 4, "unknown key 'hots'; there is host"),
+        ('restart = "sometimes"\n', 4, "restart"),
+        ("restarts = -1\n", 4, ">= 0"),
+        ("answers_within_s = 0.0\n", 4, ">= 0.2"),
+        ('host = "far"\n', 4, "a gateway looks after containers of its own host; leave it out"),
+        ('after = ["nobody"]\n', 4, "there is no container 'nobody'; there is eyes"),
+        ('rules = "care.toml"\n', 4, "there is providers and rules"),
+        ('[container.door]\ngateway = "door.toml"\n', 5, "is this file"),
+        ('[container.rosie]\nrobot = "nobody.toml"\n', 5, "there is no such file"),
+    ],
+)
+def test_what_is_wrong_with_a_container_is_named_with_its_line(tmp_path: Path, text: str, line: int, said: str) -> None:
+    file = tmp_path / "gateway.toml"
+    file.write_text(f"{ALONE}{EYES}{text}")
+    with pytest.raises(ConfigurationError) as wrong:
+        read_gateway_file(file)
+    assert str(wrong.value).startswith(f"{file}:{line}: container.")
+    assert said in str(wrong.value)
+
+
+def test_with_certificates_each_container_has_its_own(file: Path) -> None:
+    file.write_text(f"{file.read_text()}{EYES}")
+    with pytest.raises(ConfigurationError, match=r"container\.eyes\.tls: missing; .* trade pki issue eyes"):
+        read_gateway_file(file)
+    Papers(file.parent / "more").of("eyes")
+    file.write_text(f'{file.read_text()}tls = "more/issued/eyes"\n')
+    [eyes] = read_gateway_file(file).children
+    assert eyes.part.environment["TRADE_TLS"] == str(file.parent / "more/issued/eyes")
+    assert eyes.part.environment["TRADE_POLICY"] == str(file.parent / "policy.toml")
 
 
 LIMIT = "# stream_hz = 50.0"
@@ -241,3 +316,12 @@ def test_a_change_of_what_a_share_names_is_seen(sharing: Path) -> None:
         beside.write_text(beside.read_text() + "\n")
         assert digest(sharing) not in seen
         seen.append(digest(sharing))
+
+
+def test_the_record_of_a_gateway_lies_beside_its_file(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TRADE_AUDIT", "/somewhere/else")
+    monkeypatch.setenv("TRADE_AUDIT_KEEP_DAYS", "7")
+    assert read_gateway_file(file).settings.audit is None
+    change(file, 'system = "lab"', 'system = "lab"\naudit = "audit"')
+    settings = read_gateway_file(file).settings
+    assert (settings.audit, settings.audit_keep_days) == (file.parent / "audit", 7)

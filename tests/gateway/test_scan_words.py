@@ -2,8 +2,10 @@
 
 import json
 import re
+import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from typer.testing import CliRunner, Result
@@ -15,6 +17,8 @@ from trade_gateway._output import UsageError
 from trade_gateway._scan import _numbers
 from trade_gateway.cli import app
 from trade_hil_sim import Arm, DynamixelBus, Servo, UrBus
+from trade_hil_sim.damiao import DamiaoBus, Motor
+from trade_hil_sim.odrive import Axis, OdriveBus
 
 
 @pytest.fixture
@@ -74,7 +78,11 @@ def test_what_was_found_becomes_a_robot_file_that_is_not_written_over(line: Dyna
 
 @pytest.mark.parametrize(
     ("second", "complaint"),
-    [({"problem": "two share it"}, "two share it"), ({"baud": 57_600}, "57600 and 1000000 baud")],
+    [
+        ({"problem": "two share it"}, "two share it"),
+        ({"baud": 57_600}, "57600 and 1000000 baud"),
+        ({"driver": "feetech"}, "of dynamixel and feetech"),
+    ],
 )
 def test_what_cannot_be_in_one_robot_file_is_told(second: dict[str, object], complaint: str) -> None:
     one = Found(driver="dynamixel", baud=1_000_000, id=1, model="XL430-W250")
@@ -109,6 +117,21 @@ def test_an_arm_is_asked_for_by_its_host(tmp_path: Path) -> None:
     robot = parse((tmp_path / "arm.toml").read_text(encoding="utf-8"), "arm.toml")
     assert [(arm.model, arm.bus) for arm in robot.arms] == [("UR5e", robot.buses[0].name)]
     assert robot.buses[0].port == sim.port
+
+
+@pytest.mark.parametrize(
+    ("bus", "device", "model"), [(OdriveBus, Axis, "ODrive S1"), (DamiaoBus, Motor, "DM4310")], ids=["odrive", "damiao"]
+)
+def test_motors_on_a_can_bus_become_a_robot_file(bus: Any, device: Any, model: str, tmp_path: Path) -> None:
+    now = time.monotonic()
+    with bus([device(3, t=now), device(4, t=now)]) as sim:
+        port = sim.port
+        said = trade("scan", "--port", port, "--ids", "3-4", "--write", tmp_path / "can.toml")
+    assert said.exit_code == 0, said.output
+    robot = parse((tmp_path / "can.toml").read_text(encoding="utf-8"), "can.toml")
+    assert [(joint.id, joint.model) for joint in robot.joints] == [(3, model), (4, model)]
+    assert robot.buses[0].port == port
+    assert ("not looked for: driver cia402: ODrives talk" in said.output) == (bus is OdriveBus)
 
 
 def test_a_host_without_a_controller_is_named() -> None:

@@ -8,7 +8,8 @@ from typer.testing import CliRunner
 
 from certificates import Papers
 from trade.errors import ConfigurationError
-from trade_gateway._system_file import line_of, read_system_file
+from trade_gateway._parts import line_of
+from trade_gateway._system_file import read_system_file
 from trade_gateway.cli import app
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -83,6 +84,7 @@ def test_certificate_policy_and_endpoints_of_the_system_are_those_of_its_contain
         (f"{HEAD}[container.a]\n", 4, "takes one of robot, gateway, providers, rules; there is none"),
         (f'{HEAD}{LAMPS}rules = "care.toml"\n', 6, "there is providers and rules"),
         (f"{HEAD}{LAMPS}sim = true\n", 6, "goes with robot"),
+        (f'{HEAD}{LAMPS}without = ["legs"]\n', 6, "goes with robot"),
         (f'{HEAD}[container.a]\nrobot = "rosie.toml"\nallow = ["x:Y"]\n', 6, "goes with providers"),
         (f'{HEAD}{LAMPS}command = "/opt/trade"\n', 6, "goes with another host"),
         (f'{HEAD}[container.a]\nrobot = "nobody.toml"\n', 5, "nobody.toml: there is no such file"),
@@ -151,3 +153,13 @@ def test_a_file_is_checked_on_the_command_line_and_contradictions_are_refused(fo
     assert said.stdout.splitlines()[-1] == "  care: rules"
     refused = CliRunner().invoke(app, ["--system", "lab", "system", "status", str(folder / "system.toml")])
     assert "leave out --system" in str(refused.exception)
+
+
+def test_records_lie_where_the_system_says_or_the_container(folder: Path) -> None:
+    head = f'{HEAD.strip()}\naudit = "audit"\n\n'
+    far = '[container.far]\nhost = "far"\nproviders = []\n'
+    text = f'{head}{LAMPS}[container.more]\nproviders = []\naudit = "/var/more"\n{far}'
+    plan = read_system_file(write(folder, text))
+    places = {part.name: part.environment.get("TRADE_AUDIT") for part in plan.parts}
+    assert places == {"lamps": str(folder / "audit"), "more": "/var/more", "far": None}
+    assert plan.settings.audit is None

@@ -10,15 +10,18 @@ from trade_hil_sim import (
     Absent,
     BadCrc,
     BrownOut,
+    Command,
     Dribble,
     Duplicate,
     DynamixelBus,
     Echo,
     Freeze,
     Garbage,
+    HangUp,
     Heal,
     Jam,
     Late,
+    Local,
     Mute,
     Place,
     Replug,
@@ -239,3 +242,9 @@ def test_s06_an_unplugged_servo_goes_on_until_its_watchdog_stops_it(sdk: SimpleN
     assert 2048 < state.position_counts < 4000
     bus.do(Replug())
     assert bus.state().plugged
+
+
+@pytest.mark.parametrize("command", [Local(), HangUp(kind="rtde")], ids=["local", "hang up"])
+def test_what_only_controllers_of_arms_know_is_refused(bus: DynamixelBus, command: Command) -> None:
+    with pytest.raises(SimulationError, match="no controller"):
+        bus.do(command)

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from trade_hil_sim import UrBus, events, instructions, motion_writes
+from trade_hil_sim import Arm, UrBus, events, instructions, motion_writes
 from trade_hil_sim.ur import HOME
 
 pytest.importorskip("rtde_control", reason="ur-rtde has no wheel for this platform")
@@ -128,6 +128,7 @@ def test_the_control_interface_moves_in_joint_space_and_along_a_line(controller:
         + """
 goal = [q[0] + 0.2, *q[1:]]
 ok = [c.moveJ(goal, 2.0, 8.0)]
+until(lambda: abs(r.getActualQ()[0] - goal[0]) < 1e-7)
 after = r.getActualQ()
 pose = c.getForwardKinematics(after, [0.0] * 6)
 line = r.getActualTCPPose()
@@ -145,6 +146,41 @@ print(json.dumps({"ok": ok, "off": after[0] - goal[0], "pose": pose, "end": r.ge
     assert all(
         "until it ends" in entry.detail for entry in motion_writes(controller.log.entries) if entry.name != "upload"
     )
+
+
+@pytest.mark.parametrize("model", ["UR5", "UR5e"])
+def test_all_interfaces_work_with_controllers_of_both_series(model: str) -> None:
+    with UrBus(Arm(model)) as controller:
+        told = run(
+            controller,
+            CONTROL
+            + """
+from dashboard_client import DashboardClient
+from rtde_io import RTDEIOInterface
+d = DashboardClient(host)
+d.connect()
+goal = [q[0] + 0.1, *q[1:]]
+scaled = RTDEIOInterface(host).setSpeedSlider(0.9)
+print(json.dumps([d.polyscopeVersion().split(".")[0], scaled, c.moveJ(goal, 2.0, 8.0)]))
+""",
+        )
+        assert told == ["5" if model.endswith("e") else "3", True, True]
+        assert controller.state().arms[0].positions_rad[0] == pytest.approx(HOME[0] + 0.1)
+
+
+def test_the_angles_for_a_pose_are_worked_out_and_what_is_out_of_reach_is_told(controller: UrBus) -> None:
+    told = run(
+        controller,
+        CONTROL
+        + """
+pose = r.getActualTCPPose()
+near = [angle + 0.1 for angle in q]
+print(json.dumps([c.getInverseKinematics(pose, near), c.getInverseKinematicsHasSolution(pose, near),
+    c.getInverseKinematicsHasSolution([5.0, *pose[1:]], near)]))
+""",
+    )
+    assert told[0] == pytest.approx(HOME, abs=1e-6)
+    assert told[1:] == [True, False]
 
 
 def test_an_asynchronous_move_tells_its_progress_and_is_stopped(controller: UrBus) -> None:

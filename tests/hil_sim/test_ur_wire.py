@@ -14,10 +14,12 @@ from trade_hil_sim import (
     BrownOut,
     Dribble,
     Freeze,
+    HangUp,
     HardwareFault,
     Heal,
     Jam,
     Late,
+    Local,
     Mute,
     Replug,
     SimulationError,
@@ -228,6 +230,60 @@ def test_without_remote_control_the_dashboard_only_answers_questions() -> None:
         refused, mode = dashboard(controller, "power off", "robotmode")
         assert "not allowed" in refused
         assert mode == "Robotmode: RUNNING"
+
+
+def test_in_local_control_it_takes_neither_orders_nor_programs(controller: UrBus) -> None:
+    controller.do(Local())
+    assert "not allowed" in dashboard(controller, "play")[0]
+    with socket.create_connection((controller.port, 30003), PATIENCE_S) as script:
+        script.sendall(b"def other():\nend\n")
+        wait_until(lambda: dashboard(controller, "is in remote control") == ["false"], "it answers questions")
+    assert not events(controller.log.entries, "upload")
+    controller.do(Local(on=False))
+    assert dashboard(controller, "play") == ["Starting program"]
+
+
+def test_connections_of_one_kind_are_cut_and_made_again(controller: UrBus) -> None:
+    with client(controller) as rtde, socket.create_connection((controller.port, 29999), PATIENCE_S) as other:
+        rtde.stream("timestamp")
+        controller.do(HangUp(kind="rtde"))
+        with pytest.raises(ConnectionError):
+            times(rtde, 1000)
+        other.sendall(b"robotmode\n")
+        assert other.makefile().readline().startswith("Connected")
+    with client(controller) as again:
+        again.stream("timestamp")
+
+
+def test_a_safeguard_stop_holds_a_program_up_and_it_goes_on_by_itself(controller: UrBus) -> None:
+    dashboard(controller, "play")
+    wait_until(lambda: controller.state().arms[0].moving, "its own program moves it")
+    controller.do(HardwareFault(bits=5))
+    wait_until(lambda: not controller.state().arms[0].moving, "it rests")
+    assert dashboard(controller, "programState")[0].startswith("PAUSED")
+    controller.do(HardwareFault(bits=1))
+    wait_until(lambda: controller.state().arms[0].moving, "it moves again")
+    controller.do(HardwareFault(bits=5))
+    assert dashboard(controller, "stop") == ["Stopped"]
+    controller.do(HardwareFault(bits=1))
+    wait_until(lambda: controller.state().arms[0].safety_mode == "NORMAL", "it is over")
+    assert events(controller.log.entries, "program_stopped")
+    assert dashboard(controller, "running") == ["Program running: false"]
+
+
+def test_after_an_emergency_stop_the_arm_is_without_power(controller: UrBus) -> None:
+    controller.do(HardwareFault(bits=7))
+    controller.do(HardwareFault(bits=1))
+    assert dashboard(controller, "robotmode", "safetymode") == ["Robotmode: POWER_OFF", "Safetymode: NORMAL"]
+
+
+def test_a_controller_of_the_older_series_is_slower_and_knows_less() -> None:
+    with UrBus(Arm("UR10")) as controller, client(controller) as rtde:
+        assert rtde.ask("v") == struct.pack(">4I", 3, 15, 8, 106_339)
+        assert rtde.ask("O", struct.pack(">d", 125.0) + b"timestamp,ft_raw_wrench") == b"\x00DOUBLE,NOT_FOUND"
+        rtde.stream("timestamp", 500.0)
+        assert [round((b - a) * 125.0, 3) for a, b in pairwise(times(rtde, 20))] == [1.0] * 19
+        assert "could not understand" in dashboard(controller, "is in remote control")[0]
 
 
 def test_what_an_arm_has_not_got_is_refused(controller: UrBus) -> None:

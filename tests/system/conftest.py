@@ -205,6 +205,16 @@ class Bench:
         return any(abs(device.velocity_rad_s) > 0 for bus in self.sim.control.state() for device in bus.devices)
 
 
+def at_ports(robot_file: Path, sim: SimProcess, folder: Path) -> Path:
+    """A copy of a robot file that names the ports of its simulation."""
+    text = robot_file.read_text(encoding="utf-8")
+    for bus, port in sim.ports.items():
+        text = re.sub(rf'(\[bus\.{bus}\][^\[]*?port = )"[^"]*"', rf'\g<1>"{port}"', text)
+    copy = folder / robot_file.name
+    copy.write_text(text, encoding="utf-8")
+    return copy
+
+
 @pytest.fixture
 def benches(system: str, tmp_path: Path, run: Callable[..., Program]) -> Iterator[Callable[..., Bench]]:
     """Brings a robot up, its servos and its driver in processes of their own."""
@@ -212,11 +222,7 @@ def benches(system: str, tmp_path: Path, run: Callable[..., Program]) -> Iterato
 
         def start(robot_file: Path, inside: str = "") -> Bench:
             sim = undo.enter_context(SimProcess(robot_file))
-            text = robot_file.read_text(encoding="utf-8")
-            for bus, port in sim.ports.items():
-                text = re.sub(rf'(\[bus\.{bus}\][^\[]*?port = )"[^"]*"', rf'\g<1>"{port}"', text)
-            copy = tmp_path / robot_file.name
-            copy.write_text(text, encoding="utf-8")
+            copy = at_ports(robot_file, sim, tmp_path)
             bench = Bench(sim, lambda: run("-m", "trade_gateway", "up", copy, "--json", inside=inside))
             undo.callback(lambda: bench.driver.close())  # noqa: PLW0108 - the driver there is then
             return bench

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from trade import Container, LogReader, where
+from trade import Container, LogReader, current_call, service, where
 from trade._logbook import Logbook
 
 _log = logging.getLogger("trade")
@@ -81,3 +81,41 @@ def test_of_an_error_logged_with_a_line_its_type_is_told() -> None:
 def test_formatters_know_the_call(here: Container, caplog: pytest.LogCaptureFixture) -> None:
     _log.warning("outside")
     assert [record.call_id for record in caplog.records] == [0]  # type: ignore[attr-defined]
+
+
+class Leg:
+    @service
+    def step(self) -> None:
+        _log.warning("the leg steps")
+
+
+class Mind:
+    def __init__(self, container: Container) -> None:
+        self.container = container
+
+    @service
+    def walk(self) -> int:
+        _log.warning("the mind walks")
+        self.container.call(where(name="step"))
+        call = current_call()
+        assert call is not None
+        return call.id
+
+
+def test_all_that_comes_of_one_call_has_its_id(here: Container, there: Container) -> None:
+    far: Container = there
+    far.register(Leg(), "leg")
+    here.register(Mind(here), "mind")
+    here.find(where(name="step"), wait_s=20)
+    walked = far.find(where(name="walk"), wait_s=20)()
+    lines = {line.text: line for line in here.logs() if line.text in ("the mind walks", "the leg steps")}
+    assert {line.outer_id for line in lines.values()} == {walked}
+    assert lines["the mind walks"].call_id == walked
+    assert lines["the leg steps"].call_id not in (0, walked)
+
+
+def test_formatters_know_the_call_that_began_it_all(here: Container, caplog: pytest.LogCaptureFixture) -> None:
+    here.register(Leg(), "leg")
+    here.call(where(name="step"))
+    [record] = [record for record in caplog.records if record.getMessage() == "the leg steps"]
+    assert record.outer_id == record.call_id != 0  # type: ignore[attr-defined]

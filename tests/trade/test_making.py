@@ -23,7 +23,7 @@ from waiting import wait_until
 MODULE = """
 import subprocess
 from subprocess import Popen
-from trade import Resource, service
+from trade import Resource, permit, service
 
 events = []
 
@@ -57,6 +57,36 @@ class Wheel:
     def close(self) -> None:
         events.append("closed")
         raise OSError("the bus is gone")
+
+class Clock:
+    def __init__(self) -> None:
+        self.hour, self.resources = 0, (Resource("hand"),)
+
+    @service(effect="read")
+    def time(self) -> int:
+        return self.hour
+
+    @service
+    def strike(self) -> None:
+        with permit(self.resources) as allowed:
+            allowed.gate()
+
+    @service(effect="stop")
+    def stop(self) -> None: ...
+
+    def save_state(self):
+        return {"hour": self.hour}
+
+    def restore_state(self, state) -> None:
+        if state["hour"] > 24:
+            raise ValueError("no such hour")
+        if state["hour"] > 12:
+            self.strike()
+        self.hour = state["hour"]
+        events.append(f"restored {self.hour}")
+
+    def close(self) -> None:
+        events.append("clock closed")
 
 class Mute:
     def close(self) -> None:
@@ -265,6 +295,36 @@ def governed(memory: MemorySystem, maker: Container, asker: Container, tmp_path:
     maker.load_policy(policy)
     asker.load_policy(policy)
     return policy
+
+
+STATEFUL = "workshop:Clock"
+
+
+def test_what_is_made_with_a_state_has_it_before_anybody_can_call_it(
+    asker: Container, memory: MemorySystem, events: list[str]
+) -> None:
+    seen: list[str] = []
+    asker.joined(where(kind="Clock"), call=lambda handle: seen.append(" ".join(events)))
+    made = {one.name: one for one in ask(asker, "instantiate", STATEFUL, (), ["hall"], {"hour": 7})}
+    memory.settle()
+    assert made["time"]() == 7
+    made["strike"]()  # it is held still no longer
+    assert set(seen) == {"restored 7"}
+    ask(asker, "terminate", made["time"])
+    assert events == ["restored 7", "clock closed"]
+
+
+@pytest.mark.parametrize("hour", [25, 13])
+def test_S18_what_does_not_take_its_state_or_moves_by_it_is_not_offered_and_closed(
+    asker: Container, memory: MemorySystem, events: list[str], hour: int
+) -> None:
+    said = {25: "ValueError: no such hour", 13: "LockedByOther"}[hour]
+    with pytest.raises(CannotInstantiate, match=said):
+        ask(asker, "instantiate", STATEFUL, (), ["hall"], {"hour": hour})
+    memory.settle()
+    assert events == ["clock closed"]
+    with pytest.raises(NoSuchService):
+        asker.find(where(kind="Clock"), wait_s=0)
 
 
 def test_who_administers_makes_and_ends(governed: Path, asker: Container) -> None:

@@ -115,9 +115,12 @@ class Arm(ABC):
     @service(effect="actuate", cancel="stop")
     @abstractmethod
     def move_line(self, pose: Pose, speed_m_s: ToolSpeed | None = None) -> list[float]:
-        """Move the tool in a straight line; the pose measured at rest. A way that leads out of reach is a fault.
+        """Move the tool in a straight line; the pose measured at rest.
 
-        Joint limits of the robot file are looked at on the way: a joint that leaves its range ends the move.
+        Before it begins, the joint angles along the line are worked out, every 5 cm and 0.2 rad: a joint that would
+        leave its range is LimitExceeded, a line that leads out of reach InvalidArgument, and nothing moves (what was
+        under way has been stopped by then). A joint that is measured outside all the same ends the move. Nobody looks
+        for singularities, how fast joints turn near them, the arm itself or anything else that is in the way.
         """
 
     @service(effect="actuate", cancel="stop")

@@ -3,11 +3,12 @@
 import atexit
 import logging
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from typing import TypeVar
 
 import trade
+from trade import Measure
 from trade.errors import ConfigurationError, TradeError
 from trade_drivers import robotfile
 from trade_drivers._across import AcrossGroup
@@ -15,6 +16,7 @@ from trade_drivers._arm import Arm
 from trade_drivers._can_monitor import CanMonitor, HealthTeller
 from trade_drivers._driver import AttachedBus, Driver, SenseDriver, load_driver
 from trade_drivers._interfaces import Gripper, JointGroup, Motor
+from trade_drivers._measured import measures_of
 from trade_drivers._senses import Camera, Sensor
 from trade_drivers.robotfile import Group, Robot
 
@@ -33,8 +35,11 @@ SetHealth = Callable[[object, str], object]
 class AttachedRobot:
     """A robot whose devices are attached and whose services are announced, until it is closed."""
 
-    def __init__(self, robot: Robot, providers: Mapping[str, Provider], undo: ExitStack) -> None:
+    def __init__(
+        self, robot: Robot, providers: Mapping[str, Provider], buses: Mapping[str, AttachedBus], undo: ExitStack
+    ) -> None:
         self.robot = robot
+        self._buses = buses
         self.providers = dict(providers)
         """By group: ``rosie.neck.pan`` -> a Motor, ``rosie.head`` -> a JointGroup, ``rosie.left.hand`` -> a Gripper,
         ``rosie.right`` -> an Arm, ``rosie.eye`` -> a Camera, ``rosie.wrist`` -> a Sensor, ``rosie.bus.legs`` -> a
@@ -73,6 +78,10 @@ class AttachedRobot:
         if not isinstance(provider, CanMonitor):
             raise KeyError(bus)
         return provider
+
+    def measures(self) -> Iterator[Measure]:
+        """What is known of buses and joints, for `trade.Container.measured_by`; nothing is asked of a device."""
+        return measures_of(self.robot, self._buses, self.providers)
 
     def _provider(self, name: str, kind: type[_Provider]) -> _Provider:
         provider = self.providers[f"{self.robot.name}.{name}"]
@@ -134,13 +143,14 @@ def attach(
     with ExitStack() as undo:
         _check_ports(robot, ports or {})
         senses = _attach_senses(robot, ports or {}, undo)  # first: if one is missing, what moves is not even touched
-        providers = _providers(robot, _attach_buses(robot, ports or {}, healthy, undo), senses)
+        buses = _attach_buses(robot, ports or {}, healthy, undo)
+        providers = _providers(robot, buses, senses)
         for name, provider in providers.items():
             (register or trade.register)(provider, (name,))
             undo.callback(_withdraw, deregister or trade.deregister, provider)
         if (tell := set_health or (trade.set_health if register is None else None)) is not None:
             _tell_health(robot, providers, tell, undo)
-        return AttachedRobot(robot, providers, undo.pop_all())
+        return AttachedRobot(robot, providers, buses, undo.pop_all())
 
 
 def _check_ports(robot: Robot, ports: Mapping[str, str]) -> None:

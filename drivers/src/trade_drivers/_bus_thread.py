@@ -7,9 +7,10 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, Final, Generic, Protocol, TypeVar
 
+from trade import Measure
 from trade.errors import BusGone, TradeError
 from trade_drivers._exchange import BusExchange
-from trade_drivers._work import Device, PortLost
+from trade_drivers._work import Device, PortLost, PortOpening
 from trade_drivers.robotfile import Bus
 
 __all__ = ["BusThread", "Port"]
@@ -26,7 +27,10 @@ class Port(Protocol):
     """For messages."""
 
     def open(self) -> None:
-        """Begin to use it; raises ``PortLost`` while it is not there."""
+        """Begin to use it; raises ``PortLost`` while it is not there, ``PortOpening`` if that is only a matter of time.
+
+        While it is waited for, services are answered: it must not block for long.
+        """
         ...
 
     def close(self) -> None:
@@ -51,6 +55,10 @@ class BusThread(Generic[_Exchange_co]):
         self._reopen_at = 0.0
         self._reopen_s = _REOPEN_FIRST_S
         self._leaving = False
+        self.cycles = 0
+        """Since it started."""
+        self.late = 0
+        """Of those, how many ended so late that the next one began after its time by a whole period."""
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
 
     @property
@@ -65,6 +73,16 @@ class BusThread(Generic[_Exchange_co]):
     def alive(self) -> bool:
         """Whether the thread still runs."""
         return self._thread.is_alive()
+
+    def measures(self, bus: str) -> list[Measure]:
+        """How it fares; ``bus`` is its name with the robot's before it."""
+        of, missed = {"bus": bus}, self.exchange.missed_answers
+        return [
+            Measure("bus_cycles", "Cycles of a bus.", self.cycles, of, "counter"),
+            Measure("bus_late_cycles", "Cycles that ended too late by a period or more.", self.late, of, "counter"),
+            Measure("bus_missed_answers", "Exchanges not answered in time.", missed, of, "counter"),
+            Measure("bus_up", "1: its port is open; 0: gone, and looked for.", float(not self._lost_at), of),
+        ]
 
     def close(self) -> None:
         """Stop everything, hold or relax as the robot file says, let go of the port. More than once is fine.
@@ -111,12 +129,16 @@ class BusThread(Generic[_Exchange_co]):
             if self._leaving:
                 break
         now = time.monotonic()
-        return next_at if now - next_at < 1 / self._bus.rate_hz else now  # a little late, the next one is not
+        if now - next_at < 1 / self._bus.rate_hz:  # a little late, the next one is not
+            return next_at
+        self.late += 1
+        return now
 
     def _beat(self) -> None:
         if self._lost_at:
             self._reopen()
         elif self._is_healthy():
+            self.cycles += 1
             self._guarded(self.exchange.cycle)
 
     def _guarded(self, act: Callable[[], None]) -> None:
@@ -127,10 +149,10 @@ class BusThread(Generic[_Exchange_co]):
             self._lost_at, self._lost_why = time.monotonic(), str(lost)
             self._reopen_s = _REOPEN_FIRST_S
             self._reopen_at = self._lost_at + self._reopen_s
-            self._wire.close()
             self.exchange.refusing = self._gone
             self.exchange.forget_measurements()
             self.exchange.fail_all(self._gone)
+            self._wire.close()
 
     def _gone(self, device: Device) -> TradeError:
         waited_s = time.monotonic() - self._lost_at
@@ -142,6 +164,9 @@ class BusThread(Generic[_Exchange_co]):
             return
         try:
             self._wire.open()
+        except PortOpening:
+            self._reopen_at = time.monotonic() + _REOPEN_FIRST_S
+            return
         except (PortLost, TradeError) as still:
             self._lost_why = str(still)
             self._reopen_s = min(_REOPEN_MOST_S, 2 * self._reopen_s)

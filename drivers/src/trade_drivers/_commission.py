@@ -24,6 +24,8 @@ class Found(Struct, frozen=True, kw_only=True):
     driver: str
     kind: Literal["joint", "gripper", "arm"] = "joint"
     """What it is in a robot file."""
+    wire: Literal["serial", "can"] = "serial"
+    """What it was found on."""
     baud: int = 0
     """Bits per second; 0 where there is no such thing: the controller of an arm."""
     id: int = 0
@@ -77,6 +79,14 @@ class Bench(ABC):
         Raises:
             WireError: it does not answer.
         """
+
+    def homing_counts(self, device_id: int) -> int:  # noqa: ARG002 - most devices have none
+        """By how much a device shifts its zero itself; 0 where that is not known.
+
+        Raises:
+            WireError: it does not answer.
+        """
+        return 0
 
     @abstractmethod
     def write_id(self, device_id: int, to: int) -> None:

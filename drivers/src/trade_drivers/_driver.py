@@ -1,11 +1,12 @@
 """What a driver is, and finding one by its name: the entry points of the group ``trade.drivers``."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from importlib.metadata import EntryPoint, entry_points
 from importlib.util import find_spec
 from typing import ClassVar, TypeVar
 
+from trade import Measure
 from trade.errors import ConfigurationError
 from trade_drivers import robotfile
 from trade_drivers._arm import Arm
@@ -51,6 +52,10 @@ class AttachedBus(ABC):
     def monitor(self, name: str) -> CanMonitor | None:  # noqa: ARG002 - most have none
         """The bus itself, to look at; ``name`` has the robot's before it. None if there is nothing to tell of it."""
         return None
+
+    def measures(self, bus: str) -> Iterable[Measure]:  # noqa: ARG002 - whoever keeps none has none
+        """Numbers of its own that are known already, for metrics; ``bus`` is its name with the robot's before it."""
+        return ()
 
     @abstractmethod
     def close(self) -> None:

@@ -75,6 +75,8 @@ class BusExchange(ABC, Generic[_Device]):
         self.period_ns = int(1e9 / bus.rate_hz)
         self.refusing: Callable[[Device], TradeError] | None = None
         """Why nothing is taken on at present."""
+        self.missed_answers = 0
+        """Since the start."""
         self._devices = tuple(devices)
         self._inbox: deque[Work[_Device]] = deque()
         self._stops: deque[StopTicket[_Device]] = deque()
@@ -202,6 +204,7 @@ class BusExchange(ABC, Generic[_Device]):
     def missed(self, device: _Device) -> None:
         """It has not answered: it is in doubt, and left out after three times in a row."""
         now_ns = self.clock()
+        self.missed_answers += 1
         device.misses += 1
         device.doubted = True
         if device.misses >= _RETRIES and not device.silent:

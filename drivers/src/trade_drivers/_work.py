@@ -8,7 +8,18 @@ from typing import Final, Generic, Protocol, TypeVar
 from trade import Permit, current_call
 from trade.errors import DeadlineExceeded, DeviceFault, TradeError
 
-__all__ = ["Device", "Gate", "NoAnswer", "PortLost", "Steps", "WireError", "Work", "check_admitted", "losing"]
+__all__ = [
+    "Device",
+    "Gate",
+    "NoAnswer",
+    "PortLost",
+    "PortOpening",
+    "Steps",
+    "WireError",
+    "Work",
+    "check_admitted",
+    "losing",
+]
 
 Steps = Generator[None, None, None]
 """Yields after each exchange on the wire, so that stops and cycles come in between."""
@@ -22,6 +33,10 @@ _TELL_S: Final = 0.1
 
 class PortLost(Exception):
     """The port itself is gone: unplugged, down, or never opened."""
+
+
+class PortOpening(PortLost):
+    """It is about to be opened, which takes a while: ask again soon."""
 
 
 @contextmanager

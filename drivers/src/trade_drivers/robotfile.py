@@ -90,8 +90,8 @@ class UrBus(Bus, frozen=True, kw_only=True):
 
     host: Text
     """Its name or address; the ports are fixed."""
-    rate_hz: Annotated[float, Meta(gt=0, le=500)] = 500.0
-    """Set-points per second."""
+    rate_hz: Annotated[float, Meta(ge=0, le=500)] = 0.0
+    """Set-points per second; 0: as many as the controller has cycles, 500 or (CB3) 125."""
 
     @property
     def port(self) -> str:
@@ -112,6 +112,8 @@ class Joint(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     serial_number: Annotated[int, Meta(ge=0)] | None = None
     """Of the device, as it tells it; another one is refused. Not checked if left out."""
     reversed: bool = False
+    homing_counts: int = 0
+    """What the servo's own homing offset was when it was calibrated; with another one its zero has moved: refused."""
     offset_rad: float = 0.0
     """Joint angle when the device reads its centre, or 0 where counts have no centre."""
     counts_per_rev: Positive | None = None

@@ -10,7 +10,7 @@ from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
 from math import pi
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final, cast
+from typing import TYPE_CHECKING, Annotated, Final, TypeVar, cast
 
 import typer
 from msgspec import Struct
@@ -23,7 +23,7 @@ from trade_gateway._output import Output, UsageError
 if TYPE_CHECKING:
     import tomlkit
 
-__all__ = ["Sweep", "calibrate", "measured", "with_values"]
+__all__ = ["Sweep", "calibrate", "homed", "measured", "with_values"]
 
 _MARGIN_RAD: Final = 0.02
 """How far inside of what was reached the range ends: the last bit is the stop giving way."""
@@ -32,6 +32,8 @@ _LONGEST_S: Final = 600.0
 """How long somebody may take between two prompts."""
 _DIGITS: Final = 4
 _ATTEMPTS: Final = 3
+
+_Number = TypeVar("_Number", int, float)
 
 
 def calibrate(
@@ -55,7 +57,9 @@ def calibrate(
     text = robot_file.read_text(encoding="utf-8")
     record, bus = _joint(robot, joint)
     with _slack(bus, record) as bench:
-        values = _measure(out, record, Sweep(bench, record.id), zero_here=zero_here, seconds=range_from_motion)
+        sweep = Sweep(bench, record.id)
+        values = _measure(out, record, sweep, zero_here=zero_here, seconds=range_from_motion)
+        values |= homed(record, sweep.homing_counts(), zero_measured="offset_rad" in values)
     changed = with_values(text, joint, values)
     parse(changed, str(robot_file))
     _write(out, robot_file, text, changed, yes=yes)
@@ -96,10 +100,17 @@ class Sweep:
 
     def read(self) -> float:
         """Where it stands, from its own centre, in rad."""
+        return self._told(self._bench.angle_rad)
+
+    def homing_counts(self) -> int:
+        """By how much it shifts its zero itself."""
+        return self._told(self._bench.homing_counts)
+
+    def _told(self, ask: Callable[[int], _Number]) -> _Number:
         trouble = ""
         for _ in range(_ATTEMPTS):
             try:
-                return self._bench.angle_rad(self._id)
+                return ask(self._id)
             except WireError as bad:
                 trouble = str(bad)
         raise ConfigurationError(where=f"id {self._id}", problem=f"{trouble}; check its cable")
@@ -126,6 +137,20 @@ def measured(joint: Joint, zero: float | None, ends: Ends | None) -> dict[str, f
         low, high = sorted((offset + sign * ends.low, offset + sign * ends.high))
         values |= {"min_rad": low + _MARGIN_RAD, "max_rad": high - _MARGIN_RAD}
     return {key: round(value, _DIGITS) + 0.0 for key, value in values.items()}
+
+
+def homed(joint: Joint, found: int, *, zero_measured: bool) -> dict[str, float]:
+    """The key that changes if the servo's own homing offset is not what the file says.
+
+    Raises:
+        WrongDevice: its zero has moved, and was not measured.
+    """
+    if found == joint.homing_counts:
+        return {}
+    if not zero_measured:
+        where, expected = f'joint."{joint.name}"', str(joint.homing_counts)
+        raise WrongDevice(where=where, key="homing_counts", expected=expected, found=str(found))
+    return {"homing_counts": found}
 
 
 def with_values(text: str, joint: str, values: Mapping[str, float]) -> str:

@@ -24,7 +24,8 @@ def first_file(found: Sequence[tuple[str, Found]], path: Path) -> str:
     """The text of a robot file with these devices, each with the port it was found on.
 
     Raises:
-        ConfigurationError: a device has a problem, or those of one port speak at different rates.
+        ConfigurationError: a device has a problem, or those of one port speak at different rates or are of different
+            drivers.
     """
     for port, one in found:
         if one.problem:
@@ -36,6 +37,12 @@ def first_file(found: Sequence[tuple[str, Found]], path: Path) -> str:
         if len(rates) > 1:
             several = " and ".join(map(str, rates))
             problem = f"its devices speak at {several} baud; have all speak at one (`trade set-baud`)"
+            raise ConfigurationError(where=port, problem=f"{problem}. No robot file was written")
+        names = sorted({one.driver for one in here})
+        if len(names) > 1:
+            problem = (
+                f"its devices are of {' and '.join(names)}; a robot file has one driver a bus, so scan with --driver"
+            )
             raise ConfigurationError(where=port, problem=f"{problem}. No robot file was written")
         text += _table(f"bus.line{number}", _bus(port, here[0]))
         for one in here:
@@ -52,11 +59,13 @@ def _table(name: str, keys: Iterable[str]) -> str:
 def _bus(port: str, one: Found) -> list[str]:
     if one.kind == "arm":
         return [f"driver = {_text(one.driver)}", f"host = {_text(port)}    # set it to remote control"]
-    if one.driver == "cia402":
+    if one.wire == "can":
         interface, _, channel = port.partition(":")
         keys = [f"interface = {_text(interface)}", f"channel = {_text(channel)}", f"bitrate = {one.baud}"]
     else:
         keys = [f"port = {_text(str(Path(port).absolute()))}", f"baud = {one.baud}"]
+    if one.driver == "odrive":
+        keys.append('leave = "relax"    # without its driver an ODrive lets go: brake what would fall')
     return [f"driver = {_text(one.driver)}", *keys]
 
 
@@ -66,8 +75,9 @@ def _joint(one: Found) -> list[str]:
         keys.append(f"firmware = {_text(one.firmware)}      # another one is refused: it would be another device")
     if one.serial_number is not None:
         keys.append(f"serial_number = {one.serial_number}    # another one is refused: it would be another device")
-    if one.driver == "cia402":
-        keys.append("counts_per_rev = 4096   # of its encoder, for one turn of the motor: see its data sheet")
+    if one.wire == "can":
+        if one.driver == "cia402":
+            keys.append("counts_per_rev = 4096   # of its encoder, for one turn of the motor: see its data sheet")
         keys.append("gear = 1.0              # turns of the motor for one of the joint")
         measures = "to be measured"
     else:

@@ -1,6 +1,8 @@
 """``trade gateway GATEWAY.toml``: join networks, and let across what the file and its policy allow."""
 
+import queue
 import signal
+import tempfile
 import threading
 from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
@@ -9,6 +11,7 @@ from types import FrameType
 from typing import Annotated, Final
 
 import typer
+from rich.markup import escape
 
 from trade import Container, Settings
 from trade.errors import TradeError
@@ -20,6 +23,7 @@ from trade_gateway._list import Json
 from trade_gateway._notify import Notifier
 from trade_gateway._output import Output, complain
 from trade_gateway._up import leaving
+from trade_gateway.supervisor import ChildServices, News, Supervisor
 
 _LOOK_EVERY_S: Final = 1.0
 
@@ -32,7 +36,8 @@ def gateway(
 ) -> None:
     """Carry calls between networks that have no way to each other, as far as the file and its policy allow.
 
-    It may be a guest in other systems, too, and share some groups with them.
+    It may be a guest in other systems, too, and share some groups with them. Containers of its host that the file names
+    it starts, and starts again when they crash or hang; they end with it.
 
     The file is read again when it changes, when its policy, its revoked names or its certificate do, and on SIGHUP.
     What is wrong with it is said, and the gateway goes on as before.
@@ -44,6 +49,7 @@ def gateway(
     if check:
         out.say(f"{file} is right")
         _say_what_crosses(out, plan)
+        _say_children(out, plan)
         return
     if detach:
         detach_now(out, plan.settings)
@@ -57,6 +63,7 @@ def gateway(
             while not asked_to_leave.wait(_LOOK_EVERY_S):
                 if running.container.healthy():
                     notifier.alive()
+                _say_news(out, running.news)
                 now = digest(file)
                 if now != seen or hangup.is_set():
                     seen, anew = now, hangup.is_set()
@@ -66,12 +73,13 @@ def gateway(
                     notifier.ready(_status(running) if good else f"{file} is wrong; going on as before")
         finally:
             notifier.leaving()
+            out.say("leaving")
             running.close()
-        out.say("leaving")
+            _say_news(out, running.news)
 
 
 class Gateway:
-    """The container that joins the networks, and its guests in other systems, as the file says now."""
+    """The container that joins the networks, its guests in other systems, its children, as the file says now."""
 
     def __init__(self, plan: Plan, named: str, leave: Callable[[], None]) -> None:
         self._plan = plan
@@ -84,8 +92,12 @@ class Gateway:
         self._container.terminating.close = leave
         self._running: Settings | None = plan.settings
         """What the container that is open was started with."""
+        self._supervisor: Supervisor | None = None
+        self.news: queue.SimpleQueue[News] = queue.SimpleQueue()
+        """What becomes of the children."""
         try:
             self._guests.apply(self._container, plan)
+            self._look_after(plan)
         except BaseException:
             self.close()
             raise
@@ -116,6 +128,8 @@ class Gateway:
             complain(f"{file} was changed and cannot be used; going on as before: {refused}")
             return False
         self._plan, self._named = plan, named
+        self._container.note_change("gateway file read", str(file))
+        self._look_after(plan)
         out.say(f"read {file} again")
         if out.as_json:
             out.data({"reloaded": str(file)})
@@ -124,16 +138,35 @@ class Gateway:
     def _go_by(self, plan: Plan, *, anew: bool) -> None:
         if anew or plan.settings != self._running:
             self._running = None
-            self.close()
+            self._leave_networks()
             self._container = opened(plan.settings)
             self._container.terminating.close = self._leave
+            self._offer()
             self._running = plan.settings
         self._guests.apply(self._container, plan)
 
-    def close(self) -> None:
-        """Leave all networks and systems. Idempotent."""
+    def _look_after(self, plan: Plan) -> None:
+        """The children are as the file says; those of which it says nothing new go on."""
+        if self._supervisor is None and plan.children:
+            state = plan.settings.state_dir or Path(tempfile.gettempdir())
+            self._supervisor = Supervisor(lambda: self._container, self.news.put, state / plan.settings.system)
+            self._offer()
+        if self._supervisor is not None:
+            self._supervisor.go_by(plan.children)
+
+    def _offer(self) -> None:
+        if self._supervisor is not None:
+            self._container.register_functions(ChildServices(self._supervisor), "supervisor")
+
+    def _leave_networks(self) -> None:
         self._guests.close()
         self._container.close()
+
+    def close(self) -> None:
+        """End the children, then leave all networks and systems. Idempotent."""
+        if self._supervisor is not None:
+            self._supervisor.close()
+        self._leave_networks()
 
 
 @contextmanager
@@ -158,6 +191,17 @@ def _status(running: Gateway) -> str:
     return f"{settings.container} is up in system {settings.system}, as {settings.identity}"
 
 
+def _say_news(out: Output, told: "queue.SimpleQueue[News]") -> None:
+    while not told.empty():
+        news = told.get()
+        if out.as_json:
+            out.data(news)
+        elif news.bad:
+            complain(news.text)
+        else:
+            out.say(escape(news.text))
+
+
 def _say_ready(out: Output, running: Gateway, plan: Plan) -> None:
     settings = plan.settings
     if out.as_json:
@@ -169,11 +213,13 @@ def _say_ready(out: Output, running: Gateway, plan: Plan) -> None:
                 "listen": settings.listen,
                 "networks": networks,
                 "shares": {name: _share(plan, name) for name in plan.shares},
+                "children": [child.name for child in plan.children],
             }
         )
         return
     out.say(f"[bold green]{running.container.name} is up[/] in system {settings.system}, as {settings.identity}")
     _say_what_crosses(out, plan)
+    _say_children(out, plan)
     out.say("Ctrl-C leaves; the file is read again when it changes")
 
 
@@ -199,6 +245,11 @@ def _say_what_crosses(out: Output, plan: Plan) -> None:
         guest = plan.shares[name]
         out.say(f"  system {guest.system}, as {guest.identity}: it sees {_listed(share.export)} of {settings.system}")
         out.say(f"  and {settings.system} sees {_listed(share.import_)} of {guest.system}")
+
+
+def _say_children(out: Output, plan: Plan) -> None:
+    for child in plan.children:
+        out.say(f"  it keeps {escape(child.name)} up: {child.part.entry.kind}")
 
 
 def _listed(groups: Sequence[str]) -> str:

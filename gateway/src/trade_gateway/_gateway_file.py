@@ -1,4 +1,4 @@
-"""The gateway file: which networks are joined, what of each the others see, who may do what. Checked as a whole."""
+"""The gateway file: which networks are joined, what crosses, who may do what, what is kept up. Checked as a whole."""
 
 import hashlib
 import os
@@ -14,6 +14,8 @@ from msgspec import Meta, Struct
 from trade import Settings
 from trade.errors import ConfigurationError
 from trade.policies import EVERYTHING, read_policy
+from trade_gateway._parts import Around
+from trade_gateway.supervisor import Child, read_children
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -78,13 +80,14 @@ class Share(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, renam
     credentials: str = ""
     """Laboratories only, instead of ``tls``: ``user:password``."""
 
-    def settings(self, where: Path, name: str, *, insecure_lan: bool) -> Settings:
+    def settings(self, where: Path, name: str, audit: Path | None, *, insecure_lan: bool) -> Settings:
         """What the guest is started with. Raises ConfigurationError."""
         if self.policy:
             read_policy(where.parent / self.policy)
         return Settings.read(
             system=self.system,
             container=name,
+            audit=audit,
             listen=self.listen,
             connect=self.connect,
             credentials=_pair(self.credentials),
@@ -107,12 +110,18 @@ class GatewayFile(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
     """The folder that `trade pki issue --for gateway` made."""
     policy: str = ""
     """The access policy."""
+    metrics: str = ""
+    """Where Prometheus finds its metrics: ``127.0.0.1:9464``."""
+    audit: str = ""
+    """The folder for the record of what happens in it, and in its guests in other systems."""
     connect: list[_Text] = []
     """Other gateways that it dials."""
     network: dict[str, Network] = {}
-    """By a name for people; at least one, unless the gateway only shares."""
+    """By a name for people; at least one, unless the gateway only shares or looks after containers."""
     share: dict[str, Share] = {}
     """Other systems, by a name for people."""
+    container: dict[str, dict[str, Any]] = {}
+    """Containers of this host that it keeps up, by name."""
     credentials: str = ""
     """Laboratories only, instead of ``tls``: ``user:password``."""
     insecure_lan: bool = False
@@ -147,8 +156,14 @@ class GatewayFile(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
             exports=exports if limited else None,
             stream_hz={network.interface: network.limits for network in networks},
             policy=beside / self.policy if self.policy else None,
+            audit=self.audit_folder(where),
+            metrics=self.metrics,
             environment=_without_system(),
         )
+
+    def audit_folder(self, where: Path) -> Path | None:
+        """Beside the file."""
+        return where.parent / self.audit if self.audit else None
 
 
 def _pair(credentials: str) -> tuple[str, str] | None:
@@ -161,8 +176,13 @@ def _or_all(groups: Sequence[str] | None) -> Sequence[str]:
 
 
 def _without_system() -> dict[str, str]:
-    """The file says it all, and not whatever shell the gateway is started from; but for places on this host."""
-    return {name: value for name, value in os.environ.items() if not name.startswith("TRADE_") or name.endswith("_DIR")}
+    """The file says it all, and not whatever shell the gateway is started from; but for what concerns this host."""
+    kept = ("TRADE_AUDIT_READS", "TRADE_AUDIT_KEEP_DAYS", "TRADE_AUDIT_KEEP_ROWS")
+    return {
+        name: value
+        for name, value in os.environ.items()
+        if not name.startswith("TRADE_") or name.endswith("_DIR") or name in kept
+    }
 
 
 _KINDS: Final[Mapping[str, type[Struct]]] = {"network": Network, "share": Share}
@@ -175,6 +195,8 @@ class Plan(NamedTuple):
     settings: Settings
     shares: Mapping[str, Settings]
     """What the guests in other systems are started with, by the name of the share."""
+    children: Sequence[Child]
+    """The containers that it looks after, in the order in which they are started."""
 
 
 def read_gateway_file(path: Path) -> Plan:
@@ -185,7 +207,8 @@ def read_gateway_file(path: Path) -> Plan:
     """
     where = str(path)
     try:
-        raw = _read(path)
+        text = path.read_text(encoding="utf-8")
+        raw = _parsed(text)
     except FileNotFoundError:
         raise ConfigurationError(where=where, problem="there is no such file") from None
     except OSError as bad:
@@ -198,15 +221,48 @@ def read_gateway_file(path: Path) -> Plan:
         raise _explained(str(bad), raw, where) from None
     _check(file, where)
     shares = {
-        name: share.settings(path, file.name, insecure_lan=file.insecure_lan) for name, share in file.share.items()
+        name: share.settings(path, file.name, file.audit_folder(path), insecure_lan=file.insecure_lan)
+        for name, share in file.share.items()
     }
-    return Plan(file, file.settings(path), shares)
+    laboratory = _of_children(file)
+    around = Around(
+        system=file.system,
+        policy=file.policy,
+        audit=file.audit,
+        environment=laboratory,
+        inherited=_without_system(),
+    )
+    children = read_children(path, text, around, file.container, certified=bool(file.tls))
+    return Plan(file, file.settings(path), shares, children)
+
+
+def _of_children(file: GatewayFile) -> dict[str, str]:
+    """Variables by which containers of this host are let into the system as the gateway is."""
+    laboratory = {"TRADE_CREDENTIALS": file.credentials, "TRADE_INSECURE_LAN": "1" if file.insecure_lan else ""}
+    return {name: value for name, value in laboratory.items() if value}
 
 
 def _check(file: GatewayFile, where: str) -> None:
-    owners: dict[str, str] = {}
-    if not file.network and not file.share:
+    if not (file.network or file.share or file.container):
         raise ConfigurationError(where=f"{where}: network", problem=f"missing; write {_EXAMPLES['network']}")
+    _check_networks(file, where)
+    if file.network or file.share or file.connect:
+        _check_proof(file, file, f"{where}: ", "NAME --for gateway")
+    for name, share in file.share.items():
+        at = f"{where}: share.{name}."
+        if share.system in (file.system, *(one.system for known, one in file.share.items() if known != name)):
+            problem = f"{share.system!r} is this system or that of another share; name another one, once"
+            raise ConfigurationError(where=f"{at}system", problem=problem)
+        _check_groups(share.export, f"{at}export")
+        _check_groups(share.import_, f"{at}import")
+        _check_proof(file, share, at, f"NAME, by the authority of {share.system}")
+        if not share.policy and not file.insecure_lan:
+            problem = f"missing; name the policy of {share.system}: without one all of it might call what is shared"
+            raise ConfigurationError(where=f"{at}policy", problem=problem)
+
+
+def _check_networks(file: GatewayFile, where: str) -> None:
+    owners: dict[str, str] = {}
     for name, network in file.network.items():
         if other := owners.get(network.interface):
             problem = f"{network.interface} is the interface of network {other!r} already"
@@ -221,18 +277,6 @@ def _check(file: GatewayFile, where: str) -> None:
         for key in [key for key, is_given in given.items() if is_given and file.alone]:
             problem = "there is no other network of this system; leave it out: what other systems see is in [share...]"
             raise ConfigurationError(where=f"{where}: network.{name}.{key}", problem=problem)
-    _check_proof(file, file, f"{where}: ", "NAME --for gateway")
-    for name, share in file.share.items():
-        at = f"{where}: share.{name}."
-        if share.system in (file.system, *(one.system for known, one in file.share.items() if known != name)):
-            problem = f"{share.system!r} is this system or that of another share; name another one, once"
-            raise ConfigurationError(where=f"{at}system", problem=problem)
-        _check_groups(share.export, f"{at}export")
-        _check_groups(share.import_, f"{at}import")
-        _check_proof(file, share, at, f"NAME, by the authority of {share.system}")
-        if not share.policy and not file.insecure_lan:
-            problem = f"missing; name the policy of {share.system}: without one all of it might call what is shared"
-            raise ConfigurationError(where=f"{at}policy", problem=problem)
 
 
 def _check_groups(groups: Sequence[str], where: str) -> None:
@@ -320,4 +364,8 @@ def _named_by(part: Mapping[str, Any], path: Path) -> list[Path]:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    return cast("dict[str, Any]", tomllib.loads(path.read_text(encoding="utf-8")))  # pyright: ignore[reportUnknownMemberType]
+    return _parsed(path.read_text(encoding="utf-8"))
+
+
+def _parsed(text: str) -> dict[str, Any]:
+    return cast("dict[str, Any]", tomllib.loads(text))  # pyright: ignore[reportUnknownMemberType]

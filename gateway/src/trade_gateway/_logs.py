@@ -24,6 +24,9 @@ def logs(
         Literal["debug", "info", "warning", "error", "critical"], typer.Option(help="The least.")
     ] = "debug",
     container: Name = "*",
+    call: Annotated[
+        int | None, typer.Option(help="Only what was logged in this call, and in those that it led to, anywhere.")
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Show what all processes log to the logger "trade", in order of time by the clocks of their hosts.
@@ -38,7 +41,8 @@ def logs(
         reader = LogReader(member, container)
         while True:
             for line in reader.read():
-                if line.level >= least and line.container != member.name:
+                meant = call in (None, line.call_id, line.outer_id)
+                if meant and line.level >= least and line.container != member.name:
                     _say(out, line)
             if not follow:
                 return

@@ -164,7 +164,8 @@ def commissioners(name: str | None) -> dict[str, Commissioner]:
 
 
 def _scan_port(out: Output, port: str, driver: str | None, bauds: Sequence[int], ids: Sequence[int]) -> list[Found]:
-    """What the first driver finds that finds anything."""
+    """What the first driver finds that finds anything; on a CAN bus, where several kinds may be, what all find."""
+    everything: list[Found] = []
     wire = "can" if _CAN.fullmatch(port) and not Path(port).exists() else "serial"
     for name, commissioner in commissioners(driver).items():
         if commissioner.wire != wire:
@@ -184,9 +185,10 @@ def _scan_port(out: Output, port: str, driver: str | None, bauds: Sequence[int],
                 raise
             complain(f"not looked for: {bad}")  # its library is not installed
             continue
-        if found:
-            return found
-    return []
+        everything += found
+        if found and wire == "serial":
+            break
+    return everything
 
 
 def _arm(host: str) -> Found:

@@ -1,6 +1,6 @@
 """Which system a command speaks to."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import typer
 
@@ -27,5 +27,5 @@ def choice_of(context: typer.Context) -> SystemChoice:
 
 
 def visitor(context: typer.Context) -> Container:
-    """A short-lived container of this command's own."""
-    return Container(choice_of(context).settings())
+    """A short-lived container of this command's own; what it asks for is in the records of who is asked."""
+    return Container(replace(choice_of(context).settings(), audit=None, metrics=""))

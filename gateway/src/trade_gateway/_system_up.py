@@ -2,7 +2,6 @@
 
 import contextlib
 import os
-import re
 import signal
 import threading
 import time
@@ -17,9 +16,10 @@ from trade import Container, ContainerInfo, Handle, where
 from trade.errors import CannotStart, ConfigurationError, NoSuchService, TooManyServices, TradeError
 from trade.starting import LONGEST_S, Started, end_there, launch, missing_there
 from trade_gateway._detached import detached
-from trade_gateway._system_file import Made, Part, SystemPlan
+from trade_gateway._furnishing import GROUP, lacking, make
+from trade_gateway._parts import Part
+from trade_gateway._system_file import SystemPlan
 
-_GROUP: Final = "trade"
 _LEFT_S: Final = 20.0
 """How long a container may take to leave once it was told to: a robot is brought to rest before."""
 _LOOK_EVERY_S: Final = 0.05
@@ -96,7 +96,7 @@ class Bringing:
         if info is None:
             began.append(_Began(part, self._start(part)))
             info = self._await(began[-1])
-        made = [self._make(part, one) for one in self._lacking(part)]
+        made = [make(self._own(part, "instantiate"), one, wait_s=self._wait_s) for one in lacking(self._member, part)]
         state = "was up" if was_up and not made else "started"
         took_s = time.monotonic() - at
         self._tell(Told(container=part.name, host=part.entry.host, state=state, pid=info.pid, took_s=took_s))
@@ -118,7 +118,7 @@ class Bringing:
     def _await(self, began: _Began) -> ContainerInfo:
         part, started = began
         with contextlib.suppress(NoSuchService, TooManyServices):  # which one it is the epoch tells
-            self._member.find(where(name="clock", group=_GROUP, container=part.name), wait_s=self._wait_s)
+            self._member.find(where(name="clock", group=GROUP, container=part.name), wait_s=self._wait_s)
         info = next((one for one in self._member.containers() if one.epoch == started.epoch), None)
         if info is None:
             said = f"it is up there as process {started.pid}, and not seen here within {self._wait_s:g} s"
@@ -126,25 +126,8 @@ class Bringing:
             raise CannotStart(host=part.entry.host, container=part.name, reason="not seen", said=said, remedy=remedy)
         return info
 
-    def _lacking(self, part: Part) -> list[Made]:
-        """What the file wants made in a container, and it does not offer."""
-        if not part.entry.providers:
-            return []
-        found = self._member.services(where(container=part.name))
-        offered = {(kind, frozenset(handle.groups)) for handle in found for kind in handle.kinds}
-        return [
-            one
-            for one in part.entry.providers
-            if (re.split(r"[.:]", one.class_)[-1], frozenset(one.groups)) not in offered
-        ]
-
-    def _make(self, part: Part, made: Made) -> None:
-        instantiate = self._own(part, "instantiate")
-        args = made.args if isinstance(made.args, dict) else tuple(made.args)
-        instantiate.with_(deadline_s=self._wait_s)(made.class_, args, tuple(made.groups))
-
     def _own(self, part: Part, name: str) -> Handle:
-        return self._member.find(where(name=name, group=_GROUP, container=part.name), wait_s=self._wait_s)
+        return self._member.find(where(name=name, group=GROUP, container=part.name), wait_s=self._wait_s)
 
     def _seen(self, part: Part) -> ContainerInfo | None:
         """The container of that name. Raises ConfigurationError if there are two."""
@@ -207,8 +190,8 @@ class Bringing:
             if info is None:
                 yield Told(container=part.name, host=host, state="down")
                 continue
-            lacking = ", ".join(one.class_ for one in self._lacking(part))
-            state = f"lacks {lacking}" if lacking else "up"
+            lacks = ", ".join(one.class_ for one in lacking(self._member, part))
+            state = f"lacks {lacks}" if lacks else "up"
             yield Told(container=part.name, host=host, state=state, pid=info.pid, services=info.services)
 
 

@@ -68,6 +68,7 @@ def up(
                 healthy=container.healthy,
             )
         )
+        container.measured_by(attached.measures)
         _say_ready(out, robot, container, simulation)
         faults = FaultWatch(attached.providers)
         faults.begin(out)

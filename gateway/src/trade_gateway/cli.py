@@ -7,6 +7,7 @@ import typer
 
 from trade.errors import TradeError
 from trade_gateway import (
+    _audit,
     _backup,
     _calibrate,
     _call,
@@ -32,6 +33,7 @@ from trade_gateway import (
     _up,
     _watchers,
 )
+from trade_gateway._lifeline import end_with_stdin
 from trade_gateway._output import UsageError, say_error
 from trade_gateway._system_choice import SystemChoice
 
@@ -82,6 +84,7 @@ app.command("hooks", rich_help_panel=_WATCHING)(_watchers.hooks)
 app.command("tracing", rich_help_panel=_WATCHING)(_trace.tracing)
 app.command("trace", rich_help_panel=_WATCHING)(_trace.trace)
 app.command("logs", rich_help_panel=_WATCHING)(_logs.logs)
+app.add_typer(_audit.app, name="audit", rich_help_panel=_WATCHING)
 app.command("profile", rich_help_panel=_WATCHING)(_profile.profile)
 app.add_typer(_rules.app, name="rules", rich_help_panel=_WATCHING)
 app.add_typer(_pki_commands.app, name="pki", rich_help_panel=_RIGHTS)
@@ -106,11 +109,16 @@ def options(
         list[str] | None,
         typer.Option(help="Endpoint of a container, such as tcp/127.0.0.1:7450; repeatable. \\[env: TRADE_CONNECT]"),
     ] = None,
+    with_stdin: Annotated[
+        bool, typer.Option("--with-stdin", hidden=True, help="End when standard input does.")
+    ] = False,
     version: Annotated[  # noqa: ARG001 - answered by its callback
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version.")
     ] = False,
 ) -> None:
     """Options of every command."""
+    if with_stdin:
+        end_with_stdin()
     context.obj = SystemChoice(system, connect)
 
 

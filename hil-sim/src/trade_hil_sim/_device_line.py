@@ -118,6 +118,8 @@ class DeviceLine(ABC, Generic[_Device]):
                 self._line.unplug()
             case faults.Replug():
                 self._line.replug()
+            case faults.HangUp() | faults.Local():
+                raise SimulationError(f"bus {self.name} is no controller of an arm")
             case _:
                 with self._lock:
                     self._do_here(command)
@@ -140,7 +142,7 @@ class DeviceLine(ABC, Generic[_Device]):
                     self._heal(device, t)
             case faults.Echo():
                 self._echo = command.on
-            case faults.Unplug() | faults.Replug():
+            case faults.Unplug() | faults.Replug() | faults.HangUp() | faults.Local():
                 pass
             case faults.Absent(nth=int(nth)) if nth > len(self._devices):
                 raise SimulationError(f"bus {self.name} has {len(self._devices)} devices, no number {nth}")

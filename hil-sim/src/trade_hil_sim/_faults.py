@@ -7,7 +7,7 @@ Two kinds: faults of answers, which change the bytes of some answers on their wa
 a device or to the line once.
 """
 
-from typing import Annotated, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import msgspec
 from msgspec import Meta
@@ -25,10 +25,12 @@ __all__ = [
     "Emergency",
     "Freeze",
     "Garbage",
+    "HangUp",
     "HardwareFault",
     "Heal",
     "Jam",
     "Late",
+    "Local",
     "Mute",
     "Piece",
     "Place",
@@ -180,6 +182,18 @@ class Replug(_Order, frozen=True, tag="replug"):
     """Plug the serial adapter in again."""
 
 
+class HangUp(_Order, frozen=True, kw_only=True, tag="hang_up"):
+    """A controller hangs up on its clients of one kind; they may connect again."""
+
+    kind: Literal["rtde", "dashboard", "script"]
+
+
+class Local(_Order, frozen=True, kw_only=True, tag="local"):
+    """A controller is switched to local control: it takes no orders from the network. With ``on`` false, back."""
+
+    on: bool = True
+
+
 class BusOff(_Devices, frozen=True, kw_only=True, tag="bus_off"):
     """CAN controllers go bus-off: devices', or without `ids` the adapter's. With ``on`` false they start again."""
 
@@ -264,10 +278,12 @@ Command = (
     | Emergency
     | Freeze
     | Garbage
+    | HangUp
     | HardwareFault
     | Heal
     | Jam
     | Late
+    | Local
     | Mute
     | Place
     | Put

@@ -25,6 +25,7 @@ from trade._lock import Lock, OnLost, OnRequest
 from trade._locking import LEASE_S
 from trade._logbook import LogLine
 from trade._many import Outcome
+from trade._measures import Measure
 from trade._notifications import Notification, NotificationInfo
 from trade._notifying import POLL_S
 from trade._occasions import What
@@ -58,6 +59,7 @@ __all__ = [
     "LockInfo",
     "LogLine",
     "LogReader",
+    "Measure",
     "Meta",
     "Notification",
     "NotificationInfo",

@@ -65,13 +65,17 @@ FUNCTIONS: Final = {
 }
 """What the middleware's own functions need over group ``trade``; empty: open to everybody who is not revoked."""
 
+SOME_HAVE: Final = {"children": "read", "restart_child": "administer"}
+"""Likewise, of functions that only a container has which looks after others."""
+_ALL_FUNCTIONS: Final = {**FUNCTIONS, **SOME_HAVE}
+
 _NEEDS: Final = {"read": "read", "actuate": "call", "stop": _ALL}
 """What other services need over their group, by effect; a stop is open to everybody (S07)."""
 
 
 def verb_of(domain: str, name: str, effect: str) -> str:
     """What a service of a group asks of its callers over that group; empty: nothing but not to be revoked."""
-    return FUNCTIONS.get(name, "administer") if domain == DOMAIN else _NEEDS.get(effect, "call")
+    return _ALL_FUNCTIONS.get(name, "administer") if domain == DOMAIN else _NEEDS.get(effect, "call")
 
 
 def decide_call(policy: Policy, who: str, domain: str, name: str, effect: str) -> tuple[str, Decision]:

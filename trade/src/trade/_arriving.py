@@ -5,7 +5,7 @@ import hashlib
 import secrets
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 from msgspec import Struct, structs
@@ -22,8 +22,8 @@ from trade._records import imported
 from trade._service import marked_methods
 from trade._signature import Signature
 from trade._state import is_stateful, restore
-from trade._wire import Address, Scalar, domain_of, encode_message
-from trade.errors import Busy, CannotMigrate, LockedByOther, NoSuchClass
+from trade._wire import Address, Scalar, ServiceKey, domain_of, encode_message
+from trade.errors import Busy, CannotInstantiate, CannotMigrate, LockedByOther, NoSuchClass
 
 TICKET_S: Final = 20.0
 """What was prepared and is not fetched in this time is closed again."""
@@ -201,6 +201,28 @@ class Arriving:
         self._making.keep(ready.provider, ready.luggage.args)
         ready.ending.pop_all()
         ready.standing.close()
+
+    def bring_back(
+        self, class_path: str, args: Sequence[Any] | Mapping[str, Any], groups: tuple[str, ...], state: Any
+    ) -> list[ServiceKey]:
+        """Make something, give it its state, then offer it.
+
+        Raises:
+            CannotInstantiate: it does not take the state, or as for `prepare`.
+            NotInstantiable, NoSuchClass, AccessDenied, LockedByOther, ConfigurationError, Busy: as for `prepare`.
+        """
+        named = dict(args) if isinstance(args, Mapping) else tuple(args)
+        version = fingerprint(self._making.find(class_path), (), self._codec)
+        luggage = Luggage(
+            class_path=class_path, fingerprint=version, args=named, groups=groups, has_state=True, state=state
+        )
+        try:
+            prepared = self.prepare(luggage, self._own.identity)
+        except CannotMigrate as refused:
+            here = self._own.container
+            raise CannotInstantiate(class_path=class_path, container=here, problem=refused.problem) from refused
+        self.arrive(prepared.ticket, self._own.identity)
+        return [ServiceKey(self._own, prepared.domain, prepared.provider, name) for name in prepared.services]
 
     def arrived(self, ticket: str, caller: str) -> bool:
         """Whether a ticket was used; if it was not, it is good no more."""

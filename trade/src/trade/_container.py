@@ -3,16 +3,19 @@
 import itertools
 import secrets
 import threading
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, Final
 
 from trade import _process
 from trade._access import Access, verb_of
 from trade._bordering import Bordering
+from trade._context import running
 from trade._guarding import Guarding
 from trade._handle import Handle, Run
 from trade._hosting import Hosting
 from trade._invoke import container_closed
+from trade._measures import Measure
 from trade._moving import Moving
 from trade._own_services import OwnServices
 from trade._parts import Parts
@@ -66,6 +69,8 @@ class Container(Hosting, Moving, Streaming, Tracing, Guarding, Bordering):
         """What was taken off from elsewhere and can be offered again."""
         self.making: Final = self._parts.making
         """What it made for others."""
+        self.arriving: Final = self._parts.arriving
+        """What comes to it from elsewhere, or from before."""
         self.meter: Final = self._parts.meter
         """How busy it is."""
         self.terminating: Final = self._parts.terminating
@@ -83,7 +88,30 @@ class Container(Hosting, Moving, Streaming, Tracing, Guarding, Bordering):
         """
         self._check_open()
         self.access.load(Path(path))
+        self._parts.audit.changed("policy loaded", str(path), running.get())
         self._parts.judge_anew()
+
+    def note_change(self, what: str, about: str = "") -> None:
+        """Have a change of configuration in the record of what happened here, if one is kept (`Settings.audit`).
+
+        Args:
+            what: in a few words.
+            about: which file, which device.
+        """
+        self._parts.audit.changed(what, about, running.get())
+
+    def measured_by(self, tell: Callable[[], Iterable[Measure]]) -> None:
+        """Have more in this container's metrics (`Settings.metrics`): it is called whenever somebody looks.
+
+        Args:
+            tell: gives numbers that are known already, without waiting for anything.
+        """
+        self._parts.measured.append(tell)
+
+    @property
+    def metrics_port(self) -> int:
+        """Where its metrics are; 0: nowhere."""
+        return self._parts.metrics_port
 
     # --- looking up
 

@@ -49,6 +49,11 @@ class CallContext(Struct, frozen=True, gc=False):
         return (self.session,) if self.behalf is None else (self.session, *self.behalf.sessions)
 
     @property
+    def outer_id(self) -> int:
+        """The id of the call that began it all, in whatever process: one for everything that comes of it."""
+        return self.id if self.behalf is None or not self.behalf.calls else self.behalf.calls[-1]
+
+    @property
     def tokens(self) -> tuple[Token, ...]:
         """The locks under which it runs."""
         return () if self.behalf is None else self.behalf.tokens

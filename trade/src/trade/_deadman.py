@@ -5,6 +5,7 @@ import threading
 from collections.abc import Callable, Mapping, Sequence
 from typing import Final
 
+from trade._audit import Audit
 from trade._context import CallContext
 from trade._dispatch import LocalService
 from trade._locks import within
@@ -26,7 +27,9 @@ class Deadman:
         stop_of: Callable[[Resource], LocalService | None],
         stops: Callable[[], Sequence[LocalService]],
         resources: Callable[[], Sequence[Resource]],
+        audit: Audit,
     ) -> None:
+        self._audit = audit
         self._stop_of = stop_of
         self._stops = stops
         self._resources = resources
@@ -72,7 +75,9 @@ class Deadman:
                 by_stop.setdefault(service, []).append(resource)
         _ask_to_end(resources)
         for service, stopped in by_stop.items():
-            _logger.warning("stopping %s: %s", ", ".join(resource.name for resource in stopped), reason)
+            names = [resource.name for resource in stopped]
+            self._audit.note("stop", service.label, about=names, why=reason)
+            _logger.warning("stopping %s: %s", ", ".join(names), reason)
             self._begin(service, _each(stopped, done))
 
     def everything(self, done: Callable[[list[str]], None]) -> None:

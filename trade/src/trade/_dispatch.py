@@ -16,6 +16,7 @@ import msgspec
 from msgspec import Raw, structs
 
 from trade._access import Access
+from trade._audit import Audit, Audited
 from trade._context import CallContext, running
 from trade._coroutines import AsyncLoop
 from trade._crew import Crew
@@ -47,7 +48,16 @@ from trade._wire import (
     is_chunk,
     reply_key,
 )
-from trade.errors import AccessDenied, InvalidResult, NotSerialisable, RemoteError, ServiceGone, TradeError
+from trade.errors import (
+    AccessDenied,
+    Busy,
+    DeadlineExceeded,
+    InvalidResult,
+    NotSerialisable,
+    RemoteError,
+    ServiceGone,
+    TradeError,
+)
 
 _logger = logging.getLogger("trade")
 
@@ -82,6 +92,7 @@ class LocalService:
         "_loop",
         "admitted",
         "around",
+        "audited",
         "effect",
         "info",
         "label",
@@ -114,13 +125,20 @@ class LocalService:
         """What it needs for itself, or stops."""
         self.around: Around | None = None
         """What is called before and after it."""
+        self.audited: Audited | None = None
+        """Of that, what tells of each call for the record."""
         self.admitted: dict[str, Policy] = {}
         """Who may call it, and by which policy that was decided."""
         self._loop = loop
 
     def run(self, raw: Raw | bytes, context: CallContext) -> Any:
         """Validate, then call. Raises what the provider raises."""
-        args, kwargs = self.signature.decode(self.label, raw)
+        try:
+            args, kwargs = self.signature.decode(self.label, raw)
+        except TradeError as error:
+            if self.audited is not None:
+                self.audited.failed(self, context, error)
+            raise
         return self.call(args, kwargs, context)
 
     def call(self, args: Sequence[Any], kwargs: dict[str, Any], context: CallContext, *, bare: bool = False) -> Any:
@@ -187,9 +205,11 @@ class Dispatcher:
         lookup: Lookup,
         loop: AsyncLoop,
         access: Access,
+        audit: Audit,
         callers: Sequence[str] = (),
     ) -> None:
         self._transport = transport
+        self._audit = audit
         self._access = access
         self._loop = loop
         self._own = own
@@ -251,6 +271,7 @@ class Dispatcher:
                 self._refuse(replier, caller, call, Status.GONE)
             return
         if (denied := self._denied(caller, provider, service)) is not None:
+            self._note(service.label, denied, caller, call)
             self._refuse(replier, caller, call, Status.ERROR, Raw(encode_message(pack_error(denied))))
             return
         if urgent:
@@ -281,6 +302,7 @@ class Dispatcher:
     def _perform(self, ongoing: Ongoing, service: LocalService, replier: Publisher, call: Call) -> None:
         if service.too_late(call.expires_ns):
             answer: Answer = (Status.EXPIRED, EMPTY)
+            self._note(service.label, DeadlineExceeded(service=service.label, deadline_s=0.0), ongoing.caller, call)
         elif ongoing.cancelled:
             answer = cancelled(service.label)
         else:
@@ -306,6 +328,7 @@ class Dispatcher:
         ongoing.on_cancel(drop)
         ongoing.queued_ns = time.monotonic_ns()
         if not serial.submit(begin):
+            self._note(service.label, self._too_much(service.label), ongoing.caller, call)
             self._end(ongoing, service, replier, call, (Status.BUSY, EMPTY))
 
     # --- calls that came before, and calls about calls
@@ -349,8 +372,17 @@ class Dispatcher:
     def _busy(self, message: Message) -> None:
         taken = self._take(message)
         if taken is not None:
-            call, caller, _, replier = taken
+            call, caller, place, replier = taken
+            label = f"{place.partition('/')[0]}.{call.service}"
+            self._note(label, self._too_much(label), caller, call)
             self._refuse(replier, caller, call, Status.BUSY)
+
+    def _too_much(self, label: str) -> Busy:
+        return Busy(service=label, container=self._own.container)
+
+    def _note(self, label: str, error: TradeError, caller: str, call: Call) -> None:
+        """Have it in the record that a call was refused."""
+        self._audit.refused(label, error, who=foreign(call.session) or caller, session=call.session, call_id=call.id)
 
     def _take(self, message: Message) -> tuple[Call, str, str, Publisher] | None:
         """The call, who makes it, the ``domain/provider`` it is for, where to answer: else it is not run."""
@@ -364,6 +396,7 @@ class Dispatcher:
             replier = self._replier(caller, call.reply)
         except (Malformed, ValueError) as bad:
             self.malformed += 1
+            self._audit.refused(message.key, str(bad), who=message.key.split("/", 2)[1])
             if self.malformed == 1:
                 _logger.warning("dropped a call on %s: %s (further ones are counted, not logged)", message.key, bad)
             return None
@@ -421,5 +454,7 @@ def _run(caller: str, call: Call, service: LocalService, ongoing: Ongoing | None
         if not isinstance(error, TradeError) or isinstance(error, _DEFECTS):
             who = foreign(call.session) or caller
             text = info.traceback or info.message
-            _logger.warning("%s failed in a call of %s:\n%s", service.label, who, text, extra={"call_id": call.id})
+            outer_id = call.behalf.calls[-1] if call.behalf and call.behalf.calls else call.id
+            told = {"call_id": call.id, "outer_id": outer_id}
+            _logger.warning("%s failed in a call of %s:\n%s", service.label, who, text, extra=told)
         return Status.ERROR, Raw(encode_message(info))

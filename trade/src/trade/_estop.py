@@ -10,10 +10,12 @@ from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from typing import Final
 
+from trade._audit import Audit
 from trade._deadman import Deadman
 from trade._estop_store import EstopStore
 from trade._locks import LockTable
 from trade._resources import Latch
+from trade._session import foreign
 from trade._wire import Estop, EstopOrder
 
 _logger = logging.getLogger("trade")
@@ -47,7 +49,9 @@ class Estops:
         confirm: Confirm,
         changed: Callable[[], None],
         keeps: Callable[[], bool],
+        audit: Audit,
     ) -> None:
+        self._audit = audit
         self._table = table
         self._deadman = deadman
         self._store = store
@@ -68,8 +72,8 @@ class Estops:
         with self._guard:
             return tuple(sorted(self._open.values(), key=_age))
 
-    def take(self, order: EstopOrder) -> None:
-        """Do what is asked, without waiting; an order that comes again is confirmed again."""
+    def take(self, order: EstopOrder, who: str) -> None:
+        """Do what that identity asks, without waiting; an order that comes again is confirmed again."""
         answer = self._first(order.request, order.opened)
         if answer is not None:
             if answer[0] is not None:
@@ -77,7 +81,7 @@ class Estops:
         elif order.opened is not None:
             self._begin(order.opened)
         else:
-            self._clear(order.request, order.cleared)
+            self._clear(order.request, order.cleared, who)
 
     def learn(self, estops: Iterable[Estop]) -> None:
         """Others have these open: take the union. One that was cleared here is not opened again."""
@@ -108,6 +112,8 @@ class Estops:
     def _begin(self, estop: Estop) -> None:
         begun = time.monotonic()
         reason = f"e-stop {estop.id}{f': {estop.reason}' if estop.reason else ''}"
+        who = foreign(estop.by) or estop.by.partition("/")[0]
+        self._audit.note("stop", "e-stop", about=estop.id, who=who, session=estop.by, why=estop.reason)
         with self._guard:
             self._latch()
         for resource in self._table.resources():
@@ -159,7 +165,8 @@ class Estops:
 
     # --- clearing
 
-    def _clear(self, request: str, ids: Sequence[str]) -> None:
+    def _clear(self, request: str, ids: Sequence[str], who: str) -> None:
+        self._audit.note("stop", "e-stop cleared", about=list(ids), who=who)
         with self._guard:
             for estop_id in ids:
                 self._open.pop(estop_id, None)

@@ -11,6 +11,7 @@ import msgspec
 from msgspec import Struct
 
 from trade._access import Access
+from trade._audit import Audit
 from trade._transport import ChannelClosed, Message, Transport
 from trade._wire import (
     ESTOPS,
@@ -55,20 +56,22 @@ class EstopReport(Struct, frozen=True):
 class EstopLine:
     """Where one container hears orders and confirmations, and gives its own."""
 
-    def __init__(self, transport: Transport, own: Address, access: Access) -> None:
+    def __init__(self, transport: Transport, own: Address, access: Access, audit: Audit) -> None:
         self._access = access
+        self._audit = audit
+        self._own = own
         self._orders = transport.publish(estop_key(own.identity), urgent=True, droppable=True)
         self._confirmations = transport.publish(estop_confirmed_key(own), urgent=True, droppable=True)
         self._channel = transport.subscribe(ESTOPS)
-        self._take: Callable[[EstopOrder], None] | None = None
+        self._take: Callable[[EstopOrder, str], None] | None = None
         self._asked: dict[str, dict[Address, str]] = {}
         """By request: who has confirmed it, and what failed there."""
         self._changed = threading.Condition()
         self._thread = threading.Thread(target=self._read, name="trade-estop", daemon=True)
         self.malformed = 0
 
-    def listen(self, take: Callable[[EstopOrder], None]) -> None:
-        """Begin to hear; what was put before waits until then."""
+    def listen(self, take: Callable[[EstopOrder, str], None]) -> None:
+        """Begin to hear, told of each order and of who gives it; what was put before waits until then."""
         self._take = take
         self._thread.start()
 
@@ -95,7 +98,7 @@ class EstopLine:
         with self._changed:
             self._asked[order.request] = heard
         if self._take is not None:
-            self._take(order)
+            self._take(order, self._own.identity)
         while (left_s := until - time.monotonic()) > 0 and not over():
             self._orders.put(data)
             awaited.update(expected())
@@ -134,8 +137,9 @@ class EstopLine:
             order = decode_estop_order(message.payload or b"", chunks[0])
             denied = self._access.denied_order(chunks[0], clears=order.opened is None)
             if denied is not None:
+                self._audit.refused("trade.estop" if order.opened else "trade.estop_clear", denied, who=chunks[0])
                 raise Malformed(str(denied))
-            self._take(order)
+            self._take(order, chunks[0])
         elif len(chunks) == 3:
             self._hear_confirmed(Address(*chunks), decode_estop_confirmed(message.payload or b""))
 

@@ -10,6 +10,7 @@ from typing import Final
 from msgspec import structs
 
 from trade._access import Access
+from trade._audit import Audit
 from trade._deadman import Deadman
 from trade._estop import Estops
 from trade._estop_line import EstopLine, EstopReport
@@ -43,13 +44,14 @@ class Estopping:
         providers: Providers,
         folder: Path | None,
         access: Access,
+        audit: Audit,
     ) -> None:
         self._own = own
         self._registry = registry
         self._providers = providers
         self._access = access
-        self._line = EstopLine(transport, own, access)
-        self.deadman: Final = Deadman(providers.stop_of, providers.stops, table.resources)
+        self._line = EstopLine(transport, own, access, audit)
+        self.deadman: Final = Deadman(providers.stop_of, providers.stops, table.resources, audit)
         self._estops = Estops(
             table,
             self.deadman,
@@ -57,6 +59,7 @@ class Estopping:
             self._line.confirm,
             self._tell,
             lambda: bool(providers.stops()),
+            audit,
         )
         self._provider: object = None
 

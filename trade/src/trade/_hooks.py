@@ -356,7 +356,8 @@ class Hooks:
             if mine:
                 around = Around(self._home, self._codec, self._clockwork, self._home.handle(record.key), mine)
             traced = self._spans if traceable(record.key) else None
-            service.around = around if traced is None else Recorded(traced, around)
+            around = around if traced is None else Recorded(traced, around)
+            service.around = around if service.audited is None else service.audited.over(around)
 
     def _concerns(self, hook: Attached, record: Record) -> bool:
         return hook.means(record) and self._denied(hook.identity, record) is None

@@ -10,6 +10,7 @@ from trade._handle import Handle
 from trade._invoke import container_closed
 from trade._member import Member
 from trade._offerable import checked_groups, checked_health
+from trade._system import DOMAIN
 from trade._transport import ChannelClosed
 from trade._wire import HEALTHY, ProviderInfo, Scalar
 
@@ -50,6 +51,16 @@ class Hosting(Member):
             raise container_closed(self.address) from None
         self._parts.withdrawn.forget(provider)
         return tuple(self.handle(key) for key in keys)
+
+    def register_functions(self, functions: object, name: str) -> tuple[Handle, ...]:
+        """Offer further functions of the middleware in group ``trade``; what they need is in the table of access.
+
+        Args:
+            functions: an object with services.
+            name: of the provider; one name, one object.
+        """
+        self._check_open()
+        return tuple(self.handle(key) for key in self._parts.providers.add(functions, (DOMAIN,), name=name))
 
     def deregister(self, provider: object) -> None:
         """Withdraw an object's services from the whole system; handles of them fail from now on.

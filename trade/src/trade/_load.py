@@ -95,7 +95,7 @@ class Load:
             host_cpu_percent=100 * (now.busy - before.busy) / ticks if ticks > 0 else None,
             load_1min=_load_1min(),
             cores=os.cpu_count() or 1,
-            memory_bytes=_resident_bytes(),
+            memory_bytes=resident_bytes(),
             calls=now.calls,
             calls_per_s=(now.calls - before.calls) / over_s,
             in_flight=self.running,
@@ -112,7 +112,7 @@ def _load_1min() -> float | None:
         return None
 
 
-def _resident_bytes() -> int | None:
+def resident_bytes() -> int | None:
     try:
         lines = _STATUS.read_text().splitlines()
         return next((int(line.split()[1]) << 10 for line in lines if line.startswith("VmRSS:")), None)

@@ -12,7 +12,9 @@ from typing import Final
 
 from msgspec import Struct, structs
 
+from trade._audit import Audit
 from trade._resources import Holder, Latch, Resource, locked
+from trade._session import foreign
 from trade._terms import Granted, LockInfo, Terms
 from trade._wire import Token
 from trade.errors import DeviceSilent, LockedByOther, ServiceGone, SessionEnded, TradeError
@@ -49,7 +51,14 @@ class _Waiter(Struct, eq=False):
 class LockTable:
     """The resources of one container."""
 
-    def __init__(self, epoch: str, container: str, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self,
+        epoch: str,
+        container: str,
+        clock: Callable[[], float] = time.monotonic,
+        audit: Audit | None = None,
+    ) -> None:
+        self._audit = audit or Audit()
         self._epoch = epoch
         self._container = container
         self._stop: Stop = _leave_it
@@ -262,6 +271,7 @@ class LockTable:
             resource.holder, resource.live = holder, number
             resource.uses, resource.used_at = 0, 0.0
         self._watch_leases(grant.until)
+        self._note("locked", grant, holder.purpose and f"for {holder.purpose}")
         return Granted(Token(self._epoch, number), tuple(one.name for one in grant.resources), now - asked)
 
     # --- while it is held
@@ -295,6 +305,7 @@ class LockTable:
             if grant is None or grant.holder.identity != identity:
                 return False
             self._end(grant, "it was given back")
+            self._note("unlocked", grant)
             return True
 
     def retire(self, number: int, reason: str) -> Callable[[], None] | None:
@@ -307,6 +318,7 @@ class LockTable:
             if grant is None:
                 return None
             self._ended[number] = reason
+            self._note("lock lost", grant, reason)
 
         def free() -> None:
             with self._changed:
@@ -325,6 +337,7 @@ class LockTable:
                 return False
             busy = [resource for resource in grant.resources if resource.busy]
             self._end(grant, reason)
+            self._note("lock lost", grant, reason)
             for resource in busy:
                 resource.pending = _STOPPING
         self._told(number, reason)
@@ -395,6 +408,11 @@ class LockTable:
             if resource.live == grant.number:
                 resource.live, resource.holder = 0, None
         self._changed.notify_all()
+
+    def _note(self, what: str, grant: _Grant, why: str = "") -> None:
+        names, holder = [resource.name for resource in grant.resources], grant.holder
+        who = foreign(holder.session) or holder.identity
+        self._audit.note("lock", what, about=names, who=who, session=holder.session, why=why)
 
     def _stopped(self, resource: Resource, problem: str) -> None:
         with self._changed:

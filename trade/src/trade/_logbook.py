@@ -28,6 +28,8 @@ class LogLine(Struct, frozen=True, kw_only=True):
     text: str
     call_id: int
     """The call it was logged in; 0 for none."""
+    outer_id: int = 0
+    """The call that led to that one first of all: one id for all lines that come of it, in all processes."""
     container: str = ""
     """Who told of it."""
 
@@ -51,10 +53,13 @@ class Logbook(logging.Filter):
         self._count = 0
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Keep a line, and tell formatters its ``call_id``."""
+        """Keep a line, and tell formatters its ``call_id`` and ``outer_id``."""
         call = running.get()
         call_id: int = getattr(record, "call_id", 0) or (0 if call is None else call.id)
-        record.call_id = call_id
+        outer_id: int = getattr(record, "outer_id", 0)
+        if not outer_id:
+            outer_id = call_id if call is None or call.id != call_id else call.outer_id
+        record.call_id, record.outer_id = call_id, outer_id
         if self._lock.acquire(timeout=_PATIENCE_S):  # in a forked child nobody may be left to release it
             try:
                 self._count += 1
@@ -66,6 +71,7 @@ class Logbook(logging.Filter):
                         level=record.levelno,
                         text=_text(record)[:_LONGEST],
                         call_id=call_id,
+                        outer_id=outer_id,
                     )
                 )
             finally:

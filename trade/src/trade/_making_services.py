@@ -16,10 +16,14 @@ class MakingServices:
 
     @service
     def instantiate(
-        self, class_path: str, args: tuple[Any, ...] | dict[str, Any] = (), groups: tuple[str, ...] = ()
+        self,
+        class_path: str,
+        args: tuple[Any, ...] | dict[str, Any] = (),
+        groups: tuple[str, ...] = (),
+        state: Any = None,
     ) -> tuple[Handle, ...]:
-        """Make an object of a class that this container allows, and offer its services."""
-        return self._of_here.instantiate(class_path, args, groups)
+        """Make an object of a class that this container allows, give it its state if there is some, and offer it."""
+        return self._of_here.instantiate(class_path, args, groups, state)
 
     @service
     def start_container(self, host: str, name: str, allow: tuple[str, ...] = ()) -> ContainerInfo:

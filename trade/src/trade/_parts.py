@@ -2,12 +2,14 @@
 
 import contextlib
 import itertools
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterable, Iterator
 from typing import Final, Protocol
 
 from trade import _hooks, _locking, _making, _notifications, _streams
 from trade._announcing import Announcer
 from trade._arriving import Arriving
+from trade._audit import open_audit
 from trade._borrowed import Borrowed
 from trade._calls import Caller
 from trade._clockwork import Clockwork
@@ -25,10 +27,12 @@ from trade._hooks import Hooks
 from trade._inherited import InheritedLock
 from trade._joining import join
 from trade._listening import Listening
-from trade._load import Load
+from trade._load import Load, resident_bytes
 from trade._locking import Locking
 from trade._locks import LockTable
 from trade._making import Making
+from trade._measures import Measure
+from trade._metrics import open_metrics
 from trade._notifications import Notifier
 from trade._otlp import open_export
 from trade._providers import Providers
@@ -72,6 +76,7 @@ class Parts:
         self.told_of_ends: Final[list[Callable[[str], None]]] = []
         """Told of every session that ends."""
         with contextlib.ExitStack() as leaving:  # what has begun ends again if the rest cannot begin
+            self.audit = open_audit(settings, address, leaving)
             self.transport = transport or join(settings, leaving)
             leaving.callback(self.transport.close)
             self.reach: Reach | None = None
@@ -94,15 +99,17 @@ class Parts:
             self.coroutines = AsyncLoop()
             leaving.callback(self.coroutines.close)
             self.locking = Locking(home)
-            self.locks = LockTable(epoch, home.name)
+            self.locks = LockTable(epoch, home.name, audit=self.audit)
             leaving.callback(self.locks.close)
             self.borrowed = Borrowed(self.locks, epoch)
             self.announcer = Announcer(self.transport, address)
             leaving.callback(self.announcer.close)
             self.providers = Providers(
-                self.announcer, self.registry, address, self.codec, self.coroutines, self.locks, access
+                self.announcer, self.registry, address, self.codec, self.coroutines, self.locks, access, self.audit
             )
-            self.targets = Targets(address, session, access, self.registry, self.providers, self.caller, self.codec)
+            self.targets = Targets(
+                address, session, access, self.registry, self.providers, self.caller, self.codec, self.audit
+            )
             self.registry.listen(self.targets.changed)  # before anybody is told: who is told may call
             self.registry.listen(self.notifier.changed)
             self.told_of_ends.append(self.notifier.session_ended)
@@ -128,7 +135,9 @@ class Parts:
             self.told_of_ends.append(self.listening.session_ended)
             leaving.callback(self.listening.close)
             kept = None if settings.state_dir is None else settings.state_dir / settings.system / "estop"
-            self.estopping = Estopping(self.transport, address, self.registry, self.locks, self.providers, kept, access)
+            self.estopping = Estopping(
+                self.transport, address, self.registry, self.locks, self.providers, kept, access, self.audit
+            )
             leaving.callback(self.estopping.close)
             self.deadman = self.estopping.deadman
             self.locks.stop_with(self.deadman.stop)
@@ -140,13 +149,16 @@ class Parts:
             self.arriving = Arriving(address, self.providers, self.making, freezing, access, self.codec, self.clockwork)
             leaving.callback(self.arriving.close)
             self.dispatcher = Dispatcher(
-                self.transport, address, self.providers.lookup, self.coroutines, access, access.callers()
+                self.transport, address, self.providers.lookup, self.coroutines, access, self.audit, access.callers()
             )
             leaving.callback(self.dispatcher.close)
             self.meter = Load(home.name, lambda: list(self.dispatcher._crews), self.providers.waiting)
             self.terminating = Terminating(
                 home.name, self.deadman.rest, self.locks.resources, lambda: self.meter.running, home.close
             )
+            self.measured: Final[list[Callable[[], Iterable[Measure]]]] = []
+            """What else there is to measure, as whoever drives something tells it."""
+            self.metrics_port = open_metrics(settings, self.audit.calls, self._measures, leaving)
             self._leaving = leaving.pop_all()
 
     def appear(self, own: Own) -> None:
@@ -197,6 +209,30 @@ class Parts:
         spans: Spans | None = self.spans if on else None
         self.hooks.trace(spans)
         self.caller.spans = spans
+
+    def _measures(self) -> Iterator[Measure]:
+        """Asked for by the metrics, on a thread of theirs."""
+        infos, record = self.locks.infos(), self.audit.record
+        yield Measure("calls", "Calls from other containers.", sum(self._taken()), kind="counter")
+        yield Measure("calls_in_flight", "Those of them that have a thread now.", self.meter.running)
+        yield Measure("calls_queued", "Calls of serial services whose turn has not come.", self.providers.waiting())
+        yield Measure("containers", "Containers that are seen, this one included.", len(self.registry.containers()))
+        yield Measure("dropped_messages", "Malformed, or of another version.", self.dropped_messages, kind="counter")
+        yield Measure("locks", "Locks that hold here.", len(infos))
+        yield Measure("lock_waiters", "Who waits for one of them.", sum(len(info.waiting) for info in infos))
+        yield Measure("estops_open", "E-stops that are open.", len(self.estopping.open_here()))
+        yield Measure("process_cpu_seconds", "Of the whole process.", time.process_time(), kind="counter")
+        if (resident := resident_bytes()) is not None:
+            yield Measure("process_resident_bytes", "Of the whole process.", resident)
+        if record is not None:
+            yield Measure("audit_rows", "Written to the audit record.", record.written, kind="counter")
+            yield Measure("audit_lost", "Events that were not written to it.", record.lost, kind="counter")
+            yield Measure("audit_queue", "Events that are not written yet.", record.waiting)
+        for tell in list(self.measured):
+            yield from tell()
+
+    def _taken(self) -> list[int]:
+        return [crew.taken for crew in list(self.dispatcher._crews)]
 
     def _denied_hook(self, who: str, record: Record) -> AccessDenied | None:
         return self._home.access.denied(who, "instrument", record.key.domain, record.label)

@@ -11,6 +11,7 @@ from msgspec import structs
 
 from trade._access import Access
 from trade._announcing import Announcer
+from trade._audit import Audit
 from trade._codec import Codec
 from trade._constraints import checked_meta
 from trade._coroutines import AsyncLoop
@@ -23,7 +24,7 @@ from trade._resources import Resource
 from trade._serial import Serial
 from trade._service import ServiceMark, kinds_of, marked_methods
 from trade._signature import Signature
-from trade._system import DOMAIN, PROVIDER
+from trade._system import DOMAIN
 from trade._wire import (
     Address,
     ProviderInfo,
@@ -52,7 +53,9 @@ class Providers:
         loop: AsyncLoop,
         table: LockTable,
         access: Access,
+        audit: Audit,
     ) -> None:
+        self._audit = audit
         self._access = access
         self._announcer = announcer
         self._registry = registry
@@ -108,7 +111,7 @@ class Providers:
     ) -> Built:
         """All of `add` that can go wrong: `host` offers it then, or `discard` gives its resources back."""
         kind, domain = type(provider).__qualname__, domain_of(groups)
-        if name != PROVIDER:
+        if domain != DOMAIN:
             self._access.require_offer(self._own.identity, groups, kind)
         chunk = name or self._new_chunk(provider, type(provider).__name__)
         place = f"{domain}/{chunk}"
@@ -164,11 +167,16 @@ class Providers:
 
     def _host(self, place: str, registered: Registered) -> None:
         with self._announcing:
+            self._watch(place, registered.services)
             with self._lock:
                 self._require_new(registered.provider)
                 self._names[id(registered.provider)] = place
                 self._hosted[place] = registered
             self._announce(place, registered.info)
+
+    def _watch(self, place: str, services: Mapping[str, LocalService]) -> None:
+        for service in services.values():
+            self._audit.watch(place.partition("/")[0], service)
 
     def _require_new(self, provider: object) -> None:
         if id(provider) in self._names:
@@ -196,6 +204,7 @@ class Providers:
             if reread:
                 self._signatures.clear()
                 services = self._services_of(provider, info.groups, known.implements, place)
+                self._watch(place, services)
                 kinds = kinds_of(type(provider), known.implements)
                 info = structs.replace(info, services=_infos(services), kinds=kinds)
             if not reread and info == known.info:

@@ -251,6 +251,7 @@ class Rules:
         rules = read_rules(file)
         container.register(self, GROUP)
         self._go_by(rules)
+        container.note_change("rules read", str(file))
 
     def load(self, file: Path) -> None:
         """Go by another file, or by the same one as it is now. Rules that it leaves as they are go on undisturbed.
@@ -261,6 +262,7 @@ class Rules:
             ConfigurationError: it is wrong, and says where; all goes on as before.
         """
         self._go_by(read_rules(file))
+        self.container.note_change("rules read", str(file))
 
     def _go_by(self, rules: dict[str, Rule]) -> None:
         old = self._standing
@@ -288,6 +290,7 @@ class Rules:
         self._firings.append(firing)
         line = msgspec.json.encode(firing).decode()
         _logger.log(logging.ERROR if firing.stopped else logging.INFO, "%s", line)
+        self.container.note_change("rule stopped" if firing.stopped else "rule fired", firing.rule)
         if self._audit is not None:
             try:
                 with self._audit.open("a", encoding="utf-8") as file:

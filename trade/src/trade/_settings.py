@@ -40,7 +40,15 @@ _VARIABLES: Final = (
     "TRADE_STATE_DIR",
     "TRADE_TRACE",
     "TRADE_OTLP",
+    "TRADE_AUDIT",
+    "TRADE_AUDIT_READS",
+    "TRADE_AUDIT_KEEP_DAYS",
+    "TRADE_AUDIT_KEEP_ROWS",
+    "TRADE_METRICS",
 )
+_KEEP_DAYS: Final = 90
+_KEEP_ROWS: Final = 10_000_000
+_MOST_KEPT: Final = 1_000_000_000
 _CERTIFY: Final = "set TRADE_TLS to the folder that trade pki issue made"
 
 
@@ -93,6 +101,18 @@ class Settings:
     otlp: str = ""
     """URL of a collector that gets what is noted, such as ``http://127.0.0.1:4318``; none: nobody does. Takes the extra
     ``trade-core[otel]``."""
+    audit: Path | None = None
+    """Folder for a record of who called, locked, stopped, was refused and changed the configuration here; none: none is
+    kept."""
+    audit_reads: bool = False
+    """Have services that only read in it, too."""
+    audit_keep_days: int = _KEEP_DAYS
+    """How many days it is kept; the newest 10,000 rows stay in any case."""
+    audit_keep_rows: int = _KEEP_ROWS
+    """How many rows of it are kept, some 350 bytes each."""
+    metrics: str = ""
+    """Where Prometheus finds ``/metrics``, such as ``127.0.0.1:9464``; none: nowhere. Takes the extra
+    ``trade-core[metrics]``."""
 
     def __post_init__(self) -> None:
         for what, text in (("system", self.system), ("identity", self.identity), ("container", self.container)):
@@ -100,6 +120,8 @@ class Settings:
                 problem = f"{text!r} is no name for a {what}; use letters, digits, . _ - (at most 80)"
                 raise ConfigurationError(where=what, problem=problem)
         self._check_collector(urlsplit(self.otlp))
+        self._check_kept()
+        self._check_metrics()
         certificate = self.certificate()
         for endpoint in self.listen:
             self._check_reach(f"listen {endpoint}", Endpoint.read(endpoint))
@@ -116,6 +138,27 @@ class Settings:
             problem = "joins networks, and this is only one; name a second interface, or connect to another bridge"
             raise ConfigurationError(where=f"bridge {self.bridge[0]}", problem=problem)
         self._check_exports()
+
+    def _check_metrics(self) -> None:
+        if not self.metrics:
+            return
+        try:
+            place = Endpoint.read(f"tcp/{self.metrics}")
+        except ConfigurationError:
+            problem = f"{self.metrics!r} is no HOST:PORT; write 127.0.0.1:9464"
+            raise ConfigurationError(where="TRADE_METRICS", problem=problem) from None
+        if not (place.loopback or self.insecure_lan):
+            problem = (
+                "anybody there could read who is refused what, as it asks for no proof and is not encrypted; write "
+                f"127.0.0.1:{place.port}, and put a proxy that does both in front"
+            )
+            raise ConfigurationError(where="TRADE_METRICS", problem=problem)
+
+    def _check_kept(self) -> None:
+        for name, value in (("DAYS", self.audit_keep_days), ("ROWS", self.audit_keep_rows)):
+            if not 1 <= value <= _MOST_KEPT:
+                problem = f"must be from 1 to {_MOST_KEPT}, not {value}"
+                raise ConfigurationError(where=f"TRADE_AUDIT_KEEP_{name}", problem=problem)
 
     def _check_exports(self) -> None:
         if self.exports is not None and set(self.exports) != set(self.bridge):
@@ -207,6 +250,8 @@ class Settings:
         stream_hz: Mapping[str, Mapping[str, float]] = MappingProxyType({}),
         policy: Path | None = None,
         instantiable: Sequence[str] | None = None,
+        audit: Path | None = None,
+        metrics: str | None = None,
         environment: Mapping[str, str] = os.environ,
     ) -> "Settings":
         """Settings from arguments, else from the environment, else the defaults.
@@ -215,7 +260,9 @@ class Settings:
         ``TRADE_CONNECT`` (comma-separated), ``TRADE_CREDENTIALS`` (``user:password``), ``TRADE_TLS`` (a folder),
         ``TRADE_POLICY`` (a file), ``TRADE_INSECURE_LAN`` (``1``), ``TRADE_BRIDGE`` (comma-separated), ``TRADE_LOCK``
         (set by ``trade lock``), ``TRADE_INSTANTIABLE`` (comma-separated), ``TRADE_TRACE`` (``1``), ``TRADE_OTLP`` (a
-        URL), ``TRADE_RUNTIME_DIR`` and ``TRADE_STATE_DIR`` (else the user's folder for state).
+        URL), ``TRADE_AUDIT`` (a folder), ``TRADE_AUDIT_READS`` (``1``), ``TRADE_AUDIT_KEEP_DAYS``,
+        ``TRADE_AUDIT_KEEP_ROWS``, ``TRADE_METRICS`` (``HOST:PORT``), ``TRADE_RUNTIME_DIR`` and
+        ``TRADE_STATE_DIR`` (else the user's folder for state).
         Others that begin with ``TRADE_`` are warned of.
         """
         _warn_of_unknown(environment)
@@ -241,6 +288,11 @@ class Settings:
             state_dir=_state_dir(environment),
             trace=environment.get("TRADE_TRACE") == "1" or bool(environment.get("TRADE_OTLP")),
             otlp=environment.get("TRADE_OTLP", ""),
+            audit=audit or _path(environment.get("TRADE_AUDIT")),
+            audit_reads=environment.get("TRADE_AUDIT_READS") == "1",
+            audit_keep_days=_number(environment, "TRADE_AUDIT_KEEP_DAYS", _KEEP_DAYS),
+            audit_keep_rows=_number(environment, "TRADE_AUDIT_KEEP_ROWS", _KEEP_ROWS),
+            metrics=environment.get("TRADE_METRICS", "") if metrics is None else metrics,
         )
 
 
@@ -270,6 +322,14 @@ def _warn_of_unknown(environment: Mapping[str, str]) -> None:
 
 def _path(named: str | None) -> Path | None:
     return Path(named) if named else None
+
+
+def _number(environment: Mapping[str, str], name: str, default: int) -> int:
+    text = environment.get(name)
+    try:
+        return int(text) if text else default
+    except ValueError:
+        raise ConfigurationError(where=name, problem=f"{text!r} is no whole number") from None
 
 
 def _state_dir(environment: Mapping[str, str]) -> Path | None:

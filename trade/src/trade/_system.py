@@ -58,6 +58,12 @@ class _Making(Protocol):
     def terminate(self, service: Handle) -> None: ...
 
 
+class _Arriving(Protocol):
+    def bring_back(
+        self, class_path: str, args: Sequence[Any] | Mapping[str, Any], groups: tuple[str, ...], state: Any
+    ) -> list[ServiceKey]: ...
+
+
 class _Terminating(Protocol):
     def begin(self, reason: str, who: str, *, only_at_rest: bool = False) -> list[str]: ...
 
@@ -74,6 +80,8 @@ class _Member(Protocol):
     def withdrawn(self) -> _Withdrawn: ...
     @property
     def making(self) -> _Making: ...
+    @property
+    def arriving(self) -> _Arriving: ...
     @property
     def terminating(self) -> _Terminating: ...
     @property
@@ -174,7 +182,11 @@ class System:
         return self._member().withdrawn.infos()
 
     def instantiate(
-        self, class_path: str, args: Sequence[Any] | Mapping[str, Any] = (), groups: str | Sequence[str] = ()
+        self,
+        class_path: str,
+        args: Sequence[Any] | Mapping[str, Any] = (),
+        groups: str | Sequence[str] = (),
+        state: Any = None,
     ) -> tuple[Handle, ...]:
         """Make an object of a class and offer its services.
 
@@ -182,6 +194,8 @@ class System:
             class_path: such as ``mypkg.vision:Camera``; the container's ``instantiable`` must allow it.
             args: for its constructor, in order or by name; plain data.
             groups: as for `register`.
+            state: what another object of the class gave with ``save_state()``; this one takes it before anybody can
+                call it, and moves nothing (S18). None: it begins anew.
 
         Returns:
             Handles of its services.
@@ -189,11 +203,13 @@ class System:
         Raises:
             NotInstantiable: the container's settings do not allow it; nothing was imported.
             NoSuchClass: there is no such class there.
-            CannotInstantiate: its module or its constructor raised.
+            CannotInstantiate: its module or its constructor raised, or it does not take the state.
             ConfigurationError: nothing to offer, or a malformed group; what was made is closed again.
         """
-        making = self._member().making
-        named = (groups,) if isinstance(groups, str) else tuple(groups)
+        member = self._member()
+        making, named = member.making, (groups,) if isinstance(groups, str) else tuple(groups)
+        if state is not None:
+            return tuple(member.handle(key) for key in member.arriving.bring_back(class_path, args, named, state))
         return making.offer(making.make(making.find(class_path), args), named, args)
 
     def start_container(

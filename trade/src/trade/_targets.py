@@ -3,6 +3,7 @@
 from typing import Final
 
 from trade._access import Access
+from trade._audit import Audit
 from trade._calls import Caller
 from trade._codec import Codec
 from trade._handle import Handle
@@ -11,7 +12,7 @@ from trade._providers import Providers
 from trade._registry import Change, Record, Registry, gone_to
 from trade._transport import ChannelClosed
 from trade._wire import Address, ServiceKey
-from trade.errors import ServiceGone
+from trade.errors import AccessDenied, ServiceGone
 
 Target = LocalTarget | RemoteTarget
 
@@ -31,7 +32,9 @@ class Targets:
         providers: Providers,
         caller: Caller,
         codec: Codec,
+        audit: Audit,
     ) -> None:
+        self._audit = audit
         self._own = own
         self._session = session
         self._access = access
@@ -57,7 +60,7 @@ class Targets:
             self._registry.wait_for(lambda: self._registry.get(key) is not None, _PATIENCE_S)
         record = self._registry.get(key)
         if record is not None:
-            self._access.require_call(self._own.identity, key.domain, key.name, record.info.effect, record.label)
+            self._require(record)
         target = None if record is None else self._make(record)
         if target is None:
             raise self.gone(handle)
@@ -66,6 +69,14 @@ class Targets:
         if self._closed or changed:  # it left, or is another one, since we looked
             self.known.pop(key, None)
         return target
+
+    def _require(self, record: Record) -> None:
+        key, who = record.key, self._own.identity
+        try:
+            self._access.require_call(who, key.domain, key.name, record.info.effect, record.label)
+        except AccessDenied as denied:
+            self._audit.refused(record.label, denied, who=who, session=self._session)
+            raise
 
     def _make(self, record: Record) -> Target | None:
         if not record.local:

@@ -638,7 +638,7 @@ class WrongDevice(ConfigurationError):
 
     problem: str = ""
     key: str
-    """Of the robot file: ``model``, ``firmware`` or ``serial_number``."""
+    """Of the robot file: ``model``, ``firmware``, ``serial_number`` or ``homing_counts``."""
     expected: str
     found: str
 

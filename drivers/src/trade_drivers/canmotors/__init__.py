@@ -1,6 +1,6 @@
 """Motors with controllers of their own on a CAN bus, asked in every cycle: what those of all vendors have in common."""
 
-from trade_drivers.canmotors._axis import MotorAxis, Unfit
+from trade_drivers.canmotors._axis import Another, MotorAxis, Unfit
 from trade_drivers.canmotors._driver import CanMotorDriver
 
-__all__ = ["CanMotorDriver", "MotorAxis", "Unfit"]
+__all__ = ["Another", "CanMotorDriver", "MotorAxis", "Unfit"]

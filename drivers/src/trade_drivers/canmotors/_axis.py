@@ -5,7 +5,7 @@ from math import isfinite
 
 from trade_drivers.joints import Axis, Sample
 
-__all__ = ["MotorAxis", "Unfit"]
+__all__ = ["Another", "MotorAxis", "Unfit"]
 
 
 class Unfit(Exception):
@@ -14,6 +14,14 @@ class Unfit(Exception):
     def __init__(self, problem: str, key: str = "") -> None:
         super().__init__(problem)
         self.key = key
+
+
+class Another(Unfit):
+    """Another motor than the one the robot file names."""
+
+    def __init__(self, key: str, expected: str, found: str) -> None:
+        super().__init__(f"its {key} is {found}, not {expected}: it is another motor", f".{key}")
+        self.expected, self.found = expected, found
 
 
 class MotorAxis(Axis):

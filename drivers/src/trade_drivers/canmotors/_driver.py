@@ -7,11 +7,11 @@ from contextlib import ExitStack
 from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar, Final
 
-from trade.errors import ConfigurationError
+from trade.errors import ConfigurationError, WrongDevice
 from trade_drivers._can_monitor import CanMonitor
 from trade_drivers._driver import AttachedBus, Driver
 from trade_drivers._work import NoAnswer
-from trade_drivers.canmotors._axis import MotorAxis, Unfit
+from trade_drivers.canmotors._axis import Another, MotorAxis, Unfit
 from trade_drivers.joints import AttachedJoints, BusThread, PortLost
 from trade_drivers.robotfile import Bus, CanBus, Robot
 
@@ -96,6 +96,9 @@ class CanMotorDriver(Driver):
     def _check(self, exchange: "MotorExchange[Any]", axis: MotorAxis, where: str, *, last: bool) -> None:
         key = f'{where}: joint."{axis.joint.name}"'
         match exchange.problems.get(axis):
+            case Another() as other:
+                name = other.key.removeprefix(".")
+                raise WrongDevice(where=key, key=name, expected=other.expected, found=other.found)
             case Unfit() as unfit:
                 raise ConfigurationError(where=f"{key}{unfit.key}", problem=str(unfit))
             case NoAnswer() if last:

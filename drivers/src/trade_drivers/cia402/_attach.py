@@ -73,6 +73,8 @@ def _check_joint(axis: DriveAxis) -> None:
     joint = axis.joint
     if joint.counts_per_rev is None:
         raise Unfit("missing; a CiA 402 drive's angles are counts: write counts_per_rev = 4096, or as many", "")
+    if joint.homing_counts:
+        raise Unfit("is for servos; leave this key out", ".homing_counts")
     if not 1 <= joint.id < table.OUR_NODE:
         raise Unfit(f"{joint.id} is no node of a drive; 1 to 126 are (127 is the driver's own)", ".id")
     if max(abs(axis.low), abs(axis.high)) > _LARGEST:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Final
 
 from trade.errors import ConfigurationError
 from trade_drivers.can import Frame, frame_bits
-from trade_drivers.canmotors import Unfit
+from trade_drivers.canmotors import Another, Unfit
 from trade_drivers.canmotors._exchange import asked
 from trade_drivers.damiao import _frames as frames
 from trade_drivers.damiao._axis import DamiaoAxis
@@ -52,6 +52,8 @@ def _check_joint(axis: DamiaoAxis) -> None:
         raise Unfit(f"{joint.id} is none; 1 to 15 can be told apart (it answers as that and 16)", ".id")
     if joint.counts_per_rev is not None:
         raise Unfit("a Damiao motor tells radians, not counts; leave this key out", ".counts_per_rev")
+    if joint.homing_counts:
+        raise Unfit("is for servos; leave this key out", ".homing_counts")
     if joint.max_speed_rad_s * joint.gear > ranges.velocity_rad_s:
         most = ranges.velocity_rad_s / joint.gear
         raise Unfit(
@@ -60,6 +62,8 @@ def _check_joint(axis: DamiaoAxis) -> None:
     for key, value in ((".min_rad", joint.min_rad), (".max_rad", joint.max_rad)):
         if abs(axis.scale.counts(value)) * axis.grain.rad * joint.gear > _WITHIN * ranges.position_rad:
             raise Unfit(f"{value:.4g} is farther from its zero than a {joint.model} can tell", key)
+    if joint.serial_number is not None:
+        raise Unfit("a Damiao motor tells no serial number here; leave this key out", ".serial_number")
     braking_s = joint.max_speed_rad_s / joint.max_accel_rad_s2
     if braking_s > _BRAKING_S:
         problem = f"a stop from max_speed_rad_s takes {braking_s:.2g} s with it; it must take {_BRAKING_S} s at most"
@@ -87,6 +91,8 @@ def look_over(bus: "DamiaoExchange", axis: DamiaoAxis) -> Steps:
     if axis.software not in {None, axis.told}:
         raise Unfit(f"another motor answers as {axis.id}: its software is {axis.told}, not {axis.software}")
     axis.software = int(axis.told or 0)
+    if axis.joint.firmware is not None and axis.joint.firmware != str(axis.software):
+        raise Another("firmware", axis.joint.firmware, str(axis.software))
     yield from set_register(bus, axis, Register.TIMEOUT, bus.timeout)
     if axis.told != bus.timeout:
         raise Unfit(f"it does not keep its time-out (register 9): {axis.told}, not {bus.timeout}")

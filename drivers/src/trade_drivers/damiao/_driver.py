@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 from trade.errors import ConfigurationError
 from trade_drivers.canmotors import CanMotorDriver
 from trade_drivers.damiao._axis import DamiaoAxis
+from trade_drivers.damiao._commission import DamiaoCommissioner
 from trade_drivers.damiao._frames import MODELS
 from trade_drivers.robotfile import CanBus, Robot
 
@@ -20,6 +21,7 @@ class DamiaoDriver(CanMotorDriver):
     """Damiao motors on a CAN bus."""
 
     name = "damiao"
+    commissioner = DamiaoCommissioner
 
     def exchange(self, robot: Robot, bus: CanBus, wire: "CanPort", port: str) -> "DamiaoExchange":
         from trade_drivers.damiao._attach import check_bus  # noqa: PLC0415 - python-can is optional

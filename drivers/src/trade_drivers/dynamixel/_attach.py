@@ -6,7 +6,16 @@ from typing import TYPE_CHECKING, Final, NoReturn
 from trade.errors import ConfigurationError
 from trade_drivers.dynamixel import _table as table
 from trade_drivers.dynamixel._axis import CYCLIC, SLOW, DynamixelAxis
-from trade_drivers.servos import NoAnswer, again, check_firmware, check_model, check_ranges, check_rate, first_ping
+from trade_drivers.servos import (
+    NoAnswer,
+    again,
+    check_firmware,
+    check_homing,
+    check_model,
+    check_ranges,
+    check_rate,
+    first_ping,
+)
 
 if TYPE_CHECKING:
     from trade_drivers.dynamixel._sdk import Wire
@@ -29,7 +38,7 @@ def check_bus(bus: "SerialBus", axes: Sequence[DynamixelAxis], where: str) -> No
     for axis in axes:
         check_ranges(axis, where)
     count = len(axes)
-    read = 14 + count + (18 + count * 14 if bus.fast_sync else count * (11 + CYCLIC[1]))
+    read = 14 + count + (8 + count * 14 if bus.fast_sync else count * (11 + CYCLIC[1]))
     check_rate(bus, count, read + 14 + count * 5, where)
 
 
@@ -54,6 +63,7 @@ def look_over(wire: "Wire", bus: "SerialBus", axis: DynamixelAxis, clock_ns: Cal
     except NoAnswer:
         raise ConfigurationError(where=key, problem=silent) from None
     check_firmware(axis, str(table.FIRMWARE.decode(settings)), key)
+    check_homing(axis, settings, key)
     axis.take_health(health, asked_ns)
     axis.take_sample(sample, asked_ns)
     _check_settings(axis, settings, key)

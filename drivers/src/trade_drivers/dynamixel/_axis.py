@@ -68,7 +68,8 @@ class DynamixelAxis(ServoAxis[DynamixelHealth]):
 
     cyclic = CYCLIC
     slow = SLOW
-    error_remedy = "let it cool down or free it, switch its power off and on, then call enable()"
+    homing = table.HOMING_OFFSET
+    error_remedy = "let it cool down or free it, then call enable(), which starts it anew"
 
     def __init__(self, name: str, bus: str, joint: Joint, coupled: Sequence[str] = ()) -> None:
         model = table.BY_MODEL_NAME[joint.model]

@@ -49,6 +49,9 @@ class DynamixelBench(ServoBench):
     def angle_rad(self, device_id: int) -> float:
         return (self._read(device_id, table.PRESENT_POSITION) - table.CENTRE_COUNTS) * table.RAD_PER_COUNT
 
+    def homing_counts(self, device_id: int) -> int:
+        return self._read(device_id, table.HOMING_OFFSET)
+
     def write_id(self, device_id: int, to: int) -> None:
         self.told(device_id, table.ID.address, table.ID.encode(to))
 

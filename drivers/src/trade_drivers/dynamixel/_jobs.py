@@ -1,17 +1,23 @@
 """What enabling, relaxing and leaving a servo are made of: one exchange on the wire after the other."""
 
-from typing import TYPE_CHECKING, Final
+from collections.abc import Generator
+from contextlib import suppress
+from typing import TYPE_CHECKING, Final, cast
 
 from trade_drivers.dynamixel import _table as table
-from trade_drivers.dynamixel._axis import DynamixelAxis
+from trade_drivers.dynamixel._axis import DynamixelAxis, DynamixelHealth
 from trade_drivers.joints import Goal, Job, Steps
-from trade_drivers.servos import health_of, told, tried
+from trade_drivers.servos import NoAnswer, health_of, still_homed, told, tried
 
 if TYPE_CHECKING:
     from trade_drivers.dynamixel._exchange import DynamixelExchange
+    from trade_drivers.dynamixel._sdk import Wire
 
 __all__ = ["enabling", "goal_block", "leaving", "relaxing"]
 
+_BOOT_NS: Final = 2_000_000_000
+"""How long a servo may take to start anew, and to be taken on again."""
+_WAIT_S: Final = 0.001
 _GOAL_BLOCK: Final = (
     table.PROFILE_ACCELERATION.address,
     table.GOAL_POSITION.end - table.PROFILE_ACCELERATION.address,
@@ -56,8 +62,13 @@ def enabling(bus: "DynamixelExchange", job: Job, axis: DynamixelAxis) -> Steps:
     """Torque on at the measured position, with the joint's own profile and its watchdog armed; all of it read back."""
     bus.require_answering(axis)
     health = yield from health_of(bus, axis)
+    if health.error and health.torque:
+        raise axis.faulty(f"{axis.fault}, and it has not let go: call relax() before enable()")
+    if health.error:
+        health = yield from _restarted(bus, job, axis)
     if health.error:
         raise axis.faulty()
+    yield from still_homed(bus, axis)
     if health.watchdog:
         yield from _write(bus, job, axis, table.BUS_WATCHDOG, 0)
     register = table.PRESENT_POSITION
@@ -74,6 +85,23 @@ def enabling(bus: "DynamixelExchange", job: Job, axis: DynamixelAxis) -> Steps:
     if not health.torque or health.watchdog != armed or kept != block:
         raise axis.faulty("it did not keep what enabling it wrote")
     axis.fault, axis.ready = "", True
+
+
+def _restarted(bus: "DynamixelExchange", job: Job, axis: DynamixelAxis) -> Generator[None, None, DynamixelHealth]:
+    """How a servo is that has shut down, once it was started anew: nothing but that, or its power, has it go on."""
+    axis.ready = False
+    began_ns = bus.clock()
+    with suppress(NoAnswer):  # whether it has heard that is seen by what it says next
+        cast("Wire", bus.wire).reboot(axis.id, job.gate)
+    while True:
+        bus.idle(_WAIT_S)
+        yield
+        now_ns, health = bus.clock(), axis.health
+        heard = None if axis.silent or axis.doubted or health is None or health.at_ns <= began_ns else health
+        if heard is not None and (not heard.error or now_ns - began_ns > _BOOT_NS):
+            return heard
+        if now_ns - began_ns > 2 * _BOOT_NS:
+            raise axis.deaf(now_ns)
 
 
 def _write(bus: "DynamixelExchange", job: Job, axis: DynamixelAxis, register: table.Register, value: int) -> Steps:

@@ -145,6 +145,13 @@ class Wire(ServoWire):
             result, error = self._packets.writeTxRx(self._port, device_id, address, len(data), data)
             self._require(result, device_id, error)
 
+    def reboot(self, device_id: int, gate: Gate | None = None) -> None:
+        """Have one device start anew, its torque off and its RAM area at its defaults."""
+        with self._exchange(device_id, gate):
+            self._port.expected = 0
+            result, error = self._packets.reboot(self._port, device_id)
+            self._require(result, device_id, error)
+
     def sync_write(self, address: int, data: Mapping[int, bytes], gate: Gate | None = None) -> None:
         size = len(next(iter(data.values())))
         parameters = [byte for device_id, value in data.items() for byte in (device_id, *value)]

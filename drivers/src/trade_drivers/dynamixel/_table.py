@@ -1,7 +1,8 @@
-"""Control tables of the X series: registers as data, with their conversion to SI units.
+"""Control tables of X and MX servos on protocol 2.0: registers as data, with their conversion to SI units.
 
-Sources: ROBOTIS e-Manual, XL430-W250 and XM430-W350, "Control Table of EEPROM Area" and "Control Table of RAM Area".
-Both have the same addresses; they differ in what stands at 126 (load or current) and in the model number.
+Sources: ROBOTIS e-Manual, the models' pages, "Control Table of EEPROM Area" and "Control Table of RAM Area". All have
+the same addresses up to 147, which is all that is used here; behind that they differ: where indirect data begin on an
+X330 even depends on its firmware. What stands at 126 is a load or a current, in the model's own unit.
 """
 
 from enum import Enum
@@ -76,6 +77,7 @@ RETURN_DELAY: Final = Register(9, "u1", si_per_count=2e-6, unit="s", access=_EEP
 DRIVE_MODE: Final = Register(10, "u1", access=_EEPROM)
 OPERATING_MODE: Final = Register(11, "u1", access=_EEPROM)
 SHADOW_ID: Final = Register(12, "u1", access=_EEPROM)
+HOMING_OFFSET: Final = Register(20, "i4", si_per_count=RAD_PER_COUNT, unit="rad", access=_EEPROM)
 VELOCITY_LIMIT: Final = Register(44, "u4", si_per_count=RAD_S_PER_COUNT, unit="rad/s", access=_EEPROM)
 MAX_POSITION: Final = Register(48, "u4", si_per_count=RAD_PER_COUNT, unit="rad", access=_EEPROM)
 MIN_POSITION: Final = Register(52, "u4", si_per_count=RAD_PER_COUNT, unit="rad", access=_EEPROM)
@@ -91,6 +93,10 @@ REALTIME_TICK: Final = Register(120, "u2", si_per_count=0.001, unit="s")
 MOVING: Final = Register(122, "u1")
 PRESENT_LOAD: Final = Register(126, "i2", si_per_count=0.001, unit="of full load")
 PRESENT_CURRENT: Final = Register(126, "i2", si_per_count=0.00269, unit="A")
+PRESENT_CURRENT_24V: Final = Register(126, "i2", si_per_count=0.00134, unit="A")
+"""Of XH430-V."""
+PRESENT_CURRENT_330: Final = Register(126, "i2", si_per_count=0.001, unit="A")
+PRESENT_CURRENT_MX: Final = Register(126, "i2", si_per_count=0.00336, unit="A")
 PRESENT_VELOCITY: Final = Register(128, "i4", si_per_count=RAD_S_PER_COUNT, unit="rad/s")
 PRESENT_POSITION: Final = Register(132, "i4", si_per_count=RAD_PER_COUNT, unit="rad")
 VELOCITY_TRAJECTORY: Final = Register(136, "i4", si_per_count=RAD_S_PER_COUNT, unit="rad/s")
@@ -137,9 +143,54 @@ class Model(Struct, frozen=True):
     """Counts of ``effort`` that mean full load: fractions are relative to it."""
 
 
+_FULL_LOAD: Final = 1000
+
+
+def _with_load(number: int, name: str) -> Model:
+    return Model(name, number, PRESENT_LOAD, _FULL_LOAD)
+
+
+def _with_current(number: int, name: str, limit: int, effort: Register = PRESENT_CURRENT) -> Model:
+    """``limit``: the greatest that its current limit, register 38, can be set to."""
+    return Model(name, number, effort, limit)
+
+
 MODELS: Final = (
-    Model("XL430-W250", 1060, PRESENT_LOAD, 1000),
-    Model("XM430-W350", 1020, PRESENT_CURRENT, 1193),  # current limit 3.2 A
+    _with_load(1060, "XL430-W250"),
+    _with_load(1070, "XC430-W150"),
+    _with_load(1080, "XC430-W240"),
+    _with_load(1090, "2XL430-W250"),
+    _with_load(1160, "2XC430-W250"),
+    _with_current(1190, "XL330-M077", 1750, PRESENT_CURRENT_330),
+    _with_current(1200, "XL330-M288", 1750, PRESENT_CURRENT_330),
+    _with_current(1210, "XC330-T181", 910, PRESENT_CURRENT_330),
+    _with_current(1220, "XC330-T288", 910, PRESENT_CURRENT_330),
+    _with_current(1230, "XC330-M181", 2352, PRESENT_CURRENT_330),
+    _with_current(1240, "XC330-M288", 2352, PRESENT_CURRENT_330),
+    _with_current(1020, "XM430-W350", 1193),
+    _with_current(1030, "XM430-W210", 1193),
+    _with_current(1120, "XM540-W270", 2047),
+    _with_current(1130, "XM540-W150", 2047),
+    _with_current(1000, "XH430-W350", 648),
+    _with_current(1010, "XH430-W210", 648),
+    _with_current(1040, "XH430-V350", 689, PRESENT_CURRENT_24V),
+    _with_current(1050, "XH430-V210", 689, PRESENT_CURRENT_24V),
+    _with_current(1100, "XH540-W270", 2047),
+    _with_current(1110, "XH540-W150", 2047),
+    _with_current(1140, "XH540-V270", 1188),  # an older page has 2047; it draws what the V150 does
+    _with_current(1150, "XH540-V150", 1188),
+    _with_current(1001, "XD430-T350", 648),
+    _with_current(1011, "XD430-T210", 648),
+    _with_current(1101, "XD540-T270", 2047),
+    _with_current(1111, "XD540-T150", 2047),
+    _with_current(1270, "XW430-T333", 2047),
+    _with_current(1280, "XW430-T200", 2047),
+    _with_current(1170, "XW540-T260", 2047),
+    _with_current(1180, "XW540-T140", 2047),
+    _with_current(1310, "XW540-H260", 1188),
+    _with_load(30, "MX-28"),
+    _with_current(311, "MX-64", 1941, PRESENT_CURRENT_MX),
+    _with_current(321, "MX-106", 2047, PRESENT_CURRENT_MX),
 )
 BY_MODEL_NAME: Final = {model.name: model for model in MODELS}
 BY_MODEL_NUMBER: Final = {model.number: model for model in MODELS}

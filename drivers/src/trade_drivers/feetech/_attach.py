@@ -8,7 +8,15 @@ from trade_drivers.feetech import _table as table
 from trade_drivers.feetech._axis import CYCLIC, SLOW, FeetechAxis
 from trade_drivers.feetech._frames import OVERHEAD
 from trade_drivers.feetech._jobs import GOAL_BLOCK
-from trade_drivers.servos import again, check_firmware, check_model, check_ranges, check_rate, first_ping
+from trade_drivers.servos import (
+    again,
+    check_firmware,
+    check_homing,
+    check_model,
+    check_ranges,
+    check_rate,
+    first_ping,
+)
 
 if TYPE_CHECKING:
     from trade_drivers.robotfile import Robot, SerialBus
@@ -58,6 +66,7 @@ def look_over(wire: "ServoWire", bus: "SerialBus", axis: FeetechAxis, clock_ns: 
     health = again(wire, axis, lambda: wire.read(axis.id, *SLOW).data)
     sample = again(wire, axis, lambda: wire.read(axis.id, *CYCLIC).data)
     check_firmware(axis, table.firmware(settings), key)
+    check_homing(axis, settings, key)
     axis.unload = table.UNLOAD.decode(settings)
     axis.take_health(health, asked_ns)
     axis.take_sample(sample, asked_ns)

@@ -62,6 +62,7 @@ class FeetechAxis(ServoAxis[FeetechHealth]):
 
     cyclic = CYCLIC
     slow = SLOW
+    homing = table.HOMING_OFFSET
     error_remedy = "let it cool down or free it, then call enable()"
 
     def __init__(self, name: str, bus: str, joint: Joint, lead_s: float, coupled: Sequence[str] = ()) -> None:

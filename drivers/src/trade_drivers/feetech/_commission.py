@@ -43,6 +43,9 @@ class FeetechBench(ServoBench):
     def angle_rad(self, device_id: int) -> float:
         return (self._read(device_id, table.PRESENT_POSITION) - table.CENTRE_COUNTS) * table.RAD_PER_COUNT
 
+    def homing_counts(self, device_id: int) -> int:
+        return self._read(device_id, table.HOMING_OFFSET)
+
     def write_id(self, device_id: int, to: int) -> None:
         self._opened(device_id, table.ID, to)
 

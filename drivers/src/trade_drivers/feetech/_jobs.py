@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Final
 from trade_drivers.feetech import _table as table
 from trade_drivers.feetech._axis import FeetechAxis
 from trade_drivers.joints import Goal, Job, Steps
-from trade_drivers.servos import health_of, told, tried
+from trade_drivers.servos import health_of, still_homed, told, tried
 
 if TYPE_CHECKING:
     from trade_drivers.feetech._exchange import FeetechExchange
@@ -54,6 +54,7 @@ def enabling(bus: "FeetechExchange", job: Job, axis: FeetechAxis) -> Steps:
         health = yield from health_of(bus, axis)
     if health.error:
         raise axis.faulty()
+    yield from still_homed(bus, axis)
     if not health.locked:
         yield from _write(bus, job, axis, table.LOCK, 1)
         health = yield from health_of(bus, axis)

@@ -78,6 +78,7 @@ MAX_ANGLE: Final = Register(11, 2, si_per_count=RAD_PER_COUNT, unit="rad", acces
 PHASE: Final = Register(18, 1, access=_EEPROM)
 UNLOAD: Final = Register(19, 1, access=_EEPROM)
 """Which of ``STATUS_BITS`` have the servo cut its torque by itself."""
+HOMING_OFFSET: Final = Register(31, 2, si_per_count=RAD_PER_COUNT, unit="rad", access=_EEPROM, sign_bit=11)
 MODE: Final = Register(33, 1, access=_EEPROM)
 
 TORQUE: Final = Register(40, 1, access=_RAM)

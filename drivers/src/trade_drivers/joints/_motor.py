@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from trade import Resource, permit
+from trade import Measure, Resource, permit
 from trade.errors import DeviceError, DeviceSilent, LimitExceeded
 from trade_drivers._asked import expiry, span
 from trade_drivers._bus_thread import BusThread
@@ -190,6 +190,9 @@ class AttachedJoints(AttachedBus):
 
     def group(self, name: str, joints: Sequence[str]) -> JointGroup:
         return BusGroup(name, self._thread, [self._axes[joint] for joint in joints])
+
+    def measures(self, bus: str) -> list[Measure]:
+        return self._thread.measures(bus)
 
     def close(self) -> None:
         self._thread.close()

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Final
 
 from trade.errors import ConfigurationError
 from trade_drivers.can import Frame, frame_bits
-from trade_drivers.canmotors import Unfit
+from trade_drivers.canmotors import Another, Unfit
 from trade_drivers.canmotors._exchange import asked
 from trade_drivers.joints import Steps
 from trade_drivers.odrive import _frames as frames
@@ -63,6 +63,10 @@ def _check_joint(axis: OdriveAxis) -> None:
         raise Unfit(f"{joint.id} is no node; 0 to 62 are", ".id")
     if joint.counts_per_rev is not None:
         raise Unfit("an ODrive tells turns, not counts; leave this key out", ".counts_per_rev")
+    if joint.homing_counts:
+        raise Unfit("is for servos; leave this key out", ".homing_counts")
+    if joint.serial_number is not None:
+        raise Unfit("an ODrive tells no serial number here; leave this key out", ".serial_number")
     braking_s = joint.max_speed_rad_s / joint.max_accel_rad_s2
     if braking_s > _BRAKING_S:
         problem = f"a stop from max_speed_rad_s takes {braking_s:.2g} s with it; it must take {_BRAKING_S} s at most"
@@ -103,9 +107,11 @@ def _check_version(axis: OdriveAxis) -> None:
         return
     if version.line != axis.model.line:
         raise Unfit(f"is {axis.joint.model!r}, but node {axis.id} is of product line {version.line}", ".model")
+    told = ".".join(map(str, version.firmware))
     if version.firmware[:2] != _FIRMWARE:
-        told = ".".join(map(str, version.firmware))
         raise Unfit(f"the firmware of node {axis.id} is {told}; this driver speaks CANSimple of 0.6")
+    if axis.joint.firmware is not None and axis.joint.firmware != told:
+        raise Another("firmware", axis.joint.firmware, told)
     if axis.identity not in {None, version}:
         raise Unfit(f"another ODrive answers as node {axis.id}: {version}, not {axis.identity}")
     axis.identity = version

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any, cast
 from trade.errors import ConfigurationError
 from trade_drivers.canmotors import CanMotorDriver
 from trade_drivers.odrive._axis import MODELS, OdriveAxis
+from trade_drivers.odrive._commission import OdriveCommissioner
 from trade_drivers.robotfile import CanBus, Robot
 
 if TYPE_CHECKING:
@@ -19,6 +20,7 @@ class OdriveDriver(CanMotorDriver):
     """ODrives with firmware 0.6 on a CAN bus."""
 
     name = "odrive"
+    commissioner = OdriveCommissioner
 
     def exchange(self, robot: Robot, bus: CanBus, wire: "CanPort", port: str) -> "OdriveExchange":
         from trade_drivers.odrive._attach import check_bus  # noqa: PLC0415 - python-can is optional

@@ -37,6 +37,7 @@ class Command(IntEnum):
     HEARTBEAT = 0x01
     ESTOP = 0x02
     ERRORS = 0x03
+    ADDRESS = 0x06
     SET_STATE = 0x07
     ESTIMATES = 0x09
     SET_MODE = 0x0B

@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Final, NoReturn
 
+from trade import Measure
 from trade.errors import ConfigurationError
 from trade_drivers._bus_thread import BusThread
 from trade_drivers._driver import AttachedBus, Driver
@@ -48,6 +49,9 @@ class AttachedGrippers(AttachedBus):
 
     def gripper(self, name: str) -> Gripper:
         return RobotiqGripper(self._thread, self._hands[name])
+
+    def measures(self, bus: str) -> list[Measure]:
+        return self._thread.measures(bus)
 
     def close(self) -> None:
         self._thread.close()

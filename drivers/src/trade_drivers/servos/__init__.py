@@ -9,6 +9,7 @@ from trade_drivers.servos._attach import again, check_firmware, check_model, che
 from trade_drivers.servos._axis import Health, ServoAxis
 from trade_drivers.servos._driver import ServoDriver
 from trade_drivers.servos._exchange import ServoExchange
+from trade_drivers.servos._homing import check_homing, still_homed
 
 __all__ = [
     "Answer",
@@ -22,11 +23,13 @@ __all__ = [
     "WireError",
     "again",
     "check_firmware",
+    "check_homing",
     "check_model",
     "check_ranges",
     "check_rate",
     "first_ping",
     "health_of",
+    "still_homed",
     "told",
     "tried",
 ]

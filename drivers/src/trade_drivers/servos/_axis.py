@@ -2,7 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import ClassVar, Final, Generic, TypeVar
+from typing import ClassVar, Final, Generic, Protocol, TypeVar
 
 from msgspec import Struct
 
@@ -13,6 +13,18 @@ from trade_drivers.robotfile import Joint
 __all__ = ["Health", "ServoAxis"]
 
 _HEALTH_STALE_NS: Final = 2_000_000_000
+
+
+class Register(Protocol):
+    """One item of a vendor's table."""
+
+    @property
+    def address(self) -> int: ...
+    @property
+    def size(self) -> int: ...
+    def decode(self, data: bytes, start: int = 0) -> int:
+        """Counts, out of a block of bytes read from address ``start``."""
+        ...
 
 
 class Health(Struct, frozen=True, gc=False, kw_only=True):
@@ -37,6 +49,8 @@ class ServoAxis(Axis, Generic[_Health]):
     """Address and size of what is read of every joint in every cycle."""
     slow: ClassVar[tuple[int, int]]
     """Address and size of what is read of one joint at a time."""
+    homing: ClassVar[Register]
+    """What it adds to its position, or takes from it."""
     error_remedy: ClassVar[str]
     """What helps against what it complains of."""
 

@@ -5,7 +5,7 @@ import sys
 from contextlib import suppress
 from typing import Final, Literal
 
-from trade_drivers.ur._messages import Channel, Done, Hello, Order, Pulse, Report, Sample, pair
+from trade_drivers.ur._messages import Channel, Done, Failed, Gone, Hello, Order, Pulse, Report, Sample, pair
 
 __all__ = ["Child"]
 
@@ -35,6 +35,8 @@ class Child:
         self._answers: dict[int, Done] = {}
         self.ready = False
         """It has said that it takes orders."""
+        self.problem = ""
+        """Why it ended, if it said so."""
         self.running = False
         """As it last said: a move it began is under way."""
         self.pulses = 0
@@ -57,9 +59,17 @@ class Child:
         self._channel.send(order)
 
     def listen(self) -> None:
-        """Take in what it has said; raises ``Gone``."""
+        """Take in what it has said; raises ``Gone``, with why if it said so."""
+        try:
+            self._take_in()
+        except Gone as gone:
+            raise Gone(self.problem or str(gone)) from None
+
+    def _take_in(self) -> None:
         for word in self._channel.waiting():
             match word:
+                case Failed():
+                    self.problem = word.problem
                 case Sample():
                     self.samples.append(word)
                 case Pulse():

@@ -25,6 +25,7 @@ from trade_drivers.ur._messages import (
     Order,
     Pulse,
     Servo,
+    Solve,
     Take,
 )
 
@@ -34,7 +35,6 @@ _IDLE_S: Final = 60.0
 _STUCK_S: Final = 1.0
 _TAKING_S: Final = 8.0
 """The library waits 5 s for its script to start."""
-_STEP_S: Final = 0.002
 _LOOKAHEAD_S: Final = 0.05
 _GAIN: Final = 500
 _END_RAD_S2: Final = 10.0
@@ -51,6 +51,8 @@ class Child:
         self._channel = channel
         self._robot: Any = None
         self._streaming = self._free = False
+        self._step_s = 0.0
+        self._angles: list[float] = []
 
     def run(self) -> None:
         """Until the driver is gone or silent, or the connection is lost."""
@@ -85,7 +87,8 @@ class Child:
         late = 0 < order.expires_ns <= time.monotonic_ns()
         problem = "" if late else self._carry_out(order)
         if order.number:
-            self._channel.send(Done(order.number, problem, late))
+            angles, self._angles = self._angles, []
+            self._channel.send(Done(order.number, problem, late, angles))
 
     def _beat(self) -> None:
         if self._robot is None:
@@ -110,6 +113,7 @@ class Child:
             self._robot = self._library.RTDEControlInterface(self._host)
         except RuntimeError as problem:
             return str(problem)
+        self._step_s = order.step_s
         return "" if self._robot.setWatchdog(order.watchdog_hz) else "its watchdog could not be armed"
 
     def _command(self, order: Order) -> bool:
@@ -117,11 +121,15 @@ class Child:
         match order:
             case Servo():
                 self._streaming = True
-                return robot.servoJ(order.positions, 0.0, 0.0, _STEP_S, _LOOKAHEAD_S, _GAIN)
+                return robot.servoJ(order.positions, 0.0, 0.0, self._step_s, _LOOKAHEAD_S, _GAIN)
             case MoveJoints():
                 return robot.moveJ(order.positions, order.speed, order.accel, True)
             case MoveLine():
                 return robot.moveL(order.pose, order.speed, order.accel, True)
+            case Solve():
+                if robot.getInverseKinematicsHasSolution(order.pose, order.near):
+                    self._angles = robot.getInverseKinematics(order.pose, order.near)
+                return True
             case Halt():
                 return self._halt(order)
             case Free():

@@ -1,10 +1,12 @@
 """The dashboard server of a controller: one connection a question, each with a deadline. Plain sockets, no library."""
 
 import socket
+import threading
 import time
+from contextlib import suppress
 from typing import Final
 
-__all__ = ["DashboardError", "ask", "probe"]
+__all__ = ["DashboardError", "ask", "probe", "tell"]
 
 _PORT: Final = 29999
 _RTDE: Final = 30004
@@ -35,6 +37,18 @@ def ask(host: str, line: str, timeout_s: float) -> str:
             return _line(connection, until)
     except OSError as problem:
         raise DashboardError(f"{host}:{_PORT}: {problem or 'no answer'}") from None
+
+
+def tell(host: str, line: str, timeout_s: float) -> threading.Thread:
+    """Say a line to the dashboard, on a thread of its own that ends in time; nobody hears the answer."""
+
+    def say() -> None:
+        with suppress(DashboardError):
+            ask(host, line, timeout_s)
+
+    saying = threading.Thread(target=say, name=f"telling {host}", daemon=True)
+    saying.start()
+    return saying
 
 
 def probe(host: str, timeout_s: float) -> None:

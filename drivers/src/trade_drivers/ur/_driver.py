@@ -4,6 +4,9 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from typing import Final, NoReturn
 
+from msgspec import structs
+
+from trade import Measure
 from trade.errors import ConfigurationError
 from trade_drivers._arm import Arm
 from trade_drivers._bus_thread import BusThread
@@ -19,15 +22,24 @@ from trade_drivers.ur._ur_arm import UrArm
 
 __all__ = ["UrDriver"]
 
-_MODELS: Final = ("UR3", "UR3e", "UR5", "UR5e", "UR10", "UR10e", "UR16e")
+_CYCLES_HZ: Final = {
+    "UR3": 125.0,
+    "UR5": 125.0,
+    "UR10": 125.0,
+    "UR3e": 500.0,
+    "UR5e": 500.0,
+    "UR10e": 500.0,
+    "UR16e": 500.0,
+}
+"""Models of the CB3 and of the e-Series, and how many cycles a second their controllers have."""
 _ASK_S: Final = 1.0
 
 
 class AttachedController(AttachedBus):
     """A controller with its arm, and the thread that owns it."""
 
-    def __init__(self, thread: BusThread[Exchange]) -> None:
-        self._thread = thread
+    def __init__(self, thread: BusThread[Exchange], link: Link) -> None:
+        self._thread, self._link = thread, link
 
     def motor(self, joint: str) -> Motor:
         raise ConfigurationError(where=f'joint."{joint}"', problem="driver ur has no joints, only an arm: [arm.NAME]")
@@ -38,8 +50,14 @@ class AttachedController(AttachedBus):
     def arm(self, name: str) -> Arm:  # noqa: ARG002 - there is one
         return UrArm(self._thread, self._thread.exchange.limb)
 
+    def measures(self, bus: str) -> list[Measure]:
+        return self._thread.measures(bus)
+
     def close(self) -> None:
-        self._thread.close()
+        try:
+            self._thread.close()
+        finally:
+            self._link.wait_closed()
 
 
 class UrDriver(Driver):
@@ -57,11 +75,13 @@ class UrDriver(Driver):
             )
             _wrong("driver ur", f"{problem} its wheel (all but Linux x86_64 with Python 3.10-3.12) build ur-rtde 1.6.5")
         limb = _limb(robot, bus, port)
+        bus = structs.replace(bus, rate_hz=bus.rate_hz or _CYCLES_HZ[limb.arm.model])
         link = Link(port)
         with ExitStack() as undo:
+            undo.callback(link.wait_closed)
             undo.callback(link.close)
             try:
-                link.open()
+                link.wait_open()
                 _look_over(limb, f"{robot.where}: arm.{limb.arm.name}")
             except (PortLost, DashboardError) as problem:
                 _wrong(f"{where}.host", f"{problem}; is it switched on, and is this its address?")
@@ -71,7 +91,7 @@ class UrDriver(Driver):
             thread = BusThread(exchange, link, bus, healthy, name=f"bus {robot.name}.{bus.name}")
             thread.start()
             undo.pop_all()
-        return AttachedController(thread)
+        return AttachedController(thread, link)
 
 
 def _limb(robot: Robot, bus: UrBus, port: str) -> Limb:
@@ -79,9 +99,12 @@ def _limb(robot: Robot, bus: UrBus, port: str) -> Limb:
     if len(arms) != 1 or robot.joints_on(bus.name) or robot.grippers_on(bus.name):
         _wrong(f"{robot.where}: bus.{bus.name}", "a controller has one arm, and nothing else: [arm.NAME]")
     [arm] = arms
-    if arm.model not in _MODELS:
-        problem = f"{arm.model!r} is unknown to the driver ur; it knows {', '.join(_MODELS)}"
+    if arm.model not in _CYCLES_HZ:
+        problem = f"{arm.model!r} is unknown to the driver ur; it knows {', '.join(_CYCLES_HZ)}"
         _wrong(f"{robot.where}: arm.{arm.name}.model", problem)
+    if bus.rate_hz > _CYCLES_HZ[arm.model]:
+        problem = f"{bus.rate_hz:g} is more than the {_CYCLES_HZ[arm.model]:g} cycles a second of a {arm.model}"
+        _wrong(f"{robot.where}: bus.{bus.name}.rate_hz", problem)
     if bus.leave != "hold":
         _wrong(f"{robot.where}: bus.{bus.name}.leave", '"relax" is nothing an arm can: it would fall; use "hold"')
     return Limb(f"{robot.name}.{arm.name}", port, arm)

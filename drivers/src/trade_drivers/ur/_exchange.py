@@ -1,6 +1,7 @@
 """What happens between the driver and one controller, cycle by cycle: stops, measurements, work, the watchdog."""
 
 import logging
+import threading
 import time
 from collections.abc import Callable, Generator
 from typing import TYPE_CHECKING, Final
@@ -10,6 +11,7 @@ from trade_drivers._exchange import HALT_NS, BusExchange, StopTicket
 from trade_drivers._work import Device, PortLost, Steps
 from trade_drivers.robotfile import UrBus
 from trade_drivers.ur._child import Child
+from trade_drivers.ur._dashboard import tell
 from trade_drivers.ur._limb import Limb
 from trade_drivers.ur._link import Link
 from trade_drivers.ur._messages import Beat, Done, Gone, Halt, Order, Scale, Servo, Take
@@ -25,6 +27,7 @@ _STOPPED_NS: Final = 200_000_000
 """Who does not answer a stop for so long is killed; then the robot's watchdog stops it (S10)."""
 _ANSWER_NS: Final = 1_000_000_000
 _TAKEN_NS: Final = 10_000_000_000
+_ASK_S: Final = 1.0
 _SHOWN_NS: Final = 100_000_000
 """So long after the script has begun every measurement shows it."""
 _SERVO_NS: Final = 50_000_000
@@ -47,6 +50,8 @@ class Exchange(BusExchange[Limb]):
         self._halted_ns = 0
         self._ending = False
         """Once the stop is answered, the process that commands is replaced: its program has been ended."""
+        self._telling: threading.Thread | None = None
+        """The dashboard is being told to end the program."""
 
     # --- from any thread
 
@@ -119,13 +124,19 @@ class Exchange(BusExchange[Limb]):
 
     def forget_measurements(self) -> None:
         super().forget_measurements()
+        if self.taken:
+            self._end_program()
         self.limb.halting_since_ns = self._halt_number = 0
         self.taken = self._ending = False
 
     def drop_control(self, why: str) -> None:
-        """End the process that commands, and start one that knows of nothing; the robot's watchdog stops what moves."""
+        """End the process that commands, and start one that knows of nothing; the robot's watchdog stops what moves.
+
+        A program that a safeguard stop holds up would go on by itself, so the dashboard is told to end it, too.
+        """
         if self.taken:
             _log.warning("%s: %s; its watchdog stops it", self.limb.name, why)
+            self._end_program()
         self.taken, self._ending, self._halt_number = False, False, 0
         self.link.renew_control()
         if self.limb.motion is not None:
@@ -139,13 +150,15 @@ class Exchange(BusExchange[Limb]):
         if self.taken:
             return
         until_ns = self.clock() + _TAKEN_NS
-        while not self._control.ready:
+        while not self._control.ready or (self._telling is not None and self._telling.is_alive()):
             job.gate()
             if self.clock() > until_ns:
                 raise self.limb.faulty("the process that commands it does not start")
             yield
-        hz = self._watchdog_hz
-        done = yield from self._answered(job, lambda number: Take(number=number, watchdog_hz=hz), until_ns)
+        hz, step_s = self._watchdog_hz, self.period_ns / 1e9
+        done = yield from self._answered(
+            job, lambda number: Take(number=number, watchdog_hz=hz, step_s=step_s), until_ns
+        )
         if done.problem:
             self.drop_control(done.problem)
             raise self.limb.faulty("" if self.limb.fault else f"control was not granted: {done.problem}")
@@ -164,7 +177,7 @@ class Exchange(BusExchange[Limb]):
                 raise self.limb.faulty("told to stop, but it is still moving")
             yield
 
-    def carrying_out(self, job: "Command", make: Callable[[int], Order]) -> Steps:
+    def carrying_out(self, job: "Command", make: Callable[[int], Order]) -> Generator[None, None, Done]:
         """Give an order that is answered at once.
 
         Raises:
@@ -177,6 +190,7 @@ class Exchange(BusExchange[Limb]):
         if done.problem:
             self.drop_control(done.problem)
             raise self.limb.faulty("" if self.limb.fault else done.problem)
+        return done
 
     def scaling(self, job: "Command", fraction: float, expires_ns: int) -> Steps:
         """Set the speed slider, which needs no control."""
@@ -290,6 +304,9 @@ class Exchange(BusExchange[Limb]):
                 self._control.send(Halt(number=self._halt_number, decel=limb.arm.max_accel_rad_s2))
             except Gone as gone:
                 self.drop_control(f"the process that commands it is gone: {gone}")
+
+    def _end_program(self) -> None:
+        self._telling = tell(self.link.path, "stop", _ASK_S)
 
     def _forget(self, motion: "Motion", error: TradeError | None) -> None:
         if self.limb.motion is motion:

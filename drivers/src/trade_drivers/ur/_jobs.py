@@ -4,12 +4,13 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
 
 from trade import Permit
-from trade.errors import DeadlineExceeded, LimitExceeded, MotionStopped, ToleranceExceeded, TradeError
+from trade.errors import DeadlineExceeded, InvalidArgument, LimitExceeded, MotionStopped, ToleranceExceeded, TradeError
 from trade_drivers._plan import Plan
 from trade_drivers._work import Steps, Work, check_admitted
 from trade_drivers.ur._chase import Chase
 from trade_drivers.ur._limb import Limb
-from trade_drivers.ur._messages import Free, MoveJoints, MoveLine, Sample
+from trade_drivers.ur._messages import Free, MoveJoints, MoveLine, Sample, Solve
+from trade_drivers.ur._way import poses_on
 
 if TYPE_CHECKING:
     from trade_drivers.ur._exchange import Exchange
@@ -19,6 +20,9 @@ __all__ = ["Command", "EndFreedrive", "Follow", "Freedrive", "LineMove", "Motion
 _NEAR: Final = 0.01
 """rad or m: closer to its goal, a move has arrived."""
 _OUTSIDE_RAD: Final = 0.02
+"""So far outside its range a joint may be measured, where nothing was told to leave it."""
+_STUCK_NS: Final = 1_000_000_000
+"""A move that is under way changes what is measured in that time."""
 _FOREVER_NS: Final = 2**63
 _HELD_UP_NS: Final = 200_000_000
 
@@ -97,6 +101,15 @@ class Motion(Command):
             return MotionStopped(device=self.limb.name, reason="the deadline of its call came; give it a longer one")
         return None
 
+    def astray(self, sample: Sample) -> LimitExceeded | None:
+        """A joint is outside its range and goes on outwards. (From outside it may come back.)"""
+        arm = self.limb.arm
+        spans = zip(self.limb.joints, sample.positions, sample.speeds, arm.min_rad, arm.max_rad, strict=True)
+        for name, angle, speed, low, high in spans:
+            if (angle > high + _OUTSIDE_RAD and speed > 0) or (angle < low - _OUTSIDE_RAD and speed < 0):
+                return LimitExceeded(what=f"{name}, measured", value=angle, lower=low, upper=high, unit="rad")
+        return None
+
     def done_stepping(self) -> None:
         """Launched; now it is watched. (It has ended already if anything was refused.)"""
 
@@ -151,6 +164,8 @@ class Move(Motion):
         self._until_ns = until_ns
         self._pulses = -1
         """How many words there were of its process when it began."""
+        self._place: list[float] = []
+        self._moved_ns = 0
 
     def order(self, number: int) -> MoveJoints | MoveLine:
         """What is sent."""
@@ -160,10 +175,6 @@ class Move(Motion):
     def off(self, sample: Sample) -> float:
         """How far it is from its goal."""
         return max(abs(a - b) for a, b in zip(sample.positions, self.goal, strict=True))
-
-    def astray(self, sample: Sample) -> TradeError | None:  # noqa: ARG002 - in joint space it stays between its ends
-        """Why it may not go on where it is."""
-        return None
 
     def steps(self) -> Steps:
         yield from self.beginning()
@@ -181,12 +192,18 @@ class Move(Motion):
         control, sample = self.exchange.link.control, self.limb.sample
         if self._pulses < 0 or control is None or sample is None:
             return
-        ending = self.trouble(now_ns, self._until_ns) or self.astray(sample)
+        ending = self.trouble(now_ns, self._until_ns) or self.astray(sample) or self._stuck(sample)
         over = ending is None and control.pulses > self._pulses + 1 and not control.running and self.limb.still > 2
         if over and self.off(sample) > _NEAR:
             ending = self.limb.faulty("its move ended before it was there")
         if over or ending is not None:
             self.exchange.release(self, ending)
+
+    def _stuck(self, sample: Sample) -> TradeError | None:
+        """What is measured does not change at all: it is blocked, held up, or what is told is old."""
+        if sample.positions != self._place or not self._moved_ns:
+            self._place, self._moved_ns = sample.positions, sample.at_ns
+        return self.limb.faulty("it makes no progress") if sample.at_ns - self._moved_ns > _STUCK_NS else None
 
 
 class LineMove(Move):
@@ -199,14 +216,29 @@ class LineMove(Move):
     def off(self, sample: Sample) -> float:
         return max(abs(a - b) for a, b in zip(sample.pose[:3], self.goal[:3], strict=True))
 
-    def astray(self, sample: Sample) -> TradeError | None:
+    def beginning(self) -> Steps:
+        yield from super().beginning()
+        sample = self.usable()
+        near, poses = sample.positions, poses_on(sample.pose, self.goal)
+        for pose in poses:
+            done = yield from self.exchange.carrying_out(
+                self,
+                lambda number, pose=pose, near=near: Solve(
+                    number=number, expires_ns=self.expires_ns, pose=pose, near=near
+                ),
+            )
+            if not done.angles:
+                problem = f"the line leads out of reach: there are no joint angles for {pose}"
+                raise InvalidArgument(service=self.service, argument="pose", problem=problem)
+            self._check_range(near, done.angles)
+            near = done.angles
+
+    def _check_range(self, before: Sequence[float], angles: Sequence[float]) -> None:
         arm = self.limb.arm
-        spans = zip(self.limb.joints, sample.positions, sample.speeds, arm.min_rad, arm.max_rad, strict=True)
-        for name, angle, speed, low, high in spans:
-            outwards = (angle > high + _OUTSIDE_RAD and speed > 0) or (angle < low - _OUTSIDE_RAD and speed < 0)
-            if outwards:
-                return LimitExceeded(what=f"{name} on the line", value=angle, lower=low, upper=high, unit="rad")
-        return None
+        spans = zip(self.limb.joints, before, angles, arm.min_rad, arm.max_rad, strict=True)
+        for name, was, angle, low, high in spans:
+            if (angle > high and angle > was) or (angle < low and angle < was):
+                raise LimitExceeded(what=f"{name} on the line", value=angle, lower=low, upper=high, unit="rad")
 
 
 class SetPoint(Motion):
@@ -261,7 +293,8 @@ class SetPoint(Motion):
 
     def _send(self, now_ns: int) -> None:
         self.gate()
-        self.usable()
+        if (astray := self.astray(self.usable())) is not None:
+            raise astray
         if self._chase is not None and now_ns - self._sent_ns >= self.exchange.period_ns // 2:
             dt = min(now_ns - self._sent_ns, 5 * self.exchange.period_ns) / 1e9
             self._sent_ns = now_ns
@@ -315,6 +348,8 @@ class Follow(Motion):
         course, tolerances, sample = self._plan.course, self._plan.tolerances, self.usable()
         if course.failed is not None:
             raise MotionStopped(device=self.limb.name, reason=f"its group could not go on: {course.failed}")
+        if (astray := self.astray(sample)) is not None:
+            raise astray
         self._compare(sample, "path", tolerances.path_rad)
         late_s = course.elapsed_s(now_ns) - course.duration_s
         if late_s >= 0 and self.limb.still > 2:

@@ -11,6 +11,7 @@ __all__ = [
     "Beat",
     "Channel",
     "Done",
+    "Failed",
     "Free",
     "Gone",
     "Halt",
@@ -23,6 +24,7 @@ __all__ = [
     "Sample",
     "Scale",
     "Servo",
+    "Solve",
     "Take",
     "pair",
 ]
@@ -50,6 +52,8 @@ class Take(_Order, frozen=True):
     """Take control: upload the script, arm the watchdog."""
 
     watchdog_hz: float
+    step_s: float
+    """From one set-point of a stream to the next."""
 
 
 class MoveJoints(_Order, frozen=True):
@@ -74,6 +78,13 @@ class Servo(_Order, frozen=True):
     positions: list[float]
 
 
+class Solve(_Order, frozen=True):
+    """Ask for the angles that bring the tool to a pose, those next to given ones; nothing moves."""
+
+    pose: list[float]
+    near: list[float]
+
+
 class Halt(_Order, frozen=True):
     """End whatever it does: a move, a stream, freedrive; braking in rad/s^2."""
 
@@ -94,6 +105,12 @@ class Hello(Struct, frozen=True, tag=True, array_like=True):
     """Ready for orders."""
 
 
+class Failed(Struct, frozen=True, tag=True, array_like=True):
+    """Why it ends."""
+
+    problem: str
+
+
 class Done(Struct, frozen=True, tag=True, array_like=True):
     """An order was carried out, or why it was not."""
 
@@ -101,6 +118,8 @@ class Done(Struct, frozen=True, tag=True, array_like=True):
     problem: str = ""
     late: bool = False
     """It had expired, so it was not."""
+    angles: list[float] = []
+    """What ``Solve`` found; empty: there are none."""
 
 
 class Pulse(Struct, frozen=True, tag=True, array_like=True):
@@ -123,8 +142,8 @@ class Sample(Struct, frozen=True, tag=True, array_like=True):
     speed_fraction: float
 
 
-Order = Beat | Take | MoveJoints | MoveLine | Servo | Halt | Free | Scale
-Report = Hello | Done | Pulse | Sample
+Order = Beat | Take | MoveJoints | MoveLine | Servo | Solve | Halt | Free | Scale
+Report = Hello | Failed | Done | Pulse | Sample
 
 
 class Channel(Generic[Message]):

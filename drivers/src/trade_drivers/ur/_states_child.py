@@ -1,7 +1,7 @@
 """The child process that reads: it sends every new measurement, and sets the speed slider.
 
 The library tells old values as if they were new, and its constructor waits for ever for a server that is silent. So a
-value counts from when the controller's own time stamp was seen to change, and nobody waits for this process.
+value is as old as the controller's own time stamp says, the ports are probed first, and nobody waits for this process.
 """
 
 import os
@@ -12,9 +12,14 @@ import time
 from contextlib import suppress
 from typing import Any, Final
 
-from trade_drivers.ur._messages import Channel, Done, Gone, Hello, Order, Sample, Scale
+from trade_drivers.ur._age import Age
+from trade_drivers.ur._dashboard import DashboardError, probe
+from trade_drivers.ur._messages import Channel, Done, Failed, Gone, Hello, Order, Sample, Scale
 
 RATE_HZ: Final = 125.0
+_PROBE_S: Final = 1.0
+_PROBED_S: Final = 5.0
+"""The alarm while three ports are probed one after the other."""
 _STUCK_S: Final = 3.0
 _FIELDS: Final = [
     *("timestamp", "actual_q", "actual_qd", "actual_TCP_pose", "robot_mode", "safety_mode"),
@@ -36,6 +41,7 @@ class Child:
         self._host = host
         self._channel = channel
         self._clock = 0.0
+        self._age = Age()
 
     def run(self) -> None:
         """A measurement whenever there is a new one; orders in between."""
@@ -57,7 +63,7 @@ class Child:
         self._clock = clock
         self._channel.send(
             Sample(
-                at_ns,
+                self._age.measured_ns(at_ns, int(clock * 1e9)),
                 robot.getActualQ(),
                 robot.getActualQd(),
                 robot.getActualTCPPose(),
@@ -80,9 +86,15 @@ def main() -> None:
     """Serve the socket whose number is the first argument, for the controller at the second."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
-    signal.setitimer(signal.ITIMER_REAL, _STUCK_S)
+    host, channel = sys.argv[2], Channel[Order](socket.socket(fileno=int(sys.argv[1])), Order)
     with suppress(Gone):
-        Child(sys.argv[2], Channel(socket.socket(fileno=int(sys.argv[1])), Order)).run()
+        try:
+            signal.setitimer(signal.ITIMER_REAL, _PROBED_S)
+            probe(host, _PROBE_S)
+            signal.setitimer(signal.ITIMER_REAL, _STUCK_S)
+            Child(host, channel).run()
+        except (DashboardError, RuntimeError) as problem:
+            channel.send(Failed(str(problem)))
     os._exit(0)
 
 

@@ -1,10 +1,11 @@
 """Simulated Dynamixel servos on Protocol 2.0: the bytes of the X series, without the hardware."""
 
 from ._bus import DynamixelBus
+from ._models import MODELS, XL430_W250, XM430_W350
 from ._protocol import ErrorCode, Instruction, Packet, PacketReader, crc16, encode, status
 from ._rules import HardwareError
 from ._servo import Servo
-from ._table import MODELS, XL430_W250, XM430_W350, Access, Model, Register
+from ._table import Access, Model, Register
 
 __all__ = [
     "MODELS",

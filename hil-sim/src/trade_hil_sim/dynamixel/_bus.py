@@ -12,9 +12,10 @@ from trade_hil_sim._log import ByteLog
 
 from ._dispatch import Dispatch
 from ._journal import Journal
+from ._models import MODELS
 from ._protocol import BROADCAST, Packet, PacketReader
 from ._servo import Servo
-from ._table import BAUDS, CENTRE, MODELS, RAD_PER_COUNT
+from ._table import BAUDS, CENTRE, RAD_PER_COUNT
 
 if TYPE_CHECKING:
     from trade_drivers.robotfile import Joint, SerialBus

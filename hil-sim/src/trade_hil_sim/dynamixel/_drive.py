@@ -19,7 +19,6 @@ QUICK_COUNTS_S2: Final = 200.0 / RAD_PER_COUNT
 """The most a servo's motor accelerates its shaft, 200 rad/s^2: an assumption, no data sheet gives it."""
 PWM_FULL: Final = 885
 IN_POSITION_COUNTS: Final = 10
-FULL_LOAD: Final = 1000
 
 
 class Mode(IntEnum):
@@ -140,7 +139,7 @@ class Drive:
         ):
             table.set(name, value)
         effort = "present_load" if "present_load" in table.model.by_name else "present_current"
-        table.set(effort, round(self._effort(t) * FULL_LOAD) if torque else 0)
+        table.set(effort, round(self._effort(t) * table.model.full_effort_counts) if torque else 0)
 
     @property
     def _direction(self) -> int:

@@ -4,15 +4,11 @@ Knows nothing of motion or time; rules that depend on other registers are the se
 """
 
 from collections.abc import Iterable
-from typing import Final
 
 from ._protocol import ErrorCode
-from ._table import RAM_BEGINS, TABLE_ENDS, Model, Register
+from ._table import RAM_BEGINS, Model, Register
 
 __all__ = ["ControlTable", "Refusal"]
-
-INDIRECT: Final = ((224, 168, 28), (634, 578, 28))
-"""First data byte, first address register, how many (e-Manual, "Indirect Address, Indirect Data")."""
 
 
 class Refusal(Exception):
@@ -29,8 +25,8 @@ class ControlTable:
 
     def __init__(self, model: Model) -> None:
         self.model = model
-        self._bytes = bytearray(TABLE_ENDS)
-        self._at: list[Register | None] = [None] * TABLE_ENDS
+        self._bytes = bytearray(model.ends)
+        self._at: list[Register | None] = [None] * model.ends
         for register in model.registers:
             self._at[register.address : register.address + register.size] = [register] * register.size
             self.set(register.name, register.default)
@@ -54,7 +50,7 @@ class ControlTable:
 
     def forget_ram(self) -> None:
         """What happens to the memory at power loss: EEPROM stays, RAM does not."""
-        self._bytes[RAM_BEGINS:] = bytes(TABLE_ENDS - RAM_BEGINS)
+        self._bytes[RAM_BEGINS:] = bytes(self.model.ends - RAM_BEGINS)
         self.restore(register for register in self.model.registers if not register.eeprom)
 
     def read(self, address: int, length: int) -> bytes:
@@ -64,7 +60,7 @@ class ControlTable:
             Refusal: access error past the end, and where there is no register at all.
         """
         end = address + length
-        if length == 0 or end > TABLE_ENDS or not any(self._at[address:end]):
+        if length == 0 or end > self.model.ends or not any(self._at[address:end]):
             raise Refusal(ErrorCode.ACCESS, f"nothing to read at {address}, {length} bytes")
         return bytes(self._bytes[self._target(at)] for at in range(address, end))
 
@@ -74,21 +70,21 @@ class ControlTable:
         Raises:
             Refusal: undefined, read-only, half a register, or a value outside the register's own range.
         """
-        if address + len(data) > TABLE_ENDS:
+        if address + len(data) > self.model.ends:
             raise Refusal(ErrorCode.ACCESS, f"no register at {address}, {len(data)} bytes")
         bytes_at = {self._target(address + k): byte for k, byte in enumerate(data)}
         return [(register, _value(register, bytes_at)) for register in self._whole(bytes_at)]
 
     def touched(self, address: int, length: int) -> tuple[str, ...]:
         """Names of the registers in a range, through indirect addresses, in order and once each."""
-        inside = range(address, min(address + length, TABLE_ENDS))
+        inside = range(address, min(address + length, self.model.ends))
         found = (self._at[self._target(at)] for at in inside)
         return tuple(dict.fromkeys(register.name for register in found if register is not None))
 
     def _target(self, address: int) -> int:
-        for data_at, address_at, count in INDIRECT:
-            if data_at <= address < data_at + count:
-                at = address_at + 2 * (address - data_at)
+        for bank in self.model.indirect:
+            if bank.data_at <= address < bank.data_at + bank.count:
+                at = bank.address_at + 2 * (address - bank.data_at)
                 return int.from_bytes(self._bytes[at : at + 2], "little")
         return address
 

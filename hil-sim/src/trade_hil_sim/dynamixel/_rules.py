@@ -1,6 +1,6 @@
 """Rules that tie registers to each other: what may be written when, and which goals ask for no motion.
 
-Source: ROBOTIS e-Manual, descriptions of the control tables of "XL430-W250" and "XM430-W350".
+Source: ROBOTIS e-Manual, descriptions of the models' control tables.
 """
 
 from typing import Final

@@ -1,7 +1,7 @@
 """One simulated servo: how it answers instructions, and what it does by itself as time passes.
 
-Sources: ROBOTIS e-Manual, "XL430-W250" and "XM430-W350" (control table descriptions), "DYNAMIXEL Protocol 2.0". Where
-the manual leaves a choice, the one that is harder on a driver was taken; docs/simulators.md lists them.
+Sources: ROBOTIS e-Manual, the models' pages (control table descriptions), "DYNAMIXEL Protocol 2.0". Where the manual
+leaves a choice, the one that is harder on a driver was taken; docs/simulators.md lists them.
 """
 
 from collections.abc import Callable, Iterator
@@ -11,9 +11,10 @@ from trade_hil_sim._state import DeviceState
 
 from ._drive import Drive, Mode
 from ._memory import ControlTable, Refusal
+from ._models import XL430_W250
 from ._protocol import ALERT, ErrorCode
 from ._rules import GOALS, WATCHDOG_EXPIRED, HardwareError, check, seed_goals
-from ._table import BAUDS, CENTRE, RAD_PER_COUNT, XL430_W250, Model, Register
+from ._table import BAUDS, CENTRE, RAD_PER_COUNT, Model, Register
 
 __all__ = ["Emit", "Servo"]
 

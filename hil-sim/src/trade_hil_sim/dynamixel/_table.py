@@ -1,17 +1,17 @@
 """Control tables of the X series as data.
 
-Sources: ROBOTIS e-Manual, pages "XL430-W250" and "XM430-W350" (control table of EEPROM area, of RAM area). The drivers
-keep a table of their own on purpose: a mistake in one of them shows.
+Sources: ROBOTIS e-Manual, the models' pages (control table of EEPROM area, of RAM area). The drivers keep a table of
+their own on purpose: a mistake in one of them shows.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from math import tau
 from typing import Final
 
-__all__ = ["ACCELERATION_COUNTS_S2", "COUNTS_PER_TURN", "MODELS", "VELOCITY_COUNTS_S", "XL430_W250", "XM430_W350"]
-__all__ += ["Access", "Model", "Register"]
+__all__ = ["ACCELERATION_COUNTS_S2", "COUNTS_PER_TURN", "VELOCITY_COUNTS_S", "Access", "Indirect", "Model", "Register"]
+__all__ += ["gain", "x_series"]
 
 COUNTS_PER_TURN: Final = 4096
 CENTRE: Final = 2048
@@ -21,7 +21,6 @@ VELOCITY_COUNTS_S: Final = 0.229 * COUNTS_PER_TURN / 60
 ACCELERATION_COUNTS_S2: Final = 214.577 * COUNTS_PER_TURN / 3600
 """Counts per second squared in one unit of profile acceleration, 214.577 rev/min^2."""
 RAM_BEGINS: Final = 64
-TABLE_ENDS: Final = 662
 EXTENDED_RANGE: Final = 1_048_575
 """Goal positions in extended position mode: 256 turns either way."""
 BAUDS: Final = (9600, 57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000, 4_500_000)
@@ -60,6 +59,17 @@ class Register:
 
 
 @dataclass(frozen=True, slots=True)
+class Indirect:
+    """Registers that stand for others, byte by byte (e-Manual, "Indirect Address, Indirect Data")."""
+
+    first: int
+    """The number of the first one."""
+    count: int
+    address_at: int
+    data_at: int
+
+
+@dataclass(frozen=True, slots=True)
 class Model:
     """One kind of servo."""
 
@@ -69,12 +79,23 @@ class Model:
     registers: tuple[Register, ...]
     modes: frozenset[int]
     no_load_rpm: float
-    """At 12 V, e-Manual "Specifications"."""
-    supply_v: float = 12.0
+    """At the voltage it is made for, e-Manual "Specifications"."""
+    supply_v: float
+    indirect: tuple[Indirect, ...]
     by_name: Mapping[str, Register] = field(init=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "by_name", {register.name: register for register in self.registers})
+
+    @property
+    def ends(self) -> int:
+        """The address behind its last register."""
+        return self.registers[-1].address + self.registers[-1].size
+
+    @property
+    def full_effort_counts(self) -> int:
+        """What stands at address 126 at all it can do."""
+        return self.by_name["current_limit"].default if "current_limit" in self.by_name else FULL_LOAD
 
     @property
     def top_speed_counts_s(self) -> float:
@@ -85,31 +106,33 @@ class Model:
 READ: Final = Access.READ
 WRITE: Final = Access.WRITE
 GAIN: Final = (0, 16_383)
+FULL_LOAD: Final = 1000
 
 
-def _gain(address: int, name: str, default: int) -> Register:
+def gain(address: int, name: str, default: int) -> Register:
+    """A gain of its controllers, of which the simulation only keeps the number."""
     return Register(address, 2, name, WRITE, default, *GAIN)
 
 
-def _indirect() -> list[Register]:
-    """Indirect addresses and data 1..28 and 29..56; each address points at its own data until it is set."""
+def _indirect(banks: Sequence[Indirect]) -> list[Register]:
+    """Each address points at its own data until it is set."""
+    end = max(bank.data_at + bank.count for bank in banks) - 1
     registers: list[Register] = []
-    for first, address_at, data_at in ((1, 168, 224), (29, 578, 634)):
-        for k in range(28):
-            name = f"{first + k}"
-            address = Register(address_at + 2 * k, 2, f"indirect_address_{name}", WRITE, data_at + k, 64, 661)
-            registers += [address, Register(data_at + k, 1, f"indirect_data_{name}", WRITE, 0, 0, 255)]
+    for bank in banks:
+        for k in range(bank.count):
+            name, data_at = bank.first + k, bank.data_at + k
+            address = Register(bank.address_at + 2 * k, 2, f"indirect_address_{name}", WRITE, data_at, RAM_BEGINS, end)
+            registers += [address, Register(data_at, 1, f"indirect_data_{name}", WRITE, 0, 0, 255)]
     return registers
 
 
-def _x_series(number: int, firmware: int, own: list[Register]) -> tuple[Register, ...]:
-    """What all X430 share, with a model's own items put in or in place of the shared ones."""
+def x_series(number: int, firmware: int, own: Sequence[Register], indirect: Sequence[Indirect]) -> tuple[Register, ...]:
+    """What all models share, with a model's own items put in."""
     shared = [
         Register(0, 2, "model_number", READ, number),
         Register(2, 4, "model_information", READ),
         Register(6, 1, "firmware_version", READ, firmware),
         Register(7, 1, "id", WRITE, 1, 0, 252),
-        Register(8, 1, "baud_rate", WRITE, 1, 0, 7),
         Register(9, 1, "return_delay_time", WRITE, 250, 0, 254),
         Register(10, 1, "drive_mode", WRITE, 0, 0, 13),
         Register(11, 1, "operating_mode", WRITE, 3, 0, 16),
@@ -121,14 +144,12 @@ def _x_series(number: int, firmware: int, own: list[Register]) -> tuple[Register
         Register(48, 4, "max_position_limit", WRITE, 4095, 0, 4095),
         Register(52, 4, "min_position_limit", WRITE, 0, 0, 4095),
         Register(60, 1, "startup_configuration", WRITE, 0, 0, 3),
-        Register(63, 1, "shutdown", WRITE, 52, 0, 63),
         Register(64, 1, "torque_enable", WRITE, 0, 0, 1),
-        Register(65, 1, "led", WRITE, 0, 0, 1),
         Register(68, 1, "status_return_level", WRITE, 2, 0, 2),
         Register(69, 1, "registered_instruction", READ),
         Register(70, 1, "hardware_error_status", READ),
-        _gain(88, "feedforward_2nd_gain", 0),
-        _gain(90, "feedforward_1st_gain", 0),
+        gain(88, "feedforward_2nd_gain", 0),
+        gain(90, "feedforward_1st_gain", 0),
         # 255 is not in the range: it is what the register shows after the time has run out
         Register(98, 1, "bus_watchdog", WRITE, 0, 0, 127),
         Register(100, 2, "goal_pwm", WRITE, 885, signed=True),
@@ -148,58 +169,4 @@ def _x_series(number: int, firmware: int, own: list[Register]) -> tuple[Register
         Register(146, 1, "present_temperature", READ),
         Register(147, 1, "backup_ready", READ),
     ]
-    return tuple(sorted([*shared, *own, *_indirect()], key=lambda register: register.address))
-
-
-XL430_W250: Final = Model(
-    name="XL430-W250",
-    number=1060,
-    firmware=45,
-    registers=_x_series(
-        1060,
-        45,
-        [
-            Register(31, 1, "temperature_limit", WRITE, 72, 0, 100),
-            Register(32, 2, "max_voltage_limit", WRITE, 140, 60, 140),
-            Register(34, 2, "min_voltage_limit", WRITE, 60, 60, 140),
-            Register(44, 4, "velocity_limit", WRITE, 265, 0, 1023),
-            _gain(76, "velocity_i_gain", 1000),
-            _gain(78, "velocity_p_gain", 100),
-            _gain(80, "position_d_gain", 4000),
-            _gain(82, "position_i_gain", 0),
-            _gain(84, "position_p_gain", 640),
-            Register(126, 2, "present_load", READ, signed=True),
-        ],
-    ),
-    modes=frozenset({1, 3, 4, 16}),
-    no_load_rpm=61.0,
-)
-
-XM430_W350: Final = Model(
-    name="XM430-W350",
-    number=1020,
-    firmware=45,
-    registers=_x_series(
-        1020,
-        45,
-        [
-            Register(31, 1, "temperature_limit", WRITE, 80, 0, 100),
-            Register(32, 2, "max_voltage_limit", WRITE, 160, 95, 160),
-            Register(34, 2, "min_voltage_limit", WRITE, 95, 95, 160),
-            Register(38, 2, "current_limit", WRITE, 1193, 0, 1193),
-            Register(44, 4, "velocity_limit", WRITE, 200, 0, 1023),
-            _gain(76, "velocity_i_gain", 1920),
-            _gain(78, "velocity_p_gain", 100),
-            _gain(80, "position_d_gain", 0),
-            _gain(82, "position_i_gain", 0),
-            _gain(84, "position_p_gain", 800),
-            Register(102, 2, "goal_current", WRITE, 1193, signed=True),
-            Register(126, 2, "present_current", READ, signed=True),
-        ],
-    ),
-    modes=frozenset({0, 1, 3, 4, 5, 16}),
-    no_load_rpm=46.0,
-)
-
-MODELS: Final[Mapping[str, Model]] = {model.name: model for model in (XL430_W250, XM430_W350)}
-"""Simulated models, by the name printed on the device."""
+    return tuple(sorted([*shared, *own, *_indirect(indirect)], key=lambda register: register.address))

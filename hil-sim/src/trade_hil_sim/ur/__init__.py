@@ -1,8 +1,9 @@
 """A Universal Robots arm and its controller: RTDE, dashboard and script port, with the motion of six joints."""
 
 from ._arm import HOME, JOINTS, Arm
-from ._bus import PORTS, UrBus
+from ._bus import UrBus
 from ._packets import Packet, PacketType, Recipe
+from ._ports import PORTS
 from ._table import INPUTS, MODELS, OUTPUTS, Command, RobotMode, SafetyMode
 
 __all__ = [

@@ -11,7 +11,7 @@ from trade_hil_sim._log import Entry
 
 from ._kinematics import flange, joints_for, pose_between, pose_of, way_of
 from ._motions import Braking, Free, Held, Motion, Servo, Speed, Way
-from ._table import MODELS, RobotMode, SafetyMode
+from ._table import CB3, E_SERIES, MODELS, RobotMode, SafetyMode, Series
 
 __all__ = ["HOME", "JOINTS", "Arm"]
 
@@ -24,6 +24,8 @@ _HALT_RAD_S2: Final = 15.0
 _POWER_S: Final = 0.2
 _UNLOCK_S: Final = 5.0
 _JAMMED_S: Final = 0.3
+_PAUSING_S: Final = 0.1
+"""A safeguard stop brakes it to rest on its way in this time."""
 _EVERY_RAD: Final = 0.02
 _EVERY_M: Final = 0.01
 Six = tuple[float, ...]
@@ -61,15 +63,24 @@ class Arm:
         self.emit: Callable[[Entry], None] = lambda _: None
         self.stopped: Callable[[], None] = lambda: None
         """Called when safety ends whatever program runs."""
+        self.paused: Callable[[bool], None] = lambda _: None
+        """Called when a safeguard stop holds it up, and when that is over."""
         self.t = t
         self.jammed = False
         self._motion: Motion = Held()
         self._moving = False
         self._unlock_s, self._locked_at = unlock_s, t
         self._jammed_s = 0.0
+        self._pace = 1.0
+        """How fast its motion goes on: 0 while a safeguard stop holds it up."""
         self._modes: list[tuple[float, RobotMode]] = []
 
     # --- what it is
+
+    @property
+    def series(self) -> Series:
+        """Of its controller."""
+        return E_SERIES if self.model.endswith("e") else CB3
 
     @property
     def ready(self) -> bool:
@@ -91,13 +102,18 @@ class Arm:
         """Whether it can be moved by hand."""
         return isinstance(self._motion, Free)
 
+    @property
+    def speeds(self) -> Six:
+        """How fast the joints turn, in rad/s."""
+        return self.qd if self._pace else (0.0,) * 6
+
     def pose(self, q: Sequence[float] | None = None) -> Six:
         """Of the flange: x, y, z in m, and a rotation vector in rad."""
         return pose_of(flange(MODELS[self.model], self.q if q is None else q))
 
-    def joints_for(self, pose: Sequence[float]) -> Six | None:
-        """The joint angles for a pose nearest to where it is; None if there are none."""
-        return joints_for(MODELS[self.model], pose, self.q)
+    def joints_for(self, pose: Sequence[float], near: Sequence[float] | None = None) -> Six | None:
+        """The joint angles for a pose nearest to these, or to where it is; None if there are none."""
+        return joints_for(MODELS[self.model], pose, self.q if near is None else near)
 
     # --- time
 
@@ -109,6 +125,11 @@ class Arm:
         if self.jammed and not self._motion.done:
             self._strain(dt)
             return
+        self._pace = self._paced(dt)
+        if not self._pace:
+            self._rest()
+            return
+        dt *= self._pace
         q, self.qd = self._motion.step(self.q, self.qd, dt * self.speed_fraction if self.ready else dt)
         if self._motion.done:
             self._motion = Free() if self.freedrive else Held()
@@ -123,10 +144,17 @@ class Arm:
         if was and not self._moving:
             self.note("at_rest")
 
-    def _strain(self, dt: float) -> None:
+    def _paced(self, dt: float) -> float:
+        change = -dt / _PAUSING_S if self.safety_mode is SafetyMode.SAFEGUARD_STOP else dt / _PAUSING_S
+        return max(0.0, min(1.0, self._pace + change))
+
+    def _rest(self) -> None:
         if self._moving:
             self._moving = False
-            self.note("at_rest", detail="jammed")
+            self.note("at_rest")
+
+    def _strain(self, dt: float) -> None:
+        self._rest()
         self.qd = (0.0,) * 6
         self._jammed_s += dt
         if self._jammed_s >= _JAMMED_S:
@@ -209,12 +237,16 @@ class Arm:
         self.safety(SafetyMode.PROTECTIVE_STOP, why)
 
     def safety(self, mode: SafetyMode, why: str = "") -> None:
-        """Enter a safety mode."""
+        """Enter a safety mode. One that it may not move in ends its program; a safeguard stop only holds it up."""
         if mode is self.safety_mode:
             return
-        self.safety_mode, self._locked_at = mode, self.t
+        was, self.safety_mode, self._locked_at = self.safety_mode, mode, self.t
         self.note(mode.name.lower(), detail=why)
-        if not mode.moves:
+        if SafetyMode.SAFEGUARD_STOP in {was, mode}:
+            self.paused(mode is SafetyMode.SAFEGUARD_STOP)
+        if mode.cuts_power:
+            self.power(False)
+        elif not mode.moves and mode is not SafetyMode.SAFEGUARD_STOP:
             self.halt()
             self.stopped()
 
@@ -229,7 +261,7 @@ class Arm:
 
     def reboot(self) -> None:
         """As after a loss of power: off, its brakes on, everything forgotten."""
-        self._motion, self._moving, self.qd = Held(), False, (0.0,) * 6
+        self._motion, self._moving, self.qd, self._pace = Held(), False, (0.0,) * 6, 1.0
         self._modes.clear()
         self.safety_mode, self.speed_fraction = SafetyMode.NORMAL, 1.0
         self._enter(RobotMode.POWER_OFF)

@@ -20,8 +20,9 @@ from trade_hil_sim._state import ArmTruth, BusState
 
 from ._arm import HOME, Arm
 from ._client import Client
-from ._dashboard import GREETING, Dashboard
+from ._dashboard import GREETING, Dashboard, lines_in
 from ._packets import Packet
+from ._ports import listeners
 from ._program import Program
 from ._rtde import Rtde, RtdeSession, measured
 from ._table import SafetyMode
@@ -30,9 +31,8 @@ if TYPE_CHECKING:
     from trade_drivers.robotfile import Arm as ArmRecord
     from trade_drivers.robotfile import Bus
 
-__all__ = ["PORTS", "UrBus"]
+__all__ = ["UrBus"]
 
-PORTS: Final = {"rtde": 30004, "dashboard": 29999, "script": 30003}
 ANSWER_S: Final = 10.0
 _ARM: Final = 0
 """The id of the arm in faults: it is the only one of its controller."""
@@ -51,7 +51,7 @@ class UrBus:
         arm: what it moves.
         host: a loopback address; default: one whose ports are free.
         name: of the bus, in the log.
-        rate_hz: cycles a second: 500, or 125 on older controllers.
+        rate_hz: cycles a second; default: 500, or 125 for the arms of a CB3.
         remote: whether it is in remote control.
         log: where to record; default: a log in memory, at `log`.
     """
@@ -62,7 +62,7 @@ class UrBus:
         *,
         host: str = "",
         name: str = "bus",
-        rate_hz: float = 500.0,
+        rate_hz: float | None = None,
         remote: bool = True,
         log: ByteLog | None = None,
     ) -> None:
@@ -71,7 +71,8 @@ class UrBus:
         self.log = ByteLog() if log is None else log
         self.arm.emit = self._emit
         self.arm.t = time.monotonic()
-        self._program = Program(self.arm, self._emit)
+        rate_hz = rate_hz or self.arm.series.rate_hz
+        self._program = Program(self.arm, self._emit, 1 / rate_hz)
         self._rtde = Rtde(self._program, rate_hz)
         self._dashboard = Dashboard(self._program, remote=remote)
         self._period_s = 1 / rate_hz
@@ -162,7 +163,7 @@ class UrBus:
                         self._drop(client)
         finally:
             self._closing = True
-            self._hang_up()
+            self._switch_off()
             self._errands.close()
 
     def _serve(self) -> None:
@@ -204,7 +205,7 @@ class UrBus:
         for _ in range(_TRIES):
             host = self.port or f"127.{random.randint(64, 254)}.{random.randint(0, 254)}.{random.randint(1, 254)}"  # noqa: S311 - no secret
             try:
-                self._listeners = _listeners(host)
+                self._listeners = listeners(host)
             except OSError as problem:
                 if self.port:
                     raise SimulationError(f"cannot listen on {host}: {problem}; is another simulator there?") from None
@@ -242,7 +243,7 @@ class UrBus:
             case "rtde":
                 self._rtde.said(self._sessions[client], client.held)
             case "dashboard":
-                for line in _lines(client.held):
+                for line in lines_in(client.held):
                     answer = self._dashboard.answer(line)
                     detail = f"{line} -> {answer}"
                     t = time.monotonic()
@@ -250,8 +251,10 @@ class UrBus:
                     self._say(client, answer.encode() + b"\n", "dashboard")
             case _:
                 if (whole := client.held.rfind(b"\nend\n")) >= 0:
-                    self._program.upload(client.held[: whole + 5].decode(errors="replace"))
+                    text = client.held[: whole + 5].decode(errors="replace")
                     del client.held[: whole + 5]
+                    if self._dashboard.remote and not self._script.names("script"):
+                        self._program.upload(text)
 
     def _say_packet(self, client: Client, packet: Packet, name: str) -> None:
         self._say(client, packet.encode(), name)
@@ -268,12 +271,16 @@ class UrBus:
         client.close()
         self._note("left", source=client.name)
 
-    def _hang_up(self) -> None:
+    def _switch_off(self) -> None:
         for listener in self._listeners.values():
             listener.close()
         self._listeners = {}
-        for client in tuple(self._clients):
-            self._drop(client)
+        self._hang_up()
+
+    def _hang_up(self, only: str = "") -> None:
+        for client, kind in tuple(self._clients.items()):
+            if only in {"", kind}:
+                self._drop(client)
 
     # --- faults and orders
 
@@ -285,7 +292,7 @@ class UrBus:
             arm=arm.name,
             model=arm.model,
             positions_rad=list(arm.q),
-            velocities_rad_s=list(arm.qd),
+            velocities_rad_s=list(arm.speeds),
             pose=list(arm.pose()),
             moving=arm.moving,
             robot_mode=arm.robot_mode.name,
@@ -302,13 +309,8 @@ class UrBus:
         if unknown := set(getattr(command, "ids", None) or ()) - {_ARM}:
             raise SimulationError(f"bus {self.name} has no device {sorted(unknown)}; its arm is {_ARM}")
         match command:
-            case faults.Unplug():
-                self._hang_up()
-                self._note("unplugged")
-            case faults.Replug():
-                if not self._listeners:
-                    self._listen()
-                self._note("plugged")
+            case faults.Unplug() | faults.Replug() | faults.HangUp() | faults.Local():
+                self._do_to_ports(command)
             case faults.Heal():
                 self._script.heal()
                 self._rtde.frozen, self._absent, self.arm.jammed = {}, False, False
@@ -322,6 +324,20 @@ class UrBus:
                 self._absent = command.on
             case _:
                 self._do_to_arm(command)
+
+    def _do_to_ports(self, command: faults.Unplug | faults.Replug | faults.HangUp | faults.Local) -> None:
+        match command:
+            case faults.Unplug():
+                self._switch_off()
+                self._note("unplugged")
+            case faults.Replug():
+                if not self._listeners:
+                    self._listen()
+                self._note("plugged")
+            case faults.HangUp():
+                self._hang_up(command.kind)
+            case faults.Local():
+                self._dashboard.remote = not command.on
 
     def _do_to_arm(self, command: faults.Command) -> None:
         arm = self.arm
@@ -340,7 +356,7 @@ class UrBus:
             case faults.BrownOut():
                 self._program.stop()
                 arm.reboot()
-                self._hang_up()
+                self._switch_off()
                 self._note("rebooted")
                 self._boots_at = time.monotonic() + _REBOOT_S
             case _:
@@ -350,26 +366,5 @@ class UrBus:
         self._emit(Entry(time.monotonic(), "", "event", name, source=source, detail=detail))
 
     def _emit(self, entry: Entry) -> None:
-        self.log.add(msgspec.structs.replace(entry, bus=self.name, device_id=_ARM))
-
-
-def _listeners(host: str) -> dict[str, socket.socket]:
-    made: dict[str, socket.socket] = {}
-    try:
-        for name, number in PORTS.items():
-            made[name] = socket.socket()
-            made[name].setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            made[name].bind((host, number))
-            made[name].listen()
-            made[name].setblocking(False)
-    except OSError:
-        for listener in made.values():
-            listener.close()
-        raise
-    return made
-
-
-def _lines(held: bytearray) -> list[str]:
-    whole, found, rest = bytes(held).rpartition(b"\n")
-    held[:] = rest
-    return [line.decode(errors="replace").strip() for line in whole.split(b"\n")] if found else []
+        """Log it as of now: the arm's own time may lag behind when this thread is held up."""
+        self.log.add(msgspec.structs.replace(entry, t=time.monotonic(), bus=self.name, device_id=_ARM))

@@ -7,13 +7,13 @@ from collections.abc import Callable
 from typing import Final
 
 from ._arm import Arm
-from ._program import PLAYING, Program
-from ._rtde import VERSION
+from ._program import PAUSED, PLAYING, Program
 from ._table import SafetyMode
 
-__all__ = ["GREETING", "Dashboard"]
+__all__ = ["GREETING", "Dashboard", "lines_in"]
 
 GREETING: Final = "Connected: Universal Robots Dashboard Server"
+_STATES: Final = {PLAYING: "PLAYING", PAUSED: "PAUSED"}
 _NAME: Final = "wave.urp"
 _WAIT: Final = "Cannot unlock protective stop until 5s after occurrence. Always inspect cause of protective stop"
 
@@ -32,12 +32,12 @@ class Dashboard:
         self.remote = remote
         self._loaded = _NAME
         arm = self._arm
-        numbers = ".".join(str(number) for number in VERSION)
+        numbers = ".".join(str(number) for number in arm.series.version)
         self._asked: dict[str, Callable[[], str]] = {
             "robotmode": lambda: f"Robotmode: {arm.robot_mode.name}",
             "safetystatus": lambda: f"Safetystatus: {arm.safety_mode.name}",
             "safetymode": lambda: f"Safetymode: {arm.safety_mode.name}",
-            "programstate": lambda: f"{'PLAYING' if program.state == PLAYING else 'STOPPED'} {self._loaded}",
+            "programstate": lambda: f"{_STATES.get(program.state, 'STOPPED')} {self._loaded}",
             "running": lambda: f"Program running: {str(program.state == PLAYING).lower()}",
             "is in remote control": lambda: str(self.remote).lower(),
             "polyscopeversion": lambda: f"URSoftware {numbers} (Jan 01 2021)",
@@ -64,7 +64,7 @@ class Dashboard:
         """What a line gets."""
         word = " ".join(line.split())
         low = word.lower()
-        if low in self._asked:
+        if low in self._asked and low not in self._arm.series.lacks:
             return self._asked[low]()
         if not (low in self._ordered or low.startswith(("load ", "popup "))):
             return f'could not understand: "{word}"'
@@ -83,3 +83,10 @@ class Dashboard:
         self._arm.power(False)
         self._arm.safety(SafetyMode.NORMAL)
         return "Restarting safety"
+
+
+def lines_in(held: bytearray) -> list[str]:
+    """Take the whole lines out of what has come in."""
+    whole, found, rest = bytes(held).rpartition(b"\n")
+    held[:] = rest
+    return [line.decode(errors="replace").strip() for line in whole.split(b"\n")] if found else []

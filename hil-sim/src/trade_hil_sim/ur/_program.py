@@ -16,10 +16,11 @@ from ._arm import Arm
 from ._motions import Way
 from ._table import Command
 
-__all__ = ["PLAYING", "STOPPED", "Program"]
+__all__ = ["PAUSED", "PLAYING", "STOPPED", "Program"]
 
 STOPPED: Final = 1
 PLAYING: Final = 2
+PAUSED: Final = 4
 _START_S: Final = 0.02
 _READY: Final = 1
 _DONE: Final = 2
@@ -34,7 +35,6 @@ _MOVES: Final = frozenset(
         *(Command.SERVO_J, Command.SERVO_L, Command.TEACH_ON, Command.FREEDRIVE_ON),
     }
 )
-_STEP_S: Final = 0.002
 _WAVE_RAD_S: Final = 0.2
 
 
@@ -44,9 +44,10 @@ class Program:
     Args:
         arm: what it moves.
         emit: where it logs.
+        step_s: how long a cycle of the controller takes.
     """
 
-    def __init__(self, arm: Arm, emit: Callable[[Entry], None]) -> None:
+    def __init__(self, arm: Arm, emit: Callable[[Entry], None], step_s: float) -> None:
         self.arm = arm
         self.state = STOPPED
         """``runtime_state``."""
@@ -57,7 +58,7 @@ class Program:
         self.out_ints = dict.fromkeys(range(48), 0)
         self.out_doubles = dict.fromkeys(range(48), 0.0)
         self.watchdog_hz = 0.0
-        self._emit = emit
+        self._emit, self._step_s = emit, step_s
         self._starts_at: float | None = None
         self._fed_at = 0.0
         self._busy = False
@@ -65,7 +66,7 @@ class Program:
         self._shown = Command.NOTHING
         self._async: Way | None = None
         self._operation = self._writes = 0
-        arm.stopped = self.stop
+        arm.stopped, arm.paused = self.stop, self.pause
 
     # --- from outside
 
@@ -88,12 +89,22 @@ class Program:
     def stop(self) -> None:
         """End it; what it moves brakes."""
         self._starts_at = None
-        if self.state == PLAYING:
+        if self.state != STOPPED:
             self.state, self.kind = STOPPED, ""
             self.watchdog_hz = 0.0
             self.arm.note("program_stopped")
             self.arm.halt()
         self._busy, self._async, self._shown = False, None, Command.NOTHING
+
+    def pause(self, on: bool) -> None:
+        """A safeguard stop holds it up: the script reads nothing and its watchdog does not count, then both go on.
+
+        Whether the watchdog of a real one counts meanwhile is not known: here is the case that helps nobody.
+        """
+        if self.state == (PLAYING if on else PAUSED):
+            self.state = PAUSED if on else PLAYING
+            self._fed_at = self.arm.t
+            self.arm.note("program_paused" if on else "program_resumed")
 
     def written(self, ints: Mapping[int, int], doubles: Mapping[int, float]) -> None:
         """Registers have been set by a client."""
@@ -104,7 +115,7 @@ class Program:
         self._fed_at = self.arm.t
         number = ints[0]
         self._log_command(number)
-        if number == Command.END and self.kind == "control":
+        if number == Command.END and self.kind == "control" and self.state == PLAYING:
             self.stop()
 
     # --- time
@@ -113,7 +124,7 @@ class Program:
         """One step of the script: look at the registers, obey, answer."""
         if self._starts_at is not None and self.arm.t >= self._starts_at:
             self._start()
-        if self.kind != "control":
+        if self.kind != "control" or self.state != PLAYING:
             return
         if self.watchdog_hz and self.arm.t - self._fed_at > 1 / self.watchdog_hz:
             self.arm.note("watchdog_expired")
@@ -178,17 +189,31 @@ class Program:
             case Command.FREEDRIVE_STATUS:
                 self.out_ints[1] = int(arm.freedrive)
             case Command.STEP_TIME:
-                self.out_doubles[0] = _STEP_S
+                self.out_doubles[0] = self._step_s
             case Command.TRIGGER_PROTECTIVE_STOP:
                 arm.protective_stop("triggered")
             case Command.WATCHDOG:
                 self.watchdog_hz = d[0]
                 arm.note("watchdog_armed", detail=f"{d[0]:g} Hz")
-            case Command.FORWARD_KINEMATICS | Command.FORWARD_KINEMATICS_OF:
-                pose = arm.pose(None if number == Command.FORWARD_KINEMATICS else d[:6])
-                self.out_doubles.update(enumerate(pose))
             case Command.STEADY:
                 self.out_ints[1] = int(not arm.moving)
+            case _:
+                self._work_out(number, d)
+
+    def _work_out(self, number: int, d: Sequence[float]) -> None:
+        """Answer a question of geometry; a pose that the arm cannot get to, asked for its angles, ends the script."""
+        near = d[6:12] if number in {Command.INVERSE_KINEMATICS_NEAR, Command.REACHES_NEAR} else None
+        match number:
+            case Command.FORWARD_KINEMATICS | Command.FORWARD_KINEMATICS_OF:
+                pose = self.arm.pose(None if number == Command.FORWARD_KINEMATICS else d[:6])
+                self.out_doubles.update(enumerate(pose))
+            case Command.INVERSE_KINEMATICS | Command.INVERSE_KINEMATICS_NEAR:
+                if (found := self.arm.joints_for(d[:6], near)) is None:
+                    self.stop()
+                else:
+                    self.out_doubles.update(enumerate(found))
+            case Command.REACHES | Command.REACHES_NEAR:
+                self.out_ints[1] = int(self.arm.joints_for(d[:6], near) is not None)
             case _:
                 self.out_doubles.update(dict.fromkeys(range(6), 0.0))  # not simulated: answered, and nothing done
 

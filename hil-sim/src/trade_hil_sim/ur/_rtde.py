@@ -10,7 +10,6 @@ from ._table import INPUTS, OUTPUTS, RobotMode
 
 __all__ = ["Rtde", "RtdeSession", "measured"]
 
-VERSION: Final = (5, 11, 1, 108_318)
 _INT: Final = "input_int_register_"
 _DOUBLE: Final = "input_double_register_"
 _SLIDER_BIT: Final = 1
@@ -92,7 +91,7 @@ class Rtde:
             case PacketType.PROTOCOL:
                 answer = bytes([packet.payload == b"\x00\x02"])
             case PacketType.VERSION:
-                answer = b"".join(number.to_bytes(4, "big") for number in VERSION)
+                answer = b"".join(number.to_bytes(4, "big") for number in self._arm.series.version)
             case PacketType.OUTPUTS:
                 answer = self._want(session, packet.payload)
             case PacketType.INPUTS:
@@ -113,7 +112,8 @@ class Rtde:
     def _want(self, session: RtdeSession, payload: bytes) -> bytes:
         wanted_hz = _frequency(payload[:8])
         names = names_in(payload[8:])
-        types = [OUTPUTS.get(name, "NOT_FOUND") for name in names]
+        lacks = self._arm.series.lacks
+        types = ["NOT_FOUND" if name in lacks else OUTPUTS.get(name, "NOT_FOUND") for name in names]
         if "NOT_FOUND" in types or wanted_hz is None:
             return b"\x00" + ",".join(types).encode()
         session.outputs = Recipe(names, OUTPUTS)
@@ -150,7 +150,7 @@ def measured(arm: Arm, program: Program) -> dict[str, Value]:
     values |= {
         "timestamp": arm.t,
         **dict.fromkeys(("target_q", "actual_q"), arm.q),
-        **dict.fromkeys(("target_qd", "actual_qd"), arm.qd),
+        **dict.fromkeys(("target_qd", "actual_qd"), arm.speeds),
         **dict.fromkeys(("target_TCP_pose", "actual_TCP_pose"), pose),
         "joint_temperatures": (30.0,) * 6,
         "actual_joint_voltage": (48.0,) * 6 if powered else still,

@@ -4,9 +4,21 @@ Source: Universal Robots, "Real-Time Data Exchange (RTDE) Guide": field names an
 """
 
 from enum import IntEnum
-from typing import Final
+from typing import Final, NamedTuple
 
-__all__ = ["INPUTS", "MODELS", "OUTPUTS", "TYPES", "Command", "Model", "RobotMode", "SafetyMode"]
+__all__ = [
+    "CB3",
+    "E_SERIES",
+    "INPUTS",
+    "MODELS",
+    "OUTPUTS",
+    "TYPES",
+    "Command",
+    "Model",
+    "RobotMode",
+    "SafetyMode",
+    "Series",
+]
 
 TYPES: Final = {
     "BOOL": "?",
@@ -97,6 +109,11 @@ class SafetyMode(IntEnum):
         """Whether the arm may move in it."""
         return self in {SafetyMode.NORMAL, SafetyMode.REDUCED}
 
+    @property
+    def cuts_power(self) -> bool:
+        """Whether the arm is without power in it, and stays so when it is over."""
+        return self > SafetyMode.SAFEGUARD_STOP
+
 
 class Command(IntEnum):
     """What ``input_int_register_0`` asks of the control script of ur-rtde 1.6.5 (observed on the wire)."""
@@ -114,17 +131,36 @@ class Command(IntEnum):
     TEACH_OFF = 19
     SERVO_L = 24
     STEP_TIME = 26
+    INVERSE_KINEMATICS_NEAR = 30
     TRIGGER_PROTECTIVE_STOP = 31
     STOP_L = 33
     STOP_J = 34
     WATCHDOG = 35
     FORWARD_KINEMATICS = 43
     FORWARD_KINEMATICS_OF = 44
+    INVERSE_KINEMATICS = 46
     STEADY = 47
     FREEDRIVE_ON = 52
     FREEDRIVE_OFF = 53
     FREEDRIVE_STATUS = 54
+    REACHES = 60
+    REACHES_NEAR = 61
     END = 255
+
+
+class Series(NamedTuple):
+    """What controllers of one series have in common."""
+
+    version: tuple[int, int, int, int]
+    """Of their software."""
+    rate_hz: float
+    """Cycles a second."""
+    lacks: frozenset[str]
+    """Fields and lines that the other series knows."""
+
+
+E_SERIES: Final = Series((5, 11, 1, 108_318), 500.0, frozenset())
+CB3: Final = Series((3, 15, 8, 106_339), 125.0, frozenset({"ft_raw_wrench", "is in remote control"}))
 
 
 class Model:

@@ -1,0 +1,306 @@
+"""The tables of containers in a file: checked, in order, and how each container is started."""
+
+import importlib.util
+import os
+import re
+import sys
+from collections.abc import Mapping, Sequence
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+from typing import Annotated, Any, Final, NamedTuple, NoReturn, TypeVar, cast
+
+import msgspec
+from msgspec import Meta, Struct
+
+from trade import Settings
+from trade.errors import ConfigurationError
+from trade.policies import read_policy
+from trade.rules import read_rules
+from trade_drivers import load, without
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib  # pyright: ignore[reportMissingImports]
+
+__all__ = ["LOCAL", "Around", "Entry", "Made", "Part", "Tables", "at", "converted", "line_of", "read_toml"]
+
+LOCAL: Final = "local"
+_KINDS: Final = ("robot", "gateway", "providers", "rules")
+_ONLY_WITH: Final = {"sim": "robot", "without": "robot", "allow": "providers"}
+_HEADER: Final = re.compile(r"\s*\[\s*([^\[\]]+?)\s*\]\s*(?:#.*)?$")
+_NAME: Final = re.compile(r"""["']([^"']*)["']|([\w-]+)""")
+_AT: Final = re.compile(r" - at `\$\.?([^`]*)`$")
+_UNKNOWN: Final = re.compile(r"contains unknown field `([^`]*)`")
+_MISSING: Final = re.compile(r"missing required field `([^`]*)`")
+
+_Text = Annotated[str, Meta(min_length=1)]
+_Read = TypeVar("_Read", bound=Struct)
+
+
+class Made(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, rename={"class_": "class"}):
+    """An object that is made in a container, and offered."""
+
+    class_: Annotated[str, Meta(pattern=r"^[A-Za-z_][\w.]*:[A-Za-z_][\w.]*$")]
+    """Such as ``mypkg.vision:Camera``."""
+    groups: list[_Text] = []
+    args: list[Any] | dict[str, Any] = []
+    """For its constructor, in order or by name."""
+
+
+class Entry(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """One container. Files are beside the system file; those of another host are as that host sees them."""
+
+    host: _Text = LOCAL
+    """``local``, or as for ssh: HOST or USER@HOST."""
+    robot: str = ""
+    """A robot file."""
+    sim: bool = False
+    """Simulate the robot's devices."""
+    without: list[_Text] = []
+    """Buses, cameras and sensors of the robot that are left out."""
+    gateway: str = ""
+    """A gateway file."""
+    providers: list[Made] | None = None
+    """What is made in it; modules of this host may be beside the system file."""
+    allow: list[_Text] = []
+    """Classes that others may make in it, besides these."""
+    rules: str = ""
+    """A rules file."""
+    after: list[_Text] = []
+    """Containers that must be up before."""
+    tls: str = ""
+    policy: str = ""
+    audit: str = ""
+    """Folder for the record of what happens in it."""
+    metrics: str = ""
+    """Where Prometheus finds its metrics: ``127.0.0.1:9464``."""
+    connect: list[_Text] | None = None
+    """Endpoints it dials; none: those of the system."""
+    listen: list[_Text] = []
+    command: _Text = "trade"
+    """Of another host: the path of ``trade`` there."""
+
+    @property
+    def kind(self) -> str:
+        """The key that says what it is; the file is checked to have one."""
+        return next(kind for kind in _KINDS if getattr(self, kind) not in ("", None))
+
+    @property
+    def file(self) -> str:
+        """The file of a robot, a gateway or rules."""
+        return self.robot or self.gateway or self.rules
+
+    @property
+    def is_local(self) -> bool:
+        """Whether it runs on the host of whoever brings the system up."""
+        return self.host == LOCAL
+
+
+class Around(Struct, frozen=True, kw_only=True):
+    """What holds for all containers of a file."""
+
+    system: str
+    """The system id."""
+    tls: str = ""
+    """Of containers of this host that name none; so are the policy and the folder for records."""
+    policy: str = ""
+    audit: str = ""
+    connect: Sequence[str] = ()
+    environment: Mapping[str, str] = {}
+    """Variables of containers of this host, besides those they inherit."""
+    inherited: Mapping[str, str] = os.environ
+
+
+class Part(NamedTuple):
+    """A container, and how it is started."""
+
+    name: str
+    entry: Entry
+    words: Sequence[str]
+    """After ``trade``."""
+    environment: Mapping[str, str]
+    """Besides what is set anyway."""
+
+    @property
+    def files(self) -> list[str]:
+        """What its host has to have."""
+        named = [self.environment[name] for name in ("TRADE_TLS", "TRADE_POLICY") if name in self.environment]
+        return [*([self.entry.file] if self.entry.file else []), *named]
+
+
+class Tables:
+    """The tables ``[container.NAME]`` of one file, whose shape is right.
+
+    Args:
+        path: of the file.
+        text: of the file, to tell lines.
+        around: what holds for all of them.
+        entries: by name.
+    """
+
+    def __init__(self, path: Path, text: str, around: Around, entries: Mapping[str, Entry]) -> None:
+        self.path = path
+        self.around = around
+        self._text = text
+        self._entries = entries
+
+    def parts(self) -> "list[Part]":
+        """All of them, each behind those that it has to wait for. Raises ConfigurationError."""
+        return [self._part(name) for name in self._order()]
+
+    def _order(self) -> list[str]:
+        for name, entry in self._entries.items():
+            for other in entry.after:
+                if other not in self._entries:
+                    self.refuse(name, "after", f"there is no container {other!r}; {_some(self._entries)}")
+        try:
+            return list(TopologicalSorter({name: entry.after for name, entry in self._entries.items()}).static_order())
+        except CycleError as cycle:
+            ring = cast("list[str]", cycle.args[1])[::-1]
+            self.refuse(ring[0], "after", f"is a ring: {' after '.join(ring)}; leave one of them out")
+
+    def _part(self, name: str) -> "Part":
+        """How a container is started."""
+        entry = self._entries[name]
+        self.check_kind(name, entry)
+        environment = {} if entry.gateway else self._environment_of(entry)
+        part = Part(name, entry, self._words(name, entry), environment)
+        try:
+            Settings.read(system=self.around.system, container=name, environment={})
+            if entry.is_local:
+                self.check_here(name, entry, environment)
+        except ConfigurationError as wrong:
+            self.refuse(name, entry.kind if entry.file else "", str(wrong))
+        return part
+
+    def check_kind(self, name: str, entry: Entry) -> None:
+        """Raises ConfigurationError: keys that do not go together."""
+        kinds = [kind for kind in _KINDS if getattr(entry, kind) not in ("", None)]
+        if len(kinds) != 1:
+            found = f"there is {' and '.join(kinds)}" if kinds else "there is none"
+            self.refuse(name, kinds[1] if kinds else "", f"takes one of {', '.join(_KINDS)}; {found}")
+        for key, kind in _ONLY_WITH.items():
+            if getattr(entry, key) and kind not in kinds:
+                self.refuse(name, key, f"goes with {kind}; leave it out")
+        if entry.is_local and entry.command != "trade":
+            self.refuse(name, "command", "goes with another host; leave it out")
+
+    def check_here(self, name: str, entry: Entry, environment: Mapping[str, str]) -> None:
+        """Raises ConfigurationError: what it needs of this host is not there, or is wrong."""
+        file = self.beside(entry.file)
+        if entry.robot:
+            without(load(file), entry.without)
+        if entry.sim and importlib.util.find_spec("trade_hil_sim") is None:
+            self.refuse(name, "sim", "needs trade-hil-sim; pip install trade-hil-sim")
+        if entry.rules:
+            read_rules(file)
+        if policy := environment.get("TRADE_POLICY"):
+            read_policy(Path(policy))
+        Settings.read(
+            system=self.around.system,
+            container=name,
+            connect=self._connect(entry),
+            environment={**self.around.inherited, **environment},
+        )
+
+    def _words(self, name: str, entry: Entry) -> list[str]:
+        dialled = [] if entry.gateway else [word for one in self._connect(entry) for word in ("--connect", one)]
+        file = str(self.beside(entry.file)) if entry.is_local else entry.file
+        allowed = [pattern for made in entry.providers or () for pattern in (made.class_,)] + entry.allow
+        match entry.kind:
+            case "robot":
+                left_out = [word for part in entry.without for word in ("--without", part)]
+                does = ["up", file, "--name", name, *(["--sim"] if entry.sim else []), *left_out]
+            case "gateway":
+                does = ["gateway", file]
+            case "rules":
+                does = ["rules", "run", file, "--name", name]
+            case _:
+                patterns = [word for pattern in dict.fromkeys(allowed) for word in ("--allow", pattern)]
+                does = ["container", "--name", name, *patterns]
+        return ["--system", self.around.system, *dialled, *does]
+
+    def _connect(self, entry: Entry) -> Sequence[str]:
+        return self.around.connect if entry.connect is None else entry.connect
+
+    def _environment_of(self, entry: Entry) -> dict[str, str]:
+        around = self.around if entry.is_local else Around(system=self.around.system)
+        named = self.environment(entry.tls or around.tls, entry.policy or around.policy, entry.host)
+        if entry.listen:
+            named["TRADE_LISTEN"] = ",".join(entry.listen)
+        if entry.metrics:
+            named["TRADE_METRICS"] = entry.metrics
+        if audit := entry.audit or around.audit:
+            named["TRADE_AUDIT"] = str(self.beside(audit)) if entry.is_local else audit
+        if entry.providers is not None and entry.is_local:
+            known = os.environ.get("PYTHONPATH")
+            named["PYTHONPATH"] = os.pathsep.join([str(self.path.parent.absolute()), *([known] if known else [])])
+        return {**around.environment, **named}
+
+    def environment(self, tls: str, policy: str, host: str = LOCAL) -> dict[str, str]:
+        """The variables for a certificate and a policy, as the host sees them."""
+        places = {"TRADE_TLS": tls, "TRADE_POLICY": policy}
+        named = {name: place for name, place in places.items() if place}
+        return {name: str(self.beside(place)) for name, place in named.items()} if host == LOCAL else named
+
+    def beside(self, named: str) -> Path:
+        """A file that the file names."""
+        return (self.path.parent / named).absolute()
+
+    def refuse(self, name: str, key: str, problem: str) -> NoReturn:
+        """Raises ConfigurationError about a container."""
+        raise ConfigurationError(where=at(self.path, self._text, ("container", name), key), problem=problem) from None
+
+
+def read_toml(path: Path) -> tuple[str, dict[str, Any]]:
+    """The text of a file, and what it says. Raises ConfigurationError."""
+    try:
+        text = path.read_text(encoding="utf-8")
+        return text, cast("dict[str, Any]", tomllib.loads(text))  # pyright: ignore[reportUnknownMemberType]
+    except FileNotFoundError:
+        raise ConfigurationError(where=str(path), problem="there is no such file") from None
+    except OSError as bad:
+        raise ConfigurationError(where=str(path), problem=f"cannot be read: {bad.strerror}") from None
+    except ValueError as bad:  # tomllib.TOMLDecodeError is one, and so is text that is no UTF-8
+        raise ConfigurationError(where=str(path), problem=f"not valid TOML: {bad}") from None
+
+
+def converted(raw: object, kind: type[_Read], path: Path, text: str, table: tuple[str, ...]) -> _Read:
+    """What a table says. Raises ConfigurationError, which names the line."""
+    try:
+        return msgspec.convert(raw, kind)
+    except msgspec.ValidationError as bad:
+        said = str(bad)
+    place = _AT.search(said)
+    inside = place.group(1) if place else ""
+    key, fields = re.split(r"[.\[]", inside, maxsplit=1)[0], (Made if inside else kind).__struct_encode_fields__
+    problem = said[: place.start()] if place else said
+    if unknown := _UNKNOWN.search(said):
+        key, problem = key or unknown.group(1), f"unknown key {unknown.group(1)!r}; there is {', '.join(fields)}"
+    elif missing := _MISSING.search(said):
+        problem = f"{missing.group(1)} is missing"
+    raise ConfigurationError(where=at(path, text, table, key), problem=problem)
+
+
+def at(path: Path, text: str, table: tuple[str, ...], key: str) -> str:
+    """Where a file speaks of something, for errors."""
+    return f"{path}:{line_of(text, table, key)}: {'.'.join((*table, key) if key else table)}"
+
+
+def line_of(text: str, table: Sequence[str], key: str = "") -> int:
+    """The line of a key in a table of a TOML text; else that of the table's header; 1 if that is not found either."""
+    inside, found = False, 1
+    wanted = re.compile(rf"""\s*["']?{re.escape(key)}["']?\s*=""")
+    for number, line in enumerate(text.splitlines(), 1):
+        if header := _HEADER.match(line):
+            names = [quoted or bare for quoted, bare in _NAME.findall(header.group(1))]
+            inside = names[: len(table)] == list(table)
+            found = number if inside and found == 1 else found
+        elif inside and key and wanted.match(line):
+            return number
+    return found
+
+
+def _some(names: Mapping[str, object]) -> str:
+    return f"there is {', '.join(names)}"

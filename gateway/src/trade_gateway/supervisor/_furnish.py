@@ -1,0 +1,91 @@
+"""What is done in a child once its process is up: its objects are made with their state, and asked for it."""
+
+from collections.abc import Callable, Mapping
+from typing import Any, Final, NamedTuple
+
+from trade import Container, Handle
+from trade.errors import CannotInstantiate, ConfigurationError, NoSuchService, TradeError
+from trade.starting import Started
+from trade_gateway._furnishing import function_of, make, name_of
+from trade_gateway._parts import Made
+from trade_gateway.supervisor._tables import Child
+
+__all__ = ["Furnished", "furnish", "save"]
+
+_SEEN_S: Final = 15.0
+_MADE_S: Final = 30.0
+
+
+class Furnished(NamedTuple):
+    """A child that has all that its table names."""
+
+    clock: Handle
+    """What it is asked for, to see whether it answers."""
+    made: dict[str, Handle]
+    """A service of each object that may have a state, by the object's name."""
+    problems: list[str]
+
+
+def furnish(member: Callable[[], Container], child: Child, started: Started, states: Mapping[str, Any]) -> Furnished:
+    """Wait until a child is seen, and make its objects; each has its state before anybody can call it.
+
+    Args:
+        member: the container that asks; if it is another one meanwhile, that one goes on.
+        child: which.
+        started: its process.
+        states: by the names of its objects.
+
+    Raises:
+        TradeError: it is not seen, or an object cannot be made.
+    """
+    made: dict[str, Handle] = {}
+    problems: list[str] = []
+    clock = _function(member, child, started, "clock")
+    for one in child.part.entry.providers or ():
+        name = name_of(one, made)
+        instantiate = _function(member, child, started, "instantiate")
+        made[name] = _made(instantiate, one, states.get(name), problems)[0]
+    return Furnished(clock, made, problems)
+
+
+def _function(member: Callable[[], Container], child: Child, started: Started, name: str) -> Handle:
+    asked = member()
+    try:
+        return function_of(asked, child.name, name, epoch=started.epoch, wait_s=_SEEN_S)
+    except TradeError as unseen:
+        if member() is not asked:
+            return _function(member, child, started, name)
+        if not isinstance(unseen, NoSuchService):
+            raise
+    problem = (
+        f"{child.name} is not seen within {_SEEN_S:g} s; does its certificate, its policy or its connect let it in?"
+    )
+    raise ConfigurationError(where=f"container.{child.name}", problem=problem)
+
+
+def _made(instantiate: Handle, one: Made, state: Any, problems: list[str]) -> tuple[Handle, ...]:
+    if state is not None:
+        try:
+            return make(instantiate, one, wait_s=_MADE_S, state=state)
+        except CannotInstantiate as refused:
+            problems.append(f"{one.class_} begins anew, as it does not take its state: {refused.problem}")
+    return make(instantiate, one, wait_s=_MADE_S)
+
+
+def save(member: Container, furnished: Furnished) -> dict[str, Any]:
+    """The states of a child's objects, by name; without those that are in use, moving or not there.
+
+    What has no state is not asked again.
+    """
+    states: dict[str, Any] = {}
+    for name, service in list(furnished.made.items()):
+        try:
+            state = member.save_state(member.handle(service.key))
+        except ConfigurationError:
+            del furnished.made[name]
+        except Exception:  # noqa: BLE001, S112 - what save_state raises comes as its own type; the state of before stays
+            continue
+        else:
+            if state is not None:
+                states[name] = state
+    return states

@@ -1,0 +1,136 @@
+"""One process of a child: started with a lifeline to this one, watched by a file descriptor, ended."""
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Final
+
+import msgspec
+
+from trade.starting import Started
+from trade_gateway.supervisor._tables import Child
+
+__all__ = ["Process", "rss_mb"]
+
+_LONGEST: Final = 300
+"""Characters of its last words."""
+_PAGE: Final = os.sysconf("SC_PAGE_SIZE")
+
+
+class Process:
+    """``trade WORDS --json`` as a child process. It leaves when this process ends, however that ends.
+
+    Args:
+        child: which.
+        logs: a folder for what it complains of, in ``NAME.log``; of the one before in ``NAME.1.log``.
+
+    Raises:
+        OSError: there can be no further process.
+    """
+
+    def __init__(self, child: Child, logs: Path) -> None:
+        self._log = logs / f"{child.name}.log"
+        self._said = b""
+        errors = _fresh(self._log)
+        try:
+            self._process = subprocess.Popen(  # noqa: S603 - this very program
+                [sys.executable, "-m", "trade_gateway", "--with-stdin", *child.part.words, "--json"],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL if errors is None else errors,
+                env=dict(child.environment),
+                start_new_session=True,  # Ctrl-C is for this process, which tells them in their order
+            )
+        finally:
+            if errors is not None:
+                os.close(errors)
+        try:
+            os.set_blocking(self.output, False)
+            self.end = os.pidfd_open(self._process.pid)
+        except OSError:
+            self._process.kill()
+            self._forget()
+            raise
+
+    @property
+    def pid(self) -> int:
+        """Its process id."""
+        return self._process.pid
+
+    @property
+    def output(self) -> int:
+        """A file descriptor that can be read when it has said something, or will say nothing any more."""
+        assert self._process.stdout is not None  # noqa: S101 - a pipe
+        return self._process.stdout.fileno()
+
+    def read(self) -> tuple[Started | None, bool]:
+        """What it says once it is up, if this is it; and whether there may be more.
+
+        Raises:
+            ValueError: its first line is something else.
+        """
+        try:
+            data = os.read(self.output, 65536)
+        except BlockingIOError:
+            return None, True
+        if not data or self._said.endswith(b"\n"):
+            return None, bool(data)
+        line, ended, _ = (self._said + data).partition(b"\n")
+        self._said = line + ended
+        if not ended:
+            return None, True
+        return msgspec.json.decode(line, type=Started), True
+
+    def leave(self) -> None:
+        """Tell it to leave."""
+        self._process.send_signal(signal.SIGTERM)
+
+    def kill(self) -> None:
+        """End it at once; the watchdogs of its devices stop what moves."""
+        self._process.kill()
+
+    def close(self) -> str:
+        """It has ended: how, in words. To be called once `end` says so."""
+        os.close(self.end)
+        code = self._forget()
+        if code < 0:
+            return f"crashed (signal {-code})"
+        words = self._last_words() if code else ""
+        return f"ended (exit code {code}{f': {words}' if words else ''})"
+
+    def _forget(self) -> int:
+        code = self._process.wait()
+        for pipe in (self._process.stdin, self._process.stdout):
+            if pipe is not None:
+                with contextlib.suppress(BrokenPipeError):
+                    pipe.close()
+        return code
+
+    def _last_words(self) -> str:
+        try:
+            lines = self._log.read_text(encoding="utf-8", errors="replace").splitlines()
+        except OSError:
+            return ""
+        return next((line.strip()[:_LONGEST] for line in reversed(lines) if line.strip()), "")
+
+
+def rss_mb(pid: int) -> float:
+    """Resident memory of a process, in MB; 0 if there is none."""
+    try:
+        return int(Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[1]) * _PAGE / 1e6
+    except (OSError, IndexError):
+        return 0.0
+
+
+def _fresh(log: Path) -> int | None:
+    """An empty log; None where none can be written: a full disk keeps nobody from running."""
+    try:
+        log.parent.mkdir(parents=True, exist_ok=True)
+        if log.exists():
+            log.replace(log.with_suffix(".1.log"))
+        return os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o600)
+    except OSError:
+        return None

@@ -1,0 +1,379 @@
+"""Keeps child processes up: one thread that starts them in order, asks them, ends them and starts them again."""
+
+import contextlib
+import math
+import os
+import selectors
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Final
+
+from msgspec import Struct, structs
+
+from trade import Container, Handle, Run
+from trade.errors import Busy, ServiceGone, TradeError
+from trade.starting import Started
+from trade_gateway.supervisor._furnish import Furnished, furnish, save
+from trade_gateway.supervisor._life import GRACE_S, SAVE_S, Do, Life, State
+from trade_gateway.supervisor._process import Process, rss_mb
+from trade_gateway.supervisor._store import StateStore
+from trade_gateway.supervisor._tables import Child
+
+__all__ = ["ChildInfo", "News", "Supervisor"]
+
+_ENDS_S: Final = GRACE_S + SAVE_S + 5.0
+"""How long one child may take to be gone."""
+
+
+class ChildInfo(Struct, frozen=True):
+    """How a child fares."""
+
+    name: str
+    state: str
+    """``stopped``, ``starting``, ``up``, ``silent``, ``stopping``, ``waiting`` or ``given up``."""
+    pid: int
+    """0: it has no process."""
+    restarts: int
+    why: str
+    """Why it ended, or is ended; empty while it is up."""
+    rss_mb: float = 0.0
+
+
+class News(Struct, frozen=True):
+    """Something has become of a child."""
+
+    child: str
+    state: str
+    text: str
+    bad: bool = False
+
+
+class _Unit:
+    """A child with all that belongs to it; only the supervisor's thread touches it."""
+
+    def __init__(self, child: Child, grace_s: float) -> None:
+        self.child = child
+        self.life = Life(child.terms, grace_s=grace_s)
+        self.process: Process | None = None
+        self.boot = 0
+        """Counts processes: what is told of an earlier one counts for nothing."""
+        self.furnished: Furnished | None = None
+        self.begun = False
+        self.was_up = False
+        self.leaving = ""
+        """Why it is not wanted any more."""
+        self.save_at = math.inf
+
+    @property
+    def gone(self) -> bool:
+        return bool(self.leaving) and not self.life.alive
+
+
+class Supervisor:
+    """Looks after the children that `go_by` names, until `close` ends them, last first.
+
+    Args:
+        member: the container from which they are asked; it may be another one each time.
+        tell: is told of what becomes of them, on the supervisor's thread.
+        folder: for logs, in ``logs``, and for what providers remember.
+        grace_s: how long one may take to leave before it is killed.
+    """
+
+    def __init__(
+        self, member: Callable[[], Container], tell: Callable[[News], None], folder: Path, *, grace_s: float = GRACE_S
+    ) -> None:
+        self._member = member
+        self._tell = tell
+        self._folder = folder
+        self._grace_s = grace_s
+        self._store = StateStore(
+            folder / f"{member().name}.state.sqlite", lambda text: tell(News(child="", state="", text=text, bad=True))
+        )
+        self._units: dict[str, _Unit] = {}
+        self._shown: tuple[ChildInfo, ...] = ()
+        self._inbox: deque[Callable[[], None]] = deque()
+        self._jobs: set[threading.Thread] = set()
+        self._closing = False
+        self._bell, self._rope = os.pipe()
+        os.set_blocking(self._bell, False)
+        os.set_blocking(self._rope, False)
+        self._selector = selectors.DefaultSelector()
+        self._selector.register(self._bell, selectors.EVENT_READ, self._rung)
+        self._thread = threading.Thread(target=self._run, name="trade-supervisor", daemon=True)
+        self._thread.start()
+
+    # --- from other threads
+
+    def go_by(self, children: Sequence[Child]) -> None:
+        """These are wanted, started in this order; only those that are started otherwise than before start again."""
+        self._post(partial(self._go_by, {child.name: child for child in children}))
+
+    def children(self) -> list[ChildInfo]:
+        """How they fare."""
+        return [structs.replace(info, rss_mb=round(rss_mb(info.pid), 1)) for info in self._shown]
+
+    def restart(self, name: str, who: str) -> bool:
+        """Start one again, also if it was given up; returns whether there is one of that name."""
+        if all(info.name != name for info in self._shown):
+            return False
+        self._post(partial(self._restart, name, who))
+        return True
+
+    def close(self) -> None:
+        """End them, those first that others do not wait for; their state is saved before. Idempotent."""
+        if not self._thread.is_alive():
+            return
+        self._post(self._close)
+        self._thread.join(_ENDS_S * (len(self._units) + 1))
+        for job in list(self._jobs):
+            job.join(_ENDS_S)
+        self._store.close()
+        self._selector.close()
+        os.close(self._bell)
+        os.close(self._rope)
+
+    def _post(self, what: Callable[[], None]) -> None:
+        self._inbox.append(what)
+        with contextlib.suppress(BlockingIOError, OSError):  # rung already, or closed
+            os.write(self._rope, b"!")
+
+    # --- the thread
+
+    def _run(self) -> None:
+        while not (self._closing and all(unit.gone for unit in self._units.values())):
+            due = min((min(unit.life.deadline, unit.save_at) for unit in self._units.values()), default=math.inf)
+            wait_s = None if due == math.inf else max(0.0, due - time.monotonic())
+            for key, _ in self._selector.select(wait_s):
+                key.data()
+            while self._inbox:
+                self._inbox.popleft()()
+            for unit in list(self._units.values()):
+                self._look(unit, time.monotonic())
+            self._shown = tuple(_info(unit) for unit in self._units.values())
+
+    def _rung(self) -> None:
+        with contextlib.suppress(BlockingIOError):
+            os.read(self._bell, 4096)
+
+    def _look(self, unit: _Unit, now: float) -> None:
+        if unit.leaving:
+            if not unit.life.alive or not self._needed(unit):
+                self._do(unit, unit.life.stop(now, unit.leaving))
+            if unit.gone and not self._closing:
+                del self._units[unit.child.name]
+        elif not unit.begun and all(self._has_been_up(name) for name in unit.child.terms.after):
+            unit.begun = True
+            self._do(unit, unit.life.start(now))
+        if unit.life.deadline <= now:
+            self._do(unit, unit.life.due(now))
+        if unit.save_at <= now:
+            unit.save_at = math.inf
+            self._save(unit)
+
+    def _has_been_up(self, name: str) -> bool:
+        return name in self._units and self._units[name].was_up
+
+    def _needed(self, unit: _Unit) -> bool:
+        """Whether one that is to end before it is still there."""
+        others = (other for other in self._units.values() if unit.child.name in other.child.terms.after)
+        return any(other.leaving and other.life.alive for other in others)
+
+    def _go_by(self, children: Mapping[str, Child]) -> None:
+        for name, unit in self._units.items():
+            if name not in children:
+                unit.leaving = "the file names it no more"
+        for name, child in children.items():
+            unit = self._units.get(name)
+            if unit is None:
+                self._units[name] = _Unit(child, self._grace_s)
+                continue
+            same, was_leaving = unit.child.starts_like(child), bool(unit.leaving)
+            unit.child, unit.life.terms, unit.leaving = child, child.terms, ""
+            if unit.begun and (was_leaving or not same):
+                self._do(unit, unit.life.start(time.monotonic()))
+
+    def _restart(self, name: str, who: str) -> None:
+        unit = self._units.get(name)
+        if unit is not None and not unit.leaving:
+            self._told(unit, f"{name} is started again, as {who} asks for it")
+            unit.begun = True
+            self._do(unit, unit.life.start(time.monotonic()))
+
+    def _close(self) -> None:
+        self._closing = True
+        for unit in self._units.values():
+            unit.leaving = "the gateway leaves"
+
+    # --- doing what a life says
+
+    def _do(self, unit: _Unit, do: Do | None) -> None:
+        match do:
+            case Do.LAUNCH:
+                self._launch(unit)
+            case Do.ASK:
+                self._ask(unit)
+            case Do.SAVE:
+                self._save(unit)
+            case Do.LEAVE if unit.process is not None:
+                if not unit.leaving:
+                    self._told(unit, f"{unit.child.name} is told to leave: {unit.life.why}")
+                unit.process.leave()
+            case Do.KILL if unit.process is not None:
+                self._told(unit, f"{unit.child.name} does not leave and is killed", bad=True)
+                unit.process.kill()
+            case _:
+                pass
+
+    def _launch(self, unit: _Unit) -> None:
+        unit.boot, unit.furnished, unit.save_at = unit.boot + 1, None, math.inf
+        try:
+            unit.process = Process(unit.child, self._folder / "logs")
+        except OSError as none:
+            self._ended(unit, f"there can be no process: {none}")
+            return
+        self._selector.register(unit.process.end, selectors.EVENT_READ, partial(self._died, unit))
+        self._selector.register(unit.process.output, selectors.EVENT_READ, partial(self._heard, unit))
+
+    def _heard(self, unit: _Unit) -> None:
+        process = unit.process
+        if process is None:  # it ended in the same round
+            return
+        try:
+            started, more = process.read()
+        except ValueError:
+            self._do(unit, unit.life.fail(time.monotonic(), "it said something else than that it is up"))
+            return
+        if not more:
+            self._selector.unregister(process.output)
+        if started is not None:
+            self._job(unit, "furnish", partial(self._furnish, unit, unit.child, started))
+
+    def _died(self, unit: _Unit) -> None:
+        process, unit.process = unit.process, None
+        if process is None:
+            return
+        self._selector.unregister(process.end)
+        with contextlib.suppress(KeyError):  # it had nothing more to say before
+            self._selector.unregister(process.output)
+        self._ended(unit, process.close())
+
+    def _ended(self, unit: _Unit, how: str) -> None:
+        life, name = unit.life, unit.child.name
+        unit.boot, unit.furnished, unit.save_at = unit.boot + 1, None, math.inf
+        do = life.ended(time.monotonic(), how)
+        match life.state:
+            case State.WAITING:
+                self._told(unit, f"{name} {how}; back in {life.wait_s:g} s", bad=True)
+            case State.GIVEN_UP:
+                times = f"{life.terms.restarts + 1} times in {life.terms.window_s:g} s"
+                again = f"trade call trade.restart_child '\"{name}\"' starts it again"
+                self._told(unit, f"{name} ended {times} and is given up; the last time it {how}. {again}", bad=True)
+            case State.STOPPED:
+                self._told(unit, f"{name} {how}", bad=not unit.leaving)
+            case _:
+                pass
+        self._do(unit, do)
+
+    # --- asking them
+
+    def _ask(self, unit: _Unit) -> None:
+        terms, furnished, now = unit.child.terms, unit.furnished, time.monotonic()
+        if unit.process is None or furnished is None:
+            return
+        if terms.max_rss_mb is not None and (took := rss_mb(unit.process.pid)) > terms.max_rss_mb:
+            self._do(unit, unit.life.fail(now, f"it took {took:.0f} MB of memory"))
+            return
+        try:
+            run = _again(self._member(), furnished.clock).with_(deadline_s=terms.question_s).start()
+        except TradeError:
+            self._do(unit, unit.life.missed(now))
+            return
+        run.when_done(lambda run: self._post(partial(self._answered, unit, unit.boot, run)))
+
+    def _answered(self, unit: _Unit, boot: int, run: Run) -> None:
+        if boot != unit.boot:
+            return
+        error, now = run.exception(0), time.monotonic()
+        if isinstance(error, (TimeoutError, ConnectionError, ServiceGone)) and not isinstance(error, Busy):
+            self._do(unit, unit.life.missed(now))
+        else:
+            unit.life.answered(now)
+
+    # --- what takes its time, on threads of its own
+
+    def _job(self, unit: _Unit, what: str, work: Callable[[], Callable[[], None]]) -> None:
+        """Have something done that waits; what comes of it counts only for the process that is there now."""
+        boot = unit.boot
+
+        def run() -> None:
+            then = work()
+            self._post(lambda: then() if unit.boot == boot else None)
+            self._jobs.discard(threading.current_thread())
+
+        thread = threading.Thread(target=run, name=f"trade-{what}-{unit.child.name}", daemon=True)
+        self._jobs.add(thread)
+        thread.start()
+
+    def _furnish(self, unit: _Unit, child: Child, started: Started) -> Callable[[], None]:
+        try:
+            furnished = furnish(self._member, child, started, self._store.load(child.name))
+        except Exception as wrong:  # noqa: BLE001 - what an object raises may come as its own type
+            why = f"it came up, but: {wrong}"
+            return lambda: self._do(unit, unit.life.fail(time.monotonic(), why))
+        return lambda: self._up(unit, furnished)
+
+    def _up(self, unit: _Unit, furnished: Furnished) -> None:
+        unit.life.up(time.monotonic())
+        if unit.life.state is not State.UP:
+            return
+        unit.furnished, unit.was_up = furnished, True
+        unit.save_at = time.monotonic() + unit.child.terms.save_every_s if furnished.made else math.inf
+        pid = unit.process.pid if unit.process else 0
+        self._told(unit, f"{unit.child.name} is {'back' if unit.life.restarts else 'up'}, process {pid}")
+        for problem in furnished.problems:
+            self._told(unit, problem, bad=True)
+
+    def _save(self, unit: _Unit) -> None:
+        furnished, child = unit.furnished, unit.child
+        if furnished is None or not furnished.made:
+            self._saved(unit)
+            return
+
+        def work() -> Callable[[], None]:
+            states = save(self._member(), furnished)
+            if states:
+                self._store.save(child.name, states)
+            return partial(self._saved, unit)
+
+        self._job(unit, "save", work)
+
+    def _saved(self, unit: _Unit) -> None:
+        now = time.monotonic()
+        if unit.life.state is State.STOPPING:
+            self._do(unit, unit.life.saved(now))
+        elif unit.furnished is not None and unit.furnished.made:
+            unit.save_at = now + unit.child.terms.save_every_s
+
+    def _told(self, unit: _Unit, text: str, *, bad: bool = False) -> None:
+        self._tell(News(child=unit.child.name, state=unit.life.state.value, text=text, bad=bad))
+
+
+def _again(member: Container, handle: Handle) -> Handle:
+    """The same service, asked from another container."""
+    return member.handle(handle.key)
+
+
+def _info(unit: _Unit) -> ChildInfo:
+    pid = unit.process.pid if unit.process else 0
+    life = unit.life
+    return ChildInfo(
+        name=unit.child.name,
+        state=life.state.value,
+        pid=pid,
+        restarts=life.restarts,
+        why=life.why or unit.leaving,
+    )

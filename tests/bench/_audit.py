@@ -1,0 +1,99 @@
+"""What an audit record costs a call, and how many records a second it takes."""
+
+import sys
+import tempfile
+import time
+from pathlib import Path
+from statistics import median, quantiles
+from typing import Final
+
+from tests.bench._alone import alone
+from tests.bench._children import child, hear
+from tests.bench._places import own_folder
+from tests.bench._report import print_target
+
+_SYSTEM: Final = "bench-audit"
+_OFF, _ON = "off", "on"
+_RATE: Final = 2000
+_MOST: Final = 1.05
+
+
+def run(n: int, rounds: int, seconds: float) -> None:
+    """Measure and print.
+
+    Args:
+        n: calls in a round.
+        rounds: how often each kind has its turn.
+        seconds: how long records come in.
+    """
+    with own_folder(), tempfile.TemporaryDirectory() as folder:
+        results = _measure_calls(folder, n, rounds)
+        written, lost, cpu = alone(_measure_rate, folder, seconds)
+    print(f"\na call to another process, medians over {rounds} rounds of {n}")
+    for name, pairs in results.items():
+        p50, p99 = (median(values) for values in zip(*pairs, strict=True))
+        print(f"audit {name:10}{p50:8.1f} us, p99 {p99:8.1f} us")
+    for i, what in enumerate(("p50", "p99")):
+        shares = [on[i] / off[i] for on, off in zip(results[_ON], results[_OFF], strict=True)]
+        print_target(f"{what}: audit on / off", shares, f"at most {_MOST:g}", lambda share: share <= _MOST)
+    print(f"{_RATE} records/s for {seconds:g} s: {lost} lost, {cpu:.0f} % of a core")
+    print_target("records/s written", [written], f"at least {0.99 * _RATE:g}", lambda rate: rate >= 0.99 * _RATE)
+
+
+def _serve(pipe, name: str, folder: str) -> None:
+    from trade import Container, Settings, service
+
+    class Lamp:
+        @service
+        def dim(self, level: float) -> float:
+            return level
+
+    with Container(Settings.read(container=name, system=_SYSTEM, audit=Path(folder) if folder else None)) as container:
+        container.register(Lamp(), name)
+        pipe.send("up")
+        pipe.poll(None)
+
+
+def _measure_calls(folder: str, n: int, rounds: int) -> dict[str, list[tuple[float, float]]]:
+    from trade import Container, Settings, where
+
+    results: dict[str, list[tuple[float, float]]] = {_OFF: [], _ON: []}
+    with (
+        child(_serve, _OFF, "") as plain,
+        child(_serve, _ON, folder) as kept,
+        Container(Settings.read(container="caller", system=_SYSTEM)) as container,
+    ):
+        hear(plain)
+        hear(kept)
+        lamps = {name: container.find(where(name="dim", group=name), wait_s=30) for name in results}
+        for i in range(rounds):
+            for name in (_OFF, _ON) if i % 2 else (_ON, _OFF):
+                took_us: list[float] = []
+                for _ in range(n):
+                    began = time.perf_counter_ns()
+                    lamps[name](0.5)
+                    took_us.append((time.perf_counter_ns() - began) / 1e3)
+                results[name].append((median(took_us), quantiles(took_us, n=100)[98]))
+            print(f"audit: round {i + 1} of {rounds}", file=sys.stderr, flush=True)
+    return results
+
+
+def _measure_rate(folder: str, seconds: float) -> tuple[float, int, float]:
+    """Records a second that were written, those lost, and per cent of a core."""
+    from trade._audit import Event
+    from trade._audit_store import Keep
+    from trade._audit_writer import AuditWriter
+
+    writer = AuditWriter(Path(folder) / "rate.sqlite", "bench", "", Keep(90, 10_000_000))
+    event = Event(time.time_ns(), 1, "call", "rosie.arm.reach", "", "anna", "anna/mind/1", 7, "ok", "", 5)
+    cpu_s, began, told = time.process_time(), time.monotonic(), 0
+    while (gone_s := time.monotonic() - began) < seconds:
+        for _ in range(told, int(gone_s * _RATE)):
+            writer.tell(event)
+            told += 1
+        time.sleep(0.005)
+    while writer.waiting and time.monotonic() - began < 10 * seconds:
+        time.sleep(0.001)
+    took_s = time.monotonic() - began
+    writer.close()
+    return (writer.written - 2) / took_s, writer.lost, (time.process_time() - cpu_s) / took_s * 100

@@ -1,0 +1,133 @@
+"""What it costs a gateway to look after ten children, and how soon one that crashed serves again."""
+
+import json
+import os
+import secrets
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Final
+
+import psutil
+from tests.bench._report import print_target
+
+from trade import Container, Settings, where
+
+_HEAD: Final = Path(__file__).parents[2] / "examples" / "head.toml"
+_CHILDREN: Final = 10
+_MOST_CORE, _MOST_S, _MOST_RATIO = 1.0, 1.5, 1.2
+_PATIENCE_S: Final = 60.0
+
+
+def run(rounds: int, seconds: float) -> None:
+    """Measure and print.
+
+    Args:
+        rounds: how often a driver is killed, and started without a supervisor.
+        seconds: how long the gateway of ten children is looked at.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        places = {"TRADE_RUNTIME_DIR": f"{folder}/runtime", "TRADE_STATE_DIR": f"{folder}/state"}
+        environment = {**os.environ, **places, "TRADE_SYSTEM": f"bench-{secrets.token_hex(4)}"}
+        os.environ.update(places)
+        system, file = environment["TRADE_SYSTEM"], Path(folder) / "gateway.toml"
+        with Container(Settings.read(system=system, container="bench")) as member:
+            shares = _overhead(file, system, environment, member, seconds)
+            again, plain = _restarts(file, system, environment, member, rounds)
+    print(f"\nsupervisor, {_CHILDREN} children over {seconds:.0f} s; {rounds} crashes of a simulated head:")
+    print_target("supervisor: % of a core", shares, f"at most {_MOST_CORE:g}", lambda share: share <= _MOST_CORE)
+    print_target("crash to serving, s", again, f"at most {_MOST_S:g}", lambda took_s: took_s <= _MOST_S)
+    ratios = [one / other for one, other in zip(again, plain, strict=True)]
+    print_target("crash to serving / plain start", ratios, f"at most {_MOST_RATIO:g}", lambda one: one <= _MOST_RATIO)
+
+
+def _overhead(file: Path, system: str, environment: dict[str, str], member: Container, seconds: float) -> list[float]:
+    """Percent of a core that a gateway takes for ten children, beyond what one takes that only knows of them."""
+    tables = "".join(f"[container.c{n}]\nproviders = []\n" for n in range(_CHILDREN))
+    file.write_text(f'system = "{system}"\n{tables}')
+    with (
+        _trade(environment, "gateway", str(file)) as door,
+        _trade(environment, "container", "--name", "idler") as idler,
+    ):
+        _until(lambda: _states(member).count("up") == _CHILDREN)
+        print(f"supervisor: {seconds:.0f} s", file=sys.stderr, flush=True)
+        processes = [psutil.Process(door.pid), psutil.Process(idler.pid)]
+        before = [_spent_s(one) for one in processes]
+        began = time.monotonic()
+        time.sleep(seconds)
+        gateway, idle = (_spent_s(one) - was for one, was in zip(processes, before, strict=True))
+        return [100 * (gateway - idle) / (time.monotonic() - began)]
+
+
+def _restarts(
+    file: Path, system: str, environment: dict[str, str], member: Container, rounds: int
+) -> tuple[list[float], list[float]]:
+    """Seconds from the crash of a driver until the next one answers, and from the start of one by hand."""
+    file.write_text(f'system = "{system}"\n[container.head]\nrobot = "{_HEAD}"\nsim = true\nrestarts = 1000\n')
+    again: list[float] = []
+    plain: list[float] = []
+    for number in range(rounds):
+        print(f"supervisor: crash {number + 1} of {rounds}", file=sys.stderr, flush=True)
+        with _trade(environment, "gateway", str(file)):
+            epoch = _served(member, "")
+            [info] = member.call(where(name="children"))
+            began = time.monotonic()
+            os.kill(info.pid, signal.SIGKILL)
+            _served(member, epoch)
+            again.append(time.monotonic() - began)
+        began = time.monotonic()
+        with _trade(environment, "up", str(_HEAD), "--sim", "--name", "head", ready=False):
+            _served(member, epoch)
+            plain.append(time.monotonic() - began)
+    return again, plain
+
+
+def _served(member: Container, not_by: str) -> str:
+    """Wait until a head answers, of another epoch; returns its epoch."""
+    found: list[str] = []
+
+    def answers() -> bool:
+        for state in member.services(where(name="state", group="rosie.head", kind="JointGroup")):
+            if state.key.address.epoch != not_by:
+                state()
+                found.append(state.key.address.epoch)
+        return bool(found)
+
+    _until(answers)
+    return found[0]
+
+
+def _states(member: Container) -> list[str]:
+    return [info.state for handle in member.services(where(name="children")) for info in handle()]
+
+
+def _spent_s(process: psutil.Process) -> float:
+    times = process.cpu_times()
+    return times.user + times.system
+
+
+def _until(true: Callable[[], Any]) -> None:
+    deadline = time.monotonic() + _PATIENCE_S
+    while not true():
+        if time.monotonic() > deadline:
+            raise TimeoutError(f"not so within {_PATIENCE_S:g} s")
+        time.sleep(0.01)
+
+
+@contextmanager
+def _trade(environment: dict[str, str], *words: str, ready: bool = True) -> Iterator["subprocess.Popen[str]"]:
+    command = [sys.executable, "-m", "trade_gateway", *words, "--json"]
+    process = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    try:
+        if ready:
+            json.loads(process.stdout.readline())
+        yield process
+    finally:
+        process.terminate()
+        process.communicate(timeout=_PATIENCE_S)

@@ -1,0 +1,101 @@
+"""What naive code makes of ends and beginnings of motion. Each changes one function."""
+
+from collections.abc import Callable, Generator, Iterator
+from typing import Any
+
+import pytest
+
+from trade._deadman import Deadman
+from trade_drivers._bus_thread import BusThread
+from trade_drivers.damiao._exchange import DamiaoExchange
+from trade_drivers.dynamixel import _table as dynamixel
+from trade_drivers.feetech import _table as feetech
+from trade_drivers.joints import Axis, Course, Exchange
+from trade_drivers.joints._jobs import Enable
+from trade_drivers.joints._motion import Motion
+from trade_drivers.joints._setpoint import SetPoint
+from trade_drivers.servos import told
+
+
+def a_driver_that_leaves_relaxes(patch: pytest.MonkeyPatch) -> None:
+    leave = Exchange.leave
+    patch.setattr(Exchange, "leave", lambda self, alive, *, relax: leave(self, alive, relax=True))
+
+
+def enabling_wants_no_fault(patch: pytest.MonkeyPatch) -> None:
+    steps = Enable.steps
+
+    def strict(self: Enable) -> Iterator[None]:
+        for axis in self.axes:
+            if axis.fault:
+                raise axis.faulty()
+        yield from steps(self)
+
+    patch.setattr(Enable, "steps", strict)
+
+
+def enabling_starts_no_servo_anew(patch: pytest.MonkeyPatch) -> None:
+    def as_it_is(bus: Any, job: Any, axis: Any) -> Generator[None, None, Any]:
+        yield
+        return axis.health
+
+    patch.setattr("trade_drivers.dynamixel._jobs._restarted", as_it_is)
+
+
+def enabling_resets_no_fault_of_a_drive(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr("trade_drivers.cia402._jobs._reset", lambda *_: iter(()))
+
+
+def the_end_of_a_session_stops_nothing(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(Deadman, "session_ended", lambda self, session: None)
+
+
+def the_last_speed_holds_for_ever(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(SetPoint, "watch", lambda self, now_ns: None)
+
+
+def _torque_alone(address: int) -> Callable[..., Iterator[None]]:
+    def enabling(bus: Any, job: Any, axis: Any) -> Iterator[None]:
+        yield from told(bus, job, axis, address, b"\x01")
+        axis.fault, axis.ready = "", True
+
+    return enabling
+
+
+def enabling_a_dynamixel_writes_torque_alone(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr("trade_drivers.dynamixel._jobs.enabling", _torque_alone(dynamixel.TORQUE_ENABLE.address))
+
+
+def enabling_a_feetech_writes_torque_alone(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr("trade_drivers.feetech._jobs.enabling", _torque_alone(feetech.TORQUE.address))
+
+
+def a_course_begins_at_zero(patch: pytest.MonkeyPatch) -> None:
+    def stand(self: DamiaoExchange, axis: Any) -> None:
+        accel = float(axis.accel_counts)
+        axis.course = Course(0, fastest=axis.speed_counts, accel=accel, braking=accel)
+
+    patch.setattr(DamiaoExchange, "stand", stand)
+
+
+def a_port_that_was_lost_is_not_opened_again(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(BusThread, "_reopen", lambda self: self.exchange.fail_all(self._gone))
+
+
+def two_motions_have_one_joint(patch: pytest.MonkeyPatch) -> None:
+    def take_over(self: Exchange, motion: Motion) -> None:
+        for axis in motion.axes:
+            axis.motion, axis.still, axis.halting_since_ns = motion, 0, 0
+
+    patch.setattr(Exchange, "take_over", take_over)
+
+
+def who_stands_outside_is_refused(patch: pytest.MonkeyPatch) -> None:
+    check_usable = Axis.check_usable
+
+    def strict(self: Axis, now_ns: int, stale_after_ns: int) -> Any:
+        sample = check_usable(self, now_ns, stale_after_ns)
+        self.check_goal(sample.position)
+        return sample
+
+    patch.setattr(Axis, "check_usable", strict)

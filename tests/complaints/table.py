@@ -1,0 +1,63 @@
+"""How a complaint is written down: a check that the product passes, and that a named mutant of it must fail."""
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+
+import waiting
+from complaints.bodies import KINDS
+
+__all__ = ["COMPLAINTS", "Row", "complaint"]
+
+_IMPATIENCE_S = 6.0
+"""How long a check waits for what a mutant never does; with the product it may take much longer."""
+
+COMPLAINTS: dict[str, list["Row"]] = {}
+"""By test, once its module is imported: what it is shown to fail with."""
+
+Check = Callable[[Any], None]
+
+
+class Row(NamedTuple):
+    """One line of a complaint's table."""
+
+    kind: str
+    """What the check is done on: a key of `KINDS`."""
+    mutant: Callable[[pytest.MonkeyPatch], None]
+    """Makes of the product what naive code would be, or puts a vendor's library in its place."""
+    says: str
+    """What the check must complain of then: it may not fail for another reason."""
+
+
+def complaint(
+    *rows: tuple[str, Callable[[pytest.MonkeyPatch], None], str], also: tuple[str, ...] = ()
+) -> Callable[[Check], Check]:
+    """Makes a test of a check: once for each kind, where it must pass, and once for each row, where it must fail.
+
+    ``also`` names kinds that no row is about: the mutant would change the same function.
+    """
+    table = [Row(*row) for row in rows]
+    kinds = dict.fromkeys([*(row.kind for row in table), *also])
+    runs = [pytest.param(kind, None, id=f"{kind}-the_product") for kind in kinds]
+    runs += [pytest.param(row.kind, row, id=f"{row.kind}-{row.mutant.__name__}") for row in table]
+
+    def decorate(check: Check) -> Check:
+        @pytest.mark.parametrize(("kind", "row"), runs)
+        def test(kind: str, row: Row | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+            with ExitStack() as undo:
+                if row is None:
+                    check(KINDS[kind](tmp_path, undo))
+                    return
+                monkeypatch.setattr(waiting, "PATIENCE_S", _IMPATIENCE_S)
+                row.mutant(monkeypatch)
+                with pytest.raises(AssertionError, match=row.says):
+                    check(KINDS[kind](tmp_path, undo))
+
+        COMPLAINTS[check.__name__] = table
+        test.__name__, test.__doc__, test.__module__ = check.__name__, check.__doc__, check.__module__
+        return test
+
+    return decorate

@@ -1,0 +1,105 @@
+"""What a row of the table of faults says."""
+
+from enum import Enum
+from typing import Final, Literal, NamedTuple
+
+import msgspec
+
+from trade.errors import DeviceError
+from trade_hil_sim import Command, Heal
+
+__all__ = ["STRUCK", "Dashboard", "Device", "Order", "Process", "Recovery", "Row", "Sick", "Stop"]
+
+Device = Literal["dynamixel", "cia402", "robotiq", "feetech", "odrive", "damiao", "ur"]
+STRUCK: Final = {
+    "dynamixel": (1,),
+    "cia402": (1,),
+    "robotiq": (9,),
+    "feetech": (1,),
+    "odrive": (1,),
+    "damiao": (1,),
+    "ur": (),
+}
+"""The ids of the devices that are struck."""
+
+
+class Sick(msgspec.Struct, frozen=True, tag_field="do", tag="sick"):
+    """The driver's own process says that it is not healthy: no fault of the simulator."""
+
+    on: bool = True
+
+
+class Process(msgspec.Struct, frozen=True, tag_field="do", tag="process"):
+    """The process of the driver that commands an arm is sent a signal: no fault of the simulator either."""
+
+    signal: Literal["KILL", "STOP"]
+
+
+class Dashboard(msgspec.Struct, frozen=True, tag_field="do", tag="dashboard"):
+    """Somebody else says a line to the dashboard of an arm's controller."""
+
+    line: str
+
+
+Order = Command | Sick | Process | Dashboard
+
+
+class Stop(Enum):
+    """What ends the motion that was under way."""
+
+    NOTHING = "it does not stop: the move ends as asked"
+    HOLD = "the driver has it hold"
+    WATCHDOG = "its own watchdog"
+    BOTH = "the driver has it hold and falls silent; then its own watchdog"
+    ITSELF = "the device itself"
+    HOLD_OR_PROGRAM = "the driver has it hold and gets no answer; then it has the controller end the program"
+    PROGRAM = "the driver has the controller end the program, by its dashboard; else its own watchdog"
+    BLOCKED = "what blocks it; the driver has it hold, or its own overload protection lets go, whichever is first"
+    NEAR = "nothing can reach it, and it has no watchdog: its last goal, which is never far ahead"
+    GOAL = "nothing can reach it, and it has no watchdog: it ends the move it was told"
+
+
+class Recovery(Enum):
+    """What somebody has to do, once the cause is gone, before it moves again."""
+
+    NOTHING = "nothing"
+    ENABLE = "`enable()`"
+    ACTIVATE = "`clear_fault()`, `activate()`"
+    UNLOCK = "`unlock_protective_stop()`"
+    START = "`power_on()`, `release_brakes()`"
+
+
+class Row(NamedTuple):
+    """One fault that strikes one kind of device in the middle of a slow move."""
+
+    device: Device
+    fault: str
+    strike: tuple[Order, ...]
+    error: type[DeviceError] | None
+    """What the move ends with; None: it goes unnoticed."""
+    says: str = ""
+    """Part of its message."""
+    state: type[DeviceError] | str = ""
+    """What ``state()`` raises while it lasts, or part of the fault it tells."""
+    stop: Stop = Stop.HOLD
+    stop_error: type[DeviceError] | None = None
+    """What ``stop()`` raises while it lasts."""
+    recovery: Recovery = Recovery.ENABLE
+    then: tuple[Order, ...] = ()
+    """What happens once it has been noticed."""
+    found: str = ""
+    """The fault that is latched then."""
+    cure: tuple[Order, ...] = (Heal(),)
+    registry: str = "healthy"
+    """Its health in the registry while it lasts."""
+    reopens: bool = False
+    """The port is closed and opened again."""
+    refuses: bool = True
+    """Further moves end in an error as long as it lasts; False: it is over at once."""
+    alone: bool = False
+    """It is tried on a robot of its own: which of two signs is seen first depends on what was tried before."""
+
+    @property
+    def name(self) -> str:
+        """For the test's id."""
+        return f"{self.device}: {self.fault}"

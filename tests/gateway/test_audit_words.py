@@ -1,0 +1,182 @@
+"""``trade audit``: what is in the records of a folder, in order; and whether each row is still what it was."""
+
+import json
+import sqlite3
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from trade._audit_chain import AuditRow
+from trade._audit_store import AuditStore
+from trade.errors import ConfigurationError
+from trade_gateway._output import UsageError
+from trade_gateway.cli import app
+
+
+def trade(*words: str | Path) -> Any:
+    return CliRunner().invoke(app, [str(word) for word in words])
+
+
+def lines(*words: str | Path) -> list[dict[str, Any]]:
+    done = trade(*words, "--json")
+    return [json.loads(line) for line in done.stdout.splitlines()]
+
+
+def whats(*words: str | Path) -> list[str]:
+    return [line["what"] for line in lines("audit", *words)]
+
+
+def row(what: str, at_s: float, **other: Any) -> AuditRow:
+    fields = {"kind": "call", "who": "anna", "outcome": "ok", "why": "", **other}
+    kind, who, outcome, why = (fields[name] for name in ("kind", "who", "outcome", "why"))
+    return AuditRow(0, int(at_s * 1e9), 1, "boot", kind, what, "", who, "anna/mind/1", 7, outcome, why, 5)
+
+
+def write(path: Path, rows: Sequence[AuditRow]) -> None:
+    store = AuditStore(path)
+    store.add(rows)
+    store.close()
+
+
+def do(path: Path, statement: str) -> None:
+    file = sqlite3.connect(path)
+    with file:
+        file.execute(statement)
+    file.close()
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    now, found = time.time(), tmp_path / "audit"
+    arm = [
+        row("rosie.arm.reach", now - 7200),
+        row("rosie.arm.grip", now - 60, who="berta"),
+        row("rosie.arm.grip", now - 30, kind="refused", outcome="AccessDenied", why="no rule gives berta [call]"),
+    ]
+    write(found / "arm.sqlite", arm)
+    write(found / "neck.sqlite", [row("rosie.neck.look", now - 3600), row("rosie.neck.nod", now - 45)])
+    return found
+
+
+def test_the_records_of_all_containers_are_shown_in_order_of_time(folder: Path) -> None:
+    assert whats(folder) == [
+        "rosie.arm.reach",
+        "rosie.neck.look",
+        "rosie.arm.grip",
+        "rosie.neck.nod",
+        "rosie.arm.grip",
+    ]
+    last = trade("audit", folder).stdout.splitlines()[-1]
+    assert "refused   arm: anna rosie.arm.grip AccessDenied: no rule gives berta [call]  (call 7)" in last
+
+
+def test_the_folder_of_the_containers_is_the_one_that_is_meant(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TRADE_AUDIT", str(folder))
+    assert len(whats()) == 5
+    assert len(whats("--since", "1m")) == 2
+
+
+@pytest.mark.parametrize(
+    ("words", "found"),
+    [
+        (["--since", "90m"], 4),
+        (["--since", "2001-09-09T03:46"], 5),
+        (["--who", "ber*"], 1),
+        (["--service", "rosie.neck.*"], 2),
+        (["--container", "arm"], 3),
+        (["--kind", "refused"], 1),
+        (["--kind", "lock"], 0),
+        (["--since", "90m", "--service", "*.grip", "--kind", "call"], 1),
+    ],
+)
+def test_one_asks_for_some_of_them(folder: Path, words: list[str], found: int) -> None:
+    assert len(whats(folder, *words)) == found
+
+
+def test_a_moment_that_is_none_is_refused(folder: Path) -> None:
+    done = trade("audit", folder, "--since", "yesterday")
+    assert isinstance(done.exception, UsageError)
+    assert "yesterday" in str(done.exception)
+
+
+def test_a_folder_without_records_is_no_empty_record(tmp_path: Path) -> None:
+    for words in (["audit"], ["audit", "verify"], ["audit", "head"]):
+        done = trade(*words, tmp_path / "nothing")
+        assert isinstance(done.exception, ConfigurationError)
+        assert "TRADE_AUDIT" in str(done.exception)
+
+
+# --- verify
+
+
+def test_a_record_that_is_whole_verifies(folder: Path) -> None:
+    done = trade("audit", "verify", folder)
+    assert done.exit_code == 0
+    assert "arm: 3 rows" in done.stdout
+    assert [line["ok"] for line in lines("audit", "verify", folder)] == [True, True]
+
+
+@pytest.mark.parametrize(
+    ("statement", "at"),
+    [
+        ("UPDATE record SET who = 'anna' WHERE seq = 2", 2),
+        ("DELETE FROM record WHERE seq = 2", 2),
+        ("DELETE FROM record WHERE seq = 3", 3),
+        ("UPDATE record SET seq = CASE seq WHEN 2 THEN -3 ELSE -2 END WHERE seq > 1", 2),
+        ("DROP TABLE record", 1),
+    ],
+)
+def test_one_that_is_not_ends_with_exit_code_1_and_names_the_row(folder: Path, statement: str, at: int) -> None:
+    do(folder / "arm.sqlite", statement)
+    assert trade("audit", "verify", folder).exit_code == 1
+    arm, neck = lines("audit", "verify", folder)
+    assert (arm["container"], arm["ok"], arm["broken_at"]) == ("arm", False, at)
+    assert neck["ok"]
+
+
+def test_rows_in_another_order_are_found(folder: Path) -> None:
+    for statement in ("UPDATE record SET seq = -seq WHERE seq > 1", "UPDATE record SET seq = 5 + seq WHERE seq < 0"):
+        do(folder / "arm.sqlite", statement)
+    done = trade("audit", "verify", folder)
+    assert done.exit_code == 1
+    assert "row 2: it was row 3" in done.stdout
+
+
+def test_a_file_that_is_no_record_does_not_verify(folder: Path) -> None:
+    (folder / "arm.sqlite").write_bytes(b"something else" * 1000)
+    done = trade("audit", "verify", folder)
+    assert done.exit_code == 1
+    assert "cannot be read" in done.stdout
+    assert whats(folder) == ["rosie.neck.look", "rosie.neck.nod"]
+
+
+def test_a_record_that_was_moved_aside_is_not_passed_over(folder: Path) -> None:
+    (folder / "arm.sqlite").rename(folder / "arm.sqlite.broken-17")
+    done = trade("audit", "verify", folder)
+    assert done.exit_code == 1
+    assert "arm.sqlite.broken-17" in done.stdout
+
+
+def test_heads_that_were_noted_elsewhere_find_a_record_written_anew(folder: Path, tmp_path: Path) -> None:
+    noted = tmp_path / "heads"
+    noted.write_text(trade("audit", "head", folder, "--json").stdout)
+    write(folder / "arm.sqlite", [row("rosie.arm.later", time.time())])
+    assert trade("audit", "verify", folder, "--against", noted).exit_code == 0
+    (folder / "arm.sqlite").unlink()
+    write(folder / "arm.sqlite", [row("rosie.arm.nothing", 1) for _ in range(9)])
+    assert trade("audit", "verify", folder).exit_code == 0
+    done = trade("audit", "verify", folder, "--against", noted)
+    assert done.exit_code == 1
+    assert "arm: row 3" in done.stdout
+    (folder / "neck.sqlite").unlink()
+    assert "neck: noted elsewhere" in trade("audit", "verify", folder, "--against", noted).stdout
+
+
+def test_notes_that_are_none_are_refused(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "heads").write_text("arm 3\n")
+    done = trade("audit", "verify", folder, "--against", tmp_path / "heads")
+    assert isinstance(done.exception, UsageError)

@@ -1,0 +1,351 @@
+"""Children of a gateway: up in order, up again after whatever ends or hangs them, given up when that is no use."""
+
+import os
+import queue
+import signal
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+
+import trade
+from system.conftest import ROSIES_HEAD, Program, at_ports
+from trade import Container, where
+from trade.errors import ConfigurationError
+from trade_gateway._gateway_file import read_gateway_file
+from trade_gateway.supervisor import ChildInfo, News, Supervisor
+from trade_hil_sim import SimProcess, events, writes
+from waiting import wait_until
+
+MODULE = """
+import os, signal, threading
+from trade import service
+
+class Counter:
+    def __init__(self) -> None:
+        self.total = 0
+
+    @service
+    def count(self) -> int:
+        self.total += 1
+        return self.total
+
+    @service(effect="read")
+    def shown(self) -> int:
+        return self.total
+
+    def save_state(self):
+        return {"total": self.total}
+
+    def restore_state(self, state) -> None:
+        self.total = state["total"]
+
+class Dies:
+    def __init__(self) -> None:
+        os._exit(3)
+
+class Stays:
+    def __init__(self) -> None:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+
+    @service
+    def poke(self) -> None: ...
+
+class Grows:
+    @service
+    def grow(self, mb: int) -> None:
+        self.kept = bytearray(b"x") * (mb * 1000000)
+"""
+COUNTER = 'providers = [{ class = "tiny:Counter", groups = ["hall"] }]\n'
+
+
+class Keeping:
+    """A supervisor in this process, its children in theirs."""
+
+    def __init__(self, folder: Path, member: Container, grace_s: float) -> None:
+        self.file = folder / "gateway.toml"
+        self.news: queue.SimpleQueue[News] = queue.SimpleQueue()
+        self.told: list[str] = []
+        self.supervisor = Supervisor(lambda: member, self.news.put, folder / "kept", grace_s=grace_s)
+        (folder / "tiny.py").write_text(MODULE)
+        self.system = member.settings.system
+
+    def go_by(self, text: str) -> None:
+        self.file.write_text(f'system = "{self.system}"\n{text}')
+        self.supervisor.go_by(read_gateway_file(self.file).children)
+
+    def child(self, name: str) -> ChildInfo | None:
+        return next((info for info in self.supervisor.children() if info.name == name), None)
+
+    def become(self, name: str, state: str, restarts: int = 0) -> ChildInfo:
+        """Wait until a child is in a state, started again so often at least."""
+        found: list[ChildInfo] = []
+
+        def is_so() -> bool:
+            info = self.child(name)
+            if info is None or info.state != state or info.restarts < restarts:
+                return False
+            found.append(info)
+            return True
+
+        wait_until(is_so, f"{name} is {state}")
+        return found[0]
+
+    def texts(self) -> list[str]:
+        while not self.news.empty():
+            self.told.append(self.news.get().text)
+        return self.told
+
+
+@pytest.fixture
+def keeping(system: str, tmp_path: Path, start_container: Callable[..., Container]) -> Iterator[Callable[..., Keeping]]:
+    made: list[Keeping] = []
+
+    def keep(text: str, grace_s: float = 20.0) -> Keeping:
+        made.append(Keeping(tmp_path, start_container(f"door{len(made)}"), grace_s))
+        made[-1].go_by(text)
+        return made[-1]
+
+    yield keep
+    for one in made:
+        one.supervisor.close()
+
+
+def call(name: str, *args: Any) -> Any:
+    return trade.find(where(name=name, group="hall"), wait_s=30)(*args)
+
+
+def test_children_start_in_order_and_end_in_the_other_one(keeping: Callable[..., Keeping]) -> None:
+    kept = keeping(f'[container.b]\nproviders = []\nafter = ["a"]\n[container.a]\n{COUNTER}')
+    kept.become("b", "up")
+    assert call("count") == 1
+    kept.supervisor.close()
+    assert [text.split()[0] for text in kept.texts()] == ["a", "b", "b", "a"]
+    assert kept.texts()[2:] == ["b ended (exit code 0)", "a ended (exit code 0)"]
+
+
+def test_P70_a_child_that_is_killed_is_back_with_its_state(keeping: Callable[..., Keeping]) -> None:
+    kept = keeping(f"[container.a]\nsave_every_s = 1\n{COUNTER}")
+    first = kept.become("a", "up")
+    assert call("count") == 1
+    assert call("count") == 2
+    saved = kept.supervisor._store
+    wait_until(lambda: saved.load("a") == {"tiny:Counter hall": {"total": 2}}, "it is saved")
+    os.kill(first.pid, signal.SIGKILL)
+    again = kept.become("a", "up", restarts=1)
+    assert again.pid != first.pid
+    assert call("shown") == 2
+    assert kept.texts()[1:] == ["a crashed (signal 9); back in 0.1 s", f"a is back, process {again.pid}"]
+
+
+def test_a_child_that_hangs_is_killed_and_started_again(keeping: Callable[..., Keeping]) -> None:
+    kept = keeping(f"[container.a]\nanswers_within_s = 1\n{COUNTER}", grace_s=0.5)
+    hung = kept.become("a", "up")
+    os.kill(hung.pid, signal.SIGSTOP)
+    kept.become("a", "up", restarts=1)
+    assert not psutil.pid_exists(hung.pid)
+    assert kept.texts()[1:4] == [
+        "a is told to leave: it did not answer within 1 s",
+        "a does not leave and is killed",
+        "a crashed (signal 9); back in 0.1 s",
+    ]
+
+
+def test_a_child_that_ignores_being_told_to_leave_is_killed(keeping: Callable[..., Keeping]) -> None:
+    kept = keeping('[container.a]\nallow = ["tiny:*"]\nproviders = []\n', grace_s=0.5)
+    stays = kept.become("a", "up")
+    os.kill(stays.pid, signal.SIGSTOP)
+    kept.supervisor.close()
+    assert not psutil.pid_exists(stays.pid)
+    assert kept.texts()[1:] == ["a does not leave and is killed", "a crashed (signal 9)"]
+
+
+@pytest.mark.parametrize(
+    ("wanted", "why"),
+    [
+        ('providers = [{ class = "tiny:Dies" }]', "ended (exit code 3)"),
+        ('providers = [{ class = "tiny:Nobody" }]', "it came up, but: "),
+        (f'robot = "{ROSIES_HEAD}"', "ended (exit code 1: ConfigurationError: "),
+    ],
+)
+def test_a_child_that_fails_for_ever_is_given_up_with_its_reason_and_comes_by_hand(
+    keeping: Callable[..., Keeping], wanted: str, why: str
+) -> None:
+    kept = keeping(f"[container.a]\nrestarts = 2\n{wanted}\n")
+    given_up = kept.become("a", "given up")
+    assert (given_up.restarts, given_up.pid) == (2, 0)
+    assert why in given_up.why
+    assert kept.texts()[-1].startswith("a ended 3 times in 300 s and is given up; the last time it ")
+    assert sum("back in" in text for text in kept.texts()) == 2
+    kept.go_by(f"[container.a]\nrestarts = 2\n{COUNTER}")
+    kept.become("a", "up")
+    assert call("count") == 1
+
+
+def test_a_child_that_leaks_is_saved_and_started_again(keeping: Callable[..., Keeping]) -> None:
+    kept = keeping(
+        "[container.a]\nmax_rss_mb = 400\n"
+        'providers = [{ class = "tiny:Grows", groups = ["hall"] }, { class = "tiny:Counter", groups = ["hall"] }]\n'
+    )
+    kept.become("a", "up")
+    call("count")
+    assert 0 < kept.supervisor.children()[0].rss_mb < 400
+    call("grow", 500)
+    kept.become("a", "up", restarts=1)
+    assert call("shown") == 1
+    assert "MB of memory" in kept.texts()[1]
+
+
+def test_one_that_is_never_restarted_is_not(keeping: Callable[..., Keeping]) -> None:
+    kept = keeping('[container.a]\nrestart = "never"\nproviders = []\n')
+    os.kill(kept.become("a", "up").pid, signal.SIGKILL)
+    assert kept.become("a", "stopped").restarts == 0
+    assert kept.texts()[-1] == "a crashed (signal 9)"
+
+
+def test_only_what_is_started_otherwise_than_before_starts_again(keeping: Callable[..., Keeping]) -> None:
+    others = "[container.b]\nproviders = []\n[container.c]\nproviders = []\n"
+    kept = keeping(f"[container.a]\n{COUNTER}{others}")
+    before = {name: kept.become(name, "up").pid for name in "abc"}
+    call("count")
+    kept.go_by(
+        f"[container.a]\n{COUNTER}allow = ['tiny:*']\n[container.b]\nproviders = []\nrestarts = 1\n"
+        f"[container.d]\n{COUNTER}"
+    )
+    kept.become("a", "up", restarts=1)
+    kept.become("d", "up")
+    wait_until(lambda: kept.child("c") is None)
+    after = {info.name: info.pid for info in kept.supervisor.children()}
+    assert after["b"] == before["b"]
+    assert after["a"] != before["a"]
+    assert trade.find(where(name="shown", container="a"), wait_s=30)() == 1
+
+
+@pytest.fixture
+def sim() -> Iterator[SimProcess]:
+    with SimProcess(ROSIES_HEAD) as running:
+        yield running
+
+
+def test_S20_of_two_that_look_after_one_robot_the_second_is_refused_and_gives_up_with_the_reason(
+    keeping: Callable[..., Keeping], sim: SimProcess, tmp_path: Path
+) -> None:
+    robot = at_ports(ROSIES_HEAD, sim, tmp_path)
+    kept = keeping(f'[container.one]\nrobot = "{robot}"\n')
+    first = kept.become("one", "up")
+    torn = keeping(f'[container.two]\nrobot = "{robot}"\nrestarts = 1\n')
+    refused = torn.become("two", "given up")
+    assert "ended (exit code 1: ConfigurationError: " in refused.why
+    assert any(port in refused.why for port in sim.ports.values())
+    assert torn.news.qsize() == 2  # it was tried twice, and no more
+    assert kept.become("one", "up").pid == first.pid
+
+
+class Door:
+    """``trade gateway`` with children."""
+
+    def __init__(self, run: Callable[..., Program], file: Path, text: str, system: str) -> None:
+        self.file = file
+        self._system = system
+        (file.parent / "tiny.py").write_text(MODULE)
+        self.write(text)
+        self.program = run("-m", "trade_gateway", "gateway", file, "--json")
+        self.ready = self.program.json()
+
+    def write(self, text: str) -> None:
+        self.file.write_text(f'system = "{self._system}"\nname = "door"\n{text}')
+
+    def until(self, state: str, child: str = "a") -> dict[str, Any]:
+        return self.program.wait_for(lambda said: (said.get("child"), said.get("state")) == (child, state))
+
+
+@pytest.fixture
+def door(run: Callable[..., Program], tmp_path: Path, system: str) -> Callable[[str], Door]:
+    return lambda text: Door(run, tmp_path / "gateway.toml", text, system)
+
+
+def children() -> list[Any]:
+    return trade.find(where(name="children"), wait_s=30)()
+
+
+def test_a_gateway_tells_of_its_children_and_starts_one_again_for_who_asks(door: Callable[[str], Door]) -> None:
+    there = door(f"[container.a]\n{COUNTER}")
+    there.until("up")
+    [info] = children()
+    assert (info.name, info.state, info.restarts, info.pid > 0, info.rss_mb > 1) == ("a", "up", 0, True, True)
+    call("count")
+    restart = trade.find(where(name="restart_child"))
+    with pytest.raises(ConfigurationError, match="no child 'b'; there is a"):
+        restart("b")
+    restart("a")
+    there.until("up")
+    assert call("shown") == 1
+    [again] = children()
+    assert (again.restarts, again.pid != info.pid) == (1, True)
+
+
+def test_children_end_with_their_gateway_however_that_ends(door: Callable[[str], Door]) -> None:
+    there = door(f'[container.a]\n{COUNTER}[container.head]\nrobot = "{ROSIES_HEAD}"\nsim = true\n')
+    there.until("up", "head")
+    pids = [info.pid for info in children()]
+    there.program.signal(signal.SIGKILL)
+    wait_until(lambda: not any(map(psutil.pid_exists, pids)), "they have left")
+
+
+def test_S19_a_driver_that_loses_its_gateway_stops_what_moves_and_leaves(
+    door: Callable[[str], Door], sim: SimProcess, tmp_path: Path
+) -> None:
+    there = door(f'[container.head]\nrobot = "{at_ports(ROSIES_HEAD, sim, tmp_path)}"\n')
+    there.until("up", "head")
+    [info] = children()
+    pan = trade.find(where(name="move_to", group="rosie.neck.pan"), wait_s=30)
+    pan.with_(deadline_s=120).start(1.0, 0.05)
+    wait_until(lambda: events(sim.entries(), "motion_started", device_id=1))
+    killed_at = time.monotonic()
+    there.program.signal(signal.SIGKILL)
+    wait_until(lambda: events(sim.entries(), "at_rest", device_id=1, since=killed_at))
+    wait_until(lambda: not psutil.pid_exists(info.pid), "it has left")
+    assert writes(sim.entries(), device_id=1, register="goal_position", since=killed_at)
+    assert not events(sim.entries(), "watchdog_expired")  # it was told to, before anything ran out
+
+
+def test_S18_a_driver_that_is_started_again_moves_and_enables_nothing(
+    door: Callable[[str], Door], sim: SimProcess, tmp_path: Path
+) -> None:
+    there = door(f'[container.head]\nrobot = "{at_ports(ROSIES_HEAD, sim, tmp_path)}"\n')
+    there.until("up", "head")
+    [info] = children()
+    killed_at = time.monotonic()
+    os.kill(info.pid, signal.SIGKILL)
+    there.until("up", "head")
+    for register in ("goal_position", "goal_velocity", "torque_enable"):
+        assert not writes(sim.entries(), register=register, since=killed_at)
+
+
+def test_P70_a_gateway_that_is_stopped_leaves_nobody_behind_and_all_is_known_when_it_is_back(
+    door: Callable[[str], Door],
+) -> None:
+    there = door(f"[container.a]\n{COUNTER}")
+    there.until("up")
+    call("count")
+    [info] = children()
+    there.program.signal(signal.SIGTERM)
+    assert there.program.wait() == 0
+    assert not psutil.pid_exists(info.pid)
+    door(f"[container.a]\n{COUNTER}").until("up")
+    assert call("shown") == 1
+
+
+def test_nonsense_in_the_file_changes_nothing_and_what_is_right_again_is_gone_by(door: Callable[[str], Door]) -> None:
+    there = door(f"[container.a]\n{COUNTER}")
+    there.until("up")
+    [info] = children()
+    there.write("[container.a]\nprovidres = []\n")
+    wait_until(lambda: "unknown key 'providres'" in "".join(there.program.errors))
+    assert [one.pid for one in children()] == [info.pid]
+    there.write(f"[container.a]\n{COUNTER}[container.b]\nproviders = []\n")
+    there.until("up", "b")
+    assert next(one.pid for one in children() if one.name == "a") == info.pid

@@ -1,0 +1,142 @@
+"""The chain that an audit record is: each row carries the hash of the one before, so that no row changes unnoticed.
+
+Pure: rows in, a verdict out. What a chain can prove, and what it cannot, is in decision 36.
+"""
+
+import hashlib
+from collections.abc import Iterable, Mapping
+from typing import Final
+
+import msgspec
+from msgspec import Struct, structs
+
+NOTHING: Final = bytes(32)
+"""What the first row of all has for the hash of the row before."""
+DROPPED: Final = "dropped"
+"""What a row of kind ``audit`` says when older rows were dropped; it is about the last of them, see `checkpoint`."""
+_FORMAT: Final = b"trade audit 1\0"
+_NEAR: Final = 1000
+"""So many places around a row are tried for the one that it was taken from."""
+_encode: Final = msgspec.msgpack.Encoder().encode
+
+
+class AuditRow(Struct, frozen=True, array_like=True, gc=False):
+    """One row of a record, as it is written and hashed: the order of the fields is part of the format."""
+
+    seq: int
+    """Counts the rows of a record, from 1."""
+    at_ns: int
+    """``time.time_ns()`` of the host."""
+    monotonic_ns: int
+    boot: str
+    """Epoch of the container that wrote it: another one after each start."""
+    kind: str
+    what: str
+    about: str
+    who: str
+    session: str
+    call_id: int
+    outcome: str
+    why: str
+    took_ns: int
+
+
+class Link(Struct, frozen=True, gc=False):
+    """A row with what ties it to the others, as it was read."""
+
+    row: AuditRow
+    before: bytes
+    hash: bytes
+
+
+class Head(Struct, frozen=True):
+    """Where a record ends."""
+
+    seq: int
+    hash: bytes
+
+
+class Verdict(Struct, frozen=True, kw_only=True):
+    """What the rows of a record prove."""
+
+    rows: int = 0
+    first: int = 0
+    """The oldest row there is; older ones were dropped in order if it is not 1."""
+    head: Head = Head(0, NOTHING)
+    """The newest row there is."""
+    broken_at: int = 0
+    """The first row that is not what it was, or is missing; 0: none."""
+    problem: str = ""
+    """What is wrong with it; empty: nothing."""
+
+
+def row_hash(before: bytes, row: AuditRow) -> bytes:
+    """SHA-256 of a row and the hash of the one before."""
+    return hashlib.sha256(_FORMAT + before + _encode(row)).digest()
+
+
+def checkpoint(head: Head) -> str:
+    """How a row says that all up to that one were dropped."""
+    return f"{head.seq} {head.hash.hex()}"
+
+
+def verify(links: Iterable[Link], head: Head, witnessed: Mapping[int, bytes] | None = None) -> Verdict:
+    """Walk a record from its oldest row to its newest.
+
+    Args:
+        links: its rows, in the order of their numbers.
+        head: where the record itself says that it ends.
+        witnessed: hashes of rows by number, as somebody else has noted them.
+    """
+    witnessed, rows, first, begins, dropped = witnessed or {}, 0, 0, "", ""
+    last = Head(0, NOTHING)
+    broken_at, problem = 0, ""
+    for link in links:
+        row = link.row
+        if not first:
+            first, last = row.seq, Head(row.seq - 1, link.before)
+            begins = checkpoint(last)
+        broken_at, problem = _wrong_row(link, last, witnessed)
+        if problem:
+            break
+        rows, last = rows + 1, Head(row.seq, link.hash)
+        if row.kind == "audit" and row.what == DROPPED:
+            dropped = row.about
+    if not problem:
+        broken_at, problem = _wrong_end(last, head, witnessed)
+    if not problem and first > 1 and dropped != begins:
+        broken_at, problem = 1, f"rows 1 to {first - 1} are missing, and no row says that just these were dropped"
+    return Verdict(rows=rows, first=first, head=last, broken_at=broken_at, problem=problem)
+
+
+def _wrong_row(link: Link, last: Head, witnessed: Mapping[int, bytes]) -> tuple[int, str]:
+    """What is wrong with a row behind that one, and where."""
+    seq = link.row.seq
+    if seq != last.seq + 1:
+        return last.seq + 1, f"rows {last.seq + 1} to {seq - 1} are missing"
+    if row_hash(link.before, link.row) != link.hash:
+        return seq, _changed(link)
+    if link.before != (NOTHING if seq == 1 else last.hash):
+        return seq, "it does not follow from the row before: one of them was replaced"
+    if witnessed.get(seq, link.hash) != link.hash:
+        return seq, "it is not the row that was noted elsewhere: it, or one before, was written anew"
+    return 0, ""
+
+
+def _wrong_end(last: Head, head: Head, witnessed: Mapping[int, bytes]) -> tuple[int, str]:
+    """What is wrong with where the rows end."""
+    if last.seq < head.seq:
+        return last.seq + 1, f"rows {last.seq + 1} to {head.seq} are missing, at the end"
+    if last != head:
+        return head.seq + 1, f"it is beyond row {head.seq}, where the record ends"
+    if (noted := max(witnessed, default=0)) > last.seq:
+        return last.seq + 1, f"row {noted} was noted elsewhere, and the record ends at {last.seq}"
+    return 0, ""
+
+
+def _changed(link: Link) -> str:
+    seq = link.row.seq
+    for place in range(max(1, seq - _NEAR), seq + _NEAR):
+        if row_hash(link.before, structs.replace(link.row, seq=place)) == link.hash:
+            return f"it was row {place}: rows were put into another order, or others in between"
+    return "it was changed"
