@@ -59,7 +59,7 @@ def rules(root: Path) -> Path:
 
 
 def a_unit(needs: Needs = Needs(), gateway: str = "/etc/trade/gateway.toml", **parts: object) -> str:  # noqa: B008 - frozen
-    usual = {"user": "trade", "containers": 0, "program": [sys.executable, "-m", "trade_gateway"], "folders": []}
+    usual = {"user": "trade", "containers": 0, "program": ["/opt/trade/bin/trade"], "folders": [], "records": []}
     return unit_text(Path(gateway), needs=needs, **{**usual, **parts})  # type: ignore[arg-type]
 
 
@@ -168,6 +168,27 @@ def test_of_what_the_unit_hides_it_shows_what_is_needed_and_cannot_be_written() 
     assert said_of(a_unit(folders=[Path("/opt/trade")]), "ProtectHome") == ["yes"]
 
 
+def test_a_robots_computer_that_its_gateway_looks_after(tmp_path: Path, root: Path) -> None:
+    shutil.copy(EXAMPLES / "head.toml", tmp_path)
+    shutil.copy(EXAMPLES / "legs.toml", tmp_path)
+    file = tmp_path / "robot.toml"
+    tables = [f'[container.{part}]\nrobot = "{part}.toml"\n' for part in ("head", "legs")]
+    file.write_text("\n".join(['system = "lab"', 'audit = "/srv/record"', *tables]))
+    assert "install --directory --owner trade --mode 0700 /srv/record" in " ".join(install(file, root).stdout.split())
+    text = unit(root).read_text()
+    assert said_of(text, "DeviceAllow") == ["char-ttyUSB rw", "char-ttyACM rw"]
+    assert said_of(text, "RestrictAddressFamilies")[0].endswith(" AF_CAN")
+    assert said_of(text, "ReadWritePaths") == ["/srv/record"]
+    assert said_of(text, "TimeoutStopSec") == said_of(a_unit(containers=2), "TimeoutStopSec")
+
+
+def test_it_may_write_where_its_record_lies_and_its_state() -> None:
+    places = [Path("/var/lib/trade/record"), Path("/srv/record"), Path("/home/anna/record")]
+    text = a_unit(records=places)
+    assert (said_of(text, "ReadWritePaths"), said_of(text, "BindPaths")) == (["/srv/record"], ["/home/anna/record"])
+    assert said_of(text, "ProtectHome") == ["tmpfs"]
+
+
 def test_it_waits_longer_for_a_gateway_that_looks_after_others() -> None:
     alone, several = (int(said_of(a_unit(containers=count), "TimeoutStopSec")[0]) for count in (0, 3))
     assert several == 4 * alone
@@ -178,7 +199,7 @@ def test_it_waits_longer_for_a_gateway_that_looks_after_others() -> None:
 def test_systemd_takes_the_unit_and_finds_it_exposed_little(tmp_path: Path, robots: list[str]) -> None:
     made = tmp_path / "trade-gateway.service"
     needs = needs_of(load(EXAMPLES / robot) for robot in robots)
-    made.write_text(a_unit(needs, folders=[Path("/home/anna/trade")]))
+    made.write_text(a_unit(needs, program=[sys.executable], folders=[Path("/home/anna/trade")]))
     verified = analyze("verify", "--man=no", str(made))
     assert (verified.returncode, verified.stderr) == (0, "")
     judged = analyze("security", "--offline=yes", f"--threshold={MOST_EXPOSED * 10:.0f}", str(made))

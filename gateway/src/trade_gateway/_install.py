@@ -5,6 +5,7 @@ import pwd
 import re
 import shlex
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -15,7 +16,7 @@ from trade.errors import ConfigurationError
 from trade_drivers import load
 from trade_gateway._files import replace
 from trade_gateway._gateway_file import read_gateway_file
-from trade_gateway._named import named_files
+from trade_gateway._named import Named, named_files
 from trade_gateway._output import Output, UsageError
 from trade_gateway._unit import UDEV_RULES, needs_of, program_folders, unit_text
 
@@ -45,7 +46,9 @@ def install(
     for given, form, option in ((name, _NAME, "--name"), (user, _USER, "--user")):
         if not form.fullmatch(given):
             raise UsageError(where=f"{option} {given}", problem="is no such name; use letters, digits, _ and -")
-    texts = _texts(file.absolute(), user, root / _UNITS / f"{name}.service", root / _RULES)
+    read_gateway_file(file)
+    named = named_files(file.absolute())
+    texts = {root / _UNITS / f"{name}.service": _marked(_unit(named, user)), root / _RULES: _marked(UDEV_RULES)}
     if show:
         for path, text in texts.items():
             print(f"# {path}\n{text}")  # noqa: T201 - as it stands, for other programs
@@ -56,22 +59,19 @@ def install(
         if path in fresh:
             _write(path, text)
         out.say(escape(f"{'wrote' if path in fresh else 'as it should be:'} {path}"))
-    _say_next(out, user, name)
+    _say_next(out, user, name, named.records)
 
 
-def _texts(file: Path, user: str, unit: Path, rules: Path) -> dict[Path, str]:
-    """What is to be where. Raises ConfigurationError: the gateway file, or what it names, is wrong."""
-    read_gateway_file(file)
-    named = named_files(file)
-    text = unit_text(
-        file,
+def _unit(named: Named, user: str) -> str:
+    return unit_text(
+        named.files[0],
         user=user,
-        needs=needs_of(load(robot) for robot in named.robots),
+        needs=needs_of(map(load, named.robots)),
         containers=named.containers,
         program=[sys.executable, "-m", "trade_gateway"],
         folders=[*program_folders(), *(one.parent for one in named.files)],
+        records=named.records,
     )
-    return {path: _marked(body) for path, body in ((unit, text), (rules, UDEV_RULES))}
 
 
 def _marked(text: str) -> str:
@@ -106,14 +106,15 @@ def _write(path: Path, text: str) -> None:
         raise ConfigurationError(where=str(path), problem=f"cannot be written: {bad.strerror}") from None
 
 
-def _say_next(out: Output, user: str, name: str) -> None:
+def _say_next(out: Output, user: str, name: str, records: Iterable[Path]) -> None:
     out.say("Next, on that computer:")
     try:
         pwd.getpwnam(user)
     except KeyError:
         out.say(f"  sudo useradd --system --home-dir /var/lib/trade --shell /usr/sbin/nologin {user}")
-    out.say(
-        "  sudo udevadm control --reload && sudo udevadm trigger --subsystem-match=tty --subsystem-match=usb-serial"
-    )
+    for folder in records:
+        out.say(escape(f"  sudo install --directory --owner {user} --mode 0700 {shlex.quote(str(folder))}"))
+    out.say("  sudo udevadm control --reload")
+    out.say("  sudo udevadm trigger --action=add --subsystem-match=tty --subsystem-match=usb-serial")
     out.say("  sudo systemctl daemon-reload")
     out.say(f"  sudo systemctl enable {name} && sudo systemctl restart {name}")

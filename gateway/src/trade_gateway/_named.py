@@ -1,7 +1,7 @@
 """Which files a gateway file or a system file names, with those that they name in turn."""
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, Final, NamedTuple, TypeVar, cast
 
@@ -19,6 +19,7 @@ __all__ = ["Named", "named_files"]
 
 _CERTIFICATE: Final = ("ca.pem", "cert.pem", "key.pem")
 _LOCAL: Final = "local"
+_Any = TypeVar("_Any")
 _Table = TypeVar("_Table", bound=Struct)
 
 
@@ -29,6 +30,8 @@ class Named(NamedTuple):
     """The file itself first."""
     robots: tuple[Path, ...]
     """Those of them that are robot files."""
+    records: tuple[Path, ...]
+    """Folders for the record of what happens."""
     systems: tuple[str, ...]
     """The ids of the systems that it is about, its own first."""
     containers: int
@@ -40,6 +43,7 @@ class _Part(Struct, kw_only=True):
 
     tls: str = ""
     policy: str = ""
+    audit: str = ""
     robot: str = ""
     rules: str = ""
     gateway: str = ""
@@ -86,14 +90,23 @@ def named_files(path: Path) -> Named:
     file = _read(path, _File)
     own = file.system if isinstance(file.system, _System) else _System(name=file.system)
     containers = [part for part in file.container.values() if part.host == _LOCAL]
-    files, robots, systems = [path], list[Path](), [own.name, *(share.system for share in file.share.values())]
+    files, robots, records = [path], list[Path](), list[Path]()
+    systems = [own.name, *(share.system for share in file.share.values())]
     for part in (file, own, *file.share.values(), *containers):
         files += part.files(path.parent)
         robots += [path.parent / part.robot] if part.robot else []
+        records += [path.parent / part.audit] if part.audit else []
         if part.gateway:
             inner = named_files(path.parent / part.gateway)
-            files, systems = [*files, *inner.files], [*systems, *inner.systems]
-    return Named(tuple(dict.fromkeys(files)), tuple(robots), tuple(dict.fromkeys(systems)), len(containers))
+            files += inner.files
+            robots += inner.robots
+            records += inner.records
+            systems += inner.systems
+    return Named(_once(files), _once(robots), _once(records), _once(systems), len(containers))
+
+
+def _once(several: Iterable[_Any]) -> tuple[_Any, ...]:
+    return tuple(dict.fromkeys(several))
 
 
 def _read(path: Path, kind: type[_Table]) -> _Table:

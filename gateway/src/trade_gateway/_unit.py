@@ -14,7 +14,8 @@ __all__ = ["UDEV_RULES", "Needs", "needs_of", "program_folders", "unit_text"]
 
 _COMES_AND_GOES: Final = re.compile(r"/dev/(serial/|tty(USB|ACM)\d)")
 _HIDDEN: Final = tuple(map(Path, ("/home", "/root", "/run/user", "/tmp", "/var/tmp")))  # noqa: S108 - what the unit hides
-_LEAVES_S: Final = 30
+_STATE: Final = Path("/var/lib/trade")
+_LEAVES_S: Final = 35
 """How long the gateway, and each of its containers, may take to leave: a robot is brought to rest, states are saved."""
 
 
@@ -59,7 +60,14 @@ def program_folders() -> list[Path]:
 
 
 def unit_text(
-    gateway: Path, *, user: str, needs: Needs, containers: int, program: Sequence[str], folders: Iterable[Path]
+    gateway: Path,
+    *,
+    user: str,
+    needs: Needs,
+    containers: int,
+    program: Sequence[str],
+    folders: Iterable[Path],
+    records: Iterable[Path],
 ) -> str:
     """A unit for ``trade gateway``.
 
@@ -70,16 +78,22 @@ def unit_text(
         containers: how many it looks after.
         program: the command that is ``trade``, with an absolute path.
         folders: what has to be readable, as absolute paths.
+        records: what has to be writable besides its folder for state, as absolute paths.
     """
-    shown = _outermost(folder for folder in folders if any(folder.is_relative_to(hidden) for hidden in _HIDDEN))
-    binds = [f"BindReadOnlyPaths={_quoted(str(folder))}" for folder in shown]
+    shown = _outermost(filter(_is_hidden, folders))
+    written = [folder for folder in _outermost(records) if not folder.is_relative_to(_STATE)]
+    homes = [
+        *(f"BindReadOnlyPaths={_quoted(str(folder))}" for folder in shown),
+        *(f"BindPaths={_quoted(str(folder))}" for folder in written if _is_hidden(folder)),
+    ]
+    open_ = [f"ReadWritePaths={_quoted(str(folder))}" for folder in written if not _is_hidden(folder)]
     families = ["AF_UNIX", "AF_INET", "AF_INET6", "AF_NETLINK", *(["AF_CAN"] if needs.can else [])]
     parts = {
         "FILE": _plain(str(gateway)),
         "COMMAND": " ".join(map(_quoted, (*program, "gateway", str(gateway)))),
         "USER": user,
         "LEAVES": str(_LEAVES_S * (1 + containers)),
-        "HOME": "\n".join(["ProtectHome=tmpfs", *binds] if binds else ["ProtectHome=yes"]),
+        "HOME": "\n".join([f"ProtectHome={'tmpfs' if homes else 'yes'}", *homes, *open_]),
         "DEVICES": _devices(needs),
         "FAMILIES": " ".join(families),
     }
@@ -91,6 +105,10 @@ def _devices(needs: Needs) -> str:
         return "PrivateDevices=yes"
     group = ["SupplementaryGroups=dialout"] if needs.serial else []
     return "\n".join([*group, "DevicePolicy=closed", *(f"DeviceAllow={one} rw" for one in needs.devices)])
+
+
+def _is_hidden(folder: Path) -> bool:
+    return any(folder.is_relative_to(hidden) for hidden in _HIDDEN)
 
 
 def _outermost(folders: Iterable[Path]) -> list[Path]:
