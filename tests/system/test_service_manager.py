@@ -8,7 +8,10 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import psutil
 import pytest
+
+from waiting import wait_until
 
 ROOT = Path(__file__).parents[2]
 FILE = """
@@ -54,6 +57,10 @@ class Service:
             stderr=subprocess.DEVNULL,
         )
 
+    def children(self) -> list[psutil.Process]:
+        """Those that run a program of their own by now."""
+        return [one for one in psutil.Process(self.process.pid).children() if "mind" in one.cmdline()]
+
     def tells(self) -> dict[str, str]:
         lines = self._manager.recv(4096).decode().splitlines()
         return {name: value for name, _, value in (line.partition("=") for line in lines)}
@@ -90,6 +97,22 @@ def test_a_gateway_tells_when_it_is_up_reads_its_file_and_leaves(
         assert service.next_but_alive()["RELOADING"] == "1"
         assert service.next_but_alive() == first
         service.leaves()
+    finally:
+        service.end()
+
+
+def test_what_a_gateway_looks_after_does_not_speak_for_it(manager: socket.socket, file: Path) -> None:
+    file.write_text(f"{file.read_text()}\n[container.mind]\nproviders = []\n")
+    service = Service(manager, "gateway", str(file))
+    try:
+        assert service.tells()["READY"] == "1"
+        wait_until(service.children, "its container is there")
+        [mind] = service.children()
+        asked = {"NOTIFY_SOCKET", "WATCHDOG_USEC"}
+        assert asked < psutil.Process(service.process.pid).environ().keys()  # as it was started
+        assert not asked & mind.environ().keys()
+        service.leaves()
+        assert not mind.is_running()
     finally:
         service.end()
 
