@@ -111,7 +111,7 @@ def _say_next(out: Output, user: str, name: str, records: Iterable[Path]) -> Non
     try:
         pwd.getpwnam(user)
     except KeyError:
-        out.say(f"  sudo useradd --system --home-dir /var/lib/trade --shell /usr/sbin/nologin {user}")
+        out.say(f"  sudo useradd --system --user-group --home-dir /var/lib/trade --shell /usr/sbin/nologin {user}")
     for folder in records:
         out.say(escape(f"  sudo install --directory --owner {user} --mode 0700 {shlex.quote(str(folder))}"))
     out.say("  sudo udevadm control --reload")
