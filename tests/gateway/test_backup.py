@@ -103,6 +103,15 @@ def test_it_has_what_the_gateway_file_names_and_the_state_of_its_system(config: 
     assert not list(out.parent.glob(".trade*"))
 
 
+def test_however_the_gateway_file_is_named(
+    config: Path, state: Path, out: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    expected = [entry.path for entry in back_up(config, out, state).files]
+    monkeypatch.chdir(config / "robots")
+    run("backup", "../gateway.toml", out, "--state", state, "--force")
+    assert [entry.path for entry in read_archive(out).files] == expected
+
+
 def test_put_back_everything_is_as_it_was(config: Path, state: Path, out: Path, tmp_path: Path) -> None:
     back_up(config, out, state)
     to = tmp_path / "new" / "etc"
@@ -224,6 +233,11 @@ def test_what_could_not_be_put_back_is_not_backed_up(
         back_up(config, out, state)
     assert not out.exists()
     assert not list(out.parent.glob(".trade*"))
+
+
+def test_a_backup_is_not_put_into_what_it_is_of(config: Path, state: Path) -> None:
+    with pytest.raises(ConfigurationError, match="is in the folder for state"):
+        back_up(config, state / "lab" / "trade.tar.gz", state)
 
 
 def test_nothing_is_overwritten_unless_by_force(config: Path, state: Path, out: Path, tmp_path: Path) -> None:

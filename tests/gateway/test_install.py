@@ -161,10 +161,10 @@ def test_a_port_that_stays_where_it_is_is_allowed_by_its_name(tmp_path: Path) ->
 
 
 def test_of_what_the_unit_hides_it_shows_what_is_needed_and_cannot_be_written() -> None:
-    folders = [Path("/home/anna/trade"), Path("/home/anna/trade/lib"), Path("/opt/trade"), Path("/home/anna/tradex")]
-    text = a_unit(folders=folders)
+    named = ["/home/anna/trade", "/home/anna/trade/lib", "/opt/trade", "/home/anna/tradex", "/home/a $5"]
+    text = a_unit(folders=map(Path, named))
     assert said_of(text, "ProtectHome") == ["tmpfs"]
-    assert said_of(text, "BindReadOnlyPaths") == ["/home/anna/trade", "/home/anna/tradex"]
+    assert said_of(text, "BindReadOnlyPaths") == ['"/home/a $5"', "/home/anna/trade", "/home/anna/tradex"]
     assert said_of(a_unit(folders=[Path("/opt/trade")]), "ProtectHome") == ["yes"]
 
 
@@ -180,6 +180,18 @@ def test_a_robots_computer_that_its_gateway_looks_after(tmp_path: Path, root: Pa
     assert said_of(text, "RestrictAddressFamilies")[0].endswith(" AF_CAN")
     assert said_of(text, "ReadWritePaths") == ["/srv/record"]
     assert said_of(text, "TimeoutStopSec") == said_of(a_unit(containers=2), "TimeoutStopSec")
+
+
+def test_for_another_computer_paths_are_as_that_one_sees_them(file: Path, root: Path, tmp_path: Path) -> None:
+    image = tmp_path / "image"
+    (image / "etc" / "trade").mkdir(parents=True)
+    inside = image / "etc" / "trade" / "gateway.toml"
+    inside.write_text(f'audit = "record"\n{FILE}')
+    install(Path(f"{image}/etc/../etc/trade/gateway.toml"), image)
+    text = unit(image).read_text()
+    assert said_of(text, "ExecStart")[0].endswith(" gateway /etc/trade/gateway.toml")
+    assert said_of(text, "ReadWritePaths") == ["/etc/trade/record"]
+    assert str(image) not in text
 
 
 def test_it_may_write_where_its_record_lies_and_its_state() -> None:

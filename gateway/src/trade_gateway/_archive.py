@@ -121,18 +121,13 @@ def read_archive(path: Path) -> Manifest:
         ConfigurationError: it is damaged or incomplete, or would put something where it does not belong.
     """
     with _opened(path) as (archive, manifest):
-        missing = {entry.path: entry for entry in manifest.files}
-        if len(missing) != len(manifest.files) or manifest.file not in missing:
+        names = {entry.path for entry in manifest.files}
+        if len(names) != len(manifest.files) or manifest.file not in names:
             raise _refused(path, "its manifest contradicts itself")
         for wrong in (entry.path for entry in manifest.files if not _stays_inside(entry.path)):
             raise _refused(path, f"{wrong!r} leads out of its folder")
-        for member in _files(archive):
-            entry = missing.pop(member.name, None)
-            if entry is None:
-                raise _refused(path, f"its manifest does not name {member.name!r}, or only once")
+        for member, entry in _files(path, archive, manifest):
             _copy(path, archive, member, entry, lambda _: None)
-        if missing:
-            raise _refused(path, f"it lacks {', '.join(missing)}")
     return manifest
 
 
@@ -149,12 +144,10 @@ def unpack(path: Path, manifest: Manifest, folders: Mapping[str, Path]) -> list[
         OSError: a file cannot be written.
     """
     unknown = set[str]()
-    entries = {entry.path: entry for entry in manifest.files}
     with _opened(path) as (archive, again):
         if again != manifest:
             raise _refused(path, "it was changed a moment ago")
-        for member in _files(archive):
-            entry = entries[member.name]
+        for member, entry in _files(path, archive, manifest):
             target = entry.below(folders[entry.part])
             _make_folder(target.parent, entry, unknown)
             fresh = fresh_beside(target)
@@ -241,9 +234,16 @@ def _opened(path: Path) -> "Generator[tuple[tarfile.TarFile, Manifest]]":
         raise _refused(path, str(damaged)) from None
 
 
-def _files(archive: tarfile.TarFile) -> Iterator[tarfile.TarInfo]:
-    """What is behind the manifest."""
-    return itertools.islice(archive, 1, None)
+def _files(path: Path, archive: tarfile.TarFile, manifest: Manifest) -> Iterator[tuple[tarfile.TarInfo, Entry]]:
+    """What is behind the manifest. Raises ConfigurationError: it is not what that names."""
+    missing = {entry.path: entry for entry in manifest.files}
+    for member in itertools.islice(archive, 1, None):
+        entry = missing.pop(member.name, None)
+        if entry is None:
+            raise _refused(path, f"its manifest does not name {member.name!r}, or only once")
+        yield member, entry
+    if missing:
+        raise _refused(path, f"it lacks {', '.join(missing)}")
 
 
 def _copy(

@@ -64,9 +64,11 @@ def backup(
         raise UsageError(where="OUT.tar.gz", problem=f"is missing: trade backup {file} OUT.tar.gz")
     if archive.exists() and not force:
         raise ConfigurationError(where=str(archive), problem="is there already; choose another name, or say --force")
-    folder = state or _state_folder()
+    folder = (state or _state_folder()).absolute()
+    if archive.absolute().is_relative_to(folder):
+        raise ConfigurationError(where=str(archive), problem="is in the folder for state; choose another place")
     with _said(archive), _staging(archive) as staging:
-        named = named_files(file.absolute())
+        named = named_files(file)
         sources = [*_config(named, staging), *_states(named, folder, staging)]
         _say(out, archive, write_archive(archive, sources, _about(file)))
     if not any(source.path.startswith(STATE) for source in sources):
@@ -128,15 +130,13 @@ def _config(named: Named, staging: Path) -> Iterator[Source]:
     """The file and what it names. Raises ConfigurationError: something is not there, or not beside it."""
     folder = named.files[0].parent
     for one in named.files:
-        inside = Path(os.path.normpath(one))
-        if not inside.is_relative_to(folder):
+        if not one.is_relative_to(folder):
             problem = f"is not in {folder}, so a backup could not be put back elsewhere; have it there"
-            raise ConfigurationError(where=str(inside), problem=problem)
-        path = f"{CONFIG}/{inside.relative_to(folder).as_posix()}"
+            raise ConfigurationError(where=str(one), problem=problem)
         try:
-            yield Source(path, _copied(one, staging), one)
+            yield Source(f"{CONFIG}/{one.relative_to(folder).as_posix()}", _copied(one, staging), one)
         except FileNotFoundError:
-            raise ConfigurationError(where=str(inside), problem="is named, and is not there") from None
+            raise ConfigurationError(where=str(one), problem="is named, and is not there") from None
 
 
 def _states(named: Named, folder: Path, staging: Path) -> Iterator[Source]:

@@ -1,6 +1,7 @@
 """``trade install GATEWAY.toml``: have the system start a gateway, and know its serial adapters."""
 
 import hashlib
+import os
 import pwd
 import re
 import shlex
@@ -47,8 +48,9 @@ def install(
         if not form.fullmatch(given):
             raise UsageError(where=f"{option} {given}", problem="is no such name; use letters, digits, _ and -")
     read_gateway_file(file)
-    named = named_files(file.absolute())
-    texts = {root / _UNITS / f"{name}.service": _marked(_unit(named, user)), root / _RULES: _marked(UDEV_RULES)}
+    named = named_files(file)
+    bodies = {root / _UNITS / f"{name}.service": _unit(named, user, root), root / _RULES: UDEV_RULES}
+    texts = {path: _marked(body) for path, body in bodies.items()}
     if show:
         for path, text in texts.items():
             print(f"# {path}\n{text}")  # noqa: T201 - as it stands, for other programs
@@ -62,15 +64,21 @@ def install(
     _say_next(out, user, name, named.records)
 
 
-def _unit(named: Named, user: str) -> str:
+def _unit(named: Named, user: str, root: Path) -> str:
+    above = Path(os.path.normpath(root.absolute()))
+
+    def seen(path: Path) -> Path:
+        """A path as that computer sees it."""
+        return Path("/") / path.relative_to(above) if path.is_relative_to(above) else path
+
     return unit_text(
-        named.files[0],
+        seen(named.files[0]),
         user=user,
         needs=needs_of(map(load, named.robots)),
         containers=named.containers,
-        program=[sys.executable, "-m", "trade_gateway"],
-        folders=[*program_folders(), *(one.parent for one in named.files)],
-        records=named.records,
+        program=[str(seen(Path(sys.executable))), "-m", "trade_gateway"],
+        folders=map(seen, (*program_folders(), *(one.parent for one in named.files))),
+        records=map(seen, named.records),
     )
 
 

@@ -1,5 +1,6 @@
 """Which files a gateway file or a system file names, with those that they name in turn."""
 
+import os
 import sys
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -19,12 +20,11 @@ __all__ = ["Named", "named_files"]
 
 _CERTIFICATE: Final = ("ca.pem", "cert.pem", "key.pem")
 _LOCAL: Final = "local"
-_Any = TypeVar("_Any")
 _Table = TypeVar("_Table", bound=Struct)
 
 
 class Named(NamedTuple):
-    """What is named, without asking whether it is there."""
+    """What is named, as absolute paths, without asking whether it is there."""
 
     files: tuple[Path, ...]
     """The file itself first."""
@@ -87,6 +87,7 @@ def named_files(path: Path) -> Named:
     Raises:
         ConfigurationError: it, or a policy that it names, cannot be read.
     """
+    path = path.absolute()
     file = _read(path, _File)
     own = file.system if isinstance(file.system, _System) else _System(name=file.system)
     containers = [part for part in file.container.values() if part.host == _LOCAL]
@@ -102,11 +103,11 @@ def named_files(path: Path) -> Named:
             robots += inner.robots
             records += inner.records
             systems += inner.systems
-    return Named(_once(files), _once(robots), _once(records), _once(systems), len(containers))
+    return Named(_once(files), _once(robots), _once(records), tuple(dict.fromkeys(systems)), len(containers))
 
 
-def _once(several: Iterable[_Any]) -> tuple[_Any, ...]:
-    return tuple(dict.fromkeys(several))
+def _once(paths: Iterable[Path]) -> tuple[Path, ...]:
+    return tuple(dict.fromkeys(Path(os.path.normpath(path)) for path in paths))
 
 
 def _read(path: Path, kind: type[_Table]) -> _Table:

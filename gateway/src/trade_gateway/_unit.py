@@ -90,7 +90,7 @@ def unit_text(
     families = ["AF_UNIX", "AF_INET", "AF_INET6", "AF_NETLINK", *(["AF_CAN"] if needs.can else [])]
     parts = {
         "FILE": _plain(str(gateway)),
-        "COMMAND": " ".join(map(_quoted, (*program, "gateway", str(gateway)))),
+        "COMMAND": " ".join(_quoted(word).replace("$", "$$") for word in (*program, "gateway", str(gateway))),
         "USER": user,
         "LEAVES": str(_LEAVES_S * (1 + containers)),
         "HOME": "\n".join([f"ProtectHome={'tmpfs' if homes else 'yes'}", *homes, *open_]),
@@ -120,9 +120,9 @@ def _outermost(folders: Iterable[Path]) -> list[Path]:
 
 
 def _quoted(word: str) -> str:
-    """A word as a command of a unit has it."""
-    escaped = _plain(word).replace("\\", "\\\\").replace('"', '\\"').replace("$", "$$")
-    return escaped if re.fullmatch(r"[\w@%+=:,./$-]+", escaped) else f'"{escaped}"'
+    """One word of a list."""
+    escaped = _plain(word).replace("\\", "\\\\").replace('"', '\\"')
+    return escaped if re.fullmatch(r"[\w@%+=:,./-]+", escaped) else f'"{escaped}"'
 
 
 def _plain(text: str) -> str:
