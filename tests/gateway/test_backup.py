@@ -16,7 +16,7 @@ from typer.testing import CliRunner, Result
 
 from certificates import Papers
 from trade.errors import ConfigurationError
-from trade_gateway._archive import Manifest, read_archive
+from trade_gateway._archive import Manifest, read_archive, unpack
 from trade_gateway.cli import app
 
 ROOT = Path(__file__).parents[2]
@@ -341,6 +341,18 @@ def test_what_was_changed_is_refused_before_anything_is_written(
         with pytest.raises(ConfigurationError, match="is no backup, or a damaged one"):
             run(*words)
     assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize("change", ["another content", "a file less", "a manifest of nothing"])
+def test_what_is_changed_after_it_was_looked_through_is_not_put_in_place(
+    config: Path, state: Path, out: Path, tmp_path: Path, change: str
+) -> None:
+    manifest = back_up(config, out, state)
+    write(out, CHANGES[change](read(out)))
+    with pytest.raises(ConfigurationError, match="is no backup, or a damaged one"):
+        unpack(out, manifest, {"config": tmp_path / "new", "state": tmp_path / "new" / "state"})
+    assert not (tmp_path / "new" / "state" / "lab" / "estop" / "door" / "open").exists()
+    assert not list((tmp_path / "new").rglob(".*"))
 
 
 @pytest.mark.parametrize("damage", ["cut short", "one bit", "no archive"])
