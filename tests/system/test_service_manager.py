@@ -11,6 +11,10 @@ from pathlib import Path
 import psutil
 import pytest
 
+import trade
+from system.conftest import ROSIES_HEAD, at_ports
+from trade import where
+from trade_hil_sim import SimProcess, events
 from waiting import wait_until
 
 ROOT = Path(__file__).parents[2]
@@ -42,6 +46,12 @@ def file(system: str, tmp_path: Path) -> Path:
     made = tmp_path / "gateway.toml"
     made.write_text(FILE.format(system=system, port=port))
     return made
+
+
+@pytest.fixture
+def sim() -> Iterator[SimProcess]:
+    with SimProcess(ROSIES_HEAD) as started:
+        yield started
 
 
 class Service:
@@ -125,3 +135,29 @@ def test_a_robot_tells_when_it_is_up_and_leaves(manager: socket.socket, system: 
         service.leaves()
     finally:
         service.end()
+
+
+@pytest.mark.parametrize("leave", ["hold", "relax"])
+def test_S19_a_service_that_is_stopped_leaves_its_robot_as_the_robot_file_says(
+    manager: socket.socket, sim: SimProcess, system: str, tmp_path: Path, leave: str
+) -> None:
+    robot = at_ports(ROSIES_HEAD, sim, tmp_path)
+    text = robot.read_text()
+    assert text.count('leave = "hold"') == 1
+    robot.write_text(text.replace('leave = "hold"', f'leave = "{leave}"'))
+    file = tmp_path / "gateway.toml"
+    file.write_text(f'system = "{system}"\n[container.head]\nrobot = "{robot}"\n')
+    service = Service(manager, "gateway", str(file))
+    try:
+        assert service.tells()["READY"] == "1"
+        pan = trade.find(where(name="move_to", group="rosie.neck.pan"), wait_s=60)
+        pan.with_(deadline_s=120).start(1.0, 0.05)
+        wait_until(lambda: events(sim.entries(), "motion_started", device_id=1))
+        service.leaves()
+    finally:
+        service.end()
+    [bus] = sim.control.state()
+    truth = next(device for device in bus.devices if device.device_id == 1)
+    assert (truth.torque, truth.moving) == (leave == "hold", False)
+    assert truth.position_rad < 1.0
+    assert not events(sim.entries(), "watchdog_expired")  # it was told to, before anything ran out
