@@ -4,6 +4,7 @@ import contextlib
 import hashlib
 import io
 import os
+import shutil
 import sqlite3
 import stat
 import tarfile
@@ -42,6 +43,7 @@ gateway = "gateway.toml"
 
 [container.rosie]
 robot = "robots/head.toml"
+tls = "pki/issued/rosie"
 
 [container.elsewhere]
 host = "anna@far.example"
@@ -131,10 +133,12 @@ def test_of_a_system_file_it_has_the_gateway_robots_and_rules_of_this_host(
     (config / "system.toml").write_text(SYSTEM_FILE)
     (config / "robots" / "head.toml").write_text((ROOT / "examples" / "head.toml").read_text())
     (config / "rules.toml").write_text("")
+    shutil.copytree(config / "pki" / "issued" / "door", config / "pki" / "issued" / "rosie")
     assert run("backup", config / "system.toml", out, "--state", state).exit_code == 0
     manifest = read_archive(out)
     assert manifest.file == "config/system.toml"
     expected = {"config/system.toml", "config/gateway.toml", "config/robots/head.toml", "config/rules.toml", *KEYS}
+    expected |= {name.replace("door", "rosie") for name in KEYS}
     assert expected < {entry.path for entry in manifest.files}
     assert not any("far" in entry.path for entry in manifest.files)
 

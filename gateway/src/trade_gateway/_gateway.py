@@ -61,7 +61,7 @@ def gateway(
             _say_ready(out, running, plan)
             notifier.ready(_status(running))
             while not asked_to_leave.wait(_LOOK_EVERY_S):
-                if running.container.healthy():
+                if running.healthy:
                     notifier.alive()
                 _say_news(out, running.news)
                 now = digest(file)
@@ -106,6 +106,11 @@ class Gateway:
     def container(self) -> Container:
         """The one that runs now."""
         return self._container
+
+    @property
+    def healthy(self) -> bool:
+        """Whether it can take a call now, and its children are looked after."""
+        return self._container.healthy() and (self._supervisor is None or self._supervisor.alive)
 
     def reload(self, file: Path, out: Output, *, anew: bool = True) -> bool:
         """Go by the file as it is now; returns whether that could be done. If not, all stays as it was.
