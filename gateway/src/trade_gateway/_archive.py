@@ -80,8 +80,8 @@ class Source(NamedTuple):
     """In the archive."""
     content: Path
     """What is to be kept."""
-    original: Path
-    """The file whose owner and mode it has."""
+    status: os.stat_result
+    """Of the file itself: its owner and mode are kept, too."""
     database: bool = False
 
 
@@ -183,7 +183,7 @@ def _give(path: Path, entry: Entry, unknown: set[str]) -> None:
 
 
 def _entry(source: Source) -> Entry:
-    status, seen = source.original.stat(), hashlib.sha256()
+    status, seen = source.status, hashlib.sha256()
     with source.content.open("rb") as content:
         size = sum(len(piece) for piece in _pieces(content, seen.update))
     return Entry(

@@ -134,7 +134,7 @@ def _config(named: Named, staging: Path) -> Iterator[Source]:
             problem = f"is not in {folder}, so a backup could not be put back elsewhere; have it there"
             raise ConfigurationError(where=str(one), problem=problem)
         try:
-            yield Source(f"{CONFIG}/{one.relative_to(folder).as_posix()}", _copied(one, staging), one)
+            yield Source(f"{CONFIG}/{one.relative_to(folder).as_posix()}", _copied(one, staging), one.stat())
         except FileNotFoundError:
             raise ConfigurationError(where=str(one), problem="is named, and is not there") from None
 
@@ -153,8 +153,9 @@ def _states(named: Named, folder: Path, staging: Path) -> Iterator[Source]:
 
 
 def _state(path: Path, name: str, staging: Path) -> Source:
+    status = path.stat()
     if not _is_database(path):
-        return Source(name, _copied(path, staging), path)
+        return Source(name, _copied(path, staging), status)
     copy = _fresh(staging)
     try:
         with (
@@ -166,8 +167,8 @@ def _state(path: Path, name: str, staging: Path) -> Source:
         raise ConfigurationError(where=str(path), problem=f"cannot be copied: {bad}") from None
     except sqlite3.DatabaseError as corrupt:
         complain(f"{path} is damaged and was copied as it is: {corrupt}")
-        return Source(name, _copied(path, staging), path)
-    return Source(name, copy, path, database=True)
+        return Source(name, _copied(path, staging), status)
+    return Source(name, copy, status, database=True)
 
 
 def _is_database(path: Path) -> bool:
