@@ -15,7 +15,7 @@ from typer.testing import CliRunner, Result
 
 from trade.errors import ConfigurationError, TradeError
 from trade.policies import read_policy
-from trade_gateway import _pki
+from trade_gateway import _files, _pki
 from trade_gateway._pki import Authority, Issued, NameRevoked, NameTaken, NoAuthority
 from trade_gateway._pki_commands import app
 
@@ -83,13 +83,13 @@ def test_whoever_reads_a_certificate_while_it_is_replaced_gets_a_whole_one(
     authority: Authority, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = authority.issue("arm").folder / "cert.pem"
-    before, seen, claim = path.read_bytes(), [], _pki._claim
+    before, seen, claim = path.read_bytes(), [], _files.claim
 
     def watched(fresh: Path, text: bytes) -> None:
         claim(fresh, text)
         seen.append(path.read_bytes())
 
-    monkeypatch.setattr(_pki, "_claim", watched)
+    monkeypatch.setattr(_files, "claim", watched)
     authority.issue("arm")
     assert seen and set(seen) == {before}
     assert path.read_bytes() != before
@@ -174,14 +174,14 @@ def test_of_two_that_revoke_at_the_same_time_neither_is_forgotten(
 ) -> None:
     for name in ("arm", "leg"):
         authority.issue(name)
-    replace, others = _pki._replace, iter([lambda: Authority(authority.folder).revoke("leg")])
+    replace, others = _pki.replace, iter([lambda: Authority(authority.folder).revoke("leg")])
 
     def late(path: Path, text: bytes, mode: int) -> None:
         for other in others:  # comes in between, and is done before the first one writes
             other()
         replace(path, text, mode)
 
-    monkeypatch.setattr(_pki, "_replace", late)
+    monkeypatch.setattr(_pki, "replace", late)
     authority.revoke("arm")
     assert read_policy(a_policy_with(authority.folder / "revoked.toml")).revoked == {"arm", "leg"}
     assert authority.revoked() == {"arm", "leg"}

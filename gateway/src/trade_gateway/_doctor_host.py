@@ -64,7 +64,7 @@ def latencies(folder: Path = _LATENCIES) -> Iterator[Finding]:
             yield Finding(level="ok", about=about, text=f"hands on what has come within {ms} ms")
             continue
         text = f"sits on what has come for up to {ms} ms, so that a cycle takes that long"
-        fix = f'echo 1 | sudo tee {timer}; for good, by a udev rule: ATTR{{latency_timer}}="1"'
+        fix = f"echo 1 | sudo tee {timer}; for good, by the udev rules of `trade install`"
         yield Finding(level="warning", about=about, text=text, fix=fix)
 
 

@@ -20,6 +20,7 @@ from trade_gateway._detached import Detach, detach_now, ready
 from trade_gateway._gateway_file import Plan, digest, named_digest, read_gateway_file
 from trade_gateway._guests import Guests, opened
 from trade_gateway._list import Json
+from trade_gateway._notify import Notifier
 from trade_gateway._output import Output, complain
 from trade_gateway._up import leaving
 from trade_gateway.supervisor import ChildServices, News, Supervisor
@@ -43,7 +44,7 @@ def gateway(
 
     For example: trade gateway /etc/trade/gateway.toml --check
     """
-    out = Output(as_json=as_json)
+    out, notifier = Output(as_json=as_json), Notifier()
     plan = read_gateway_file(file)
     if check:
         out.say(f"{file} is right")
@@ -53,19 +54,25 @@ def gateway(
     if detach:
         detach_now(out, plan.settings)
         return
-    with leaving() as asked_to_leave, hangups() as hangup:
+    with leaving() as asked_to_leave, hangups() as hangup, notifier:
         seen = digest(file)
         running = Gateway(plan, named_digest(file), asked_to_leave.set)
         try:
             _say_ready(out, running, plan)
+            notifier.ready(_status(running))
             while not asked_to_leave.wait(_LOOK_EVERY_S):
+                if running.healthy:
+                    notifier.alive()
                 _say_news(out, running.news)
                 now = digest(file)
                 if now != seen or hangup.is_set():
                     seen, anew = now, hangup.is_set()
                     hangup.clear()
-                    running.reload(file, out, anew=anew)
+                    notifier.reloading()
+                    good = running.reload(file, out, anew=anew)
+                    notifier.ready(_status(running) if good else f"{file} is wrong; going on as before")
         finally:
+            notifier.leaving()
             out.say("leaving")
             running.close()
             _say_news(out, running.news)
@@ -99,6 +106,11 @@ class Gateway:
     def container(self) -> Container:
         """The one that runs now."""
         return self._container
+
+    @property
+    def healthy(self) -> bool:
+        """Whether it can take a call now, and its children are looked after."""
+        return self._container.healthy() and (self._supervisor is None or self._supervisor.alive)
 
     def reload(self, file: Path, out: Output, *, anew: bool = True) -> bool:
         """Go by the file as it is now; returns whether that could be done. If not, all stays as it was.
@@ -177,6 +189,11 @@ def hangups() -> Generator[threading.Event]:
     finally:
         if number is not None:
             signal.signal(number, before)
+
+
+def _status(running: Gateway) -> str:
+    settings = running.container.settings
+    return f"{settings.container} is up in system {settings.system}, as {settings.identity}"
 
 
 def _say_news(out: Output, told: "queue.SimpleQueue[News]") -> None:

@@ -28,6 +28,7 @@ from msgspec import Struct
 
 from trade._wire import is_chunk
 from trade.errors import ConfigurationError
+from trade_gateway._files import claim, replace
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -103,11 +104,11 @@ class Authority:
         )
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         try:
-            _claim(folder / "ca.key", _key_text(key))
+            claim(folder / "ca.key", _key_text(key))
         except FileExistsError:
             problem = "there is an authority already; use it, or name another folder"
             raise NoAuthority(where=str(folder), problem=problem) from None
-        _replace(folder / "ca.pem", certificate.public_bytes(serialization.Encoding.PEM), 0o644)
+        replace(folder / "ca.pem", certificate.public_bytes(serialization.Encoding.PEM), 0o644)
         made = cls(folder)
         made._list_revoked()  # a policy that names the list must find one
         return made
@@ -154,9 +155,9 @@ class Authority:
         had = _hosts_so_far(folder / "cert.pem") if renewed else [*_addresses(_HERE[1:]), x509.DNSName(_HERE[0])]
         certificate = self._signed(name, key, list(dict.fromkeys([*had, *wanted])), until)
         if not renewed:
-            _replace(folder / "key.pem", _key_text(key), 0o600)
-        _replace(folder / "ca.pem", self._certificate.public_bytes(serialization.Encoding.PEM), 0o644)
-        _replace(folder / "cert.pem", certificate.public_bytes(serialization.Encoding.PEM), 0o644)
+            replace(folder / "key.pem", _key_text(key), 0o600)
+        replace(folder / "ca.pem", self._certificate.public_bytes(serialization.Encoding.PEM), 0o644)
+        replace(folder / "cert.pem", certificate.public_bytes(serialization.Encoding.PEM), 0o644)
         return self._known(name)
 
     def revoke(self, name: str) -> Issued:
@@ -172,7 +173,7 @@ class Authority:
         marks = self.folder / "revoked"
         marks.mkdir(mode=0o700, exist_ok=True)
         with contextlib.suppress(FileExistsError):
-            _claim(marks / name, b"")
+            claim(marks / name, b"")
         self._list_revoked()
         return self._known(name)
 
@@ -181,7 +182,7 @@ class Authority:
         while (names := self.revoked()) != self._listed():
             listed = ", ".join(f'"{name}"' for name in sorted(names))
             text = f"# Written by trade pki: identities that policies refuse.\nrevoked = [{listed}]\n"
-            _replace(self._revoked_file, text.encode(), 0o644)
+            replace(self._revoked_file, text.encode(), 0o644)
 
     def issued(self) -> list[Issued]:
         """All names that were ever issued, in their order."""
@@ -240,7 +241,7 @@ class Authority:
         marks = self.folder / "names"
         marks.mkdir(mode=0o700, exist_ok=True)
         with contextlib.suppress(FileExistsError):
-            _claim(marks / name, f"{purpose or 'container'}\n".encode())
+            claim(marks / name, f"{purpose or 'container'}\n".encode())
             return False
         given = self._purpose(name)
         if purpose not in (None, given):
@@ -368,18 +369,3 @@ def _key_text(key: ec.EllipticCurvePrivateKey) -> bytes:
     return key.private_bytes(
         serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
     )
-
-
-def _claim(path: Path, text: bytes) -> None:
-    """Write a file for this user only. Raises FileExistsError: it is there already."""
-    with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
-        file.write(text)
-        os.fsync(file.fileno())
-
-
-def _replace(path: Path, text: bytes, mode: int) -> None:
-    """Write a file in place of another in one step."""
-    fresh = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
-    _claim(fresh, text)
-    fresh.chmod(mode)
-    fresh.replace(path)

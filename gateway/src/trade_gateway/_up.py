@@ -17,6 +17,7 @@ from trade_drivers.robotfile import Robot
 from trade_gateway._detached import Detach, detach_now, ready
 from trade_gateway._faults import FaultWatch
 from trade_gateway._list import Json
+from trade_gateway._notify import Notifier
 from trade_gateway._output import Output, UsageError
 from trade_gateway._system_choice import choice_of
 
@@ -47,7 +48,7 @@ def up(
     if detach:
         detach_now(out, choice_of(context).settings(name or robot.name))
         return
-    with ExitStack() as stack:
+    with Notifier() as notifier, ExitStack() as stack:
         asked_to_leave = stack.enter_context(leaving())
         simulation = stack.enter_context(_simulation(robot, sim_log)) if sim else None
         ports: dict[str, str] | None = simulation.ports if simulation else None
@@ -71,8 +72,12 @@ def up(
         _say_ready(out, robot, container, simulation)
         faults = FaultWatch(attached.providers)
         faults.begin(out)
+        stack.callback(notifier.leaving)
+        notifier.ready(f"{robot.name} is up in container {container.name}")
         while not asked_to_leave.wait(_LOOK_EVERY_S):
             faults.tell(out)
+            if container.healthy():
+                notifier.alive()
             if simulation is not None and not simulation.running:
                 raise ConfigurationError(where="simulation", problem="its process ended; start again")
         out.say("leaving")

@@ -17,6 +17,7 @@ __all__ = ["build", "main"]
 _SERVICES: Final = "Services"
 _MOTION: Final = "Locks and stops"
 _ROBOTS: Final = "Robots, containers and networks"
+_OPERATION: Final = "Keeping it up"
 _HARDWARE: Final = "Setting hardware up"
 _WATCHING: Final = "Watching and rules"
 _RIGHTS: Final = "Identities and rights"
@@ -28,6 +29,9 @@ _COMMANDS: Final = {
     "start": (_ROBOTS, "_start:start"),
     "migrate": (_ROBOTS, "_migrate:migrate"),
     "system": (_ROBOTS, "_system_commands:app"),
+    "install": (_OPERATION, "_install:install"),
+    "backup": (_OPERATION, "_backup:backup"),
+    "restore": (_OPERATION, "_backup:restore"),
     "scan": (_HARDWARE, "_scan:scan"),
     "set-id": (_HARDWARE, "_scan:set_id"),
     "set-baud": (_HARDWARE, "_scan:set_baud"),

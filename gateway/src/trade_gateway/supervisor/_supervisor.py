@@ -112,6 +112,11 @@ class Supervisor:
         """These are wanted, started in this order; only those that are started otherwise than before start again."""
         self._post(partial(self._go_by, {child.name: child for child in children}))
 
+    @property
+    def alive(self) -> bool:
+        """Whether somebody looks after them."""
+        return self._thread.is_alive()
+
     def children(self) -> list[ChildInfo]:
         """How they fare."""
         return [structs.replace(info, rss_mb=round(rss_mb(info.pid), 1)) for info in self._shown]

@@ -1,0 +1,120 @@
+"""Which files a gateway file or a system file names, with those that they name in turn."""
+
+import os
+import sys
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any, Final, NamedTuple, TypeVar, cast
+
+import msgspec
+from msgspec import Struct
+
+from trade.errors import ConfigurationError
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib  # pyright: ignore[reportMissingImports]
+
+__all__ = ["Named", "named_files"]
+
+_CERTIFICATE: Final = ("ca.pem", "cert.pem", "key.pem")
+_LOCAL: Final = "local"
+_Table = TypeVar("_Table", bound=Struct)
+
+
+class Named(NamedTuple):
+    """What is named, as absolute paths, without asking whether it is there."""
+
+    files: tuple[Path, ...]
+    """The file itself first."""
+    robots: tuple[Path, ...]
+    """Those of them that are robot files."""
+    records: tuple[Path, ...]
+    """Folders for the record of what happens."""
+    systems: tuple[str, ...]
+    """The ids of the systems that it is about, its own first."""
+    containers: int
+    """How many containers of this host there are besides the gateway."""
+
+
+class _Part(Struct, kw_only=True):
+    """A table that may name files; what else it says is for others to check."""
+
+    tls: str = ""
+    policy: str = ""
+    audit: str = ""
+    robot: str = ""
+    rules: str = ""
+    gateway: str = ""
+    host: str = _LOCAL
+
+    def files(self, folder: Path) -> Iterator[Path]:
+        """The files of this host that it names itself."""
+        for name in (self.robot, self.rules):
+            if name:
+                yield folder / name
+        if self.tls:
+            yield from (folder / self.tls / name for name in _CERTIFICATE)
+        if self.policy:
+            policy = folder / self.policy
+            yield policy
+            if revoked := _read(policy, _Policy).revoked_file:
+                yield policy.parent / revoked
+
+
+class _System(_Part, kw_only=True):
+    name: str
+
+
+class _Share(_Part, kw_only=True):
+    system: str
+
+
+class _File(_Part, kw_only=True):
+    system: str | _System
+    share: dict[str, _Share] = {}
+    container: dict[str, _Part] = {}
+
+
+class _Policy(Struct):
+    revoked_file: str = ""
+
+
+def named_files(path: Path) -> Named:
+    """Look through a gateway file or a system file.
+
+    Raises:
+        ConfigurationError: it, or a policy that it names, cannot be read.
+    """
+    path = path.absolute()
+    file = _read(path, _File)
+    own = file.system if isinstance(file.system, _System) else _System(name=file.system)
+    containers = [part for part in file.container.values() if part.host == _LOCAL]
+    files, robots, records = [path], list[Path](), list[Path]()
+    systems = [own.name, *(share.system for share in file.share.values())]
+    for part in (file, own, *file.share.values(), *containers):
+        files += part.files(path.parent)
+        robots += [path.parent / part.robot] if part.robot else []
+        records += [path.parent / part.audit] if part.audit else []
+        if part.gateway:
+            inner = named_files(path.parent / part.gateway)
+            files += inner.files
+            robots += inner.robots
+            records += inner.records
+            systems += inner.systems
+    return Named(_once(files), _once(robots), _once(records), tuple(dict.fromkeys(systems)), len(containers))
+
+
+def _once(paths: Iterable[Path]) -> tuple[Path, ...]:
+    return tuple(dict.fromkeys(Path(os.path.normpath(path)) for path in paths))
+
+
+def _read(path: Path, kind: type[_Table]) -> _Table:
+    try:
+        raw = cast("dict[str, Any]", tomllib.loads(path.read_text(encoding="utf-8")))  # pyright: ignore[reportUnknownMemberType]
+        return msgspec.convert(raw, kind)
+    except FileNotFoundError:
+        raise ConfigurationError(where=str(path), problem="there is no such file") from None
+    except (OSError, ValueError) as bad:  # what is no TOML, no UTF-8 or of another shape is a ValueError
+        raise ConfigurationError(where=str(path), problem=f"cannot be read: {bad}") from None

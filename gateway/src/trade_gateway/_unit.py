@@ -1,0 +1,208 @@
+"""What `trade install` writes: a unit for systemd that may do no more than its gateway needs, and udev rules."""
+
+import re
+import sys
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Final
+
+from msgspec import Struct
+
+from trade_drivers import CanBus, Robot, SerialBus
+
+__all__ = ["UDEV_RULES", "Needs", "needs_of", "program_folders", "unit_text"]
+
+_COMES_AND_GOES: Final = re.compile(r"/dev/(serial/|tty(USB|ACM)\d)")
+_HIDDEN: Final = tuple(map(Path, ("/home", "/root", "/run/user", "/tmp", "/var/tmp")))  # noqa: S108 - what the unit hides
+_STATE: Final = Path("/var/lib/trade")
+_LEAVES_S: Final = 35
+"""How long the gateway, and each of its containers, may take to leave: a robot is brought to rest, states are saved."""
+
+
+class Needs(Struct, frozen=True):
+    """What of the host a gateway and its robots need."""
+
+    serial: bool = False
+    """Whether there are serial ports."""
+    devices: tuple[str, ...] = ()
+    """As DeviceAllow= names them."""
+    can: bool = False
+    """Whether there are CAN interfaces of the kernel."""
+
+
+def needs_of(robots: Iterable[Robot]) -> Needs:
+    """What robot files name. A camera or sensor is known by the options that begin with ``/dev/``."""
+    ports, others, can = set[str](), set[str](), False
+    for robot in robots:
+        for bus in robot.buses:
+            match bus:
+                case SerialBus():
+                    ports.add(bus.port)
+                case CanBus(interface="socketcan"):
+                    can = True
+                case CanBus() if bus.channel.startswith("/dev/"):
+                    ports.add(bus.channel)
+                case _:
+                    pass
+        for sense in (*robot.cameras, *robot.sensors):
+            others |= {
+                value for value in sense.options.values() if isinstance(value, str) and value.startswith("/dev/")
+            }
+    # One that is plugged in again may have another number, so all of its kind are allowed.
+    kinds = ("char-ttyUSB", "char-ttyACM") if ports else ()
+    fixed = {port for port in ports if not _COMES_AND_GOES.match(port)}
+    return Needs(serial=bool(ports), devices=(*kinds, *sorted(fixed | others)), can=can)
+
+
+def program_folders() -> list[Path]:
+    """Where the Python that runs now, and what it imports, lies."""
+    return [Path(sys.prefix), Path(sys.base_prefix), *(Path(one) for one in sys.path if Path(one).is_dir())]
+
+
+def unit_text(
+    gateway: Path,
+    *,
+    user: str,
+    needs: Needs,
+    containers: int,
+    program: Sequence[str],
+    folders: Iterable[Path],
+    records: Iterable[Path],
+) -> str:
+    """A unit for ``trade gateway``.
+
+    Args:
+        gateway: the gateway file, as an absolute path.
+        user: the user it runs as.
+        needs: of its robots.
+        containers: how many it looks after.
+        program: the command that is ``trade``, with an absolute path.
+        folders: what has to be readable, as absolute paths.
+        records: what has to be writable besides its folder for state, as absolute paths.
+    """
+    shown = _outermost(filter(_is_hidden, folders))
+    written = [folder for folder in _outermost(records) if not folder.is_relative_to(_STATE)]
+    homes = [
+        *(f"BindReadOnlyPaths={_quoted(str(folder))}" for folder in shown),
+        *(f"BindPaths={_quoted(str(folder))}" for folder in written if _is_hidden(folder)),
+    ]
+    open_ = [f"ReadWritePaths={_quoted(str(folder))}" for folder in written if not _is_hidden(folder)]
+    families = ["AF_UNIX", "AF_INET", "AF_INET6", "AF_NETLINK", *(["AF_CAN"] if needs.can else [])]
+    parts = {
+        "FILE": _plain(str(gateway)),
+        "COMMAND": " ".join(_quoted(word).replace("$", "$$") for word in (*program, "gateway", str(gateway))),
+        "USER": user,
+        "LEAVES": str(_LEAVES_S * (1 + containers)),
+        "HOME": "\n".join([f"ProtectHome={'tmpfs' if homes else 'yes'}", *homes, *open_]),
+        "DEVICES": _devices(needs),
+        "FAMILIES": " ".join(families),
+    }
+    return re.sub(r"@([A-Z]+)@", lambda found: parts[found.group(1)], _UNIT)
+
+
+def _devices(needs: Needs) -> str:
+    if not needs.devices:
+        return "PrivateDevices=yes"
+    group = ["SupplementaryGroups=dialout"] if needs.serial else []
+    return "\n".join([*group, "DevicePolicy=closed", *(f"DeviceAllow={one} rw" for one in needs.devices)])
+
+
+def _is_hidden(folder: Path) -> bool:
+    return any(folder.is_relative_to(hidden) for hidden in _HIDDEN)
+
+
+def _outermost(folders: Iterable[Path]) -> list[Path]:
+    kept: list[Path] = []
+    for folder in sorted(set(folders)):
+        if not any(folder.is_relative_to(other) for other in kept):
+            kept.append(folder)
+    return kept
+
+
+def _quoted(word: str) -> str:
+    """One word of a list."""
+    escaped = _plain(word).replace("\\", "\\\\").replace('"', '\\"')
+    return escaped if re.fullmatch(r"[\w@%+=:,./-]+", escaped) else f'"{escaped}"'
+
+
+def _plain(text: str) -> str:
+    return text.replace("%", "%%")
+
+
+_UNIT: Final = """\
+[Unit]
+Description=TRADE gateway of @FILE@
+Wants=network-online.target
+After=network-online.target time-sync.target
+# A network or an adapter that comes late is waited for, however long.
+StartLimitIntervalSec=0
+
+[Service]
+Type=notify
+ExecStart=@COMMAND@
+ExecReload=/bin/kill -HUP $MAINPID
+# The gateway alone is told first: it has its containers leave in their order, each robot as its file says.
+ExecStop=-/bin/sh -c 'kill -TERM "$MAINPID" && exec tail --pid="$MAINPID" -f /dev/null'
+# What is left then, or if the gateway itself dies or hangs, is told to leave at once, and killed after this time only:
+# motors without a watchdog of their own would go on with what they were told last.
+KillMode=control-group
+TimeoutStopSec=@LEAVES@
+WatchdogSec=30
+WatchdogSignal=SIGTERM
+Restart=on-failure
+RestartSec=5
+
+User=@USER@
+StateDirectory=trade
+StateDirectoryMode=0700
+RuntimeDirectory=trade
+RuntimeDirectoryMode=0700
+Environment=TRADE_STATE_DIR=%S/trade TRADE_RUNTIME_DIR=%t/trade PYTHONUNBUFFERED=1
+UMask=0077
+
+NoNewPrivileges=yes
+CapabilityBoundingSet=
+AmbientCapabilities=
+PrivateUsers=yes
+ProtectSystem=strict
+@HOME@
+PrivateTmp=yes
+@DEVICES@
+ProtectProc=invisible
+ProtectClock=yes
+ProtectControlGroups=yes
+ProtectHostname=yes
+ProtectKernelLogs=yes
+ProtectKernelModules=yes
+ProtectKernelTunables=yes
+RestrictAddressFamilies=@FAMILIES@
+RestrictNamespaces=yes
+RestrictRealtime=yes
+RestrictSUIDSGID=yes
+LockPersonality=yes
+MemoryDenyWriteExecute=yes
+RemoveIPC=yes
+SystemCallArchitectures=native
+SystemCallFilter=@system-service
+SystemCallFilter=~@privileged @resources
+SystemCallErrorNumber=EPERM
+# Not restricted, and why:
+# PrivateNetwork, IPAddressDeny: it carries calls between networks; who may call what is for its policy to say.
+# AF_NETLINK: the transport asks the kernel for the addresses of its interfaces.
+# ProcSubset: `trade containers --load` reads the load and the memory of the host in /proc.
+# RootDirectory: it runs the Python it was installed with, and reads the files that its gateway file names.
+
+[Install]
+WantedBy=multi-user.target
+"""
+
+UDEV_RULES: Final = """\
+# Their names that stay the same, /dev/serial/by-id/..., are made by the rules of the system.
+ACTION=="remove", GOTO="trade_end"
+# Serial adapters are for the group dialout; ModemManager would ask what is behind them whether it is a modem.
+SUBSYSTEM=="tty", KERNEL=="ttyUSB[0-9]*|ttyACM[0-9]*", GROUP="dialout", MODE="0660"
+SUBSYSTEM=="tty", KERNEL=="ttyUSB[0-9]*|ttyACM[0-9]*", ENV{ID_MM_DEVICE_IGNORE}="1", ENV{ID_MM_PORT_IGNORE}="1"
+# FTDI's adapters sit on what has come for 16 ms unless told otherwise, and a cycle of a bus takes as long.
+SUBSYSTEM=="usb-serial", DRIVER=="ftdi_sio", ATTR{latency_timer}="1"
+LABEL="trade_end"
+"""

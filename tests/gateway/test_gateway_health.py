@@ -1,0 +1,31 @@
+"""When a gateway tells that it is alive: while it takes calls, and looks after whom it has to."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from trade_gateway._gateway import Gateway
+from trade_gateway._gateway_file import read_gateway_file
+
+
+@pytest.fixture
+def running(system: str, tmp_path: Path) -> Iterator[Gateway]:
+    file = tmp_path / "gateway.toml"
+    file.write_text(f'system = "{system}"\n[container.mind]\nproviders = []\n')
+    made = Gateway(read_gateway_file(file), "", lambda: None)
+    yield made
+    made.close()
+
+
+def test_it_is_well_until_it_takes_no_calls_any_more(running: Gateway) -> None:
+    assert running.healthy
+    running.container.close()
+    assert not running.healthy
+
+
+def test_it_is_not_well_when_nobody_looks_after_its_children(running: Gateway) -> None:
+    assert running._supervisor is not None
+    running._supervisor.close()
+    assert running.container.healthy()
+    assert not running.healthy
