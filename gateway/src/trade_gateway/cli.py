@@ -10,6 +10,7 @@ from trade_gateway import (
     _calibrate,
     _call,
     _doctor,
+    _door,
     _empty_container,
     _estop,
     _gateway,
@@ -56,6 +57,7 @@ app.command("gateway", rich_help_panel=_ROBOTS)(_gateway.gateway)
 app.command("container", rich_help_panel=_ROBOTS)(_empty_container.container)
 app.command("start", rich_help_panel=_ROBOTS)(_start.start)
 app.command("migrate", rich_help_panel=_ROBOTS)(_migrate.migrate)
+app.add_typer(_door.app, name="door", rich_help_panel=_ROBOTS)
 app.add_typer(_system_commands.app, name="system", rich_help_panel=_ROBOTS)
 app.command("scan", rich_help_panel=_HARDWARE)(_scan.scan)
 app.command("set-id", rich_help_panel=_HARDWARE)(_scan.set_id)
