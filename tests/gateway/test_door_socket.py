@@ -54,6 +54,8 @@ def test_what_cannot_be_read_is_answered_and_ends_nothing(door: Opened) -> None:
             page.send(nonsense)
             told = heard(page)
             assert told["problem"]["title"] == "BadMessage"
+        page.send(b"\x00")
+        assert heard(page)["problem"]["title"] == "BadMessage"
         assert ask(page, **go_on())["result"] is None
 
 
@@ -108,13 +110,17 @@ def test_a_lock_is_the_pages_and_falls_with_it(door: Opened) -> None:
     wait_until(lambda: bert.call("robot.b.move", 1.0).status == 200, "it fell")
 
 
-def test_a_page_hears_that_its_lock_is_lost(door: Opened) -> None:
+def test_a_page_hears_that_its_lock_is_lost_and_does_nothing_until_it_knows(door: Opened) -> None:
     with door.client().socket() as page:
         taken = ask(page, do="lock", id=1, group="robot.a")["result"]
-        door.robot.system.kill("a")
+        door.robot.me.break_lock([door.robot.find("a")], "it is needed")
         told = heard(page)
         assert (told["event"], told["lock"]) == ("lock_lost", taken["lock"])
         assert told["problem"]["title"] == "LockLost"
+        assert ask(page, **go_on())["problem"]["title"] == "LockLost"
+        assert not door["a"].resource.moving
+        ask(page, do="unlock", id=2, lock=taken["lock"])
+        assert ask(page, **go_on())["result"] is None
 
 
 def test_a_stream_is_heard_until_it_is_ended(door: Opened) -> None:
@@ -197,6 +203,18 @@ def test_a_closing_door_leaves_nothing_moving(door: Opened) -> None:
         ask(page, **go_on())
         door.door.close()
         assert door["a"].stopped.wait(20)
+
+
+def test_a_connection_that_asks_nothing_is_closed(door: Opened, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("trade_gateway.door._protocols._ASKED_WITHIN_S", 0.5)
+    place = urlsplit(door.door.url)
+    with socket.create_connection((place.hostname, place.port), timeout=PATIENCE_S) as idle:  # type: ignore[arg-type]
+        idle.sendall(b"GET /services HTTP/1.1\r\n")
+        assert idle.recv(1) == b""
+    with door.client().socket() as page:
+        say(page, do="stream", id=1, group="robot.a", name="where_is_it", hz=20)
+        numbers = [heard(page)["sample"]["number"] for _ in range(30)]  # longer than that
+        assert numbers == sorted(numbers)
 
 
 class _Frozen:

@@ -41,6 +41,7 @@ class Client:
         self._locks: dict[str, Held] = {}
         self._runs: set[Run] = set()
         self._guard = threading.Lock()
+        self._leaving = False
         self._told: list[Callable[[], object]] = []
 
     @property
@@ -49,7 +50,10 @@ class Client:
 
     @contextmanager
     def speaking(self) -> Generator[None]:
-        """Calls made inside are the client's, under its locks. Raises SessionEnded."""
+        """Calls made inside are the client's, under its locks: also those that are lost, until they are given back.
+
+        Raises SessionEnded.
+        """
         self.session.check()
         with ExitStack() as around:
             around.enter_context(self.session.use())
@@ -93,11 +97,9 @@ class Client:
             held.lock.release()
         return held is not None
 
-    def forget(self, lock: Lock) -> str:
-        """A lock is lost; returns what named it."""
-        name = next((name for name, held in list(self._locks.items()) if held.lock is lock), "")
-        self._locks.pop(name, None)
-        return name
+    def name_of(self, lock: Lock) -> str:
+        """What names a lock; empty if it has it not, or not yet."""
+        return next((name for name, held in list(self._locks.items()) if held.lock is lock), "")
 
     def has_locked(self, handle: Handle) -> bool:
         """Whether it holds all that a service uses."""
@@ -115,14 +117,13 @@ class Client:
     def close(self) -> None:
         """It is gone: what it moves stops, its locks fall, its calls are told to end. Idempotent."""
         with self._guard:
-            if self.closed:
+            if self._leaving:
                 return
-            self.session.close()
+            self._leaving = True
+        self.session.close()
         self._left(self)
         for run in list(self._runs):
             run.ask_to_end()
-        for name in list(self._locks):
-            self.unlock(name)
         for tell in list(self._told):
             tell()
 

@@ -22,13 +22,14 @@ from trade.errors import (
 from trade_gateway.door import _messages as messages
 from trade_gateway.door._clients import Client, Clients, places
 from trade_gateway.door._judge import Judge
-from trade_gateway.door._quota import Quota
+from trade_gateway.door._quota import MOST, Quota
 
 _logger = logging.getLogger("trade")
 
 T = TypeVar("T")
 
-_THREADS: Final = 16
+_THREADS: Final = MOST + 16
+"""As many as there may be calls, locks and questions under way, and some for sessions that come and go."""
 _NO_GROUP: Final = "_"
 
 Gone = Callable[[], Awaitable[object]]
@@ -49,6 +50,14 @@ class Deeds:
     async def apart(self, do: Callable[..., T], *args: Any, stops: bool = False) -> T:
         """Do in a thread what may wait for others; what stops waits for no thread."""
         return await run_sync(partial(do, *args), limiter=self._stop_threads if stops else self._threads)
+
+    async def counted(self, who: str, do: Callable[..., T], *args: Any) -> T:
+        """Likewise, as one of what may be under way. Raises TooMany."""
+        ended = self._quota.take(who)
+        try:
+            return await self.apart(do, *args)
+        finally:
+            ended()
 
     # --- looking
 
@@ -151,11 +160,7 @@ class Deeds:
             TradeError: see `trade.Container.lock`; and TooMany.
         """
         client.locking()
-        counted = self._quota.take(client.identity)
-        try:
-            return await self.apart(self._lock, client, body, on_lost)
-        finally:
-            counted()
+        return await self.counted(client.identity, self._lock, client, body, on_lost)
 
     def _lock(
         self, client: Client, body: messages.LockBody, on_lost: Callable[[str, LockLost], object]
@@ -166,7 +171,7 @@ class Deeds:
         taken: list[Lock] = []
 
         def lost(error: LockLost) -> None:
-            on_lost(client.forget(taken[0]) if taken else "", error)
+            on_lost(client.name_of(taken[0]), error)
 
         with client.session.use():
             lock = self._container.lock(
@@ -183,7 +188,7 @@ class Deeds:
     async def locks(self, who: str) -> list[messages.LockView]:
         """The locks on what an identity may know of."""
         known = {name for _, name in places(self.seen(who))}
-        found = await self.apart(self._container.locks)
+        found = await self.counted(who, self._container.locks)
         return [messages.lock_view(info) for info in found if not known.isdisjoint(info.resources)]
 
     async def resume(self, client: Client, body: messages.GroupBody) -> list[str]:
@@ -198,7 +203,7 @@ class Deeds:
             with client.speaking():
                 return self._container.resume(handles)
 
-        return await self.apart(resume)
+        return await self.counted(client.identity, resume)
 
     async def estop(self, who: str, body: messages.EstopBody) -> messages.Stopped:
         """Stop everything in the system."""
@@ -211,7 +216,7 @@ class Deeds:
         self.judge.require_system(who, f"e-stop {', '.join(ids)}")
         if not ids:
             return messages.Stopped("", True, (), (), {})
-        return _stopped(await self.apart(self._container.estop_clear, ids))
+        return _stopped(await self.counted(who, self._container.estop_clear, ids))
 
     def estops(self) -> list[messages.EstopView]:
         """Those that are open."""
@@ -227,7 +232,7 @@ class Deeds:
             with client.session.use():
                 return self._container.stream(handle, hz=asked.hz, on_change=asked.on_change)
 
-        return await self.apart(listen)
+        return await self.counted(client.identity, listen)
 
     def watch(self, client: Client, asked: messages.Watch, tell: Callable[[str, Handle], object]) -> list[Notification]:
         """Have services that come, go or change told of, those that the client may know of, until it is gone."""

@@ -151,6 +151,7 @@ class Http:
             yield self._deeds.clients.of(secret, who), False
             return
         client = await self._deeds.apart(self._deeds.clients.open_for_one, who, stops=True)
+        self._leases.begin(client, 0, lambda: self._entry.still(request.scope, who))
         try:
             yield client, True
         finally:

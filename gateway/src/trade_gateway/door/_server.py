@@ -36,7 +36,7 @@ MOST_MESSAGE_BYTES: Final = 1 << 20
 _PING_EVERY_S: Final = 0.5
 _PONG_WITHIN_S: Final = 1.5
 """With the ping before it, the 2 s after which who is silent is gone (S05)."""
-_IDLE_S: Final = 30
+_IDLE_S: Final = 10
 _PARTING_S: Final = 2
 _BACKLOG: Final = 128
 _LAST_PORT: Final = 65_535

@@ -85,10 +85,9 @@ class Conversation:
         async with self._tasks:
             self._client.when_closed(lambda: self._soon(self._end))
             self._tasks.start_soon(self._carry)
-            with suppress(WebSocketDisconnect):
-                while True:
-                    self._hear(await self._websocket.receive_text())
-            self._tasks.cancel_scope.cancel()
+            while (message := await self._websocket.receive())["type"] != "websocket.disconnect":
+                self._hear(message.get("text") or "")
+            self._end()
 
     def _end(self) -> None:
         self._tasks.cancel_scope.cancel()
@@ -146,11 +145,13 @@ class Conversation:
         """Raises TooMany, BadMessage: it cannot be begun."""
         if asked.id in self._ongoing:
             raise BadMessage(problem=f"what has id {asked.id!r} has not ended yet; take another id")
-        stops = isinstance(asked, messages.Estop | messages.Cancel) or (
-            isinstance(asked, messages.Call) and self._found(asked).effect == "stop"
-        )
-        if len(self._ongoing) >= MOST_UNDER_WAY and not stops:
+        if len(self._ongoing) >= MOST_UNDER_WAY and not self._stops(asked):
             raise TooMany(what="calls, streams and watches of this connection", limit=MOST_UNDER_WAY)
+
+    def _stops(self, asked: messages.Asked) -> bool:
+        if isinstance(asked, messages.Call):
+            return self._found(asked).effect == "stop"
+        return isinstance(asked, messages.Estop | messages.Cancel)
 
     async def _do(self, asked: messages.Asked, ongoing: _Ongoing) -> None:
         result = None
