@@ -1,5 +1,9 @@
 """The door over HTTP: calls, sessions, locks and stops of clients who speak nothing else (S03, S05, S07)."""
 
+import os
+import re
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from http.client import HTTPConnection
@@ -9,9 +13,26 @@ import pytest
 from tests.trade.test_locking import Robot
 
 from doors import Axis, Opened, opened
-from trade import where
+from trade import Handle, service, where
 from trade.testing import memory_system
 from waiting import wait_until
+
+
+class Lamp:
+    def __init__(self, handle: Handle | None = None) -> None:
+        self.handle = handle
+
+    @service
+    def shine(self, level: float) -> bool:
+        return level > 0
+
+    @service(effect="read")
+    def picture(self) -> bytes:
+        return b"PNG"
+
+    @service(effect="read")
+    def which(self) -> Handle | None:
+        return self.handle
 
 
 @pytest.fixture
@@ -38,6 +59,31 @@ def test_services_are_listed_and_called_by_place_and_by_name(door: Opened) -> No
     assert anna.ask("POST", "/call/robot.a/where_is_it").body == {"result": 0.7}
     assert door["a"].written == [0.5, 0.7]
     assert {one["name"] for one in anna.ask("GET", "/containers").body} >= {"a", "b", "me"}
+
+
+def test_the_page_about_it_does_what_it_says(door: Opened) -> None:
+    text = (Path(__file__).parents[2] / "docs" / "http.md").read_text(encoding="utf-8")
+    [program] = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    door.robot.system.container("lamps").register(Lamp(), "lab.desk")
+    door.robot.system.settle()
+    environment = {**os.environ, "DOOR": door.door.url, "TOKEN": door.client().token}
+    ended = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False, env=environment
+    )
+    assert ended.stdout.splitlines() == re.findall(r"print\(.*\) +# (.*)", program), ended.stderr
+
+
+def test_services_of_no_group_and_of_one_container_among_several_are_called(door: Opened) -> None:
+    system, anna = door.robot.system, door.client()
+    system.container("one").register(Lamp(door.robot.find("a")))
+    system.container("two").register(Lamp())
+    system.settle()
+    assert anna.call("_.shine", 0.5).title == "TooManyServices"
+    assert anna.call("_.shine", 0.5, container="two").body == {"result": True}
+    assert anna.call("_.move", 0.5).title == "NoSuchService"
+    assert anna.call("_.picture", container="two").body == {"result": "UE5H"}  # bytes are base64 in JSON
+    given = anna.call("_.which", container="one").body["result"]
+    assert given == {"service": "robot.a.move", "container": "a"}
 
 
 def test_errors_are_problems_that_name_the_error_and_what_to_do(door: Opened) -> None:

@@ -4,6 +4,7 @@ import base64
 import os
 import socket
 import struct
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -14,8 +15,18 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
 from doors import Axis, Client, Opened, ask, heard, opened, say
+from trade import progress, service
 from trade.testing import memory_system
 from waiting import PATIENCE_S, wait_until
+
+
+class Walker:
+    @service
+    def walk(self, steps: int) -> int:
+        for step in range(steps):
+            progress(step)
+            threading.Event().wait(0.05)
+        return steps
 
 
 @pytest.fixture
@@ -46,6 +57,19 @@ def test_calls_and_their_errors_are_answered_under_their_ids(door: Opened) -> No
         assert refused["problem"]["title"] == "InvalidArgument"
         assert ask(page, do="call", id=3, group="robot.axis", name="stop") == {"id": 3, "result": None}
         assert heard(page) == {"id": "slow", "result": 2.0}
+
+
+def test_a_call_tells_how_far_it_is(door: Opened) -> None:
+    door.robot.system.container("walker").register(Walker(), "walker")
+    door.robot.system.settle()
+    with door.client().socket() as page:
+        say(page, do="call", id=1, group="walker", name="walk", args=[3])
+        told = [heard(page)]
+        while "progress" in told[-1]:
+            told.append(heard(page))
+        assert told[-1] == {"id": 1, "result": 3}
+        assert [one["progress"] for one in told[:-1]] == sorted(one["progress"] for one in told[:-1])
+        assert told[:-1]
 
 
 def test_what_cannot_be_read_is_answered_and_ends_nothing(door: Opened) -> None:
