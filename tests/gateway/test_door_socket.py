@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from urllib.parse import urlsplit
 
+import msgspec
 import pytest
 from tests.trade.test_locking import Robot
 from websockets.exceptions import ConnectionClosed, InvalidStatus
@@ -16,6 +17,8 @@ from websockets.sync.client import connect
 
 from doors import Axis, Client, Opened, ask, heard, opened, say
 from trade import progress, service
+from trade._memory._network import Passage
+from trade._wire import decode_call
 from trade.testing import memory_system
 from waiting import PATIENCE_S, wait_until
 
@@ -27,6 +30,10 @@ class Walker:
             progress(step)
             threading.Event().wait(0.05)
         return steps
+
+    @service(effect="read")
+    def map(self) -> dict[tuple[int, int], str]:
+        return {(0, 0): "here"}
 
 
 @pytest.fixture
@@ -70,6 +77,53 @@ def test_a_call_tells_how_far_it_is(door: Opened) -> None:
         assert told[-1] == {"id": 1, "result": 3}
         assert [one["progress"] for one in told[:-1]] == sorted(one["progress"] for one in told[:-1])
         assert told[:-1]
+
+
+def test_what_has_no_form_in_json_ends_one_call_and_nothing_else(door: Opened) -> None:
+    door.robot.system.container("walker").register(Walker(), "walker")
+    door.robot.system.settle()
+    with door.client().socket() as page:
+        told = ask(page, do="call", id=1, group="walker", name="map")
+        assert told["problem"]["title"] == "InvalidResult"
+        say(page, do="stream", id=2, group="walker", name="map")
+        assert heard(page)["failed"]["title"] == "InvalidResult"
+        assert ask(page, **go_on(number=3))["result"] is None
+    refused = door.client("bert").call("walker.map")
+    assert (refused.status, refused.title) == (502, "InvalidResult")
+
+
+def test_S04_set_points_leave_in_the_order_in_which_they_came(door: Opened) -> None:
+    wanted, left = [float(number) for number in range(60)], list[float]()
+
+    def note(passage: Passage) -> None:
+        if passage.key.startswith("call/") and passage.payload is not None and not passage.arrived:
+            call = decode_call(passage.payload)
+            left.extend(msgspec.msgpack.decode(call.args) if call.service == "move" else ())
+
+    door.robot.system.tap(note)
+    with door.client().socket() as page:
+        ask(page, **go_on())  # a container's clock is asked for before the first call to it
+        for number, value in enumerate(wanted, 1):
+            say(page, do="call", id=number, group="robot.a", name="move", args=[value])
+            if number % 15 == 0:  # so many may be under way
+                assert all("result" in heard(page) for _ in range(15))
+    assert left == wanted
+
+
+def test_S08_what_was_asked_for_before_a_stop_never_begins_after_it(door: Opened) -> None:
+    """All of it is sent at once: the stop overtakes what has not begun."""
+    with door.client().socket() as page:
+        ask(page, **go_on(number=0))
+        for number in range(1, 11):
+            say(page, **go_on(number=number))
+        say(page, do="call", id="stop", group="robot.a", name="stop")
+        told = [heard(page) for _ in range(11)]
+        assert {"id": "stop", "result": None} in told
+        door.robot.system.settle()
+        wait_until(lambda: not door["a"].resource.calls, "all have ended")
+        assert not door["a"].resource.moving
+        assert ask(page, **go_on(number=20))["result"] is None  # what comes after it does
+        assert door["a"].resource.moving
 
 
 def test_what_cannot_be_read_is_answered_and_ends_nothing(door: Opened) -> None:

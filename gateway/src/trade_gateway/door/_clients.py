@@ -2,6 +2,7 @@
 
 import secrets
 import threading
+from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from typing import Final
@@ -16,6 +17,7 @@ MOST_OF_ONE: Final = 16
 """Sessions of one identity that last; those of single requests do not count."""
 MOST_LOCKS: Final = 16
 """Of one session."""
+_STOPS_KEPT: Final = 16
 
 Place = tuple[object, str]
 """A resource, and the container that judges it."""
@@ -42,6 +44,8 @@ class Client:
         self._runs: set[Run] = set()
         self._guard = threading.Lock()
         self._leaving = False
+        self._stops = 0
+        self._stopping: deque[tuple[int, Callable[[], object]]] = deque(maxlen=_STOPS_KEPT)
         self._told: list[Callable[[], object]] = []
 
     @property
@@ -62,6 +66,25 @@ class Client:
             yield
 
     # --- calls
+
+    def admit(self, handle: Handle) -> int:
+        """A call was asked for; returns the number of stops so far, which it raises if it is one."""
+        self._stops += handle.effect == "stop"
+        return self._stops
+
+    def overtaken(self, admitted: int) -> bool:
+        """Whether a stop was asked for after that number was given: what had not begun by then must not (S08)."""
+        return self._stops != admitted
+
+    def stopping(self, admitted: int, again: Callable[[], object]) -> None:
+        """A stop of that number is about to be sent, by this."""
+        self._stopping.append((admitted, again))
+
+    def stop_again(self, admitted: int) -> None:
+        """A call of that number was sent, perhaps after a stop that was asked for later: that has the last word."""
+        for number, again in list(self._stopping):
+            if number > admitted:
+                again()
 
     def note(self, run: Run) -> None:
         """It ends with the client."""

@@ -88,23 +88,45 @@ class Deeds:
 
     # --- calling
 
-    async def begin(self, client: Client, handle: Handle, body: messages.CallBody) -> Run:
+    async def begin(self, client: Client, handle: Handle, body: messages.CallBody, admitted: int) -> Run:
         """Make a call without waiting for its end.
 
+        Args:
+            client: whose call it is.
+            handle: of what.
+            body: its arguments.
+            admitted: what `Client.admit` said when it was asked for.
+
         Raises:
-            TradeError: it is not allowed, or could not begin.
+            TradeError: it is not allowed, or could not begin; Cancelled: the client has asked for a stop since.
         """
         self.judge.require_call(client.identity, handle)
         stops = handle.effect == "stop"
         counted = None if stops else self._quota.take(client.identity)
         try:
-            run = await self.apart(_begin, self._container, client, handle, body, stops=stops)
+            run = await self.apart(self._begin, client, handle, body, admitted, stops=stops)
         except BaseException:
             if counted is not None:
                 counted()
             raise
         if counted is not None:
             run.when_done(lambda _: counted())
+        return run
+
+    def _begin(self, client: Client, handle: Handle, body: messages.CallBody, admitted: int) -> Run:
+        given: Any = messages.numbers(body.args)
+        args: tuple[Any, ...] = tuple(given) if isinstance(body.args, list) else ()
+        kwargs: dict[str, Any] = given if isinstance(body.args, dict) else {}
+        begin = partial(self._container.begin, handle, args, kwargs, body.deadline_s)
+        with client.speaking():
+            if handle.effect == "stop":
+                client.stopping(admitted, begin)
+            elif handle.effect == "actuate" and client.overtaken(admitted):
+                raise Cancelled(service=handle.label)
+            run = begin()
+            if handle.effect == "actuate":
+                client.stop_again(admitted)
+        client.note(run)
         return run
 
     async def end(self, client: Client, run: Run) -> None:
@@ -131,7 +153,7 @@ class Deeds:
             TradeError: it could not begin.
             Cancelled: nobody waits any more.
         """
-        run = await self.begin(client, handle, body)
+        run = await self.begin(client, handle, body, client.admit(handle))
 
         async def watch() -> None:
             await gone()
@@ -253,16 +275,6 @@ class Deeds:
     def containers(self) -> list[messages.ContainerView]:
         """Those of the system."""
         return [messages.ContainerView(one.name, one.identity, one.host) for one in self._container.containers()]
-
-
-def _begin(container: Container, client: Client, handle: Handle, body: messages.CallBody) -> Run:
-    given: Any = messages.numbers(body.args)
-    args: tuple[Any, ...] = tuple(given) if isinstance(body.args, list) else ()
-    kwargs: dict[str, Any] = given if isinstance(body.args, dict) else {}
-    with client.speaking():
-        run = container.begin(handle, args, kwargs, body.deadline_s)
-    client.note(run)
-    return run
 
 
 def _wanted(group: str | None, name: str | None) -> Constraint:

@@ -11,7 +11,7 @@ from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import Route
 
-from trade.errors import LockLost, TradeError
+from trade.errors import InvalidResult, LockLost, TradeError
 from trade_gateway.door import _messages as messages
 from trade_gateway.door._clients import Client
 from trade_gateway.door._deeds import Deeds
@@ -77,7 +77,12 @@ class Http:
             gone = lambda: _gone(request)  # noqa: E731
             run = await self._deeds.call(client, handle, body, gone, alone=alone)
         error = run.exception(0)
-        return _answer({"result": run.result(0)}) if error is None else problem_response(error)
+        if error is not None:
+            return problem_response(error)
+        try:
+            return _answer({"result": run.result(0)})
+        except messages.NO_JSON as bad:
+            raise InvalidResult(service=handle.label, problem=f"it has no form in JSON: {bad}") from None
 
     # --- sessions
 

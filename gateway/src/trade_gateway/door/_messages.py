@@ -218,5 +218,7 @@ def numbers(value: Any) -> Any:
             return value
 
 
+NO_JSON: Final = (TypeError, ValueError, OverflowError, RecursionError)
+"""What encoding raises of values that have no form in JSON."""
 encoder: Final = msgspec.json.Encoder(enc_hook=plain)
 read_asked: Final = msgspec.json.Decoder(Asked).decode

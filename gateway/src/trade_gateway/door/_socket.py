@@ -3,7 +3,7 @@
 import asyncio
 from collections import deque
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from typing import Any, Final
 
 import anyio
@@ -11,7 +11,7 @@ import msgspec
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from trade import Handle, Run
-from trade.errors import LockLost, TradeError
+from trade.errors import InvalidResult, LockLost, TradeError
 from trade_gateway.door import _messages as messages
 from trade_gateway.door._clients import Client
 from trade_gateway.door._deeds import Deeds
@@ -60,9 +60,16 @@ class Socket:
 class _Ongoing:
     """What one message has begun."""
 
-    def __init__(self) -> None:
+    def __init__(self, asked: messages.Asked, handle: Handle | None, admitted: int) -> None:
+        self.asked: Final = asked
+        self.handle: Final = handle
+        """Of what to call or stream."""
+        self.admitted: Final = admitted
+        """At which of the client's stops."""
         self.scope = anyio.CancelScope()
         self.run: Run | None = None
+        self.unwanted = False
+        """Whether a call was cancelled, if only before it had begun."""
 
 
 class Conversation:
@@ -75,6 +82,8 @@ class Conversation:
         self._tasks = anyio.create_task_group()
         self._ongoing: dict[messages.Id, _Ongoing] = {}
         self._speaking = anyio.Lock()
+        self._beginning = anyio.Lock()
+        """Calls begin in the order in which they were asked for: of two set-points the later one counts."""
         self._waiting: deque[dict[str, Any]] = deque(maxlen=_MOST_WAITING)
         self._missed = 0
         self._more = asyncio.Event()
@@ -83,24 +92,27 @@ class Conversation:
     async def run(self) -> None:
         """Until one of both ends it. What was begun ends with it."""
         async with self._tasks:
-            self._client.when_closed(lambda: self._soon(self._end))
+            self._client.when_closed(lambda: self._soon(self._tasks.cancel_scope.cancel))
             self._tasks.start_soon(self._carry)
             while (message := await self._websocket.receive())["type"] != "websocket.disconnect":
                 self._hear(message.get("text") or "")
-            self._end()
+            await self._end()
 
-    def _end(self) -> None:
+    async def _end(self) -> None:
+        """First what moves stops, then the rest is put away."""
+        await self._apart(self._client.close)
         self._tasks.cancel_scope.cancel()
 
     # --- speaking
 
     async def _say(self, message: dict[str, Any]) -> None:
+        text = _text(message)
         with anyio.move_on_after(_SENT_WITHIN_S) as limit:
             async with self._speaking:
                 with suppress(WebSocketDisconnect, RuntimeError):  # it is gone; who listens hears of it
-                    await self._websocket.send_text(messages.encoder.encode(message).decode())
+                    await self._websocket.send_text(text)
         if limit.cancelled_caught:
-            self._end()
+            await self._end()
 
     def _post(self, message: dict[str, Any]) -> None:
         """Say it as soon as it can be said; from any thread."""
@@ -133,43 +145,44 @@ class Conversation:
             self._note({"id": None, "problem": problem_of(BadMessage(problem=str(bad)))})
             return
         try:
-            self._refuse(asked)
+            ongoing = self._admitted(asked)
         except TradeError as error:
             self._note({"id": asked.id, "problem": problem_of(error)})
             return
-        ongoing = _Ongoing()
         self._ongoing[asked.id] = ongoing
-        self._tasks.start_soon(self._do, asked, ongoing)
+        self._tasks.start_soon(self._do, ongoing)
 
-    def _refuse(self, asked: messages.Asked) -> None:
-        """Raises TooMany, BadMessage: it cannot be begun."""
+    def _admitted(self, asked: messages.Asked) -> _Ongoing:
+        """Raises BadMessage, TooMany, NoSuchService, TooManyServices: it cannot be begun."""
         if asked.id in self._ongoing:
             raise BadMessage(problem=f"what has id {asked.id!r} has not ended yet; take another id")
-        if len(self._ongoing) >= MOST_UNDER_WAY and not self._stops(asked):
+        handle, stops = None, isinstance(asked, messages.Estop | messages.Cancel)
+        if isinstance(asked, messages.Call | messages.Stream):
+            handle = self._deeds.find(self._client.identity, asked.group, asked.name, asked.container)
+            stops = handle.effect == "stop"
+        if len(self._ongoing) >= MOST_UNDER_WAY and not stops:
             raise TooMany(what="calls, streams and watches of this connection", limit=MOST_UNDER_WAY)
+        return _Ongoing(asked, handle, 0 if handle is None else self._client.admit(handle))
 
-    def _stops(self, asked: messages.Asked) -> bool:
-        if isinstance(asked, messages.Call):
-            return self._found(asked).effect == "stop"
-        return isinstance(asked, messages.Estop | messages.Cancel)
-
-    async def _do(self, asked: messages.Asked, ongoing: _Ongoing) -> None:
-        result = None
+    async def _do(self, ongoing: _Ongoing) -> None:
+        result, name = None, ongoing.asked.id
         try:
             with ongoing.scope:
-                result = await self._done(asked, ongoing)
-            answer = {"id": asked.id, "result": result}
+                result = await self._done(ongoing)
+            answer = {"id": name, "result": result}
         except Exception as error:  # noqa: BLE001 - whatever a provider raises is for the client
-            answer = {"id": asked.id, "problem": problem_of(error)}
-        del self._ongoing[asked.id]
+            answer = {"id": name, "problem": problem_of(error)}
+        del self._ongoing[name]
         await self._say(answer)
 
-    async def _done(self, asked: messages.Asked, ongoing: _Ongoing) -> Any:
-        match asked:
+    async def _done(self, ongoing: _Ongoing) -> Any:
+        match asked := ongoing.asked:
             case messages.Call():
-                return await self._call(asked, ongoing)
+                assert ongoing.handle is not None  # noqa: S101 - it was found when this was admitted
+                return await self._call(asked, ongoing.handle, ongoing)
             case messages.Stream():
-                return await self._stream(asked)
+                assert ongoing.handle is not None  # noqa: S101 - likewise
+                return await self._stream(asked, ongoing.handle)
             case messages.Watch():
                 return await self._watch(asked)
             case messages.TakeLock():
@@ -185,11 +198,12 @@ class Conversation:
 
     # --- doing
 
-    def _found(self, asked: messages.Call | messages.Stream) -> Handle:
-        return self._deeds.find(self._client.identity, asked.group, asked.name, asked.container)
-
-    async def _call(self, asked: messages.Call, ongoing: _Ongoing) -> Any:
-        ongoing.run = run = await self._deeds.begin(self._client, self._found(asked), asked)
+    async def _call(self, asked: messages.Call, handle: Handle, ongoing: _Ongoing) -> Any:
+        async with nullcontext() if handle.effect == "stop" else self._beginning:
+            run = await self._deeds.begin(self._client, handle, asked, ongoing.admitted)
+        ongoing.run = run
+        if ongoing.unwanted:
+            await self._deeds.end(self._client, run)
         run.on_progress(lambda value: self._post({"id": asked.id, "progress": value}))
         await run.settled()
         return run.result(0)
@@ -198,14 +212,18 @@ class Conversation:
         ongoing = self._ongoing.get(which)
         if ongoing is None:
             return False
-        if ongoing.run is None:
-            ongoing.scope.cancel()
-        else:
-            await self._deeds.end(self._client, ongoing.run)
+        match ongoing.asked:
+            case messages.Call():
+                ongoing.unwanted = True
+                if ongoing.run is not None:
+                    await self._deeds.end(self._client, ongoing.run)
+            case messages.Stream() | messages.Watch():
+                ongoing.scope.cancel()
+            case _:
+                return False
         return True
 
-    async def _stream(self, asked: messages.Stream) -> None:
-        handle = self._found(asked)
+    async def _stream(self, asked: messages.Stream, handle: Handle) -> None:
         samples = await self._deeds.stream(self._client, handle, asked)
         try:
             while True:
@@ -219,7 +237,7 @@ class Conversation:
                 else:
                     await self._say({"id": asked.id, "sample": sample})
         finally:
-            await self._ended(samples.close)
+            await self._apart(samples.close)
 
     async def _watch(self, asked: messages.Watch) -> None:
         def tell(occasion: str, handle: Handle) -> None:
@@ -230,11 +248,20 @@ class Conversation:
             await anyio.sleep_forever()
         finally:
             for one in standing:
-                await self._ended(one.cancel)
+                await self._apart(one.cancel)
 
-    async def _ended(self, close: Callable[[], object]) -> None:
+    async def _apart(self, close: Callable[[], object]) -> None:
         with anyio.CancelScope(shield=True):
             await self._deeds.apart(close, stops=True)
 
     def _lock_lost(self, lock: str, error: LockLost) -> None:
         self._post({"event": "lock_lost", "lock": lock, "problem": problem_of(error)})
+
+
+def _text(message: dict[str, Any]) -> str:
+    try:
+        return messages.encoder.encode(message).decode()
+    except messages.NO_JSON as bad:
+        what = "problem" if "result" in message else "failed"
+        wrong = InvalidResult(service=str(message["id"]), problem=f"it has no form in JSON: {bad}")
+        return messages.encoder.encode({"id": message["id"], what: problem_of(wrong)}).decode()
