@@ -32,6 +32,10 @@ class Walker:
         return steps
 
     @service(effect="read")
+    def look(self) -> str:
+        return "." * 300_000
+
+    @service(effect="read")
     def map(self) -> dict[tuple[int, int], str]:
         return {(0, 0): "here"}
 
@@ -160,9 +164,11 @@ def test_S05_a_call_ends_with_the_page_that_made_it(door: Opened) -> None:
 
 def test_S05_a_page_that_freezes_is_gone_although_its_connection_stands(door: Opened) -> None:
     """It answers no pings and takes nothing more; a stream fills what lies between."""
+    door.robot.system.container("walker").register(Walker(), "walker")
+    door.robot.system.settle()
     with _Frozen(door.client()) as page:
         page.send(b'{"do":"call","id":1,"group":"robot.a","name":"go_on","args":[1.0]}')
-        page.send(b'{"do":"stream","id":2,"group":"robot.a","name":"where_is_it","hz":1000}')
+        page.send(b'{"do":"stream","id":2,"group":"walker","name":"look","hz":1000}')
         wait_until(lambda: door["a"].resource.moving, "it moves")
         assert door["a"].stopped.wait(PATIENCE_S)
 
