@@ -234,6 +234,16 @@ def test_S07_of_too_much_at_once_some_is_refused_and_a_stop_is_not(door: Opened)
             request.close()
 
 
+def test_S07_a_stop_needs_no_session_not_even_the_one_it_names(door: Opened) -> None:
+    ended, bert = door.client("anna").opened(lease_s=60), door.client("bert").opened(lease_s=60)
+    ended.ask("DELETE", "/session")
+    bert.call("robot.a.go_on", 1.0)
+    assert ended.call("robot.a.go_on", 1.0).title == "NoSuchSession"
+    assert ended.call("robot.a.stop").status == 200
+    assert not door["a"].resource.moving
+    assert ended.ask("POST", "/estop").body["complete"]
+
+
 def test_what_is_too_large_is_refused(door: Opened) -> None:
     answer = door.client().ask("POST", "/estop", b" " * (2 << 20))
     assert answer.status == 413

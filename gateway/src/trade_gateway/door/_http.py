@@ -19,7 +19,7 @@ from trade_gateway.door._entry import Entry
 from trade_gateway.door._gate import problem_response
 from trade_gateway.door._leases import Leases
 from trade_gateway.door._openapi import document
-from trade_gateway.door._problems import BadMessage, HttpError, NeedsSession, NotLetIn
+from trade_gateway.door._problems import BadMessage, HttpError, NeedsSession, NoSuchSession, NotLetIn
 
 MOST_BODY_BYTES: Final = 1 << 20
 SESSION: Final = "Trade-Session"
@@ -71,9 +71,10 @@ class Http:
     # --- calling
 
     async def call(self, request: Request) -> Response:
-        who, body = self._who(request), await _body(request, messages.CallBody)
+        who, body = self._entry.who(request.scope), await _body(request, messages.CallBody)
         handle = self._deeds.find(who, request.path_params["group"], request.path_params["name"], body.container)
-        async with self._client(request, who) as (client, alone):
+        named = self._heard(request, who, stops=handle.effect == "stop")
+        async with self._client(request, who, named) as (client, alone):
             gone = lambda: _gone(request)  # noqa: E731
             run = await self._deeds.call(client, handle, body, gone, alone=alone)
         error = run.exception(0)
@@ -119,7 +120,7 @@ class Http:
 
     async def resume(self, request: Request) -> Response:
         who, body = self._who(request), await _body(request, messages.GroupBody)
-        async with self._client(request, who) as (client, _):
+        async with self._client(request, who, self._heard(request, who)) as (client, _):
             return _answer({"resumed": await self._deeds.resume(client, body)})
 
     async def estops(self, request: Request) -> Response:
@@ -127,7 +128,9 @@ class Http:
         return _answer(self._deeds.estops())
 
     async def estop(self, request: Request) -> Response:
-        return _answer(await self._deeds.estop(self._who(request), await _body(request, messages.EstopBody)))
+        who = self._entry.who(request.scope)
+        self._heard(request, who, stops=True)
+        return _answer(await self._deeds.estop(who, await _body(request, messages.EstopBody)))
 
     async def clear(self, request: Request) -> Response:
         return _answer(await self._deeds.clear(self._who(request), await _body(request, messages.ClearBody)))
@@ -136,24 +139,38 @@ class Http:
 
     def _who(self, request: Request) -> str:
         who = self._entry.who(request.scope)
-        secret = request.headers.get(SESSION)
-        if secret is not None:
-            self._leases.renew(self._deeds.clients.of(secret, who))
+        self._heard(request, who)
         return who
+
+    def _heard(self, request: Request, who: str, *, stops: bool = False) -> Client | None:
+        """The session that a request names, which is renewed by it; None if it names none.
+
+        Raises NoSuchSession, but not to a request that stops something: that needs none (S07).
+        """
+        secret = request.headers.get(SESSION)
+        if secret is None:
+            return None
+        try:
+            client = self._deeds.clients.of(secret, who)
+        except NoSuchSession:
+            if stops:
+                return None
+            raise
+        self._leases.renew(client)
+        return client
 
     def _lasting(self, request: Request, who: str, what: str) -> Client:
         """The session that a request names. Raises NeedsSession, NoSuchSession."""
-        secret = request.headers.get(SESSION)
-        if secret is None:
+        client = self._heard(request, who)
+        if client is None:
             raise NeedsSession(what=what)
-        return self._deeds.clients.of(secret, who)
+        return client
 
     @asynccontextmanager
-    async def _client(self, request: Request, who: str) -> AsyncGenerator[tuple[Client, bool]]:
-        """The session that a request names; else one of its own, for as long as it lasts."""
-        secret = request.headers.get(SESSION)
-        if secret is not None:
-            yield self._deeds.clients.of(secret, who), False
+    async def _client(self, request: Request, who: str, named: Client | None) -> AsyncGenerator[tuple[Client, bool]]:
+        """The session that a request names; else one of its own, for as long as it lasts, and that it is so."""
+        if named is not None:
+            yield named, False
             return
         client = await self._deeds.apart(self._deeds.clients.open_for_one, who, stops=True)
         self._leases.begin(client, 0, lambda: self._entry.still(request.scope, who))
