@@ -246,7 +246,7 @@ def test_S07_a_stop_needs_no_session_not_even_the_one_it_names(door: Opened) -> 
 
 def test_what_is_too_large_is_refused(door: Opened) -> None:
     answer = door.client().ask("POST", "/estop", b" " * (2 << 20))
-    assert answer.status == 413
+    assert (answer.status, answer.title) == (413, "TooLarge")
 
 
 def test_one_client_has_so_many_sessions_and_no_more(door: Opened) -> None:

@@ -6,6 +6,7 @@ import socket
 import struct
 import threading
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -251,6 +252,17 @@ def test_S07_a_page_with_all_it_may_have_under_way_can_stop(door: Opened) -> Non
         assert ask(page, do="call", id="stop", group="robot.a", name="stop") == {"id": "stop", "result": None}
         assert ask(page, do="estop", id="all", reason="smoke")["result"]["complete"]
         assert ask(page, do="cancel", id="less", which=0)["result"] == {"cancelled": True}
+
+
+def test_a_message_that_is_too_large_ends_the_connection_and_what_it_moves(door: Opened) -> None:
+    with door.client().socket() as page:
+        ask(page, **go_on())
+        with suppress(ConnectionClosed):  # before all of it was sent
+            page.send(" " * (2 << 20))
+        with pytest.raises(ConnectionClosed) as why:
+            heard(page)
+        assert why.value.rcvd is None or why.value.rcvd.code == 1009
+        assert door["a"].stopped.wait(20)
 
 
 def test_pages_show_their_token_as_a_subprotocol(door: Opened) -> None:

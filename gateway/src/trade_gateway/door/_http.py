@@ -11,7 +11,7 @@ from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import Route
 
-from trade.errors import InvalidResult, LockLost, TradeError
+from trade.errors import InvalidResult, LockLost, TooLarge, TradeError
 from trade_gateway.door import _messages as messages
 from trade_gateway.door._clients import Client
 from trade_gateway.door._deeds import Deeds
@@ -210,7 +210,8 @@ async def _read(request: Request) -> bytes:
     async for chunk in request.stream():
         data += chunk
         if len(data) > MOST_BODY_BYTES:
-            raise HttpError(status=413, problem=f"a body has at most {MOST_BODY_BYTES} bytes")
+            path, size = request.url.path, len(data)
+            raise TooLarge(service=path, what="a body", size_bytes=size, limit_bytes=MOST_BODY_BYTES)
     return bytes(data)
 
 

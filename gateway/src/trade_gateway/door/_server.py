@@ -102,7 +102,6 @@ class Door:
         )
         self._server = uvicorn.Server(config)
         self._thread = threading.Thread(target=self._serve, name="trade-door", daemon=True)
-        self._closing = threading.Lock()
 
     def open(self) -> "Door":
         """Let clients in; who comes before it is ready waits."""
@@ -116,12 +115,11 @@ class Door:
 
     def close(self) -> None:
         """Let nobody in any more; what clients have set moving stops. Idempotent."""
-        with self._closing:
-            self._deeds.clients.close()
-            self._server.should_exit = True
-            if self._thread.ident is not None:
-                self._thread.join(_JOINED_WITHIN_S)
-            self._socket.close()
+        self._deeds.clients.close()
+        self._server.should_exit = True
+        if self._thread.ident is not None:
+            self._thread.join(_JOINED_WITHIN_S)
+        self._socket.close()
 
     def _serve(self) -> None:
         try:
