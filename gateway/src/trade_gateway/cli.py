@@ -28,6 +28,7 @@ _COMMANDS: Final = {
     "container": (_ROBOTS, "_empty_container:container"),
     "start": (_ROBOTS, "_start:start"),
     "migrate": (_ROBOTS, "_migrate:migrate"),
+    "door": (_ROBOTS, "_door:app"),
     "system": (_ROBOTS, "_system_commands:app"),
     "install": (_OPERATION, "_install:install"),
     "backup": (_OPERATION, "_backup:backup"),

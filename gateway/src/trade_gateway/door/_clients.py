@@ -1,0 +1,212 @@
+"""Clients of the door: each a session of its own, with its locks, calls and streams, which end with it (S03, S05)."""
+
+import secrets
+import threading
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator
+from contextlib import ExitStack, contextmanager
+from typing import Final
+
+from msgspec import Struct
+
+from trade import Container, Handle, Lock, Run, Session
+from trade_gateway.door._problems import NoSuchSession, TooMany
+
+MOST_CLIENTS: Final = 64
+MOST_OF_ONE: Final = 16
+"""Sessions of one identity that last; those of single requests do not count."""
+MOST_LOCKS: Final = 16
+"""Of one session."""
+_STOPS_KEPT: Final = 16
+
+Place = tuple[object, str]
+"""A resource, and the container that judges it."""
+
+
+class Held(Struct, frozen=True):
+    """A lock of a client."""
+
+    lock: Lock
+    covers: frozenset[Place]
+    """What it is of."""
+
+
+class Client:
+    """One page, program or request. Its methods may wait for others: they are for threads, not for the event loop."""
+
+    def __init__(self, identity: str, session: Session, left: "Callable[[Client], None]") -> None:
+        self.identity: Final = identity
+        self.session: Final = session
+        self.secret: Final = secrets.token_urlsafe(18)
+        """What shows a request to be its own."""
+        self._left = left
+        self._locks: dict[str, Held] = {}
+        self._runs: set[Run] = set()
+        self._guard = threading.Lock()
+        self._leaving = False
+        self._stops = 0
+        self._stopping: deque[tuple[int, Callable[[], object]]] = deque(maxlen=_STOPS_KEPT)
+        self._told: list[Callable[[], object]] = []
+
+    @property
+    def closed(self) -> bool:
+        return self.session.closed
+
+    @contextmanager
+    def speaking(self) -> Generator[None]:
+        """Calls made inside are the client's, under its locks: also those that are lost, until they are given back.
+
+        Raises SessionEnded.
+        """
+        self.session.check()
+        with ExitStack() as around:
+            around.enter_context(self.session.use())
+            for held in list(self._locks.values()):
+                around.enter_context(held.lock.use())
+            yield
+
+    # --- calls
+
+    def admit(self, handle: Handle) -> int:
+        """A call was asked for; returns the number of stops so far, which it raises if it is one."""
+        self._stops += handle.effect == "stop"
+        return self._stops
+
+    def overtaken(self, admitted: int) -> bool:
+        """Whether a stop was asked for after that number was given: what had not begun by then must not (S08)."""
+        return self._stops != admitted
+
+    def stopping(self, admitted: int, again: Callable[[], object]) -> None:
+        """A stop of that number is about to be sent, by this."""
+        self._stopping.append((admitted, again))
+
+    def stop_again(self, admitted: int) -> None:
+        """A call of that number was sent, perhaps after a stop that was asked for later: that has the last word."""
+        for number, again in list(self._stopping):
+            if number > admitted:
+                again()
+
+    def note(self, run: Run) -> None:
+        """It ends with the client."""
+        self._runs.add(run)
+        run.when_done(self._runs.discard)
+        if self.closed:  # meanwhile
+            run.ask_to_end()
+
+    def cancel(self, run: Run) -> None:
+        """End a call of its own early."""
+        with self.speaking():
+            run.cancel()
+
+    # --- locks
+
+    def locking(self) -> None:
+        """Raises TooMany: it has as many as it may."""
+        if len(self._locks) >= MOST_LOCKS:
+            raise TooMany(what="locks of this session", limit=MOST_LOCKS)
+
+    def keep(self, lock: Lock, handles: list[Handle]) -> str:
+        """It has taken a lock; returns what names it."""
+        name = secrets.token_hex(4)
+        self._locks[name] = Held(lock, frozenset(places(handles)))
+        if self.closed:  # meanwhile
+            self.unlock(name)
+        return name
+
+    def unlock(self, name: str) -> bool:
+        """Give a lock back; returns whether there was one."""
+        held = self._locks.pop(name, None)
+        if held is not None:
+            held.lock.release()
+        return held is not None
+
+    def name_of(self, lock: Lock) -> str:
+        """What names a lock; empty if it has it not, or not yet."""
+        return next((name for name, held in list(self._locks.items()) if held.lock is lock), "")
+
+    def has_locked(self, handle: Handle) -> bool:
+        """Whether it holds all that a service uses."""
+        held = {place for one in list(self._locks.values()) if one.lock.held for place in one.covers}
+        return held.issuperset(places([handle]))
+
+    # --- its end
+
+    def when_closed(self, tell: Callable[[], object]) -> None:
+        """Have this called at its end, on any thread; at once if that has come."""
+        self._told.append(tell)
+        if self.closed:
+            tell()
+
+    def close(self) -> None:
+        """It is gone: what it moves stops, its locks fall, its calls are told to end. Idempotent."""
+        with self._guard:
+            if self._leaving:
+                return
+            self._leaving = True
+        self.session.close()
+        self._left(self)
+        for run in list(self._runs):
+            run.ask_to_end()
+        for tell in list(self._told):
+            tell()
+
+
+class Clients:
+    """All of them."""
+
+    def __init__(self, container: Container) -> None:
+        self._container = container
+        self._all: dict[str, Client] = {}
+        self._lasting: dict[object, str] = {}
+        """Whose those are that count."""
+        self._guard = threading.Lock()
+
+    def open(self, identity: str) -> Client:
+        """A session that lasts. Waits for others. Raises TooMany."""
+        with self._guard:
+            if len(self._lasting) >= MOST_CLIENTS:
+                raise TooMany(what="sessions", limit=MOST_CLIENTS)
+            if list(self._lasting.values()).count(identity) >= MOST_OF_ONE:
+                raise TooMany(what=f"sessions of {identity}", limit=MOST_OF_ONE)
+            place = object()
+            self._lasting[place] = identity
+        try:
+            client = self.open_for_one(identity)
+        except BaseException:
+            self._lasting.pop(place, None)
+            raise
+        client.when_closed(lambda: self._lasting.pop(place, None))
+        return client
+
+    def open_for_one(self, identity: str) -> Client:
+        """A session for one request; there are as many as there are requests, so that every stop has one (S07)."""
+        client = Client(identity, self._container.open_session(identity), self._left)
+        self._all[client.secret] = client
+        return client
+
+    def of(self, secret: str, identity: str) -> Client:
+        """The client that a request is of. Raises NoSuchSession."""
+        client = self._all.get(secret)
+        if client is None or client.identity != identity or client.closed:
+            raise NoSuchSession(session=secret[:8])
+        return client
+
+    def _left(self, client: Client) -> None:
+        self._all.pop(client.secret, None)
+
+    def __iter__(self) -> Iterator[Client]:
+        return iter(list(self._all.values()))
+
+    def close(self) -> None:
+        """End all. Idempotent."""
+        for client in self:
+            client.close()
+
+
+def places(handles: Iterable[Handle]) -> set[Place]:
+    """What services use, and where that is judged; one that names no resource is one itself."""
+    return {(handle.key.address, name) for handle in handles for name in handle.resources or (_itself(handle),)}
+
+
+def _itself(handle: Handle) -> str:
+    return f"{handle.key.domain}/{handle.key.provider}/{handle.name}"

@@ -1,0 +1,224 @@
+"""What clients say and are told, over HTTP and over the WebSocket: records, read strictly."""
+
+import sys
+from typing import Annotated, Any, Final, Literal, cast
+
+import msgspec
+from msgspec import Meta, Struct
+
+from trade import Handle, LockInfo
+
+MOST_DEADLINE_S: Final = 86_400.0
+SESSION_LEASE_S: Final = 2.0
+LEAST_INTEGER: Final = -(2**63)
+MOST_INTEGER: Final = 2**64 - 1
+_MOST_EXACT: Final = 2**53
+
+Deadline = Annotated[float, Meta(gt=0, le=MOST_DEADLINE_S)]
+Group = Annotated[str, Meta(min_length=1, max_length=200)]
+Arguments = list[Any] | dict[str, Any]
+Occasion = Literal["joined", "left", "changed"]
+Id = Annotated[str, Meta(max_length=80)] | int
+
+
+# --- bodies
+
+
+class CallBody(Struct, forbid_unknown_fields=True, kw_only=True):
+    args: Arguments = {}
+    """By place, or by name."""
+    deadline_s: Deadline = 10.0
+    container: str = ""
+    """Only the service of this container."""
+
+
+class LockBody(Struct, forbid_unknown_fields=True, kw_only=True):
+    group: Group
+    """The actuating services of this group and beneath it."""
+    purpose: Annotated[str, Meta(max_length=200)] = ""
+    wait_s: Annotated[float, Meta(ge=0, le=60)] = 10.0
+    partial: bool = False
+
+
+class GroupBody(Struct, forbid_unknown_fields=True, kw_only=True):
+    group: Group
+
+
+class EstopBody(Struct, forbid_unknown_fields=True, kw_only=True):
+    reason: Annotated[str, Meta(max_length=300)] = ""
+
+
+class ClearBody(Struct, forbid_unknown_fields=True, kw_only=True):
+    ids: list[str] = []
+    """None: all that are open."""
+
+
+class SessionBody(Struct, forbid_unknown_fields=True, kw_only=True):
+    lease_s: Annotated[float, Meta(ge=0.2, le=60)] = SESSION_LEASE_S
+    """How long it outlives its last request, and what it moves with it."""
+
+
+# --- messages of the WebSocket
+
+
+class Call(CallBody, tag="call", tag_field="do", kw_only=True):
+    id: Id
+    group: Group
+    name: str
+
+
+class TakeLock(LockBody, tag="lock", tag_field="do", kw_only=True):
+    id: Id
+
+
+class Unlock(Struct, tag="unlock", tag_field="do", forbid_unknown_fields=True, kw_only=True):
+    id: Id
+    lock: str
+
+
+class Resume(GroupBody, tag="resume", tag_field="do", kw_only=True):
+    id: Id
+
+
+class Estop(EstopBody, tag="estop", tag_field="do", kw_only=True):
+    id: Id
+
+
+class Stream(Struct, tag="stream", tag_field="do", forbid_unknown_fields=True, kw_only=True):
+    id: Id
+    group: Group
+    name: str
+    hz: Annotated[float, Meta(ge=0.001, le=1000)] = 10.0
+    on_change: bool = False
+    container: str = ""
+
+
+class Watch(Struct, tag="watch", tag_field="do", forbid_unknown_fields=True, kw_only=True):
+    id: Id
+    group: Group | None = None
+    name: str | None = None
+    occasions: tuple[Occasion, ...] = ("joined", "left", "changed")
+    existing: bool = False
+    """Also tell of what is there already, as joined."""
+
+
+class Cancel(Struct, tag="cancel", tag_field="do", forbid_unknown_fields=True, kw_only=True):
+    id: Id
+    which: Id
+    """The call, stream or watch to end."""
+
+
+Asked = Call | TakeLock | Unlock | Resume | Estop | Stream | Watch | Cancel
+
+
+# --- answers
+
+
+class ServiceView(Struct, frozen=True):
+    group: str
+    """With the name: where it is called."""
+    name: str
+    groups: tuple[str, ...]
+    signature: str
+    doc: str
+    effect: str
+    resources: tuple[str, ...]
+    health: str
+    container: str
+    host: str
+
+
+class ContainerView(Struct, frozen=True):
+    name: str
+    identity: str
+    host: str
+
+
+class LockView(Struct, frozen=True):
+    resources: tuple[str, ...]
+    container: str
+    owner: str
+    """``identity/container``, or the client of a door behind it."""
+    purpose: str
+    since: float
+    waiting: tuple[str, ...]
+
+
+class LockTaken(Struct, frozen=True):
+    lock: str
+    """What releases it."""
+    resources: tuple[str, ...]
+
+
+class SessionOpened(Struct, frozen=True):
+    session: str
+    """To be sent as ``Trade-Session``; a secret of the client's."""
+    name: str
+    """As others see it."""
+    lease_s: float
+
+
+class EstopView(Struct, frozen=True):
+    id: str
+    by: str
+    reason: str
+    at: float
+
+
+class Stopped(Struct, frozen=True):
+    id: str
+    complete: bool
+    confirmed: tuple[str, ...]
+    missing: tuple[str, ...]
+    failed: dict[str, str]
+
+
+def service_view(handle: Handle) -> ServiceView:
+    return ServiceView(
+        handle.key.domain,
+        handle.name,
+        handle.groups,
+        handle.signature,
+        handle.doc,
+        handle.effect,
+        handle.resources,
+        handle.health,
+        handle.container,
+        handle.host,
+    )
+
+
+def lock_view(info: LockInfo) -> LockView:
+    holder = info.holder
+    client = holder.session.partition(f"{holder.container}/")[2].partition("/")[2]
+    own = client and ":" not in client  # of another system: its owner says so already
+    owner = f"{holder.owner} for {client.rpartition('.')[0]}" if own else holder.owner
+    return LockView(info.resources, info.container, owner, holder.purpose, holder.since, info.waiting)
+
+
+def plain(value: Any) -> Any:
+    """Values that JSON has no form for."""
+    if isinstance(value, Handle):
+        return {"service": value.label, "container": value.container}
+    raise TypeError(f"a {type(value).__qualname__} has no form in JSON")
+
+
+def numbers(value: Any) -> Any:
+    """JSON has one kind of number: 2.0 is an integer where one is asked for, and what no integer holds is a float."""
+    match value:
+        case dict():
+            return {key: numbers(inner) for key, inner in cast("dict[str, Any]", value).items()}
+        case list():
+            return [numbers(inner) for inner in cast("list[Any]", value)]
+        case float() if value.is_integer() and abs(value) < _MOST_EXACT:
+            return int(value)
+        case int() if not LEAST_INTEGER <= value <= MOST_INTEGER and abs(value) < sys.float_info.max:
+            return float(value)
+        case _:
+            return value
+
+
+NO_JSON: Final = (TypeError, ValueError, OverflowError, RecursionError)
+"""What encoding raises of values that have no form in JSON."""
+encoder: Final = msgspec.json.Encoder(enc_hook=plain)
+read_asked: Final = msgspec.json.Decoder(Asked).decode

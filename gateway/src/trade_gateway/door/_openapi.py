@@ -1,0 +1,205 @@
+"""The door as an OpenAPI document: what it offers always, and the services that the asking client may know of now."""
+
+from collections.abc import Mapping, Sequence
+from importlib.metadata import version
+from typing import Any, Final, cast
+
+import msgspec
+
+from trade import Handle
+from trade_gateway.door import _messages as messages
+from trade_gateway.door._problems import MEDIA_TYPE, Problem
+
+Schema = dict[str, Any]
+
+_OPENAPI: Final = "3.1.0"
+_BODIES: Final = (
+    messages.CallBody,
+    messages.LockBody,
+    messages.GroupBody,
+    messages.EstopBody,
+    messages.ClearBody,
+    messages.SessionBody,
+    messages.ServiceView,
+    messages.ContainerView,
+    messages.LockView,
+    messages.LockTaken,
+    messages.SessionOpened,
+    messages.EstopView,
+    messages.Stopped,
+    Problem,
+)
+_COMPONENTS: Final = "#/components/schemas/"
+_FORMATS: Final = {"datetime": "date-time", "date": "date", "time": "time", "UUID": "uuid"}
+_SESSION: Final = {
+    "name": "Trade-Session",
+    "in": "header",
+    "description": "A session that POST /session opened; without it the request is one of its own.",
+    "schema": {"type": "string"},
+}
+
+
+def document(handles: Sequence[Handle]) -> Schema:
+    """The document, as JSON.
+
+    Args:
+        handles: the services to describe, each under ``/call/GROUP/NAME``.
+    """
+    _, components = msgspec.json.schema_components(_BODIES, ref_template=_COMPONENTS + "{name}")
+    schemas: Schema = {**components, "Problem": {**components["Problem"], "additionalProperties": True}}
+    paths: Schema = {}
+    for handle in handles:
+        path = f"/call/{handle.key.domain}/{handle.name}"
+        if path not in paths:
+            paths[path] = {"post": _call(handle, schemas)}
+    return {
+        "openapi": _OPENAPI,
+        "info": {"title": "TRADE", "version": version("trade-gateway"), "description": __doc__},
+        "paths": {**paths, **_fixed()},
+        "components": {
+            "schemas": schemas,
+            "securitySchemes": {"token": {"type": "http", "scheme": "bearer"}},
+        },
+        "security": [{"token": []}],
+    }
+
+
+def _call(handle: Handle, schemas: Schema) -> Schema:
+    record, described = handle.record, handle.schema
+    name = f"{handle.key.domain}.{handle.name}"
+    arguments = _placed(described["arguments"], name, schemas)
+    named = {**arguments, "additionalProperties": False}
+    kinds: list[Any] = [named]
+    if not any(one.required and one.keyword_only for one in record.info.parameters):
+        kinds.append(_by_place([one for one in record.info.parameters if not one.keyword_only], arguments))
+    needs_some = any(one.required for one in record.info.parameters)
+    properties = {**schemas["CallBody"]["properties"], "args": {"anyOf": kinds}}
+    body = {**schemas["CallBody"], "properties": properties, "required": ["args"] if needs_some else []}
+    result = {
+        "type": "object",
+        "properties": {"result": _placed(described["result"], name, schemas)},
+        "required": ["result"],
+    }
+    return {
+        "operationId": name,
+        "summary": handle.signature,
+        "description": handle.doc,
+        "tags": [handle.key.domain],
+        "parameters": [_SESSION],
+        "requestBody": _json(body, required=needs_some),
+        "responses": _responses(result),
+        "x-trade-effect": handle.effect,
+    }
+
+
+def _by_place(parameters: Sequence[Any], arguments: Schema) -> Schema:
+    if not parameters:
+        return {"type": "array", "maxItems": 0}
+    return {
+        "type": "array",
+        "prefixItems": [arguments["properties"][one.name] for one in parameters],
+        "items": False,
+        "minItems": sum(one.required for one in parameters),
+    }
+
+
+def _placed(schema: Mapping[str, Any], name: str, schemas: Schema) -> Schema:
+    """A service's own schema, with what it refers to among the document's under the service's name."""
+    own = schema.get("$defs", {})
+    for title, definition in own.items():
+        schemas[f"{name}.{title}"] = _led(definition, name)
+    return _led({key: value for key, value in schema.items() if key != "$defs"}, name)
+
+
+def _led(part: Any, name: str) -> Any:
+    """References into the document, formats where there are some, and what an integer holds."""
+    if isinstance(part, list):
+        return [_led(one, name) for one in cast("list[Any]", part)]
+    if not isinstance(part, dict):
+        return part
+    led = {key: _led(value, name) for key, value in cast("Schema", part).items()}
+    if isinstance(ref := led.get("$ref"), str):
+        led["$ref"] = f"{_COMPONENTS}{name}.{ref.rpartition('/')[2]}"
+    if (form := _FORMATS.get(str(led.get("x-trade-kind")))) is not None:
+        led.setdefault("format", form)
+    if led.get("type") == "integer":
+        led = {"minimum": messages.LEAST_INTEGER, "maximum": messages.MOST_INTEGER, **led}
+    return led
+
+
+# --- what is there always
+
+
+def _fixed() -> Schema:
+    query = [
+        {"name": name, "in": "query", "schema": {"type": "string"}, "description": text}
+        for name, text in (("group", "This group and beneath it."), ("name", "`*` and `?` stand for anything."))
+    ]
+    held = {**_SESSION, "required": True}
+    lock = {"name": "lock", "in": "path", "required": True, "schema": {"type": "string"}}
+    names = {"type": "array", "items": {"type": "string"}}
+    resumed = {"type": "object", "properties": {"resumed": names}, "required": ["resumed"]}
+    opened = {"type": "object", "properties": {"name": {"type": "string"}, "lease_s": {"type": "number"}}}
+    return {
+        "/openapi.json": {"get": _operation("This document.", {"type": "object"})},
+        "/services": {"get": _operation("Services.", _list("ServiceView"), parameters=query)},
+        "/containers": {"get": _operation("Containers.", _list("ContainerView"))},
+        "/session": {
+            "post": _operation("Open a session.", _ref("SessionOpened"), body="SessionBody", status="201"),
+            "get": _operation("Renew a session, as any request in it does.", opened, parameters=[held]),
+            "delete": _operation("End a session: what it moves stops.", None, parameters=[held], status="204"),
+        },
+        "/locks": {
+            "get": _operation("Locks.", _list("LockView")),
+            "post": _operation(
+                "Take a lock.", _ref("LockTaken"), body="LockBody", needed=True, parameters=[held], status="201"
+            ),
+        },
+        "/locks/{lock}": {"delete": _operation("Release a lock.", None, parameters=[lock, held], status="204")},
+        "/resume": {
+            "post": _operation(
+                "Let move again what somebody else stopped.",
+                resumed,
+                body="GroupBody",
+                needed=True,
+                parameters=[_SESSION],
+            )
+        },
+        "/estops": {"get": _operation("Open e-stops.", _list("EstopView"))},
+        "/estop": {"post": _operation("Stop everything. Not safety-rated.", _ref("Stopped"), body="EstopBody")},
+        "/estop/clear": {"post": _operation("Clear e-stops.", _ref("Stopped"), body="ClearBody")},
+    }
+
+
+def _operation(
+    summary: str,
+    answer: Schema | None,
+    *,
+    body: str = "",
+    needed: bool = False,
+    parameters: Sequence[Schema] = (),
+    status: str = "200",
+) -> Schema:
+    asked = {"requestBody": _json(_ref(body), required=needed)} if body else {}
+    return {"summary": summary, "parameters": list(parameters), **asked, "responses": _responses(answer, status)}
+
+
+def _responses(answer: Schema | None, status: str = "200") -> Schema:
+    done = {"description": "Done.", **({} if answer is None else _content(answer, "application/json"))}
+    return {status: done, "default": {"description": "Why not.", **_content(_ref("Problem"), MEDIA_TYPE)}}
+
+
+def _json(schema: Schema, *, required: bool) -> Schema:
+    return {"required": required, **_content(schema, "application/json")}
+
+
+def _content(schema: Schema, media_type: str) -> Schema:
+    return {"content": {media_type: {"schema": schema}}}
+
+
+def _ref(name: str) -> Schema:
+    return {"$ref": _COMPONENTS + name}
+
+
+def _list(name: str) -> Schema:
+    return {"type": "array", "items": _ref(name)}

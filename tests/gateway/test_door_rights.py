@@ -1,0 +1,266 @@
+"""Who is let in, as whom, and what the policy lets that one do: the client is judged, not the door (S21)."""
+
+import ssl
+import stat
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from tests.trade.test_locking import Robot
+
+from certificates import Papers
+from doors import Client, Opened, ask, heard, opened, say
+from trade.errors import ConfigurationError
+from trade.testing import memory_system
+from trade_gateway.door import Door, Tokens, add_token
+
+POLICY = """
+[roles.all]
+call = ["*"]
+read = ["*"]
+register = ["*"]
+lock = ["*"]
+administer = ["*"]
+instrument = ["*"]
+
+[roles.operator]
+call = ["robot.a"]
+read = ["robot.a"]
+lock = ["robot.a"]
+
+[roles.viewer]
+read = ["robot"]
+
+[identities]
+tester = ["all"]
+chief = ["all"]
+anna = ["operator"]
+bert = ["viewer"]
+"""
+
+
+@pytest.fixture
+def door(tmp_path: Path) -> Iterator[Opened]:
+    """Of a door that may do everything."""
+    with memory_system() as system:
+        robot = Robot(system)
+        govern(robot, tmp_path, POLICY)
+        with opened(robot.me, tmp_path) as (made, tokens):
+            yield Opened(robot, made, tokens)
+
+
+def govern(robot: Robot, folder: Path, text: str) -> None:
+    path = folder / "policy.toml"
+    path.write_text(text)
+    robot.me.load_policy(path)
+
+
+def test_a_client_may_do_what_the_policy_lets_it_and_not_what_the_door_may(door: Opened) -> None:
+    anna, bert = door.client("anna"), door.client("bert")
+    assert anna.call("robot.a.move", 1.0).status == 200
+    denied = bert.call("robot.a.move", 2.0)
+    assert (denied.status, denied.title) == (403, "AccessDenied")
+    assert denied.body["data"]["who"] == "bert"
+    assert "no rule of role viewer allows call in robot.a" in denied.body["detail"]
+    assert bert.call("robot.a.where_is_it").body == {"result": 1.0}
+    assert door["a"].written == [1.0]
+
+
+def test_what_a_client_may_not_know_of_it_does_not_see(door: Opened) -> None:
+    anna, stranger = door.client("anna"), door.client("carl")
+    assert {one["group"] for one in anna.ask("GET", "/services").body} == {"robot.a"}
+    assert anna.call("robot.b.move", 1.0).title == "NoSuchService"
+    assert "/call/robot.b/move" not in anna.ask("GET", "/openapi.json").body["paths"]
+    assert stranger.ask("GET", "/services").body == []
+    with door.robot.me.lock([door.robot.find("b")]):
+        assert anna.ask("GET", "/locks").body == []
+    with anna.socket() as page:
+        say(page, do="watch", id=1, name="move", existing=True, occasions=["joined"])
+        assert heard(page)["service"]["group"] == "robot.a"
+        door.robot.system.container("b").deregister(door["b"])
+        door.robot.system.container("b").register(door["b"], ["robot.b", "robot.a"])  # its first group is what counts
+        door.robot.system.container("a").deregister(door["a"])
+        door.robot.system.container("a").register(door["a"], "robot.a.again")
+        assert heard(page)["service"]["group"] == "robot.a.again"
+
+
+def test_locks_resuming_and_clearing_are_the_clients_rights_too(door: Opened) -> None:
+    anna, bert, chief = (door.client(name).opened(lease_s=60) for name in ("anna", "bert", "chief"))
+    assert bert.ask("POST", "/locks", {"group": "robot.a"}).title == "AccessDenied"
+    assert anna.ask("POST", "/locks", {"group": "robot"}).title == "AccessDenied"
+    assert anna.ask("POST", "/locks", {"group": "trade"}).title == "AccessDenied"
+    taken = anna.ask("POST", "/locks", {"group": "robot.a"})
+    anna.call("robot.a.go_on", 1.0)
+    assert bert.call("robot.a.stop").status == 200  # a stop needs no role
+    assert anna.call("robot.a.go_on", 1.0).title == "Stopped"
+    assert bert.ask("POST", "/resume", {"group": "robot.a"}).title == "AccessDenied"
+    assert anna.ask("POST", "/resume", {"group": "robot.a"}).body == {"resumed": ["a"]}  # it is its lock
+    anna.call("robot.a.go_on", 1.0)
+    anna.ask("DELETE", f"/locks/{taken.body['lock']}")
+    bert.call("robot.a.stop")
+    assert anna.ask("POST", "/resume", {"group": "robot.a"}).title == "AccessDenied"
+    assert chief.ask("POST", "/resume", {"group": "robot.a"}).body == {"resumed": ["a"]}
+    given = bert.ask("POST", "/estop").body
+    assert given["complete"]
+    assert anna.ask("POST", "/estop/clear", {"ids": [given["id"]]}).title == "AccessDenied"
+    assert chief.ask("POST", "/estop/clear", {"ids": [given["id"]]}).body["complete"]
+
+
+def test_functions_of_the_middleware_are_nobodys_by_the_door(door: Opened) -> None:
+    """They would be judged as the door's."""
+    chief = door.client("chief")
+    assert chief.ask("POST", "/call/trade/terminate_container", {"args": ["x"]}).title == "NoSuchService"
+    assert not [one for one in chief.ask("GET", "/services").body if one["group"] == "trade"]
+
+
+def test_streams_are_the_clients_rights_too_and_end_with_them(door: Opened, tmp_path: Path) -> None:
+    with door.client("bert").socket() as page:
+        page.send('{"do": "stream", "id": 1, "group": "robot.a", "name": "where_is_it", "hz": 50}')
+        assert page.recv(timeout=60)
+        govern(door.robot, tmp_path, POLICY.replace('read = ["robot"]', 'read = ["robot.b"]'))
+        while b"problem" not in (told := page.recv(timeout=60, decode=False)):
+            pass
+        assert b"AccessDenied" in told
+        denied = ask(page, do="stream", id=2, group="robot.a", name="where_is_it")
+        assert denied["problem"]["title"] == "NoSuchService"
+
+
+def test_who_is_revoked_is_let_in_no_more_and_what_it_moves_stops(door: Opened, tmp_path: Path) -> None:
+    anna = door.client("anna")
+    with anna.socket() as page:
+        ask(page, do="call", id=1, group="robot.a", name="go_on", args=[1.0])
+        (tmp_path / "revoked.toml").write_text('revoked = ["anna"]\n')
+        govern(door.robot, tmp_path, 'revoked_file = "revoked.toml"\n' + POLICY)
+        assert door["a"].stopped.wait(20)
+    refused = anna.ask("GET", "/services")
+    assert (refused.status, refused.title) == (403, "AccessDenied")
+
+
+def test_nobody_known_is_let_in_only_by_name(door: Opened, tmp_path: Path) -> None:
+    unknown = Client(door.door.url)
+    answer = unknown.ask("GET", "/services")
+    assert (answer.status, answer.title) == (401, "NotLetIn")
+    assert answer.headers["www-authenticate"].startswith("Bearer")
+    govern(door.robot, tmp_path, POLICY + '"*" = ["viewer"]\n')
+    assert unknown.ask("POST", "/estop").status == 401  # a pattern means those whom one knows
+    govern(door.robot, tmp_path, POLICY + 'anonymous = ["viewer"]\n')
+    assert unknown.call("robot.a.where_is_it").status == 200
+    assert unknown.call("robot.a.move", 1.0).title == "AccessDenied"
+    unknown.token = "guess"
+    assert unknown.ask("GET", "/services").status == 401
+
+
+def test_each_request_without_a_token_is_refused_whatever_it_asks_for(door: Opened) -> None:
+    paths = Client(door.door.url, door.client().token).ask("GET", "/openapi.json").body["paths"]
+    asked = 0
+    for path, operations in paths.items():
+        for method in operations:
+            body = None if method in ("get", "delete") else {}
+            assert Client(door.door.url).ask(method.upper(), path.replace("{lock}", "x"), body).status == 401
+            asked += 1
+    assert asked > 15
+
+
+# --- under which name, by which page
+
+
+def test_under_another_name_the_door_does_not_answer(door: Opened) -> None:
+    anna = door.client("anna")
+    for wrong in ("evil.example", "evil.example:80", "", "127.0.0.1.evil.example"):
+        answer = anna.ask("GET", "/services", Host=wrong)
+        assert answer.status in (400, 403), wrong
+    for right in ("localhost", "LOCALHOST:1", "127.0.0.1:7080", "[::1]:7080"):
+        assert anna.ask("GET", "/services", Host=right).status == 200, right
+
+
+def test_pages_of_other_sites_are_not_let_in(door: Opened) -> None:
+    anna = door.client("anna")
+    for origin in ("http://evil.example", "null", door.door.url):
+        refused = anna.ask("POST", "/estop", {}, Origin=origin)
+        assert (refused.status, refused.title) == (403, "WrongDoor")
+        assert "access-control-allow-origin" not in refused.headers
+    assert anna.ask("GET", "/estops").body == []
+
+
+def test_a_site_that_is_named_is_let_in_and_no_other(tmp_path: Path) -> None:
+    page = "http://localhost:5173"
+    with memory_system() as system:
+        robot = Robot(system)
+        with opened(robot.me, tmp_path, origins=[page]) as (made, tokens):
+            anna = Opened(robot, made, tokens).client()
+            asked = {"Access_Control_Request_Method": "POST", "Access_Control_Request_Headers": "authorization"}
+            told = Client(made.url).ask("OPTIONS", "/estop", Origin=page, **asked)
+            assert (told.status, told.headers["access-control-allow-origin"]) == (200, page)
+            assert anna.ask("GET", "/services", Origin=page).headers["access-control-allow-origin"] == page
+            assert anna.ask("GET", "/services", Origin="http://localhost:5174").status == 403
+            with anna.socket(origin=page) as socket:
+                assert ask(socket, do="call", id=1, group="robot.a", name="move", args=[1.0])["result"] == 1.0
+
+
+# --- where it listens, and the tokens
+
+
+def test_S21_a_door_to_a_network_needs_encryption_and_a_policy(tmp_path: Path) -> None:
+    tokens = tmp_path / "tokens.toml"
+    add_token(tokens, "anna")
+    papers = Papers(tmp_path / "pki").of("door")
+    with memory_system() as system:
+        me = system.container("me")
+        with pytest.raises(ConfigurationError, match="--tls"):
+            Door(me, listen="0.0.0.0:0", tokens=Tokens(tokens))
+        with pytest.raises(ConfigurationError, match="TRADE_POLICY"):
+            Door(me, listen="0.0.0.0:0", tokens=Tokens(tokens), tls=papers)
+        with pytest.raises(ConfigurationError, match="trade door token"):
+            Door(me, listen="127.0.0.1:0", tokens=Tokens(None))
+        with pytest.raises(ConfigurationError, match="HOST:PORT"):
+            Door(me, listen="127.0.0.1", tokens=Tokens(tokens))
+        with (
+            Door(me, listen="127.0.0.1:0", tokens=Tokens(tokens)) as first,
+            pytest.raises(ConfigurationError, match="cannot be used"),
+        ):
+            Door(me, listen=first.url.removeprefix("http://"), tokens=Tokens(tokens))
+
+
+def test_a_certificate_of_the_systems_authority_is_an_identity_and_of_no_other(tmp_path: Path) -> None:
+    ours, others = Papers(tmp_path / "pki"), Papers(tmp_path / "other")
+    with memory_system() as system:
+        robot = Robot(system)
+        govern(robot, tmp_path, POLICY)
+        with opened(robot.me, tmp_path, tls=ours.of("door", addresses=["127.0.0.1"])) as (made, tokens):
+            assert made.url.startswith("https://")
+            trust = ssl.create_default_context(cafile=str(tmp_path / "pki" / "ca.pem"))
+            token = Client(made.url, add_token(tokens, "bert"), trust=trust)
+            assert token.call("robot.a.move", 1.0).body["data"]["who"] == "bert"
+            assert Client(made.url, trust=trust).ask("GET", "/services").status == 401
+            shown = ours.of("anna")
+            trust.load_cert_chain(shown / "cert.pem", shown / "key.pem")
+            anna = Client(made.url, trust=trust)
+            assert anna.call("robot.a.move", 1.0).status == 200
+            with anna.socket(ssl=trust) as page:
+                assert ask(page, do="call", id=1, group="robot.a", name="move", args=[1.0])["result"] == 1.0
+            foreign = others.of("anna")
+            trust.load_cert_chain(foreign / "cert.pem", foreign / "key.pem")
+            with pytest.raises(OSError):
+                Client(made.url, trust=trust).ask("GET", "/services")
+
+
+def test_the_file_of_tokens_has_hashes_alone_and_is_read_as_it_is_now(tmp_path: Path) -> None:
+    path = tmp_path / "tokens.toml"
+    one = add_token(path, "anna")
+    tokens = Tokens(path)
+    other = add_token(path, "bert")
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    assert one not in path.read_text()
+    assert (tokens.who(one), tokens.who(other), tokens.who("guess"), tokens.who("")) == ("anna", "bert", None, None)
+    path.write_text("[tokens\n")
+    assert tokens.who(one) == "anna"  # what is wrong changes nothing
+    path.write_text("[tokens]\n")
+    assert tokens.who(one) is None
+    for wrong in ('[tokens]\nshort = "anna"\n', f'[tokens]\n{"a" * 64} = "no name"\n'):
+        path.write_text(wrong)
+        with pytest.raises(ConfigurationError, match="SHA-256"):
+            Tokens(path)
+    with pytest.raises(ConfigurationError, match="no identity"):
+        add_token(path, "an na")
+    with pytest.raises(ConfigurationError, match="trade door token"):
+        Tokens(tmp_path / "missing.toml")
