@@ -12,7 +12,7 @@ from trade_gateway._detached import ready
 from trade_gateway._list import Json
 from trade_gateway._output import Output
 from trade_gateway._system_choice import SystemChoice
-from trade_gateway._up import leaving, refuse_twice
+from trade_gateway._up import leaving, refuse_twice, settle
 
 _LOOK_EVERY_S: Final = 1.0
 _TOKENS: Final = Path("door-tokens.toml")
@@ -68,6 +68,7 @@ def door(
     ):
         refuse_twice(container, "trade door")
         container.terminating.close = asked_to_leave.set
+        settle()
         _say_ready(out, container, standing.url)
         while not asked_to_leave.wait(_LOOK_EVERY_S):
             if not standing.serving:

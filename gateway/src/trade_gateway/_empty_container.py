@@ -11,7 +11,7 @@ from trade_gateway._detached import Detach, detach_now, ready
 from trade_gateway._list import Json
 from trade_gateway._output import Output
 from trade_gateway._system_choice import choice_of
-from trade_gateway._up import leaving, refuse_twice
+from trade_gateway._up import leaving, refuse_twice, settle
 
 _LOOK_EVERY_S = 0.2
 
@@ -41,6 +41,7 @@ def container(
     with leaving() as asked_to_leave, Container(settings) as running:
         running.terminating.close = asked_to_leave.set
         refuse_twice(running, "trade container")
+        settle()
         if as_json:
             out.data({**ready(running), "instantiable": settings.instantiable})
         out.say(

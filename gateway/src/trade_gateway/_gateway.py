@@ -22,7 +22,7 @@ from trade_gateway._guests import Guests, opened
 from trade_gateway._list import Json
 from trade_gateway._notify import Notifier
 from trade_gateway._output import Output, complain
-from trade_gateway._up import leaving
+from trade_gateway._up import leaving, settle
 from trade_gateway.supervisor import ChildServices, News, Supervisor
 
 _LOOK_EVERY_S: Final = 1.0
@@ -58,6 +58,7 @@ def gateway(
         seen = digest(file)
         running = Gateway(plan, named_digest(file), asked_to_leave.set)
         try:
+            settle()
             _say_ready(out, running, plan)
             notifier.ready(_status(running))
             while not asked_to_leave.wait(_LOOK_EVERY_S):

@@ -1,6 +1,7 @@
 """``trade-hil-sim ROBOT.toml``: simulate the buses of a robot file until told to stop."""
 
 import argparse
+import gc
 import os
 import shutil
 import signal
@@ -88,6 +89,8 @@ def _run(options: argparse.Namespace, stack: ExitStack, stop: "_Stop") -> None:
         log=None if options.log is None else str(options.log.absolute()),
         control=str(control.path),
     )
+    gc.collect()
+    gc.freeze()  # a later collection of all that was loaded would hold every device up for as long as a deadline
     sys.stdout.write(msgspec.json.encode(told).decode() + "\n")
     sys.stdout.flush()
     stop.wait(options.parent, sys.stdin.fileno() if options.stdin else None)

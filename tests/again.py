@@ -1,0 +1,126 @@
+"""A test that was late because the computer stood still runs once more, and the run's summary says which and why.
+
+The devices of these tests have deadlines of milliseconds. Drivers keep their promises by saying so when they were held
+up, and who shares a processor with other programs is held up now and then. So a failure counts only if nothing stood
+still: a process of its own looks at the clock, and the product's own words for being late count as well. What fails
+twice has failed. More than `_MOST` such tests fail the run: that is no accident any more.
+"""
+
+import os
+import re
+import subprocess
+import sys
+import time
+from typing import Final
+
+import pytest
+from _pytest.runner import runtestprotocol
+
+_MOST: Final = 12
+_STILL_S: Final = 0.04
+"""For so long a device of these tests may go unattended."""
+_LATE: Final = re.compile(r"was held up for [\d.]+ s|did not answer on \S+ within \d+ ms")
+_CLOCK: Final = f"""
+import os, time
+last = time.monotonic()
+while os.getppid() == {{parent}}:
+    time.sleep(0.01)
+    now = time.monotonic()
+    if now - last > 0.01 + {_STILL_S}:
+        print(now - last - 0.01, flush=True)
+    last = now
+"""
+_KEY: Final = "ran again"
+
+
+class Clock:
+    """A process that does nothing but look whether it is woken in time."""
+
+    def __init__(self) -> None:
+        self._process = subprocess.Popen(
+            [sys.executable, "-S", "-c", _CLOCK.format(parent=os.getpid())], stdout=subprocess.PIPE, bufsize=0
+        )
+        assert self._process.stdout is not None
+        self._said = self._process.stdout
+        os.set_blocking(self._said.fileno(), False)
+
+    def stood_still_s(self) -> float:
+        """For how long at once, since this was asked last."""
+        words = self._said.read() or b""
+        return max(map(float, words.split()), default=0.0)
+
+    def close(self) -> None:
+        """End it."""
+        self._process.kill()
+        self._process.wait()
+        self._said.close()
+
+
+class Again:
+    """The plugin; in each process that runs tests."""
+
+    def __init__(self) -> None:
+        self._clock = Clock()
+
+    @pytest.hookimpl(tryfirst=True)
+    def pytest_runtest_protocol(self, item: pytest.Item, nextitem: pytest.Item | None) -> bool:
+        """Run one test, and once more if that one was late."""
+        item.ihook.pytest_runtest_logstart(nodeid=item.nodeid, location=item.location)
+        self._clock.stood_still_s()
+        reports = runtestprotocol(item, nextitem=nextitem, log=False)
+        if late := self._late(reports):
+            item.user_properties.append((_KEY, late))
+            item._initrequest()  # type: ignore[attr-defined]  # new fixtures
+            reports = runtestprotocol(item, nextitem=nextitem, log=False)
+        for report in reports:
+            item.ihook.pytest_runtest_logreport(report=report)
+        item.ihook.pytest_runtest_logfinish(nodeid=item.nodeid, location=item.location)
+        return True
+
+    def pytest_unconfigure(self) -> None:
+        self._clock.close()
+
+    def _late(self, reports: list[pytest.TestReport]) -> str:
+        """Why it may have failed through no fault of its own; empty if it has not, or there is no such reason."""
+        failed = [report for report in reports if report.failed]
+        if not failed:
+            return ""
+        time.sleep(0.05)  # what the clock has to say of the last moment
+        still_s = self._clock.stood_still_s()
+        if still_s:
+            return f"the computer stood still for {still_s:.2f} s"
+        found = next(filter(None, (_LATE.search(report.longreprtext) for report in failed)), None)
+        return "" if found is None else f"it {found.group()}"
+
+
+class Told:
+    """The summary, in the process that the user sees."""
+
+    def __init__(self) -> None:
+        self._again: dict[str, str] = {}
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        """Remember who ran again."""
+        for key, why in report.user_properties:
+            if key == _KEY:
+                self._again[report.nodeid] = str(why)
+
+    def pytest_sessionfinish(self, session: pytest.Session) -> None:
+        """Too many of them is a failure."""
+        if len(self._again) > _MOST and session.exitstatus == pytest.ExitCode.OK:
+            session.exitstatus = pytest.ExitCode.TESTS_FAILED
+
+    def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
+        """Say who ran again."""
+        if self._again:
+            terminalreporter.section(f"ran twice: {len(self._again)} (more than {_MOST} are a failure)")
+            for name, why in self._again.items():
+                terminalreporter.line(f"{name}: {why}")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Called for a module that is named as a plugin."""
+    if not hasattr(config, "workerinput"):
+        config.pluginmanager.register(Told())
+    if hasattr(config, "workerinput") or not getattr(config.option, "numprocesses", None):
+        config.pluginmanager.register(Again())

@@ -1,0 +1,90 @@
+"""Who is late runs once more, who is wrong does not; tests of `again`, in a run of their own."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+LATE = """
+import pathlib, signal, os, time, pytest
+from trade.errors import MotionStopped
+
+@pytest.fixture
+def ready():
+    yield "fresh"
+
+def test_it(ready):
+    seen = pathlib.Path(__file__).with_suffix(".seen")
+    first = not seen.exists()
+    seen.touch()
+    assert ready == "fresh"
+    {body}
+"""
+
+
+def _run(tmp_path: Path, body: str, times: int = 1) -> tuple[int, str]:
+    for number in range(times):
+        (tmp_path / f"test_late{number}.py").write_text(LATE.format(body=body))
+    done = subprocess.run(  # noqa: PLW1510 - its exit code is what is asked for
+        [
+            sys.executable,
+            "-m",
+            "pytest",
+            "-q",
+            "-p",
+            "again",
+            "-p",
+            "no:cacheprovider",
+            "-c",
+            "/dev/null",
+            "--rootdir",
+            ".",
+            ".",
+        ],
+        cwd=tmp_path,
+        env={"PYTHONPATH": str(Path(__file__).parent), "PATH": "/usr/bin:/bin"},
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    return done.returncode, done.stdout
+
+
+def test_what_was_late_once_runs_again_and_is_told(tmp_path: Path) -> None:
+    code, said = _run(tmp_path, "assert not first, 'its driver was held up for 0.35 s'")
+    assert code == 0, said
+    assert "ran twice: 1" in said
+    assert "test_late0.py::test_it: it was held up for 0.35 s" in said
+
+
+def test_what_is_wrong_does_not_run_again(tmp_path: Path) -> None:
+    code, said = _run(tmp_path, "assert not first")
+    assert code == 1
+    assert "1 failed" in said
+    assert "ran twice" not in said
+
+
+def test_what_is_late_twice_has_failed(tmp_path: Path) -> None:
+    code, said = _run(tmp_path, "assert False, 'its driver was held up for 0.35 s'")
+    assert code == 1
+    assert "1 failed" in said
+
+
+@pytest.mark.parametrize("times", [12, 13])
+def test_too_many_of_them_fail_the_run(tmp_path: Path, times: int) -> None:
+    code, said = _run(tmp_path, "assert not first, 'j1 did not answer on /dev/x within 251 ms; is it powered'", times)
+    assert code == (times > 12)
+    assert f"{times} passed" in said
+
+
+def test_a_computer_that_stood_still_is_a_reason(tmp_path: Path) -> None:
+    """The clock that is asked is stopped for a moment, as the whole computer would be."""
+    freeze = (
+        "import psutil; clock, = psutil.Process().children()\n"
+        "    clock.suspend(); time.sleep(0.2); clock.resume(); time.sleep(0.1)\n"
+        "    assert not first"
+    )
+    code, said = _run(tmp_path, freeze)
+    assert code == 0, said
+    assert "the computer stood still for 0." in said
