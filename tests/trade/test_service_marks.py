@@ -7,7 +7,7 @@ from typing import Protocol
 import pytest
 
 from trade import Container, service, where
-from trade.errors import ConfigurationError
+from trade.errors import ConfigurationError, LockedByOther
 
 
 class Lamp:
@@ -327,7 +327,7 @@ def test_deregistering_what_is_not_registered_is_refused(here: Container) -> Non
 
 
 def test_an_unknown_effect_is_refused_where_it_is_written() -> None:
-    with pytest.raises(ConfigurationError, match="effect must be one of read, actuate, stop, not 'look'"):
+    with pytest.raises(ConfigurationError, match="effect must be one of read, note, actuate, stop, not 'look'"):
         service(effect="look")  # type: ignore[call-overload]
 
 
@@ -350,3 +350,38 @@ def test_a_parameter_without_a_type_hint_is_refused_with_what_to_write(here: Con
         ConfigurationError, match=r"robot\.move: argument 'angle_rad' has no type hint; write angle_rad: "
     ):
         here.register(Careless(), "robot")
+
+
+class Diary:
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+
+    @service(effect="note")
+    def write(self, line: str) -> None:
+        self.lines.append(line)
+
+    @service
+    def burn(self) -> None:
+        self.lines.clear()
+
+
+def test_what_only_writes_something_down_is_neither_locked_nor_held_up_by_a_lock(
+    here: Container, there: Container
+) -> None:
+    diary = Diary()
+    here.register(diary, "hall.diary")
+    write = there.find(where(name="write", group="hall.diary"))
+    burn = there.find(where(name="burn", group="hall.diary"))
+    with here.lock(where(group="hall")) as lock:
+        assert [name.rpartition("/")[2] for name in lock.resources] == ["burn"]
+        write("rain")
+        with pytest.raises(LockedByOther):
+            burn()
+    assert diary.lines == ["rain"]
+    with pytest.raises(ConfigurationError, match="only writes something down; no lock takes it"):
+        there.lock([write]).acquire()
+
+
+def test_a_note_needs_nothing_physical() -> None:
+    with pytest.raises(ConfigurationError, match="a note needs nothing physical"):
+        service(effect="note", uses=["pen"])(lambda: None)

@@ -69,7 +69,7 @@ SOME_HAVE: Final = {"children": "read", "restart_child": "administer"}
 """Likewise, of functions that only a container has which looks after others."""
 _ALL_FUNCTIONS: Final = {**FUNCTIONS, **SOME_HAVE}
 
-_NEEDS: Final = {"read": "read", "actuate": "call", "stop": _ALL}
+_NEEDS: Final = {"read": "read", "note": "call", "actuate": "call", "stop": _ALL}
 """What other services need over their group, by effect; a stop is open to everybody (S07)."""
 
 

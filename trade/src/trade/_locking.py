@@ -139,6 +139,9 @@ def selected(which: Constraint | Iterable[Handle], select: Callable[[Constraint]
             raise ConfigurationError(where=f"lock of {which}", problem=problem)
         return found
     found = list(which)
+    if noted := next((handle for handle in found if handle.effect == "note"), None):
+        problem = "it only writes something down; no lock takes it"
+        raise ConfigurationError(where=noted.label, problem=problem)
     if not found:
         raise ConfigurationError(where="lock", problem="an empty selection locks nothing; name some services")
     for handle in found:

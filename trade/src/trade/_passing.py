@@ -122,4 +122,5 @@ def passed_on_service(
 
 def _effect(named: str) -> Effect:
     """What it is called by; a word that this version does not know is taken for the one that needs most rights."""
-    return "read" if named == "read" else "stop" if named == "stop" else "actuate"
+    known: dict[str, Effect] = {"read": "read", "note": "note", "stop": "stop"}
+    return known.get(named, "actuate")

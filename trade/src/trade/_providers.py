@@ -350,7 +350,7 @@ class Providers:
                 raise ConfigurationError(where=label, problem=problem)
             signature = self._signature(label, name, mark, function)
             info = signature.info
-            if resources and mark.effect != "read":
+            if resources and mark.effect not in {"read", "note"}:
                 names = tuple(one if isinstance(one, str) else one.name for one in resources)
                 info = structs.replace(info, uses=(*mark.uses, *names))
             services[name] = LocalService(
@@ -375,7 +375,7 @@ class Providers:
 
     def _adopt(self, mark: ServiceMark, needed: Sequence[Resource | str], itself: str) -> tuple[Resource, ...]:
         """What a service needs for itself; what names nothing, or only reads, can be locked as itself."""
-        if itself.startswith(f"{DOMAIN}/"):
+        if itself.startswith(f"{DOMAIN}/") or mark.effect == "note":
             return ()
         if mark.effect == "read" or (not needed and mark.effect == "actuate"):
             needed = (itself,)

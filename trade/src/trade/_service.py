@@ -14,11 +14,11 @@ from trade.errors import ConfigurationError
 
 __all__ = ["Effect", "ServiceMark", "marked_methods", "service"]
 
-Effect = Literal["read", "actuate", "stop"]
+Effect = Literal["read", "note", "actuate", "stop"]
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 _MARK = "__trade_service__"
-_EFFECTS = ("read", "actuate", "stop")
+_EFFECTS = ("read", "note", "actuate", "stop")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,8 +62,9 @@ def service(
     """Mark a method as a service, in a class or in an interface whose implementations then have it.
 
     Args:
-        effect: ``"read"`` changes nothing, ``"actuate"`` (default) may move something or change state, ``"stop"`` ends
-            motion: it overtakes everything and ignores deadlines.
+        effect: ``"read"`` changes nothing, ``"note"`` only writes something down, so that no lock takes it or holds it
+            up, ``"actuate"`` (default) may move something or change state, ``"stop"`` ends motion: it overtakes
+            everything and ignores deadlines.
         cancel: name of the service of the same provider that ends this one early.
         achieves: post-conditions, predicates such as ``"open(gripper)"`` or ``"at(?place)"``.
         uses: physical resources it needs for itself.
@@ -80,6 +81,8 @@ def service(
         raise ConfigurationError(problem=f"effect must be one of {', '.join(_EFFECTS)}, not {effect!r}")
     if serial and effect == "stop":
         raise ConfigurationError(problem="a stop waits for nobody: it cannot be serial")
+    if uses and effect == "note":
+        raise ConfigurationError(problem="a note needs nothing physical; leave out uses, or have it actuate")
     for condition in _several(achieves):
         parse_achieved(condition)
     mark = ServiceMark(

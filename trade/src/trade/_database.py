@@ -1,0 +1,115 @@
+"""One SQLite file, and the one thread that uses it: all goes on without the disk but the saving."""
+
+import contextlib
+import sqlite3
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import TimeoutError as TookTooLong  # the builtin one from 3.11 on
+from pathlib import Path
+from typing import Final, TypeVar
+
+import msgspec
+
+__all__ = ["Database"]
+
+_WAIT_S: Final = 10.0
+"""How long the disk may take."""
+_BESIDE: Final = ("", "-wal", "-shm")
+"""Of the file's name, what else belongs to it."""
+
+_Result = TypeVar("_Result")
+
+
+class Database:
+    """A file that others derive from to say what is in it.
+
+    What is wrong with the disk is told once, and when it is well again. A file that is no sound database is moved
+    aside, and a new one is begun.
+
+    Args:
+        path: of the file; its folder is made.
+        table: the statement that makes its table, if it is not there.
+        what: what is in it, in one word, for messages.
+        tell: is told what is wrong, and when it is not any more.
+    """
+
+    def __init__(self, path: Path, table: str, what: str, tell: Callable[[str], None]) -> None:
+        self._path = path
+        self._table = table
+        self._what = what
+        self._tell = tell
+        self._thread = ThreadPoolExecutor(1, f"trade-{what}s")
+        self._open: sqlite3.Connection | None = None
+        self._trouble = ""
+
+    def close(self) -> None:
+        """End its thread. Idempotent."""
+        with contextlib.suppress(RuntimeError):  # it has ended already
+            self._thread.submit(self._let_go)
+        self._thread.shutdown()
+
+    def _ask(self, what: Callable[[sqlite3.Connection], _Result], *, default: _Result) -> _Result:
+        """What comes of it, or the default if the disk does not do it in time."""
+        try:
+            return self._start(what, default=default).result(_WAIT_S)
+        except (TookTooLong, RuntimeError):  # the latter: it was closed meanwhile
+            return default
+
+    def _start(self, what: Callable[[sqlite3.Connection], _Result], *, default: _Result) -> "Future[_Result]":
+        """Have it done without waiting; RuntimeError if it was closed."""
+        return self._thread.submit(self._do, what, default)
+
+    # --- on its thread
+
+    def _do(self, what: Callable[[sqlite3.Connection], _Result], default: _Result) -> _Result:
+        try:
+            result = self._tried(what)
+        except (sqlite3.Error, OSError) as wrong:
+            self._let_go()
+            if not self._trouble:
+                self._trouble = str(wrong)
+                self._tell(f"no {self._what} is saved: {self._path}: {wrong}; all else goes on")
+            return default
+        if self._trouble:
+            self._trouble = ""
+            self._tell(f"{self._what} is saved again: {self._path}")
+        return result
+
+    def _tried(self, what: Callable[[sqlite3.Connection], _Result]) -> _Result:
+        try:
+            return what(self._opened())
+        except sqlite3.OperationalError:  # the disk, not what is on it
+            raise
+        except (sqlite3.DatabaseError, msgspec.DecodeError) as corrupt:
+            self._let_go()
+            aside = self._move_aside()
+            self._tell(f"{self._path} is corrupt ({corrupt}) and is {aside.name} now; what it held is not restored")
+            return what(self._opened())
+
+    def _opened(self) -> sqlite3.Connection:
+        if self._open is None:
+            self._path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            self._open = sqlite3.connect(self._path, timeout=_WAIT_S / 2)
+            self._open.execute("pragma journal_mode = wal")
+            self._open.execute("pragma synchronous = full")
+            [[said]] = self._open.execute("pragma quick_check(1)").fetchall()
+            if said != "ok":
+                raise sqlite3.DatabaseError(said)
+            self._open.execute(self._table)
+            self._path.chmod(0o600)
+        return self._open
+
+    def _move_aside(self) -> Path:
+        number = 1
+        while (aside := self._path.with_name(f"{self._path.name}.corrupt-{number}")).exists():
+            number += 1
+        for end in _BESIDE:
+            with contextlib.suppress(FileNotFoundError):
+                self._path.with_name(self._path.name + end).replace(aside.with_name(aside.name + end))
+        return aside
+
+    def _let_go(self) -> None:
+        if self._open is not None:
+            with contextlib.suppress(sqlite3.Error):
+                self._open.close()
+            self._open = None
