@@ -5,7 +5,7 @@ from typing import Final, Literal, NamedTuple
 
 import msgspec
 
-from trade.errors import DeviceError
+from trade.errors import BusGone, DeviceError, DeviceSilent
 from trade_hil_sim import Command, Heal
 
 __all__ = ["STRUCK", "Dashboard", "Device", "Order", "Process", "Recovery", "Row", "Sick", "Stop"]
@@ -90,14 +90,23 @@ class Row(NamedTuple):
     found: str = ""
     """The fault that is latched then."""
     cure: tuple[Order, ...] = (Heal(),)
-    registry: str = "healthy"
-    """Its health in the registry while it lasts."""
+    bus_health: str = "healthy"
+    """What its bus says in the registry while it lasts, of itself and of all its devices."""
     reopens: bool = False
     """The port is closed and opened again."""
     refuses: bool = True
     """Further moves end in an error as long as it lasts; False: it is over at once."""
     alone: bool = False
     """It is tried on a robot of its own: which of two signs is seen first depends on what was tried before."""
+
+    @property
+    def registry(self) -> str:
+        """Part of its own health in the registry while it lasts."""
+        if self.bus_health != "healthy":
+            return self.bus_health
+        if isinstance(self.state, str):
+            return f"degraded: {self.state}" if self.state else "healthy"
+        return {DeviceSilent: "degraded: silent", BusGone: "degraded: bus gone"}.get(self.state, "degraded: ")
 
     @property
     def name(self) -> str:

@@ -55,9 +55,9 @@ def _silent(device: Device, fault: str, *strike: Order, stop: Stop = Stop.HOLD, 
     return Row(device, fault, strike, DeviceSilent, "did not answer", DeviceSilent, stop, DeviceSilent, after)
 
 
-def _gone(device: Device, says: str, stop: Stop, after: Recovery, registry: str = "healthy") -> Row:
+def _gone(device: Device, says: str, stop: Stop, after: Recovery, bus_health: str = "healthy") -> Row:
     row = Row(device, "unplug and replug", (Unplug(),), BusGone, says, BusGone, stop, BusGone, after)
-    return row._replace(cure=(Replug(),), registry=registry, reopens=True)
+    return row._replace(cure=(Replug(),), bus_health=bus_health, reopens=True)
 
 
 def _faulty(device: Device, fault: str, strike: Order, says: str, stop: Stop, after: Recovery | None = None) -> Row:
@@ -128,7 +128,7 @@ _CIA402: Final = (
         Stop.WATCHDOG,
         DeviceSilent,
         cure=(BusOff(on=False),),
-        registry="degraded: CAN bus-off",
+        bus_health="degraded: CAN bus-off",
         reopens=True,
     ),
     _faulty("cia402", "EMCY", Emergency(ids=ONE, code=0x2310), "error 2310h, continuous over-current", Stop.ITSELF),
@@ -305,7 +305,9 @@ through, row by row, with the simulator's log as the judge.
   again is neither enabled nor sent anywhere, and at most told to hold where it stands.
 
 What strikes one joint leaves the others of its bus alone, but for those that move in one group with it: they stop.
-In the registry only CAN buses tell their health, and so do the joints on them.
+In the registry a device with a fault is `degraded: ` and what is wrong, one that cannot be heard `degraded: silent` or
+`degraded: bus gone`, and so is a group that it belongs to. Where a CAN bus is not well, that is said of all that hangs
+on it. Each fault is kept, with what was measured before ([drivers](drivers.md#what-was-wrong)).
 """
 _COLUMNS: Final = ("fault", "struck by", "the move ends with", "state()", "stop()", "stopped by", "then")
 
@@ -325,7 +327,7 @@ def _section(device: str) -> Iterator[str]:
 
 def _cells(row: Row) -> tuple[str, ...]:
     then = f'; when it is noticed, {_orders(row, row.then)}: fault "{row.found}"' if row.then else ""
-    health = "" if row.registry == "healthy" else f'; in the registry "{row.registry}"'
+    health = "" if row.bus_health == "healthy" else f'; in the registry "{row.bus_health}"'
     if row.error is None:
         return row.fault, _orders(row, row.strike), "nothing: it arrives", "no fault", "nothing", *_end(row)
     error = (

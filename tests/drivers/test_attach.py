@@ -266,7 +266,7 @@ def test_close_withdraws_what_was_announced_and_can_be_repeated(head: Rig) -> No
         deregister=announced.remove,
         ports={"neck": str(head.sim.port)},
     )
-    assert len(announced) == 3
+    assert len(announced) == 4  # two joints, their group, and what tells of faults
     closing = [Outcome(robot.close) for _ in range(3)]
     assert [outcome.wait().error for outcome in closing] == [None] * 3
     assert not announced

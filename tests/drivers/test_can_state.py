@@ -110,7 +110,7 @@ def test_health_is_degraded_from_error_passive_on(frame_id: int, data: int, heal
             assert port.receive(5) is None
         except PortLost:
             assert "bus-off" in health
-    assert monitor.health == health
+    assert monitor.health() == health
     port.close()
 
 

@@ -13,6 +13,7 @@ from trade_drivers._senses import UNITS, Camera, CameraInfo, Image, Reading, Sen
 from trade_drivers._trajectory import Trajectory, TrajectoryPoint
 from trade_drivers._without import without
 from trade_drivers._work import WireError
+from trade_drivers.faults import Fault, FaultInfo, FaultLog, FaultSample, Tell, Trouble
 from trade_drivers.robotfile import Bus, CanBus, Coupled, Group, Joint, Robot, SerialBus, UrBus, parse
 
 __all__ = [
@@ -33,6 +34,10 @@ __all__ = [
     "Commissioner",
     "Coupled",
     "Driver",
+    "Fault",
+    "FaultInfo",
+    "FaultLog",
+    "FaultSample",
     "FollowProgress",
     "Found",
     "Gripper",
@@ -54,9 +59,11 @@ __all__ = [
     "Sensor",
     "SensorInfo",
     "SerialBus",
+    "Tell",
     "Tolerances",
     "Trajectory",
     "TrajectoryPoint",
+    "Trouble",
     "UrBus",
     "WireError",
     "attach",

@@ -5,7 +5,8 @@ import logging
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from typing import TypeVar
+from pathlib import Path
+from typing import Final, TypeVar
 
 import trade
 from trade import Measure
@@ -13,16 +14,19 @@ from trade.errors import ConfigurationError, TradeError
 from trade_drivers import robotfile
 from trade_drivers._across import AcrossGroup
 from trade_drivers._arm import Arm
-from trade_drivers._can_monitor import CanMonitor, HealthTeller
+from trade_drivers._can_monitor import CanMonitor
 from trade_drivers._driver import AttachedBus, Driver, SenseDriver, load_driver
+from trade_drivers._health import HEALTHY, HealthTeller
 from trade_drivers._interfaces import Gripper, JointGroup, Motor
 from trade_drivers._measured import measures_of
 from trade_drivers._senses import Camera, Sensor
+from trade_drivers.faults import FaultLog, FaultRecorder, FaultStore
 from trade_drivers.robotfile import Group, Robot
 
 __all__ = ["AttachedRobot", "attach"]
 
 _log = logging.getLogger("trade")
+_FAULTS: Final = "faults"
 
 Provider = Motor | JointGroup | Gripper | Arm | Camera | Sensor | CanMonitor
 _Sense = TypeVar("_Sense", Camera, Sensor)
@@ -36,9 +40,16 @@ class AttachedRobot:
     """A robot whose devices are attached and whose services are announced, until it is closed."""
 
     def __init__(
-        self, robot: Robot, providers: Mapping[str, Provider], buses: Mapping[str, AttachedBus], undo: ExitStack
+        self,
+        robot: Robot,
+        providers: Mapping[str, Provider],
+        buses: Mapping[str, AttachedBus],
+        faults: FaultLog,
+        undo: ExitStack,
     ) -> None:
         self.robot = robot
+        self.faults = faults
+        """What is and was wrong with its devices; the provider in group ``rosie.faults``."""
         self._buses = buses
         self.providers = dict(providers)
         """By group: ``rosie.neck.pan`` -> a Motor, ``rosie.head`` -> a JointGroup, ``rosie.left.hand`` -> a Gripper,
@@ -118,13 +129,15 @@ def attach(
     set_health: SetHealth | None = None,
     ports: Mapping[str, str] | None = None,
     healthy: Callable[[], bool] = _always,
+    state_dir: Path | None = None,
 ) -> AttachedRobot:
     """Attach all devices of a robot, then announce their services. Nothing is moved or enabled; what moves is stopped.
 
     Joint ``neck.pan`` of robot ``rosie`` becomes a Motor in group ``rosie.neck.pan``, group ``head`` a JointGroup in
     ``rosie.head``, whether its joints share a bus or not, gripper ``left.hand`` a Gripper in ``rosie.left.hand``, arm
     ``right`` an Arm in ``rosie.right``, camera ``eye`` a Camera in ``rosie.eye``, sensor ``wrist`` a Sensor in
-    ``rosie.wrist``, CAN bus ``legs`` a CanMonitor in ``rosie.bus.legs``. If anything is wrong, nothing is announced and
+    ``rosie.wrist``, CAN bus ``legs`` a CanMonitor in ``rosie.bus.legs``, and what is wrong with any of them is told in
+    ``rosie.faults``. If anything is wrong, nothing is announced and
     no port is kept.
 
     Args:
@@ -136,21 +149,47 @@ def attach(
             camera or sensor -> what its driver calls its port: for simulated devices.
         healthy: asked by every bus thread in every cycle; while it says no, devices are told to hold once and the bus
             falls silent, so that their own watchdogs stop them.
+        state_dir: where faults are kept for the next process; by default nowhere, or, if ``register`` is not given,
+            where the default container keeps what outlives it.
 
     Raises:
         ConfigurationError: a driver is missing, a port cannot be had, a device is absent, another, or set wrongly.
     """
     with ExitStack() as undo:
         _check_ports(robot, ports or {})
+        faults = _fault_log(robot, state_dir if register is not None else state_dir or _default_state_dir(), undo)
+        recorder = FaultRecorder(faults, f"faults of {robot.name}")
+        undo.callback(recorder.close)  # after the devices: what befalls them while they are left is noted, too
         senses = _attach_senses(robot, ports or {}, undo)  # first: if one is missing, what moves is not even touched
         buses = _attach_buses(robot, ports or {}, healthy, undo)
         providers = _providers(robot, buses, senses)
-        for name, provider in providers.items():
+        recorder.start(providers, _unwatched(robot, buses, recorder))
+        for name, provider in {**providers, f"{robot.name}.{_FAULTS}": faults}.items():
             (register or trade.register)(provider, (name,))
             undo.callback(_withdraw, deregister or trade.deregister, provider)
         if (tell := set_health or (trade.set_health if register is None else None)) is not None:
-            _tell_health(robot, providers, tell, undo)
-        return AttachedRobot(robot, providers, buses, undo.pop_all())
+            _tell_health(robot, providers, faults, tell, undo)
+        return AttachedRobot(robot, providers, buses, faults, undo.pop_all())
+
+
+def _default_state_dir() -> Path | None:
+    settings = trade.container().settings
+    return None if settings.state_dir is None else settings.state_dir / settings.system
+
+
+def _fault_log(robot: Robot, state_dir: Path | None, undo: ExitStack) -> FaultLog:
+    path = None if state_dir is None else state_dir / "faults" / f"{robot.name}.sqlite"
+    log = FaultLog(robot.name, None if path is None else FaultStore(path, _log.warning))
+    undo.callback(log.close)
+    return log
+
+
+def _unwatched(robot: Robot, buses: Mapping[str, AttachedBus], recorder: FaultRecorder) -> set[str]:
+    """Have buses tell what is wrong with their devices; the names of the devices of which nobody does."""
+    deaf = {name for name, bus in buses.items() if not bus.watched(recorder.tell)}
+    moving = (*robot.joints, *robot.grippers, *robot.arms)
+    names = [*(device.name for device in moving if device.bus in deaf), *(sensor.name for sensor in robot.sensors)]
+    return {f"{robot.name}.{name}" for name in names}
 
 
 def _check_ports(robot: Robot, ports: Mapping[str, str]) -> None:
@@ -212,6 +251,10 @@ def _providers(
     for provider in providers.values():
         provider.members = members
     named: dict[str, Provider] = {**providers, **senses}
+    if (taken := f"{robot.name}.{_FAULTS}") in named:
+        raise ConfigurationError(
+            where=robot.where, problem=f"{taken} is what tells of faults; name the joints otherwise"
+        )
     return named | _monitors(robot, buses, named)
 
 
@@ -231,17 +274,34 @@ def _monitors(robot: Robot, buses: Mapping[str, AttachedBus], others: Mapping[st
     return monitors
 
 
-def _tell_health(robot: Robot, providers: Mapping[str, Provider], tell: SetHealth, undo: ExitStack) -> None:
-    """Have what hangs on a CAN bus, and the bus itself, tell when that is not well."""
-    watched: dict[CanMonitor, list[object]] = {}
-    for bus in robot.buses:
-        monitor = providers.get(_bus_group(robot, bus.name))
-        if isinstance(monitor, CanMonitor):
-            here = {joint.name for joint in robot.joints_on(bus.name)}
-            groups = [group.name for group in robot.groups if not here.isdisjoint(group.joints)]
-            watched[monitor] = [monitor, *(providers[f"{robot.name}.{name}"] for name in (*here, *groups))]
-    if watched:
-        undo.callback(HealthTeller(watched, tell, f"health of {robot.name}").close)
+def _tell_health(
+    robot: Robot, providers: Mapping[str, Provider], faults: FaultLog, tell: SetHealth, undo: ExitStack
+) -> None:
+    """Have every device and group tell when it is not well, because of its CAN bus or a fault."""
+    groups = {group.name: group.joints for group in robot.groups}
+    bus_of = {device.name: device.bus for device in (*robot.joints, *robot.grippers, *robot.arms)}
+    watched: dict[object, list[Callable[[], str]]] = {}
+    for full, provider in providers.items():
+        if isinstance(provider, CanMonitor):
+            watched[provider] = [provider.health]
+            continue
+        name = full.removeprefix(f"{robot.name}.")
+        parts = groups.get(name, [name])
+        buses = dict.fromkeys(bus_of[part] for part in parts if part in bus_of)
+        monitors = [providers.get(_bus_group(robot, bus)) for bus in buses]
+        watched[provider] = [monitor.health for monitor in monitors if isinstance(monitor, CanMonitor)]
+        watched[provider] += [_health_by(faults, f"{robot.name}.{part}", whole=name in groups) for part in parts]
+    undo.callback(HealthTeller(watched, tell, f"health of {robot.name}").close)
+
+
+def _health_by(faults: FaultLog, device: str, *, whole: bool) -> Callable[[], str]:
+    """What its faults say of a device, or of a group that it belongs to."""
+
+    def health() -> str:
+        wrong = faults.health(device)
+        return f"degraded: {f'{device}: ' if whole else ''}{wrong}" if wrong else HEALTHY
+
+    return health
 
 
 def _group(robot: Robot, group: Group, buses: Mapping[str, AttachedBus]) -> JointGroup:

@@ -11,6 +11,7 @@ from trade import Measure
 from trade.errors import BusGone, TradeError
 from trade_drivers._exchange import BusExchange
 from trade_drivers._work import Device, PortLost, PortOpening
+from trade_drivers.faults import Lookout, Tell
 from trade_drivers.robotfile import Bus
 
 __all__ = ["BusThread", "Port"]
@@ -55,6 +56,7 @@ class BusThread(Generic[_Exchange_co]):
         self._reopen_at = 0.0
         self._reopen_s = _REOPEN_FIRST_S
         self._leaving = False
+        self._lookout: Lookout | None = None
         self.cycles = 0
         """Since it started."""
         self.late = 0
@@ -69,6 +71,10 @@ class BusThread(Generic[_Exchange_co]):
     def start(self) -> None:
         """Begin to cycle; the port must be open."""
         self._thread.start()
+
+    def watched(self, tell: Tell) -> None:
+        """Have ``tell`` told, on the bus thread, what is wrong with devices, now and whenever that changes."""
+        self._lookout = Lookout(self._exchange, tell)
 
     def alive(self) -> bool:
         """Whether the thread still runs."""
@@ -103,19 +109,31 @@ class BusThread(Generic[_Exchange_co]):
     # --- the thread
 
     def _run(self) -> None:
-        problem = "the thread of its bus has ended"
+        problem, failed = "the thread of its bus has ended", False
         try:
             next_at = time.monotonic()
             while not self._leaving:
                 self._beat()
+                self._look()
                 next_at = self._rest(next_at + 1 / self._bus.rate_hz)
+            self._look()
         except Exception as defect:  # noqa: BLE001 - whatever it is: the bus falls silent, and the watchdogs stop the motors
-            problem = f"the thread of its bus failed: {defect!r}"
+            problem, failed = f"the thread of its bus failed: {defect!r}", True
             _log.exception("bus %s: its thread failed; its devices stop by their watchdogs", self._bus.name)
         finally:
             self.exchange.refusing = lambda device: device.faulty(problem)
             self._wire.close()
             self.exchange.fail_all(self.exchange.refusing)
+            if failed:
+                self._look()
+
+    def _look(self) -> None:
+        if self._lookout is not None:
+            try:
+                self._lookout.look()
+            except Exception:  # noqa: BLE001 - who looks on ends no motion
+                self._lookout = None
+                _log.exception("bus %s: faults of its devices are not noticed any more", self._bus.name)
 
     def _rest(self, next_at: float) -> float:
         """Wait for the next cycle; stops do not wait."""

@@ -14,6 +14,7 @@ from trade_drivers._can_monitor import CanMonitor
 from trade_drivers._commission import Commissioner
 from trade_drivers._interfaces import Gripper, JointGroup, Motor
 from trade_drivers._senses import Camera, Sensor
+from trade_drivers.faults import Tell
 from trade_drivers.robotfile import Bus, Robot
 
 __all__ = ["AnyDriver", "AttachedBus", "Driver", "SenseDriver", "drivers", "load_driver"]
@@ -56,6 +57,13 @@ class AttachedBus(ABC):
     def measures(self, bus: str) -> Iterable[Measure]:  # noqa: ARG002 - whoever keeps none has none
         """Numbers of its own that are known already, for metrics; ``bus`` is its name with the robot's before it."""
         return ()
+
+    def watched(self, tell: Tell) -> bool:  # noqa: ARG002 - whoever does not notice is asked
+        """Have ``tell`` told what is wrong with devices of this bus, now and at every change, by whoever notices first.
+
+        Returns whether that is done; else their ``state()`` is asked again and again.
+        """
+        return False
 
     @abstractmethod
     def close(self) -> None:

@@ -40,6 +40,11 @@ class BusDevice(Device, Protocol):
     silent_since_ns: int
     probe_at_ns: int
 
+    @property
+    def fault(self) -> str:
+        """Why it refuses to move; empty if it does not."""
+        ...
+
     def age_ns(self, now_ns: int) -> int:
         """Age of the newest measurement, or the time it has been silent if there is none."""
         ...
@@ -106,6 +111,11 @@ class BusExchange(ABC, Generic[_Device]):
         Raises:
             TradeError: not everything could be left so.
         """
+
+    @property
+    def devices(self) -> tuple[_Device, ...]:
+        """Those on this bus."""
+        return self._devices
 
     # --- from any thread
 

@@ -10,6 +10,7 @@ from trade_drivers._checks import finite, one_each, valid, within
 from trade_drivers._driver import AttachedBus
 from trade_drivers._interfaces import JointGroup, JointLimits, Motor, MotorState
 from trade_drivers._plan import Plan
+from trade_drivers.faults import Tell
 from trade_drivers.joints._axis import Axis
 from trade_drivers.joints._exchange import Exchange
 from trade_drivers.joints._follow import Follow
@@ -193,6 +194,10 @@ class AttachedJoints(AttachedBus):
 
     def measures(self, bus: str) -> list[Measure]:
         return self._thread.measures(bus)
+
+    def watched(self, tell: Tell) -> bool:
+        self._thread.watched(tell)
+        return True
 
     def close(self) -> None:
         self._thread.close()

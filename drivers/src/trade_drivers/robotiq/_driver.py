@@ -10,6 +10,7 @@ from trade_drivers._bus_thread import BusThread
 from trade_drivers._driver import AttachedBus, Driver
 from trade_drivers._interfaces import Gripper, JointGroup, Motor
 from trade_drivers._work import PortLost
+from trade_drivers.faults import Tell
 from trade_drivers.robotfile import Bus, Robot, SerialBus
 from trade_drivers.robotiq import _table as table
 from trade_drivers.robotiq._commission import RobotiqCommissioner
@@ -52,6 +53,10 @@ class AttachedGrippers(AttachedBus):
 
     def measures(self, bus: str) -> list[Measure]:
         return self._thread.measures(bus)
+
+    def watched(self, tell: Tell) -> bool:
+        self._thread.watched(tell)
+        return True
 
     def close(self) -> None:
         self._thread.close()

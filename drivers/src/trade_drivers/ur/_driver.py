@@ -13,6 +13,7 @@ from trade_drivers._bus_thread import BusThread
 from trade_drivers._driver import AttachedBus, Driver
 from trade_drivers._interfaces import JointGroup, Motor
 from trade_drivers._work import PortLost
+from trade_drivers.faults import Tell
 from trade_drivers.robotfile import Bus, Robot, UrBus
 from trade_drivers.ur._dashboard import DashboardError, ask
 from trade_drivers.ur._exchange import Exchange
@@ -52,6 +53,10 @@ class AttachedController(AttachedBus):
 
     def measures(self, bus: str) -> list[Measure]:
         return self._thread.measures(bus)
+
+    def watched(self, tell: Tell) -> bool:
+        self._thread.watched(tell)
+        return True
 
     def close(self) -> None:
         try:

@@ -1,0 +1,119 @@
+"""Takes what bus threads notice, remembers what devices measured lately, and tells the log of both."""
+
+import queue
+import threading
+import time
+from collections import deque
+from collections.abc import Collection, Mapping
+from typing import Any, Final
+
+from trade.errors import DeviceFault
+from trade_drivers._arm import Arm, ArmState
+from trade_drivers._interfaces import Gripper, Motor
+from trade_drivers._senses import Sensor
+from trade_drivers.faults._log import FaultLog
+from trade_drivers.faults._lookout import Found, Trouble, found_in
+from trade_drivers.faults._record import Moment, when
+
+__all__ = ["FaultRecorder"]
+
+_EVERY_S: Final = 0.04
+_KEPT: Final = 50
+"""Measurements of each device: those of two seconds."""
+_END_S: Final = 5.0
+_END: Final = Trouble("", "fault", 0.0, 0.0)
+"""Nothing is told after it."""
+_MEASURING: Final = (Motor, Gripper, Arm, Sensor)
+
+
+class FaultRecorder:
+    """A thread for the devices of one robot; it has the time to wait that bus threads have not.
+
+    Args:
+        log: is told of every fault that begins or ends.
+        name: of the thread.
+    """
+
+    def __init__(self, log: FaultLog, name: str) -> None:
+        self._log = log
+        self._told: queue.SimpleQueue[Trouble] = queue.SimpleQueue()
+        self._devices: dict[str, Any] = {}
+        self._asked: frozenset[str] = frozenset()
+        self._lately: dict[str, deque[Moment]] = {}
+        self._known: dict[tuple[str, str], dict[str, Found]] = {}
+        """By device and respect, what is wrong with it."""
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+
+    def tell(self, trouble: Trouble) -> None:
+        """Take what somebody noticed; never waits."""
+        self._told.put(trouble)
+
+    def start(self, devices: Mapping[str, object], asked: Collection[str]) -> None:
+        """Begin.
+
+        Args:
+            devices: by name; what measures nothing is left out.
+            asked: the names of those of which nobody else notices what is wrong: they are asked 25 times a second.
+        """
+        self._devices = {name: device for name, device in devices.items() if isinstance(device, _MEASURING)}
+        self._asked = frozenset(asked) & frozenset(self._devices)
+        self._lately = {name: deque(maxlen=_KEPT) for name in self._devices}
+        self._thread.start()
+
+    def close(self) -> None:
+        """End, once all that was told is noted. More than once is fine."""
+        self._told.put(_END)
+        if self._thread.ident is not None:
+            self._thread.join(_END_S)
+
+    # --- the thread
+
+    def _run(self) -> None:
+        due_s = time.monotonic()
+        while (trouble := self._next(due_s)) is not _END:
+            if trouble is not None:
+                self._take(trouble)
+            if time.monotonic() >= due_s:
+                due_s = time.monotonic() + _EVERY_S
+                self._look_at_all()
+                self._log.save()
+
+    def _next(self, due_s: float) -> Trouble | None:
+        try:
+            return self._told.get(timeout=max(0.0, due_s - time.monotonic()))
+        except queue.Empty:
+            return None
+
+    def _look_at_all(self) -> None:
+        for name in self._devices:
+            found = self._measure(name)
+            if name in self._asked:
+                self._take(Trouble(name, "fault", time.time(), time.monotonic(), found))
+
+    def _measure(self, name: str) -> tuple[Found, ...]:
+        """Keep what a device has measured, if that is new; what is wrong with it, by what it says itself."""
+        device, lately = self._devices[name], self._lately[name]
+        try:
+            state = device.read() if isinstance(device, Sensor) else device.state()
+        except Exception as error:  # noqa: BLE001 - a mistake of the driver's is told, and ends nothing
+            return found_in(name, error)
+        at_s = when(state)
+        if not lately or lately[-1][0] < at_s:
+            lately.append((at_s, state))
+        fault = getattr(state, "fault", "")
+        remedy = state.remedy if isinstance(state, ArmState) else "remove the cause, then enable it again"
+        return found_in(name, DeviceFault(device=name, bus="", fault=fault, remedy=remedy)) if fault else ()
+
+    def _take(self, trouble: Trouble) -> None:
+        device = trouble.device
+        before = self._known.get((device, trouble.respect), {})
+        now = {found.kind: found for found in trouble.found}
+        self._known[device, trouble.respect] = now
+        for kind in before:
+            if kind not in now:
+                self._log.end(device, kind, trouble.at, trouble.at_s)
+        begun = [found for kind, found in now.items() if kind not in before]
+        if begun and device in self._devices:
+            self._measure(device)
+        for found in begun:
+            self._log.begin(device, found, trouble.at, trouble.at_s, tuple(self._lately.get(device, ())))
