@@ -105,7 +105,7 @@ class Row(NamedTuple):
         if self.bus_health != "healthy":
             return self.bus_health
         if isinstance(self.state, str):
-            return f"degraded: {self.state}" if self.state else "healthy"
+            return self.state or "healthy"
         return {DeviceSilent: "degraded: silent", BusGone: "degraded: bus gone"}.get(self.state, "degraded: ")
 
     @property

@@ -4,6 +4,7 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+from unittest.mock import create_autospec
 
 import pytest
 
@@ -11,8 +12,9 @@ import trade_hil_sim as sim
 from drivers.conftest import Outcome, Rig
 from drivers.gripper_rig import HandRig, made_rig
 from trade import Container, where
-from trade.errors import ConfigurationError
-from trade_drivers import AttachedRobot, FaultInfo
+from trade.errors import ConfigurationError, DeviceSilent
+from trade_drivers import AttachedRobot, Camera, FaultInfo, FaultLog, Motor, MotorState, Reading, Sensor
+from trade_drivers.faults import FaultRecorder
 from waiting import wait_until
 
 
@@ -220,3 +222,77 @@ def test_to_look_costs_the_bus_thread_a_small_part_of_its_cycle(head: Rig) -> No
     thread.exchange.cycle, thread._lookout.look = timed("cycle", cycle), timed("look", look)
     wait_until(lambda: thread.cycles - before > 150, "it has cycled")
     assert 0 < spent["look"] < 0.2 * spent["cycle"], spent
+
+
+# --- devices of which nobody tells
+
+
+def asked(log: FaultLog, name: str, device: object) -> FaultRecorder:
+    recorder = FaultRecorder(log, "faults of a test")
+    recorder.start({name: device}, {name})
+    return recorder
+
+
+def test_a_device_of_another_driver_is_asked_and_its_mistakes_are_faults_too() -> None:
+    motor, log = create_autospec(Motor, instance=True), FaultLog("rosie")
+    motor.state.return_value = None
+    silent = DeviceSilent(device="rosie.pan", bus="/dev/ttyUSB0", waited_s=0.3)
+    well: dict[str, Any] = dict.fromkeys(("position_rad", "velocity_rad_s", "load", "measured_at", "age_s"), 0.0)
+    well |= {"name": "rosie.pan", "temperature_c": None, "voltage_v": None, "enabled": True, "moving": False}
+    recorder = asked(log, "rosie.pan", motor)
+    try:
+        wait_until(lambda: log.health("rosie.pan") == "TypeError", "what is no state is a mistake")
+        for answer, kind in (
+            (MotorState(**well), ""),
+            (MotorState(**well, fault="overload"), "overload"),
+            (silent, "silent"),
+            (ZeroDivisionError("oops"), "ZeroDivisionError"),
+            (MotorState(**well), ""),
+        ):
+            motor.state.side_effect = [answer] * 10_000
+            wait_until(lambda kind=kind: log.health("rosie.pan") == kind, f"it is {kind!r}")
+    finally:
+        recorder.close()
+    told = {info.kind: (info.text, info.open) for info in log.faults()}
+    assert told == {
+        "overload": ("rosie.pan: overload", False),
+        "silent": (str(silent), False),
+        "TypeError": (
+            "rosie.pan: its state cannot be read: TypeError('NoneType is no record of what was measured')",
+            False,
+        ),
+        "ZeroDivisionError": ("rosie.pan: its state cannot be read: ZeroDivisionError('oops')", False),
+    }
+
+
+def test_a_sensor_is_silent_and_well_again_and_what_it_measured_before_is_kept() -> None:
+    sensor, log = create_autospec(Sensor, instance=True), FaultLog("rosie")
+    silent = DeviceSilent(device="rosie.scale", bus="/dev/ttyUSB0", waited_s=1.2)
+    sensor.read.return_value = Reading(name="rosie.scale", value=[1.0, 2.5], unit="kg", stamp_ns=1, age_s=0.0)
+    recorder = asked(log, "rosie.scale", sensor)
+    try:
+        wait_until(lambda: sensor.read.call_count > 3, "it was read")
+        sensor.read.side_effect = silent
+        wait_until(lambda: log.health("rosie.scale") == "silent", "it is silent")
+        sensor.read.side_effect = None
+        sensor.read.return_value = Reading(name="rosie.scale", value=1.0, unit="kg", stamp_ns=10**9, age_s=0.0)
+        wait_until(lambda: not log.health("rosie.scale"), "it is well")
+    finally:
+        recorder.close()
+    [info] = log.faults()
+    assert (info.text, info.count) == (str(silent), 1)
+    assert log.fault(info.id).first[-1].values == {"value.0": 1.0, "value.1": 2.5}
+
+
+def test_a_camera_is_not_asked_for_pictures_to_see_whether_it_is_well() -> None:
+    camera, motor, log = (
+        create_autospec(Camera, instance=True),
+        create_autospec(Motor, instance=True),
+        FaultLog("rosie"),
+    )
+    motor.state.side_effect = DeviceSilent(device="rosie.pan", bus="/dev/ttyUSB0", waited_s=0.3)
+    recorder = FaultRecorder(log, "faults of a test")
+    recorder.start({"rosie.eye": camera, "rosie.pan": motor}, {"rosie.eye", "rosie.pan"})
+    wait_until(lambda: log.health("rosie.pan") == "silent", "the others are asked")
+    recorder.close()
+    camera.image.assert_not_called()

@@ -1,4 +1,4 @@
-"""What `trade up` tells of its joints, once for each change."""
+"""What `trade up` tells of its devices, once for each change; and that `trade services` shows what is not well."""
 
 import json
 from typing import Any
@@ -6,37 +6,56 @@ from unittest.mock import create_autospec
 
 import pytest
 
-from trade.errors import DeviceSilent
-from trade_drivers import Motor, MotorState
+from trade_drivers import FaultLog, Motor
+from trade_drivers.faults._lookout import Found
 from trade_gateway._faults import FaultWatch
 from trade_gateway._output import Output
 
-SILENT = DeviceSilent(device="rosie.pan", bus="/dev/ttyUSB0", waited_s=0.3)
-STATES: list[tuple[object, str | None]] = [
-    ("", None),
-    ("overload", "rosie.pan: overload. When you have looked: trade call rosie.pan.enable"),
-    ("overload", None),
-    (SILENT, str(SILENT)),
-    (DeviceSilent(device="rosie.pan", bus="/dev/ttyUSB0", waited_s=0.8), None),
-    (ZeroDivisionError("oops"), "rosie.pan: its state cannot be read: ZeroDivisionError('oops')"),
-    ("is it blocked?", "rosie.pan: is it blocked? When you have looked: trade call rosie.pan.enable"),
-    ("", ""),
-    ("", None),
-]
+OVERLOAD = Found("overload", "rosie.pan: overload", "remove the cause")
+BLOCKED = Found("is it blocked?", "rosie.pan: is it blocked?", "remove the cause")
+SILENT = Found("silent", "rosie.pan did not answer")
+PROTECTIVE = Found("protective stop", "rosie.pan: protective stop", "call unlock_protective_stop()")
+BEGIN: dict[str, tuple[Any, str]] = {
+    "overload": (OVERLOAD, "rosie.pan: overload. When you have looked: trade call rosie.pan.enable"),
+    "blocked": (BLOCKED, "rosie.pan: is it blocked? When you have looked: trade call rosie.pan.enable"),
+    "silent": (SILENT, "rosie.pan did not answer"),
+}
 
 
-def state(fault: str) -> MotorState:
-    numbers: dict[str, Any] = dict.fromkeys(
-        ("position_rad", "velocity_rad_s", "load", "temperature_c", "voltage_v", "measured_at", "age_s"), 0.0
-    )
-    return MotorState(name="rosie.pan", enabled=True, moving=False, fault=fault, **numbers)
+@pytest.fixture
+def log() -> FaultLog:
+    return FaultLog("rosie")
 
 
-def test_each_change_is_told_once_in_both_directions(capsys: pytest.CaptureFixture[str]) -> None:
-    motor = create_autospec(Motor, instance=True)
-    motor.state.side_effect = [state(said) if isinstance(said, str) else said for said, _ in STATES]
-    watch = FaultWatch({"rosie.pan": motor})
-    for _, told in STATES:
-        assert watch.tell(Output(as_json=True)) is (told is not None)
-        lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-        assert [(line["joint"], line["fault"]) for line in lines] == ([] if told is None else [("rosie.pan", told)])
+def told(capsys: pytest.CaptureFixture[str]) -> list[tuple[str, str]]:
+    lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    return [(line["joint"], line["fault"]) for line in lines]
+
+
+@pytest.mark.parametrize(("found", "line"), BEGIN.values(), ids=BEGIN)
+def test_each_change_is_told_once_in_both_directions(
+    found: Found, line: str, log: FaultLog, capsys: pytest.CaptureFixture[str]
+) -> None:
+    watch, out = FaultWatch(log, {"rosie.pan": create_autospec(Motor, instance=True)}), Output(as_json=True)
+    assert not watch.tell(out)
+    log.begin("rosie.pan", found, 0.0, 0.0)
+    assert [watch.tell(out), watch.tell(out)] == [True, False]
+    assert told(capsys) == [("rosie.pan", line)]
+    log.end("rosie.pan", found.kind, 1.0, 1.0)
+    assert [watch.tell(out), watch.tell(out)] == [True, False]
+    assert told(capsys) == [("rosie.pan", "")]
+
+
+def test_of_two_faults_the_newest_is_told_and_it_is_well_when_both_are_gone(
+    log: FaultLog, capsys: pytest.CaptureFixture[str]
+) -> None:
+    watch, out = FaultWatch(log, {}), Output(as_json=True)
+    log.begin("rosie.pan", PROTECTIVE, 0.0, 0.0)
+    log.begin("rosie.pan", SILENT, 0.0, 0.0)
+    watch.tell(out)
+    log.end("rosie.pan", "silent", 1.0, 1.0)
+    watch.tell(out)
+    log.end("rosie.pan", "protective stop", 1.0, 1.0)
+    watch.tell(out)
+    remedied = "rosie.pan: protective stop; call unlock_protective_stop()"
+    assert [text for _, text in told(capsys)] == ["rosie.pan did not answer", remedied, ""]

@@ -135,7 +135,9 @@ def test_tables_in_a_pipe_are_whole_lines(rosie_up, trade_command: Command) -> N
 def test_a_group_nobody_is_in_is_answered_with_those_there_are(rosie_up, trade_command: Command) -> None:
     rosie_up()
     said = trade_command("services", "--group", "roise").stdout
-    assert said == "no services match group='roise'; there is rosie.head, rosie.neck.pan, rosie.neck.tilt\n"
+    assert (
+        said == "no services match group='roise'; there is rosie.faults, rosie.head, rosie.neck.pan, rosie.neck.tilt\n"
+    )
 
 
 def test_faults_that_latch_and_heal_are_told_with_what_to_do(rosie_up, trade_command: Command) -> None:

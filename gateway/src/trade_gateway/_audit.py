@@ -9,15 +9,15 @@ import time
 from collections.abc import Iterator, Mapping
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal, NamedTuple
+from typing import Annotated, Final, Literal, NamedTuple
 
 import msgspec
 import typer
 from rich.markup import escape
-from typer.core import TyperGroup
 
 from trade.auditing import AuditRow, Verdict, moved_aside_in, reading, records_in, verify
 from trade.errors import ConfigurationError
+from trade_gateway._by_default import FirstByDefault
 from trade_gateway._list import Json
 from trade_gateway._output import Output, UsageError, complain
 
@@ -30,18 +30,8 @@ Folder = Annotated[
 ]
 
 
-class _ShownByDefault(TyperGroup):
-    """``trade audit FOLDER`` is ``trade audit show FOLDER``."""
-
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """What begins with none of the commands is for the first."""
-        if not args or args[0] not in (*self.commands, "-h", "--help"):
-            args = ["show", *args]
-        return super().parse_args(ctx, args)
-
-
 app = typer.Typer(
-    cls=_ShownByDefault,
+    cls=FirstByDefault,
     help="Who called, locked, stopped, was refused, changed the configuration. Without one of the commands: show.",
 )
 

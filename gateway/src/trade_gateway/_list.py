@@ -13,6 +13,7 @@ from trade_gateway._loads import loads, loads_table
 from trade_gateway._output import Output, UsageError
 from trade_gateway._system_choice import visitor
 
+HEALTHY: Final = "healthy"
 _ALONE: Final = "no other container is up in this system; [bold]trade up examples/rosie.toml --sim[/] starts one"
 Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
@@ -41,7 +42,7 @@ def services(
                 doc_text = indent(handle.doc or "(undocumented)", "  ")
                 out.say(f"[bold]{escape(handle.label)}[/]  {escape(handle.signature)}\n{escape(doc_text)}\n")
         else:
-            out.table(("SERVICE", "CALLED AS", "EFFECT", "CONTAINER", "HOST"), [_row(handle) for handle in found])
+            out.table(*_table(found))
 
 
 def asked_for(what: str, *, name: str | None, group: str | None, container: str | None = None) -> Constraint:
@@ -81,12 +82,21 @@ def describe(handle: Handle) -> dict[str, Any]:
         "doc": handle.doc,
         "container": handle.container,
         "host": handle.host,
+        "health": handle.health,
         "schema": handle.schema,
     }
 
 
-def _row(handle: Handle) -> tuple[str, ...]:
-    return handle.label, handle.signature, handle.effect, handle.container, handle.host
+def _table(found: Sequence[Handle]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    """Where one is not well, there is a column for it."""
+    columns: dict[str, list[str]] = {"SERVICE": [handle.label for handle in found]}
+    if any(handle.health != HEALTHY for handle in found):
+        columns["HEALTH"] = [handle.health for handle in found]
+    columns["CALLED AS"] = [handle.signature for handle in found]
+    columns["EFFECT"] = [handle.effect for handle in found]
+    columns["CONTAINER"] = [handle.container for handle in found]
+    columns["HOST"] = [handle.host for handle in found]
+    return tuple(columns), list(zip(*columns.values(), strict=True))
 
 
 def containers(

@@ -59,6 +59,7 @@ def up(
         if left_out:
             out.say(f"[bold]{robot.name}[/]: left out: {', '.join(left_out)}")
         _say_attaching(out, robot, ports)
+        state_dir = container.settings.state_dir
         attached = stack.enter_context(
             attach(
                 robot,
@@ -67,12 +68,13 @@ def up(
                 set_health=container.set_health,
                 ports=ports,
                 healthy=container.healthy,
+                state_dir=state_dir and state_dir / container.settings.system,
             )
         )
         container.measured_by(attached.measures)
         settle()
         _say_ready(out, robot, container, simulation)
-        faults = FaultWatch(attached.providers)
+        faults = FaultWatch(attached.faults, attached.providers)
         faults.begin(out)
         stack.callback(notifier.leaving)
         notifier.ready(f"{robot.name} is up in container {container.name}")

@@ -52,6 +52,7 @@ _COMMANDS: Final = {
     "tracing": (_WATCHING, "_trace:tracing"),
     "trace": (_WATCHING, "_trace:trace"),
     "logs": (_WATCHING, "_logs:logs"),
+    "faults": (_WATCHING, "_fault_words:app"),
     "audit": (_WATCHING, "_audit:app"),
     "profile": (_WATCHING, "_profile:profile"),
     "rules": (_WATCHING, "_rules:app"),

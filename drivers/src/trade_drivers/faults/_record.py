@@ -85,9 +85,11 @@ def parts_of(text: str) -> list[str]:
 
 
 def when(state: Any) -> float:
-    """When a state or reading was measured, by ``time.monotonic()``."""
+    """When a state or reading was measured, by ``time.monotonic()``; TypeError if it is neither."""
+    if not isinstance(state, Struct):
+        raise TypeError(f"{type(state).__name__} is no record of what was measured")
     stamp_ns = getattr(state, "stamp_ns", None)
-    return float(state.measured_at if stamp_ns is None else stamp_ns / 1e9)
+    return float(state.measured_at if stamp_ns is None else stamp_ns / 1e9)  # type: ignore[attr-defined]
 
 
 def samples_of(moments: Sequence[Moment], began_s: float) -> list[FaultSample]:

@@ -95,12 +95,11 @@ class FaultRecorder:
         device, lately = self._devices[name], self._lately[name]
         try:
             state = device.read() if isinstance(device, Sensor) else device.state()
+            at_s, fault = when(state), str(getattr(state, "fault", ""))
         except Exception as error:  # noqa: BLE001 - a mistake of the driver's is told, and ends nothing
             return found_in(name, error)
-        at_s = when(state)
         if not lately or lately[-1][0] < at_s:
             lately.append((at_s, state))
-        fault = getattr(state, "fault", "")
         remedy = state.remedy if isinstance(state, ArmState) else "remove the cause, then enable it again"
         return found_in(name, DeviceFault(device=name, bus="", fault=fault, remedy=remedy)) if fault else ()
 
