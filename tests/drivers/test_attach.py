@@ -189,7 +189,7 @@ def test_a_group_over_two_buses_is_a_provider_like_any_other(rig: Rig) -> None:
     other = DynamixelBus([Servo(1)], rig.sim.port.with_name("arm"), paced=False)
     with other:
         robot = rig.attach(ports={"neck": str(rig.sim.port), "arm": str(other.port)})
-        assert rig.announced == [("rosie.neck.pan",), ("rosie.neck.tilt",), ("rosie.head",)]
+        assert rig.announced == [("rosie.neck.pan",), ("rosie.neck.tilt",), ("rosie.head",), ("rosie.faults",)]
         assert robot.group("head").joints() == ["rosie.neck.pan", "rosie.neck.tilt"]
         assert robot.motor("neck.pan").members["rosie.head"] == ["rosie.neck.pan", "rosie.neck.tilt"]
         robot.close()
