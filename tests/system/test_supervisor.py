@@ -3,6 +3,7 @@
 import os
 import queue
 import signal
+import socket
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -12,10 +13,12 @@ import psutil
 import pytest
 
 import trade
+from doors import Client
 from system.conftest import ROSIES_HEAD, Program, at_ports
 from trade import Container, where
 from trade.errors import ConfigurationError
 from trade_gateway._gateway_file import read_gateway_file
+from trade_gateway.door import add_token
 from trade_gateway.supervisor import ChildInfo, News, Supervisor
 from trade_hil_sim import SimProcess, events, writes
 from waiting import wait_until
@@ -349,3 +352,22 @@ def test_nonsense_in_the_file_changes_nothing_and_what_is_right_again_is_gone_by
     there.write(f"[container.a]\n{COUNTER}[container.b]\nproviders = []\n")
     there.until("up", "b")
     assert next(one.pid for one in children() if one.name == "a") == info.pid
+
+
+def test_a_door_that_is_killed_is_back_at_its_place_for_those_who_have_a_token(
+    door: Callable[[str], Door], tmp_path: Path
+) -> None:
+    token = add_token(tmp_path / "tokens.toml", "anna")
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        place = f"127.0.0.1:{taken.getsockname()[1]}"
+    there = door(
+        f"[container.a]\n{COUNTER}"
+        f'[container.page]\nafter = ["a"]\ndoor = {{ tokens = "tokens.toml", listen = "{place}" }}\n'
+    )
+    there.until("up", "page")
+    anna = Client(f"http://{place}", token)
+    wait_until(lambda: anna.call("hall.count").status == 200, "who comes by the door is heard")
+    page = next(info for info in children() if info.name == "page")
+    os.kill(page.pid, signal.SIGKILL)
+    there.until("up", "page")
+    wait_until(lambda: anna.call("hall.shown").status == 200, "it is open again")
