@@ -43,6 +43,7 @@ _COMMANDS: Final = {
     "containers": (_SERVICES, "_list:containers"),
     "call": (_SERVICES, "_call:call"),
     "stream": (_SERVICES, "_stream:stream"),
+    "ask": (_SERVICES, "_ask:ask"),
     "lock": (_MOTION, "_lock:lock"),
     "locks": (_MOTION, "_locks:locks"),
     "unlock": (_MOTION, "_locks:unlock"),
