@@ -20,6 +20,7 @@ _ROBOTS: Final = "Robots, containers and networks"
 _OPERATION: Final = "Keeping it up"
 _HARDWARE: Final = "Setting hardware up"
 _WATCHING: Final = "Watching and rules"
+_RECORDINGS: Final = "Recordings"
 _RIGHTS: Final = "Identities and rights"
 
 _COMMANDS: Final = {
@@ -49,6 +50,7 @@ _COMMANDS: Final = {
     "estop": (_MOTION, "_estop:estop"),
     "notifications": (_WATCHING, "_watchers:notifications"),
     "hooks": (_WATCHING, "_watchers:hooks"),
+    "record": (_RECORDINGS, "recording._record:record"),
     "tracing": (_WATCHING, "_trace:tracing"),
     "trace": (_WATCHING, "_trace:trace"),
     "logs": (_WATCHING, "_logs:logs"),
