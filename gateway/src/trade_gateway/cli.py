@@ -51,6 +51,7 @@ _COMMANDS: Final = {
     "notifications": (_WATCHING, "_watchers:notifications"),
     "hooks": (_WATCHING, "_watchers:hooks"),
     "record": (_RECORDINGS, "recording._record:record"),
+    "replay": (_RECORDINGS, "recording._replay:replay"),
     "tracing": (_WATCHING, "_trace:tracing"),
     "trace": (_WATCHING, "_trace:trace"),
     "logs": (_WATCHING, "_logs:logs"),

@@ -20,7 +20,7 @@ from trade_gateway.recording._channels import (
     service_channel,
 )
 
-__all__ = ["Sources", "Wanted", "within"]
+__all__ = ["Sources", "Wanted", "joint_states", "within"]
 
 _KEEP: Final = 500
 """So many samples of a stream wait for a disk that is slow."""
@@ -177,10 +177,11 @@ def _faults(value: Any) -> list[tuple[str, str]]:
     return [(state.name, state.fault) for state in states]
 
 
-def _joints(handle: Handle, sample: Sample) -> Message:
+def joint_states(sample: Sample) -> JointStates:
+    """The state of a motor or of a group of joints, as it is recorded."""
     value: Any = sample.value
     motors: list[Any] = cast("list[Any]", value) if isinstance(value, list) else [value]
-    states = JointStates(
+    return JointStates(
         names=[motor.name for motor in motors],
         position_rad=[motor.position_rad for motor in motors],
         velocity_rad_s=[motor.velocity_rad_s for motor in motors],
@@ -189,6 +190,10 @@ def _joints(handle: Handle, sample: Sample) -> Message:
         fault=[motor.fault for motor in motors],
         stamp_s=[sample.at - motor.age_s for motor in motors],
     )
+
+
+def _joints(handle: Handle, sample: Sample) -> Message:
+    states = joint_states(sample)
     return Message(joints_channel(handle.groups[0]), 0, _ns(min(states.stamp_s)), encoded(states))
 
 
