@@ -21,6 +21,7 @@ _ROBOTS: Final = "Robots, containers and networks"
 _OPERATION: Final = "Keeping it up"
 _HARDWARE: Final = "Setting hardware up"
 _WATCHING: Final = "Watching and rules"
+_RECORDINGS: Final = "Recordings"
 _RIGHTS: Final = "Identities and rights"
 
 _COMMANDS: Final = {
@@ -53,6 +54,8 @@ _COMMANDS: Final = {
     "top": (_WATCHING, "_top:top"),
     "notifications": (_WATCHING, "_watchers:notifications"),
     "hooks": (_WATCHING, "_watchers:hooks"),
+    "record": (_RECORDINGS, "recording._record:record"),
+    "replay": (_RECORDINGS, "recording._replay:replay"),
     "tracing": (_WATCHING, "_trace:tracing"),
     "trace": (_WATCHING, "_trace:trace"),
     "logs": (_WATCHING, "_logs:logs"),
