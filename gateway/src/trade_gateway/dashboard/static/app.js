@@ -8,6 +8,7 @@ const ASK_AGAIN_MS = 1000;
 const ESTOP_WITHIN_MS = 1000;
 const SILENT_MS = 3000; // a door that answers nothing for so long is as good as gone
 const LONGEST_PAUSE_MS = 4000;
+const TOLD_FOR_MS = 10000;
 const MOST_LINES = 300;
 
 const $ = (id) => document.getElementById(id);
@@ -50,7 +51,15 @@ function show(element, key, children) {
 const fixed = (value, digits) => (value >= 0 ? "+" : "−") + Math.abs(value).toFixed(digits);
 const degrees = (rad) => `${fixed((rad * 180) / Math.PI, 1)}°`;
 const clock = (seconds) => new Date(seconds * 1000).toLocaleTimeString();
-const tell = (text) => write($("told"), text);
+
+let told_for = 0;
+
+/** Say something in passing. */
+function tell(text) {
+  write($("told"), text);
+  clearTimeout(told_for);
+  told_for = setTimeout(() => write($("told"), ""), TOLD_FOR_MS);
+}
 
 // --- the door
 
@@ -377,25 +386,33 @@ class Device {
     this.resume.hidden = error.title !== "Stopped";
   }
 
+  /** Under a lock, as that is for whoever has it, or administers the joint. */
   async let_move_again() {
+    let lock = "";
     try {
-      const resumed = await door.ask({ do: "resume", group: this.group });
-      this.say(resumed.resumed.length ? "It may move again." : "Nothing was held.");
+      if (!door.has_locked(this.resources)) lock = await door.lock(this.group, "let it move again", 0.5);
+      await door.ask({ do: "resume", group: this.group });
+      this.say("It may move again.");
     } catch (error) {
       this.refused(error);
     }
+    if (lock && door.connected) await door.unlock(lock).catch((error) => this.refused(error));
   }
 
   build() {
     this.message = make("p", { class: "problem", role: "status" });
     this.resume = button("Let it move again", () => this.let_move_again(), { hidden: true });
     this.badges = make("p", { class: "badges" });
+    this.locked = make("span", { class: "locked" });
+    this.trouble = make("p", { class: "problem" });
     this.figures = make("dl", { class: "figures" });
     this.stopping = button("Stop", () => this.stop(), { class: "stop", "aria-label": `Stop ${this.name}` });
     this.hands = make("div", { class: "hands" }, this.stopping);
     this.number = make("span", { class: "number" });
     const title = make("h4", {}, this.number, this.name);
-    const parts = [title, this.badges, this.picture(), this.figures, this.hands, this.message, this.resume];
+    const notes = make("div", { class: "notes", tabindex: 0, "aria-label": `Notes on ${this.name}`, role: "group" }, this.trouble, this.message, this.resume);
+    const owner = make("p", { class: "owner" }, "🔒 Locked by ", this.locked);
+    const parts = [title, this.badges, this.picture(), this.figures, owner, this.hands, notes];
     return make("li", { class: "device", id: `at-${this.group}` }, ...parts);
   }
 
@@ -405,16 +422,13 @@ class Device {
 
   paint() {
     const { state } = this;
-    const fault = state?.fault || "";
-    const words = [];
-    if (this.problem) words.push(["bad", `✕ ${this.problem}`]);
-    else if (!state) words.push(["", "no data yet"]);
-    else if (this.stale) words.push(["bad", "✕ not heard of lately"]);
-    if (fault) words.push(["bad", `✕ fault: ${fault}`]);
-    if (state) words.push(...this.words(state));
+    const silent = this.problem || (state ? this.stale && "not heard of lately" : "no data yet");
+    const wrong = [silent, state?.fault && `fault: ${state.fault}`].filter(Boolean).join("; ");
+    write(this.trouble, wrong && `✕ ${wrong}`);
+    const words = state ? this.words(state) : [];
+    show(this.badges, JSON.stringify(words), () => words.map((text) => make("span", { class: "badge" }, text)));
     const lock = lockOn(this.resources);
-    if (lock) words.push(["", `🔒 ${lock.owner}${lock.purpose ? `, ${lock.purpose}` : ""}`]);
-    show(this.badges, JSON.stringify(words), () => words.map(([kind, text]) => make("span", { class: `badge ${kind}` }, text)));
+    write(this.locked, lock ? `${lock.owner}, ${lock.purpose}` : "nobody");
     this.element.classList.toggle("stale", !state || this.stale || !door.connected);
     if (!state) return;
     const figures = this.measured(state);
@@ -425,7 +439,7 @@ class Device {
   }
 
   words(state) {
-    return [["", state.moving ? "▶ moving" : "■ at rest"]];
+    return [state.moving ? "▶ moving" : "■ at rest"];
   }
 
   measured() {
@@ -451,7 +465,8 @@ class Joint extends Device {
   }
 
   words(state) {
-    return [...super.words(state), ["", state.enabled ? "● torque on" : "○ torque off"]];
+    const closed = this.jogs.length && !this.may("set_velocity") ? ["⊘ look only"] : [];
+    return [...super.words(state), state.enabled ? "● torque on" : "○ torque off", ...closed];
   }
 
   measured(state) {
@@ -471,7 +486,6 @@ class Joint extends Device {
     const allowed = this.may("set_velocity");
     for (const jog of this.jogs) jog.button.disabled = !(allowed && limits && door.connected);
     this.stopping.disabled = !door.connected;
-    if (this.jogs.length && !allowed) this.say("You may look at this joint, but not move it.");
     if (!state || !limits) return;
     const at = (rad) => (100 * (rad - limits.min_rad)) / (limits.max_rad - limits.min_rad);
     this.mark.setAttribute("x", Math.min(Math.max(at(state.position_rad), 0), 100) - 1.2);
@@ -497,8 +511,8 @@ class Gripper extends Device {
   }
 
   words(state) {
-    const holds = state.holding && ["", "● holds something"];
-    return [...super.words(state), ["", state.activated ? "● activated" : "○ not activated"], holds].filter(Boolean);
+    const words = [...super.words(state), state.activated ? "● activated" : "○ not activated"];
+    return state.holding ? [...words, "● holds something"] : words;
   }
 
   measured(state) {
@@ -520,7 +534,7 @@ class Gripper extends Device {
 
 class Arm extends Device {
   words(state) {
-    return [...super.words(state), ["", state.enabled ? "● brakes released" : "○ brakes on"], ["", `safety: ${state.safety}`]];
+    return [...super.words(state), state.enabled ? "● brakes released" : "○ brakes on", `safety: ${state.safety}`];
   }
 
   measured(state) {
@@ -641,7 +655,15 @@ function kindOf(state) {
   return "positions_rad" in fields ? Arm : null;
 }
 
-async function lookAround() {
+let looking = Promise.resolve();
+
+/** Look what is there, one look after the other. */
+function lookAround() {
+  looking = looking.catch(() => {}).then(lookOnce);
+  return looking;
+}
+
+async function lookOnce() {
   [services, described] = await Promise.all([door.get("/services"), door.get("/openapi.json")]);
   showServices();
   const groups = new Map();
@@ -674,7 +696,12 @@ async function arrange(groups) {
   chains = [];
   const shown = [...robots].sort().map(([name, inside]) => robotCard(name, inside, members));
   $("robot-list").replaceChildren(...(shown.length ? shown : [make("p", { class: "note" }, "No robot is there, or none that you may see.")]));
-  for (const device of [...devices.values()]) await device.follow(); // one after the other: a client may ask for 16 things at once
+  followAll([...devices.values()]);
+}
+
+/** One after the other: a client may ask for 16 things at once. */
+async function followAll(all) {
+  for (const device of all) await device.follow();
 }
 
 function robotCard(name, groups, members) {
@@ -703,52 +730,62 @@ function part(group, inside, sketched) {
 
 // --- e-stop
 
+let open_estops = [];
+let said_of_estop = ""; // what came of the last press here
+
 async function pressEstop() {
   releaseAll();
-  const words = [make("strong", {}, "Stopping everything …")];
-  show($("stopped"), `pressing ${performance.now()}`, () => words);
+  said_of_estop = "Stopping everything …";
+  showEstops();
   try {
-    reportStop("Everything was told to stop", await door.estop("dashboard"));
+    said_of_estop = reportOf(await door.estop("dashboard"));
   } catch (error) {
-    const why = error.errors?.at(-1).message ?? error.message;
-    const text = `THE E-STOP WAS NOT CONFIRMED: ${why} Use the hardware’s own.`;
-    show($("stopped"), `failed ${performance.now()}`, () => [make("strong", {}, text)]);
+    said_of_estop = `✕ THE E-STOP WAS NOT CONFIRMED: ${error.message} Use the hardware’s own.`;
   }
-  await lookForEstops();
+  showEstops();
+  await lookForEstops().catch(() => {}); // what came of it stays
 }
 
-let report = "";
-
-function reportStop(what, told) {
+function reportOf(told) {
   const failed = Object.entries(told.failed).map(([who, why]) => `${who}: ${why}`);
-  report = [
-    `${what}. Confirmed by ${told.confirmed.join(", ") || "nobody"}.`,
+  return [
+    `Confirmed by ${told.confirmed.join(", ") || "nobody"}.`,
     told.missing.length ? `✕ NOT CONFIRMED by ${told.missing.join(", ")}.` : "",
     failed.length ? `✕ Failed: ${failed.join("; ")}.` : "",
   ].filter(Boolean).join(" ");
 }
 
 async function lookForEstops() {
-  const open = await door.get("/estops");
-  const key = JSON.stringify([open, open.length ? report : "", me?.administers]);
-  show($("stopped"), key, () => open.length ? [
-    make("strong", {}, "E-STOP: nothing moves until it is cleared."),
-    make("ul", {}, ...open.map((one) => make("li", {}, `${clock(one.at)} ${one.by}: ${one.reason}`))),
-    report ? make("p", {}, report) : null,
-    me?.administers ? button("Clear the e-stop", () => clearEstop(open)) : make("p", {}, "Who administers the system may clear it."),
-  ].filter(Boolean) : []);
-  document.body.classList.toggle("estopped", open.length > 0);
+  open_estops = await door.get("/estops");
+  showEstops();
+}
+
+function showEstops() {
+  const open = open_estops;
+  show($("stopped"), JSON.stringify([open, said_of_estop, me?.administers]), () => [
+    open.length ? make("strong", {}, "E-STOP: nothing moves until it is cleared.") : "",
+    ...open.map((one) => make("p", {}, `${clock(one.at)} ${one.by}: ${one.reason}`)),
+    said_of_estop ? make("p", {}, said_of_estop) : "",
+    open.length && me?.administers ? button("Clear the e-stop", () => clearEstop(open)) : "",
+    open.length && !me?.administers ? make("p", {}, "Who administers the system may clear it.") : "",
+    !open.length && said_of_estop ? button("Understood", forgetEstop) : "",
+  ].filter(Boolean));
+}
+
+function forgetEstop() {
+  said_of_estop = "";
+  showEstops();
 }
 
 async function clearEstop(open) {
   try {
     const told = await door.post("/estop/clear", { ids: open.map((one) => one.id) });
-    report = "";
-    tell(told.complete ? "The e-stop is cleared; nothing moves by itself." : `Not cleared by ${told.missing.join(", ")}.`);
+    said_of_estop = "";
+    tell(told.complete ? "The e-stop is cleared. Nothing moves by itself, and what it stopped not before it is let." : `Not cleared by ${told.missing.join(", ")}.`);
   } catch (error) {
     tell(`${error.title}: ${error.message}`);
   }
-  await lookForEstops();
+  await lookForEstops().catch(() => {}); // it is looked for again anyway
 }
 
 $("estop").onclick = pressEstop;
