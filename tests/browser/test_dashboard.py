@@ -60,7 +60,7 @@ def test_a_joint_moves_while_its_button_is_held_and_no_longer(bench: Bench, brow
     expect(anna.page.locator("#lock-list")).to_have_text("Nothing is locked.")
 
 
-@pytest.mark.parametrize("key", ["Space"])
+@pytest.mark.parametrize("key", ["Space", "Enter"])
 def test_a_joint_moves_while_a_key_is_held_on_its_button(bench: Bench, browsers: Browsers, key: str) -> None:
     anna = browsers.view("anna")
 
