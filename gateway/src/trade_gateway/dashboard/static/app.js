@@ -411,7 +411,7 @@ class Device {
     this.number = make("span", { class: "number" });
     const title = make("h4", {}, this.number, this.name);
     const notes = make("div", { class: "notes", tabindex: 0, "aria-label": `Notes on ${this.name}`, role: "group" }, this.trouble, this.message, this.resume);
-    const owner = make("p", { class: "owner" }, "🔒 Locked by ", this.locked);
+    const owner = make("p", { class: "owner" }, "Locked by ", this.locked);
     const parts = [title, this.badges, this.picture(), this.figures, owner, this.hands, notes];
     return make("li", { class: "device", id: `at-${this.group}` }, ...parts);
   }
