@@ -5,6 +5,9 @@ export UV_PYTHON ?= $(PYTHON)
 export UV_PYTHON_DOWNLOADS ?= never
 # Networks with certificates of their own work as they do for every other program of the machine.
 export UV_SYSTEM_CERTS ?= true
+# A start without compiled modules takes 0.9 s more of a processor, and the tests start a thousand processes.
+unexport PYTHONDONTWRITEBYTECODE
+export UV_COMPILE_BYTECODE := 1
 RUN := $(UV) run --locked
 ARGS ?=
 SEED ?= 1
@@ -28,9 +31,10 @@ demo: $(UV) ## a simulated robot looks, walks and grips for behaviours beyond a 
 	@$(RUN) python examples/demo.py $(ARGS)
 
 test: $(UV) ## the whole test suite; what needs its devices in time, one after the other
-	@$(RUN) pytest -n 3 --dist loadfile --ignore tests/drivers --ignore tests/complaints --ignore tests/system --ignore tests/bench --ignore tests/chaos $(ARGS)
+	@$(RUN) pytest -n 3 --dist loadfile --ignore tests/drivers --ignore tests/complaints --ignore tests/system --ignore tests/bench --ignore tests/chaos --ignore tests/browser $(ARGS)
 	@$(RUN) pytest -n 2 --dist loadfile tests/system tests/bench tests/chaos --ignore tests/system/test_demo.py $(ARGS)
-	@$(RUN) pytest tests/drivers tests/complaints tests/system/test_demo.py $(ARGS)
+	@$(RUN) pytest -n 2 --dist loadfile tests/drivers tests/complaints $(ARGS)
+	@$(RUN) pytest tests/browser tests/system/test_demo.py $(ARGS)
 
 test-socketcan: $(UV) ## the CAN suites on kernel interfaces; where the kernel has none, inside User-Mode Linux
 	@$(RUN) tests/socketcan/run pytest tests/socketcan $(ARGS)

@@ -20,6 +20,7 @@ from pathlib import Path
 from types import FrameType
 
 from demo_judge import PAN, Judge
+from demo_kept import kill_and_see
 from demo_stage import PATIENCE_S, DemoFailed, Stage, stage
 
 import trade
@@ -128,11 +129,9 @@ def stop_everything(judge: Judge) -> None:
 
 
 def come_back(scene: Stage, look: trade.Handle) -> None:
-    title(8, "The robot leaves and comes back", "A handle is of one boot: no call reaches who came after it.")
+    title(8, "What is killed comes back", "With what it knew, but nothing moves by itself; a handle is of one boot.")
     expect((errors.ServiceGone, errors.ContainerLost), lambda: look([0.0, 0.0]))
-    with scene.robot(scene.folder / "again.jsonl"):
-        again = trade.find(HEAD & where(name="move_to"), wait_s=PATIENCE_S)
-        print(f"  the robot is back; a new look-up finds it and it looks at {again([0.3, -0.2])[0]:+.3f} rad")
+    expect((errors.ServiceGone, errors.ContainerLost), kill_and_see(scene))
 
 
 def expect(kind: type[Exception] | tuple[type[Exception], ...], act: Callable[[], object]) -> None:

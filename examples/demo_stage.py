@@ -51,7 +51,28 @@ administer = ["*"]
 rosie = ["driver"]
 planner = ["operator"]                 # the behaviours
 visitor = ["viewer"]
+keeper = ["chief", "operator"]         # makes objects in what it keeps up, and saves them
 anna = ["operator", "chief"]           # the demo itself
+"""
+
+
+KEEPER = """
+system = "{system}"
+name = "keeper"
+tls = "pki/issued/keeper"
+policy = "policy.toml"
+connect = ["{door}"]
+
+[container.head]
+robot = "{head}"
+tls = "pki/issued/rosie"
+connect = ["{door}"]
+
+[container.lamp]
+providers = [{{ class = "lamp:Lamp", groups = ["rosie.lamp"] }}]
+tls = "pki/issued/rosie"
+connect = ["{door}"]
+save_every_s = 1
 """
 
 
@@ -189,6 +210,19 @@ class Stage:
             yield
 
     @contextlib.contextmanager
+    def keeper(self, head: Path) -> Generator[None]:
+        """A gateway on the robot's network that keeps a driver and a lamp up; what it remembers lies in its folder."""
+        door = self.places.door["robot"]
+        (self.folder / "keeper.toml").write_text(KEEPER.format(system=self.system, door=door, head=head))
+        known = self.environment("robot", "keeper")
+        environment = {name: known[name] for name in ("TRADE_RUNTIME_DIR", "TRADE_STATE_DIR")}
+        environment["PYTHONPATH"] = str(HERE)  # where lamp.py is
+        words = [*_TRADE, "gateway", self.folder / "keeper.toml", "--json"]
+        with self._started("keeper", words, environment, "robot") as keeper:
+            keeper.ready()
+            yield
+
+    @contextlib.contextmanager
     def _started(
         self, name: str, words: Sequence[str | Path], environment: Mapping[str, str], place: str = ""
     ) -> Generator[Actor]:
@@ -214,7 +248,7 @@ def stage(folder: Path, *, loopback: bool) -> Generator[Stage]:
         made = Stage(folder, places)
         (folder / "policy.toml").write_text(POLICY)
         authority = Authority.create(folder / "pki")  # what `trade pki init` and `trade pki issue` do
-        for name in ("rosie", "planner", "visitor", "anna"):
+        for name in ("rosie", "planner", "visitor", "keeper", "anna"):
             authority.issue(name)
         for name, text in places.gateway_files(made.system).items():
             authority.issue(name, purpose="gateway", addresses=places.addresses)

@@ -68,9 +68,8 @@ class Again:
         item.ihook.pytest_runtest_logstart(nodeid=item.nodeid, location=item.location)
         self._clock.stood_still_s()
         reports = runtestprotocol(item, nextitem=nextitem, log=False)
-        if late := self._late(reports):
+        if (late := self._late(reports)) and _afresh(item):
             item.user_properties.append((_KEY, late))
-            item._initrequest()  # type: ignore[attr-defined]  # new fixtures
             reports = runtestprotocol(item, nextitem=nextitem, log=False)
         for report in reports:
             item.ihook.pytest_runtest_logreport(report=report)
@@ -91,6 +90,16 @@ class Again:
             return f"the computer stood still for {still_s:.2f} s"
         found = next(filter(None, (_LATE.search(report.longreprtext) for report in failed)), None)
         return "" if found is None else f"it {found.group()}"
+
+
+def _afresh(item: pytest.Item) -> bool:
+    """Have it made all that it needs anew, also what whole modules share; False if what was there cannot be ended."""
+    try:
+        item.session._setupstate.teardown_exact(None)
+    except Exception:  # noqa: BLE001 - the failure that there is says more
+        return False
+    item._initrequest()  # type: ignore[attr-defined]
+    return True
 
 
 class Told:

@@ -71,6 +71,22 @@ def test_what_is_late_twice_has_failed(tmp_path: Path) -> None:
     assert "1 failed" in said
 
 
+def test_what_a_module_shares_is_made_anew_if_it_was_late(tmp_path: Path) -> None:
+    (tmp_path / "test_shared.py").write_text(
+        "import pytest\n"
+        "made = []\n"
+        "@pytest.fixture(scope='module')\n"
+        "def shared():\n"
+        "    made.append(1)\n"
+        "    assert len(made) > 1, 'its driver was held up for 0.35 s'\n"
+        "def test_one(shared): ...\n"
+        "def test_two(shared): assert len(made) == 2\n"
+    )
+    code, said = _run(tmp_path, "", times=0)
+    assert code == 0, said
+    assert "2 passed" in said
+
+
 @pytest.mark.parametrize("times", [12, 13])
 def test_too_many_of_them_fail_the_run(tmp_path: Path, times: int) -> None:
     code, said = _run(tmp_path, "assert not first, 'j1 did not answer on /dev/x within 251 ms; is it powered'", times)

@@ -37,6 +37,12 @@ def test_the_guide_on_locks_and_stops_does_what_it_says(system: str, tmp_path: P
     assert ended.stdout.splitlines() == re.findall(r"print\(.*\) +# (.*)", program)
 
 
+def test_no_merge_was_left_half_done() -> None:
+    texts = [*PAGES, *ROOT.glob("*.md"), *ROOT.glob("examples/*"), ROOT / "Makefile", ROOT / ".ci" / "run"]
+    marks = re.compile(r"^(<<<<<<<|>>>>>>>)( |$)", re.MULTILINE)
+    assert not [str(path) for path in texts if path.is_file() and marks.search(path.read_text(encoding="utf-8"))]
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_links_lead_somewhere(page: Path) -> None:
     for target in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", page.read_text(encoding="utf-8")):

@@ -85,7 +85,7 @@ def _measure_rate(folder: str, seconds: float) -> tuple[float, int, float]:
     from trade._audit_writer import AuditWriter
 
     writer = AuditWriter(Path(folder) / "rate.sqlite", "bench", "", Keep(90, 10_000_000))
-    event = Event(time.time_ns(), 1, "call", "rosie.arm.reach", "", "anna", "anna/mind/1", 7, "ok", "", 5)
+    event = Event(time.time_ns(), 1, "call", "rosie.arm.reach", "", "anna", "anna/mind/1", 7, 3, "ok", "", 5)
     cpu_s, began, told = time.process_time(), time.monotonic(), 0
     while (gone_s := time.monotonic() - began) < seconds:
         for _ in range(told, int(gone_s * _RATE)):

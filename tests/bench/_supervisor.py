@@ -34,6 +34,8 @@ def run(rounds: int, seconds: float) -> None:
     with tempfile.TemporaryDirectory() as folder:
         places = {"TRADE_RUNTIME_DIR": f"{folder}/runtime", "TRADE_STATE_DIR": f"{folder}/state"}
         environment = {**os.environ, **places, "TRADE_SYSTEM": f"bench-{secrets.token_hex(4)}"}
+        environment.pop("PYTHONDONTWRITEBYTECODE", None)
+        environment["PYTHONPYCACHEPREFIX"] = f"{folder}/bytecode"  # compiled once, as an installation is
         os.environ.update(places)
         system, file = environment["TRADE_SYSTEM"], Path(folder) / "gateway.toml"
         with Container(Settings.read(system=system, container="bench")) as member:

@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from trade._audit_chain import AuditRow
-from trade._audit_store import AuditStore
+from trade._audit_store import AuditStore, Keep
 from trade.errors import ConfigurationError
 from trade_gateway._output import UsageError
 from trade_gateway.cli import app
@@ -31,9 +31,10 @@ def whats(*words: str | Path) -> list[str]:
 
 
 def row(what: str, at_s: float, **other: Any) -> AuditRow:
-    fields = {"kind": "call", "who": "anna", "outcome": "ok", "why": "", **other}
-    kind, who, outcome, why = (fields[name] for name in ("kind", "who", "outcome", "why"))
-    return AuditRow(0, int(at_s * 1e9), 1, "boot", kind, what, "", who, "anna/mind/1", 7, outcome, why, 5)
+    fields = {"kind": "call", "who": "anna", "call_id": 7, "outer_id": 7, "outcome": "ok", "why": "", **other}
+    kind, who, call_id, outer_id, outcome, why = fields.values()
+    at_ns = int(at_s * 1e9)
+    return AuditRow(0, at_ns, 1, "boot", kind, what, "", who, "anna/mind/1", call_id, outer_id, outcome, why, 5)
 
 
 def write(path: Path, rows: Sequence[AuditRow]) -> None:
@@ -95,6 +96,15 @@ def test_the_folder_of_the_containers_is_the_one_that_is_meant(folder: Path, mon
 )
 def test_one_asks_for_some_of_them(folder: Path, words: list[str], found: int) -> None:
     assert len(whats(folder, *words)) == found
+
+
+def test_all_that_came_of_a_call_is_found_by_its_id_and_by_that_of_what_came_of_it(folder: Path) -> None:
+    write(folder / "mind.sqlite", [row("rosie.mind.plan", time.time() - 50, call_id=30, outer_id=30)])
+    write(folder / "neck.sqlite", [row("rosie.neck.turn", time.time() - 49, call_id=41, outer_id=30)])
+    assert whats(folder, "--call", "30") == ["rosie.mind.plan", "rosie.neck.turn"]
+    assert whats(folder, "--call", "41") == ["rosie.neck.turn"]
+    said = trade("audit", folder, "--call", "41").stdout
+    assert "(call 41 of 30)" in said
 
 
 def test_a_moment_that_is_none_is_refused(folder: Path) -> None:
@@ -174,6 +184,26 @@ def test_heads_that_were_noted_elsewhere_find_a_record_written_anew(folder: Path
     assert "arm: row 3" in done.stdout
     (folder / "neck.sqlite").unlink()
     assert "neck: noted elsewhere" in trade("audit", "verify", folder, "--against", noted).stdout
+
+
+def test_a_noted_head_that_was_dropped_since_is_said_to_prove_nothing(folder: Path, tmp_path: Path) -> None:
+    noted = tmp_path / "heads"
+    noted.write_text(trade("audit", "head", folder, "--json").stdout)
+    store = AuditStore(folder / "arm.sqlite")
+    store.add([row("rosie.arm.later", time.time()) for _ in range(5)])
+    assert store.drop(Keep(days=1, rows=2, least=0, piece=6), row("", time.time())) == 6
+    store.close()
+    done = trade("audit", "verify", folder, "--against", noted)
+    assert done.exit_code == 3
+    assert "arm: 3 rows, each follows from the one before; those before row 7 were dropped in order" in done.stdout
+    assert "arm: row 3 was noted elsewhere and is dropped: whether it was that one cannot be told" in done.stdout
+    arm, neck = lines("audit", "verify", folder, "--against", noted)
+    assert (arm["ok"], arm["untold"], arm["proven"]) == (True, [3], 0)
+    assert (neck["ok"], neck["untold"], neck["proven"]) == (True, [], 2)
+    noted.write_text(noted.read_text() + trade("audit", "head", folder, "--json").stdout)
+    later = trade("audit", "verify", folder, "--against", noted)
+    assert later.exit_code == 0
+    assert "cannot be told" in later.stdout
 
 
 def test_notes_that_are_none_are_refused(folder: Path, tmp_path: Path) -> None:

@@ -51,6 +51,9 @@ robot = "/robots/far.toml"
 
 [container.rules]
 rules = "rules.toml"
+
+[container.page]
+door = { tokens = "pages/tokens.toml" }
 """
 KEYS = {f"config/pki/issued/door/{name}" for name in ("ca.pem", "cert.pem", "key.pem")}
 
@@ -133,11 +136,20 @@ def test_of_a_system_file_it_has_the_gateway_robots_and_rules_of_this_host(
     (config / "system.toml").write_text(SYSTEM_FILE)
     (config / "robots" / "head.toml").write_text((ROOT / "examples" / "head.toml").read_text())
     (config / "rules.toml").write_text("")
+    (config / "pages").mkdir()
+    (config / "pages" / "tokens.toml").write_text("[tokens]\n")
     shutil.copytree(config / "pki" / "issued" / "door", config / "pki" / "issued" / "rosie")
     assert run("backup", config / "system.toml", out, "--state", state).exit_code == 0
     manifest = read_archive(out)
     assert manifest.file == "config/system.toml"
-    expected = {"config/system.toml", "config/gateway.toml", "config/robots/head.toml", "config/rules.toml", *KEYS}
+    expected = {
+        "config/system.toml",
+        "config/gateway.toml",
+        "config/pages/tokens.toml",
+        "config/robots/head.toml",
+        "config/rules.toml",
+        *KEYS,
+    }
     expected |= {name.replace("door", "rosie") for name in KEYS}
     assert expected < {entry.path for entry in manifest.files}
     assert not any("far" in entry.path for entry in manifest.files)

@@ -1,5 +1,6 @@
 """Who is let in, as whom, and what the policy lets that one do: the client is judged, not the door (S21)."""
 
+import logging
 import ssl
 import stat
 from collections.abc import Iterator
@@ -13,6 +14,7 @@ from doors import Client, Opened, ask, heard, opened, say
 from trade.errors import ConfigurationError
 from trade.testing import memory_system
 from trade_gateway.door import Door, Tokens, add_token
+from waiting import wait_until
 
 POLICY = """
 [roles.all]
@@ -106,6 +108,62 @@ def test_locks_resuming_and_clearing_are_the_clients_rights_too(door: Opened) ->
     assert chief.ask("POST", "/estop/clear", {"ids": [given["id"]]}).body["complete"]
 
 
+def test_a_client_is_told_who_it_is_and_what_it_may_do(door: Opened) -> None:
+    anna, bert, chief = (door.client(name) for name in ("anna", "bert", "chief"))
+    assert anna.ask("GET", "/me").body == {"identity": "anna", "administers": False, "reads": False}
+    assert chief.ask("GET", "/me").body == {"identity": "chief", "administers": True, "reads": True}
+    may = {one["name"]: one["allowed"] for one in bert.ask("GET", "/services?group=robot.a").body}
+    assert (may["where_is_it"], may["move"], may["stop"]) == (True, False, True)
+    assert all(one["allowed"] for one in anna.ask("GET", "/services").body)
+
+
+def test_locks_are_asked_for_by_who_sees_them_and_broken_by_who_administers(door: Opened) -> None:
+    anna, bert, carl, chief = (door.client(name).opened(lease_s=60) for name in ("anna", "bert", "carl", "chief"))
+    asked: list[tuple[str, str]] = []
+    own = door.robot.me.lock([door.robot.find("a")], on_request=lambda who, why: asked.append((who, why))).acquire()
+    wanted = {"resources": ["a"], "reason": "lunch"}
+    assert bert.ask("POST", "/locks/request", wanted).body == {"asked": ["tester/me"]}
+    wait_until(lambda: bool(asked))
+    assert asked[0][1] == "bert: lunch"
+    assert carl.ask("POST", "/locks/request", wanted).title == "NoSuchService"
+    assert bert.ask("POST", "/locks/request", {"resources": ["b", "none"]}).body == {"asked": []}
+    assert anna.ask("POST", "/locks/break", wanted).title == "AccessDenied"
+    assert own.held
+    assert [one["resources"] for one in chief.ask("POST", "/locks/break", wanted).body] == [["a"]]
+    wait_until(lambda: not own.held)
+    assert anna.ask("GET", "/locks").body == []
+    own.release()
+
+
+def test_load_is_for_everybody_and_what_others_have_standing_for_who_reads_the_system(door: Opened) -> None:
+    anna, chief = door.client("anna"), door.client("chief")
+    assert {one["container"] for one in anna.ask("GET", "/loads").body} >= {"a", "b"}
+    watching = door.robot.me.every(s=60, call=door.robot.find("a", "where_is_it"))
+    hook = door.robot.me.before_service(door.robot.find("a"), door.robot.find("a", "where_is_it"))
+    assert watching.id in [one["id"] for one in chief.ask("GET", "/notifications").body]
+    assert [one["id"] for one in chief.ask("GET", "/hooks").body] == [hook.id]
+    for path in ("/notifications", "/hooks"):
+        assert anna.ask("GET", path).title == "AccessDenied"
+    hook.detach()
+    watching.cancel()
+
+
+def test_the_log_is_told_line_by_line_to_who_reads_the_system(door: Opened) -> None:
+    with door.client("chief").socket() as page:
+        say(page, do="logs", id=1, level=30)
+        door.robot.system.settle()
+        logging.getLogger("trade").info("not this one")
+        logging.getLogger("trade").warning("the lamp is hot")
+        while "the lamp is hot" not in (line := heard(page)["line"])["text"]:
+            assert line["level"] >= 30
+        say(page, do="cancel", id=2, which=1)
+        while (told := heard(page)).get("id") != 2:
+            pass
+        assert told["result"] == {"cancelled": True}
+    with door.client("anna").socket() as page:
+        assert ask(page, do="logs", id=1)["problem"]["title"] == "AccessDenied"
+
+
 def test_functions_of_the_middleware_are_nobodys_by_the_door(door: Opened) -> None:
     """They would be judged as the door's."""
     chief = door.client("chief")
@@ -175,11 +233,23 @@ def test_under_another_name_the_door_does_not_answer(door: Opened) -> None:
 
 def test_pages_of_other_sites_are_not_let_in(door: Opened) -> None:
     anna = door.client("anna")
-    for origin in ("http://evil.example", "null", door.door.url):
+    other_port = f"{door.door.url[:-1]}{(int(door.door.url[-1]) + 1) % 10}"
+    for origin in ("http://evil.example", "null", other_port, door.door.url.replace("http", "https")):
         refused = anna.ask("POST", "/estop", {}, Origin=origin)
         assert (refused.status, refused.title) == (403, "WrongDoor")
         assert "access-control-allow-origin" not in refused.headers
     assert anna.ask("GET", "/estops").body == []
+
+
+def test_the_doors_own_page_is_let_in_under_the_name_that_it_was_called_by(door: Opened) -> None:
+    anna, port = door.client("anna"), door.door.url.rpartition(":")[2]
+    assert anna.ask("GET", "/services", Origin=door.door.url).status == 200
+    assert anna.ask("GET", "/services", Origin=f"http://localhost:{port}").status == 403
+    assert anna.ask("GET", "/services", Origin=f"http://localhost:{port}", Host=f"localhost:{port}").status == 200
+    with anna.socket(origin=door.door.url) as page:
+        assert ask(page, do="call", id=1, group="robot.a", name="move", args=[1.0])["result"] == 1.0
+    evil = f"http://evil.example:{port}"
+    assert anna.ask("GET", "/services", Origin=evil, Host=f"evil.example:{port}").title == "WrongDoor"
 
 
 def test_a_site_that_is_named_is_let_in_and_no_other(tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from trade_gateway.cli import app
 EXAMPLES = Path(__file__).parents[2] / "examples"
 HEAD = '[system]\nname = "home"\n\n'
 LAMPS = '[container.lamps]\nproviders = [{ class = "lamp:Lamp", groups = ["hall"] }]\n'
+PAGE = "[container.page]\n"
 
 
 @pytest.fixture
@@ -81,11 +82,18 @@ def test_certificate_policy_and_endpoints_of_the_system_are_those_of_its_contain
         (f'{HEAD}[container.a]\nproviders = [\n  {{ groups = ["x"] }},\n]\n', 5, "class is missing"),
         (f"{HEAD}{LAMPS}after = 3\n", 6, "Expected `array`"),
         (f'{HEAD}{LAMPS}after = ["rosie"]\n', 6, "no container 'rosie'; there is lamps"),
-        (f"{HEAD}[container.a]\n", 4, "takes one of robot, gateway, providers, rules; there is none"),
+        (f"{HEAD}[container.a]\n", 4, "takes one of robot, gateway, providers, rules, door; there is none"),
         (f'{HEAD}{LAMPS}rules = "care.toml"\n', 6, "there is providers and rules"),
         (f"{HEAD}{LAMPS}sim = true\n", 6, "goes with robot"),
         (f'{HEAD}{LAMPS}without = ["legs"]\n', 6, "goes with robot"),
         (f'{HEAD}[container.a]\nrobot = "rosie.toml"\nallow = ["x:Y"]\n', 6, "goes with providers"),
+        (f"{HEAD}{PAGE}door = {{}}\n", 5, "nobody could come in; name tokens"),
+        (f'{HEAD}{PAGE}door = {{ tokens = "t.toml" }}\n', 5, "trade door token NAME --tokens "),
+        (
+            f"{HEAD}{PAGE}door = {{ port = 80 }}\n",
+            5,
+            "unknown key 'port'; there is listen, tokens, tls, origins, hosts",
+        ),
         (f'{HEAD}{LAMPS}command = "/opt/trade"\n', 6, "goes with another host"),
         (f'{HEAD}[container.a]\nrobot = "nobody.toml"\n', 5, "nobody.toml: there is no such file"),
         (f'{HEAD}[container.a]\nrules = "rosie.toml"\n', 5, "rosie.toml"),
@@ -103,6 +111,7 @@ def test_what_is_wrong_is_named_with_its_line(folder: Path, text: str, line: int
     with pytest.raises(ConfigurationError) as wrong:
         read_system_file(path)
     assert str(wrong.value).startswith(f"{path}:{line}: ")
+    assert str(wrong.value).count(f"{path}:") == 1, "it is said once where"
     assert said in str(wrong.value)
 
 
@@ -163,3 +172,11 @@ def test_records_lie_where_the_system_says_or_the_container(folder: Path) -> Non
     places = {part.name: part.environment.get("TRADE_AUDIT") for part in plan.parts}
     assert places == {"lamps": str(folder / "audit"), "more": "/var/more", "far": None}
     assert plan.settings.audit is None
+
+
+def test_a_door_is_opened_with_what_its_table_says(folder: Path) -> None:
+    (folder / "t.toml").touch()
+    said = 'door = { tokens = "t.toml", listen = "127.0.0.1:7081", origins = ["http://a", "http://b"] }\n'
+    [part] = read_system_file(write(folder, f"{HEAD}{PAGE}{said}")).parts
+    named = ["--listen", "127.0.0.1:7081", "--origin", "http://a", "--origin", "http://b"]
+    assert list(part.words)[2:] == ["door", "--name", "page", *named, "--tokens", str(folder / "t.toml")]

@@ -42,6 +42,10 @@ def test_rosie_walks_through_a_gateway_between_two_networks(run: Run) -> None:
     assert demo.wait() == 0, demo.errors
     assert "The networks are network namespaces" in story
     assert "has the legs, for 'walk'" in story
+    assert sorted(re.findall(r"(\w+) +process \d+ was killed", story)) == ["head", "lamp"]
+    assert sorted(re.findall(r"(\w+) +is served again", story)) == ["head", "lamp"]
+    assert "0 writes that could move it; neck.pan at +0.3" in story
+    assert "the new lamp shines at 0.7" in story
     assert left_of(story) == []
 
 
@@ -69,7 +73,7 @@ def test_a_demo_that_stays_ends_with_ctrl_c_and_leaves_nothing(run: Run) -> None
     demo.signal(signal.SIGINT)
     assert demo.wait() == 0, demo.errors
     rest = "".join(demo.lines())
-    assert "the robot is back" not in rest
+    assert "was killed" not in rest
     assert "Done in" in rest
     assert left_of(story) == []
 

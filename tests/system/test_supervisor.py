@@ -3,6 +3,7 @@
 import os
 import queue
 import signal
+import socket
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -12,10 +13,13 @@ import psutil
 import pytest
 
 import trade
+from certificates import Papers
+from doors import Client
 from system.conftest import ROSIES_HEAD, Program, at_ports
 from trade import Container, where
 from trade.errors import ConfigurationError
 from trade_gateway._gateway_file import read_gateway_file
+from trade_gateway.door import add_token
 from trade_gateway.supervisor import ChildInfo, News, Supervisor
 from trade_hil_sim import SimProcess, events, writes
 from waiting import wait_until
@@ -139,6 +143,18 @@ def test_P70_a_child_that_is_killed_is_back_with_its_state(keeping: Callable[...
     assert again.pid != first.pid
     assert call("shown") == 2
     assert kept.texts()[1:] == ["a crashed (signal 9); back in 0.1 s", f"a is back, process {again.pid}"]
+
+
+def test_what_was_before_the_last_save_that_is_told_comes_back(keeping: Callable[..., Keeping]) -> None:
+    kept = keeping(f"[container.a]\nsave_every_s = 1\n{COUNTER}")
+    first = kept.become("a", "up")
+    call("count")
+    counted_at = time.time()
+    wait_until(lambda: (kept.child("a") or first).saved_at > counted_at, "it is saved")
+    os.kill(first.pid, signal.SIGKILL)
+    again = kept.become("a", "up", restarts=1)
+    assert call("shown") == 1
+    assert again.saved_at > counted_at
 
 
 def test_a_child_that_hangs_is_killed_and_started_again(keeping: Callable[..., Keeping]) -> None:
@@ -339,6 +355,38 @@ def test_P70_a_gateway_that_is_stopped_leaves_nobody_behind_and_all_is_known_whe
     assert call("shown") == 1
 
 
+POLICY = """
+gateways = ["door"]
+[roles.robot]
+register = ["hall"]
+[roles.chief]
+read = ["*"]
+call = ["*"]
+administer = ["*"]
+[identities]
+a = ["robot"]
+anna = ["chief"]
+door = ["chief"]
+"""
+
+
+def test_with_certificates_a_gateway_shows_keeps_and_saves_its_children(
+    door: Callable[[str], Door], tmp_path: Path, start_container: Callable[..., Container]
+) -> None:
+    papers = Papers(tmp_path / "pki")
+    (tmp_path / "policy.toml").write_text(POLICY)
+    door_tls, child_tls, my_tls = papers.of("door", purpose="gateway"), papers.of("a"), papers.of("anna")
+    there = door(f'tls = "{door_tls}"\npolicy = "policy.toml"\n[container.a]\ntls = "{child_tls}"\n{COUNTER}')
+    there.until("up")
+    anna = start_container("anna", tls=my_tls, policy=tmp_path / "policy.toml")
+    anna.find(where(name="count"), wait_s=30)()
+    anna.find(where(name="restart_child"), wait_s=30)("a")
+    there.until("up")
+    assert anna.find(where(name="shown"), wait_s=30)() == 1
+    [info] = anna.find(where(name="children"))()
+    assert (info.name, info.state, info.restarts) == ("a", "up", 1)
+
+
 def test_nonsense_in_the_file_changes_nothing_and_what_is_right_again_is_gone_by(door: Callable[[str], Door]) -> None:
     there = door(f"[container.a]\n{COUNTER}")
     there.until("up")
@@ -349,3 +397,22 @@ def test_nonsense_in_the_file_changes_nothing_and_what_is_right_again_is_gone_by
     there.write(f"[container.a]\n{COUNTER}[container.b]\nproviders = []\n")
     there.until("up", "b")
     assert next(one.pid for one in children() if one.name == "a") == info.pid
+
+
+def test_a_door_that_is_killed_is_back_at_its_place_for_those_who_have_a_token(
+    door: Callable[[str], Door], tmp_path: Path
+) -> None:
+    token = add_token(tmp_path / "tokens.toml", "anna")
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        place = f"127.0.0.1:{taken.getsockname()[1]}"
+    there = door(
+        f"[container.a]\n{COUNTER}"
+        f'[container.page]\nafter = ["a"]\ndoor = {{ tokens = "tokens.toml", listen = "{place}" }}\n'
+    )
+    there.until("up", "page")
+    anna = Client(f"http://{place}", token)
+    wait_until(lambda: anna.call("hall.count").status == 200, "who comes by the door is heard")
+    page = next(info for info in children() if info.name == "page")
+    os.kill(page.pid, signal.SIGKILL)
+    there.until("up", "page")
+    wait_until(lambda: anna.call("hall.shown").status == 200, "it is open again")

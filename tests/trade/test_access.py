@@ -312,6 +312,7 @@ def test_only_its_own_functions_are_offered_by_everybody_in_the_group_of_the_mid
     access = member("planner").access
     assert access.may_offer("dash", "trade", "system", ("trade",))
     assert not access.may_offer("dash", "trade", "system", ("trade", "rosie"))
+    assert access.may_offer("dash", "trade", "supervisor", ("trade",))
     assert not access.may_offer("dash", "trade", "another", ("trade",))
     assert not access.may_offer("thief", "trade", "system", ("trade",))
 

@@ -87,6 +87,32 @@ def test_a_call_is_written_down_with_who_made_it_and_by_which_id(
     assert row.boot == there.address.epoch
 
 
+class Mind:
+    def __init__(self, home: Container) -> None:
+        self._home = home
+
+    @service
+    def plan(self, angle_rad: float) -> float:
+        return call(self._home, "reach", angle_rad)
+
+
+def test_what_comes_of_a_call_has_the_id_of_the_one_that_began_it_all_in_every_record(
+    here: Container, there: Container, folder: Path, start_container: Start
+) -> None:
+    between = start_container("between", audit=folder)
+    between.register(Mind(between), "rosie.mind")
+    plan = here.find(where(name="plan"), wait_s=20)
+    plan(0.5)
+    with there.lock(where(group="rosie.arm")), pytest.raises(LockedByOther):
+        plan(0.5)
+    planned = [row for row in rows(between, folder) if row.what == "rosie.mind.plan"]
+    reached = [row for row in rows(there, folder) if row.what == "rosie.arm.reach"]
+    assert [row.kind for row in reached] == ["call", "refused"]
+    assert [row.outer_id for row in planned] == [row.call_id for row in planned]
+    assert [row.outer_id for row in reached] == [row.call_id for row in planned]
+    assert {row.call_id for row in reached}.isdisjoint(row.call_id for row in planned)
+
+
 def test_a_call_within_the_container_is_written_down_too(there: Container, folder: Path) -> None:
     call(there, "reach", 0.5)
     assert ("call", "rosie.arm.reach", "ok") in told(there, folder)

@@ -14,7 +14,7 @@ DAY_NS = 86_400_000_000_000
 
 
 def row(what: str, at_ns: int = 1) -> AuditRow:
-    return AuditRow(0, at_ns, 1, "boot", "call", what, "", "anna", "anna/mind/1", 7, "ok", "", 5)
+    return AuditRow(0, at_ns, 1, "boot", "call", what, "", "anna", "anna/mind/1", 7, 3, "ok", "", 5)
 
 
 @pytest.fixture
@@ -175,6 +175,30 @@ def test_rows_that_were_dropped_by_somebody_else_are_missed(path: Path, store: A
     tamper(path, "DELETE FROM record WHERE seq < 14")
     assert verdict(path).broken_at == 1
     assert "no row says" in verdict(path).problem
+
+
+def test_of_a_dropped_row_the_row_that_says_so_bears_witness(path: Path, store: AuditStore) -> None:
+    hashes = {link.row.seq: link.hash for link in links(path)}
+    keep = Keep(days=1, rows=9, least=0, piece=5)
+    assert store.drop(keep, row("", at_ns=2)) == 10
+    store.add([row("rosie.on") for _ in range(5)])
+    assert store.drop(keep, row("", at_ns=2)) == 5
+    for seq in (10, 15):  # the last that went the first time, and the second
+        right = verdict(path, {seq: hashes[seq]})
+        assert (right.problem, right.untold, right.proven) == ("", (), seq)
+        wrong = verdict(path, {seq: bytes(32)})
+        assert wrong.broken_at == seq
+        assert "noted elsewhere" in wrong.problem
+
+
+def test_of_a_dropped_row_that_nothing_names_it_is_said_that_it_cannot_be_told(path: Path, store: AuditStore) -> None:
+    hashes = {link.row.seq: link.hash for link in links(path)}
+    store.drop(Keep(days=1, rows=9, least=0, piece=5), row("", at_ns=2))
+    dropped = verdict(path, {7: hashes[7]})
+    assert (dropped.problem, dropped.untold, dropped.proven) == ("", (7,), 0)
+    both = verdict(path, {7: bytes(32), 12: hashes[12]})
+    assert (both.problem, both.untold, both.proven) == ("", (7,), 12)
+    assert verdict(path, {7: hashes[7], 12: bytes(32)}).broken_at == 12
 
 
 # --- several at it

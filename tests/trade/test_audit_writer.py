@@ -22,7 +22,7 @@ KEEP = Keep(90, 1_000_000)
 
 
 def event(what: str = "rosie.step", at_ns: int = 1) -> Event:
-    return Event(at_ns, 1, "call", what, "", "anna", "anna/mind/1", 7, "ok", "", 5)
+    return Event(at_ns, 1, "call", what, "", "anna", "anna/mind/1", 7, 3, "ok", "", 5)
 
 
 @pytest.fixture
@@ -160,7 +160,7 @@ from trade._audit_store import Keep
 from pathlib import Path
 writing._AGAIN_S = 0.01
 writer = writing.AuditWriter(Path({str(path)!r}), "boot", "", Keep(90, 10**6))
-event = Event(1, 1, "call", "rosie." + "x" * 400, "", "anna", "", 7, "ok", "", 5)
+event = Event(1, 1, "call", "rosie." + "x" * 400, "", "anna", "", 7, 3, "ok", "", 5)
 resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, resource.RLIM_INFINITY))
 for _ in range(2000):
     writer.tell(event)
@@ -339,7 +339,7 @@ connect = sqlite3.connect
 def write():
     sqlite3.connect = lambda *words, **named: connect(*words, factory=Counted, **named)
     store = AuditStore(path)
-    row = writing._row_of(Event(1, 1, "call", "rosie.step", "", "anna", "", 7, "ok", "", 5), "boot")
+    row = writing._row_of(Event(1, 1, "call", "rosie.step", "", "anna", "", 7, 3, "ok", "", 5), "boot")
     for _ in range(3):
         store.add([row] * 3)
         store.drop(Keep(1, 4, least=0, piece=2), row)
@@ -379,7 +379,7 @@ from trade._audit import Event
 from pathlib import Path
 writing._GATHER_S = 0.001
 writer = writing.AuditWriter(Path({str(path)!r}), "boot", "", Keep(90, 10**6))
-event = Event(1, 1, "call", "rosie.step", "", "anna", "", 7, "ok", "", 5)
+event = Event(1, 1, "call", "rosie.step", "", "anna", "", 7, 3, "ok", "", 5)
 said = False
 while True:
     writer.tell(event)

@@ -117,6 +117,23 @@ def test_untraced_nothing_stands_around_a_service_and_nothing_is_noted(
     assert here._parts.caller.spans is None
 
 
+def test_notes_are_counted_so_that_one_can_read_on(
+    here: Container, monkeypatch: pytest.MonkeyPatch, start_container: Any
+) -> None:
+    monkeypatch.setattr(noted, "MOST", 5)
+    small = start_container("small")
+    small.register(Arm(), "rosie.arm")
+    spans = small.find(where(name="spans", container="small"))
+    switch = small.find(where(name="set_tracing", container="small"))
+    assert [switch(True), switch(True)] == [False, True]
+    for step in range(8):
+        small.call(where(name="reach"), step / 10)
+    assert [span.number for span in spans()] == [4, 5, 6, 7, 8]
+    assert [span.number for span in spans(None, 6)] == [7, 8]
+    assert [span.number for span in spans(None, 2)] == [4, 5, 6, 7, 8]
+    assert spans(None, 8) == spans(None, 9) == []
+
+
 def test_the_notes_are_bounded(here: Container, monkeypatch: pytest.MonkeyPatch, start_container: Any) -> None:
     monkeypatch.setattr(noted, "MOST", 5)
     small = start_container("small")

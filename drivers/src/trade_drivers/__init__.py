@@ -10,7 +10,7 @@ from trade_drivers._load import load
 from trade_drivers._plan import FollowProgress, JointLimits, Plan, Tolerances
 from trade_drivers._polled import Measured, PolledSensor
 from trade_drivers._senses import UNITS, Camera, CameraInfo, Image, Reading, Sensor, SensorInfo
-from trade_drivers._trajectory import Trajectory, TrajectoryPoint
+from trade_drivers._trajectory import Trajectory, TrajectoryPoint, planned
 from trade_drivers._without import without
 from trade_drivers._work import WireError
 from trade_drivers.faults import Fault, FaultInfo, FaultLog, FaultSample, Tell, Trouble
@@ -71,6 +71,7 @@ __all__ = [
     "load",
     "load_driver",
     "parse",
+    "planned",
     "scan",
     "without",
 ]

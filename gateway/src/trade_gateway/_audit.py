@@ -53,6 +53,9 @@ def show(
     kind: Annotated[
         Literal["call", "read", "stop", "lock", "configure", "refused", "audit"] | None, typer.Option(help="Only this.")
     ] = None,
+    call: Annotated[
+        int | None, typer.Option(help="Only what belongs to this call: it, and all that came of it.")
+    ] = None,
     follow: Annotated[bool, typer.Option("--follow", "-f", help="Go on with what comes, until Ctrl-C.")] = False,
     as_json: Json = False,
 ) -> None:
@@ -66,7 +69,7 @@ def show(
         found = [_rows(path, seen) for path in _records(folder, missing_is_wrong=not follow)]
         for told in heapq.merge(*found, key=lambda told: told.row.at_ns):
             row = told.row
-            meant = row.at_ns >= after_ns and kind in (None, row.kind)
+            meant = row.at_ns >= after_ns and kind in (None, row.kind) and call in (None, row.call_id, row.outer_id)
             patterns = ((row.who, who), (row.what, service), (told.container, container))
             if meant and all(fnmatch.fnmatchcase(text, pattern) for text, pattern in patterns):
                 _say(out, told)
@@ -85,16 +88,23 @@ def verify_command(
 ) -> None:
     """Check that no row was changed, removed, added or put elsewhere; exit code 1, and the first such row, if one was.
 
+    With --against, exit code 3 if of no row that was noted of a record it can be told whether it was that one: all were
+    dropped since.
+
     For example: trade audit verify /var/lib/trade/audit --against /media/stick/heads
     """
     out, noted = Output(as_json=as_json), {} if against is None else _noted(against)
-    bad = 0
+    bad = untold = 0
     for path in _records(folder):
         verdict = _verified(path, noted.pop(path.stem, {}))
         bad += bool(verdict.problem)
+        untold += bool(verdict.untold and not verdict.proven)
         if as_json:
             out.data({"container": path.stem, "ok": not verdict.problem, **_told(verdict)})
         out.say(_sentence(path, verdict))
+        for seq in verdict.untold:
+            dropped = f"row {seq} was noted elsewhere and is dropped: whether it was that one cannot be told"
+            out.say(f"[bold yellow]{escape(path.stem)}[/]: {dropped}")
     for name in noted:
         bad += 1
         out.say(f"[bold red]{escape(name)}[/]: noted elsewhere, and there is no record of it")
@@ -105,8 +115,8 @@ def verify_command(
         out.say(f"[bold red]{escape(path.name)}[/]: was found broken and moved aside")
         if as_json:
             out.data({"container": path.stem, "ok": False, "problem": f"{path.name} was found broken and moved aside"})
-    if bad:
-        raise typer.Exit(1)
+    if bad or untold:
+        raise typer.Exit(1 if bad else 3)
 
 
 @app.command()
@@ -202,7 +212,8 @@ def _say(out: Output, told: Told) -> None:
     end = "" if row.outcome == "ok" else f" {row.outcome}"
     about = f" {row.about}" if row.about else ""
     why = f": {row.why}" if row.why else ""
-    call = f"  (call {row.call_id})" if row.call_id else ""
+    began = f" of {row.outer_id}" if row.outer_id != row.call_id else ""
+    call = f"  (call {row.call_id}{began})" if row.call_id else ""
     who = row.who or "-"
     out.say(escape(f"{at} {row.kind:9} {told.container}: {who} {row.what}{about}{end}{why}{call}"))
 
@@ -215,6 +226,8 @@ def _told(verdict: Verdict) -> dict[str, object]:
         "hash": verdict.head.hash.hex(),
         "broken_at": verdict.broken_at,
         "problem": verdict.problem,
+        "proven": verdict.proven,
+        "untold": verdict.untold,
     }
 
 

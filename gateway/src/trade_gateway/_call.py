@@ -43,14 +43,19 @@ def call(
     args, kwargs = parse_arguments(arguments or [])
     with visitor(context) as visiting:
         handle = find(visiting, service, container, wait).with_(deadline_s=deadline)
-        with _interruptible():
-            run = handle.start(*args, **kwargs)
-            try:
-                result = run.result()
-            except KeyboardInterrupt:
-                _cancel(handle)
-                raise
+        result = run_to_end(handle, *args, **kwargs)
     Output(as_json=as_json).data(result)
+
+
+def run_to_end(handle: Handle, *args: Any, **kwargs: Any) -> Any:
+    """Call a service; Ctrl-C and its kin end what it began, and raise KeyboardInterrupt."""
+    with _interruptible():
+        run = handle.start(*args, **kwargs)
+        try:
+            return run.result()
+        except KeyboardInterrupt:
+            _cancel(handle)
+            raise
 
 
 @contextmanager

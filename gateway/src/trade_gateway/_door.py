@@ -19,7 +19,9 @@ _TOKENS: Final = Path("door-tokens.toml")
 _NAME: Final = "door"
 
 app = typer.Typer(
-    invoke_without_command=True, help="Let HTTP and WebSocket clients in, each as an identity of its own."
+    invoke_without_command=True,
+    help="Let HTTP and WebSocket clients in, each as an identity of its own.\n\n"
+    "For example: trade door token anna, and then trade door",
 )
 
 TokenFile = Annotated[Path, typer.Option("--tokens", help="File of tokens; trade door token makes it.")]
@@ -43,12 +45,7 @@ def door(
     name: Annotated[str, typer.Option(help="Name of its container.")] = _NAME,
     as_json: Json = False,
 ) -> None:
-    """Let HTTP and WebSocket clients into the system, until Ctrl-C.
-
-    Whoever shows a token is the identity that it was made for; the policy (TRADE_POLICY) says what that may do.
-
-    For example: trade door token anna, and then trade door
-    """
+    """Let HTTP and WebSocket clients into the system, until Ctrl-C."""
     if context.invoked_subcommand is not None:
         return
     out = Output(as_json=as_json)

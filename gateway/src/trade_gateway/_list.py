@@ -26,7 +26,10 @@ def services(
     doc: Annotated[bool, typer.Option("--doc", help="Show what each service does.")] = False,
     as_json: Json = False,
 ) -> None:
-    """List services: group and name, arguments, where they run."""
+    """List services: group and name, arguments, where they run.
+
+    For example: trade services --group rosie.head --doc
+    """
     constraint = asked_for(f"--group {group}" if group else "services", group=group, name=name)
     if not everything and group is None:
         constraint = constraint & ~where(group="trade")
@@ -104,7 +107,10 @@ def containers(
     load: Annotated[bool, typer.Option("--load", help="How busy each is, over one second.")] = False,
     as_json: Json = False,
 ) -> None:
-    """List the containers of the system."""
+    """List the containers of the system.
+
+    For example: trade containers --load
+    """
     out = Output(as_json=as_json)
     with visitor(context) as container:
         if load:

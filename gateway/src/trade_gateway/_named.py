@@ -38,6 +38,11 @@ class Named(NamedTuple):
     """How many containers of this host there are besides the gateway."""
 
 
+class _Door(Struct):
+    tokens: str = ""
+    tls: str = ""
+
+
 class _Part(Struct, kw_only=True):
     """A table that may name files; what else it says is for others to check."""
 
@@ -46,16 +51,19 @@ class _Part(Struct, kw_only=True):
     audit: str = ""
     robot: str = ""
     rules: str = ""
+    door: _Door | None = None
     gateway: str = ""
     host: str = _LOCAL
 
     def files(self, folder: Path) -> Iterator[Path]:
         """The files of this host that it names itself."""
-        for name in (self.robot, self.rules):
+        door = self.door or _Door()
+        for name in (self.robot, self.rules, door.tokens):
             if name:
                 yield folder / name
-        if self.tls:
-            yield from (folder / self.tls / name for name in _CERTIFICATE)
+        for tls in (self.tls, door.tls):
+            if tls:
+                yield from (folder / tls / name for name in _CERTIFICATE)
         if self.policy:
             policy = folder / self.policy
             yield policy

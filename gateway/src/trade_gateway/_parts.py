@@ -4,7 +4,8 @@ import importlib.util
 import os
 import re
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
+from contextlib import contextmanager
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 from typing import Annotated, Any, Final, NamedTuple, NoReturn, TypeVar, cast
@@ -26,7 +27,7 @@ else:
 __all__ = ["LOCAL", "Around", "Entry", "Made", "Part", "Tables", "at", "converted", "line_of", "read_toml"]
 
 LOCAL: Final = "local"
-_KINDS: Final = ("robot", "gateway", "providers", "rules")
+_KINDS: Final = ("robot", "gateway", "providers", "rules", "door")
 _ONLY_WITH: Final = {"sim": "robot", "without": "robot", "allow": "providers"}
 _HEADER: Final = re.compile(r"\s*\[\s*([^\[\]]+?)\s*\]\s*(?:#.*)?$")
 _NAME: Final = re.compile(r"""["']([^"']*)["']|([\w-]+)""")
@@ -48,6 +49,20 @@ class Made(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, rename
     """For its constructor, in order or by name."""
 
 
+class Doorway(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """HTTP and WebSocket for those who speak nothing else: the options of ``trade door``."""
+
+    listen: _Text = "127.0.0.1:7080"
+    tokens: str = ""
+    """The file of tokens: ``trade door token NAME --tokens FILE``."""
+    tls: str = ""
+    """Folder of the certificate that pages see."""
+    origins: list[_Text] = []
+    """Sites whose pages may come in."""
+    hosts: list[_Text] = []
+    """Further names by which it is called."""
+
+
 class Entry(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """One container. Files are beside the system file; those of another host are as that host sees them."""
 
@@ -67,6 +82,7 @@ class Entry(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Classes that others may make in it, besides these."""
     rules: str = ""
     """A rules file."""
+    door: Doorway | None = None
     after: list[_Text] = []
     """Containers that must be up before."""
     tls: str = ""
@@ -95,6 +111,10 @@ class Entry(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     def is_local(self) -> bool:
         """Whether it runs on the host of whoever brings the system up."""
         return self.host == LOCAL
+
+
+_INSIDE: Final[Mapping[str, type[Struct]]] = {"providers": Made, "door": Doorway}
+"""What stands under a key of an entry."""
 
 
 class Around(Struct, frozen=True, kw_only=True):
@@ -166,13 +186,19 @@ class Tables:
         self.check_kind(name, entry)
         environment = {} if entry.gateway else self._environment_of(entry)
         part = Part(name, entry, self._words(name, entry), environment)
-        try:
+        with self.about(name, entry):
             Settings.read(system=self.around.system, container=name, environment={})
-            if entry.is_local:
-                self.check_here(name, entry, environment)
+        if entry.is_local:
+            self.check_here(name, entry, environment)
+        return part
+
+    @contextmanager
+    def about(self, name: str, entry: Entry) -> Generator[None]:
+        """What is found wrong inside is said of a container's table."""
+        try:
+            yield
         except ConfigurationError as wrong:
             self.refuse(name, entry.kind if entry.file else "", str(wrong))
-        return part
 
     def check_kind(self, name: str, entry: Entry) -> None:
         """Raises ConfigurationError: keys that do not go together."""
@@ -188,21 +214,27 @@ class Tables:
 
     def check_here(self, name: str, entry: Entry, environment: Mapping[str, str]) -> None:
         """Raises ConfigurationError: what it needs of this host is not there, or is wrong."""
-        file = self.beside(entry.file)
-        if entry.robot:
-            without(load(file), entry.without)
         if entry.sim and importlib.util.find_spec("trade_hil_sim") is None:
             self.refuse(name, "sim", "needs trade-hil-sim; pip install trade-hil-sim")
-        if entry.rules:
-            read_rules(file)
-        if policy := environment.get("TRADE_POLICY"):
-            read_policy(Path(policy))
-        Settings.read(
-            system=self.around.system,
-            container=name,
-            connect=self._connect(entry),
-            environment={**self.around.inherited, **environment},
-        )
+        if entry.door and importlib.util.find_spec("uvicorn") is None:
+            self.refuse(name, "door", "needs the extra http; pip install 'trade-gateway[http]'")
+        if entry.door and not (entry.door.tokens or entry.door.tls):
+            self.refuse(name, "door", "nobody could come in; name tokens, or tls and its authority's certificates")
+        if entry.door and entry.door.tokens and not (tokens := self.beside(entry.door.tokens)).exists():
+            self.refuse(name, "door", f"there is no {tokens}; make it: trade door token NAME --tokens {tokens}")
+        with self.about(name, entry):
+            if entry.robot:
+                without(load(self.beside(entry.robot)), entry.without)
+            if entry.rules:
+                read_rules(self.beside(entry.rules))
+            if policy := environment.get("TRADE_POLICY"):
+                read_policy(Path(policy))
+            Settings.read(
+                system=self.around.system,
+                container=name,
+                connect=self._connect(entry),
+                environment={**self.around.inherited, **environment},
+            )
 
     def _words(self, name: str, entry: Entry) -> list[str]:
         dialled = [] if entry.gateway else [word for one in self._connect(entry) for word in ("--connect", one)]
@@ -216,10 +248,19 @@ class Tables:
                 does = ["gateway", file]
             case "rules":
                 does = ["rules", "run", file, "--name", name]
+            case "door":
+                does = ["door", "--name", name, *self._door_words(entry)]
             case _:
                 patterns = [word for pattern in dict.fromkeys(allowed) for word in ("--allow", pattern)]
                 does = ["container", "--name", name, *patterns]
         return ["--system", self.around.system, *dialled, *does]
+
+    def _door_words(self, entry: Entry) -> list[str]:
+        said = entry.door or Doorway()
+        options = {"--listen": [said.listen], "--origin": said.origins, "--host": said.hosts}
+        for option, named in (("--tokens", said.tokens), ("--tls", said.tls)):
+            options[option] = [str(self.beside(named)) if entry.is_local else named] if named else []
+        return [word for option, values in options.items() for value in values for word in (option, value)]
 
     def _connect(self, entry: Entry) -> Sequence[str]:
         return self.around.connect if entry.connect is None else entry.connect
@@ -274,7 +315,8 @@ def converted(raw: object, kind: type[_Read], path: Path, text: str, table: tupl
         said = str(bad)
     place = _AT.search(said)
     inside = place.group(1) if place else ""
-    key, fields = re.split(r"[.\[]", inside, maxsplit=1)[0], (Made if inside else kind).__struct_encode_fields__
+    key = re.split(r"[.\[]", inside, maxsplit=1)[0]
+    fields = _INSIDE.get(key, kind).__struct_encode_fields__
     problem = said[: place.start()] if place else said
     if unknown := _UNKNOWN.search(said):
         key, problem = key or unknown.group(1), f"unknown key {unknown.group(1)!r}; there is {', '.join(fields)}"

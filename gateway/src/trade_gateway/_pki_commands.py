@@ -112,7 +112,10 @@ def revoke(name: Name, folder: Folder = _DEFAULT) -> None:
 
 @app.command("list")
 def list_(folder: Folder = _DEFAULT, as_json: Json = False) -> None:
-    """List the identities: what for, until when, whether revoked."""
+    """List the identities: what for, until when, whether revoked.
+
+    For example: trade pki list --json
+    """
     out = Output(as_json=as_json)
     found = _authority(folder).issued()
     if as_json:

@@ -54,7 +54,10 @@ def up(
 
 @app.command("status")
 def status(context: typer.Context, file: File, as_json: Json = False) -> None:
-    """Say of each container of a file whether it is up. Exit code 0: all are; 1: something is missing."""
+    """Say of each container of a file whether it is up. Exit code 0: all are; 1: something is missing.
+
+    For example: trade system status examples/system.toml
+    """
     out, plan = Output(as_json=as_json), _plan(context, file)
     with Container(plan.settings) as member:
         found = list(Bringing(plan, member, ssh_config=None, wait_s=0.0, tell=_teller(out)).status())
@@ -76,7 +79,10 @@ def down(
     ] = False,
     as_json: Json = False,
 ) -> None:
-    """End the containers of a file, those first that were started last; stop at one that is locked or moves."""
+    """End the containers of a file, those first that were started last; stop at one that is locked or moves.
+
+    For example: trade system down examples/system.toml
+    """
     out, plan = Output(as_json=as_json), _plan(context, file)
     with Container(plan.settings) as member:
         bringing = Bringing(plan, member, ssh_config=None, wait_s=5.0, tell=_teller(out))

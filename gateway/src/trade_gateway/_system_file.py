@@ -104,7 +104,8 @@ class _WithGateways(Tables):
             super().check_here(name, entry, environment)
             return
         file = self.beside(entry.gateway)
-        settings = read_gateway_file(file).settings
+        with self.about(name, entry):
+            settings = read_gateway_file(file).settings
         for key, said, wanted in (
             ("name", settings.container, name),
             ("system", settings.system, self.around.system),

@@ -41,6 +41,8 @@ def up(
     """Bring a robot up and keep it up; Ctrl-C or SIGTERM leaves it as its file says (hold or relax).
 
     Attaching moves nothing and resets nothing. A line tells when a joint has a fault, and when it has none any more.
+
+    For example: trade up examples/rosie.toml --sim
     """
     if sim_log is not None and not sim:
         raise UsageError(where="--sim-log", problem="is the log of the simulator; it needs --sim")

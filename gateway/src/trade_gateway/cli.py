@@ -1,5 +1,6 @@
 """The command ``trade``: bring a robot up, look at a system, call its services."""
 
+import os
 import sys
 from collections.abc import Sequence
 from importlib import import_module
@@ -20,6 +21,7 @@ _ROBOTS: Final = "Robots, containers and networks"
 _OPERATION: Final = "Keeping it up"
 _HARDWARE: Final = "Setting hardware up"
 _WATCHING: Final = "Watching and rules"
+_RECORDINGS: Final = "Recordings"
 _RIGHTS: Final = "Identities and rights"
 
 _COMMANDS: Final = {
@@ -42,13 +44,18 @@ _COMMANDS: Final = {
     "containers": (_SERVICES, "_list:containers"),
     "call": (_SERVICES, "_call:call"),
     "stream": (_SERVICES, "_stream:stream"),
+    "ask": (_SERVICES, "_ask:ask"),
     "lock": (_MOTION, "_lock:lock"),
     "locks": (_MOTION, "_locks:locks"),
     "unlock": (_MOTION, "_locks:unlock"),
     "resume": (_MOTION, "_locks:resume"),
     "estop": (_MOTION, "_estop:estop"),
+    "watch": (_WATCHING, "_watch:watch"),
+    "top": (_WATCHING, "_top:top"),
     "notifications": (_WATCHING, "_watchers:notifications"),
     "hooks": (_WATCHING, "_watchers:hooks"),
+    "record": (_RECORDINGS, "recording._record:record"),
+    "replay": (_RECORDINGS, "recording._replay:replay"),
     "tracing": (_WATCHING, "_trace:tracing"),
     "trace": (_WATCHING, "_trace:trace"),
     "logs": (_WATCHING, "_logs:logs"),
@@ -60,6 +67,8 @@ _COMMANDS: Final = {
     "policy": (_RIGHTS, "_policy:app"),
 }
 """By name: where help shows it, and the function or the group of commands that does it."""
+_COMPLETED: Final = ("COMP_WORDS", "_TYPER_COMPLETE_ARGS")
+"""Where shells say what is to be completed."""
 _WITH_VALUE: Final = ("--system", "--connect")
 """Options of every command that take another word."""
 
@@ -73,7 +82,6 @@ def build(only: str | None = None) -> typer.Typer:
     made = typer.Typer(
         name="trade",
         no_args_is_help=True,
-        add_completion=False,
         rich_markup_mode="rich",
         help="Robots as services: bring one up, see what it offers, call it.",
         epilog="Without hardware: trade up examples/rosie.toml --sim, then in another terminal: trade services",
@@ -110,6 +118,14 @@ def _asked_for(words: Sequence[str]) -> str | None:
     return None
 
 
+def _words() -> Sequence[str]:
+    """Of the command line, or of the one that a shell completes."""
+    if "_TRADE_COMPLETE" in os.environ:
+        line = next((os.environ[name] for name in _COMPLETED if name in os.environ), "")
+        return line.split()[1:]
+    return sys.argv[1:]
+
+
 def _version(wanted: bool) -> None:
     if wanted:
         from importlib.metadata import version  # noqa: PLC0415 - only for this option
@@ -143,7 +159,7 @@ def options(
 def main() -> None:
     """Run the command line; errors of ours are one line on stderr and exit code 1, or 2 if its words are wrong."""
     try:
-        build(_asked_for(sys.argv[1:]))()
+        build(_asked_for(_words()))()
     except UsageError as error:
         say_error(error)
         sys.exit(2)

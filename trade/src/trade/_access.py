@@ -68,6 +68,8 @@ FUNCTIONS: Final = {
 SOME_HAVE: Final = {"children": "read", "restart_child": "administer"}
 """Likewise, of functions that only a container has which looks after others."""
 _ALL_FUNCTIONS: Final = {**FUNCTIONS, **SOME_HAVE}
+_OF_EVERYBODY: Final = (PROVIDER, "supervisor")
+"""The providers of these functions: who offers them needs no right, as whoever calls them is asked for one."""
 
 _NEEDS: Final = {"read": "read", "note": "call", "actuate": "call", "stop": _ALL}
 """What other services need over their group, by effect; a stop is open to everybody (S07)."""
@@ -161,7 +163,7 @@ class Access:
         """Whether an identity may have offered what a registry entry tells of: its own functions, and what it may."""
         if self.policy is None:
             return True
-        if domain == DOMAIN and provider == PROVIDER and tuple(groups) == (DOMAIN,):
+        if domain == DOMAIN and provider in _OF_EVERYBODY and tuple(groups) == (DOMAIN,):
             return self.policy.authenticated(who).allowed
         return all(self.policy.decide(who, "register", group).allowed for group in (domain, *groups))
 

@@ -71,6 +71,8 @@ class Event(Struct, frozen=True, gc=False):
     session: str
     call_id: int
     """0: it was no call."""
+    outer_id: int
+    """The call that led to that one first of all, the same in all containers; 0: it was no call."""
     outcome: str
     """``ok``, or the type of the error."""
     why: str
@@ -127,6 +129,7 @@ class Audit:
         who: str = "",
         session: str = "",
         call_id: int = 0,
+        outer_id: int = 0,
         outcome: str = "ok",
         why: str = "",
         took_ns: int = 0,
@@ -134,23 +137,48 @@ class Audit:
         """Tell of something that is no call of a service."""
         if self._tell is not None:
             at_ns, now_ns = time.time_ns(), time.monotonic_ns()
-            self._tell(Event(at_ns, now_ns, kind, what, about, who, session, call_id, outcome, why, took_ns))
+            self._tell(Event(at_ns, now_ns, kind, what, about, who, session, call_id, outer_id, outcome, why, took_ns))
 
-    def refused(self, what: str, error: TradeError | str, *, who: str, session: str = "", call_id: int = 0) -> None:
+    def refused(
+        self,
+        what: str,
+        error: TradeError | str,
+        *,
+        who: str,
+        session: str = "",
+        call_id: int = 0,
+        outer_id: int = 0,
+    ) -> None:
         """Tell that somebody was refused something, and by which error or for what reason."""
         outcome = "Malformed" if isinstance(error, str) else type(error).__name__
         if self.calls is not None:
             self.calls.refuse(outcome)
         if self._tell is not None:
-            why = str(error)
-            self.note("refused", what, who=who, session=session, call_id=call_id, outcome=outcome, why=why)
+            self.note(
+                "refused",
+                what,
+                who=who,
+                session=session,
+                call_id=call_id,
+                outer_id=outer_id,
+                outcome=outcome,
+                why=str(error),
+            )
 
     def changed(self, what: str, about: str, call: CallContext | None) -> None:
         """Tell of a change of configuration, made in a call, or by this container itself."""
         if self._tell is None:
             return
         if call is not None:
-            self.note("configure", what, about=about, who=call.caller, session=call.session, call_id=call.id)
+            self.note(
+                "configure",
+                what,
+                about=about,
+                who=call.caller,
+                session=call.session,
+                call_id=call.id,
+                outer_id=call.outer_id,
+            )
         elif self._own is not None:
             self.note("configure", what, about=about, who=self._own.identity, session=str(self._own))
 
@@ -228,7 +256,7 @@ class Audited:
 
     def run(self, service: "LocalService", args: Sequence[Any], kwargs: dict[str, Any], context: CallContext) -> Any:
         """Call the service and tell of that. Its errors pass."""
-        began_ns = time.monotonic_ns()
+        began_ns, outer_id = time.monotonic_ns(), context.outer_id  # when it has ended, it belongs to nobody
         try:
             if self._around is None:
                 result = service.call(args, kwargs, context, bare=True)
@@ -237,12 +265,12 @@ class Audited:
         except BaseException as error:
             if self._timed is not None:
                 self._timed.add(time.monotonic_ns() - began_ns, failed=True)
-            self.failed(service, context, error, began_ns, args, kwargs)
+            self.failed(service, context, error, began_ns, args, kwargs, outer_id)
             raise
         if self._timed is not None:
             self._timed.add(time.monotonic_ns() - began_ns, failed=False)
         if self._rule.always:
-            self._say(service, context, self._rule.kind, "ok", "", began_ns, args, kwargs)
+            self._say(service, context, self._rule.kind, "ok", "", began_ns, args, kwargs, outer_id)
         return result
 
     def failed(
@@ -253,6 +281,7 @@ class Audited:
         began_ns: int = 0,
         args: Sequence[Any] = (),
         kwargs: dict[str, Any] | None = None,
+        outer_id: int = 0,
     ) -> None:
         """Tell of a call that ended with an error, or never began."""
         refused = isinstance(error, _REFUSALS)
@@ -262,7 +291,7 @@ class Audited:
             kind: Kind = "refused" if refused else self._rule.kind
             told = isinstance(error, TradeError) and not service.signature.has_secrets
             why = str(error) if told else ""
-            self._say(service, context, kind, type(error).__name__, why, began_ns, args, kwargs or {})
+            self._say(service, context, kind, type(error).__name__, why, began_ns, args, kwargs or {}, outer_id)
 
     def _say(
         self,
@@ -274,6 +303,7 @@ class Audited:
         began_ns: int,
         args: Sequence[Any],
         kwargs: dict[str, Any],
+        outer_id: int,
     ) -> None:
         if self._tell is None:
             return
@@ -283,5 +313,5 @@ class Audited:
         now_ns = time.monotonic_ns()
         who, session = foreign(context.session) or context.caller, context.session
         took_ns = now_ns - began_ns if began_ns else 0
-        at_ns = time.time_ns()
-        self._tell(Event(at_ns, now_ns, kind, service.label, about, who, session, context.id, outcome, why, took_ns))
+        at_ns, ids = time.time_ns(), (context.id, outer_id or context.outer_id)
+        self._tell(Event(at_ns, now_ns, kind, service.label, about, who, session, *ids, outcome, why, took_ns))

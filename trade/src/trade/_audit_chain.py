@@ -17,6 +17,7 @@ DROPPED: Final = "dropped"
 _FORMAT: Final = b"trade audit 1\0"
 _NEAR: Final = 1000
 """So many places around a row are tried for the one that it was taken from."""
+_ANOTHER: Final = "it is not the row that was noted elsewhere: it, or one before, was written anew"
 _encode: Final = msgspec.msgpack.Encoder().encode
 
 
@@ -36,6 +37,7 @@ class AuditRow(Struct, frozen=True, array_like=True, gc=False):
     who: str
     session: str
     call_id: int
+    outer_id: int
     outcome: str
     why: str
     took_ns: int
@@ -68,6 +70,10 @@ class Verdict(Struct, frozen=True, kw_only=True):
     """The first row that is not what it was, or is missing; 0: none."""
     problem: str = ""
     """What is wrong with it; empty: nothing."""
+    proven: int = 0
+    """The newest row noted elsewhere that is, or was when it was dropped, the one that was noted; 0: none."""
+    untold: tuple[int, ...] = ()
+    """Rows noted elsewhere that were dropped, and that no row which is left names: nobody can tell any more."""
 
 
 def row_hash(before: bytes, row: AuditRow) -> bytes:
@@ -88,7 +94,8 @@ def verify(links: Iterable[Link], head: Head, witnessed: Mapping[int, bytes] | N
         head: where the record itself says that it ends.
         witnessed: hashes of rows by number, as somebody else has noted them.
     """
-    witnessed, rows, first, begins, dropped = witnessed or {}, 0, 0, "", ""
+    witnessed, rows, first, begins = witnessed or {}, 0, 0, ""
+    dropped: list[str] = []
     last = Head(0, NOTHING)
     broken_at, problem = 0, ""
     for link in links:
@@ -101,12 +108,32 @@ def verify(links: Iterable[Link], head: Head, witnessed: Mapping[int, bytes] | N
             break
         rows, last = rows + 1, Head(row.seq, link.hash)
         if row.kind == "audit" and row.what == DROPPED:
-            dropped = row.about
+            dropped.append(row.about)
     if not problem:
         broken_at, problem = _wrong_end(last, head, witnessed)
-    if not problem and first > 1 and dropped != begins:
+    if not problem and first > 1 and dropped[-1:] != [begins]:
         broken_at, problem = 1, f"rows 1 to {first - 1} are missing, and no row says that just these were dropped"
-    return Verdict(rows=rows, first=first, head=last, broken_at=broken_at, problem=problem)
+    if problem:
+        return Verdict(rows=rows, first=first, head=last, broken_at=broken_at, problem=problem)
+    told = _dropped_before(first, dropped, witnessed)
+    broken_at, problem = next(((seq, _ANOTHER) for seq, right in told.items() if not right), (0, ""))
+    untold = tuple(sorted(seq for seq in witnessed if seq < first and seq not in told))
+    return Verdict(
+        rows=rows,
+        first=first,
+        head=last,
+        broken_at=broken_at,
+        problem=problem,
+        proven=max((seq for seq in witnessed if seq not in untold), default=0),
+        untold=untold,
+    )
+
+
+def _dropped_before(first: int, dropped: Iterable[str], witnessed: Mapping[int, bytes]) -> dict[int, bool]:
+    """Of rows that are gone, whether they were those that were noted, as far as the rows that say so name them."""
+    named = {about.partition(" ")[0]: about for about in dropped}
+    gone = {seq: noted for seq, noted in witnessed.items() if seq < first and str(seq) in named}
+    return {seq: named[str(seq)] == checkpoint(Head(seq, noted)) for seq, noted in sorted(gone.items())}
 
 
 def _wrong_row(link: Link, last: Head, witnessed: Mapping[int, bytes]) -> tuple[int, str]:
@@ -119,7 +146,7 @@ def _wrong_row(link: Link, last: Head, witnessed: Mapping[int, bytes]) -> tuple[
     if link.before != (NOTHING if seq == 1 else last.hash):
         return seq, "it does not follow from the row before: one of them was replaced"
     if witnessed.get(seq, link.hash) != link.hash:
-        return seq, "it is not the row that was noted elsewhere: it, or one before, was written anew"
+        return seq, _ANOTHER
     return 0, ""
 
 

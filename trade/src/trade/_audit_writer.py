@@ -220,7 +220,7 @@ class AuditWriter:
 
     def _row(self, what: str, about: str) -> AuditRow:
         at_ns, now_ns = self._clocks()
-        return AuditRow(0, at_ns, now_ns, self._boot, "audit", what, about, "", "", 0, "ok", "", 0)
+        return AuditRow(0, at_ns, now_ns, self._boot, "audit", what, about, "", "", 0, 0, "ok", "", 0)
 
     def _offset(self) -> int:
         at_ns, now_ns = self._clocks()
@@ -246,6 +246,7 @@ def _row_of(event: Event, boot: str) -> AuditRow:
         _clipped(event.who),
         _clipped(event.session),
         event.call_id & _MOST_ID,
+        event.outer_id & _MOST_ID,
         event.outcome,
         _clipped(event.why),
         event.took_ns,

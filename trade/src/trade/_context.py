@@ -19,6 +19,11 @@ __all__ = ["CallContext", "current_call", "progress"]
 _MOST_EVENTS: Final = 100
 
 
+def outer_of(call_id: int, behalf: Behalf | None) -> int:
+    """The id of the call that began it all, of a call with that id and what it inherited."""
+    return behalf.calls[-1] if behalf is not None and behalf.calls else call_id
+
+
 class CallContext(Struct, frozen=True, gc=False):
     """One call, seen from inside the service."""
 
@@ -51,7 +56,7 @@ class CallContext(Struct, frozen=True, gc=False):
     @property
     def outer_id(self) -> int:
         """The id of the call that began it all, in whatever process: one for everything that comes of it."""
-        return self.id if self.behalf is None or not self.behalf.calls else self.behalf.calls[-1]
+        return outer_of(self.id, self.behalf)
 
     @property
     def tokens(self) -> tuple[Token, ...]:

@@ -17,7 +17,7 @@ from msgspec import Raw, structs
 
 from trade._access import Access
 from trade._audit import Audit, Audited
-from trade._context import CallContext, running
+from trade._context import CallContext, outer_of, running
 from trade._coroutines import AsyncLoop
 from trade._crew import Crew
 from trade._failures import pack_error, unpack_error
@@ -382,7 +382,8 @@ class Dispatcher:
 
     def _note(self, label: str, error: TradeError, caller: str, call: Call) -> None:
         """Have it in the record that a call was refused."""
-        self._audit.refused(label, error, who=foreign(call.session) or caller, session=call.session, call_id=call.id)
+        who, outer_id = foreign(call.session) or caller, outer_of(call.id, call.behalf)
+        self._audit.refused(label, error, who=who, session=call.session, call_id=call.id, outer_id=outer_id)
 
     def _take(self, message: Message) -> tuple[Call, str, str, Publisher] | None:
         """The call, who makes it, the ``domain/provider`` it is for, where to answer: else it is not run."""
@@ -454,7 +455,6 @@ def _run(caller: str, call: Call, service: LocalService, ongoing: Ongoing | None
         if not isinstance(error, TradeError) or isinstance(error, _DEFECTS):
             who = foreign(call.session) or caller
             text = info.traceback or info.message
-            outer_id = call.behalf.calls[-1] if call.behalf and call.behalf.calls else call.id
-            told = {"call_id": call.id, "outer_id": outer_id}
+            told = {"call_id": call.id, "outer_id": outer_of(call.id, call.behalf)}
             _logger.warning("%s failed in a call of %s:\n%s", service.label, who, text, extra=told)
         return Status.ERROR, Raw(encode_message(info))

@@ -204,11 +204,13 @@ class Parts:
         owner = Address(*holder.session.split("/")[:3])
         self._home.handle(ServiceKey(owner, DOMAIN, PROVIDER, "release_requested")).start(token, who, reason)
 
-    def trace(self, on: bool) -> None:
-        """Told by the settings, and by the trace services: note calls, or no more."""
+    def trace(self, on: bool) -> bool:
+        """Told by the settings, and by the trace services: note calls, or no more. Whether it did before."""
+        was = self.caller.spans is not None
         spans: Spans | None = self.spans if on else None
         self.hooks.trace(spans)
         self.caller.spans = spans
+        return was
 
     def _measures(self) -> Iterator[Measure]:
         """Asked for by the metrics, on a thread of theirs."""

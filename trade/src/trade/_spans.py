@@ -1,5 +1,6 @@
 """What a container notes of calls while it is traced: what was called for whom, when, how long, how it ended."""
 
+import itertools
 import time
 from collections import deque
 from collections.abc import Callable, Collection, Sequence
@@ -51,6 +52,8 @@ class Span(Struct, frozen=True, kw_only=True):
     """What was noted of it, and how many seconds after it began."""
     remote: bool = False
     """Whether it was ``served`` for another container."""
+    number: int = 0
+    """Counted from 1 in the container that noted it."""
 
     @property
     def ids(self) -> tuple[int, ...]:
@@ -83,6 +86,7 @@ class Spans:
         """Told of each span."""
         self._lock = Lock()
         self._kept: deque[Span] = deque(maxlen=MOST)
+        self._noted = 0
 
     def asked(self, call_id: int, service: str, request: Request, error: BaseException | None) -> None:
         """A call of this container to another one has ended."""
@@ -138,14 +142,17 @@ class Spans:
 
     def _keep(self, span: Span) -> None:
         with self._lock:
+            self._noted += 1
+            structs.force_setattr(span, "number", self._noted)
             self._kept.append(span)
         if self._tell is not None:
             self._tell(span)
 
-    def kept(self, calls: Collection[int] | None = None) -> list[Span]:
-        """What is kept, oldest first; of these calls and those that they led to, or of all."""
+    def kept(self, calls: Collection[int] | None = None, after: int = 0) -> list[Span]:
+        """What is kept above that number, oldest first; of these calls and those that they led to, or of all."""
         with self._lock:
-            kept = list(self._kept)
+            old = max(0, after - self._noted + len(self._kept))
+            kept = list(itertools.islice(self._kept, old, None))
         return kept if calls is None else [span for span in kept if not frozenset(span.ids).isdisjoint(calls)]
 
 

@@ -8,7 +8,7 @@ from trade._logbook import LogLine, logbook
 from trade._service import service
 from trade._spans import Span, Spans
 
-Switch = Callable[[bool], None]
+Switch = Callable[[bool], bool]
 
 
 class TraceServices:
@@ -20,14 +20,14 @@ class TraceServices:
         self._switch = switch
 
     @service
-    def set_tracing(self, on: bool) -> None:
-        """Note every call that this container makes and serves; off: what was noted stays."""
-        self._switch(on)
+    def set_tracing(self, on: bool) -> bool:
+        """Note every call that this container makes and serves; off: what was noted stays. Whether it was on before."""
+        return self._switch(on)
 
     @service(effect="read")
-    def spans(self, calls: list[int] | None = None) -> list[Span]:
-        """What this container noted of these calls and of those they led to, or of all; oldest first."""
-        return self._noted.kept(None if calls is None else frozenset(calls))
+    def spans(self, calls: list[int] | None = None, after: int = 0) -> list[Span]:
+        """What this container noted above that number, of these calls and those they led to, or all; oldest first."""
+        return self._noted.kept(None if calls is None else frozenset(calls), after)
 
     @service(effect="read")
     def log_lines(self, after: int = 0) -> list[LogLine]:

@@ -9,7 +9,21 @@ from typing import Any, Final, TypeVar
 import anyio
 from anyio.to_thread import run_sync
 
-from trade import Constraint, Container, EstopReport, Handle, Lock, Notification, Run, where
+from trade import (
+    Constraint,
+    Container,
+    EstopReport,
+    Handle,
+    HookInfo,
+    LoadInfo,
+    Lock,
+    LogLine,
+    LogReader,
+    Notification,
+    NotificationInfo,
+    Run,
+    where,
+)
 from trade import Stream as Samples
 from trade.errors import (
     Cancelled,
@@ -19,6 +33,7 @@ from trade.errors import (
     TooManyServices,
     TradeError,
 )
+from trade_gateway._loads import loads
 from trade_gateway.door import _messages as messages
 from trade_gateway.door._clients import Client, Clients, places
 from trade_gateway.door._judge import Judge
@@ -213,6 +228,27 @@ class Deeds:
         found = await self.counted(who, self._container.locks)
         return [messages.lock_view(info) for info in found if not known.isdisjoint(info.resources)]
 
+    async def request_release(self, who: str, body: messages.RequestBody) -> list[str]:
+        """Ask the owners of locks to give them back; who was asked. Raises NoSuchService."""
+        handles, reason = self._using(who, body.resources), f"{who}: {body.reason}" if body.reason else f"by {who}"
+        return await self.counted(who, self._container.request_release, handles, reason)
+
+    async def break_locks(self, who: str, body: messages.RequestBody) -> list[messages.LockView]:
+        """Take locks away from their owners; what moves under them stops. Raises AccessDenied, NoSuchService."""
+        handles, reason = self._using(who, body.resources), f"{who}: {body.reason}" if body.reason else f"by {who}"
+        self.judge.require(who, "administer", handles)
+        broken = await self.counted(who, self._container.break_lock, handles, reason)
+        return [messages.lock_view(info) for info in broken]
+
+    def _using(self, who: str, resources: Sequence[str]) -> list[Handle]:
+        """What uses these and nothing else. Raises NoSuchService: an identity knows of no such service."""
+        wanted = set(resources)
+        actuating = [one for one in self.seen(who) if one.effect == "actuate"]
+        found = [one for one in actuating if wanted.issuperset(name for _, name in places([one]))]
+        if not found:
+            raise NoSuchService(constraint=", ".join(resources), groups=_groups(self.seen(who)))
+        return found
+
     async def resume(self, client: Client, body: messages.GroupBody) -> list[str]:
         """Let services move again; without a lock of its own that is for who administers them. Raises AccessDenied."""
         handles = [one for one in self.seen(client.identity, body.group) if one.effect == "actuate"]
@@ -235,7 +271,7 @@ class Deeds:
     async def clear(self, who: str, body: messages.ClearBody) -> messages.Stopped:
         """Clear e-stops. Raises AccessDenied, NoSuchEstop."""
         ids = body.ids or [one.id for one in self._container.estops()]
-        self.judge.require_system(who, f"e-stop {', '.join(ids)}")
+        self.judge.require_system(who, "administer", f"e-stop {', '.join(ids)}")
         if not ids:
             return messages.Stopped("", True, (), (), {})
         return _stopped(await self.counted(who, self._container.estop_clear, ids))
@@ -243,6 +279,39 @@ class Deeds:
     def estops(self) -> list[messages.EstopView]:
         """Those that are open."""
         return [messages.EstopView(one.id, one.by, one.reason, one.at) for one in self._container.estops()]
+
+    # --- the system
+
+    def me(self, who: str) -> messages.Me:
+        """What an identity is here."""
+        return messages.Me(who, self.judge.may_system(who, "administer"), self.judge.may_system(who, "read"))
+
+    def containers(self) -> list[messages.ContainerView]:
+        """Those of the system."""
+        return [messages.ContainerView(one.name, one.identity, one.host) for one in self._container.containers()]
+
+    async def loads(self, who: str) -> list[LoadInfo]:
+        """How busy they are; takes a second."""
+        return await self.counted(who, loads, self._container)
+
+    async def notifications(self, who: str) -> list[NotificationInfo]:
+        """Those that stand. Raises AccessDenied."""
+        self.judge.require_system(who, "read", "notifications")
+        return await self.counted(who, self._container.notifications)
+
+    async def hooks(self, who: str) -> list[HookInfo]:
+        """Those that are attached. Raises AccessDenied."""
+        self.judge.require_system(who, "read", "hooks")
+        return await self.counted(who, self._container.hooks)
+
+    async def log_lines(self, who: str, reader: LogReader) -> list[LogLine]:
+        """What the system has logged since the last time. Raises AccessDenied."""
+        self.judge.require_system(who, "read", "log")
+        return await self.counted(who, reader.read)
+
+    def log(self) -> LogReader:
+        """Of all processes of the system, from what they still have on."""
+        return LogReader(self._container, "*")
 
     # --- listening
 
@@ -255,6 +324,10 @@ class Deeds:
                 return self._container.stream(handle, hz=asked.hz, on_change=asked.on_change)
 
         return await self.counted(client.identity, listen)
+
+    def view(self, who: str, handle: Handle) -> messages.ServiceView:
+        """A service, as an identity is told of it."""
+        return messages.service_view(handle, allowed=self.judge.may_call(who, handle))
 
     def watch(self, client: Client, asked: messages.Watch, tell: Callable[[str, Handle], object]) -> list[Notification]:
         """Have services that come, go or change told of, those that the client may know of, until it is gone."""
@@ -271,10 +344,6 @@ class Deeds:
                 "changed": here.changed,
             }
             return [kinds[one](wanted, partial(told, one)) for one in dict.fromkeys(asked.occasions)]
-
-    def containers(self) -> list[messages.ContainerView]:
-        """Those of the system."""
-        return [messages.ContainerView(one.name, one.identity, one.host) for one in self._container.containers()]
 
 
 def _wanted(group: str | None, name: str | None) -> Constraint:

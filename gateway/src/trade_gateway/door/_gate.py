@@ -17,8 +17,8 @@ LOOPBACK_NAMES: Final = frozenset({"127.0.0.1", "localhost", "[::1]"})
 class Gate:
     """Refuses requests that a page made without its user's knowledge.
 
-    A page of another site has an ``Origin`` that is not listed. One that let its own name lead to this host (DNS
-    rebinding) has that name in ``Host``.
+    A page of the door itself has as ``Origin`` what ``Host`` says, one of another site something that is not listed.
+    One that let its own name lead to this host (DNS rebinding) has that name in ``Host``.
     """
 
     def __init__(self, app: ASGIApp, *, hosts: Collection[str], origins: Collection[str]) -> None:
@@ -30,7 +30,7 @@ class Gate:
         if scope["type"] not in ("http", "websocket"):
             await self._app(scope, receive, send)
             return
-        wrong = self._wrong(Headers(scope=scope))
+        wrong = self._wrong(scope, Headers(scope=scope))
         if wrong is None:
             await self._app(scope, receive, send)
         elif scope["type"] == "http":
@@ -38,13 +38,13 @@ class Gate:
         else:
             await WebSocket(scope, receive, send).send_denial_response(problem_response(wrong))
 
-    def _wrong(self, headers: Headers) -> WrongDoor | None:
+    def _wrong(self, scope: Scope, headers: Headers) -> WrongDoor | None:
         host = _without_port(headers.get("host", "")).lower()
         if host not in self._hosts:
             remedy = f"this door answers to {', '.join(sorted(self._hosts))}; `trade door --host NAME` adds one"
             return WrongDoor(what=f"host {host!r}", remedy=remedy)
         origin = headers.get("origin")
-        if origin is not None and origin not in self._origins:
+        if origin is not None and origin not in self._origins and origin != _own_site(scope, headers):
             return WrongDoor(what=f"a page of {origin!r}", remedy="`trade door --origin URL` lets one in")
         return None
 
@@ -53,6 +53,11 @@ def problem_response(error: BaseException, headers: dict[str, str] | None = None
     """An error as an answer."""
     problem = problem_of(error)
     return Response(encoder.encode(problem), problem.status, headers, MEDIA_TYPE)
+
+
+def _own_site(scope: Scope, headers: Headers) -> str:
+    """The origin of pages that the door itself has given, under the name that it was called by now."""
+    return f"{'https' if scope['scheme'] in ('https', 'wss') else 'http'}://{headers.get('host', '').lower()}"
 
 
 def _without_port(host: str) -> str:

@@ -43,10 +43,16 @@ class Http:
         return [
             _route("/openapi.json", GET=self.openapi),
             _route("/services", "group", "name", GET=self.services),
+            _route("/me", GET=self.me),
             _route("/containers", GET=self.containers),
+            _route("/loads", GET=self.loads),
+            _route("/notifications", GET=self.notifications),
+            _route("/hooks", GET=self.hooks),
             _route("/call/{group}/{name}", POST=self.call),
             _route("/session", POST=self.open_session, GET=self.session, DELETE=self.close_session),
             _route("/locks", GET=self.locks, POST=self.lock),
+            _route("/locks/request", POST=self.request_release),
+            _route("/locks/break", POST=self.break_locks),
             _route("/locks/{lock}", DELETE=self.unlock),
             _route("/resume", POST=self.resume),
             _route("/estops", GET=self.estops),
@@ -61,8 +67,21 @@ class Http:
 
     async def services(self, request: Request) -> Response:
         asked = request.query_params
-        found = self._deeds.seen(self._who(request), asked.get("group"), asked.get("name"))
-        return _answer([messages.service_view(handle) for handle in found])
+        who = self._who(request)
+        found = self._deeds.seen(who, asked.get("group"), asked.get("name"))
+        return _answer([self._deeds.view(who, handle) for handle in found])
+
+    async def me(self, request: Request) -> Response:
+        return _answer(self._deeds.me(self._who(request)))
+
+    async def loads(self, request: Request) -> Response:
+        return _answer(await self._deeds.loads(self._who(request)))
+
+    async def notifications(self, request: Request) -> Response:
+        return _answer(await self._deeds.notifications(self._who(request)))
+
+    async def hooks(self, request: Request) -> Response:
+        return _answer(await self._deeds.hooks(self._who(request)))
 
     async def containers(self, request: Request) -> Response:
         self._who(request)
@@ -117,6 +136,14 @@ class Http:
         if not await self._deeds.apart(client.unlock, request.path_params["lock"]):
             raise HttpError(status=404, problem="this session has no such lock, or it was lost")
         return Response(status_code=204)
+
+    async def request_release(self, request: Request) -> Response:
+        who, body = self._who(request), await _body(request, messages.RequestBody)
+        return _answer({"asked": await self._deeds.request_release(who, body)})
+
+    async def break_locks(self, request: Request) -> Response:
+        who, body = self._who(request), await _body(request, messages.RequestBody)
+        return _answer(await self._deeds.break_locks(who, body))
 
     async def resume(self, request: Request) -> Response:
         who, body = self._who(request), await _body(request, messages.GroupBody)

@@ -48,6 +48,14 @@ class Judge:
             return False
         return policy is None or any(policy.decide(who, verb, group).allowed for verb in _TO_SEE)
 
+    def may_call(self, who: str, handle: Handle) -> bool:
+        """Whether an identity may call a service."""
+        try:
+            self.require_call(who, handle)
+        except AccessDenied:
+            return False
+        return True
+
     def require_call(self, who: str, handle: Handle) -> None:
         """Raises AccessDenied: it may not call that; a stop needs no right."""
         if handle.key.domain == _OWN:
@@ -63,6 +71,10 @@ class Judge:
                 raise AccessDenied(who=who, verb=verb, what=handle.label, rule=rule)
             self._access.require(who, verb, handle.key.domain, handle.label)
 
-    def require_system(self, who: str, what: str) -> None:
-        """Raises AccessDenied: it does not administer the system."""
-        self._access.require(who, "administer", _OWN, what)
+    def require_system(self, who: str, verb: str, what: str) -> None:
+        """Raises AccessDenied: it may not ``administer`` or ``read`` the system itself."""
+        self._access.require(who, verb, _OWN, what)
+
+    def may_system(self, who: str, verb: str) -> bool:
+        """Whether it may."""
+        return self._access.denied(who, verb, _OWN, "the system") is None

@@ -44,6 +44,12 @@ class GroupBody(Struct, forbid_unknown_fields=True, kw_only=True):
     group: Group
 
 
+class RequestBody(Struct, forbid_unknown_fields=True, kw_only=True):
+    resources: Annotated[list[str], Meta(min_length=1, max_length=200)]
+    """As ``GET /locks`` names them."""
+    reason: Annotated[str, Meta(max_length=200)] = ""
+
+
 class EstopBody(Struct, forbid_unknown_fields=True, kw_only=True):
     reason: Annotated[str, Meta(max_length=300)] = ""
 
@@ -102,16 +108,30 @@ class Watch(Struct, tag="watch", tag_field="do", forbid_unknown_fields=True, kw_
     """Also tell of what is there already, as joined."""
 
 
+class Logs(Struct, tag="logs", tag_field="do", forbid_unknown_fields=True, kw_only=True):
+    id: Id
+    level: Annotated[int, Meta(ge=0, le=100)] = 20
+    """The least, as Python counts them: 20 is info, 30 warning, 40 error."""
+
+
 class Cancel(Struct, tag="cancel", tag_field="do", forbid_unknown_fields=True, kw_only=True):
     id: Id
     which: Id
-    """The call, stream or watch to end."""
+    """The call, stream, watch or log to end."""
 
 
-Asked = Call | TakeLock | Unlock | Resume | Estop | Stream | Watch | Cancel
+Asked = Call | TakeLock | Unlock | Resume | Estop | Stream | Watch | Logs | Cancel
 
 
 # --- answers
+
+
+class Me(Struct, frozen=True):
+    identity: str
+    administers: bool
+    """The system: it may clear e-stops."""
+    reads: bool
+    """The system: its log, notifications and hooks."""
 
 
 class ServiceView(Struct, frozen=True):
@@ -126,6 +146,8 @@ class ServiceView(Struct, frozen=True):
     health: str
     container: str
     host: str
+    allowed: bool
+    """Whether the asking client may call it."""
 
 
 class ContainerView(Struct, frozen=True):
@@ -173,7 +195,7 @@ class Stopped(Struct, frozen=True):
     failed: dict[str, str]
 
 
-def service_view(handle: Handle) -> ServiceView:
+def service_view(handle: Handle, *, allowed: bool) -> ServiceView:
     return ServiceView(
         handle.key.domain,
         handle.name,
@@ -185,6 +207,7 @@ def service_view(handle: Handle) -> ServiceView:
         handle.health,
         handle.container,
         handle.host,
+        allowed,
     )
 
 

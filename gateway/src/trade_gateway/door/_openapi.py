@@ -6,7 +6,7 @@ from typing import Any, Final, cast
 
 import msgspec
 
-from trade import Handle
+from trade import Handle, HookInfo, LoadInfo, NotificationInfo
 from trade_gateway.door import _messages as messages
 from trade_gateway.door._problems import MEDIA_TYPE, Problem
 
@@ -17,9 +17,11 @@ _BODIES: Final = (
     messages.CallBody,
     messages.LockBody,
     messages.GroupBody,
+    messages.RequestBody,
     messages.EstopBody,
     messages.ClearBody,
     messages.SessionBody,
+    messages.Me,
     messages.ServiceView,
     messages.ContainerView,
     messages.LockView,
@@ -27,6 +29,9 @@ _BODIES: Final = (
     messages.SessionOpened,
     messages.EstopView,
     messages.Stopped,
+    LoadInfo,
+    NotificationInfo,
+    HookInfo,
     Problem,
 )
 _COMPONENTS: Final = "#/components/schemas/"
@@ -138,12 +143,17 @@ def _fixed() -> Schema:
     held = {**_SESSION, "required": True}
     lock = {"name": "lock", "in": "path", "required": True, "schema": {"type": "string"}}
     names = {"type": "array", "items": {"type": "string"}}
+    asked = {"type": "object", "properties": {"asked": names}, "required": ["asked"]}
     resumed = {"type": "object", "properties": {"resumed": names}, "required": ["resumed"]}
     opened = {"type": "object", "properties": {"name": {"type": "string"}, "lease_s": {"type": "number"}}}
     return {
         "/openapi.json": {"get": _operation("This document.", {"type": "object"})},
         "/services": {"get": _operation("Services.", _list("ServiceView"), parameters=query)},
+        "/me": {"get": _operation("As whom the client is known, and its rights over the system.", _ref("Me"))},
         "/containers": {"get": _operation("Containers.", _list("ContainerView"))},
+        "/loads": {"get": _operation("How busy they are, over the second that this takes.", _list("LoadInfo"))},
+        "/notifications": {"get": _operation("Notifications that stand.", _list("NotificationInfo"))},
+        "/hooks": {"get": _operation("Hooks that are attached.", _list("HookInfo"))},
         "/session": {
             "post": _operation("Open a session.", _ref("SessionOpened"), body="SessionBody", status="201"),
             "get": _operation("Renew a session, as any request in it does.", opened, parameters=[held]),
@@ -155,6 +165,10 @@ def _fixed() -> Schema:
                 "Take a lock.", _ref("LockTaken"), body="LockBody", needed=True, parameters=[held], status="201"
             ),
         },
+        "/locks/request": {
+            "post": _operation("Ask their owners to give locks back.", asked, body="RequestBody", needed=True)
+        },
+        "/locks/break": {"post": _operation("Take locks away.", _list("LockView"), body="RequestBody", needed=True)},
         "/locks/{lock}": {"delete": _operation("Release a lock.", None, parameters=[lock, held], status="204")},
         "/resume": {
             "post": _operation(

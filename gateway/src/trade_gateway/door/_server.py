@@ -20,6 +20,7 @@ from starlette.routing import WebSocketRoute
 
 from trade import Container
 from trade.errors import ConfigurationError
+from trade_gateway.dashboard import pages
 from trade_gateway.door._deeds import Deeds
 from trade_gateway.door._entry import Entry
 from trade_gateway.door._gate import LOOPBACK_NAMES, Gate
@@ -154,7 +155,11 @@ def _application(deeds: Deeds, tokens: Tokens, hosts: Collection[str], origins: 
             Middleware(CORSMiddleware, allow_origins=list(origins), allow_methods=methods, allow_headers=allowed)
         )
     application = Starlette(
-        routes=[*Http(deeds, entry, leases).routes(), WebSocketRoute("/ws", Socket(deeds, entry, leases).serve)],
+        routes=[
+            *Http(deeds, entry, leases).routes(),
+            WebSocketRoute("/ws", Socket(deeds, entry, leases).serve),
+            *pages(),
+        ],
         middleware=middleware,
         exception_handlers={HTTPException: refused, 500: broken},
         lifespan=lifespan,

@@ -26,6 +26,9 @@ _MOST_WAITING: Final = 256
 """Events that wait for a slow client; the oldest goes first."""
 _SENT_WITHIN_S: Final = 2.0
 """A client that takes nothing for so long is gone (S05)."""
+_LOG_EVERY_S: Final = 0.5
+_OLD_LINES: Final = 200
+"""Of the log, that are told at first."""
 
 _ENDED: Final = 1008
 
@@ -185,6 +188,8 @@ class Conversation:
                 return await self._stream(asked, ongoing.handle)
             case messages.Watch():
                 return await self._watch(asked)
+            case messages.Logs():
+                return await self._logs(asked)
             case messages.TakeLock():
                 return await self._deeds.lock(self._client, asked, self._lock_lost)
             case messages.Unlock():
@@ -217,7 +222,7 @@ class Conversation:
                 ongoing.unwanted = True
                 if ongoing.run is not None:
                     await self._deeds.end(self._client, ongoing.run)
-            case messages.Stream() | messages.Watch():
+            case messages.Stream() | messages.Watch() | messages.Logs():
                 ongoing.scope.cancel()
             case _:
                 return False
@@ -241,7 +246,8 @@ class Conversation:
 
     async def _watch(self, asked: messages.Watch) -> None:
         def tell(occasion: str, handle: Handle) -> None:
-            self._post({"id": asked.id, "event": occasion, "service": messages.service_view(handle)})
+            told = self._deeds.view(self._client.identity, handle)
+            self._post({"id": asked.id, "event": occasion, "service": told})
 
         standing = await self._deeds.apart(self._deeds.watch, self._client, asked, tell)
         try:
@@ -249,6 +255,17 @@ class Conversation:
         finally:
             for one in standing:
                 await self._apart(one.cancel)
+
+    async def _logs(self, asked: messages.Logs) -> None:
+        reader = self._deeds.log()
+        lines = await self._deeds.log_lines(self._client.identity, reader)
+        lines = lines[-_OLD_LINES:]
+        while True:
+            for line in lines:
+                if line.level >= asked.level:
+                    await self._say({"id": asked.id, "line": line})
+            await anyio.sleep(_LOG_EVERY_S)
+            lines = await self._deeds.log_lines(self._client.identity, reader)
 
     async def _apart(self, close: Callable[[], object]) -> None:
         with anyio.CancelScope(shield=True):

@@ -41,6 +41,8 @@ class ChildInfo(Struct, frozen=True):
     why: str
     """Why it ended, or is ended; empty while it is up."""
     rss_mb: float = 0.0
+    saved_at: float = 0.0
+    """What all its objects knew then, in seconds since the epoch, is on disk; 0: nothing yet."""
 
 
 class News(Struct, frozen=True):
@@ -67,6 +69,7 @@ class _Unit:
         self.leaving = ""
         """Why it is not wanted any more."""
         self.save_at = math.inf
+        self.saved_at = 0.0
 
     @property
     def gone(self) -> bool:
@@ -349,15 +352,16 @@ class Supervisor:
             return
 
         def work() -> Callable[[], None]:
+            began = time.time()
             states = save(self._member(), furnished)
-            if states:
-                self._store.save(child.name, states)
-            return partial(self._saved, unit)
+            kept = bool(states) and self._store.save(child.name, states)
+            whole = kept and states.keys() == furnished.made.keys()
+            return partial(self._saved, unit, began if whole else 0.0)
 
         self._job(unit, "save", work)
 
-    def _saved(self, unit: _Unit) -> None:
-        now = time.monotonic()
+    def _saved(self, unit: _Unit, saved_at: float = 0.0) -> None:
+        now, unit.saved_at = time.monotonic(), saved_at or unit.saved_at
         if unit.life.state is State.STOPPING:
             self._do(unit, unit.life.saved(now))
         elif unit.furnished is not None and unit.furnished.made:
@@ -381,4 +385,5 @@ def _info(unit: _Unit) -> ChildInfo:
         pid=pid,
         restarts=life.restarts,
         why=life.why or unit.leaving,
+        saved_at=unit.saved_at,
     )

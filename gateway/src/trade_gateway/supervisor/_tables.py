@@ -93,6 +93,6 @@ class _OfGateway(Tables):
         if not entry.is_local:
             self.refuse(name, "host", "a gateway looks after containers of its own host; leave it out")
         if entry.gateway:
-            self.refuse(name, "gateway", "is this file; a gateway looks after robots, providers and rules")
+            self.refuse(name, "gateway", "is this file; a gateway looks after robots, providers, rules and doors")
         if self._certified and not entry.tls:
             self.refuse(name, "tls", f"missing; name the folder with its certificate: trade pki issue {name}")

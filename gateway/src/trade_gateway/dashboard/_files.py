@@ -1,0 +1,46 @@
+"""The files of the page, and what a browser is told about them."""
+
+import hashlib
+from importlib.resources import files
+from typing import Final
+
+from starlette.requests import Request
+from starlette.responses import Response
+from starlette.routing import Route
+
+_FILES: Final = (
+    ("/", "index.html", "text/html"),
+    ("/dashboard/app.js", "app.js", "text/javascript"),
+    ("/dashboard/style.css", "style.css", "text/css"),
+    ("/dashboard/icon.svg", "icon.svg", "image/svg+xml"),
+)
+HEADERS: Final = {
+    "Content-Security-Policy": (
+        "default-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'; object-src 'none'; "
+        "require-trusted-types-for 'script'; trusted-types 'none'"
+    ),
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+    "Cache-Control": "no-cache",
+}
+"""Nothing runs but the script of the page itself, and no other site shows the page inside of its own."""
+
+
+def pages() -> list[Route]:
+    """A route for each file. They say nothing of the system: whoever can reach the door may read them."""
+    folder = files(__name__.rpartition(".")[0]) / "static"
+    return [_route(path, (folder / name).read_bytes(), kind) for path, name, kind in _FILES]
+
+
+def _route(path: str, body: bytes, kind: str) -> Route:
+    tag = f'"{hashlib.sha256(body).hexdigest()[:16]}"'
+
+    async def answer(request: Request) -> Response:
+        headers = {**HEADERS, "ETag": tag}
+        if request.headers.get("if-none-match") == tag:
+            return Response(status_code=304, headers=headers)
+        return Response(body, headers=headers, media_type=kind)
+
+    return Route(path, answer, methods=["GET"])

@@ -1,0 +1,16 @@
+"""Recordings of a system as MCAP files: what was measured, called, locked and wrong; made, read, replayed, exported."""
+
+from importlib import import_module
+
+from trade.errors import ConfigurationError
+
+__all__ = ["require"]
+
+
+def require(library: str, extra: str) -> None:
+    """Raises ConfigurationError: a library of an extra is missing."""
+    try:
+        import_module(library)
+    except ImportError:
+        problem = f'needs {library}; pip install "trade-gateway[{extra}]"'
+        raise ConfigurationError(where="recordings", problem=problem) from None

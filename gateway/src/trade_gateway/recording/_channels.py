@@ -1,0 +1,234 @@
+"""What a recording holds: the channels, the messages on them, and the JSON Schemas that say so in the file."""
+
+import base64
+from collections.abc import Mapping
+from functools import cache
+from typing import Annotated, Any, Final, Literal, NamedTuple, cast
+
+import msgspec
+from msgspec import Meta, Struct
+
+__all__ = [
+    "CALLS",
+    "FAULTS",
+    "LOCKS",
+    "Call",
+    "Channel",
+    "CompressedImage",
+    "Fault",
+    "FaultKind",
+    "JointStates",
+    "Lock",
+    "Locks",
+    "Message",
+    "RawImage",
+    "Time",
+    "camera_channel",
+    "encoded",
+    "group_of",
+    "joints_channel",
+    "picture",
+    "service_channel",
+]
+
+_JOINTS: Final = "/joints"
+Base64 = Annotated[str, Meta(extra_json_schema={"contentEncoding": "base64"})]
+FaultKind = Literal["health", "gone", "unreadable", "joint", "e-stop"]
+Index = Annotated[int, Meta(ge=0)]
+
+
+class JointStates(Struct, frozen=True, kw_only=True):
+    """What was measured at the joints of a group; all lists are in the order of the names."""
+
+    names: list[str]
+    position_rad: list[float]
+    velocity_rad_s: list[float]
+    load: list[float]
+    """Effort as a fraction of the most a motor can give; empty: the device does not tell."""
+    enabled: list[bool]
+    fault: list[str]
+    stamp_s: list[float]
+    """When each was measured: seconds since the epoch by the clock of its host."""
+
+
+class Call(Struct, frozen=True, kw_only=True):
+    """One call, as a container noted it. Without arguments and results."""
+
+    call_id: str
+    calls: list[str]
+    """Ids of those that led to it, nearest first."""
+    service: str
+    side: Literal["asked", "served"]
+    container: str
+    caller: str
+    session: str
+    began_s: float
+    """Seconds since the epoch by the clock of its host."""
+    waited_s: float
+    took_s: float
+    outcome: str
+    """``ok``, or the type of its error."""
+    locks: list[str]
+
+
+class Lock(Struct, frozen=True, kw_only=True):
+    """One lock that holds in one container."""
+
+    container: str
+    resources: list[str]
+    owner: str
+    purpose: str
+    since_s: float
+    """Seconds since the epoch by the clock of its host."""
+    waiting: list[str]
+
+
+class Locks(Struct, frozen=True, kw_only=True):
+    """All locks of the system at one moment."""
+
+    locks: list[Lock]
+
+
+class Fault(Struct, frozen=True, kw_only=True):
+    """A change of what is wrong."""
+
+    about: str
+    """A group whose health it is or whose services are gone, a service that cannot be read, a joint, an e-stop."""
+    kind: FaultKind
+    text: str
+    """What is wrong; empty: nothing any more."""
+    new: bool = True
+    """False: it was so when the recording began."""
+
+
+class Time(Struct, frozen=True):
+    """A moment, as Foxglove writes it."""
+
+    sec: Index
+    nsec: Annotated[int, Meta(ge=0, le=999_999_999)]
+
+    @classmethod
+    def of(cls, at_ns: int) -> "Time":
+        """A moment in nanoseconds since the epoch."""
+        return cls(*divmod(at_ns, 1_000_000_000))
+
+
+class CompressedImage(Struct, frozen=True, kw_only=True):
+    """A picture as a whole file; named and laid out as Foxglove knows it."""
+
+    timestamp: Time
+    frame_id: str
+    data: Base64
+    format: str
+
+
+class RawImage(Struct, frozen=True, kw_only=True):
+    """Pixels row by row; named and laid out as Foxglove knows it."""
+
+    timestamp: Time
+    frame_id: str
+    width: Index
+    height: Index
+    encoding: str
+    step: Index
+    data: Base64
+
+
+class Channel(NamedTuple):
+    """Where messages of one shape go."""
+
+    topic: str
+    schema_name: str
+    schema: bytes
+    """JSON Schema of an object."""
+
+
+class Message(NamedTuple):
+    """One entry of a recording."""
+
+    channel: Channel
+    arrived_ns: int
+    """When it arrived here, in nanoseconds since the epoch."""
+    stamp_ns: int
+    """When it was so, by the clock of its source."""
+    data: bytes
+
+
+def inlined(schema: Mapping[str, Any]) -> dict[str, Any]:
+    """A schema that refers to nothing, as viewers follow no references; what contains itself is left open."""
+    definitions = cast("Mapping[str, Any]", schema.get("$defs", {}))
+
+    def within(node: Any, open_: tuple[str, ...]) -> Any:
+        if isinstance(node, list):
+            return [within(each, open_) for each in cast("list[Any]", node)]
+        if not isinstance(node, Mapping):
+            return node
+        found = cast("Mapping[str, Any]", node)
+        if (reference := found.get("$ref")) is not None:
+            name = str(reference).rpartition("/")[2]
+            return {} if name in open_ else within(definitions[name], (*open_, name))
+        return {key: within(value, open_) for key, value in found.items() if key != "$defs"}
+
+    return cast("dict[str, Any]", within(schema, ()))
+
+
+def _schema(kind: type[Struct], title: str) -> bytes:
+    return msgspec.json.encode({**inlined(msgspec.json.schema(kind)), "title": title})
+
+
+def _channel(topic: str, kind: type[Struct], name: str) -> Channel:
+    return Channel(topic, name, _schema(kind, name))
+
+
+CALLS: Final = _channel("/calls", Call, "trade.Call")
+LOCKS: Final = _channel("/locks", Locks, "trade.Locks")
+FAULTS: Final = _channel("/faults", Fault, "trade.Fault")
+
+
+@cache
+def joints_channel(group: str) -> Channel:
+    """Of the joints of a group: ``/rosie.head/joints``."""
+    return _channel(f"/{group}{_JOINTS}", JointStates, "trade.JointStates")
+
+
+def group_of(topic: str) -> str | None:
+    """The group whose joints are on a topic; None: it has others."""
+    return topic[1 : -len(_JOINTS)] if topic.endswith(_JOINTS) else None
+
+
+@cache
+def camera_channel(group: str, raw: bool) -> Channel:
+    """Of the pictures of a camera: ``/cameras/rosie.eye``."""
+    if raw:
+        return _channel(f"/cameras/{group}", RawImage, "foxglove.RawImage")
+    return _channel(f"/cameras/{group}", CompressedImage, "foxglove.CompressedImage")
+
+
+def service_channel(label: str, result: Mapping[str, Any]) -> Channel:
+    """Of the answers of any service, each as ``value`` of an object: ``/services/rosie.hand.state``."""
+    wrapped = {"title": label, "type": "object", "properties": {"value": inlined(result)}, "required": ["value"]}
+    return Channel(f"/services/{label}", label, msgspec.json.encode(wrapped))
+
+
+def picture(group: str, data: bytes, layout: str, width_px: int, height_px: int, at_ns: int) -> Message:
+    """A message with what a camera saw, without its time of arrival."""
+    text = base64.b64encode(data).decode()
+    bytes_a_pixel = {"rgb8": 3, "mono8": 1}.get(layout)
+    if bytes_a_pixel is None:
+        value: Struct = CompressedImage(timestamp=Time.of(at_ns), frame_id=group, data=text, format=layout)
+    else:
+        value = RawImage(
+            timestamp=Time.of(at_ns),
+            frame_id=group,
+            width=width_px,
+            height=height_px,
+            encoding=layout,
+            step=width_px * bytes_a_pixel,
+            data=text,
+        )
+    return Message(camera_channel(group, bytes_a_pixel is not None), 0, at_ns, encoded(value))
+
+
+def encoded(value: Any) -> bytes:
+    """A message as JSON; what JSON has no word for, such as a handle, as text."""
+    return msgspec.json.encode(value, enc_hook=str)

@@ -1,0 +1,153 @@
+"""An MCAP file that is written: readable up to the last second whatever ends it, and closed in order on a full disk."""
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import IO, Any, Final, Protocol, cast
+
+from mcap.data_stream import RecordBuilder
+from mcap.records import DataEnd, Footer
+from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
+
+from trade.errors import ConfigurationError
+from trade_gateway.recording._channels import Channel, Message
+
+__all__ = ["Attachment", "RecordingFile"]
+
+_CHUNK_BYTES: Final = 1 << 20
+_SEQUENCE: Final = (1 << 32) - 1
+
+Attachment = tuple[str, bytes]
+"""Name and contents of a file that goes into the recording."""
+
+
+class Raw(Protocol):
+    """An unbuffered file; ``write`` may take a part only."""
+
+    def write(self, data: Any, /) -> int | None: ...
+    def tell(self) -> int: ...
+    def seek(self, offset: int, /) -> int: ...
+    def truncate(self, size: int, /) -> int: ...
+    def close(self) -> None: ...
+
+
+def _unbuffered(path: Path) -> Raw:
+    return path.open("xb", buffering=0)
+
+
+class RecordingFile:
+    """One file. Used by one thread; a context manager.
+
+    When a write fails, the file is ended after its last whole chunk, without an index, and the OSError passes.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        about: Mapping[str, str],
+        attachments: Sequence[Attachment] = (),
+        opened: Callable[[Path], Raw] = _unbuffered,
+    ) -> None:
+        """Begin it.
+
+        Args:
+            path: where; what is there already is not overwritten.
+            about: goes into it as the metadata record ``trade``.
+            attachments: robot files and the like.
+            opened: makes the file.
+
+        Raises:
+            ConfigurationError: it cannot be made.
+        """
+        try:
+            self._raw: Final = opened(path)
+        except OSError as bad:
+            raise ConfigurationError(where=str(path), problem=f"cannot be written: {bad.strerror}") from None
+        self.path: Final = path
+        self.messages = 0
+        self.size_bytes = 0
+        """Up to here the file has whole chunks."""
+        self._channels: dict[tuple[str, str], int] = {}
+        self._closed = False
+        stream = cast("IO[Any]", _Whole(self._raw))
+        self._writer = Writer(stream, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
+        self._do(lambda: self._begin(about, attachments))
+
+    def _begin(self, about: Mapping[str, str], attachments: Sequence[Attachment]) -> None:
+        now_ns = time.time_ns()
+        self._writer.start()
+        for name, data in attachments:
+            self._writer.add_attachment(now_ns, now_ns, name, "application/toml", data)
+        self._writer.add_metadata("trade", dict(about))
+
+    def write(self, message: Message) -> None:
+        """Add a message; it is in the file after the next ``flush``, or earlier."""
+        self._do(lambda: self._add(message))
+
+    def _add(self, message: Message) -> None:
+        channel = self._channel(message.channel)
+        self.messages += 1
+        number = self.messages & _SEQUENCE
+        self._writer.add_message(channel, message.arrived_ns, message.data, message.stamp_ns, sequence=number)
+
+    def _channel(self, channel: Channel) -> int:
+        key = channel.topic, channel.schema_name
+        known = self._channels.get(key)
+        if known is None:
+            schema = self._writer.register_schema(channel.schema_name, "jsonschema", channel.schema)
+            known = self._channels[key] = self._writer.register_channel(channel.topic, "json", schema)
+        return known
+
+    def flush(self) -> None:
+        """Have all messages in the file: so far it is readable from now on, even if this process is killed."""
+        self._do(self._writer.flush)
+
+    def close(self) -> None:
+        """End the file with its index. Idempotent."""
+        if not self._closed:
+            self._do(self._writer.finish)
+            self._closed = True
+            self._raw.close()
+
+    def _do(self, write: Callable[[], object]) -> None:
+        try:
+            write()
+        except OSError:
+            self._cut_off()
+            raise
+        self.size_bytes = self._raw.tell()
+
+    def _cut_off(self) -> None:
+        """End it after its last whole chunk: what that frees is enough."""
+        self._closed = True
+        end = RecordBuilder()
+        DataEnd(0).write(end)
+        Footer(summary_start=0, summary_offset_start=0, summary_crc=0).write(end)
+        with closing(self._raw):
+            self._raw.truncate(self.size_bytes)
+            self._raw.seek(self.size_bytes)
+            _Whole(self._raw).write(end.end() + MCAP0_MAGIC)
+
+    def __enter__(self) -> "RecordingFile":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+class _Whole:
+    """A file that takes all it is given, or raises."""
+
+    def __init__(self, raw: Raw) -> None:
+        self._raw = raw
+        self.tell = raw.tell
+
+    def write(self, data: bytes) -> int:
+        left = memoryview(data)
+        while left:
+            left = left[self._raw.write(left) or 0 :]
+        return len(data)
+
+    def flush(self) -> None:
+        """Nothing is held back."""

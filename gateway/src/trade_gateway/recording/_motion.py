@@ -1,0 +1,239 @@
+"""The motion of joints in a recording: as it was measured, as a trajectory, and how far another one was from it."""
+
+import math
+from bisect import bisect_left
+from collections.abc import Iterable, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import msgspec
+
+from trade.errors import ConfigurationError, LimitExceeded
+from trade_drivers import JointLimits, Tolerances, Trajectory, TrajectoryPoint, planned
+from trade_gateway.recording._channels import JointStates, group_of
+from trade_gateway.recording._reader import entries
+
+__all__ = ["Deviation", "Motion", "Track", "deviation", "fitted", "motion_of", "motions", "trajectory"]
+
+_decode: Final = msgspec.json.Decoder(JointStates).decode
+_STEP_S: Final = 0.05
+"""Between points of a trajectory, in the time of the recording."""
+_REACH_S: Final = 0.08
+"""So far before and after a point measurements count for it."""
+_STEPS: Final = 8
+_NEAR_RAD: Final = 0.005
+_NOISE: Final = 0.95
+_SLOWER: Final = 0.99
+_SLOWEST: Final = 0.05
+_SAME_S: Final = 0.002
+"""Stamps of one measurement that was read twice differ by less."""
+_GAP_S: Final = 0.5
+_STILL_RAD: Final = 0.02
+"""A joint that is as near after a gap has not moved meanwhile."""
+
+
+class Track(NamedTuple):
+    """What was measured at one joint, at rising times in seconds since the recording's first measurement."""
+
+    times_s: Sequence[float]
+    positions_rad: Sequence[float]
+
+    def at(self, time_s: float) -> float:
+        """The angle at a time, on the straight line between two measurements."""
+        times, positions = self
+        after = bisect_left(times, time_s)
+        if after == 0:
+            return positions[0]
+        if after == len(times):
+            return positions[-1]
+        share = (time_s - times[after - 1]) / (times[after] - times[after - 1])
+        return positions[after - 1] + share * (positions[after] - positions[after - 1])
+
+    def around(self, time_s: float) -> tuple[float, float]:
+        """Angle and speed at a time, of the mean over what was measured about then: noise is no motion.
+
+        The speed is the derivative of that mean, so nothing is quicker, or gets quicker sooner, than it was.
+        """
+        steps = [self.at(time_s + _REACH_S * (2 * step / _STEPS - 1)) for step in range(_STEPS + 1)]
+        mean = (sum(steps) - (steps[0] + steps[-1]) / 2) / _STEPS
+        return mean, (steps[-1] - steps[0]) / (2 * _REACH_S)
+
+
+class Motion(NamedTuple):
+    """The joints of a group over time."""
+
+    group: str
+    joints: Sequence[str]
+    tracks: Sequence[Track]
+
+    @property
+    def duration_s(self) -> float:
+        """From the first measurement to the last."""
+        return max(track.times_s[-1] for track in self.tracks)
+
+    @property
+    def start(self) -> list[float]:
+        """Where it begins."""
+        return [track.around(0.0)[0] for track in self.tracks]
+
+
+class Deviation(NamedTuple):
+    """How far joints were from a recorded motion, in rad."""
+
+    greatest_rad: Sequence[float]
+    """Of each joint."""
+    rms_rad: Sequence[float]
+    """Of each joint: root of the mean square."""
+
+
+def motions(path: Path) -> dict[str, list[JointStates]]:
+    """What a recording has of joints, by group.
+
+    Raises:
+        ConfigurationError: it cannot be read.
+    """
+    found: dict[str, list[JointStates]] = {}
+    for entry in entries(path):
+        group = group_of(entry.topic)
+        if group is not None:
+            found.setdefault(group, []).append(_decode(entry.data))
+    return found
+
+
+def motion_of(group: str, states: Iterable[JointStates]) -> Motion:
+    """The motion of a group; a value that was sent twice counts once.
+
+    Raises:
+        ConfigurationError: its joints are not the same all through, or are missing while they moved.
+    """
+    joints: list[str] = []
+    measured: list[list[tuple[float, float]]] = []
+    for each in states:
+        joints = joints or each.names
+        measured = measured or [[] for _ in joints]
+        if each.names != joints:
+            problem = f"{group} has other joints later: {', '.join(each.names)} instead of {', '.join(joints)}"
+            raise ConfigurationError(where="recording", problem=problem)
+        for track, at_s, position in zip(measured, each.stamp_s, each.position_rad, strict=True):
+            if not track or at_s > track[-1][0] + _SAME_S:
+                track.append((at_s, position))
+    if not measured or any(len(track) < 3 for track in measured):
+        raise ConfigurationError(where="recording", problem=f"{group} was measured less than three times")
+    began = max(track[0][0] for track in measured)
+    tracks: list[Track] = []
+    for joint, track in zip(joints, measured, strict=True):
+        _whole(joint, track, began)
+        tracks.append(Track([at - began for at, _ in track], [position for _, position in track]))
+    return Motion(group, joints, tracks)
+
+
+def _whole(joint: str, track: Sequence[tuple[float, float]], began: float) -> None:
+    for (before_s, before), (after_s, after) in pairwise(track):
+        if after_s - before_s > _GAP_S and abs(after - before) > _STILL_RAD:
+            problem = f"{joint} was not measured from {before_s - began:.1f} to {after_s - began:.1f} s, while it moved"
+            raise ConfigurationError(where="recording", problem=problem)
+
+
+def fitted(motion: Motion, speed: float, limits: Sequence[JointLimits]) -> tuple[Trajectory, float]:
+    """The motion as a trajectory that keeps the limits, and its speed: what was asked for, or up to 5 % less.
+
+    What was recorded at a limit is measured a little beyond it as often as not.
+
+    Raises:
+        LimitExceeded: it does not keep them, even so; says at which speed it would, if at any.
+    """
+    refused: LimitExceeded | None = None
+    slower = speed
+    while slower >= _SLOWEST:
+        way = trajectory(motion, slower, limits)
+        try:
+            planned(way, Tolerances(), limits)
+        except LimitExceeded as problem:
+            refused = refused or problem
+        else:
+            if refused is None or slower >= speed * _NOISE:
+                return way, slower
+            what = f"{refused.what} (with --speed {math.floor(slower * 100) / 100:.2f} it keeps the limits)"
+            raise LimitExceeded(
+                what=what, value=refused.value, lower=refused.lower, upper=refused.upper, unit=refused.unit
+            )
+        if refused.unit == "rad":  # no speed helps
+            raise refused
+        slower *= _SLOWER
+    assert refused is not None  # noqa: S101 - the loop ran
+    raise refused
+
+
+def trajectory(motion: Motion, speed: float, limits: Sequence[JointLimits] = ()) -> Trajectory:
+    """The motion as points over time, at rest at both ends, its noise smoothed.
+
+    Args:
+        motion: what was recorded.
+        speed: 1 is that of the recording; 0.5 takes twice as long.
+        limits: angles that are measured less than 5 mrad beyond them are taken for the limit.
+    """
+    ranges = {limit.name: (limit.min_rad, limit.max_rad) for limit in limits}
+    count = max(2, round(motion.duration_s / _STEP_S))
+    step_s = motion.duration_s / count
+    points: list[TrajectoryPoint] = []
+    for number in range(count + 1):
+        places = [track.around(number * step_s) for track in motion.tracks]
+        still = number in (0, count)
+        points.append(
+            TrajectoryPoint(
+                time_from_start_s=number * step_s / speed,
+                positions_rad=[
+                    _inside(position, ranges.get(joint))
+                    for joint, (position, _) in zip(motion.joints, places, strict=True)
+                ],
+                velocities_rad_s=[0.0 if still else velocity * speed for _, velocity in places],
+            )
+        )
+    return Trajectory(joints=list(motion.joints), points=points)
+
+
+def _inside(position_rad: float, ends: tuple[float, float] | None) -> float:
+    if ends is None:
+        return position_rad
+    inside = min(max(position_rad, ends[0]), ends[1])
+    return inside if abs(inside - position_rad) < _NEAR_RAD else position_rad
+
+
+def deviation(motion: Motion, speed: float, measured: Motion, latest_s: float = 2.0) -> tuple[Deviation, float]:
+    """How far a motion that was measured is from a recorded one, at the delay at which they fit best.
+
+    Args:
+        motion: what was recorded.
+        speed: at which it was replayed.
+        measured: of the same joints, from before it began to after its end.
+        latest_s: the greatest delay that is tried.
+
+    Returns:
+        The deviation, and the delay in seconds from the first measurement to the beginning.
+    """
+    coarse = [latest_s * step / 100 for step in range(101)]
+    best = min(coarse, key=lambda delay: _misfit(motion, speed, measured, delay))
+    fine = [best + latest_s * step / 2000 for step in range(-20, 21)]
+    best = min(fine, key=lambda delay: _misfit(motion, speed, measured, delay))
+    errors = _errors(motion, speed, measured, best, 1)
+    greatest = [max(map(abs, each), default=0.0) for each in errors]
+    rms = [math.sqrt(sum(error * error for error in each) / max(1, len(each))) for each in errors]
+    return Deviation(greatest, rms), best
+
+
+def _misfit(motion: Motion, speed: float, measured: Motion, delay_s: float) -> float:
+    every = max(1, len(measured.tracks[0].times_s) // 400)
+    return sum(error * error for each in _errors(motion, speed, measured, delay_s, every) for error in each)
+
+
+def _errors(motion: Motion, speed: float, measured: Motion, delay_s: float, every: int) -> list[list[float]]:
+    """Of each joint, at each measurement of it or at some: measured minus recorded."""
+    tracks = dict(zip(measured.joints, measured.tracks, strict=True))
+    return [
+        [
+            position - track.at((at_s - delay_s) * speed)
+            for at_s, position in list(zip(*tracks[joint], strict=True))[::every]
+        ]
+        for joint, track in zip(motion.joints, motion.tracks, strict=True)
+    ]

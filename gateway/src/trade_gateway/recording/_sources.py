@@ -1,0 +1,223 @@
+"""What is listened to: joints, arms, cameras and other services, as they come and go."""
+
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from fnmatch import fnmatchcase
+from typing import Any, Final, NamedTuple, cast
+
+from trade import Container, Handle, Sample, Stream, where
+from trade.errors import ServiceGone, TradeError
+from trade_gateway.recording._channels import (
+    FAULTS,
+    Fault,
+    FaultKind,
+    JointStates,
+    Message,
+    encoded,
+    joints_channel,
+    picture,
+    service_channel,
+)
+
+__all__ = ["Sources", "Wanted", "joint_states", "within"]
+
+_KEEP: Final = 500
+"""So many samples of a stream wait for a disk that is slow."""
+_LIMITS_S: Final = 2.0
+
+Read = Callable[[Handle, Sample], Message]
+
+
+class Wanted(NamedTuple):
+    """What of a system is to be recorded."""
+
+    groups: Sequence[str] = ()
+    """These and what is beneath them; none: all."""
+    services: Sequence[str] = ()
+    """Others that only read, by group and name; ``*`` and ``?`` stand for anything."""
+    joints_hz: float = 50.0
+    cameras_hz: float = 5.0
+    services_hz: float = 10.0
+
+
+class _Source(NamedTuple):
+    stream: Stream
+    read: Read
+
+
+class Sources:
+    """The streams that are open. Used by one thread, which is woken when there is something to take."""
+
+    def __init__(self, container: Container, wanted: Wanted, wake: threading.Event) -> None:
+        self._container = container
+        self._wanted = wanted
+        self._wake = wake
+        self._open: dict[Handle, _Source] = {}
+        self._arms: dict[Handle, list[str]] = {}
+        """The names of their joints."""
+        self._wrong: dict[tuple[str, FaultKind], str] = {}
+        """What was told last of each service and joint; empty: it is well."""
+        self._refused: list[Message] = []
+        self.dropped = 0
+        """Samples that were lost on the way, or while the disk was too slow."""
+
+    def look(self) -> None:
+        """Listen to what has come, and no more to what has gone."""
+        present: set[Handle] = set()
+        for handle, hz, read in self._meant():
+            present.add(handle)
+            if handle not in self._open:
+                self._listen(handle, hz, read)
+        for gone in [handle for handle in self._open if handle not in present]:
+            self._open.pop(gone).stream.close()
+
+    def _listen(self, handle: Handle, hz: float, read: Read) -> None:
+        try:
+            stream = self._container.stream(handle, hz=hz, keep=_KEEP)
+        except TradeError as bad:  # it has left already, or may not be read; looked at again
+            text = f"{type(bad).__name__}: {bad}"
+            self._refused.extend(self._noted(handle.label, "unreadable", text, type(bad).__name__))
+            return
+        stream.tell(self._wake.set)
+        self._open[handle] = _Source(stream, read)
+        self._wake.set()
+
+    def _meant(self) -> Iterator[tuple[Handle, float, Read]]:
+        wanted = self._wanted
+        readable = [
+            handle
+            for handle in self._container.services(~where(group="trade"))
+            if handle.effect == "read" and within(handle.label, wanted.groups)
+        ]
+        grouped = {name for handle in self._container.services(where(kind="JointGroup")) for name in handle.resources}
+        for handle in readable:
+            if handle.name == "state" and _moves(handle, grouped):
+                yield handle, wanted.joints_hz, self._arm if "Arm" in handle.kinds else _joints
+            elif handle.name == "image" and "Camera" in handle.kinds:
+                yield handle, wanted.cameras_hz, _image
+            elif any(fnmatchcase(handle.label, pattern) for pattern in wanted.services):
+                yield handle, wanted.services_hz, _answer
+
+    def take(self) -> Iterator[Message]:
+        """What has come since the last time."""
+        refused, self._refused = self._refused, []
+        yield from refused
+        for source in list(self._open.values()):
+            yield from self._taken(source)
+
+    def _taken(self, source: _Source) -> Iterator[Message]:
+        handle = source.stream.source
+        while True:
+            try:
+                sample = source.stream.take()
+            except ServiceGone:  # told by the registry, too
+                return
+            except Exception as bad:  # noqa: BLE001 - whatever the service itself raises
+                yield from self._noted(handle.label, "unreadable", f"{type(bad).__name__}: {bad}", type(bad).__name__)
+                if bad is source.stream.why_ended:
+                    return
+                continue
+            if sample is None:
+                return
+            self.dropped += sample.dropped
+            yield from self._noted(handle.label, "unreadable", "")
+            if source.read is not _image and source.read is not _answer:
+                for joint, fault in _faults(sample.value):
+                    yield from self._noted(joint, "joint", fault)
+            yield source.read(handle, sample)._replace(arrived_ns=time.time_ns())
+
+    def _noted(self, about: str, kind: FaultKind, text: str, what: str = "") -> Iterator[Message]:
+        """A change of what is wrong, by ``what`` rather than by the whole text, which may have times in it."""
+        now, before = what or text, self._wrong.get((about, kind))
+        self._wrong[about, kind] = now
+        if now != (before or ""):
+            now_ns = time.time_ns()
+            fault = Fault(about=about, kind=kind, text=text, new=before is not None)
+            yield Message(FAULTS, now_ns, now_ns, encoded(fault))
+
+    def _arm(self, handle: Handle, sample: Sample) -> Message:
+        names = self._arms.get(handle)
+        if names is None:
+            limits = where(name="limits", group=handle.groups[0], container=handle.container, kind="Arm")
+            told = self._container.find(limits, wait_s=0).with_(deadline_s=_LIMITS_S)()
+            names = self._arms[handle] = [joint.name for joint in told.joints]
+        return _arm_joints(handle, sample, names)
+
+    def labels(self) -> list[str]:
+        """What is listened to."""
+        return sorted(source.stream.source.label for source in self._open.values())
+
+    def close(self) -> None:
+        """Listen to nothing. Idempotent."""
+        for source in self._open.values():
+            source.stream.close()
+        self._open.clear()
+
+
+def within(label: str, groups: Iterable[str]) -> bool:
+    """Whether a service, by its group and name, is of one of these groups; of none given: always."""
+    asked = list(groups)
+    return not asked or any(label == group or label.startswith(f"{group}.") for group in asked)
+
+
+def _moves(handle: Handle, grouped: set[str]) -> bool:
+    """Whether a state is that of joints which no other one tells of."""
+    kinds = handle.kinds
+    return "JointGroup" in kinds or "Arm" in kinds or ("Motor" in kinds and handle.groups[0] not in grouped)
+
+
+def _ns(at_s: float) -> int:
+    return int(at_s * 1e9)
+
+
+def _faults(value: Any) -> list[tuple[str, str]]:
+    """Joints, or arms, and what is wrong with each."""
+    states: list[Any] = cast("list[Any]", value) if isinstance(value, list) else [value]
+    return [(state.name, state.fault) for state in states]
+
+
+def joint_states(sample: Sample) -> JointStates:
+    """The state of a motor or of a group of joints, as it is recorded."""
+    value: Any = sample.value
+    motors: list[Any] = cast("list[Any]", value) if isinstance(value, list) else [value]
+    return JointStates(
+        names=[motor.name for motor in motors],
+        position_rad=[motor.position_rad for motor in motors],
+        velocity_rad_s=[motor.velocity_rad_s for motor in motors],
+        load=[motor.load for motor in motors],
+        enabled=[motor.enabled for motor in motors],
+        fault=[motor.fault for motor in motors],
+        stamp_s=[sample.at - motor.age_s for motor in motors],
+    )
+
+
+def _joints(handle: Handle, sample: Sample) -> Message:
+    states = joint_states(sample)
+    return Message(joints_channel(handle.groups[0]), 0, _ns(min(states.stamp_s)), encoded(states))
+
+
+def _arm_joints(handle: Handle, sample: Sample, names: list[str]) -> Message:
+    arm: Any = sample.value
+    stamp_s = sample.at - arm.age_s
+    states = JointStates(
+        names=names,
+        position_rad=arm.positions_rad,
+        velocity_rad_s=arm.velocities_rad_s,
+        load=[],
+        enabled=[arm.enabled] * len(names),
+        fault=[arm.fault] * len(names),
+        stamp_s=[stamp_s] * len(names),
+    )
+    return Message(joints_channel(handle.groups[0]), 0, _ns(stamp_s), encoded(states))
+
+
+def _image(handle: Handle, sample: Sample) -> Message:
+    image: Any = sample.value
+    at_ns = _ns(sample.at - image.age_s)
+    return picture(handle.groups[0], image.data, image.format, image.width_px, image.height_px, at_ns)
+
+
+def _answer(handle: Handle, sample: Sample) -> Message:
+    channel = service_channel(handle.label, handle.schema["result"])
+    return Message(channel, 0, _ns(sample.at), encoded({"value": sample.value}))

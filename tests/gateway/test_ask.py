@@ -1,0 +1,218 @@
+"""``trade ask``: sentences become calls, and what comes of them becomes sentences."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from trade import Container, service, where
+from trade.errors import ConfigurationError, InvalidArgument
+from trade.testing import MemorySystem, memory_system
+from trade_gateway.cli import app
+from trade_gateway.talk import Memory, NotUnderstood, Talk, read_lexicon
+
+
+class Eyes:
+    @service(effect="read", achieves=["see(?x)"])
+    def check_for(self, what: str) -> bool:
+        """Look for something in front of the robot."""
+        return what == "cup"
+
+
+class Head:
+    def __init__(self) -> None:
+        self.turned = 0.0
+
+    @service(uses="neck")
+    def turn(self, angle_rad: float) -> float:
+        self.turned = angle_rad
+        return angle_rad
+
+    @service(effect="stop")
+    def stop(self) -> None: ...
+
+
+@pytest.fixture
+def memory() -> Iterator[MemorySystem]:
+    with memory_system() as system:
+        yield system
+
+
+@pytest.fixture
+def robot(memory: MemorySystem) -> Container:
+    robot = memory.container("robot")
+    robot.register(Eyes(), "rosie.eyes")
+    robot.register(Head(), "rosie.head")
+    return robot
+
+
+@pytest.fixture
+def talk(memory: MemorySystem, robot: Container) -> Talk:
+    made = Talk(memory.container("asker"), read_lexicon(), Memory())
+    memory.settle()
+    return made
+
+
+def test_P58_a_dialogue_about_what_there_is(talk: Talk, robot: Container, memory: MemorySystem) -> None:
+    host = robot.containers()[0].host
+    dialogue = [
+        ("Which computers are there?", f"There is one host: {host}."),
+        (f"What runs on {host}?", f"On {host} there is one container: robot."),
+        ("What services are there?", "There are 3 services: rosie.eyes.check_for, rosie.head.stop, rosie.head.turn."),
+        ("What can the eyes do?", "eyes has one service: rosie.eyes.check_for."),
+        ("Where is the check_for service?", f"check_for is in container robot on host {host}."),
+        ("Who can see?", "rosie.eyes.check_for can."),
+        ("Who can fly(?x)?", "Nobody can fly(?x)."),
+        (
+            "How do I ask check_for?",
+            "rosie.eyes.check_for is check_for(what: str) -> bool: Look for something in front of the robot.",
+        ),
+        ("Who has the head?", "Nobody has it: head is free."),
+        ("Is everything all right?", "All is well."),
+        ("What is new?", "I have not looked before; from now on I know."),
+        ("what's new", "Nothing is new."),
+    ]
+    for asked, answered in dialogue:
+        assert talk.say(asked).text == answered
+
+
+def test_P58_what_is_new_is_what_came_and_went_since_one_asked(
+    talk: Talk, robot: Container, memory: MemorySystem
+) -> None:
+    talk.say("what is new")
+    other = Eyes()
+    robot.register(other, "dora.eyes")
+    memory.settle()
+    assert talk.say("Anything new?").text == "new: dora.eyes.check_for."
+    robot.deregister(other)
+    memory.settle()
+    assert talk.say("What has changed?").data == {"came": [], "gone": ["dora.eyes.check_for"]}
+
+
+def test_who_has_what_and_what_is_wrong_are_told(talk: Talk, robot: Container, memory: MemorySystem) -> None:
+    other = memory.container("other")
+    memory.settle()
+    with other.lock(where(group="rosie.head"), purpose="looking", wait_s=20):
+        told = talk.say("Who has the head?")
+        assert told.text.startswith("tester/other has neck, for 'looking', since ")
+        assert talk.say("what is locked?").data == told.data
+    dizzy = Head()
+    robot.register(dizzy, "dora.head")
+    robot.set_health(dizzy, "degraded: dizzy")
+    memory.settle()
+    assert talk.say("What is wrong?").text == "There is a problem: dora.head: degraded: dizzy."
+
+
+def test_an_order_to_stop_stops_everything(talk: Talk, robot: Container, memory: MemorySystem) -> None:
+    told = talk.say("Stop everything because of smoke!")
+    memory.settle()
+    assert [one.reason for one in robot.estops()] == ["smoke"]
+    assert "confirmed by" in told.text
+    assert "an e-stop is open" in talk.say("what is wrong").text
+
+
+@pytest.mark.parametrize(
+    ("sentence", "said"),
+    [
+        ("Make me a sandwich", "I do not understand that"),
+        ("Who has the wings?", "I know no group 'wings'; there is rosie, rosie.eyes, rosie.head"),
+        ("What runs on host mars?", "I know no host 'mars'"),
+        ("Who can see(", "is no predicate"),
+        ("", "I do not understand that"),
+    ],
+)
+def test_what_is_not_understood_is_said_with_what_is(talk: Talk, sentence: str, said: str) -> None:
+    with pytest.raises(NotUnderstood) as wrong:
+        talk.say(sentence)
+    assert said in str(wrong.value)
+
+
+LEXICON = """
+[[phrase]]
+hear = ["look {number} (radians|rad) [to the left]", "turn [the] head to {number}"]
+call = "rosie.head.turn"
+args = ["{number}"]
+say = "I look at {result} rad."
+
+[[phrase]]
+hear = ["do you see [a] {thing}"]
+call = "rosie.eyes.check_for"
+args = { what = "{thing}" }
+say = "About the {thing}: {result}."
+"""
+
+
+def test_a_lexicon_of_ones_own_goes_first_and_calls_what_it_names(
+    memory: MemorySystem, robot: Container, tmp_path: Path
+) -> None:
+    (tmp_path / "own.toml").write_text(LEXICON)
+    asker = memory.container("asker")
+    memory.settle()
+    talk = Talk(asker, read_lexicon(tmp_path / "own.toml"), Memory())
+    assert talk.say("Look -0.25 rad to the left!").text == "I look at -0.25 rad."
+    assert talk.say("do you see a cup?").text == "About the cup: true."
+    assert talk.say("Do you see a teddy bear?").text == "About the teddy bear: false."
+    assert talk.say("what services are there?").means == "services"
+
+
+def test_a_lexicon_can_do_no_more_than_the_service_takes(
+    memory: MemorySystem, robot: Container, tmp_path: Path
+) -> None:
+    (tmp_path / "own.toml").write_text(LEXICON.replace('args = ["{number}"]', 'args = ["{number}", 3]'))
+    asker = memory.container("asker")
+    memory.settle()
+    with pytest.raises(InvalidArgument):
+        Talk(asker, read_lexicon(tmp_path / "own.toml"), Memory()).say("turn the head to 0.1")
+
+
+PHRASE = '[[phrase]]\nhear = ["hello {name}"]\n'
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("[[phrase", "own.toml"),
+        (f'{PHRASE}say = "hi"\n', "takes one of ask and call"),
+        (f'{PHRASE}say = "hi"\nask = "wether"\n', "there is no question 'wether'; there is services, containers"),
+        (f'{PHRASE}say = "hi"\nask = "hosts"\n', "question 'hosts' has no use for {name}; it takes none"),
+        (
+            f'{PHRASE}say = "hi {{nmae}}"\ncall = "a.b"\n',
+            "{nmae} is nothing that can be said; there is {name}, {result}",
+        ),
+        (f'{PHRASE}say = "hi"\ncall = "greet"\n', "'greet' is no service; write GROUP.NAME"),
+        ('[[phrase]]\nhear = ["who (has"]\nask = "hosts"\nsay = "x"\n', "is no sentence with gaps"),
+        ('[[phrase]]\nhear = ["who {"]\nask = "hosts"\nsay = "x"\n', "stops making sense at '{'"),
+        (f'{PHRASE}say = "hi {{"\ncall = "a.b"\n', "'hi {'"),
+        (f"{PHRASE}tell = 1\n", "unknown field `tell`"),
+        (None, "cannot be read"),
+    ],
+)
+def test_a_lexicon_that_is_wrong_is_refused_with_what_would_be_right(
+    tmp_path: Path, text: str | None, said: str
+) -> None:
+    path = tmp_path / "own.toml"
+    if text is not None:
+        path.write_text(text)
+    with pytest.raises(ConfigurationError) as wrong:
+        read_lexicon(path)
+    assert said in str(wrong.value)
+
+
+def test_on_the_command_line_what_is_new_is_since_it_was_asked_last(start_container, system: str) -> None:
+    robot = start_container("robot")
+    robot.register(Eyes(), "rosie.eyes")
+
+    def ask(*words: str) -> str:
+        done = CliRunner().invoke(app, ["ask", *words])
+        assert done.exit_code == 0, done.output
+        return done.stdout.strip()
+
+    assert ask("what", "is", "new?") == "I have not looked before; from now on I know."
+    robot.register(Head(), "rosie.head")
+    assert json.loads(ask("anything new?", "--json"))["data"]["came"] == ["rosie.head.stop", "rosie.head.turn"]
+    done = CliRunner().invoke(app, ["ask"], input="what is new\nfoo\nwho is there\n")
+    assert done.stdout.splitlines()[1:] == ["Nothing is new.", "There is one container: robot."]
+    assert "I do not understand that" in done.stderr
+    assert "what is new" in ask("--phrases")

@@ -1,0 +1,132 @@
+"""A robot's recording: killed, at a fault of its simulation, and replayed in another one."""
+
+import json
+import signal
+import subprocess
+import threading
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import pytest
+
+import trade
+from system.conftest import ROSIES_HEAD, Bench, Program, Rosie
+from trade import where
+from trade_gateway.recording._reader import entries
+from trade_hil_sim import events, motion_writes, read_log
+from waiting import PATIENCE_S, wait_until
+
+
+def test_a_recording_whose_program_was_killed_is_readable_to_its_last_second(
+    rosie_up: Callable[[], Rosie], run: Callable[..., Program], tmp_path: Path
+) -> None:
+    rosie_up()
+    file = tmp_path / "a.mcap"
+    recording = run("-m", "trade_gateway", "record", file, "--json")
+    flushed = recording.wait_for(lambda line: line.get("messages", 0) > 50)
+    recording.signal(signal.SIGKILL)
+    assert recording.wait() == -signal.SIGKILL
+    found = list(entries(file))
+    assert len(found) >= flushed["messages"]
+    assert {"/rosie.head/joints"} <= {entry.topic for entry in found}
+
+
+def test_a_fault_in_the_simulator_saves_the_seconds_before_it(
+    bench: Bench, run: Callable[..., Program], tmp_path: Path
+) -> None:
+    folder = tmp_path / "faults"
+    recording = run("-m", "trade_gateway", "record", "--keep-last", "30", "--at-fault", folder, "--json")
+    recording.wait_for(lambda line: line.get("messages", 0) > 100)
+    bench.sim.control.unplug("neck")
+    saved = recording.wait_for(lambda line: "saved" in line)
+    assert saved["messages"] > 50
+    found = list(entries(Path(saved["saved"])))
+    assert len([entry for entry in found if entry.topic == "/rosie.head/joints"]) > 50
+    fault = json.loads(found[-1].data)
+    assert found[-1].topic == "/faults"
+    assert fault["new"]
+    assert saved["why"] == f"{fault['about']}: {fault['text']}"
+
+
+WAY = ([0.5, -0.3], [-0.6, 0.3], [0.2, 0.1], [0.0, 0.0])
+TOLERANCE_RAD = 0.1
+
+
+@pytest.fixture
+def recorded(rosie_up: Callable[[], Rosie], run: Callable[..., Program], tmp_path: Path) -> tuple[Path, Path]:
+    """A recording of rosie's head, and the log of the simulation that it looked about in; both have ended."""
+    rosie = rosie_up()
+    file = tmp_path / "look.mcap"
+    recording = run("-m", "trade_gateway", "record", file, "--group", "rosie.head", "--json")
+    recording.wait_for(lambda line: line.get("messages", 0) > 20)
+    look = trade.find(where(name="move_to", group="rosie.head"), wait_s=PATIENCE_S)
+    for place in WAY:
+        look(place, 1.5)
+        threading.Event().wait(0.5)  # it stands there for a moment
+    recording.signal(signal.SIGINT)
+    assert recording.wait() == 0
+    rosie.program.close()
+    wait_until(lambda: not trade.services(where(group="rosie")))
+    return file, rosie.log
+
+
+def _rests(log: Path, joint: str) -> list[float]:
+    return [entry.position_rad or 0.0 for entry in events(read_log(log), "at_rest") if entry.joint == joint]
+
+
+def _in_order(wanted: Sequence[float], found: Sequence[float]) -> bool:
+    """Whether one after the other is among those found, within the tolerance, whatever is in between."""
+    left = iter(found)
+    return all(any(abs(other - each) <= TOLERANCE_RAD for other in left) for each in wanted)
+
+
+def test_a_replay_in_a_second_simulation_goes_where_the_first_one_went(
+    recorded: tuple[Path, Path],
+    rosie_up: Callable[[], Rosie],
+    trade_command: Callable[..., subprocess.CompletedProcess[str]],
+) -> None:
+    file, first = recorded
+    second = rosie_up()
+    done = trade_command("replay", file, "--speed", "0.5", "--tolerance-rad", str(TOLERANCE_RAD), "--json")
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert found["greatest_rad"] <= TOLERANCE_RAD
+    for number, joint in enumerate(("neck.pan", "neck.tilt")):
+        went = _rests(first, joint)
+        assert _in_order([place[number] for place in WAY], went)
+        assert _in_order(went, _rests(second.log, joint))
+
+
+def test_what_the_robot_file_forbids_is_refused_before_anything_moves(
+    recorded: tuple[Path, Path],
+    run: Callable[..., Program],
+    trade_command: Callable[..., subprocess.CompletedProcess[str]],
+    tmp_path: Path,
+) -> None:
+    narrow = tmp_path / "head.toml"
+    narrow.write_text(ROSIES_HEAD.read_text(encoding="utf-8").replace("max_rad = 1.4", "max_rad = 0.4"))
+    log = tmp_path / "narrow.jsonl"
+    run("-m", "trade_gateway", "up", narrow, "--sim", "--sim-log", log, "--json").json()
+    done = trade_command("replay", recorded[0], "--go-to-start")
+    assert done.returncode == 1
+    assert "LimitExceeded: rosie.neck.pan angle" in done.stderr
+    assert motion_writes(read_log(log)) == []
+
+
+def test_a_robot_that_is_elsewhere_moves_only_if_it_is_told_to_go_to_the_start(
+    recorded: tuple[Path, Path],
+    rosie_up: Callable[[], Rosie],
+    trade_command: Callable[..., subprocess.CompletedProcess[str]],
+) -> None:
+    log = rosie_up().log
+    trade.find(where(name="move_to", group="rosie.head"), wait_s=PATIENCE_S)([-0.5, 0.0])
+    count = len(motion_writes(read_log(log)))
+    refused = trade_command("replay", recorded[0], "--speed", "0.5")
+    assert refused.returncode == 1
+    assert "rosie.neck.pan is -0.50 rad off; --go-to-start moves it there first" in " ".join(refused.stderr.split())
+    assert len(motion_writes(read_log(log))) == count
+    checked = trade_command("replay", recorded[0], "--speed", "0.5", "--go-to-start", "--dry-run")
+    assert checked.returncode == 0, checked.stderr
+    assert len(motion_writes(read_log(log))) == count
+    done = trade_command("replay", recorded[0], "--speed", "0.5", "--go-to-start", "--json")
+    assert done.returncode == 0, done.stderr

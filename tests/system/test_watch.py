@@ -1,0 +1,102 @@
+"""``trade watch`` tells what happens, and ``trade top`` how busy it is, from outside of everything that happens."""
+
+import signal
+import subprocess
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from system.conftest import Program
+from trade import Container, service, where
+
+StartContainer = Callable[..., Container]
+Run = Callable[..., Program]
+Command = Callable[..., subprocess.CompletedProcess[str]]
+
+
+class Lamp:
+    @service(uses="lamp")
+    def shine(self) -> None: ...
+
+    @service(effect="stop")
+    def stop(self) -> None: ...
+
+    @service(effect="read")
+    def shines(self) -> bool:
+        return False
+
+
+@pytest.fixture
+def hall(start_container: StartContainer) -> Container:
+    hall = start_container("hall")
+    hall.register(Lamp(), "hall.lamp")
+    return hall
+
+
+def test_what_happens_is_told_in_its_words(hall: Container, run: Run, start_container: StartContainer) -> None:
+    me = start_container("me")
+    with me.lock(where(group="hall.lamp"), purpose="reading", wait_s=30):
+        watching = run("-m", "trade_gateway", "watch", "--json")
+        locked = watching.wait_for(lambda said: said["what"] == "locked")
+        assert (locked["container"], "(reading)" in locked["text"]) == ("hall", True)
+    assert watching.wait_for(lambda said: said["what"] == "released")["about"] == locked["about"]
+
+    def next_of(what: str, about: str) -> dict[str, Any]:
+        return watching.wait_for(lambda said: (said["what"], said["about"]) == (what, about))
+
+    lamp = Lamp()
+    hall.register(lamp, "hall.other")
+    next_of("came", "hall.other.shine")
+    hall.set_health(lamp, "its wire is loose")
+    assert next_of("is not well", "hall.other.shine")["text"] == "its wire is loose"
+    hall.set_health(lamp, "healthy")
+    next_of("is well", "hall.other.shine")
+    hall.deregister(lamp)
+    next_of("went", "hall.other.shine")
+    report = hall.estop("smoke")
+    assert next_of("e-stop", report.id)["text"].endswith(": smoke")
+    hall.estop_clear([report.id])
+    next_of("cleared", report.id)
+    watching.signal(signal.SIGINT)
+    assert watching.wait() == 130
+
+
+def test_only_what_is_asked_for_is_told_and_much_at_once_is_one_line(
+    hall: Container, run: Run, start_container: StartContainer
+) -> None:
+    watching = run("-m", "trade_gateway", "watch", "--group", "hall.row")
+    assert watching.line().startswith("watching 0 services in system ")
+    hall.register(Lamp(), "hall.column")
+    for number in range(4):
+        hall.register(Lamp(), f"hall.row.{number}")
+    told = watching.line()
+    assert " hall " in told
+    assert " came " in told
+    assert "hall.column" not in told
+
+
+def test_how_busy_it_is_who_is_silent_and_what_is_wrong(
+    hall: Container, run: Run, start_container: StartContainer, trade_command: Command
+) -> None:
+    frozen = run("-m", "trade_gateway", "container", "--name", "frozen", "--json")
+    frozen.json()
+    lamp = Lamp()
+    hall.register(lamp, "hall.other")
+    hall.set_health(lamp, "its wire is loose")
+    me = start_container("me")
+    with me.lock(where(group="hall.lamp"), purpose="reading", wait_s=30):
+        looking = run("-m", "trade_gateway", "top", "--every", "1", "--json")
+        assert looking.json()["silent"] == []
+        frozen.signal(signal.SIGSTOP)
+        try:
+            told = looking.wait_for(lambda shown: shown["silent"] == ["frozen"])
+        finally:
+            frozen.signal(signal.SIGCONT)
+        text = trade_command("top", "--count", "1", "--every", "1").stdout
+    assert {"hall", "me"} <= {info["container"] for info in told["containers"]}
+    assert told["silent"] == ["frozen"]
+    assert told["unwell"] == [{"group": "hall.other", "container": "hall", "health": "its wire is loose"}]
+    [locked] = told["locks"]
+    assert (locked["purpose"], locked["waiting"]) == ("reading", [])
+    assert all(words in text for words in ("CPU %", "NOT WELL", "its wire is loose", "LOCKED", "reading"))
