@@ -1,0 +1,157 @@
+"""What a drill is made of: its scenes, limits, judge and report. The drill itself is in tests/system."""
+
+import json
+import re
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from trade_drivers import load
+from trade_drivers.robotfile import Drill
+from trade_gateway._drill import _chosen
+from trade_gateway._output import UsageError
+from trade_gateway.drill import SCENES, Played, Report, Stop, as_data, page, targets_of
+from trade_gateway.drill._judge import Judge
+from trade_gateway.drill._scenes import ALLOWANCE_S, limit_s
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+BY_NAME = {scene.name: scene for scene in SCENES}
+
+
+def test_each_scene_has_its_limit_in_the_robot_file_and_no_other_key_is_there() -> None:
+    assert set(BY_NAME) == set(Drill.__struct_fields__)
+    assert len(BY_NAME) == len(SCENES)
+
+
+def test_of_each_bus_the_widest_joint_or_the_arm_moves_and_a_gripper_does_not() -> None:
+    targets, left_out = targets_of(load(EXAMPLES / "rosie.toml"))
+    found = {target.bus: target.name for target in targets}
+    assert found.items() >= {"neck": "neck.pan", "right_arm": "right.wrist.roll", "tail": "tail.tip"}.items()
+    assert left_out["hand"] == "a gripper ends its stroke by itself"
+    assert set(found) | set(left_out) == {bus.name for bus in load(EXAMPLES / "rosie.toml").buses}
+
+
+def test_a_coupled_joint_moves_only_where_there_is_no_other() -> None:
+    head = load(EXAMPLES / "head.toml")
+    pan, tilt = head.joints
+    coupled = type(load(EXAMPLES / "dora.toml").coupled[0])
+    with_pan = msgspec.structs.replace(head, coupled=[coupled(joints=[pan.name, "other"])])
+    assert targets_of(with_pan)[0][0].name == tilt.name
+    with_both = msgspec.structs.replace(head, coupled=[coupled(joints=[pan.name, tilt.name])])
+    assert targets_of(with_both)[0][0].name == pan.name
+
+
+@pytest.mark.parametrize("angle", [-1.4, -0.2, 0.0, 0.3, 1.4])
+def test_a_joint_is_sent_to_its_farther_end_slowly_and_stays_within_its_range(angle: float) -> None:
+    [pan], _ = targets_of(load(EXAMPLES / "head.toml"))
+    goal, speed = pan.way(angle)
+    assert pan.min_rad < goal < pan.max_rad
+    assert abs(goal - angle) > (pan.max_rad - pan.min_rad) * 0.4
+    assert 0 < speed < pan.max_speed_rad_s / 10
+
+
+def test_a_limit_is_what_the_robot_file_says_or_what_the_rules_say_of_that_joint() -> None:
+    [pan], _ = targets_of(load(EXAMPLES / "head.toml"))
+    braking_s = 2.5 / 20.0
+    assert limit_s(BY_NAME["driver_killed"], pan, Drill()) == pytest.approx(0.3 + braking_s + ALLOWANCE_S)
+    assert limit_s(BY_NAME["caller_killed"], pan, Drill()) == pytest.approx(braking_s + ALLOWANCE_S)
+    assert limit_s(BY_NAME["partition"], pan, Drill()) == pytest.approx(3.0 + braking_s + ALLOWANCE_S)
+    given = Drill(driver_killed=0.001)
+    assert limit_s(BY_NAME["driver_killed"], pan, given) == 0.001
+    assert limit_s(BY_NAME["driver_frozen"], pan, given) > 0.3
+
+
+def test_bus_off_concerns_can_buses_alone() -> None:
+    [pan], _ = targets_of(load(EXAMPLES / "head.toml"))
+    [leg], _ = targets_of(load(EXAMPLES / "legs.toml"))
+    assert [scene.name for scene in SCENES if not scene.concerns(pan)] == ["bus_off"]
+    assert all(scene.concerns(leg) for scene in SCENES)
+
+
+def test_scenes_are_chosen_by_name_and_held_in_the_order_of_the_table() -> None:
+    assert _chosen([]) == list(SCENES)
+    assert [scene.name for scene in _chosen(["partition", "caller_killed"])] == ["caller_killed", "partition"]
+    with pytest.raises(UsageError, match="there is no such scene; there is caller_killed"):
+        _chosen(["fire"])
+
+
+def test_the_judge_reads_a_log_while_it_is_written(tmp_path: Path) -> None:
+    log = tmp_path / "log.jsonl"
+
+    def write(*entries: tuple[float, str], end: str = "\n") -> None:
+        lines = [json.dumps({"t": t, "bus": "b", "kind": "event", "name": n, "joint": "j"}) for t, n in entries]
+        with log.open("a") as file:
+            file.write("\n".join(lines).replace('": ', '":') + end)
+
+    judge = Judge(log)
+    write((1.0, "motion_started"), (1.5, "torque_on"), (2.0, "at_rest"))
+    judge.look()
+    assert (judge.moves("j"), judge.moves("j", at=1.5), judge.rested("j")) == (False, True, 2.0)
+    write((3.0, "motion_started"), end="")
+    judge.look()
+    assert not judge.moves("j")
+    write(end="\n")
+    judge.look()
+    assert judge.moves("j")
+    assert (judge.began("j", since=2.0), judge.began("j", since=3.0)) == (3.0, None)
+    assert not judge.moves("another")
+
+
+def _report(*stops: Stop, problem: str = "") -> Report:
+    played = Played(scene="unplug", what="a <b>", shows="S06", stops=list(stops), problem=problem)
+    good = Played(scene="partition", what="cut", shows="S05", stops=[_stop(1.0)])
+    return Report(
+        robot="rosie",
+        file="r.toml",
+        version="1",
+        host="h",
+        at="2026-11-22",
+        scenes=[good, played],
+        left_out={"hand": "x"},
+    )
+
+
+def _stop(took_s: float | None, again_s: float | None = None) -> Stop:
+    return Stop(joint="neck.pan", bus="neck", took_s=took_s, limit_s=2.0, again_s=again_s)
+
+
+@pytest.mark.parametrize(
+    ("stop", "verdict"),
+    [
+        (_stop(2.0), "ok"),
+        (_stop(2.1), "too long"),
+        (_stop(None), "did not stop"),
+        (_stop(1.0, again_s=3.0), "moved again"),
+    ],
+)
+def test_a_drill_is_passed_if_each_joint_kept_its_limit_and_rested(stop: Stop, verdict: str) -> None:
+    report = _report(stop)
+    assert report.ok == (verdict == "ok")
+    told = as_data(report)
+    assert told["ok"] == report.ok
+    assert told["scenes"][1]["stops"][0]["verdict"] == verdict
+    assert f">{verdict}" in page(report)
+
+
+def test_a_scene_that_could_not_be_held_is_not_passed_and_neither_is_a_drill_without_scenes() -> None:
+    report = _report(problem="the driver ended")
+    assert not report.ok
+    assert "the driver ended" in page(report)
+    assert not msgspec.structs.replace(report, scenes=[]).ok
+
+
+def test_the_page_stands_alone_and_shows_the_worst_first() -> None:
+    text = page(_report(_stop(1.9)))
+    assert text.index("unplug") < text.index("partition")
+    assert "a &lt;b&gt;" in text
+    assert "hand: x" in text
+    assert not re.search(r"<script|https?:|src=|@import", text)
+    widths = [float(width) for width in re.findall(r"<i[^>]* style=\"width: ([\d.]+)%", text)]
+    assert widths[0] > widths[1]
+    assert max(widths) < 70.0
+
+
+def test_a_bar_ends_with_the_page_however_long_it_took() -> None:
+    assert 'width: 100.0%"' in page(_report(_stop(1e6)))
+    assert 'width: 100.0%"' in page(_report(_stop(None)))
