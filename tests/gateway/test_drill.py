@@ -16,12 +16,18 @@ from trade_gateway.drill._judge import Judge
 from trade_gateway.drill._scenes import ALLOWANCE_S, limit_s
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
+DRILL_PAGE = EXAMPLES.parent / "docs" / "drill.md"
 BY_NAME = {scene.name: scene for scene in SCENES}
 
 
 def test_each_scene_has_its_limit_in_the_robot_file_and_no_other_key_is_there() -> None:
     assert set(BY_NAME) == set(Drill.__struct_fields__)
     assert len(BY_NAME) == len(SCENES)
+
+
+def test_the_page_on_drills_has_a_row_for_each_scene_with_the_rule_it_shows() -> None:
+    rows = re.findall(r"^\| `(\w+)` \|.*?\| \[?(S\d\d)", DRILL_PAGE.read_text(encoding="utf-8"), re.MULTILINE)
+    assert rows == [(scene.name, scene.shows) for scene in SCENES]
 
 
 def test_of_each_bus_the_widest_joint_or_the_arm_moves_and_a_gripper_does_not() -> None:

@@ -1,6 +1,7 @@
 """``trade drill ROBOT.toml``: take away what stops a robot while it moves, and measure how long it goes on."""
 
 import platform
+import signal
 import tempfile
 from collections.abc import Sequence
 from datetime import datetime
@@ -54,6 +55,7 @@ def drill(
     without(robot, left_out)  # or it says why it cannot be
     for part, why in left_out.items():
         out.say(f"[bold]{robot.name}[/]: {escape(part)} is left out: {escape(why)}")
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that nobody is left behind, least of all frozen
     impossible = {scene.name: "no CAN bus takes part" for scene in scenes if not any(map(scene.concerns, targets))}
     played: list[Played] = []
     with tempfile.TemporaryDirectory(prefix="trade-drill-") as folder:

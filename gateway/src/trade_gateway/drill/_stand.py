@@ -11,7 +11,7 @@ import time
 from collections.abc import Generator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import msgspec
 
@@ -183,7 +183,6 @@ def standing(robot: Robot, targets: Sequence[Target], left_out: Sequence[str], f
         ConfigurationError: there is no simulator, or it refuses this robot.
         DrillFailed: something does not come up.
     """
-    simulated: Any
     try:
         from trade_hil_sim import SimProcess, SimulationError, remove_leftovers  # noqa: PLC0415 - only a drill needs it
     except ImportError:
@@ -191,15 +190,16 @@ def standing(robot: Robot, targets: Sequence[Target], left_out: Sequence[str], f
             where="trade drill", problem="needs trade-hil-sim; pip install trade-hil-sim"
         ) from None
     remove_leftovers()
-    with ExitStack() as undo:
-        try:
-            simulated = undo.enter_context(SimProcess(robot.where, buses=[target.bus for target in targets]))
-        except SimulationError as problem:
-            raise ConfigurationError(where=robot.where, problem=str(problem)) from None
-        stand = Stand(robot, left_out, simulated, folder)
-        undo.callback(stand.close)
-        stand.begin()
-        yield stand
+    try:
+        with SimProcess(robot.where, buses=[target.bus for target in targets]) as simulated:
+            stand = Stand(robot, left_out, simulated, folder)
+            try:
+                stand.begin()
+                yield stand
+            finally:
+                stand.close()
+    except SimulationError as problem:
+        raise ConfigurationError(where=robot.where, problem=str(problem)) from None
 
 
 def _free_ports(count: int) -> list[int]:
