@@ -11,7 +11,8 @@ from trade_drivers import load
 from trade_drivers.robotfile import Drill
 from trade_gateway._drill import _chosen
 from trade_gateway._output import UsageError
-from trade_gateway.drill import SCENES, Played, Report, Stop, as_data, page, targets_of
+from trade_gateway.drill import SCENES, Played, Report, Stop, as_data, page, play, targets_of
+from trade_gateway.drill._actors import DrillFailed
 from trade_gateway.drill._judge import Judge
 from trade_gateway.drill._scenes import ALLOWANCE_S, limit_s
 
@@ -104,8 +105,8 @@ def test_the_judge_reads_a_log_while_it_is_written(tmp_path: Path) -> None:
     assert not judge.moves("another")
 
 
-def _report(*stops: Stop, problem: str = "") -> Report:
-    played = Played(scene="unplug", what="a <b>", shows="S06", stops=list(stops), problem=problem)
+def _report(*stops: Stop, problems: tuple[str, ...] = ()) -> Report:
+    played = Played(scene="unplug", what="a <b>", shows="S06", stops=list(stops), problems=list(problems))
     good = Played(scene="partition", what="cut", shows="S05", stops=[_stop(1.0)])
     return Report(
         robot="rosie",
@@ -141,10 +142,47 @@ def test_a_drill_is_passed_if_each_joint_kept_its_limit_and_rested(stop: Stop, v
 
 
 def test_a_scene_that_could_not_be_held_is_not_passed_and_neither_is_a_drill_without_scenes() -> None:
-    report = _report(problem="the driver ended")
+    report = _report(problems=("the driver ended", "it rested"))
     assert not report.ok
     assert "the driver ended" in page(report)
     assert not msgspec.structs.replace(report, scenes=[]).ok
+
+
+def test_a_scene_that_was_held_at_last_is_passed_and_the_page_says_what_kept_it() -> None:
+    report = _report(_stop(1.0), problems=("the driver ended",))
+    assert report.ok
+    assert "the driver ended" in page(report)
+
+
+class BusyStand:
+    """A stand on which nothing begins, as often as it was said."""
+
+    def __init__(self, failures: int) -> None:
+        self.failures, self.calls, self.dismissed = failures, 0, 0
+
+    def mend(self) -> None:
+        self.calls += 1
+        if self.calls <= self.failures:
+            raise DrillFailed(problem="too busy")
+        raise NothingMeasured
+
+    def dismiss(self) -> None:
+        self.dismissed += 1
+
+
+class NothingMeasured(Exception):
+    pass
+
+
+def test_a_scene_is_tried_three_times_and_no_more() -> None:
+    stand = BusyStand(failures=3)
+    played = play(stand, BY_NAME["partition"], [], Drill())
+    assert (played.problems, played.stops) == (["too busy"] * 3, [])
+    assert (stand.calls, stand.dismissed) == (3, 3)
+    again = BusyStand(failures=2)
+    with pytest.raises(NothingMeasured):
+        play(again, BY_NAME["partition"], [], Drill())
+    assert again.dismissed == 3
 
 
 def test_the_page_stands_alone_and_shows_the_worst_first() -> None:

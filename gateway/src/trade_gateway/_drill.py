@@ -100,8 +100,8 @@ def _list(out: Output) -> None:
 
 def _tell(out: Output, played: Played) -> None:
     out.say(f"{played.scene}: {escape(played.what)}")
-    if played.problem:
-        out.say(f"  [{_COLOURS[False]}]not held[/]: {escape(played.problem)}")
+    for problem in played.problems:
+        out.say(f"  [{_COLOURS[False]}]not held[/]: {escape(problem)}")
     for stop in played.stops:
         ok = stop.verdict == "ok"
         went_on = f"moved for {stop.took_s:.3f} s" if stop.took_s is not None else "was still moving"
@@ -123,7 +123,7 @@ def _conclude(out: Output, found: Report, folder: Path | None) -> None:
     failed = [played for played in found.scenes if not played.ok]
     for played in failed:
         bad = ", ".join(f"{stop.joint} {stop.verdict}" for stop in played.stops if stop.verdict != "ok")
-        out.say(f"[bold red]failed[/]: {played.scene}: {escape(bad or played.problem)}")
+        out.say(f"[bold red]failed[/]: {played.scene}: {escape(bad or 'could not be held')}")
     if found.ok:
         out.say(f"[bold green]passed[/]: {len(found.scenes)} scenes, all within their limits")
     elif not failed:

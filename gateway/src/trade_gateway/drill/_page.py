@@ -54,8 +54,9 @@ def _scene(played: Played) -> str:
     colour, word = ("ok", "ok") if played.ok else ("bad", "failed")
     head = f'<h2>{escape(played.scene)} <small class="{colour}">{word}</small></h2>'
     what = f"<p>{escape(played.what)} (shows {escape(played.shows)} of docs/safety.md)</p>"
-    if played.problem:
-        return f'<section>{head}{what}<p class="bad">not held: {escape(played.problem)}</p></section>'
+    what += "".join(f"<p>not held: {escape(problem)}</p>" for problem in played.problems)
+    if not played.stops:
+        return f"<section>{head}{what}</section>"
     rows = "".join(map(_row, sorted(played.stops, key=lambda stop: -stop.part)))
     columns = "<tr><th>joint</th><th>bus</th><th>moved for</th><th>limit</th><th></th><th></th></tr>"
     return f"<section>{head}{what}<table>{columns}{rows}</table></section>"

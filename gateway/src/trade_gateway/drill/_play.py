@@ -14,6 +14,7 @@ from trade_gateway.drill._targets import Target
 
 __all__ = ["play"]
 
+_TRIES: Final = 3
 _BEGUN_S: Final = 20.0
 _ON_ITS_WAY_S: Final = 0.5
 """From the first to move until the deed at least."""
@@ -25,15 +26,22 @@ _LOOK_EVERY_S: Final = 0.05
 
 
 def play(stand: Stand, scene: Scene, targets: Sequence[Target], given: Drill) -> Played:
-    """Hold a scene with those it concerns; the stand is whole afterwards, unless that is what the problem is."""
+    """Hold a scene with those it concerns.
+
+    One that comes to no measurement, as on a computer so busy that a watchdog runs out before the deed, is held again.
+    What was measured stands.
+    """
     concerned = [target for target in targets if scene.concerns(target)]
-    try:
-        stops = _played(stand, scene, concerned, given)
-    except DrillFailed as problem:
-        return Played(scene=scene.name, what=scene.what, shows=scene.shows, problem=str(problem))
-    finally:
-        stand.dismiss()
-    return Played(scene=scene.name, what=scene.what, shows=scene.shows, stops=stops)
+    problems: list[str] = []
+    stops: list[Stop] = []
+    while not stops and len(problems) < _TRIES:
+        try:
+            stops = _played(stand, scene, concerned, given)
+        except DrillFailed as problem:
+            problems.append(str(problem))
+        finally:
+            stand.dismiss()
+    return Played(scene=scene.name, what=scene.what, shows=scene.shows, stops=stops, problems=problems)
 
 
 def _played(stand: Stand, scene: Scene, targets: Sequence[Target], given: Drill) -> list[Stop]:

@@ -43,13 +43,13 @@ class Played(Struct, frozen=True, kw_only=True):
     what: str
     shows: str
     stops: list[Stop] = []
-    problem: str = ""
-    """Why it could not be held; empty if it was."""
+    problems: list[str] = []
+    """Why it could not be held, each time that it could not; it was in the end if there are stops."""
 
     @property
     def ok(self) -> bool:
         """Whether it was held, and each joint kept its limit."""
-        return not self.problem and all(stop.verdict == "ok" for stop in self.stops)
+        return bool(self.stops) and all(stop.verdict == "ok" for stop in self.stops)
 
 
 class Report(Struct, frozen=True, kw_only=True):
