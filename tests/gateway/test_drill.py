@@ -2,6 +2,7 @@
 
 import json
 import re
+import time
 from pathlib import Path
 
 import msgspec
@@ -11,7 +12,7 @@ from trade_drivers import load
 from trade_drivers.robotfile import Drill
 from trade_gateway._drill import _chosen
 from trade_gateway._output import UsageError
-from trade_gateway.drill import SCENES, Played, Report, Stop, as_data, page, play, targets_of
+from trade_gateway.drill import SCENES, Played, Report, Scene, Stop, Target, _play, as_data, page, play, targets_of
 from trade_gateway.drill._actors import DrillFailed
 from trade_gateway.drill._judge import Judge
 from trade_gateway.drill._scenes import ALLOWANCE_S, limit_s
@@ -199,3 +200,79 @@ def test_the_page_stands_alone_and_shows_the_worst_first() -> None:
 def test_a_bar_ends_with_the_page_however_long_it_took() -> None:
     assert 'width: 100.0%"' in page(_report(_stop(1e6)))
     assert 'width: 100.0%"' in page(_report(_stop(None)))
+
+
+class ScriptedStand:
+    """A stand whose joint does what a script says: times relative to the deed, and whether it moves from then on."""
+
+    def __init__(self, log: Path, script: list[tuple[float, bool]], after_mending: list[tuple[float, bool]]) -> None:
+        self._log, self._script, self._after_mending = log, script, after_mending
+        self._mended = 0
+        self.judge = Judge(log)
+
+    def mend(self) -> None:
+        self._mended += 1
+        if self._mended == 2:  # the first time is before the deed
+            self._write(time.monotonic(), self._after_mending)
+
+    def call(self, scene: Scene, targets: list[Target]) -> "ScriptedStand":
+        return self
+
+    def tell(self) -> None:
+        self._write(time.monotonic(), [(0.0, True)])
+
+    def objection(self) -> str:
+        return ""
+
+    def strike(self, scene: Scene, targets: list[Target]) -> float:
+        now = time.monotonic()
+        self._write(now, self._script)
+        return now
+
+    def look(self) -> None:
+        self.judge.look()
+
+    def dismiss(self) -> None:
+        pass
+
+    def _write(self, zero: float, script: list[tuple[float, bool]]) -> None:
+        names = {True: "motion_started", False: "at_rest"}
+        lines = [msgspec.json.encode({"t": zero + t, "name": names[on], "joint": "neck.pan"}) for t, on in script]
+        with self._log.open("ab") as file:
+            file.writelines(line + b"\n" for line in lines)
+
+
+@pytest.mark.parametrize(
+    ("script", "after_mending", "verdict"),
+    [
+        ([(0.002, False)], [], "ok"),
+        ([(0.002, False), (0.003, True), (0.9, False)], [], "too long"),
+        ([], [], "did not stop"),
+        ([(0.002, False), (0.003, True)], [], "did not stop"),
+        ([(0.002, False)], [(0.001, True), (0.002, False)], "moved again"),
+    ],
+    ids=["rests", "is led on", "goes on", "begins anew", "moves by itself later"],
+)
+def test_a_joint_is_judged_by_when_it_rested_for_good(
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    script: list[tuple[float, bool]],
+    after_mending: list[tuple[float, bool]],
+    verdict: str,
+) -> None:
+    for name, seconds in (("_ON_ITS_WAY_S", 0.01), ("_QUIET_S", 0.05), ("_REST_S", 2.0)):
+        monkeypatch.setattr(_play, name, seconds)
+    targets, _ = targets_of(load(EXAMPLES / "head.toml"))
+    stand = ScriptedStand(tmp_path / "log.jsonl", script, after_mending)
+    played = play(stand, BY_NAME["unplug"], targets, Drill(unplug=0.5))
+    assert (played.problems, [stop.verdict for stop in played.stops]) == ([], [verdict])
+
+
+def test_a_joint_that_rested_before_the_deed_has_shown_nothing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    for name, seconds in (("_ON_ITS_WAY_S", 0.01), ("_QUIET_S", 0.05)):
+        monkeypatch.setattr(_play, name, seconds)
+    targets, _ = targets_of(load(EXAMPLES / "head.toml"))
+    stand = ScriptedStand(tmp_path / "log.jsonl", [(-0.001, False)], [])
+    played = play(stand, BY_NAME["unplug"], targets, Drill())
+    assert not played.ok
+    assert all("rested already" in problem for problem in played.problems)
