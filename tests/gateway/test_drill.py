@@ -77,6 +77,13 @@ def test_bus_off_concerns_can_buses_alone() -> None:
     assert all(scene.concerns(leg) for scene in SCENES)
 
 
+def test_an_arm_that_would_be_there_before_its_stream_is_over_shows_nothing_about_streams() -> None:
+    [arm], _ = targets_of(load(EXAMPLES / "arm.toml"))
+    fast = msgspec.structs.replace(arm, max_speed_rad_s=3.0)
+    assert BY_NAME["stream_frozen"].concerns(arm)
+    assert [scene.name for scene in SCENES if not scene.concerns(fast)] == ["stream_frozen", "bus_off"]
+
+
 def test_scenes_are_chosen_by_name_and_held_in_the_order_of_the_table() -> None:
     assert _chosen([]) == list(SCENES)
     assert [scene.name for scene in _chosen(["partition", "caller_killed"])] == ["caller_killed", "partition"]

@@ -56,7 +56,9 @@ def drill(
     for part, why in left_out.items():
         out.say(f"[bold]{robot.name}[/]: {escape(part)} is left out: {escape(why)}")
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that nobody is left behind, least of all frozen
-    impossible = {scene.name: "no CAN bus takes part" for scene in scenes if not any(map(scene.concerns, targets))}
+    impossible = {
+        scene.name: "it concerns nothing that moves here" for scene in scenes if not any(map(scene.concerns, targets))
+    }
     played: list[Played] = []
     with tempfile.TemporaryDirectory(prefix="trade-drill-") as folder:
         out.say(f"[bold]{robot.name}[/]: moving {', '.join(target.name for target in targets)}, simulated")

@@ -37,7 +37,7 @@ class Order(msgspec.Struct, frozen=True, kw_only=True):
     group: str
     arm: bool
     stream: bool
-    """With set-points that are given again and again, instead of one move."""
+    """With set-points given again and again, instead of one move; an arm goes for a far one as fast as it may."""
     from_rad: list[float]
     """Where it is: one angle, or those of an arm."""
     goal_rad: list[float]
@@ -75,26 +75,14 @@ def _beginning(order: Order) -> Callable[[threading.Event], None]:
         goal = order.goal_rad if order.arm else order.goal_rad[0]
         return lambda _: move(goal, order.speed_rad_s)
     turn = _service(order.group, "servo" if order.arm else "set_velocity")
-    point = _servo if order.arm else _speed
+    forwards = order.goal_rad[0] > order.from_rad[0]
+    point = order.goal_rad if order.arm else order.speed_rad_s if forwards else -order.speed_rad_s
 
     def stream(hushed: threading.Event) -> None:
-        began = time.monotonic()
         while not hushed.wait(_PERIOD_S):
-            turn(point(order, time.monotonic() - began), order.valid_s)
+            turn(point, order.valid_s)
 
     return stream
-
-
-def _servo(order: Order, elapsed_s: float) -> list[float]:
-    """Where an arm should be by now."""
-    way = [goal - begun for begun, goal in zip(order.from_rad, order.goal_rad, strict=True)]
-    longest = max(map(abs, way))
-    part = min(1.0, elapsed_s * order.speed_rad_s / longest)
-    return [begun + part * length for begun, length in zip(order.from_rad, way, strict=True)]
-
-
-def _speed(order: Order, _elapsed_s: float) -> float:
-    return order.speed_rad_s if order.goal_rad[0] > order.from_rad[0] else -order.speed_rad_s
 
 
 def _told(motion: Callable[[threading.Event], None], hushed: threading.Event) -> None:

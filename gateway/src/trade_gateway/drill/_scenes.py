@@ -40,7 +40,7 @@ class Scene(Struct, frozen=True, kw_only=True):
 
     def concerns(self, target: Target) -> bool:
         """Whether it can happen to what moves on this bus."""
-        return target.can or self.deed != "bus_off"
+        return target.can if self.deed == "bus_off" else target.streams or self.motion != "stream"
 
 
 SCENES: Final = (

@@ -11,6 +11,8 @@ __all__ = ["LASTS_S", "Target", "targets_of"]
 
 LASTS_S = 20.0
 """How long a motion of a drill would last if nothing ended it."""
+_STREAMS_S = 2.5
+"""So long a stream takes at least until it falls silent and its last set-point is over, on a busy computer."""
 _MARGIN = 0.05
 """The fraction of its range that a joint keeps off either end."""
 
@@ -37,6 +39,12 @@ class Target(Struct, frozen=True, kw_only=True):
     def brakes_s(self) -> float:
         """How long it takes to brake from its greatest speed."""
         return self.max_speed_rad_s / self.max_accel_rad_s2
+
+    @property
+    def streams(self) -> bool:
+        """Whether it is still on its way when a stream of set-points falls silent: an arm goes as fast as it may."""
+        shortest = (0.5 - _MARGIN) * (self.max_rad - self.min_rad)
+        return not self.arm or shortest / self.max_speed_rad_s > _STREAMS_S
 
     def way(self, angle_rad: float) -> tuple[float, float]:
         """Where to send it from an angle, so that it is on its way for `LASTS_S`, and how fast: rad and rad/s."""
