@@ -13,7 +13,7 @@ ARGS ?=
 SEED ?= 1
 MINUTES ?= 3
 
-.PHONY: demo test test-socketcan soak-registry chaos chaos-robots check bench clean
+.PHONY: demo screenshots test test-socketcan soak-registry chaos chaos-robots check bench clean
 .DEFAULT_GOAL := help
 
 help: ## show the targets
@@ -56,6 +56,9 @@ check: $(UV) ## lint, formatting, types, import rules, isolated install of the c
 	@$(UV) run --isolated --no-project --with ./trade python -W error -c 'import trade, sys; \
 	  foreign = {"serial", "cryptography", "dynamixel_sdk", "typer", "trade_drivers", "opentelemetry"} & set(sys.modules); \
 	  sys.exit(f"the core alone imports {foreign}" if foreign else 0)'
+
+screenshots: $(UV) ## the pictures of README and docs, of a simulated robot in a browser (needs chromium)
+	@$(RUN) python docs/pictures/take.py
 
 bench: $(UV) ## speed as ratios against peers in the same run
 	@$(RUN) python -m tests.bench $(ARGS)

@@ -21,6 +21,7 @@ from types import FrameType
 
 from demo_judge import PAN, Judge
 from demo_kept import kill_and_see
+from demo_page import dashboard
 from demo_stage import PATIENCE_S, DemoFailed, Stage, stage
 
 import trade
@@ -175,8 +176,10 @@ def wait_for_the_user(scene: Stage) -> None:
     print("\nThe robot stays up; Ctrl-C here ends it. In another terminal, on the laboratory's network:\n")
     way = [scene.places.way_in(), "source .venv/bin/activate", f"source {script}", "trade services --group rosie"]
     way += ["trade call rosie.head.move_to '[0.3, -0.2]'", "trade call rosie.left.hand.open", "trade locks"]
-    with contextlib.suppress(KeyboardInterrupt):
-        print("\n".join(f"  {line}" for line in way if line))
+    print("\n".join(f"  {line}" for line in way if line))
+    with contextlib.suppress(KeyboardInterrupt), dashboard(scene) as (url, token):
+        print(f"\nOr in a browser: {url}\n  token: {token}")
+        print("  Open it, sign in with the token, and hold + of neck.pan: the head turns while you do.")
         while True:
             time.sleep(1)
 

@@ -188,6 +188,12 @@ class Stage:
         with self._started(" ".join((program, *role)), words, self.environment("lab", "planner")) as actor:
             yield actor
 
+    @contextlib.contextmanager
+    def trade(self, who: str, *words: str | Path) -> Generator[Actor]:
+        """A command that stays, of somebody of the laboratory."""
+        with self._started(f"trade {words[0]}", [*_TRADE, *words], self.environment("lab", who)) as actor:
+            yield actor
+
     def command(self, who: str, *words: str) -> str:
         """What `trade WORDS` says when somebody of the laboratory types it, complaints included."""
         environment = {**os.environ, **self.environment("lab", who)}
@@ -274,6 +280,8 @@ class Loopback:
     """Two networks by agreement: nobody dials the other side, and only what the gateways let across is seen."""
 
     addresses = ("127.0.0.1",)
+    window: socket.socket | None = None
+    """What a browser of this host connects to needs no way around."""
 
     def __init__(self, why: str) -> None:
         self.why = why
@@ -312,6 +320,8 @@ class Namespaces:
 
     def __init__(self, undo: contextlib.ExitStack) -> None:
         mark = secrets.token_hex(3)
+        self.window: socket.socket | None = undo.enter_context(socket.create_server(("127.0.0.1", 0)))
+        """Listens on this host's own network, also when we have stepped into another one."""
         self._names = {place: f"trade-demo-{mark}-{place}" for place in ("robot", "gateway", "lab")}
         self.door = {"robot": "tls/192.168.7.1:7450", "lab": "tls/10.0.0.7:7450"}
         for name in self._names.values():

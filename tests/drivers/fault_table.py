@@ -89,9 +89,9 @@ _DYNAMIXEL: Final = (
     _forgiven("dynamixel", "garbage before answers", Garbage(ids=ONE, count=30)),
     _silent("dynamixel", "garbage for answers", Garbage(ids=ONE), Truncate(ids=ONE, missing=999)),
     _faulty("dynamixel", "frozen value", Freeze(ids=ONE), "it makes no progress", Stop.HOLD),
-    _faulty("dynamixel", "frozen clock", Freeze(ids=ONE, tick=True), "its clock jumped", Stop.HOLD)._replace(
-        alone=True
-    ),
+    _faulty(
+        "dynamixel", "frozen clock", Freeze(ids=ONE, tick=True), "its clock jumped, or it makes no progress", Stop.HOLD
+    )._replace(alone=True),
     _faulty("dynamixel", "blocked", Jam(ids=ONE), "it makes no progress", Stop.BLOCKED)._replace(alone=True),
     _silent("dynamixel", "cable off", Absent(ids=ONE), stop=Stop.WATCHDOG, after=Recovery.ENABLE),
     _gone("dynamixel", _REPLUG, Stop.WATCHDOG, Recovery.ENABLE),

@@ -45,7 +45,7 @@ def test_a_fault_while_moving_ends_the_move_and_nothing_moves_on_recovery(row: R
     error = moving.wait().error
     assert row.error is not None
     assert isinstance(error, row.error), error
-    assert row.says in str(error)
+    assert _one_of(row.says, str(error))
     _check_stop(row, subject, struck)
 
     stood, rested = subject.travelled, written_now()
@@ -126,7 +126,12 @@ def _tells(subject: Subject, wanted: type[DeviceError] | str) -> bool:
         fault = subject.provider.state().fault
     except DeviceError as error:
         return isinstance(wanted, type) and isinstance(error, wanted)
-    return isinstance(wanted, str) and (wanted in fault if wanted else not fault)
+    return isinstance(wanted, str) and (_one_of(wanted, fault) if wanted else not fault)
+
+
+def _one_of(wanted: str, text: str) -> bool:
+    """Of a servo whose values and clock stand still, it is chance which is noticed first."""
+    return any(words in text for words in wanted.split(", or "))
 
 
 def _latched(subject: Subject) -> str:

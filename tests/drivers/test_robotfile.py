@@ -8,6 +8,7 @@ from msgspec.structs import replace
 from robots import HAND, HEAD
 from trade.errors import ConfigurationError
 from trade_drivers import CanBus, Robot, SerialBus, load, parse
+from trade_drivers.robotfile import Drill
 
 
 def test_a_robot_file_becomes_records() -> None:
@@ -59,6 +60,11 @@ max_accel_rad_s2 = 20.0
 """
 
 
+def test_the_limits_of_a_drill_are_seconds_and_may_be_left_out() -> None:
+    assert parse(HEAD, "head.toml").drill == Drill()
+    assert parse(f"{HEAD}\n[drill]\npartition = 3\n", "head.toml").drill == Drill(partition=3.0)
+
+
 def test_a_bus_with_the_words_of_python_can_is_a_can_bus() -> None:
     robot = parse(LEGS, "legs.toml")
     [bus], [joint] = robot.buses, robot.joints
@@ -99,7 +105,8 @@ MISTAKES = [
         "name",
         (
             "head.toml: [name]: unknown table; "
-            "a robot file has [robot], [bus], [joint], [gripper], [arm], [camera], [sensor], [group], [[coupled]]"
+            "a robot file has [robot], [bus], [joint], [gripper], [arm], [camera], [sensor], [group], [drill], "
+            "[[coupled]]"
         ),
     ),
     ('name = "rosie"', "", 'head.toml: [robot]: missing; write [robot] and name = "rosie"'),
@@ -161,6 +168,10 @@ MISTAKES = [
     ("[group.head]", "[[coupled]]\n[group.head]", "coupled 1: missing required key 'joints'"),
     ("[group.head]", "[coupled]\n[group.head]", "coupled: must be a list of tables, each with a heading of its own"),
     ("[robot]", "coupled = [3]\n[robot]", "coupled 1"),
+    ("[robot]", "[drill]\npartitoin = 3\n[robot]", "drill.partitoin: unknown key; the keys are caller_killed, "),
+    ("[robot]", "[drill]\npartition = 0\n[robot]", "drill.partition: Expected `float` > 0"),
+    ("[robot]", "[drill]\npartition = inf\n[robot]", "drill.partition: must be a finite number"),
+    ("[robot]", "drill = 3\n[robot]", "drill: must be a table: [drill]"),
     ('["neck.pan", "neck.tilt"]', "[]", "group.head.joints: Expected `array` of length >= 1"),
 ]
 

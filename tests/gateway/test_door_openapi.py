@@ -94,6 +94,7 @@ def test_what_comes_and_goes_is_in_the_document_as_it_does(door: Opened) -> None
 def test_the_door_keeps_to_its_document(door: Opened, mode: str) -> None:
     """Whatever schemathesis thinks of is answered as the document says; what it forbids is refused."""
     import schemathesis
+    from schemathesis.checks import not_a_server_error
 
     anna = door.client()
     schema = schemathesis.openapi.from_dict(anna.ask("GET", "/openapi.json").body)
@@ -107,7 +108,9 @@ def test_the_door_keeps_to_its_document(door: Opened, mode: str) -> None:
         )
         def keeps_to_it(case: schemathesis.Case) -> None:
             case.headers["Authorization"] = f"Bearer {anna.token}"  # who shows none is another test's
-            answer = case.call_and_validate(base_url=anna.url, timeout=60)
+            answer = case.call(base_url=anna.url, timeout=60)
+            late = answer.status_code == 504 and answer.json()["data"]["deadline_s"] < 1.0  # it may ask for as little
+            case.validate_response(answer, excluded_checks=[not_a_server_error] if late else None)
             answered.add((case.operation.path, answer.status_code))
 
         try:

@@ -8,8 +8,10 @@ from pathlib import Path
 
 import pytest
 
+from doors import Client
 from system.conftest import ROOT, Program
 from system.networks import ip, why_not
+from waiting import wait_until
 
 pytestmark = pytest.mark.timeout(300)
 
@@ -67,9 +69,13 @@ def test_the_demo_fails_when_the_simulator_is_muted(run: Run) -> None:
     assert why_not() or left_of(story) == []
 
 
-def test_a_demo_that_stays_ends_with_ctrl_c_and_leaves_nothing(run: Run) -> None:
+def test_a_demo_that_stays_shows_a_page_ends_with_ctrl_c_and_leaves_nothing(run: Run) -> None:
     demo = run(DEMO, "--stay")
-    story = told(demo, "trade locks")
+    story = told(demo, "the head turns while you do")
+    [url], [token] = re.findall(r"in a browser: (\S+)", story), re.findall(r"token: (\S+)", story)
+    anna = Client(url, token)
+    assert anna.ask("GET", "/").status == 200
+    wait_until(lambda: anna.ask("GET", "/services?group=rosie.neck.pan&name=set_velocity").body, "rosie is seen")
     demo.signal(signal.SIGINT)
     assert demo.wait() == 0, demo.errors
     rest = "".join(demo.lines())

@@ -8,7 +8,7 @@ from msgspec import Meta, Struct
 
 from trade_drivers._tables import record_of
 
-__all__ = ["Arm", "Camera", "Coupled", "Gripper", "Group", "Positive", "Sensor", "arm_problem"]
+__all__ = ["Arm", "Camera", "Coupled", "Drill", "Gripper", "Group", "Positive", "Sensor", "arm_problem"]
 
 Positive = Annotated[float, Meta(gt=0)]
 Angles = Annotated[list[float], Meta(min_length=6, max_length=6)]
@@ -93,6 +93,20 @@ class Coupled(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Joints that hinder each other, so that none is locked without the others."""
 
     joints: Annotated[list[str], Meta(min_length=2)]
+
+
+class Drill(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """How soon, in seconds, all must be at rest after each thing that `trade drill` does; None: what the rules say."""
+
+    caller_killed: Positive | None = None
+    caller_frozen: Positive | None = None
+    stream_frozen: Positive | None = None
+    gateway_killed: Positive | None = None
+    partition: Positive | None = None
+    driver_killed: Positive | None = None
+    driver_frozen: Positive | None = None
+    unplug: Positive | None = None
+    bus_off: Positive | None = None
 
 
 def arm_problem(arm: Arm) -> tuple[str, str] | None:

@@ -9,7 +9,7 @@ import msgspec
 from msgspec import Meta, Struct
 
 from trade.errors import ConfigurationError
-from trade_drivers._records import Arm, Camera, Coupled, Gripper, Group, Positive, Sensor, arm_problem
+from trade_drivers._records import Arm, Camera, Coupled, Drill, Gripper, Group, Positive, Sensor, arm_problem
 from trade_drivers._tables import explain, record_of, wrong
 
 if sys.version_info >= (3, 11):
@@ -23,6 +23,7 @@ __all__ = [
     "Camera",
     "CanBus",
     "Coupled",
+    "Drill",
     "Gripper",
     "Group",
     "Joint",
@@ -140,6 +141,7 @@ class Robot(Struct, frozen=True, kw_only=True):
     arms: list[Arm] = []
     cameras: list[Camera] = []
     sensors: list[Sensor] = []
+    drill: Drill = Drill()
     given: dict[str, list[str]] = {}
     """By bus: the keys that its table has, so that a driver can refuse those that mean nothing to it."""
 
@@ -204,6 +206,7 @@ def parse(text: str, where: str) -> Robot:
         sensors=[_sense(*entry, Sensor, where) for entry in _tables(raw, "sensor", where)],
         groups=[record_of(*entry, Group, where) for entry in _tables(raw, "group", where)],
         coupled=_coupled(raw.get("coupled", []), where),
+        drill=_drill(raw.get("drill", {}), where),
         where=where,
         given={name: list(table) for _, name, table in buses},
     )
@@ -212,7 +215,7 @@ def parse(text: str, where: str) -> Robot:
 
 
 def _only_known(raw: Mapping[str, object], where: str) -> None:
-    sections = ("robot", "bus", "joint", "gripper", "arm", "camera", "sensor", "group")
+    sections = ("robot", "bus", "joint", "gripper", "arm", "camera", "sensor", "group", "drill")
     known = {key: f"[{key}]" for key in sections} | {"coupled": "[[coupled]]"}
     for key in raw:
         if key not in known:
@@ -284,6 +287,12 @@ def _sense(key: str, name: str, table: Mapping[str, object], record: type[_Sense
         raise wrong(where, f"{key}.driver", 'must name its driver, such as driver = "snapshot"')
     options = {option: value for option, value in table.items() if option != "driver"}
     return record(name=name, driver=driver, options=options, key=key, where=where)
+
+
+def _drill(table: object, where: str) -> Drill:
+    if not isinstance(table, dict):
+        raise wrong(where, "drill", "must be a table: [drill]")
+    return record_of("drill", None, cast("dict[str, object]", table), Drill, where)
 
 
 def _coupled(tables: object, where: str) -> list[Coupled]:

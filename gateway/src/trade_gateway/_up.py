@@ -3,7 +3,7 @@
 import gc
 import signal
 import threading
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import FrameType
@@ -30,6 +30,10 @@ def up(
     robot_file: Annotated[Path, typer.Argument(metavar="ROBOT.toml", help="The robot file.")],
     sim: Annotated[bool, typer.Option("--sim", help="Simulate the devices: the same bytes, no hardware.")] = False,
     sim_log: Annotated[Path | None, typer.Option(help="With --sim: where to write the log of all bytes.")] = None,
+    port: Annotated[
+        list[str] | None,
+        typer.Option(metavar="PART=PORT", help="A port instead of the file's, such as neck=/dev/ttyUSB1; repeatable."),
+    ] = None,
     leave_out: Annotated[
         list[str] | None,
         typer.Option("--without", metavar="PART", help="A bus, camera or sensor to leave out; again for another."),
@@ -46,15 +50,18 @@ def up(
     """
     if sim_log is not None and not sim:
         raise UsageError(where="--sim-log", problem="is the log of the simulator; it needs --sim")
+    if sim and port:
+        raise UsageError(where="--port", problem="names hardware, and --sim simulates it; leave one of them out")
     out = Output(as_json=as_json)
     robot, left_out = without(load(robot_file), leave_out or [])
+    told = ports_told(port or [])
     if detach:
         detach_now(out, choice_of(context).settings(name or robot.name))
         return
     with Notifier() as notifier, ExitStack() as stack:
         asked_to_leave = stack.enter_context(leaving())
         simulation = stack.enter_context(_simulation(robot, sim_log)) if sim else None
-        ports: dict[str, str] | None = simulation.ports if simulation else None
+        ports: dict[str, str] = simulation.ports if simulation else told
         container = stack.enter_context(Container(choice_of(context).settings(name or robot.name)))
         container.terminating.close = asked_to_leave.set
         refuse_twice(container, "trade up")
@@ -87,6 +94,23 @@ def up(
             if simulation is not None and not simulation.running:
                 raise ConfigurationError(where="simulation", problem="its process ended; start again")
         out.say("leaving")
+
+
+def ports_told(words: Sequence[str]) -> dict[str, str]:
+    """By part of the robot: the port that the command line names instead of the file's.
+
+    Raises:
+        UsageError: a word is no PART=PORT, or names a part a second time.
+    """
+    ports: dict[str, str] = {}
+    for word in words:
+        part, _, port = word.partition("=")
+        if not (part and port):
+            raise UsageError(where=f"--port {word}", problem="is no PART=PORT; write neck=/dev/ttyUSB1")
+        if part in ports:
+            raise UsageError(where=f"--port {word}", problem=f"{part} has {ports[part]} already")
+        ports[part] = port
+    return ports
 
 
 @contextmanager
@@ -135,7 +159,7 @@ def refuse_twice(container: Container, command: str) -> None:
             raise ConfigurationError(where=command, problem=problem)
 
 
-def _say_attaching(out: Output, robot: Robot, ports: dict[str, str] | None) -> None:
+def _say_attaching(out: Output, robot: Robot, ports: dict[str, str]) -> None:
     for bus in robot.buses:
         devices = (*robot.joints_on(bus.name), *robot.grippers_on(bus.name))
         named = ", ".join(
@@ -144,9 +168,9 @@ def _say_attaching(out: Output, robot: Robot, ports: dict[str, str] | None) -> N
                 *(f"{arm.name} ({arm.model})" for arm in robot.arms_on(bus.name)),
             ]
         )
-        out.say(f"[bold]{robot.name}[/]: attaching bus {bus.name} on {(ports or {}).get(bus.name, bus.port)}: {named}")
+        out.say(f"[bold]{robot.name}[/]: attaching bus {bus.name} on {ports.get(bus.name, bus.port)}: {named}")
     for sense in (*robot.cameras, *robot.sensors):
-        place = f" on {ports[sense.name]}" if ports else ""
+        place = f" on {ports[sense.name]}" if sense.name in ports else ""
         out.say(f"[bold]{robot.name}[/]: attaching {type(sense).__name__.lower()} {sense.name} ({sense.driver}){place}")
 
 

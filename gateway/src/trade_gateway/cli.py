@@ -40,6 +40,7 @@ _COMMANDS: Final = {
     "set-baud": (_HARDWARE, "_scan:set_baud"),
     "calibrate": (_HARDWARE, "_calibrate:calibrate"),
     "doctor": (_HARDWARE, "_doctor:doctor"),
+    "drill": (_HARDWARE, "_drill:drill"),
     "services": (_SERVICES, "_list:services"),
     "containers": (_SERVICES, "_list:containers"),
     "call": (_SERVICES, "_call:call"),

@@ -1,0 +1,47 @@
+"""The dashboard of a demo that stays: a door on the laboratory's network, and a way to it from this host's browser."""
+
+import contextlib
+import socket
+import threading
+from collections.abc import Generator
+from urllib.parse import urlsplit
+
+from demo_stage import Stage
+
+from trade_gateway.door import add_token
+
+_CHUNK = 65536
+
+
+@contextlib.contextmanager
+def dashboard(scene: Stage) -> Generator[tuple[str, str]]:
+    """An address for the browser, and a token for anna."""
+    tokens = scene.folder / "door-tokens.toml"
+    token = add_token(tokens, "anna")
+    with scene.trade("anna", "door", "--name", "page", "--listen", "127.0.0.1:0", "--tokens", tokens, "--json") as door:
+        url: str = door.ready()["url"]
+        if (window := scene.places.window) is None:
+            yield url, token
+            return
+        threading.Thread(target=_let_through, args=(window, urlsplit(url).port), daemon=True).start()
+        yield f"http://127.0.0.1:{window.getsockname()[1]}", token
+
+
+def _let_through(window: socket.socket, port: int) -> None:
+    """Whoever connects at the window, which is this host's, comes out at a port of the network that we are on."""
+    while True:
+        try:
+            outside, _ = window.accept()
+            inside = socket.create_connection(("127.0.0.1", port))
+        except OSError:  # the demo has ended
+            return
+        for one, other in ((outside, inside), (inside, outside)):
+            threading.Thread(target=_pump, args=(one, other), daemon=True).start()
+
+
+def _pump(source: socket.socket, sink: socket.socket) -> None:
+    with contextlib.suppress(OSError):
+        while data := source.recv(_CHUNK):
+            sink.sendall(data)
+    with contextlib.suppress(OSError):
+        sink.shutdown(socket.SHUT_WR)

@@ -1,0 +1,137 @@
+"""A process of a drill: started with a lifeline to this one, heard line by line, killed, frozen and woken."""
+
+import json
+import os
+import queue
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from trade.errors import TradeError
+
+__all__ = ["Actor", "DrillFailed"]
+
+_END_S: Final = 20.0
+
+
+@dataclass(kw_only=True, eq=False)
+class DrillFailed(TradeError):
+    """A drill cannot be held: what it needs does not come up, or does not move."""
+
+    problem: str
+
+    def describe(self) -> str:
+        return self.problem
+
+
+class Actor:
+    """``python -m WORDS`` as a child process that speaks JSON, a line at a time.
+
+    Args:
+        name: for messages.
+        words: module and arguments.
+        environment: of the process; whole.
+        complaints: a file for what it writes to standard error.
+    """
+
+    def __init__(self, name: str, words: Sequence[str], environment: Mapping[str, str], complaints: Path) -> None:
+        self.name = name
+        self._complaints = complaints
+        with complaints.open("ab") as errors:
+            self._process = subprocess.Popen(  # noqa: S603 - modules of ours
+                [sys.executable, "-m", *words],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=errors,
+                env=dict(environment),
+                start_new_session=True,  # Ctrl-C is for this process, which ends the others in their order
+            )
+        self._lines: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+        self._reader = threading.Thread(target=self._read, name=f"drill-{name}", daemon=True)
+        self._reader.start()
+
+    def _read(self) -> None:
+        assert self._process.stdout is not None  # noqa: S101 - a pipe
+        for line in self._process.stdout:
+            self._lines.put(line)
+        self._lines.put(b"")
+
+    @property
+    def running(self) -> bool:
+        """Whether it has not ended."""
+        return self._process.poll() is None
+
+    def said(self, within_s: float) -> dict[str, Any]:
+        """What it says next; raises DrillFailed: nothing in time, or that it cannot do what it should."""
+        try:
+            line = self._lines.get(timeout=within_s)
+        except queue.Empty:
+            raise DrillFailed(problem=f"the {self.name} was not ready within {within_s:g} s") from None
+        if not line:
+            raise DrillFailed(problem=f"the {self.name} ended: {self._last_words()}")
+        told: dict[str, Any] = json.loads(line)
+        if "error" in told:
+            raise DrillFailed(problem=f"the {self.name} says {told['error']}")
+        return told
+
+    def objection(self) -> str:
+        """What it says it cannot do; empty if it has said nothing more."""
+        if self._lines.empty():
+            return ""
+        try:
+            self.said(0.0)
+        except DrillFailed as failed:
+            return failed.problem
+        return ""
+
+    def tell(self) -> None:
+        """Give it its next cue: a line."""
+        assert self._process.stdin is not None  # noqa: S101 - a pipe
+        try:
+            self._process.stdin.write(b"\n")
+            self._process.stdin.flush()
+        except BrokenPipeError:
+            raise DrillFailed(problem=f"the {self.name} ended: {self._last_words()}") from None
+
+    def kill(self) -> None:
+        """As kill -9 does."""
+        self._process.kill()
+
+    def freeze(self) -> None:
+        """It does nothing any more, and its links stay open."""
+        self._process.send_signal(signal.SIGSTOP)
+
+    def wake(self) -> None:
+        """Go on; harmless if it is not frozen."""
+        self._process.send_signal(signal.SIGCONT)
+
+    def close(self, *, gently: bool) -> None:
+        """End it, in order if there is one, and wait for that. Idempotent."""
+        self.wake()
+        if gently:
+            self._process.terminate()
+        else:
+            self._process.kill()
+        try:
+            self._process.wait(_END_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._reader.join(_END_S)
+        for pipe in (self._process.stdin, self._process.stdout):
+            if pipe is not None and not pipe.closed:
+                pipe.close()
+
+    def _last_words(self) -> str:
+        lines = self._complaints.read_text(encoding="utf-8", errors="replace").splitlines()
+        return next((line.strip() for line in reversed(lines) if line.strip()), "it said nothing")
+
+
+def bare_environment() -> dict[str, str]:
+    """This one's, without what would lead a container into another system."""
+    return {name: value for name, value in os.environ.items() if not name.startswith("TRADE_")}

@@ -1,0 +1,80 @@
+"""The report of a drill as one page of HTML: without scripts, for light and dark screens and for paper. Pure."""
+
+from html import escape
+from typing import Final
+
+from trade_gateway.drill._record import Played, Report, Stop
+
+__all__ = ["page"]
+
+_LIMIT_PERCENT: Final = 70.0
+"""Where in a bar the limit is."""
+
+_STYLE: Final = """
+:root { color-scheme: light dark; --ok: #2e7d32; --bad: #c62828; --line: #8886; }
+body { font: 16px/1.5 system-ui, sans-serif; max-width: 56rem; margin: 2rem auto; padding: 0 1rem; }
+h1 { margin-bottom: 0; }
+.ok { color: var(--ok); } .bad { color: var(--bad); }
+section { border-top: 1px solid var(--line); padding: .5rem 0; break-inside: avoid; }
+table { border-collapse: collapse; width: 100%; }
+td, th { text-align: left; padding: .15rem .75rem .15rem 0; font-weight: normal; white-space: nowrap; }
+td.bar { width: 50%; }
+.bar div { position: relative; height: .8rem; background: #8883; print-color-adjust: exact; }
+.bar i { position: absolute; inset: 0 auto 0 0; background: var(--ok); print-color-adjust: exact; }
+.bar i.over { background: var(--bad); }
+.bar b { position: absolute; top: -.15rem; bottom: -.15rem; border-left: 2px solid currentColor; }
+@media (prefers-color-scheme: dark) { :root { --ok: #81c784; --bad: #ef9a9a; } }
+"""
+
+
+def page(report: Report) -> str:
+    """The page: what is worst comes first."""
+    verdict = '<strong class="ok">passed</strong>' if report.ok else '<strong class="bad">failed</strong>'
+    facts = f"{escape(report.file)}, TRADE {escape(report.version)}, on {escape(report.host)}, {escape(report.at)}"
+    parts = [
+        "<!DOCTYPE html>",
+        '<html lang="en"><head><meta charset="utf-8">',
+        '<meta name="viewport" content="width=device-width, initial-scale=1">',
+        f"<title>Drill of {escape(report.robot)}</title><style>{_STYLE}</style></head><body>",
+        f"<h1>Drill of {escape(report.robot)}: {verdict}</h1><p>{facts}</p>",
+        "<p>Simulated devices; the times are from their log: from the deed until a joint was at rest for good.",
+        "The mark in a bar is the limit. Nothing of this is safety-rated.</p>",
+        *(_scene(played) for played in sorted(report.scenes, key=_severity)),
+        _left_out(report),
+        "</body></html>",
+    ]
+    return "\n".join(part for part in parts if part) + "\n"
+
+
+def _severity(played: Played) -> tuple[bool, float]:
+    return played.ok, -max((stop.part for stop in played.stops), default=0.0)
+
+
+def _scene(played: Played) -> str:
+    colour, word = ("ok", "ok") if played.ok else ("bad", "failed")
+    head = f'<h2>{escape(played.scene)} <small class="{colour}">{word}</small></h2>'
+    what = f"<p>{escape(played.what)} (shows {escape(played.shows)} of docs/safety.md)</p>"
+    what += "".join(f"<p>not held: {escape(problem)}</p>" for problem in played.problems)
+    if not played.stops:
+        return f"<section>{head}{what}</section>"
+    rows = "".join(map(_row, sorted(played.stops, key=lambda stop: -stop.part)))
+    columns = "<tr><th>joint</th><th>bus</th><th>moved for</th><th>limit</th><th></th><th></th></tr>"
+    return f"<section>{head}{what}<table>{columns}{rows}</table></section>"
+
+
+def _row(stop: Stop) -> str:
+    took = "-" if stop.took_s is None else f"{stop.took_s:.3f} s"
+    colour = "ok" if stop.verdict == "ok" else "bad"
+    again = f", {stop.again_s:.3f} s after the deed" if stop.again_s is not None else ""
+    width = min(100.0, stop.part * _LIMIT_PERCENT)
+    over = ' class="over"' if stop.part > 1 else ""
+    bar = f'<div><i{over} style="width: {width:.1f}%"></i><b style="left: {_LIMIT_PERCENT:.1f}%"></b></div>'
+    cells = f"<td>{escape(stop.joint)}</td><td>{escape(stop.bus)}</td><td>{took}</td><td>{stop.limit_s:.3f} s</td>"
+    return f'<tr>{cells}<td class="bar">{bar}</td><td class="{colour}">{stop.verdict}{again}</td></tr>'
+
+
+def _left_out(report: Report) -> str:
+    if not report.left_out:
+        return ""
+    items = "".join(f"<li>{escape(part)}: {escape(why)}</li>" for part, why in report.left_out.items())
+    return f"<section><h2>Left out</h2><ul>{items}</ul></section>"
