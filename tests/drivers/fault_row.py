@@ -23,6 +23,9 @@ STRUCK: Final = {
 """The ids of the devices that are struck."""
 
 
+_SILENT, _GONE = "degraded: silent", "degraded: bus gone"
+
+
 class Sick(msgspec.Struct, frozen=True, tag_field="do", tag="sick"):
     """The driver's own process says that it is not healthy: no fault of the simulator."""
 
@@ -106,7 +109,7 @@ class Row(NamedTuple):
             return self.bus_health
         if isinstance(self.state, str):
             return self.state or "healthy"
-        return {DeviceSilent: "degraded: silent", BusGone: "degraded: bus gone"}.get(self.state, "degraded: ")
+        return {DeviceSilent: f"{_SILENT}, or {_GONE}", BusGone: _GONE}.get(self.state, "degraded: ")
 
     @property
     def name(self) -> str:

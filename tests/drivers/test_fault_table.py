@@ -50,7 +50,7 @@ def test_a_fault_while_moving_ends_the_move_and_nothing_moves_on_recovery(row: R
 
     stood, rested = subject.travelled, written_now()
     wait_until(lambda: _tells(subject, row.state), f"state() tells {row.state!r}")
-    wait_until(lambda: row.registry in subject.told.get(subject.provider, "healthy"), row.registry)
+    wait_until(lambda: _one_of(row.registry, subject.told.get(subject.provider, "healthy")), row.registry)
     if row.refuses:
         _check_refused(row, subject)
     if row.then:

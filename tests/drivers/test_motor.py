@@ -14,7 +14,7 @@ def robot(head: Rig) -> AttachedRobot:
 
 
 def test_joints_and_groups_become_providers_in_groups_named_after_them(head: Rig, robot: AttachedRobot) -> None:
-    assert head.announced == [("rosie.neck.pan",), ("rosie.neck.tilt",), ("rosie.head",)]
+    assert head.announced == [("rosie.neck.pan",), ("rosie.neck.tilt",), ("rosie.head",), ("rosie.faults",)]
     assert [one.name for one in robot.group("head").resources] == ["rosie.neck.pan", "rosie.neck.tilt"]
     assert robot.group("head").resources[0] is robot.motor("neck.pan").resources[0]
     assert robot.group("head").joints() == ["rosie.neck.pan", "rosie.neck.tilt"]

@@ -37,7 +37,7 @@ class TestRobotiqGripper(GripperContract):
 
 def test_a_gripper_becomes_a_provider_in_the_group_named_after_it(hand: HandRig) -> None:
     robot = hand.attach()
-    assert hand.announced == [("rosie.left.hand",)]
+    assert hand.announced == [("rosie.left.hand",), ("rosie.faults",)]
     assert robot.gripper("left.hand").members == {"rosie": ["rosie.left.hand"], "rosie.left": ["rosie.left.hand"]}
     with pytest.raises(KeyError):
         robot.motor("left.hand")

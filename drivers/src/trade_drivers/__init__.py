@@ -13,7 +13,7 @@ from trade_drivers._senses import UNITS, Camera, CameraInfo, Image, Reading, Sen
 from trade_drivers._trajectory import Trajectory, TrajectoryPoint, planned
 from trade_drivers._without import without
 from trade_drivers._work import WireError
-from trade_drivers.faults import Fault, FaultInfo, FaultLog, FaultSample, Tell, Trouble
+from trade_drivers.faults import Fault, FaultInfo, FaultLog, FaultSample, Trouble
 from trade_drivers.robotfile import Bus, CanBus, Coupled, Group, Joint, Robot, SerialBus, UrBus, parse
 
 __all__ = [
@@ -59,7 +59,6 @@ __all__ = [
     "Sensor",
     "SensorInfo",
     "SerialBus",
-    "Tell",
     "Tolerances",
     "Trajectory",
     "TrajectoryPoint",
