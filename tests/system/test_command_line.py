@@ -278,7 +278,7 @@ def test_what_is_left_out_of_a_robot_is_named_and_not_looked_for(run, trade_comm
     while up.line() != "Ctrl-C leaves\n":
         pass
     listed = json.loads(trade_command("services", "--group", "rosie", "--json").stdout)
-    stayed = ("neck.pan", "neck.tilt", "head", "tail.root", "tail.tip", "tail", "bus.tail")
+    stayed = ("neck.pan", "neck.tilt", "head", "tail.root", "tail.tip", "tail", "bus.tail", "faults")
     assert {group for each in listed for group in each["groups"]} == {f"rosie.{name}" for name in stayed}
     nothing = trade_command("up", rosie, *out, "--without", "neck", "--without", "tail")
     assert "nothing would be left" in nothing.stderr
