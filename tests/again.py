@@ -19,7 +19,7 @@ from _pytest.runner import runtestprotocol
 _MOST: Final = 12
 _STILL_S: Final = 0.04
 """For so long a device of these tests may go unattended."""
-_LATE: Final = re.compile(r"was held up for [\d.]+ s|did not answer on \S+ within \d+ ms")
+_LATE: Final = re.compile(r"was held up for [\d.]+ s|did not answer on \S+ within \d+ ms|nobody answers;")
 _CLOCK: Final = f"""
 import os, time
 last = time.monotonic()
@@ -89,7 +89,7 @@ class Again:
         if still_s:
             return f"the computer stood still for {still_s:.2f} s"
         found = next(filter(None, (_LATE.search(report.longreprtext) for report in failed)), None)
-        return "" if found is None else f"it {found.group()}"
+        return "" if found is None else f"it said: {found.group()}"
 
 
 def _afresh(item: pytest.Item) -> bool:

@@ -55,7 +55,7 @@ def test_what_was_late_once_runs_again_and_is_told(tmp_path: Path) -> None:
     code, said = _run(tmp_path, "assert not first, 'its driver was held up for 0.35 s'")
     assert code == 0, said
     assert "ran twice: 1" in said
-    assert "test_late0.py::test_it: it was held up for 0.35 s" in said
+    assert "test_late0.py::test_it: it said: was held up for 0.35 s" in said
 
 
 def test_what_is_wrong_does_not_run_again(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ import pytest
 
 from trade_hil_sim import Arm, UrBus, events, instructions, motion_writes
 from trade_hil_sim.ur import HOME
+from waiting import wait_until
 
 pytest.importorskip("rtde_control", reason="ur-rtde has no wheel for this platform")
 DEADLINE_S = 60
@@ -142,7 +143,7 @@ print(json.dumps({"ok": ok, "off": after[0] - goal[0], "pose": pose, "end": r.ge
     assert told["pose"] == pytest.approx(controller.arm.pose((HOME[0] + 0.2, *HOME[1:])), abs=1e-6)
     assert abs(told["off"]) < 1e-6
     assert told["end"] == pytest.approx(told["line"], abs=1e-4)
-    assert len(events(controller.log.entries, "at_rest")) == 2
+    wait_until(lambda: len(events(controller.log.entries, "at_rest")) == 2, "both moves have come to rest")
     assert all(
         "until it ends" in entry.detail for entry in motion_writes(controller.log.entries) if entry.name != "upload"
     )
