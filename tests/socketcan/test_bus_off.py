@@ -22,7 +22,7 @@ def test_error_states_of_a_controller_are_told_as_they_come_and_go(
     leg: Leg, adapter: SlcanAdapter, robot: AttachedRobot
 ) -> None:
     monitor = robot.monitor("legs")
-    assert (monitor.bus_state().state, monitor.health) == ("error-active", "healthy")
+    assert (monitor.bus_state().state, monitor.health()) == ("error-active", "healthy")
     for letter, errors, state, health in (
         ("w", 96, "error-warning", "healthy"),
         ("p", 128, "error-passive", "degraded: CAN error-passive"),
@@ -30,7 +30,7 @@ def test_error_states_of_a_controller_are_told_as_they_come_and_go(
     ):
         adapter.say(letter, errors)
         wait_until(lambda state=state: monitor.bus_state().state == state, state)
-        assert monitor.health == health
+        assert monitor.health() == health
     assert monitor.bus_state().error_frames >= 3
     assert robot.motor("leg.hip").move_to(0.1) == pytest.approx(0.1, abs=0.01)
 
@@ -46,7 +46,7 @@ def test_S18_a_bus_off_while_moving_is_told_and_nothing_moves_when_it_is_over(
     assert isinstance(error, BusGone)
     assert f"ip link set {adapter.interface} down" in str(error)
     assert (monitor.bus_state().state, monitor.bus_state().up) == ("bus-off", False)
-    assert monitor.health == "degraded: CAN bus-off"
+    assert monitor.health() == "degraded: CAN bus-off"
     leg.wait_for("at_rest", HIP, started.t)  # by the drive's own watchdog
     mark = written_now()
     down(adapter.interface)
