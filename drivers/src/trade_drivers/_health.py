@@ -5,11 +5,11 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from typing import Final
 
+from trade._wire import HEALTHY
 from trade.errors import TradeError
 
 __all__ = ["HEALTHY", "HealthTeller"]
 
-HEALTHY: Final = "healthy"
 _LOOK_EVERY_S: Final = 0.5
 _END_S: Final = 5.0
 

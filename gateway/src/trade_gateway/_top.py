@@ -15,13 +15,13 @@ from rich.live import Live
 from rich.text import Text
 
 from trade import Container, Handle, LoadInfo, where
+from trade._wire import HEALTHY
 from trade_gateway._list import Json
 from trade_gateway._loads import loads_table
 from trade_gateway._output import Output, table_lines
 from trade_gateway._system_choice import visitor
 
 _ANSWERS_WITHIN_S: Final = 1.0
-_HEALTHY: Final = "healthy"
 
 
 class Unwell(Struct, frozen=True):
@@ -109,7 +109,7 @@ def _unwell(services: Sequence[Handle]) -> list[Unwell]:
     found = {
         Unwell(handle.groups[0] if handle.groups else handle.label, handle.container, handle.health)
         for handle in services
-        if handle.health != _HEALTHY
+        if handle.health != HEALTHY
     }
     return sorted(found, key=lambda one: one.group)
 

@@ -13,6 +13,7 @@ from msgspec import Struct
 from rich.markup import escape
 
 from trade import Constraint, Container, Estop, Handle, LockInfo, where
+from trade._wire import HEALTHY
 from trade.errors import TradeError
 from trade_gateway._list import Json, asked_for
 from trade_gateway._output import Output
@@ -24,7 +25,6 @@ _EVERY_S: Final = 0.3
 _ASKED_EVERY_S: Final = 1.0
 """How often every container is asked for its locks."""
 _NAMED: Final = 3
-_HEALTHY: Final = "healthy"
 _COLOURS: Final = {"is well": "green", "is not well": "bold red", "e-stop": "bold red", "cleared": "green"}
 
 _Key = TypeVar("_Key")
@@ -91,7 +91,7 @@ class Watched:
         known = container.services(here)
         self.services: Final = len(known)
         """How many there were at the beginning."""
-        self._health = {handle.key: handle.health for handle in known if handle.health != _HEALTHY}
+        self._health = {handle.key: handle.health for handle in known if handle.health != HEALTHY}
         self._meant = meant
         self._locks: dict[tuple[str, str], LockInfo] = {}
         self._estops: dict[str, Estop] = {}
@@ -113,15 +113,15 @@ class Watched:
             yield from self._of_estops(now)
 
     def _of_service(self, at: float, what: What, handle: Handle) -> Happening:
-        before = self._health.pop(handle.key, _HEALTHY)
+        before = self._health.pop(handle.key, HEALTHY)
         if what == "went":
             return Happening(at, what, handle.label, handle.container)
         health = handle.health
-        if health != _HEALTHY:
+        if health != HEALTHY:
             self._health[handle.key] = health
         if health == before:
             return Happening(at, what, handle.label, handle.container)
-        well = health == _HEALTHY
+        well = health == HEALTHY
         return Happening(
             at, "is well" if well else "is not well", handle.label, handle.container, "" if well else health
         )

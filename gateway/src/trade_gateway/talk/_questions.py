@@ -8,12 +8,12 @@ from typing import Any, Final, NamedTuple
 from msgspec import Struct
 
 from trade import Container, Handle, where
+from trade._wire import HEALTHY
 from trade.errors import ConfigurationError
 from trade_gateway.talk._memory import Memory
 
 __all__ = ["QUESTIONS", "Answer", "Question", "Unknown"]
 
-_HEALTHY: Final = "healthy"
 _SPLIT: Final = re.compile(r"[\s._]+")
 _NAMED: Final = 12
 """More names are counted, and not said."""
@@ -101,7 +101,7 @@ def _locks(container: Container, _: Memory, gaps: Mapping[str, str]) -> Answer:
 
 def _unwell(container: Container, _: Memory, gaps: Mapping[str, str]) -> Answer:
     bad = {(handle.groups or (handle.label,))[0]: handle.health for handle in _matching(container, gaps)}
-    bad = {group: health for group, health in bad.items() if health != _HEALTHY}
+    bad = {group: health for group, health in bad.items() if health != HEALTHY}
     stopped = [f"an e-stop is open, by {one.by}{f': {one.reason}' if one.reason else ''}" for one in container.estops()]
     said = [*stopped, *(f"{group}: {health}" for group, health in sorted(bad.items()))]
     return Answer(len(said), {"count": len(said), "problems": "; ".join(said)}, said)
