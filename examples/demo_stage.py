@@ -181,18 +181,14 @@ class Stage:
         with self._started("rosie", words, self.environment("robot", "rosie"), "robot") as rosie:
             yield rosie.ready()
 
-    @contextlib.contextmanager
-    def behaviour(self, program: str, *role: str) -> Generator[Actor]:
+    def behaviour(self, program: str, *role: str) -> contextlib.AbstractContextManager[Actor]:
         """One of the examples, on the laboratory's network."""
         words = [sys.executable, "-u", HERE / program, *role]
-        with self._started(" ".join((program, *role)), words, self.environment("lab", "planner")) as actor:
-            yield actor
+        return self._started(" ".join((program, *role)), words, self.environment("lab", "planner"))
 
-    @contextlib.contextmanager
-    def trade(self, who: str, *words: str | Path) -> Generator[Actor]:
+    def trade(self, who: str, *words: str | Path) -> contextlib.AbstractContextManager[Actor]:
         """A command that stays, of somebody of the laboratory."""
-        with self._started(f"trade {words[0]}", [*_TRADE, *words], self.environment("lab", who)) as actor:
-            yield actor
+        return self._started(f"trade {words[0]}", [*_TRADE, *words], self.environment("lab", who))
 
     def command(self, who: str, *words: str) -> str:
         """What `trade WORDS` says when somebody of the laboratory types it, complaints included."""
