@@ -309,6 +309,7 @@ def test_what_is_made_with_a_state_has_it_before_anybody_can_call_it(
     memory.settle()
     assert made["time"]() == 7
     made["strike"]()  # it is held still no longer
+    wait_until(lambda: len(seen) == len(made))
     assert set(seen) == {"restored 7"}
     ask(asker, "terminate", made["time"])
     assert events == ["restored 7", "clock closed"]

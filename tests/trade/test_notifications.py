@@ -7,6 +7,7 @@ import pytest
 
 from trade import Container, Handle, service, where
 from trade.errors import ConfigurationError, ServiceGone
+from waiting import wait_until
 
 
 class Lamp:
@@ -125,7 +126,7 @@ def test_a_failing_callback_kills_nothing(
     here.register(Lamp(), "one")
     here.register(Lamp(), "two")
     assert [listener.next().label for _ in range(2)] == ["one.switch", "two.switch"]
-    assert failed == ["one.switch", "two.switch"]
+    wait_until(lambda: failed == ["one.switch", "two.switch"] and notification.info().failures == 2)
     assert notification.active
     assert "the call of <Notification joined name='switch'> failed" in caplog.text
 
