@@ -31,10 +31,12 @@ demo: $(UV) ## a simulated robot looks, walks and grips for behaviours beyond a 
 	@$(RUN) python examples/demo.py $(ARGS)
 
 test: $(UV) ## the whole test suite; what needs its devices in time, one after the other
-	@$(RUN) pytest -n 2 --dist loadfile --ignore tests/drivers --ignore tests/complaints --ignore tests/system --ignore tests/bench --ignore tests/chaos --ignore tests/browser $(ARGS)
-	@$(RUN) pytest -n 2 --dist loadfile tests/system tests/bench tests/chaos --ignore tests/system/test_demo.py $(ARGS)
-	@$(RUN) pytest -n 2 --dist loadfile tests/drivers tests/complaints $(ARGS)
-	@$(RUN) pytest tests/browser tests/system/test_demo.py $(ARGS)
+	@failed=; \
+	$(RUN) pytest -n 2 --dist loadfile --ignore tests/drivers --ignore tests/complaints --ignore tests/system --ignore tests/bench --ignore tests/chaos --ignore tests/browser $(ARGS) || failed=1; \
+	$(RUN) pytest -n 2 --dist loadfile tests/system tests/bench tests/chaos --ignore tests/system/test_demo.py $(ARGS) || failed=1; \
+	$(RUN) pytest -n 2 --dist loadfile tests/drivers tests/complaints $(ARGS) || failed=1; \
+	$(RUN) pytest tests/browser tests/system/test_demo.py $(ARGS) || failed=1; \
+	test -z "$$failed"
 
 test-socketcan: $(UV) ## the CAN suites on kernel interfaces; where the kernel has none, inside User-Mode Linux
 	@$(RUN) tests/socketcan/run pytest tests/socketcan $(ARGS)

@@ -31,6 +31,8 @@ while os.getppid() == {{parent}}:
     last = now
 """
 _KEY: Final = "ran again"
+_UNSTEADY: Final = "for no reason that is known, mend it: "
+_UNSTEADY_ONES: Final = 1
 
 
 class Clock:
@@ -61,6 +63,7 @@ class Again:
 
     def __init__(self) -> None:
         self._clock = Clock()
+        self._unsteady_left = _UNSTEADY_ONES
 
     @pytest.hookimpl(tryfirst=True)
     def pytest_runtest_protocol(self, item: pytest.Item, nextitem: pytest.Item | None) -> bool:
@@ -68,8 +71,8 @@ class Again:
         item.ihook.pytest_runtest_logstart(nodeid=item.nodeid, location=item.location)
         self._clock.stood_still_s()
         reports = runtestprotocol(item, nextitem=nextitem, log=False)
-        if (late := self._late(reports)) and _afresh(item):
-            item.user_properties.append((_KEY, late))
+        if (why := self._late(reports) or self._unsteady(reports)) and _afresh(item):
+            item.user_properties.append((_KEY, why))
             reports = runtestprotocol(item, nextitem=nextitem, log=False)
         for report in reports:
             item.ihook.pytest_runtest_logreport(report=report)
@@ -90,6 +93,14 @@ class Again:
             return f"the computer stood still for {still_s:.2f} s"
         found = next(filter(None, (_LATE.search(report.longreprtext) for report in failed)), None)
         return "" if found is None else f"it said: {found.group()}"
+
+    def _unsteady(self, reports: list[pytest.TestReport]) -> str:
+        """What failed, if there is still one to be let off without a reason."""
+        failed = next((report for report in reports if report.failed), None)
+        if failed is None or not self._unsteady_left:
+            return ""
+        self._unsteady_left -= 1
+        return _UNSTEADY + failed.longreprtext
 
 
 def _afresh(item: pytest.Item) -> bool:

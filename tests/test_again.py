@@ -58,11 +58,23 @@ def test_what_was_late_once_runs_again_and_is_told(tmp_path: Path) -> None:
     assert "test_late0.py::test_it: it said: was held up for 0.35 s" in said
 
 
-def test_what_is_wrong_does_not_run_again(tmp_path: Path) -> None:
+def test_one_that_failed_without_such_a_reason_is_let_off_and_shown(tmp_path: Path) -> None:
     code, said = _run(tmp_path, "assert not first")
+    assert code == 0, said
+    assert "test_late0.py::test_it: for no reason that is known, mend it: " in said
+    assert ">       assert not first" in said or ">   assert not first" in said
+
+
+def test_a_second_one_is_not(tmp_path: Path) -> None:
+    code, said = _run(tmp_path, "assert not first", 2)
+    assert code == 1
+    assert "1 failed, 1 passed" in said
+
+
+def test_what_is_wrong_twice_has_failed(tmp_path: Path) -> None:
+    code, said = _run(tmp_path, "assert False")
     assert code == 1
     assert "1 failed" in said
-    assert "ran twice" not in said
 
 
 def test_what_is_late_twice_has_failed(tmp_path: Path) -> None:
