@@ -63,13 +63,13 @@ def test_one_provider_is_moved_and_not_several_or_none(scene: Scene) -> None:
 
 def test_it_is_withdrawn_before_it_is_offered_there(scene: Scene) -> None:
     count, _ = scene.counter()
-    seen: list[tuple[str, str]] = []
-    scene.asker.joined(where(name="count"), lambda one: seen.append(("joined", one.container)))
-    scene.asker.left(where(name="count"), lambda one: seen.append(("left", one.container)))
+    seen: list[list[str]] = []
+    there = where(name="count")
+    scene.asker.joined(there, lambda _: seen.append([one.container for one in scene.asker.services(there)]))
     scene.asker.migrate(count, to="new")
     scene.memory.settle()
-    wait_until(lambda: len(seen) == 2)
-    assert seen == [("left", "old"), ("joined", "new")]
+    wait_until(lambda: seen)
+    assert seen == [["new"]]
 
 
 def test_it_can_go_on_and_on(scene: Scene) -> None:
