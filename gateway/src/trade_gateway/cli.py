@@ -46,6 +46,7 @@ _COMMANDS: Final = {
     "call": (_SERVICES, "_call:call"),
     "stream": (_SERVICES, "_stream:stream"),
     "ask": (_SERVICES, "_ask:ask"),
+    "mcp": (_SERVICES, "_mcp:mcp"),
     "lock": (_MOTION, "_lock:lock"),
     "locks": (_MOTION, "_locks:locks"),
     "unlock": (_MOTION, "_locks:unlock"),
@@ -66,6 +67,7 @@ _COMMANDS: Final = {
     "rules": (_WATCHING, "_rules:app"),
     "pki": (_RIGHTS, "_pki_commands:app"),
     "policy": (_RIGHTS, "_policy:app"),
+    "approvals": (_RIGHTS, "_approvals:app"),
 }
 """By name: where help shows it, and the function or the group of commands that does it."""
 _COMPLETED: Final = ("COMP_WORDS", "_TYPER_COMPLETE_ARGS")

@@ -100,6 +100,27 @@ class Container(Hosting, Moving, Streaming, Tracing, Guarding, Bordering):
         """
         self._parts.audit.changed(what, about, running.get())
 
+    def note_asked(self, what: str, about: str = "", *, outcome: str = "ok", why: str = "", took_ns: int = 0) -> None:
+        """Have in the record, if one is kept, what somebody asked of a program that speaks for him: an agent's tool.
+
+        Args:
+            what: in a few words.
+            about: which service; no arguments, as these may be secret.
+            outcome: ``ok``, or the type of the error.
+            why: what the error says.
+            took_ns: how long it took.
+        """
+        own = self.address
+        self._parts.audit.note(
+            *("call", what),
+            about=about,
+            who=own.identity,
+            session=str(own),
+            outcome=outcome,
+            why=why,
+            took_ns=took_ns,
+        )
+
     def measured_by(self, tell: Callable[[], Iterable[Measure]]) -> None:
         """Have more in this container's metrics (`Settings.metrics`): it is called whenever somebody looks.
 

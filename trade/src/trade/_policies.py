@@ -53,6 +53,7 @@ class Policy:
         revoked: Iterable[str] = (),
         source: str = "policy",
         gateways: Iterable[str] = (),
+        approval: Mapping[str, Sequence[str]] | None = None,
     ) -> None:
         """Compile it.
 
@@ -62,12 +63,14 @@ class Policy:
             revoked: identities that may do nothing at all any more, stopping included.
             source: where it was read from, for people.
             gateways: identities that the transport believes whatever they pass on, as they have checked it.
+            approval: names, or patterns, to groups in which an agent of that name does nothing without a person's word.
         """
         self.source: Final = source
         self.roles: Final = {role.name: role for role in roles}
         self.identities: Final = {pattern: tuple(names) for pattern, names in identities.items()}
         self.revoked: Final = frozenset(revoked)
         self.gateways: Final = tuple(gateways)
+        self.approval: Final = {pattern: tuple(groups) for pattern, groups in (approval or {}).items()}
         self._of_role = {name: self._rights_of_role(name) for name in self.roles}
         self._of: dict[str, _Rights] = {}
 
@@ -98,6 +101,12 @@ class Policy:
     def authenticated(self, who: str) -> Decision:
         """Whether what everybody may do is open to an identity: to all but the revoked ones."""
         return Decision(False, f"{who} is revoked") if who in self.revoked else Decision(True, "everybody may")
+
+    def asks_first(self, who: str, group: str) -> bool:
+        """Whether an agent of that name needs a person's word for what does something in a whole dotted group."""
+        marked = {one for name, groups in self.approval.items() if fnmatch.fnmatchcase(who, name) for one in groups}
+        words = group.split(".")
+        return not marked.isdisjoint({EVERYTHING, *(".".join(words[:count]) for count in range(1, len(words) + 1))})
 
     def roles_of(self, who: str) -> tuple[str, ...]:
         """The roles of an identity, in the order of the policy; a revoked one has none."""

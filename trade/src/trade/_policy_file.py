@@ -20,11 +20,12 @@ else:
 __all__ = ["read_policy"]
 
 _PATTERN: Final = re.compile(r"[A-Za-z0-9_.@:*?-]{1,80}")
-_KEYS: Final = ("roles", "identities", "gateways", "revoked", "revoked_file")
+_KEYS: Final = ("roles", "identities", "gateways", "revoked", "revoked_file", "approval")
 _ROLE_KEYS: Final = (*VERBS, "includes")
 _EXAMPLES: Final = {
     "roles": '[roles.operator] and call = ["rosie"]',
     "identities": '[identities] and planner = ["operator"]',
+    "approval": '[approval] and "agent-*" = ["rosie.legs"]',
 }
 _Table = Mapping[str, object]
 
@@ -49,7 +50,12 @@ def read_policy(path: Path) -> Policy:
         if not isinstance(beside, str) or not beside:
             raise _wrong(f"{where}: revoked_file", 'must be a path, such as revoked_file = "revoked.toml"')
         revoked = (*revoked, *_revoked_elsewhere(path.parent / beside, where))
-    return Policy(roles.values(), identities, revoked, where, _names(raw, "gateways", where))
+    marked: _Table = _table(raw, "approval", where) if "approval" in raw else {}
+    approval = {
+        _checked_identity(name, f"{where}: approval"): _groups(groups, f'{where}: approval."{name}"')
+        for name, groups in marked.items()
+    }
+    return Policy(roles.values(), identities, revoked, where, _names(raw, "gateways", where), approval)
 
 
 def _load(path: Path) -> _Table:

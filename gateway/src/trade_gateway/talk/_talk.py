@@ -42,14 +42,21 @@ class Talk:
         self._lexicon = lexicon
         self._memory = memory
 
-    def say(self, sentence: str) -> Reply:
+    def say(self, sentence: str, *, orders: bool = True) -> Reply:
         """Do what a sentence asks.
+
+        Args:
+            sentence: in words of the lexicon.
+            orders: whether it may call services; otherwise it is understood as a question alone.
 
         Raises:
             NotUnderstood: it fits no phrase, or names something that there is not.
             TradeError: what the call led to.
         """
         phrase, gaps = self._lexicon.hear(sentence)
+        if phrase.call and not orders:
+            problem = f"that is an order, to call {phrase.call}; here are only questions"
+            raise NotUnderstood(where=repr(sentence), problem=problem)
         if phrase.call:
             return self._call(phrase, gaps)
         try:

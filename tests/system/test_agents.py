@@ -1,0 +1,81 @@
+"""An agent's client starts ``trade mcp`` as a program: what moves on the simulated robot is the judge."""
+
+import json
+import os
+import sys
+from typing import Any
+
+import anyio
+import psutil
+from anyio.to_thread import run_sync
+from mcp import ClientSession, StdioServerParameters
+from mcp.client.stdio import stdio_client
+
+from system.conftest import ROSIES_HEAD, Bench
+from waiting import wait_until
+
+FAR = [1.0, 0.0]
+
+
+def _program(*words: str) -> StdioServerParameters:
+    environment = {name: value for name, value in os.environ.items() if name.startswith("TRADE_") or name == "PATH"}
+    return StdioServerParameters(command=sys.executable, args=["-m", "trade_gateway", "mcp", *words], env=environment)
+
+
+async def _used(session: ClientSession, tool: str, **arguments: Any) -> Any:
+    answer = await session.call_tool(tool, arguments)
+    assert not answer.isError, answer.content
+    [content] = answer.content
+    assert content.type == "text"
+    return json.loads(content.text)
+
+
+def test_what_is_tried_on_the_twin_moves_nothing_and_is_what_the_robot_does_then(bench: Bench) -> None:
+
+    async def main() -> None:
+        async with (
+            stdio_client(_program("--twin", str(ROSIES_HEAD))) as (hears, says),
+            ClientSession(hears, says) as session,
+        ):
+            await session.initialize()
+            call = {"group": "rosie.head", "name": "move_to", "args": [[0.4, -0.2]]}
+            tried = await _used(session, "dry_run", **call)
+            assert tried["ok"], tried
+            assert tried["began_where_the_robot_is"]
+            assert [abs(round(one["position_rad"], 1)) for one in tried["after"]] == [0.4, 0.2]
+            beyond = await _used(session, "dry_run", **{**call, "args": [[9.0, 0.0]]})
+            assert not beyond["ok"]
+            assert beyond["error"].startswith("LimitExceeded")
+            assert not bench.rests("neck.pan")
+            taken = await _used(session, "lock", group="rosie.head", purpose="to look")
+            done = await _used(session, "call", **call)
+            assert [round(angle, 1) for angle in done["result"]] == [0.4, -0.2]
+            await _used(session, "unlock", lock=taken["lock"])
+
+    anyio.run(main)
+    assert round(bench.rests("neck.pan")[-1], 1) == 0.4
+    assert not [one for one in psutil.Process().children(recursive=True) if "--name twin" in " ".join(one.cmdline())]
+
+
+def test_S03_the_client_of_an_agent_dies_and_what_the_agent_moves_stops(bench: Bench) -> None:
+
+    def has_moved() -> bool:
+        return abs(bench.sim.control.device("neck.pan").position_rad) > 0.05
+
+    async def main() -> None:
+        async with stdio_client(_program()) as (hears, says), ClientSession(hears, says) as session:
+            await session.initialize()
+            await _used(session, "lock", group="rosie.head", purpose="to look")
+            slowly = {"args": {"positions_rad": FAR, "speed_rad_s": 0.1}, "deadline_s": 60}
+            async with anyio.create_task_group() as tasks:
+
+                async def moves() -> None:
+                    await session.call_tool("call", {"group": "rosie.head", "name": "move_to", **slowly})
+
+                tasks.start_soon(moves)
+                await run_sync(wait_until, has_moved, "the head has begun to move")
+                tasks.cancel_scope.cancel()
+
+    anyio.run(main)
+    wait_until(lambda: bench.rests("neck.pan"), "the head rests")
+    assert 0.0 < bench.rests("neck.pan")[-1] < FAR[0] / 2
