@@ -68,6 +68,8 @@ class Motion(NamedTuple):
     group: str
     joints: Sequence[str]
     tracks: Sequence[Track]
+    began_s: float = 0.0
+    """When its time is zero, in seconds since the epoch."""
 
     @property
     def duration_s(self) -> float:
@@ -127,7 +129,7 @@ def motion_of(group: str, states: Iterable[JointStates]) -> Motion:
     for joint, track in zip(joints, measured, strict=True):
         _whole(joint, track, began)
         tracks.append(Track([at - began for at, _ in track], [position for _, position in track]))
-    return Motion(group, joints, tracks)
+    return Motion(group, joints, tracks, began)
 
 
 def _whole(joint: str, track: Sequence[tuple[float, float]], began: float) -> None:
@@ -145,7 +147,8 @@ def moving(motion: Motion) -> Motion:
         return motion
     from_s = max(0.0, min(at_s for at_s in leaves if at_s is not None) - _REST_S)
     until_s = min(motion.duration_s, max(at_s for at_s in arrives if at_s is not None) + _REST_S)
-    return motion._replace(tracks=[_cut(track, from_s, until_s) for track in motion.tracks])
+    tracks = [_cut(track, from_s, until_s) for track in motion.tracks]
+    return motion._replace(tracks=tracks, began_s=motion.began_s + from_s)
 
 
 def _away(times_s: Sequence[float], positions_rad: Sequence[float]) -> float | None:
