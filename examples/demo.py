@@ -6,6 +6,7 @@ the simulator's own log of what the devices did; the demo fails if they disagree
     make demo                    the story, then everything ends
     make demo ARGS=--stay        and the robot stays up for you to play with
     make demo ARGS=--loopback    on loopback addresses, also where there could be network namespaces
+    make demo ARGS="--record demo.mcap"    and all that happens is recorded (docs/recordings.md)
 """
 
 import argparse
@@ -32,6 +33,15 @@ LOOKS_RAD = (0.6, -0.6, 0.0)
 OBJECT_M = 0.04
 ALL_THE_WAY_RAD = 1.2
 HEAD = where(group="rosie.head")
+
+
+class Options(argparse.Namespace):
+    """The words of the command line."""
+
+    stay: bool
+    loopback: bool
+    mute: bool
+    record: Path | None
 
 
 def title(number: int, what: str, why: str) -> None:
@@ -145,13 +155,16 @@ def expect(kind: type[Exception] | tuple[type[Exception], ...], act: Callable[[]
         raise DemoFailed("a call went through that should have been refused")
 
 
-def tell(scene: Stage, *, mute: bool, stay: bool) -> None:
+def tell(scene: Stage, recording: contextlib.ExitStack, options: Options) -> None:
     log = scene.folder / "bytes.jsonl"
     with scene.robot(log) as ready, SimControl(ready["control"]) as control:
         print(f"\nRosie is up on her network: head, arms, hand, legs and tail; {len(ready['services'])} services.")
         for bus, missing in scene.left_out.items():
             print(f"Left out: bus {bus}. Not installed: {missing}, of which there are no wheels for every platform.")
-        if mute:
+        if options.record:
+            recording.enter_context(scene.recorder(options.record))
+            print(f"All that she does from now on is recorded to {options.record}.")
+        if options.mute:
             control.mute(bus="neck")
             print("The simulator was muted: the servos of the head no longer answer.")
         judge = Judge(log)
@@ -164,7 +177,7 @@ def tell(scene: Stage, *, mute: bool, stay: bool) -> None:
         grip(scene, control)
         stop_everything(judge)
         look = trade.find(HEAD & where(name="move_to"))
-        if stay:
+        if options.stay:
             wait_for_the_user(scene)
             return
     come_back(scene, look)
@@ -189,7 +202,8 @@ def main() -> int:
     parser.add_argument("--stay", action="store_true", help="keep the robot up until Ctrl-C")
     parser.add_argument("--loopback", action="store_true", help="take loopback addresses for the networks")
     parser.add_argument("--mute", action="store_true", help="mute the simulated servos: the demo must fail")
-    options = parser.parse_args()
+    parser.add_argument("--record", type=Path, metavar="FILE.mcap", help="record all that happens to this new file")
+    options = parser.parse_args(namespace=Options())
     sys.stdout.reconfigure(line_buffering=True)  # type: ignore[union-attr]
     signal.signal(signal.SIGTERM, _interrupted)
     began_s = time.monotonic()
@@ -200,7 +214,8 @@ def main() -> int:
         ):
             print("\n".join(scene.places.told()))
             try:
-                tell(scene, mute=options.mute, stay=options.stay)
+                with contextlib.ExitStack() as recording:
+                    tell(scene, recording, options)
             except DemoFailed:
                 print("".join(scene.complaints()), file=sys.stderr)
                 raise

@@ -26,6 +26,8 @@ from trade_gateway._pki import Authority
 HERE = Path(__file__).parent
 ROBOT = HERE / "rosie.toml"
 PATIENCE_S = 60.0
+RECORD_HZ = "20"
+"""Samples of joints a second: half of what the slowest bus measures, so that two processors do for all of this."""
 _LAST = 20
 _NEW_NETWORK = 0x40000000
 """CLONE_NEWNET of setns(2)."""
@@ -44,6 +46,10 @@ includes = ["viewer"]
 call = ["rosie"]
 lock = ["rosie"]
 
+[roles.recorder]
+includes = ["viewer"]
+instrument = ["trade"]                 # to have containers note their calls
+
 [roles.chief]
 administer = ["*"]
 
@@ -53,6 +59,7 @@ planner = ["operator"]                 # the behaviours
 visitor = ["viewer"]
 keeper = ["chief", "operator"]         # makes objects in what it keeps up, and saves them
 anna = ["operator", "chief"]           # the demo itself
+archive = ["recorder"]                 # who records what happens, if that is asked for
 """
 
 
@@ -181,6 +188,14 @@ class Stage:
         with self._started("rosie", words, self.environment("robot", "rosie"), "robot") as rosie:
             yield rosie.ready()
 
+    @contextlib.contextmanager
+    def recorder(self, file: Path) -> Generator[None]:
+        """All that happens on the robot's network goes to a file, from now on until this ends."""
+        words = [*_TRADE, "record", file, "--hz", RECORD_HZ, "--attach", ROBOT, "--json"]
+        with self._started("trade record", words, self.environment("robot", "archive"), "robot") as recording:
+            recording.ready()
+            yield
+
     def behaviour(self, program: str, *role: str) -> contextlib.AbstractContextManager[Actor]:
         """One of the examples, on the laboratory's network."""
         words = [sys.executable, "-u", HERE / program, *role]
@@ -250,7 +265,7 @@ def stage(folder: Path, *, loopback: bool) -> Generator[Stage]:
         made = Stage(folder, places)
         (folder / "policy.toml").write_text(POLICY)
         authority = Authority.create(folder / "pki")  # what `trade pki init` and `trade pki issue` do
-        for name in ("rosie", "planner", "visitor", "keeper", "anna"):
+        for name in ("rosie", "planner", "visitor", "keeper", "anna", "archive"):
             authority.issue(name)
         for name, text in places.gateway_files(made.system).items():
             authority.issue(name, purpose="gateway", addresses=places.addresses)

@@ -9,7 +9,7 @@ import pytest
 from trade.errors import ConfigurationError, LimitExceeded
 from trade_drivers import JointLimits, Tolerances, planned
 from trade_gateway.recording._channels import JointStates
-from trade_gateway.recording._motion import Motion, Track, deviation, fitted, motion_of, trajectory
+from trade_gateway.recording._motion import Motion, Track, deviation, fitted, motion_of, moving, trajectory
 
 LIMITS = JointLimits(name="rosie.neck.pan", min_rad=-1.4, max_rad=1.4, max_speed_rad_s=2.5, max_accel_rad_s2=20.0)
 COUNT_RAD = math.tau / 4096
@@ -70,6 +70,29 @@ def test_half_the_speed_takes_twice_as_long() -> None:
     assert [point.positions_rad for point in slow] == [point.positions_rad for point in once]
     assert once[12].velocities_rad_s is not None
     assert slow[12].velocities_rad_s == [velocity / 2 for velocity in once[12].velocities_rad_s]
+
+
+def test_of_what_stands_still_at_both_ends_half_a_second_is_left() -> None:
+    whole = motion_of("rosie.head", states(seconds=60, late_s=40))
+    part = moving(whole)
+    once = moving(motion_of("rosie.head", states(seconds=4)))
+    assert part.duration_s == pytest.approx(once.duration_s, abs=0.03)
+    assert part.duration_s < 2.5
+    assert (part.start, part.tracks[0].at(9)) == ([0.0], whole.tracks[0].positions_rad[-1])
+    assert max(abs(part.tracks[0].at(t / 100) - once.tracks[0].at(t / 100)) for t in range(200)) < 0.05
+
+
+def test_a_joint_that_was_not_measured_while_the_others_moved_stays_where_it_was() -> None:
+    motion = Motion("rosie.head", ["pan", "tilt"], [Track([0, 5, 5.5, 10], [0, 0, 1, 1]), Track([0, 10], [0.3, 0.3])])
+    part = moving(motion)
+    assert [track.positions_rad[0] for track in part.tracks] == [0, 0.3]
+    assert [track.positions_rad[-1] for track in part.tracks] == [1, 0.3]
+    assert part.duration_s == pytest.approx(1.5, abs=0.03)
+
+
+def test_what_never_moved_stays_as_it_is() -> None:
+    motion = motion_of("rosie.head", states(scale=0.01))
+    assert moving(motion) == motion
 
 
 def test_what_is_beyond_a_limit_is_refused() -> None:

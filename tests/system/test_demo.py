@@ -1,22 +1,44 @@
 """``make demo``: the story is told to its end on both kinds of networks, and nothing is left of it."""
 
+import json
+import math
 import re
 import signal
+import subprocess
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import jsonschema_rs
 import pytest
+from mcap.reader import make_reader
 
 from doors import Client
 from system.conftest import ROOT, Program
 from system.networks import ip, why_not
+from trade_drivers import load
+from trade_gateway.recording._motion import Motion, Track, deviation, motion_of, motions, moving
+from trade_hil_sim import frames, motion_writes, read_log
 from waiting import wait_until
 
 pytestmark = pytest.mark.timeout(300)
 
 DEMO = ROOT / "examples" / "demo.py"
+ROSIE = ROOT / "examples" / "rosie.toml"
+TOPICS = {
+    *(f"/rosie.{group}/joints" for group in ("head", "right.arm", "legs", "tail")),
+    *("/calls", "/locks", "/faults"),
+}
+PATIENT = (
+    "rate_hz = 50            # SYNCs per second\nwatchdog_s = 0.3",
+    "rate_hz = 50\nstale_after_s = 2\nwatchdog_s = 2",
+)
+TOLERANCE_RAD = 0.1
+SPEED = 0.5
+"""What was measured rarely, on a busy host, looks quicker than it was, and its legs were near their limits."""
 Run = Callable[..., Program]
+Command = Callable[..., subprocess.CompletedProcess[str]]
 
 
 def told(demo: Program, until: str) -> str:
@@ -51,12 +73,73 @@ def test_rosie_walks_through_a_gateway_between_two_networks(run: Run) -> None:
     assert left_of(story) == []
 
 
-def test_rosie_walks_through_gateways_on_loopback_addresses(run: Run) -> None:
-    demo = run(DEMO, "--loopback")
+def test_rosie_walks_through_gateways_on_loopback_addresses_and_all_of_it_is_recorded_and_can_be_replayed(
+    run: Run, trade_command: Command, tmp_path: Path
+) -> None:
+    file = tmp_path / "demo.mcap"
+    demo = run(DEMO, "--loopback", "--record", file)
     story = told(demo, "agrees with what the devices did")
     assert demo.wait() == 0, demo.errors
     assert "loopback addresses of this host, as you said --loopback" in story
     assert "has the legs, for 'walk'" in story
+    said = by_topic(file)
+    assert said.keys() >= TOPICS | ({"/rosie.left.arm/joints"} if "bus left_arm" not in story else set())
+    assert {call["service"] for call in said["/calls"]} >= {
+        "rosie.head.move_to",
+        "rosie.legs.follow",
+        "rosie.lamp.shine",
+    }
+    assert {lock["purpose"] for locks in said["/locks"] for lock in locks["locks"]} >= {"walk", "watch the way"}
+    gone = [fault["about"] for fault in said["/faults"] if fault["kind"] == "gone"]
+    assert gone.count("rosie.lamp") >= 2  # killed, and at the end
+    assert gone.count("rosie.head") >= 3  # that of the first robot, too
+    assert_replayed(file, run, trade_command, tmp_path / "again.jsonl")
+
+
+def by_topic(file: Path) -> dict[str, list[Any]]:
+    """All that is in a recording, after each message was checked against the schema of its channel."""
+    found: dict[str, list[Any]] = {}
+    validators: dict[int, jsonschema_rs.Validator] = {}
+    with file.open("rb") as stream:
+        for schema, channel, message in make_reader(stream).iter_messages():
+            assert schema is not None
+            if schema.id not in validators:
+                validators[schema.id] = jsonschema_rs.validator_for(json.loads(schema.data))
+            said = json.loads(message.data)
+            validators[schema.id].validate(said)
+            found.setdefault(channel.topic, []).append(said)
+    return found
+
+
+def assert_replayed(file: Path, run: Run, trade_command: Command, log: Path) -> None:
+    """The walk, in a fresh simulation of the same robot: its own log has the drives where the recording has them."""
+    patient = log.with_name("rosie.toml")  # drives that do not stop at once where the host is busy
+    patient.write_text(ROSIE.read_text(encoding="utf-8").replace(*PATIENT), encoding="utf-8")
+    without = [word for bus in load(ROSIE).buses if bus.name != "legs" for word in ("--without", bus.name)]
+    words = ("--sim", "--sim-log", log, "--json", *without)
+    run("-m", "trade_gateway", "up", patient, *words).json()
+    assert trade_command("call", "rosie.legs.enable").returncode == 0
+    enabled_s = read_log(log)[-1].t
+    words = ("--group", "rosie.legs", "--speed", str(SPEED), "--tolerance-rad", "1")  # the log judges
+    done = trade_command("replay", file, *words)
+    assert done.returncode == 0, done.stdout + done.stderr
+    walked = moving(motion_of("rosie.legs", motions(file)["rosie.legs"]))
+    assert [round(max(track.positions_rad), 1) for track in walked.tracks][:2] == [0.3, 0.8]
+    began_s = motion_writes(read_log(log), since=enabled_s)[0].t
+    found, _ = deviation(walked, SPEED, Motion("rosie.legs", walked.joints, by_drives(log, began_s)))
+    assert max(found.greatest_rad) <= TOLERANCE_RAD
+
+
+def by_drives(log: Path, since: float) -> list[Track]:
+    """Where each drive of the legs said that it was, in the log of its simulation."""
+    tracks: list[Track] = []
+    for joint in load(ROSIE).joints_on("legs"):
+        assert joint.counts_per_rev
+        told = frames(read_log(log), "tpdo1", device_id=joint.id, since=since)
+        rad_per_count = math.tau / (joint.counts_per_rev * joint.gear)
+        counts = [int.from_bytes(frame.data[2:6], "little", signed=True) for frame in told]
+        tracks.append(Track([frame.t - since for frame in told], [count * rad_per_count for count in counts]))
+    return tracks
 
 
 def test_the_demo_fails_when_the_simulator_is_muted(run: Run) -> None:

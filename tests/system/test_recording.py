@@ -1,19 +1,24 @@
 """A robot's recording: killed, at a fault of its simulation, and replayed in another one."""
 
 import json
+import math
 import signal
 import subprocess
 import threading
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
+from itertools import dropwhile
 from pathlib import Path
 
 import pytest
 
 import trade
-from system.conftest import ROSIES_HEAD, Bench, Program, Rosie
+from system.conftest import ROOT, ROSIES_HEAD, Bench, Program, Rosie
 from trade import where
+from trade_gateway.recording._motion import Motion, Track, deviation, motion_of, motions, moving
 from trade_gateway.recording._reader import entries
-from trade_hil_sim import events, motion_writes, read_log
+from trade_hil_sim import SimControl, events, motion_writes, read_log
 from waiting import PATIENCE_S, wait_until
 
 
@@ -50,6 +55,10 @@ def test_a_fault_in_the_simulator_saves_the_seconds_before_it(
 
 WAY = ([0.5, -0.3], [-0.6, 0.3], [0.2, 0.1], [0.0, 0.0])
 TOLERANCE_RAD = 0.1
+ARM = ROOT / "examples" / "arm.toml"
+HOME = (0.0, -1.5708, 1.5708, -1.5708, -1.5708, 0.0)
+WAVES = ((0.5, -1.3), (-0.3, -1.6), (0.2, -1.4), HOME[:2])
+"""Of the base and the shoulder of the arm; the other joints stay at home."""
 
 
 @pytest.fixture
@@ -130,3 +139,83 @@ def test_a_robot_that_is_elsewhere_moves_only_if_it_is_told_to_go_to_the_start(
     assert len(motion_writes(read_log(log))) == count
     done = trade_command("replay", recorded[0], "--speed", "0.5", "--go-to-start", "--json")
     assert done.returncode == 0, done.stderr
+
+
+class Arm:
+    """A simulated arm that holds itself, and where it really was since then."""
+
+    def __init__(self, program: Program) -> None:
+        self.program = program
+        self.control = SimControl(program.json()["control"])
+        for name in ("power_on", "release_brakes"):
+            self.service(name)()
+        self.was: list[tuple[float, list[float]]] = []
+        self._ended = threading.Event()
+        self._looks = threading.Thread(target=self._look)
+        self._looks.start()
+
+    def service(self, name: str) -> trade.Handle:
+        return trade.find(where(name=name, group="ada.right", kind="Arm"), wait_s=PATIENCE_S).with_(
+            deadline_s=PATIENCE_S
+        )
+
+    def _look(self) -> None:
+        while not self._ended.wait(0.01):
+            self.was.append((time.monotonic(), self.control.arm("right").positions_rad))
+
+    def tracks(self) -> list[Track]:
+        """Where each joint was, from when the last of them was at home."""
+        was = list(dropwhile(lambda at: math.dist(at[1], HOME) > 0.02, self.was))
+        times_s = [at_s - was[0][0] for at_s, _ in was]
+        return [Track(times_s, list(angles)) for angles in zip(*(angles for _, angles in was), strict=True)]
+
+    def close(self) -> None:
+        self._ended.set()
+        self._looks.join()
+        self.control.close()
+        self.program.close()
+
+
+@pytest.fixture
+def arm_up(run: Callable[..., Program]) -> Iterator[Callable[[], Arm]]:
+    """Brings an arm up, simulated; one at a time."""
+    pytest.importorskip("rtde_control", reason="ur-rtde has no wheel for this platform")
+    with ExitStack() as undo:
+
+        def up() -> Arm:
+            arm = Arm(run("-m", "trade_gateway", "up", ARM, "--sim", "--json"))
+            undo.callback(arm.close)
+            return arm
+
+        yield up
+
+
+def test_an_arm_that_is_replayed_in_a_second_simulation_goes_where_it_went_in_the_first(
+    arm_up: Callable[[], Arm],
+    run: Callable[..., Program],
+    trade_command: Callable[..., subprocess.CompletedProcess[str]],
+    tmp_path: Path,
+) -> None:
+    first, file = arm_up(), tmp_path / "wave.mcap"
+    recording = run("-m", "trade_gateway", "record", file, "--json")
+    recording.wait_for(lambda line: line.get("messages", 0) > 20)
+    for wave in WAVES:
+        first.service("move_joints")([*wave, *HOME[2:]])
+    recording.signal(signal.SIGINT)
+    assert recording.wait() == 0
+    first.close()
+    wait_until(lambda: not trade.services(where(group="ada")))
+    second = arm_up()
+    second.service("move_joints")([0.3, *HOME[1:]])
+    second.was.clear()
+    refused = trade_command("replay", file, "--speed", "0.8")
+    assert refused.returncode == 1
+    assert "+0.30 rad off; --go-to-start moves it there first" in " ".join(refused.stderr.split())
+    words = ("--speed", "0.8", "--go-to-start", "--tolerance-rad", str(TOLERANCE_RAD), "--json")
+    done = trade_command("replay", file, *words)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["joints"] == [joint.name for joint in second.service("limits")().joints]
+    waved = moving(motion_of("ada.right", motions(file)["ada.right"]))
+    assert [round(max(track.positions_rad), 1) for track in waved.tracks][:2] == [0.5, -1.3]
+    found, _ = deviation(waved, 0.8, Motion("ada.right", waved.joints, second.tracks()), latest_s=PATIENCE_S)
+    assert max(found.greatest_rad) <= TOLERANCE_RAD

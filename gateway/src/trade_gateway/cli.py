@@ -58,6 +58,7 @@ _COMMANDS: Final = {
     "hooks": (_WATCHING, "_watchers:hooks"),
     "record": (_RECORDINGS, "recording._record:record"),
     "replay": (_RECORDINGS, "recording._replay:replay"),
+    "export": (_RECORDINGS, "recording._export:export"),
     "tracing": (_WATCHING, "_trace:tracing"),
     "trace": (_WATCHING, "_trace:trace"),
     "logs": (_WATCHING, "_logs:logs"),

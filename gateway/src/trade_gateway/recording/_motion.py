@@ -14,7 +14,7 @@ from trade_drivers import JointLimits, Tolerances, Trajectory, TrajectoryPoint, 
 from trade_gateway.recording._channels import JointStates, group_of
 from trade_gateway.recording._reader import entries
 
-__all__ = ["Deviation", "Motion", "Track", "deviation", "fitted", "motion_of", "motions", "trajectory"]
+__all__ = ["Deviation", "Motion", "Track", "deviation", "fitted", "motion_of", "motions", "moving", "trajectory"]
 
 _decode: Final = msgspec.json.Decoder(JointStates).decode
 _STEP_S: Final = 0.05
@@ -31,6 +31,8 @@ _SAME_S: Final = 0.002
 _GAP_S: Final = 0.5
 _STILL_RAD: Final = 0.02
 """A joint that is as near after a gap has not moved meanwhile."""
+_REST_S: Final = 0.5
+"""So much of standing still is left before and after what moves."""
 
 
 class Track(NamedTuple):
@@ -66,6 +68,8 @@ class Motion(NamedTuple):
     group: str
     joints: Sequence[str]
     tracks: Sequence[Track]
+    began_s: float = 0.0
+    """When its time is zero, in seconds since the epoch."""
 
     @property
     def duration_s(self) -> float:
@@ -125,7 +129,7 @@ def motion_of(group: str, states: Iterable[JointStates]) -> Motion:
     for joint, track in zip(joints, measured, strict=True):
         _whole(joint, track, began)
         tracks.append(Track([at - began for at, _ in track], [position for _, position in track]))
-    return Motion(group, joints, tracks)
+    return Motion(group, joints, tracks, began)
 
 
 def _whole(joint: str, track: Sequence[tuple[float, float]], began: float) -> None:
@@ -133,6 +137,32 @@ def _whole(joint: str, track: Sequence[tuple[float, float]], began: float) -> No
         if after_s - before_s > _GAP_S and abs(after - before) > _STILL_RAD:
             problem = f"{joint} was not measured from {before_s - began:.1f} to {after_s - began:.1f} s, while it moved"
             raise ConfigurationError(where="recording", problem=problem)
+
+
+def moving(motion: Motion) -> Motion:
+    """A motion without what stands still at its ends, but for half a second; one that never moves as it is."""
+    leaves = [_away(track.times_s, track.positions_rad) for track in motion.tracks]
+    arrives = [_away(track.times_s[::-1], track.positions_rad[::-1]) for track in motion.tracks]
+    if not any(at_s is not None for at_s in leaves):
+        return motion
+    from_s = max(0.0, min(at_s for at_s in leaves if at_s is not None) - _REST_S)
+    until_s = min(motion.duration_s, max(at_s for at_s in arrives if at_s is not None) + _REST_S)
+    tracks = [_cut(track, from_s, until_s) for track in motion.tracks]
+    return motion._replace(tracks=tracks, began_s=motion.began_s + from_s)
+
+
+def _away(times_s: Sequence[float], positions_rad: Sequence[float]) -> float | None:
+    """When a joint was measured last before it was elsewhere than at the beginning; None: it never was."""
+    for before_s, position in zip(times_s, positions_rad[1:], strict=False):
+        if abs(position - positions_rad[0]) > _STILL_RAD:
+            return before_s
+    return None
+
+
+def _cut(track: Track, from_s: float, until_s: float) -> Track:
+    inside = [(at_s, place) for at_s, place in zip(*track, strict=True) if from_s < at_s < until_s]
+    places = [(from_s, track.at(from_s)), *inside, (until_s, track.at(until_s))]
+    return Track([at_s - from_s for at_s, _ in places], [place for _, place in places])
 
 
 def fitted(motion: Motion, speed: float, limits: Sequence[JointLimits]) -> tuple[Trajectory, float]:

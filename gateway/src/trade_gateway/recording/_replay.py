@@ -31,7 +31,7 @@ def replay(
     ] = 0.1,
     as_json: Json = False,
 ) -> None:
-    """Move a group of joints as it was recorded, and say how far from that it was.
+    """Move a group of joints, or an arm, as it was recorded, and say how far from that it was.
 
     What is beyond the limits of the robot file is refused before anything moves, and so is a robot that is not where
     the recording begins. Ctrl-C stops.

@@ -142,7 +142,7 @@ class Sources:
             limits = where(name="limits", group=handle.groups[0], container=handle.container, kind="Arm")
             told = self._container.find(limits, wait_s=0).with_(deadline_s=_LIMITS_S)()
             names = self._arms[handle] = [joint.name for joint in told.joints]
-        return _arm_joints(handle, sample, names)
+        return _joints(handle, sample, names)
 
     def labels(self) -> list[str]:
         """What is listened to."""
@@ -177,9 +177,16 @@ def _faults(value: Any) -> list[tuple[str, str]]:
     return [(state.name, state.fault) for state in states]
 
 
-def joint_states(sample: Sample) -> JointStates:
-    """The state of a motor or of a group of joints, as it is recorded."""
-    value: Any = sample.value
+def joint_states(value: Any, at_s: float, arm_joints: list[str] | None = None) -> JointStates:
+    """The state of a motor, of a group of joints or of an arm, as it is recorded.
+
+    Args:
+        value: what its ``state`` answered.
+        at_s: when, in seconds since the epoch.
+        arm_joints: names of the joints of an arm; None: it is none.
+    """
+    if arm_joints is not None:
+        return _arm_states(value, at_s, arm_joints)
     motors: list[Any] = cast("list[Any]", value) if isinstance(value, list) else [value]
     return JointStates(
         names=[motor.name for motor in motors],
@@ -188,28 +195,25 @@ def joint_states(sample: Sample) -> JointStates:
         load=[motor.load for motor in motors],
         enabled=[motor.enabled for motor in motors],
         fault=[motor.fault for motor in motors],
-        stamp_s=[sample.at - motor.age_s for motor in motors],
+        stamp_s=[at_s - motor.age_s for motor in motors],
     )
 
 
-def _joints(handle: Handle, sample: Sample) -> Message:
-    states = joint_states(sample)
-    return Message(joints_channel(handle.groups[0]), 0, _ns(min(states.stamp_s)), encoded(states))
-
-
-def _arm_joints(handle: Handle, sample: Sample, names: list[str]) -> Message:
-    arm: Any = sample.value
-    stamp_s = sample.at - arm.age_s
-    states = JointStates(
+def _arm_states(arm: Any, at_s: float, names: list[str]) -> JointStates:
+    return JointStates(
         names=names,
         position_rad=arm.positions_rad,
         velocity_rad_s=arm.velocities_rad_s,
         load=[],
         enabled=[arm.enabled] * len(names),
         fault=[arm.fault] * len(names),
-        stamp_s=[stamp_s] * len(names),
+        stamp_s=[at_s - arm.age_s] * len(names),
     )
-    return Message(joints_channel(handle.groups[0]), 0, _ns(stamp_s), encoded(states))
+
+
+def _joints(handle: Handle, sample: Sample, arm_joints: list[str] | None = None) -> Message:
+    states = joint_states(sample.value, sample.at, arm_joints)
+    return Message(joints_channel(handle.groups[0]), 0, _ns(min(states.stamp_s)), encoded(states))
 
 
 def _image(handle: Handle, sample: Sample) -> Message:

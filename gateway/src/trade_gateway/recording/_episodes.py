@@ -1,0 +1,111 @@
+"""Episodes of a recording: what lies between two moments, as frames at even times."""
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import Final, NamedTuple
+
+import msgspec
+
+from trade.errors import ConfigurationError
+from trade_gateway.recording._channels import LOCKS, JointStates, Lock, Locks
+from trade_gateway.recording._motion import motion_of
+from trade_gateway.recording._reader import Entry
+from trade_gateway.recording._sources import within
+
+__all__ = ["Episode", "Span", "episodes", "locked"]
+
+_decode: Final = msgspec.json.Decoder(Locks).decode
+_ROUNDING: Final = 1e-6
+
+
+class Span(NamedTuple):
+    """A part of a recording, in seconds since the epoch."""
+
+    task: str
+    from_s: float = -math.inf
+    until_s: float = math.inf
+
+
+class Episode(NamedTuple):
+    """Where all joints were, at even times."""
+
+    task: str
+    states: Sequence[Sequence[float]]
+    """Of each frame: the angle of each joint in rad."""
+    actions: Sequence[Sequence[float]]
+    """Of each frame: the state one frame later, as recordings have no commands."""
+
+
+def locked(entries: Iterable[Entry], joints: Sequence[str]) -> list[Span]:
+    """The times in which somebody had a lock over any of some joints, each with the purpose of that lock."""
+    open_: dict[tuple[str, str], Span] = {}
+    """By owner and purpose: a lock over several containers is one."""
+    found: list[Span] = []
+    looked_s = last_s = -math.inf
+    for entry in entries:
+        last_s = max(last_s, entry.stamp_ns / 1e9)
+        if entry.topic != LOCKS.topic:
+            continue
+        now = _held(_decode(entry.data), joints)
+        for key, span in list(open_.items()):
+            taken_again_s = now.get(key, math.inf)
+            if taken_again_s > looked_s:
+                found.append(span._replace(until_s=min(taken_again_s, last_s)))
+                del open_[key]
+        for key, since_s in now.items():
+            open_.setdefault(key, Span(key[1], since_s))
+        looked_s = entry.stamp_ns / 1e9
+    found += [span._replace(until_s=last_s) for span in open_.values()]
+    return sorted(found, key=lambda span: span.from_s)
+
+
+def _held(locks: Locks, joints: Sequence[str]) -> dict[tuple[str, str], float]:
+    """Since when, by owner and purpose, of those over any of the joints."""
+    held: dict[tuple[str, str], float] = {}
+    for lock in locks.locks:
+        if _over(lock, joints):
+            key = lock.owner, lock.purpose
+            held[key] = min(lock.since_s, held.get(key, math.inf))
+    return held
+
+
+def _over(lock: Lock, joints: Sequence[str]) -> bool:
+    return any(within(joint, lock.resources) for joint in joints) if lock.resources else False
+
+
+def episodes(
+    states: Mapping[str, Sequence[JointStates]],
+    spans: Sequence[Span],
+    fps: int,
+    left_out: Callable[[Span, str], None],
+) -> Iterator[Episode]:
+    """What was measured in each span, straight lines between the measurements.
+
+    Args:
+        states: what was measured, by group; the joints of all of them are in each frame, in this order.
+        spans: the parts to take.
+        fps: frames a second.
+        left_out: told of a span that is no episode, and why: joints were not measured in it, or not all through.
+    """
+    for span in spans:
+        try:
+            found = _episode(states, span, fps)
+        except ConfigurationError as problem:
+            left_out(span, problem.problem)
+        else:
+            yield found
+
+
+def _episode(states: Mapping[str, Sequence[JointStates]], span: Span, fps: int) -> Episode:
+    motions = [
+        motion_of(group, [one for one in measured if span.from_s <= min(one.stamp_s) <= span.until_s])
+        for group, measured in states.items()
+    ]
+    tracks = [(motion.began_s, track) for motion in motions for track in motion.tracks]
+    from_s = max(began_s + track.times_s[0] for began_s, track in tracks)
+    until_s = min(began_s + track.times_s[-1] for began_s, track in tracks)
+    count = int((until_s - from_s) * fps + _ROUNDING)
+    if count < 1:
+        raise ConfigurationError(where="recording", problem=f"it has less than one frame at {fps} a second")
+    places = [[track.at(from_s + number / fps - began_s) for began_s, track in tracks] for number in range(count + 1)]
+    return Episode(span.task, places[:-1], places[1:])

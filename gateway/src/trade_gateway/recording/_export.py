@@ -1,0 +1,73 @@
+"""``trade export``: a recording as a dataset of episodes that learning programs read."""
+
+from enum import Enum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+
+from trade.errors import ConfigurationError
+from trade_gateway._list import Json
+from trade_gateway._output import Output, UsageError, complain
+from trade_gateway.recording import require
+
+
+class Cut(str, Enum):
+    """What one episode is."""
+
+    WHOLE = "whole"
+    LOCKS = "locks"
+
+
+def export(
+    file: Annotated[Path, typer.Argument(metavar="FILE.mcap", help="A recording.")],
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Where to make the dataset: new, or empty.")],
+    group: Annotated[
+        list[str] | None, typer.Option(help="Only these joints or this arm; repeatable. Default: all there are.")
+    ] = None,
+    fps: Annotated[int, typer.Option(min=1, max=1000, help="Frames a second.")] = 30,
+    cut: Annotated[
+        Cut, typer.Option("--episodes", help="whole: the recording is one; locks: each time somebody had the joints.")
+    ] = Cut.WHOLE,
+    task: Annotated[
+        str | None, typer.Option(help="What is done, in words. Default: the purpose of the lock, or the file's name.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Write the joints of a recording as a LeRobot dataset (v3.0): tables in Parquet, without pictures.
+
+    observation.state is what was measured, in rad; action is what was measured one frame later.
+
+    For example: trade export walk.mcap walk/ --group rosie.legs --episodes locks --fps 30
+    """
+    require("mcap", "export")
+    require("pyarrow", "export")
+    from trade_gateway.recording import _lerobot  # noqa: PLC0415 - loads what the other commands do not need
+    from trade_gateway.recording._episodes import Span, episodes, locked  # noqa: PLC0415 - likewise
+    from trade_gateway.recording._motion import motions  # noqa: PLC0415 - likewise
+    from trade_gateway.recording._reader import entries  # noqa: PLC0415 - likewise
+
+    found = motions(file)
+    if not found:
+        raise ConfigurationError(where=str(file), problem="has no joints")
+    groups = group or sorted(found)
+    if missing := [name for name in groups if name not in found]:
+        problem = f"{file} has no {', '.join(missing)}; it has {', '.join(sorted(found))}"
+        raise UsageError(where="--group", problem=problem)
+    states = {name: found[name] for name in groups}
+    joints = [joint for measured in states.values() for joint in measured[0].names]
+    spans = locked(entries(file), joints) if cut is Cut.LOCKS else [Span(file.stem)]
+    if task is not None:
+        spans = [span._replace(task=task) for span in spans]
+    made = list(episodes(states, spans, fps, lambda span, why: complain(f"{span.task} is left out: {why}")))
+    if not made:
+        raise ConfigurationError(where=str(file), problem=f"has no episode of {', '.join(groups)}")
+    _lerobot.write(folder, ", ".join(groups), joints, fps, made, file.name)
+    out, frames = Output(as_json=as_json), sum(len(episode.states) for episode in made)
+    if as_json:
+        tasks = [episode.task for episode in made]
+        out.data({"folder": str(folder), "episodes": len(made), "frames": frames, "joints": joints, "tasks": tasks})
+    for number, episode in enumerate(made):
+        out.say(f"  episode {number}: {escape(episode.task)}, {len(episode.states) / fps:.1f} s")
+    out.say(f"[bold]exported[/] {frames} frames of {len(joints)} joints to {escape(str(folder))}")
