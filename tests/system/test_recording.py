@@ -19,6 +19,7 @@ from trade import where
 from trade_gateway.recording._motion import Motion, Track, deviation, motion_of, motions, moving
 from trade_gateway.recording._reader import entries
 from trade_hil_sim import SimControl, events, motion_writes, read_log
+from viewers import viewer
 from waiting import PATIENCE_S, wait_until
 
 
@@ -219,3 +220,36 @@ def test_an_arm_that_is_replayed_in_a_second_simulation_goes_where_it_went_in_th
     assert [round(max(track.positions_rad), 1) for track in waved.tracks][:2] == [0.5, -1.3]
     found, _ = deviation(waved, 0.8, Motion("ada.right", waved.joints, second.tracks()), latest_s=PATIENCE_S)
     assert max(found.greatest_rad) <= TOLERANCE_RAD
+@pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM])
+def test_a_viewer_sees_live_what_a_recording_would_have(
+    rosie_up: Callable[[], Rosie], run: Callable[..., Program], ending: signal.Signals
+) -> None:
+    rosie_up()
+    showing = run("-m", "trade_gateway", "foxglove", "--group", "rosie.head", "--port", "0", "--json")
+    ready = showing.json()
+    assert ready["services"] == ["rosie.head.state"]
+    with viewer(ready["url"]) as looking:
+        looking.subscribe("/rosie.head/joints")
+        places: list[float] = []
+        look = trade.find(where(name="move_to", group="rosie.head"), wait_s=PATIENCE_S).start([0.5, 0.0])
+        while not places or places[-1] < 0.4:
+            places.append(looking.message()[2]["position_rad"][0])
+        look.result()
+        assert places[0] < 0.1
+        assert len({round(place, 2) for place in places}) > 5
+        looking.subscribe("/locks")
+        while looking.message()[0] != "/locks":
+            pass
+        showing.signal(ending)
+        assert showing.wait() == 0
+    assert showing.errors == []
+
+
+def test_beyond_this_host_the_live_view_warns_that_everybody_can_look_on(
+    run: Callable[..., Program],
+) -> None:
+    showing = run("-m", "trade_gateway", "foxglove", "--host", "127.1", "--port", "0", "--json")
+    showing.json()
+    showing.signal(signal.SIGINT)
+    assert showing.wait() == 0
+    assert "warning: whoever reaches ws://127.1:" in "".join(showing.errors)

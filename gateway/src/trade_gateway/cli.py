@@ -21,7 +21,7 @@ _ROBOTS: Final = "Robots, containers and networks"
 _OPERATION: Final = "Keeping it up"
 _HARDWARE: Final = "Setting hardware up"
 _WATCHING: Final = "Watching and rules"
-_RECORDINGS: Final = "Recordings"
+_RECORDINGS: Final = "Recordings and live views"
 _RIGHTS: Final = "Identities and rights"
 
 _COMMANDS: Final = {
@@ -57,6 +57,7 @@ _COMMANDS: Final = {
     "notifications": (_WATCHING, "_watchers:notifications"),
     "hooks": (_WATCHING, "_watchers:hooks"),
     "record": (_RECORDINGS, "recording._record:record"),
+    "foxglove": (_RECORDINGS, "recording._foxglove:foxglove"),
     "replay": (_RECORDINGS, "recording._replay:replay"),
     "export": (_RECORDINGS, "recording._export:export"),
     "tracing": (_WATCHING, "_trace:tracing"),

@@ -6,7 +6,6 @@ import ssl
 import threading
 from collections.abc import AsyncGenerator, Collection, Sequence
 from contextlib import asynccontextmanager
-from ipaddress import ip_address
 from pathlib import Path
 from socket import AF_INET, AF_INET6, SO_REUSEADDR, SOL_SOCKET, socket
 from typing import Final
@@ -20,6 +19,7 @@ from starlette.routing import WebSocketRoute
 
 from trade import Container
 from trade.errors import ConfigurationError
+from trade_gateway._hosts import in_url, is_loopback
 from trade_gateway.dashboard import pages
 from trade_gateway.door._deeds import Deeds
 from trade_gateway.door._entry import Entry
@@ -76,11 +76,11 @@ class Door:
             problem = "nobody could come in: make a token with trade door token NAME"
             raise ConfigurationError(where=f"door {listen}", problem=problem)
         self._deeds = deeds
-        names = {*LOOPBACK_NAMES, *hosts} if _is_loopback(host) else {_in_url(host), *hosts}
+        names = {*LOOPBACK_NAMES, *hosts} if is_loopback(host) else {in_url(host), *hosts}
         self._app = _application(deeds, tokens, names, origins)
         context = None if tls is None else _context(tls)
         self._socket = _bound(host, port)
-        self.url: Final = f"http{'s' if tls else ''}://{_in_url(host)}:{self._socket.getsockname()[1]}"
+        self.url: Final = f"http{'s' if tls else ''}://{in_url(host)}:{self._socket.getsockname()[1]}"
         """Where it is."""
         config = uvicorn.Config(
             self._app,
@@ -178,22 +178,9 @@ def _address(listen: str) -> tuple[str, int]:
     return host.strip("[]"), int(port)
 
 
-def _is_loopback(host: str) -> bool:
-    if host == "localhost":
-        return True
-    try:
-        return ip_address(host).is_loopback
-    except ValueError:
-        return False
-
-
-def _in_url(host: str) -> str:
-    return f"[{host}]" if ":" in host else host
-
-
 def _check_reach(listen: str, host: str, deeds: Deeds, tls: Path | None) -> None:
     """S21: raises ConfigurationError if it would be reached from a network by accident."""
-    if _is_loopback(host):
+    if is_loopback(host):
         return
     if tls is None:
         problem = "is beyond this host, where tokens would be read by others: --tls FOLDER, which trade pki issue makes"
