@@ -10,10 +10,12 @@ from starlette.routing import Route
 
 _MODULES: Final = (
     "app",
+    "calls",
     "chain",
     "devices",
     "door",
     "estop",
+    "faults",
     "jog",
     "locks",
     "log",

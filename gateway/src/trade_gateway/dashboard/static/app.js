@@ -1,13 +1,15 @@
 // The dashboard: a client of the door like any other. It comes, asks, goes and comes back.
 
+import { readCalls, showCalls } from "./calls.js";
 import { STATE_HZ } from "./devices.js";
 import { door } from "./door.js";
 import { lookForEstops } from "./estop.js";
+import { lookAtFaults } from "./faults.js";
 import { lookForLocks } from "./locks.js";
 import { readLog } from "./log.js";
 import { $, sleep, tell, write } from "./page.js";
 import { forget, lookAround, paintAll } from "./robots.js";
-import { lookAtContainers, lookAtWatchers } from "./system.js";
+import { lookAtAudit, lookAtContainers, lookAtPolicy, lookAtWatchers } from "./system.js";
 
 const ASK_AGAIN_MS = 1000;
 const LONGEST_PAUSE_MS = 4000;
@@ -47,6 +49,7 @@ async function signIn(error) {
   write($("link"), "Not signed in");
   write($("who"), "");
   document.body.classList.remove("offline");
+  document.body.classList.add("outside");
   write($("login-problem"), door.token ? error.message : "");
   $("token").focus();
   await new Promise((done) => {
@@ -58,6 +61,7 @@ async function signIn(error) {
     };
   });
   sessionStorage.setItem("token", door.token);
+  document.body.classList.remove("outside");
 }
 
 $("leave").onclick = () => {
@@ -76,8 +80,10 @@ async function main() {
       pause_ms = 250;
       forget();
       door.begin({ do: "watch" }, onChange).ended.catch(() => {});
-      if (door.me.reads) readLog();
-      else write($("log-problem"), "It is for who may read the system (group trade).");
+      if (door.me.reads) {
+        readLog();
+        readCalls();
+      } else write($("log-problem"), "It is for who may read the system (group trade).");
       lookAround().catch((error) => tell(error.message));
       await closed;
     } catch (error) {
@@ -98,4 +104,8 @@ keepAsking(lookForEstops, ASK_AGAIN_MS);
 keepAsking(lookForLocks, ASK_AGAIN_MS);
 keepAsking(lookAtContainers, 4 * ASK_AGAIN_MS);
 keepAsking(lookAtWatchers, 3 * ASK_AGAIN_MS);
+keepAsking(lookAtFaults, 2 * ASK_AGAIN_MS);
+keepAsking(showCalls, ASK_AGAIN_MS);
+keepAsking(lookAtPolicy, 5 * ASK_AGAIN_MS);
+keepAsking(lookAtAudit, 5 * ASK_AGAIN_MS);
 main();

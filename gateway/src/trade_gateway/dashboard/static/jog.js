@@ -1,10 +1,10 @@
 // Hold to move.
 
 import { door } from "./door.js";
-import { $, make, sleep } from "./page.js";
+import { $, make, sleep, write } from "./page.js";
 
 const JOG_EVERY_MS = 80;
-const JOG_VALID_S = 0.2; // so long a set-point holds: whatever happens to this page, motion ends then
+export const JOG_VALID_S = 0.2; // so long a set-point holds: whatever happens to this page, motion ends then
 
 const held = new Set();
 
@@ -12,16 +12,20 @@ export function releaseAll() {
   for (const jog of [...held]) jog.release();
 }
 
-/** One direction of one joint. It moves while it is held and this page is visible, by set-points that end by themselves. */
+/**
+ * One direction of one joint of a device. It moves while it is held and this page is visible, by set-points that end by
+ * themselves: the device says which service takes them, and how fast the joint would turn.
+ */
 export class Jog {
   #moving = false;
   #stopped = Promise.resolve();
 
-  constructor(joint, sign) {
-    this.joint = joint;
+  constructor(device, name, sign, place = 0) {
+    this.device = device;
     this.sign = sign;
+    this.place = place; // among the joints of the device
     const way = sign < 0 ? "negative" : "positive";
-    const label = `Hold to turn ${joint.name} in the ${way} direction`;
+    const label = `Hold to turn ${name} in the ${way} direction`;
     const parts = [make("span", { "aria-hidden": "true" }, sign < 0 ? "◀ −" : "+ ▶"), make("small")];
     this.button = make("button", { type: "button", class: "hold", "aria-label": label, "aria-pressed": "false" }, ...parts);
     this.button.onpointerdown = (event) => {
@@ -42,7 +46,7 @@ export class Jog {
       if (event.key === " " || event.key === "Enter") this.release();
     };
     this.button.onclick = (event) => {
-      if (event.detail === 0 && !this.pressed) this.joint.say("Hold Space or Enter to move.");
+      if (event.detail === 0 && !this.pressed) this.device.say("Hold Space or Enter to move.");
     };
   }
 
@@ -51,43 +55,54 @@ export class Jog {
   }
 
   get speed_rad_s() {
-    return (this.joint.limits.max_speed_rad_s * Number($("speed").value)) / 100;
+    return (this.device.joint_limits[this.place].max_speed_rad_s * Number($("speed").value)) / 100;
+  }
+
+  write_speed() {
+    write(this.button.lastChild, `${this.speed_rad_s.toFixed(3)} rad/s`);
+  }
+
+  /** Whether it may be held; who holds it while it may not any more lets go. */
+  let(allowed) {
+    this.button.disabled = !allowed;
+    if (!allowed) this.release();
   }
 
   press() {
     if (this.pressed || this.button.disabled || document.visibilityState !== "visible" || !door.connected) return;
     held.add(this);
     this.button.setAttribute("aria-pressed", "true");
-    this.joint.say("");
-    this.joint.busy = this.joint.busy.then(() => this.#run());
+    this.device.say("");
+    this.device.busy = this.device.busy.then(() => this.#run());
   }
 
   release() {
     if (!held.delete(this)) return;
     this.button.setAttribute("aria-pressed", "false");
-    if (this.#moving) this.#stopped = this.joint.stop();
+    if (this.#moving) this.#stopped = this.device.stop();
   }
 
   async #run() {
     if (!this.pressed) return;
-    const { group, resources } = this.joint;
+    const { group, resources } = this.device;
     let lock = "";
     try {
       if (!door.has_locked(resources)) lock = await door.lock(group, "jog by hand", 0.5);
+      const setpoint = this.device.setpoints(this);
       while (this.pressed) {
         this.#moving = true;
         const next = sleep(JOG_EVERY_MS);
-        const args = { velocity_rad_s: this.sign * this.speed_rad_s, valid_s: JOG_VALID_S };
-        await door.call(group, "set_velocity", args, { deadline_s: 1 }); // one at a time: none piles up on a slow link
+        const [name, args] = setpoint();
+        await door.call(group, name, { ...args, valid_s: JOG_VALID_S }, { deadline_s: 1 }); // one at a time: none piles up on a slow link
         await next;
       }
     } catch (error) {
-      if (this.pressed) this.joint.refused(error);
+      if (this.pressed) this.device.refused(error);
     } finally {
       this.release();
       this.#moving = false;
       await this.#stopped;
-      if (lock && door.connected) await door.unlock(lock).catch((error) => this.joint.refused(error));
+      if (lock && door.connected) await door.unlock(lock).catch((error) => this.device.refused(error));
     }
   }
 }

@@ -39,6 +39,7 @@ export function show(element, key, children) {
 
 export const fixed = (value, digits) => (value >= 0 ? "+" : "−") + Math.abs(value).toFixed(digits);
 export const degrees = (rad) => `${fixed((rad * 180) / Math.PI, 1)}°`;
+export const moment = (seconds) => new Date(seconds * 1000).toLocaleString();
 export const clock = (seconds) => new Date(seconds * 1000).toLocaleTimeString();
 
 let told_for = 0;
@@ -50,14 +51,17 @@ export function tell(text) {
   told_for = setTimeout(() => write($("told"), ""), TOLD_FOR_MS);
 }
 
+/** A table; a cell is a text, or what a button says and does: `{ label, act, name }`. Without rows, a sentence. */
 export function table(element, caption, columns, rows, none) {
-  show(element, JSON.stringify(rows), () => {
+  show(element, JSON.stringify([rows, none]), () => {
     if (!rows.length) return [make("p", { class: "note" }, none)];
     const head = make("tr", {}, ...columns.map((name) => make("th", { scope: "col" }, name)));
-    const lines = rows.map(([first, ...rest]) => make("tr", {}, make("th", { scope: "row" }, first), ...rest.map((text) => make("td", {}, text))));
+    const lines = rows.map(([first, ...rest]) => make("tr", {}, make("th", { scope: "row" }, first), ...rest.map((cell) => make("td", {}, cellOf(cell)))));
     const whole = make("table", {}, make("caption", {}, caption), make("thead", {}, head), make("tbody", {}, ...lines));
     return [make("div", { class: "wide", tabindex: 0, role: "region", "aria-label": caption }, whole)];
   });
 }
+
+const cellOf = (cell) => (typeof cell === "string" ? cell : button(cell.label, cell.act, { "aria-label": cell.name }));
 
 export const measure = (value, digits, unit) => (value === null || value === undefined ? "—" : `${value.toFixed(digits)} ${unit}`.trim());

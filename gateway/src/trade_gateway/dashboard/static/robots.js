@@ -20,8 +20,8 @@ export function paintAll() {
 
 function showFaults(bad) {
   const key = JSON.stringify([devices.size, bad.map((one) => one.group)]);
-  $("faults").className = bad.length ? "problem" : "note";
-  show($("faults"), key, () => {
+  $("ailing").className = bad.length ? "problem" : "note";
+  show($("ailing"), key, () => {
     if (!devices.size) return [];
     if (!bad.length) return ["✓ Nothing reports a fault."];
     const links = bad.map((one) => make("a", { href: `#at-${one.group}` }, one.name));
@@ -117,5 +117,5 @@ export function forget() {
 
 $("speed").oninput = () => {
   write($("speed-value"), `${$("speed").value} %`);
-  for (const device of devices.values()) device.write_speed?.();
+  for (const device of devices.values()) device.write_speed();
 };
