@@ -189,6 +189,7 @@ def test_calls_are_told_as_they_end_to_who_reads_the_system_once_they_are_noted(
         with chief.socket() as page:
             say(page, do="calls", id=1)
             for number in (1.0, 2.0):  # what was noted before is told at most once, what comes is told, too
+                anna.call("robot.a.where_is_it")
                 anna.call("robot.a.move", number)
                 told = [heard(page)["call"] for _ in ("asked", "served")]
                 assert {one["service"] for one in told} == {"robot.a.move"}
@@ -196,7 +197,9 @@ def test_calls_are_told_as_they_end_to_who_reads_the_system_once_they_are_noted(
                 assert len({one["id"] for one in told}) == 1
                 assert all("/anna." in one["session"] for one in told)
             say(page, do="cancel", id=2, which=1)
-            assert heard(page)["result"] == {"cancelled": True}
+            assert {(told := heard(page))["id"]: told["result"] for _ in "12"} == {1: None, 2: {"cancelled": True}}
+            say(page, do="calls", id=3, reads=True)
+            assert heard(page)["call"]["service"] == "robot.a.where_is_it"
         with anna.socket() as page:
             assert ask(page, do="calls", id=1)["problem"]["title"] == "AccessDenied"
     finally:

@@ -10,10 +10,16 @@ _MOST: Final = 200
 
 
 class CallReader:
-    """Reads on where it was: each call once, or twice if who called and who served it are both traced."""
+    """Reads on where it was: each call once, or twice if who called and who served it are both traced.
 
-    def __init__(self, container: Container) -> None:
+    Args:
+        container: of whose system.
+        reads: also calls of services that only read.
+    """
+
+    def __init__(self, container: Container, *, reads: bool) -> None:
         self._container = container
+        self._reads = reads
         self._read: dict[Handle, int] = {}
         """By what tells of a container's calls, the number of the last one told."""
 
@@ -24,6 +30,7 @@ class CallReader:
             AccessDenied: the policy does not let this container read group ``trade``.
         """
         handles, first = self._container.services(where(name="spans", group="trade")), not self._read
+        left_out = set() if self._reads else {one.label for one in self._container.services() if one.effect == "read"}
         new: list[Span] = []
         for outcome in self._container.call_all([one.bind(None, self._read.get(one, 0)) for one in handles]):
             if isinstance(outcome.error, AccessDenied):
@@ -32,6 +39,6 @@ class CallReader:
                 continue
             spans: list[Span] = outcome.result
             self._read[outcome.handle] = spans[-1].number if spans else self._read.get(outcome.handle, 0)
-            new += spans
+            new += [span for span in spans if span.service not in left_out]
         new.sort(key=lambda span: (span.began, span.call_id))
         return new[-_MOST:] if first else new

@@ -121,6 +121,8 @@ class Logs(Struct, tag="logs", tag_field="do", forbid_unknown_fields=True, kw_on
 
 class Calls(Struct, tag="calls", tag_field="do", forbid_unknown_fields=True, kw_only=True):
     id: Id
+    reads: bool = False
+    """Also those of services that only read: streams make many of them."""
 
 
 class Cancel(Struct, tag="cancel", tag_field="do", forbid_unknown_fields=True, kw_only=True):

@@ -62,9 +62,9 @@ class Overview:
         self._judge.require_system(who, "read", "calls")
         return await self._counted(who, reader.read)
 
-    def ended(self) -> CallReader:
-        """Of all calls of the system that are noted, from what is kept of them."""
-        return CallReader(self._container)
+    def ended(self, *, reads: bool) -> CallReader:
+        """Of the calls of the system that are noted, from what is kept of them."""
+        return CallReader(self._container, reads=reads)
 
     def containers(self) -> list[messages.ContainerView]:
         """Those of the system."""

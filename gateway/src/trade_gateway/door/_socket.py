@@ -268,7 +268,7 @@ class Conversation:
             lines = await self._deeds.overview.log_lines(self._client.identity, reader)
 
     async def _calls(self, asked: messages.Calls) -> None:
-        reader = self._deeds.overview.ended()
+        reader = self._deeds.overview.ended(reads=asked.reads)
         while True:
             for span in await self._deeds.overview.calls(self._client.identity, reader):
                 await self._say({"id": asked.id, "call": messages.call_view(span)})

@@ -11,8 +11,9 @@ let reading = null;
 
 /** Read on from what is kept; of a connection that ended nothing comes any more. */
 export function readCalls() {
+  if (reading) door.cancel(reading.id);
   ended.clear();
-  const here = door.begin({ do: "calls" }, ({ call }) => {
+  const here = door.begin({ do: "calls", reads: $("call-reads").checked }, ({ call }) => {
     if (here === reading && !(call.side === "asked" && ended.has(call.id))) {
       ended.delete(call.id);
       ended.set(call.id, call);
@@ -51,4 +52,5 @@ async function note(on) {
 
 $("note-calls").onclick = () => note(true);
 $("note-no-calls").onclick = () => note(false);
+$("call-reads").onchange = readCalls;
 $("call-search").oninput = showCalls;

@@ -279,7 +279,7 @@ export class Gripper extends Device {
 }
 
 export class Arm extends Device {
-  static offers = [["power_on", "Power on"], ["release_brakes", "Release brakes"], ["unlock_protective_stop", "Unlock"]];
+  static offers = [["power_on", "Power on"], ["release_brakes", "Release brakes"], ["unlock_protective_stop", "Unlock protective stop"]];
   static moved_by = "servo";
 
   /** A row for each joint, once it is known how many there are. */

@@ -4,7 +4,7 @@ import { door } from "./door.js";
 import { $, moment, table, tell } from "./page.js";
 import { services } from "./schemas.js";
 
-const COLUMNS = ["Device", "Fault", "Now", "Times", "Last", "What to do", "Seen by"];
+const COLUMNS = ["Device", "Fault", "Now", "Seen by", "What to do", "Times", "Last"];
 
 export async function lookAtFaults() {
   const logs = services.filter((one) => one.name === "faults" && one.group.endsWith(".faults"));
@@ -24,7 +24,7 @@ async function faultsOf(log, open_only) {
 function rowOf(one) {
   const see = { label: "I have seen it", act: () => acknowledge(one), name: `I have seen: ${one.text}` };
   const seen = one.acknowledged_by || (one.may ? see : "nobody");
-  return [one.device, one.kind, one.open ? "✕ there" : "gone", `${one.count}`, moment(one.last_at), one.remedy || "—", seen];
+  return [one.device, one.kind, one.open ? "✕ there" : "gone", seen, one.remedy || "—", `${one.count}`, moment(one.last_at)];
 }
 
 async function acknowledge(one) {
