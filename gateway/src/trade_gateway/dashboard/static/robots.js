@@ -19,10 +19,12 @@ export function paintAll() {
 }
 
 function showFaults(bad) {
-  const key = JSON.stringify([devices.size, bad.map((one) => one.group)]);
+  const unheard = [...devices.values()].filter((one) => !one.state).length;
+  const key = JSON.stringify([devices.size, unheard, bad.map((one) => one.group)]);
   $("ailing").className = bad.length ? "problem" : "note";
   show($("ailing"), key, () => {
     if (!devices.size) return [];
+    if (!bad.length && unheard) return [`… ${unheard} of ${devices.size} have not been heard yet.`];
     if (!bad.length) return ["✓ Nothing reports a fault."];
     const links = bad.map((one) => make("a", { href: `#at-${one.group}` }, one.name));
     return [`✕ ${bad.length} of ${devices.size} have a fault or are silent: `, ...links.flatMap((link, place) => (place ? [", ", link] : [link]))];
