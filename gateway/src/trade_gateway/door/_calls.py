@@ -30,7 +30,8 @@ class CallReader:
             AccessDenied: the policy does not let this container read group ``trade``.
         """
         handles, first = self._container.services(where(name="spans", group="trade")), not self._read
-        left_out = set() if self._reads else {one.label for one in self._container.services() if one.effect == "read"}
+        reading = [] if self._reads else [one for one in self._container.services() if one.effect == "read"]
+        left_out = {one.label for one in reading}
         new: list[Span] = []
         for outcome in self._container.call_all([one.bind(None, self._read.get(one, 0)) for one in handles]):
             if isinstance(outcome.error, AccessDenied):
