@@ -1,7 +1,8 @@
 # `make demo` and `make test` need nothing but Python 3.10-3.13 with venv; they fetch uv into .uv/ themselves.
 PYTHON ?= $(firstword $(foreach v,python3 python3.13 python3.12 python3.11 python3.10,$(shell command -v $(v) 2>/dev/null)))
 UV := .uv/bin/uv
-export UV_PYTHON ?= $(PYTHON)
+# The interpreter itself: a shim (pyenv) would have uv make the environment anew each time.
+export UV_PYTHON := $(or $(UV_PYTHON),$(and $(PYTHON),$(shell $(PYTHON) -c 'import sys; print(sys.executable)')))
 export UV_PYTHON_DOWNLOADS ?= never
 # Networks with certificates of their own work as they do for every other program of the machine.
 export UV_SYSTEM_CERTS ?= true

@@ -54,7 +54,8 @@ def dashboard(browser: Browser, url: str, token: str, name: str, **look: Any) ->
         page.keyboard.press("Enter")
         expect(page.locator("#link")).to_have_text("● Connected")
         expect(page.locator('[id="at-rosie.neck.pan"]')).to_be_visible()
-        page.wait_for_timeout(2000)  # for a sample of everything
+        expect(page.locator("#ailing")).to_have_text("✓ Nothing reports a fault.")  # of everything there is a sample
+        expect(page.locator(".device.stale")).to_have_count(0)
         page.screenshot(path=HERE / name)
         print(f"wrote {HERE / name}")
 

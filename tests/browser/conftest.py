@@ -84,6 +84,7 @@ def doorway(
 ) -> Doorway:
     (tmp_path / "policy.toml").write_text(POLICY.format(own=Settings.read().identity))
     monkeypatch.setenv("TRADE_POLICY", str(tmp_path / "policy.toml"))
+    monkeypatch.setenv("TRADE_AUDIT", str(tmp_path / "audit"))
     made = Doorway(run, tmp_path)
     client = Client(made.url, made.token("chief"))
     wait_until(lambda: client.ask("GET", f"/services?group={PAN}&name=state").body, "it is known")

@@ -180,6 +180,8 @@ def test_they_are_services_that_anybody_may_ask_and_to_acknowledge_names_who_did
     with driver.lock(where(group="rosie"), wait_s=10) as lock:
         assert lock.resources == ("rosie.neck.pan", "rosie.neck.tilt")
         assert ask("acknowledge")(info.id).acknowledged_by == asker.address.identity
+    with asker.open_session("anna") as session, session.use():
+        assert ask("acknowledge")(info.id).acknowledged_by == f"{asker.address.identity} for anna"
 
     def healths() -> set[tuple[str, str]]:
         found = asker.services(where(name="state", group="rosie"))

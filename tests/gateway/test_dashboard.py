@@ -38,9 +38,25 @@ def test_a_page_of_the_dashboard_is_only_read(tmp_path: Path, path: str) -> None
 
 
 def test_nothing_in_the_page_comes_from_elsewhere_or_is_inline() -> None:
-    page, script, style = ((STATIC / name).read_text("utf-8") for name in ("index.html", "app.js", "style.css"))
-    for text in (page, style, script.replace("http://www.w3.org/2000/svg", "")):
+    page, style = ((STATIC / name).read_text("utf-8") for name in ("index.html", "style.css"))
+    scripts = "".join(path.read_text("utf-8") for path in STATIC.glob("*.js"))
+    for text in (page, style, scripts.replace("http://www.w3.org/2000/svg", "")):
         assert "http://" not in text
         assert "https://" not in text
     assert not re.search(r"<script(?![^>]*src=)|\son\w+=|\sstyle=|javascript:", page)
-    assert not re.search(r"innerHTML|outerHTML|insertAdjacentHTML|document\.write|\beval\b|localStorage", script)
+    assert not re.search(r"innerHTML|outerHTML|insertAdjacentHTML|document\.write|\beval\b|localStorage", scripts)
+
+
+def test_each_module_is_short_is_loaded_with_the_page_and_imports_what_there_is() -> None:
+    page = (STATIC / "index.html").read_text("utf-8")
+    modules = {path.name: path.read_text("utf-8") for path in STATIC.glob("*.js")}
+    assert {path.name for path in STATIC.iterdir()} == {*modules, "index.html", "style.css", "icon.svg"}
+    for name, text in modules.items():
+        assert len(text.splitlines()) < 400, name
+        assert page.count(f'"/dashboard/{name}"') == 1, name
+        for imported, source in re.findall(r'^import (.*) from "\./(.*)";$', text, re.MULTILINE):
+            for one in imported.strip("{} ").split(", "):
+                assert re.search(
+                    rf"^export .*\b(function|class|const|let) {re.escape(one)}(?!\w)", modules[source], re.MULTILINE
+                )
+                assert len(re.findall(rf"(?<![\w.]){re.escape(one)}(?!\w)", text)) > 1, f"{name} does not use {one}"

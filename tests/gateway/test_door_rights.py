@@ -11,9 +11,12 @@ from tests.trade.test_locking import Robot
 
 from certificates import Papers
 from doors import Client, Opened, ask, heard, opened, say
+from trade._audit_chain import AuditRow
+from trade._audit_store import AuditStore
 from trade.errors import ConfigurationError
 from trade.testing import memory_system
 from trade_gateway.door import Door, Tokens, add_token
+from trade_gateway.door._records import newest
 from waiting import wait_until
 
 POLICY = """
@@ -110,8 +113,9 @@ def test_locks_resuming_and_clearing_are_the_clients_rights_too(door: Opened) ->
 
 def test_a_client_is_told_who_it_is_and_what_it_may_do(door: Opened) -> None:
     anna, bert, chief = (door.client(name) for name in ("anna", "bert", "chief"))
-    assert anna.ask("GET", "/me").body == {"identity": "anna", "administers": False, "reads": False}
-    assert chief.ask("GET", "/me").body == {"identity": "chief", "administers": True, "reads": True}
+    may_nothing = {"administers": False, "reads": False, "instruments": False}
+    assert anna.ask("GET", "/me").body == {"identity": "anna", **may_nothing}
+    assert chief.ask("GET", "/me").body == {"identity": "chief", **dict.fromkeys(may_nothing, True)}
     may = {one["name"]: one["allowed"] for one in bert.ask("GET", "/services?group=robot.a").body}
     assert (may["where_is_it"], may["move"], may["stop"]) == (True, False, True)
     assert all(one["allowed"] for one in anna.ask("GET", "/services").body)
@@ -142,8 +146,14 @@ def test_load_is_for_everybody_and_what_others_have_standing_for_who_reads_the_s
     hook = door.robot.me.before_service(door.robot.find("a"), door.robot.find("a", "where_is_it"))
     assert watching.id in [one["id"] for one in chief.ask("GET", "/notifications").body]
     assert [one["id"] for one in chief.ask("GET", "/hooks").body] == [hook.id]
-    for path in ("/notifications", "/hooks"):
+    for path in ("/notifications", "/hooks", "/policy", "/audit"):
         assert anna.ask("GET", path).title == "AccessDenied"
+    assert anna.ask("POST", "/tracing", {"on": True}).title == "AccessDenied"
+    with anna.socket() as page:
+        say(page, do="watch", id=1, existing=True)
+        heard(page)
+        calls = [one["call"] for one in chief.ask("GET", "/notifications").body]
+        assert calls.count("tell anna (a client of the door)") == 3
     hook.detach()
     watching.cancel()
 
@@ -162,6 +172,53 @@ def test_the_log_is_told_line_by_line_to_who_reads_the_system(door: Opened) -> N
         assert told["result"] == {"cancelled": True}
     with door.client("anna").socket() as page:
         assert ask(page, do="logs", id=1)["problem"]["title"] == "AccessDenied"
+
+
+def test_who_reads_the_system_is_told_its_policy(door: Opened) -> None:
+    chief = door.client("chief")
+    told = chief.ask("GET", "/policy").body
+    assert (told["governed"], told["revoked"]) == (True, [])
+    anna = next(one for one in told["identities"] if one["name"] == "anna")
+    assert (anna["roles"], anna["rights"]["call"], anna["rights"]["administer"]) == (["operator"], ["robot.a"], [])
+
+
+def test_calls_are_told_as_they_end_to_who_reads_the_system_once_they_are_noted(door: Opened) -> None:
+    anna, chief = door.client("anna"), door.client("chief")
+    assert "a" in chief.ask("POST", "/tracing", {"on": True}).body["containers"]
+    try:
+        with chief.socket() as page:
+            say(page, do="calls", id=1)
+            for number in (1.0, 2.0):  # what was noted before is told at most once, what comes is told, too
+                anna.call("robot.a.where_is_it")
+                anna.call("robot.a.move", number)
+                told = [heard(page)["call"] for _ in ("asked", "served")]
+                assert {one["service"] for one in told} == {"robot.a.move"}
+                assert {one["side"] for one in told} == {"asked", "served"}
+                assert len({one["id"] for one in told}) == 1
+                assert all("/anna." in one["session"] for one in told)
+            say(page, do="cancel", id=2, which=1)
+            assert {(told := heard(page))["id"]: told["result"] for _ in "12"} == {1: None, 2: {"cancelled": True}}
+            say(page, do="calls", id=3, reads=True)
+            assert heard(page)["call"]["service"] == "robot.a.where_is_it"
+        with anna.socket() as page:
+            assert ask(page, do="calls", id=1)["problem"]["title"] == "AccessDenied"
+    finally:
+        chief.ask("POST", "/tracing", {"on": False})
+
+
+def test_the_newest_of_all_audit_records_of_a_folder_are_told_newest_first(tmp_path: Path) -> None:
+    for name, times in (("a", (1, 3, 5)), ("b", (2, 4))):
+        store = AuditStore(tmp_path / f"{name}.sqlite")
+        store.add(
+            [AuditRow(0, at, 1, "boot", "call", f"{at}", "", "anna", "", 2**63 - 1, 0, "ok", "", 5) for at in times]
+        )
+        store.close()
+    found = newest(tmp_path, 3)
+    assert [(one.container, one.what) for one in found] == [("a", "5"), ("b", "4"), ("a", "3")]
+    assert found[0].call_id == "9223372036854775807"
+    (tmp_path / "c.sqlite").write_bytes(b"not at all" * 100)
+    with pytest.raises(ConfigurationError, match="cannot be read"):
+        newest(tmp_path, 3)
 
 
 def test_functions_of_the_middleware_are_nobodys_by_the_door(door: Opened) -> None:

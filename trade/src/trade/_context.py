@@ -49,6 +49,12 @@ class CallContext(Struct, frozen=True, gc=False):
     """What was noted of it, and when by ``time.monotonic_ns()``; None if it is not traced."""
 
     @property
+    def asker(self) -> str:
+        """Who asks, for people: its caller, and the client that this one acts for: ``page for anna``."""
+        client = self.session.split("/")[3:]
+        return f"{self.caller} for {client[0].rpartition('.')[0]}" if client else self.caller
+
+    @property
     def sessions(self) -> tuple[str, ...]:
         """For whom it runs, nearest first: what it moves stops when one of them ends."""
         return (self.session,) if self.behalf is None else (self.session, *self.behalf.sessions)

@@ -112,7 +112,7 @@ class FaultLog:
             InvalidArgument: there is none of that id.
         """
         call = current_call()
-        by = "its own process" if call is None else call.caller
+        by = "its own process" if call is None else call.asker
         with self._lock:
             entry = self._found(id, "acknowledge")
             self._change(entry, acknowledged_by=by, acknowledged_at=self._wall())

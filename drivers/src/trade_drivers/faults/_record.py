@@ -53,7 +53,7 @@ class FaultInfo(Struct, frozen=True, kw_only=True):
     count: int = 1
     """How often it began."""
     acknowledged_by: str = ""
-    """Who has seen it since it began the latest time; empty: nobody."""
+    """Who has seen it since it began the latest time: an identity, ``page for anna`` by a door; empty: nobody."""
     acknowledged_at: float | None = None
     evidence: list[str] = []
     """What others have found out about it, oldest first."""

@@ -8,9 +8,26 @@ from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import Route
 
+_MODULES: Final = (
+    "app",
+    "calls",
+    "chain",
+    "devices",
+    "door",
+    "estop",
+    "faults",
+    "jog",
+    "locks",
+    "log",
+    "page",
+    "robots",
+    "schemas",
+    "services",
+    "system",
+)
 _FILES: Final = (
     ("/", "index.html", "text/html"),
-    ("/dashboard/app.js", "app.js", "text/javascript"),
+    *((f"/dashboard/{name}.js", f"{name}.js", "text/javascript") for name in _MODULES),
     ("/dashboard/style.css", "style.css", "text/css"),
     ("/dashboard/icon.svg", "icon.svg", "image/svg+xml"),
 )
@@ -25,7 +42,7 @@ HEADERS: Final = {
     "X-Content-Type-Options": "nosniff",
     "Cache-Control": "no-cache",
 }
-"""Nothing runs but the script of the page itself, and no other site shows the page inside of its own."""
+"""Nothing runs but the scripts of the page itself, and no other site shows the page inside of its own."""
 
 
 def pages() -> list[Route]:

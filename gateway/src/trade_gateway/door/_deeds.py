@@ -14,13 +14,8 @@ from trade import (
     Container,
     EstopReport,
     Handle,
-    HookInfo,
-    LoadInfo,
     Lock,
-    LogLine,
-    LogReader,
     Notification,
-    NotificationInfo,
     Run,
     where,
 )
@@ -33,10 +28,10 @@ from trade.errors import (
     TooManyServices,
     TradeError,
 )
-from trade_gateway._loads import loads
 from trade_gateway.door import _messages as messages
 from trade_gateway.door._clients import Client, Clients, places
 from trade_gateway.door._judge import Judge
+from trade_gateway.door._overview import Overview
 from trade_gateway.door._quota import MOST, Quota
 
 _logger = logging.getLogger("trade")
@@ -61,6 +56,7 @@ class Deeds:
         self._threads = anyio.CapacityLimiter(_THREADS)
         self._stop_threads = anyio.CapacityLimiter(inf)
         self._quota = Quota()
+        self.overview: Final = Overview(container, self.judge, self.counted)
 
     async def apart(self, do: Callable[..., T], *args: Any, stops: bool = False) -> T:
         """Do in a thread what may wait for others; what stops waits for no thread."""
@@ -280,39 +276,6 @@ class Deeds:
         """Those that are open."""
         return [messages.EstopView(one.id, one.by, one.reason, one.at) for one in self._container.estops()]
 
-    # --- the system
-
-    def me(self, who: str) -> messages.Me:
-        """What an identity is here."""
-        return messages.Me(who, self.judge.may_system(who, "administer"), self.judge.may_system(who, "read"))
-
-    def containers(self) -> list[messages.ContainerView]:
-        """Those of the system."""
-        return [messages.ContainerView(one.name, one.identity, one.host) for one in self._container.containers()]
-
-    async def loads(self, who: str) -> list[LoadInfo]:
-        """How busy they are; takes a second."""
-        return await self.counted(who, loads, self._container)
-
-    async def notifications(self, who: str) -> list[NotificationInfo]:
-        """Those that stand. Raises AccessDenied."""
-        self.judge.require_system(who, "read", "notifications")
-        return await self.counted(who, self._container.notifications)
-
-    async def hooks(self, who: str) -> list[HookInfo]:
-        """Those that are attached. Raises AccessDenied."""
-        self.judge.require_system(who, "read", "hooks")
-        return await self.counted(who, self._container.hooks)
-
-    async def log_lines(self, who: str, reader: LogReader) -> list[LogLine]:
-        """What the system has logged since the last time. Raises AccessDenied."""
-        self.judge.require_system(who, "read", "log")
-        return await self.counted(who, reader.read)
-
-    def log(self) -> LogReader:
-        """Of all processes of the system, from what they still have on."""
-        return LogReader(self._container, "*")
-
     # --- listening
 
     async def stream(self, client: Client, handle: Handle, asked: messages.Stream) -> Samples:
@@ -332,10 +295,6 @@ class Deeds:
     def watch(self, client: Client, asked: messages.Watch, tell: Callable[[str, Handle], object]) -> list[Notification]:
         """Have services that come, go or change told of, those that the client may know of, until it is gone."""
 
-        def told(occasion: str, handle: Handle) -> None:
-            if self.judge.sees(client.identity, handle):
-                tell(occasion, handle)
-
         wanted, here = _wanted(asked.group, asked.name), self._container
         with client.session.use():
             kinds = {
@@ -343,7 +302,25 @@ class Deeds:
                 "left": here.left,
                 "changed": here.changed,
             }
-            return [kinds[one](wanted, partial(told, one)) for one in dict.fromkeys(asked.occasions)]
+            return [
+                kinds[one](wanted, _Told(client, one, self.judge, tell).hear) for one in dict.fromkeys(asked.occasions)
+            ]
+
+
+class _Told:
+    """Tells a client of services, of those that it may know of."""
+
+    def __init__(self, client: Client, occasion: str, judge: Judge, tell: Callable[[str, Handle], object]) -> None:
+        self._client = client
+        self._occasion = occasion
+        self._judge = judge
+        self._tell = tell
+        self.told_as = f"tell {client.identity} (a client of the door)"
+        """In lists of notifications."""
+
+    def hear(self, handle: Handle) -> None:
+        if self._judge.sees(self._client.identity, handle):
+            self._tell(self._occasion, handle)
 
 
 def _wanted(group: str | None, name: str | None) -> Constraint:

@@ -48,6 +48,9 @@ class Http:
             _route("/loads", GET=self.loads),
             _route("/notifications", GET=self.notifications),
             _route("/hooks", GET=self.hooks),
+            _route("/policy", GET=self.policy),
+            _route("/audit", GET=self.audit),
+            _route("/tracing", POST=self.tracing),
             _route("/call/{group}/{name}", POST=self.call),
             _route("/session", POST=self.open_session, GET=self.session, DELETE=self.close_session),
             _route("/locks", GET=self.locks, POST=self.lock),
@@ -72,20 +75,30 @@ class Http:
         return _answer([self._deeds.view(who, handle) for handle in found])
 
     async def me(self, request: Request) -> Response:
-        return _answer(self._deeds.me(self._who(request)))
+        return _answer(self._deeds.overview.me(self._who(request)))
 
     async def loads(self, request: Request) -> Response:
-        return _answer(await self._deeds.loads(self._who(request)))
+        return _answer(await self._deeds.overview.loads(self._who(request)))
 
     async def notifications(self, request: Request) -> Response:
-        return _answer(await self._deeds.notifications(self._who(request)))
+        return _answer(await self._deeds.overview.notifications(self._who(request)))
 
     async def hooks(self, request: Request) -> Response:
-        return _answer(await self._deeds.hooks(self._who(request)))
+        return _answer(await self._deeds.overview.hooks(self._who(request)))
+
+    async def policy(self, request: Request) -> Response:
+        return _answer(self._deeds.overview.policy(self._who(request)))
+
+    async def audit(self, request: Request) -> Response:
+        return _answer(await self._deeds.overview.audit(self._who(request)))
+
+    async def tracing(self, request: Request) -> Response:
+        who, body = self._who(request), await _body(request, messages.TracingBody)
+        return _answer({"containers": await self._deeds.overview.set_tracing(who, on=body.on)})
 
     async def containers(self, request: Request) -> Response:
         self._who(request)
-        return _answer(self._deeds.containers())
+        return _answer(self._deeds.overview.containers())
 
     # --- calling
 

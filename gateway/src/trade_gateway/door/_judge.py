@@ -9,6 +9,7 @@ from typing import Final
 
 from trade import Container, Handle
 from trade.errors import AccessDenied
+from trade.policies import Policy
 
 ANONYMOUS: Final = "anonymous"
 """Who shows neither token nor certificate; let in only where the policy names it."""
@@ -35,6 +36,11 @@ class Judge:
         """Whether the policy has given a role to those whom nobody knows, by name and not by a pattern."""
         policy = self._access.policy
         return policy is not None and ANONYMOUS in policy.names() and bool(policy.roles_of(ANONYMOUS))
+
+    @property
+    def policy(self) -> Policy | None:
+        """What it goes by."""
+        return self._access.policy
 
     def admits(self, who: str) -> bool:
         """Whether an identity may speak at all: it is not revoked."""

@@ -6,7 +6,8 @@ from typing import Annotated, Any, Final, Literal, cast
 import msgspec
 from msgspec import Meta, Struct
 
-from trade import Handle, LockInfo
+from trade import Handle, LockInfo, Span
+from trade.policies import VERBS, Policy
 
 MOST_DEADLINE_S: Final = 86_400.0
 SESSION_LEASE_S: Final = 2.0
@@ -57,6 +58,10 @@ class EstopBody(Struct, forbid_unknown_fields=True, kw_only=True):
 class ClearBody(Struct, forbid_unknown_fields=True, kw_only=True):
     ids: list[str] = []
     """None: all that are open."""
+
+
+class TracingBody(Struct, forbid_unknown_fields=True, kw_only=True):
+    on: bool
 
 
 class SessionBody(Struct, forbid_unknown_fields=True, kw_only=True):
@@ -114,13 +119,19 @@ class Logs(Struct, tag="logs", tag_field="do", forbid_unknown_fields=True, kw_on
     """The least, as Python counts them: 20 is info, 30 warning, 40 error."""
 
 
+class Calls(Struct, tag="calls", tag_field="do", forbid_unknown_fields=True, kw_only=True):
+    id: Id
+    reads: bool = False
+    """Also those of services that only read: streams make many of them."""
+
+
 class Cancel(Struct, tag="cancel", tag_field="do", forbid_unknown_fields=True, kw_only=True):
     id: Id
     which: Id
-    """The call, stream, watch or log to end."""
+    """The call, stream, watch, log or list of calls to end."""
 
 
-Asked = Call | TakeLock | Unlock | Resume | Estop | Stream | Watch | Logs | Cancel
+Asked = Call | TakeLock | Unlock | Resume | Estop | Stream | Watch | Logs | Calls | Cancel
 
 
 # --- answers
@@ -131,7 +142,9 @@ class Me(Struct, frozen=True):
     administers: bool
     """The system: it may clear e-stops."""
     reads: bool
-    """The system: its log, notifications and hooks."""
+    """The system: its log, calls, notifications, hooks and policy."""
+    instruments: bool
+    """The system: it may have calls noted."""
 
 
 class ServiceView(Struct, frozen=True):
@@ -148,6 +161,52 @@ class ServiceView(Struct, frozen=True):
     host: str
     allowed: bool
     """Whether the asking client may call it."""
+
+
+class CallView(Struct, frozen=True):
+    """A call that has ended, as the container noted it that asked for it or that served it."""
+
+    id: str
+    """As text: it is larger than the numbers that pages can hold."""
+    service: str
+    side: str
+    container: str
+    caller: str
+    session: str
+    began: float
+    took_s: float
+    outcome: str
+
+
+class AuditView(Struct, frozen=True, kw_only=True):
+    """A row of the audit record."""
+
+    at: float
+    container: str
+    kind: str
+    what: str
+    about: str
+    who: str
+    session: str
+    outcome: str
+    why: str
+    call_id: str
+
+
+class IdentityView(Struct, frozen=True):
+    """What the policy lets an identity do, or all that fit a pattern."""
+
+    name: str
+    roles: tuple[str, ...]
+    rights: dict[str, list[str]]
+    """Groups by what it may do in them."""
+
+
+class PolicyView(Struct, frozen=True):
+    governed: bool
+    """Whether there is a policy; without one everybody may do everything."""
+    identities: tuple[IdentityView, ...]
+    revoked: tuple[str, ...]
 
 
 class ContainerView(Struct, frozen=True):
@@ -209,6 +268,30 @@ def service_view(handle: Handle, *, allowed: bool) -> ServiceView:
         handle.host,
         allowed,
     )
+
+
+def call_view(span: Span) -> CallView:
+    return CallView(
+        str(span.call_id),
+        span.service,
+        span.side,
+        span.container,
+        span.caller,
+        span.session,
+        span.began,
+        span.took_s,
+        span.outcome,
+    )
+
+
+def policy_view(policy: Policy | None) -> PolicyView:
+    if policy is None:
+        return PolicyView(governed=False, identities=(), revoked=())
+    found = (
+        IdentityView(name, policy.roles_of(name), {verb: policy.groups_of(name, (verb,)) for verb in VERBS})
+        for name in policy.identities
+    )
+    return PolicyView(governed=True, identities=tuple(found), revoked=tuple(sorted(policy.revoked)))
 
 
 def lock_view(info: LockInfo) -> LockView:

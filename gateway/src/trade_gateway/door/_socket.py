@@ -188,8 +188,8 @@ class Conversation:
                 return await self._stream(asked, ongoing.handle)
             case messages.Watch():
                 return await self._watch(asked)
-            case messages.Logs():
-                return await self._logs(asked)
+            case messages.Logs() | messages.Calls():
+                return await (self._logs(asked) if isinstance(asked, messages.Logs) else self._calls(asked))
             case messages.TakeLock():
                 return await self._deeds.lock(self._client, asked, self._lock_lost)
             case messages.Unlock():
@@ -222,7 +222,7 @@ class Conversation:
                 ongoing.unwanted = True
                 if ongoing.run is not None:
                     await self._deeds.end(self._client, ongoing.run)
-            case messages.Stream() | messages.Watch() | messages.Logs():
+            case messages.Stream() | messages.Watch() | messages.Logs() | messages.Calls():
                 ongoing.scope.cancel()
             case _:
                 return False
@@ -257,15 +257,22 @@ class Conversation:
                 await self._apart(one.cancel)
 
     async def _logs(self, asked: messages.Logs) -> None:
-        reader = self._deeds.log()
-        lines = await self._deeds.log_lines(self._client.identity, reader)
+        reader = self._deeds.overview.log()
+        lines = await self._deeds.overview.log_lines(self._client.identity, reader)
         lines = lines[-_OLD_LINES:]
         while True:
             for line in lines:
                 if line.level >= asked.level:
                     await self._say({"id": asked.id, "line": line})
             await anyio.sleep(_LOG_EVERY_S)
-            lines = await self._deeds.log_lines(self._client.identity, reader)
+            lines = await self._deeds.overview.log_lines(self._client.identity, reader)
+
+    async def _calls(self, asked: messages.Calls) -> None:
+        reader = self._deeds.overview.ended(reads=asked.reads)
+        while True:
+            for span in await self._deeds.overview.calls(self._client.identity, reader):
+                await self._say({"id": asked.id, "call": messages.call_view(span)})
+            await anyio.sleep(_LOG_EVERY_S)
 
     async def _apart(self, close: Callable[[], object]) -> None:
         with anyio.CancelScope(shield=True):

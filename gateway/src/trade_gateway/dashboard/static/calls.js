@@ -1,0 +1,56 @@
+// Calls of the whole system as they end, while its containers note them.
+
+import { door } from "./door.js";
+import { $, clock, table, tell, write } from "./page.js";
+
+const MOST_CALLS = 100;
+const COLUMNS = ["Ended", "Service", "In", "For", "Took", "Outcome"];
+const ended = new Map(); // by call; what served it tells more than who asked
+
+let reading = null;
+
+/** Read on from what is kept; of a connection that ended nothing comes any more. */
+export function readCalls() {
+  if (reading) door.cancel(reading.id);
+  ended.clear();
+  const here = door.begin({ do: "calls", reads: $("call-reads").checked }, ({ call }) => {
+    if (here === reading && !(call.side === "asked" && ended.has(call.id))) {
+      ended.delete(call.id);
+      ended.set(call.id, call);
+    }
+    if (ended.size > MOST_CALLS) ended.delete(ended.keys().next().value);
+  });
+  reading = here;
+  here.ended.catch((error) => here === reading && door.connected && write($("call-problem"), `${error.title}: ${error.message}`));
+}
+
+export function showCalls() {
+  for (const button of [$("note-calls"), $("note-no-calls")]) button.disabled = !(door.me?.instruments && door.connected);
+  if (!door.me?.reads) {
+    table($("call-list"), "", [], [], "They are for who may read the system (group trade).");
+    return;
+  }
+  const wanted = $("call-search").value.toLowerCase();
+  const rows = [...ended.values()].reverse().map(rowOf).filter((row) => row.join(" ").toLowerCase().includes(wanted));
+  table($("call-list"), "The latest calls", COLUMNS, rows, ended.size ? "None of them is like that." : "No call has been noted yet.");
+}
+
+function rowOf(call) {
+  const client = call.session.split("/")[3]; // of a door, whose call it was
+  const who = client ? `${call.caller} for ${client.slice(0, client.lastIndexOf("."))}` : call.caller;
+  return [clock(call.began + call.took_s), call.service, call.container, who, `${(call.took_s * 1000).toFixed(1)} ms`, call.outcome];
+}
+
+async function note(on) {
+  try {
+    const { containers } = await door.post("/tracing", { on });
+    tell(`${on ? "Calls are noted" : "No more calls are noted"} in ${containers.join(", ") || "no container"}.`);
+  } catch (error) {
+    tell(`${error.title}: ${error.message}`);
+  }
+}
+
+$("note-calls").onclick = () => note(true);
+$("note-no-calls").onclick = () => note(false);
+$("call-reads").onchange = readCalls;
+$("call-search").oninput = showCalls;

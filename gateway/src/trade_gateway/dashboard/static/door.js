@@ -1,0 +1,149 @@
+// The way to the door: requests, and the WebSocket with what is under way on it. All that is known of the other side is in docs/http.md.
+
+import { sleep, tell } from "./page.js";
+
+const ESTOP_WITHIN_MS = 1000;
+const SILENT_MS = 3000; // a door that answers nothing for so long is as good as gone
+
+/** What the door or the system would not do, with the problem as it was told. */
+export class Refused extends Error {
+  constructor(problem) {
+    super(problem.detail || problem.title);
+    this.title = problem.title;
+    this.status = problem.status;
+    this.data = problem.data;
+  }
+}
+
+const lost = () => new Refused({ title: "NotConnected", status: 0, detail: "There is no connection to the door." });
+
+class Door {
+  token = sessionStorage.getItem("token") || "";
+  me = null; // who is signed in, and what that identity may do to the system
+  locks = new Map(); // those of this page: name -> resources
+  on_loss = () => {}; // called when a lock or the connection is lost
+  #socket = null;
+  #under_way = new Map();
+  #number = 0;
+
+  get connected() {
+    return this.#socket?.readyState === WebSocket.OPEN;
+  }
+
+  async request(method, path, body) {
+    const headers = this.token ? { Authorization: `Bearer ${this.token}` } : {};
+    if (body) headers["Content-Type"] = "application/json";
+    const options = { method, headers, body: body && JSON.stringify(body), cache: "no-store" };
+    const answer = await fetch(path, { ...options, signal: AbortSignal.timeout(method === "GET" ? SILENT_MS : 15000) });
+    const told = await answer.json();
+    if (!answer.ok) throw new Refused(told);
+    return told;
+  }
+
+  get(path) {
+    return this.request("GET", path);
+  }
+
+  post(path, body) {
+    return this.request("POST", path, body);
+  }
+
+  /** Connect; resolves once connected, with a promise of the end. */
+  open() {
+    const place = `${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/ws`;
+    const socket = new WebSocket(place, this.token ? ["trade.v1", `bearer.${this.token}`] : ["trade.v1"]);
+    this.#socket = socket;
+    return new Promise((resolve, reject) => {
+      const closed = new Promise((ended) => {
+        socket.onclose = () => {
+          reject(lost());
+          this.#forget();
+          ended();
+        };
+      });
+      socket.onopen = () => resolve({ closed });
+      socket.onmessage = (event) => this.#hear(JSON.parse(event.data));
+    });
+  }
+
+  drop() {
+    this.#socket?.close();
+    this.#forget();
+  }
+
+  #forget() {
+    this.#socket = null;
+    this.locks.clear();
+    this.on_loss();
+    for (const { reject } of this.#under_way.values()) reject(lost());
+    this.#under_way.clear();
+  }
+
+  #hear(told) {
+    if (told.event === "lock_lost") {
+      this.locks.delete(told.lock);
+      this.on_loss();
+      tell(`A lock was lost: ${told.problem.detail}`);
+      return;
+    }
+    const waiting = this.#under_way.get(told.id);
+    if (!waiting) return;
+    if (!("result" in told) && !("problem" in told)) {
+      waiting.heard(told);
+      return;
+    }
+    this.#under_way.delete(told.id);
+    if ("problem" in told) waiting.reject(new Refused(told.problem));
+    else waiting.resolve(told.result);
+  }
+
+  /** Begin something; `heard` gets what is said on the way, `ended` is how it ends. */
+  begin(message, heard = () => {}) {
+    const id = ++this.#number;
+    const ended = new Promise((resolve, reject) => {
+      if (!this.connected) {
+        reject(lost());
+        return;
+      }
+      this.#under_way.set(id, { resolve, reject, heard });
+      this.#socket.send(JSON.stringify({ ...message, id }));
+    });
+    return { id, ended };
+  }
+
+  ask(message) {
+    return this.begin(message).ended;
+  }
+
+  call(group, name, args = {}, options = {}) {
+    return this.ask({ do: "call", group, name, args, ...options });
+  }
+
+  cancel(which) {
+    if (this.connected) this.ask({ do: "cancel", which }).catch(() => {});
+  }
+
+  async lock(group, purpose, wait_s) {
+    const taken = await this.ask({ do: "lock", group, purpose, wait_s });
+    this.locks.set(taken.lock, taken.resources);
+    return taken.lock;
+  }
+
+  async unlock(lock) {
+    this.locks.delete(lock);
+    await this.ask({ do: "unlock", lock });
+  }
+
+  has_locked(resources) {
+    const mine = new Set([...this.locks.values()].flat());
+    return resources.length > 0 && resources.every((one) => mine.has(one));
+  }
+
+  /** Stop everything: over the socket, and if that says nothing in time, over a request of its own. */
+  async estop(reason) {
+    const stopped = this.connected ? this.ask({ do: "estop", reason }).catch(() => null) : null;
+    return (await Promise.race([stopped, sleep(stopped ? ESTOP_WITHIN_MS : 0)])) ?? this.post("/estop", { reason });
+  }
+}
+
+export const door = new Door();

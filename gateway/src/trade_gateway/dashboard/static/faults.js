@@ -1,0 +1,39 @@
+// What is or was wrong with devices, from the robots' logs of faults, and that somebody has seen it.
+
+import { door } from "./door.js";
+import { $, moment, table, tell } from "./page.js";
+import { services } from "./schemas.js";
+
+const COLUMNS = ["Device", "Fault", "Now", "Seen by", "What to do", "Times", "Last"];
+
+export async function lookAtFaults() {
+  const logs = services.filter((one) => one.name === "faults" && one.group.endsWith(".faults"));
+  const open_only = $("open-faults").checked;
+  const told = await Promise.all(logs.filter((one) => one.allowed).map((one) => faultsOf(one, open_only)));
+  const rows = told.flat().sort((one, other) => other.last_at - one.last_at).map(rowOf);
+  const none = open_only ? "Nothing is wrong." : "No fault is known.";
+  table($("fault-list"), "Faults, the latest first", COLUMNS, rows, logs.length ? none : "No robot that you may see keeps a log of faults.");
+}
+
+async function faultsOf(log, open_only) {
+  const may = services.some((one) => one.group === log.group && one.name === "acknowledge" && one.allowed);
+  const found = await door.call(log.group, "faults", { open_only }, { container: log.container });
+  return found.map((one) => ({ ...one, may, log }));
+}
+
+function rowOf(one) {
+  const see = { label: "I have seen it", act: () => acknowledge(one), name: `I have seen: ${one.text}` };
+  const seen = one.acknowledged_by || (one.may ? see : "nobody");
+  return [one.device, one.kind, one.open ? "✕ there" : "gone", seen, one.remedy || "—", `${one.count}`, moment(one.last_at)];
+}
+
+async function acknowledge(one) {
+  try {
+    await door.call(one.log.group, "acknowledge", { id: one.id }, { container: one.log.container });
+    await lookAtFaults();
+  } catch (error) {
+    tell(`${error.title}: ${error.message}`);
+  }
+}
+
+$("open-faults").onchange = () => lookAtFaults().catch((error) => tell(error.message));

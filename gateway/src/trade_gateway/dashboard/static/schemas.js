@@ -1,0 +1,18 @@
+// What services there are, and of what kind their arguments and results are.
+
+import { door } from "./door.js";
+
+export let services = [];
+let described = { paths: {}, components: { schemas: {} } };
+
+/** Ask for all of it again. */
+export async function lookForServices() {
+  [services, described] = await Promise.all([door.get("/services"), door.get("/openapi.json")]);
+}
+
+export function resolve(schema) {
+  const name = schema?.$ref?.split("/").at(-1);
+  return name ? resolve(described.components.schemas[name]) : schema;
+}
+
+export const operationOf = (one) => described.paths[`/call/${one.group}/${one.name}`]?.post;

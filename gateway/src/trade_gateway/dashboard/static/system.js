@@ -1,0 +1,72 @@
+// The system: containers, notifications and hooks, rules and policy, the audit record.
+
+import { door } from "./door.js";
+import { $, measure, moment, table } from "./page.js";
+import { services } from "./schemas.js";
+
+const VERBS = ["call", "read", "register", "lock", "instrument", "administer"];
+
+export async function lookAtContainers() {
+  const [there, loads] = await Promise.all([door.get("/containers"), door.get("/loads")]);
+  const busy = new Map(loads.map((one) => [one.container, one]));
+  const rows = there.sort((one, other) => one.name.localeCompare(other.name)).map((one) => {
+    const load = busy.get(one.name);
+    const memory = load?.memory_bytes;
+    return [
+      one.name, one.identity, one.host, measure(load?.cpu_percent, 0, "%"), measure(load?.host_cpu_percent, 0, "%"),
+      memory ? `${(memory / 1e6).toFixed(0)} MB` : "—", measure(load?.calls_per_s, 1, "/s"), measure(load?.in_flight, 0, ""),
+    ];
+  });
+  table($("container-list"), "Containers, over the last second", ["Container", "Identity", "Host", "CPU", "Host’s CPU", "Memory", "Calls", "Running"], rows, "No container is there.");
+}
+
+export async function lookAtWatchers() {
+  if (!door.me.reads) {
+    table($("watcher-list"), "", [], [], "They are for who may read the system (group trade).");
+    return;
+  }
+  const [standing, hooks] = await Promise.all([door.get("/notifications"), door.get("/hooks")]);
+  const rows = [
+    ...standing.map((one) => [one.occasion, one.call, one.condition || "—", one.owner, `${one.fired}`, `${one.failures}`, one.last_error || one.state]),
+    ...hooks.map((one) => [`${one.side} ${one.target}`, one.call, "—", one.owner, `${one.fired}`, `${one.failures}`, one.last_error || (one.suspended ? "suspended" : "attached")]),
+  ];
+  table($("watcher-list"), "Notifications and hooks", ["Occasion", "Call", "Condition", "Owner", "Fired", "Failed", "State"], rows, "No notification and no hook stands.");
+}
+
+export async function lookAtPolicy() {
+  await lookAtRules();
+  if (!door.me.reads) {
+    table($("policy-list"), "", [], [], "It is for who may read the system (group trade).");
+    return;
+  }
+  const { governed, identities, revoked } = await door.get("/policy");
+  const rows = [
+    ...identities.map((one) => [one.name, one.roles.join(", ") || "—", ...VERBS.map((verb) => one.rights[verb].join(", ") || "—")]),
+    ...revoked.map((name) => [name, "revoked", ...VERBS.map(() => "—")]),
+  ];
+  const none = governed ? "The policy names nobody." : "There is no policy: whoever is let in may do everything.";
+  table($("policy-list"), "Who may do what in which groups", ["Identity", "Roles", ...VERBS], rows, none);
+}
+
+async function lookAtRules() {
+  const told = services.filter((one) => one.name === "rules" && one.group === "rules" && one.allowed);
+  const found = await Promise.all(told.map((one) => door.call("rules", "rules", {}, { container: one.container })));
+  const rows = found.flat().map((one) => [one.name, one.occasion, one.condition || "—", one.container, `${one.fired}`, `${one.failed}`, one.why || one.last_error || one.state]);
+  table($("rule-list"), "Rules by which the system configures itself", ["Rule", "Occasion", "Condition", "Runs in", "Fired", "Failed", "State"], rows, "No rules stand.");
+}
+
+export async function lookAtAudit() {
+  const columns = ["At", "Kind", "Who", "What", "About", "In", "Outcome"];
+  let [rows, none] = [[], "It is for who administers the system."];
+  if (door.me.administers) {
+    try {
+      const found = await door.get("/audit");
+      rows = found.map((one) => [moment(one.at), one.kind, one.who || "—", one.what, one.about || "—", one.container, one.why || one.outcome]);
+      none = "Nothing is on record.";
+    } catch (error) {
+      if (error.status !== 404) throw error;
+      none = error.message;
+    }
+  }
+  table($("audit-list"), "The newest rows of this host", columns, rows, none);
+}

@@ -1,0 +1,94 @@
+"""What clients are told of the system itself: who may read, instrument or administer it is judged by the policy."""
+
+from collections.abc import Callable, Coroutine
+from typing import Any, Final
+
+from trade import Container, HookInfo, LoadInfo, LogLine, LogReader, NotificationInfo, Span
+from trade_gateway._loads import loads
+from trade_gateway.door import _messages as messages
+from trade_gateway.door._calls import CallReader
+from trade_gateway.door._judge import Judge
+from trade_gateway.door._problems import HttpError
+from trade_gateway.door._records import newest
+
+_ROWS: Final = 200
+"""Of the audit records."""
+
+Counted = Callable[..., Coroutine[Any, Any, Any]]
+"""Does something in a thread, as one of what an identity may have under way."""
+
+
+class Overview:
+    """Of the door's system.
+
+    Args:
+        container: of the door.
+        judge: of its clients.
+        counted: called with an identity, what to do, and with which arguments.
+    """
+
+    def __init__(self, container: Container, judge: Judge, counted: Counted) -> None:
+        self._container = container
+        self._judge = judge
+        self._counted = counted
+
+    def me(self, who: str) -> messages.Me:
+        """What an identity is here."""
+        administers, reads, instruments = (
+            self._judge.may_system(who, verb) for verb in ("administer", "read", "instrument")
+        )
+        return messages.Me(who, administers, reads, instruments)
+
+    def policy(self, who: str) -> messages.PolicyView:
+        """Who may do what. Raises AccessDenied."""
+        self._judge.require_system(who, "read", "policy")
+        return messages.policy_view(self._judge.policy)
+
+    async def audit(self, who: str) -> list[messages.AuditView]:
+        """The newest rows of the audit records of this host. Raises AccessDenied, HttpError."""
+        self._judge.require_system(who, "administer", "audit")
+        folder = self._container.settings.audit
+        if folder is None:
+            raise HttpError(status=404, problem="no audit record is kept; TRADE_AUDIT=FOLDER keeps one")
+        return await self._counted(who, newest, folder, _ROWS)
+
+    async def set_tracing(self, who: str, *, on: bool) -> list[str]:
+        """Have the system's containers note calls; which of them do. Raises AccessDenied."""
+        self._judge.require_system(who, "instrument", "tracing")
+        return await self._counted(who, self._container.set_tracing, on)
+
+    async def calls(self, who: str, reader: CallReader) -> list[Span]:
+        """What calls have ended since the last time. Raises AccessDenied."""
+        self._judge.require_system(who, "read", "calls")
+        return await self._counted(who, reader.read)
+
+    def ended(self, *, reads: bool) -> CallReader:
+        """Of the calls of the system that are noted, from what is kept of them."""
+        return CallReader(self._container, reads=reads)
+
+    def containers(self) -> list[messages.ContainerView]:
+        """Those of the system."""
+        return [messages.ContainerView(one.name, one.identity, one.host) for one in self._container.containers()]
+
+    async def loads(self, who: str) -> list[LoadInfo]:
+        """How busy they are; takes a second."""
+        return await self._counted(who, loads, self._container)
+
+    async def notifications(self, who: str) -> list[NotificationInfo]:
+        """Those that stand. Raises AccessDenied."""
+        self._judge.require_system(who, "read", "notifications")
+        return await self._counted(who, self._container.notifications)
+
+    async def hooks(self, who: str) -> list[HookInfo]:
+        """Those that are attached. Raises AccessDenied."""
+        self._judge.require_system(who, "read", "hooks")
+        return await self._counted(who, self._container.hooks)
+
+    async def log_lines(self, who: str, reader: LogReader) -> list[LogLine]:
+        """What the system has logged since the last time. Raises AccessDenied."""
+        self._judge.require_system(who, "read", "log")
+        return await self._counted(who, reader.read)
+
+    def log(self) -> LogReader:
+        """Of all processes of the system, from what they still have on."""
+        return LogReader(self._container, "*")
