@@ -14,7 +14,7 @@ ARGS ?=
 SEED ?= 1
 MINUTES ?= 3
 
-.PHONY: demo screenshots test test-socketcan soak-registry chaos chaos-robots check bench clean
+.PHONY: demo screenshots test test-socketcan soak-registry soak-relocation chaos chaos-robots check bench clean
 .DEFAULT_GOAL := help
 
 help: ## show the targets
@@ -50,6 +50,9 @@ chaos-robots: $(UV) ## a lock over two robots while a driver is killed and start
 
 soak-registry: $(UV) ## three containers on two hosts register at the same moment, 200 times (root, iproute2)
 	@SOAK_ROUNDS=200 $(RUN) pytest tests/system/test_namespaces.py -k same_moment $(ARGS)
+
+soak-relocation: $(UV) ## a host is lost 100 times, with random trouble between; never two (SEED=..; root, iproute2; 45 min)
+	@SOAK_ROUNDS=100 SEED=$(SEED) $(RUN) pytest -s tests/system/test_relocation.py -k never_two -p no:again $(ARGS)
 
 check: $(UV) ## lint, formatting, types, import rules, isolated install of the core
 	@$(RUN) ruff check

@@ -94,6 +94,7 @@ def test_a_container_starts_again_only_for_what_starts_it(tmp_path: Path) -> Non
     before = read("")
     assert before.starts_like(read("restarts = 3\nwindow_s = 5\nsave_every_s = 2\n"))
     assert not before.starts_like(read('allow = ["a:*"]\n'))
+    assert not before.starts_like(read('lease_from = "base"\n'))
     assert not before.starts_like(read('connect = ["tcp/127.0.0.1:7450"]\n'))
 
 
@@ -107,6 +108,13 @@ def test_a_container_starts_again_only_for_what_starts_it(tmp_path: Path) -> Non
         ('host = "far"\n', 4, "a gateway looks after containers of its own host; leave it out"),
         ('after = ["nobody"]\n', 4, "there is no container 'nobody'; there is eyes"),
         ('rules = "care.toml"\n', 4, "there is providers and rules"),
+        ('lease_from = "base"\nstands_in_for = "base"\n', 4, "leave one of them out"),
+        ("lease_s = 5.0\n", 4, "goes with stands_in_for; leave it out"),
+        ('lease_from = "base"\nlease_s = 5.0\n', 5, "is for base to say; leave it out"),
+        ('stands_in_for = "rover"\nlease_s = 1.0\n', 5, ">= 2"),
+        ('lease_from = "base"\nrestart = "never"\n', 5, "does not go with lease_from"),
+        ('[container.care]\nrules = "care.toml"\nlease_from = "base"\n', 6, "a rules is pinned to its host"),
+        ('[container.rosie]\nrobot = "nobody.toml"\nstands_in_for = "rover"\n', 6, "a robot is pinned to its host"),
         ('[container.door]\ngateway = "door.toml"\n', 5, "is this file"),
         ('[container.rosie]\nrobot = "nobody.toml"\n', 5, "there is no such file"),
     ],

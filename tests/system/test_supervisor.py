@@ -24,9 +24,9 @@ from trade_gateway.supervisor import ChildInfo, News, Supervisor
 from trade_hil_sim import SimProcess, events, writes
 from waiting import wait_until
 
-MODULE = """
-import os, signal, threading
-from trade import service
+MODULE = '''
+import ctypes, os, signal, threading
+from trade import Resource, service
 
 class Counter:
     def __init__(self) -> None:
@@ -51,18 +51,30 @@ class Dies:
     def __init__(self) -> None:
         os._exit(3)
 
-class Stays:
+class Stays(Counter):
+    @service
+    def ignore(self) -> None:
+        """SIGTERM, for the whole process, which Python itself lets no other thread than the main one do."""
+        ctypes.CDLL(None).signal(signal.SIGTERM, ctypes.c_void_p(1))
+
+class Wheel:
     def __init__(self) -> None:
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        self.resources = (Resource("wheel"),)
 
     @service
-    def poke(self) -> None: ...
+    def turn(self) -> None: ...
+
+    @service(effect="stop")
+    def stop(self) -> None: ...
+
+class Loose(Wheel):
+    relocatable = True
 
 class Grows:
     @service
     def grow(self, mb: int) -> None:
         self.kept = bytearray(b"x") * (mb * 1000000)
-"""
+'''
 COUNTER = 'providers = [{ class = "tiny:Counter", groups = ["hall"] }]\n'
 
 
@@ -76,6 +88,7 @@ class Keeping:
         self.supervisor = Supervisor(lambda: member, self.news.put, folder / "kept", grace_s=grace_s)
         (folder / "tiny.py").write_text(MODULE)
         self.system = member.settings.system
+        self.member = member
 
     def go_by(self, text: str) -> None:
         self.file.write_text(f'system = "{self.system}"\n{text}')
@@ -177,6 +190,25 @@ def test_a_child_that_ignores_being_told_to_leave_is_killed(keeping: Callable[..
     kept.supervisor.close()
     assert not psutil.pid_exists(stays.pid)
     assert kept.texts()[1:] == ["a does not leave and is killed", "a crashed (signal 9)"]
+
+
+def test_a_child_that_ignores_sigterm_is_killed_after_its_grace_and_started_again_with_its_state(
+    keeping: Callable[..., Keeping],
+) -> None:
+    kept = keeping('[container.a]\nproviders = [{ class = "tiny:Stays", groups = ["hall"] }]\n', grace_s=0.5)
+    stays = kept.become("a", "up")
+    call("count")
+    call("ignore")
+    assert kept.supervisor.restart("a", "anna")
+    again = kept.become("a", "up", restarts=1)
+    assert not psutil.pid_exists(stays.pid)
+    assert call("shown") == 1
+    assert kept.texts()[1:] == [
+        "a is started again, as anna asks for it",
+        "a is told to leave: it is to start again",
+        "a does not leave and is killed",
+        f"a is back, process {again.pid}",
+    ]
 
 
 @pytest.mark.parametrize(

@@ -151,13 +151,16 @@ def options(
     with_stdin: Annotated[
         bool, typer.Option("--with-stdin", hidden=True, help="End when standard input does.")
     ] = False,
+    leased: Annotated[
+        bool, typer.Option("--leased", hidden=True, help="With it: stay only as long as standard input says.")
+    ] = False,
     version: Annotated[  # noqa: ARG001 - answered by its callback
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version.")
     ] = False,
 ) -> None:
     """Options of every command."""
     if with_stdin:
-        end_with_stdin()
+        end_with_stdin(leased=leased)
     context.obj = SystemChoice(system, connect)
 
 

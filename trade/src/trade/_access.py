@@ -65,7 +65,13 @@ FUNCTIONS: Final = {
 }
 """What the middleware's own functions need over group ``trade``; empty: open to everybody who is not revoked."""
 
-SOME_HAVE: Final = {"children": "read", "restart_child": "administer"}
+SOME_HAVE: Final = {
+    "children": "read",
+    "restart_child": "administer",
+    "hand_back_child": "administer",
+    "lease_child": _ALL,  # asks itself for the gateway that is stood in for
+    "keep_child": _ALL,  # likewise
+}
 """Likewise, of functions that only a container has which looks after others."""
 _ALL_FUNCTIONS: Final = {**FUNCTIONS, **SOME_HAVE}
 _OF_EVERYBODY: Final = (PROVIDER, "supervisor")

@@ -124,7 +124,7 @@ class Providers:
             pid=os.getpid(),
             services=_infos(services),
             kinds=kinds_of(type(provider), implements),
-            meta=checked_meta(meta or {}),
+            meta=checked_meta({**_own_meta(provider), **(meta or {})}),
             members={group: tuple(names) for group, names in getattr(provider, "members", {}).items()},
             estops=getattr(provider, "open_estops", ()) if domain == DOMAIN else (),
         )
@@ -391,3 +391,8 @@ def _infos(services: Mapping[str, LocalService]) -> tuple[ServiceInfo, ...]:
 
 def _not_registered(provider: object) -> ConfigurationError:
     return ConfigurationError(where=type(provider).__qualname__, problem="it is not registered in this container")
+
+
+def _own_meta(provider: object) -> dict[str, Scalar]:
+    """What others need to know of its class: that it may go on elsewhere although it drives something (S20)."""
+    return {"relocatable": True} if getattr(provider, "relocatable", False) is True else {}

@@ -1,10 +1,12 @@
 """What is done in a child once its process is up: its objects are made with their state, and asked for it."""
 
+import threading
+import time
 from collections.abc import Callable, Mapping
 from typing import Any, Final, NamedTuple
 
 from trade import Container, Handle
-from trade.errors import CannotInstantiate, ConfigurationError, NoSuchService, TradeError
+from trade.errors import CannotInstantiate, ConfigurationError, NoSuchService, ServiceGone, TradeError
 from trade.starting import Started
 from trade_gateway._furnishing import function_of, make, name_of
 from trade_gateway._parts import Made
@@ -14,6 +16,7 @@ __all__ = ["Furnished", "furnish", "save"]
 
 _SEEN_S: Final = 15.0
 _MADE_S: Final = 30.0
+_LOOK_EVERY_S: Final = 0.02
 
 
 class Furnished(NamedTuple):
@@ -36,7 +39,7 @@ def furnish(member: Callable[[], Container], child: Child, started: Started, sta
         states: by the names of its objects.
 
     Raises:
-        TradeError: it is not seen, or an object cannot be made.
+        TradeError: it is not seen, or an object cannot be made, or is pinned to this host and must not be (S20).
     """
     made: dict[str, Handle] = {}
     problems: list[str] = []
@@ -44,7 +47,10 @@ def furnish(member: Callable[[], Container], child: Child, started: Started, sta
     for one in child.part.entry.providers or ():
         name = name_of(one, made)
         instantiate = _function(member, child, started, "instantiate")
-        made[name] = _made(instantiate, one, states.get(name), problems)[0]
+        services = _made(instantiate, one, states.get(name), problems)
+        if any(child.lease):
+            _refuse_pinned(one, services)
+        made[name] = services[0]
     return Furnished(clock, made, problems)
 
 
@@ -70,6 +76,25 @@ def _made(instantiate: Handle, one: Made, state: Any, problems: list[str]) -> tu
         except CannotInstantiate as refused:
             problems.append(f"{one.class_} begins anew, as it does not take its state: {refused.problem}")
     return make(instantiate, one, wait_s=_MADE_S)
+
+
+def _refuse_pinned(one: Made, services: tuple[Handle, ...]) -> None:
+    drives = sorted({name for service in services for name in _pinned_by(service)})
+    if drives:
+        problem = f"it drives {', '.join(drives)} of this host; only a class that is relocatable can be back elsewhere"
+        raise ConfigurationError(where=one.class_, problem=problem)
+
+
+def _pinned_by(service: Handle) -> tuple[str, ...]:
+    """What it drives that its class does not say can be reached from elsewhere. Raises ServiceGone: it is not seen."""
+    until, pause = time.monotonic() + _SEEN_S, threading.Event()
+    while True:
+        try:
+            return () if service.meta.get("relocatable") else service.resources
+        except ServiceGone:  # it is called before it is heard of
+            if time.monotonic() > until:
+                raise
+        pause.wait(_LOOK_EVERY_S)
 
 
 def save(member: Container, furnished: Furnished) -> dict[str, Any]:

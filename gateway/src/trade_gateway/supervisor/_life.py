@@ -105,10 +105,10 @@ class Life:
             return self._launch(now)
         return self._end(now, "it is to start again", _After.START, save=self._was_up)
 
-    def stop(self, now: float, why: str) -> Do | None:
-        """It is not wanted any more."""
+    def stop(self, now: float, why: str, *, save: bool = True) -> Do | None:
+        """It is not wanted any more; its state may be worth nothing any more, either."""
         if self.alive:
-            return self._end(now, why, _After.STOPPED, save=self._was_up)
+            return self._end(now, why, _After.STOPPED, save=save and self._was_up)
         self._rest(State.STOPPED)
         return None
 

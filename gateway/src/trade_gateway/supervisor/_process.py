@@ -11,6 +11,8 @@ from typing import Final
 import msgspec
 
 from trade.starting import Started
+from trade_gateway._fence import Term
+from trade_gateway.supervisor._alone import alone
 from trade_gateway.supervisor._tables import Child
 
 __all__ = ["Process", "rss_mb"]
@@ -26,28 +28,36 @@ class Process:
     Args:
         child: which.
         logs: a folder for what it complains of, in ``NAME.log``; of the one before in ``NAME.1.log``.
+        lock: a file that it locks for its life, if it must be the only one.
+        term: how long it may stay unless it is told otherwise; None: as long as this process.
 
     Raises:
         OSError: there can be no further process.
     """
 
-    def __init__(self, child: Child, logs: Path) -> None:
+    def __init__(self, child: Child, logs: Path, lock: Path | None = None, term: Term | None = None) -> None:
+        leased = [] if term is None else ["--leased"]
         self._log = logs / f"{child.name}.log"
         self._said = b""
         errors = _fresh(self._log)
         try:
-            self._process = subprocess.Popen(  # noqa: S603 - this very program
-                [sys.executable, "-m", "trade_gateway", "--with-stdin", *child.part.words, "--json"],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.DEVNULL if errors is None else errors,
-                env=dict(child.environment),
-                start_new_session=True,  # Ctrl-C is for this process, which tells them in their order
-            )
+            with alone(lock) as locked:
+                self._process = subprocess.Popen(  # noqa: S603 - this very program
+                    [sys.executable, "-m", "trade_gateway", "--with-stdin", *leased, *child.part.words, "--json"],
+                    stdin=subprocess.PIPE,
+                    stdout=subprocess.PIPE,
+                    stderr=subprocess.DEVNULL if errors is None else errors,
+                    env=dict(child.environment),
+                    start_new_session=True,  # Ctrl-C is for this process, which tells them in their order
+                    pass_fds=locked,
+                )
         finally:
             if errors is not None:
                 os.close(errors)
         try:
+            os.set_blocking(self._input, False)
+            if term is not None:
+                self.stay(term)
             os.set_blocking(self.output, False)
             self.end = os.pidfd_open(self._process.pid)
         except OSError:
@@ -59,6 +69,11 @@ class Process:
     def pid(self) -> int:
         """Its process id."""
         return self._process.pid
+
+    @property
+    def _input(self) -> int:
+        assert self._process.stdin is not None  # noqa: S101 - a pipe
+        return self._process.stdin.fileno()
 
     @property
     def output(self) -> int:
@@ -83,6 +98,11 @@ class Process:
         if not ended:
             return None, True
         return msgspec.json.decode(line, type=Started), True
+
+    def stay(self, term: Term) -> None:
+        """It may stay so long; one that does not listen is as far as before."""
+        with contextlib.suppress(BlockingIOError, BrokenPipeError):
+            os.write(self._input, f"{term.line()}\n".encode())
 
     def leave(self) -> None:
         """Tell it to leave."""

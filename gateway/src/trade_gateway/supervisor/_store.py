@@ -33,11 +33,19 @@ class StateStore(Database):
     def __init__(self, path: Path, tell: Callable[[str], None]) -> None:
         super().__init__(path, _TABLE, "state", tell)
 
-    def save(self, container: str, states: Mapping[str, Any]) -> bool:
-        """Keep the states of objects of one container, all or none; returns whether they are on disk."""
+    def save(self, container: str, states: Mapping[str, Any], wanted: Callable[[], bool] = lambda: True) -> bool:
+        """Keep the states of objects of one container, all or none; returns whether they are on disk.
+
+        Args:
+            container: its name.
+            states: by the names of its objects.
+            wanted: asked when its turn has come, after all that was saved or loaded before it.
+        """
         rows = [(container, name, time.time(), msgspec.msgpack.encode(state)) for name, state in states.items()]
 
         def save(database: sqlite3.Connection) -> bool:
+            if not wanted():
+                return False
             with database:
                 database.executemany(_SAVE, rows)
             return True

@@ -10,70 +10,25 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
-from msgspec import Struct, structs
+from msgspec import structs
 
 from trade import Container, Handle, Run
-from trade.errors import Busy, ServiceGone, TradeError
+from trade.errors import Busy, ConfigurationError, ServiceGone, TradeError
 from trade.starting import Started
 from trade_gateway.supervisor._furnish import Furnished, furnish, save
-from trade_gateway.supervisor._life import GRACE_S, SAVE_S, Do, Life, State
+from trade_gateway.supervisor._leasing import Asking, Leased, StandIn
+from trade_gateway.supervisor._life import GRACE_S, SAVE_S, Do, State
 from trade_gateway.supervisor._process import Process, rss_mb
 from trade_gateway.supervisor._store import StateStore
 from trade_gateway.supervisor._tables import Child
+from trade_gateway.supervisor._unit import ChildInfo, News, Unit
 
-__all__ = ["ChildInfo", "News", "Supervisor"]
+__all__ = ["Supervisor"]
 
 _ENDS_S: Final = GRACE_S + SAVE_S + 5.0
 """How long one child may take to be gone."""
-
-
-class ChildInfo(Struct, frozen=True):
-    """How a child fares."""
-
-    name: str
-    state: str
-    """``stopped``, ``starting``, ``up``, ``silent``, ``stopping``, ``waiting`` or ``given up``."""
-    pid: int
-    """0: it has no process."""
-    restarts: int
-    why: str
-    """Why it ended, or is ended; empty while it is up."""
-    rss_mb: float = 0.0
-    saved_at: float = 0.0
-    """What all its objects knew then, in seconds since the epoch, is on disk; 0: nothing yet."""
-
-
-class News(Struct, frozen=True):
-    """Something has become of a child."""
-
-    child: str
-    state: str
-    text: str
-    bad: bool = False
-
-
-class _Unit:
-    """A child with all that belongs to it; only the supervisor's thread touches it."""
-
-    def __init__(self, child: Child, grace_s: float) -> None:
-        self.child = child
-        self.life = Life(child.terms, grace_s=grace_s)
-        self.process: Process | None = None
-        self.boot = 0
-        """Counts processes: what is told of an earlier one counts for nothing."""
-        self.furnished: Furnished | None = None
-        self.begun = False
-        self.was_up = False
-        self.leaving = ""
-        """Why it is not wanted any more."""
-        self.save_at = math.inf
-        self.saved_at = 0.0
-
-    @property
-    def gone(self) -> bool:
-        return bool(self.leaving) and not self.life.alive
 
 
 class Supervisor:
@@ -93,10 +48,8 @@ class Supervisor:
         self._tell = tell
         self._folder = folder
         self._grace_s = grace_s
-        self._store = StateStore(
-            folder / f"{member().name}.state.sqlite", lambda text: tell(News(child="", state="", text=text, bad=True))
-        )
-        self._units: dict[str, _Unit] = {}
+        self._store = StateStore(folder / f"{member().name}.state.sqlite", self._complain)
+        self._units: dict[str, Unit] = {}
         self._shown: tuple[ChildInfo, ...] = ()
         self._inbox: deque[Callable[[], None]] = deque()
         self._jobs: set[threading.Thread] = set()
@@ -120,6 +73,11 @@ class Supervisor:
         """Whether somebody looks after them."""
         return self._thread.is_alive()
 
+    @property
+    def certified(self) -> bool:
+        """Whether links tell who is who."""
+        return self._member().settings.tls is not None
+
     def children(self) -> list[ChildInfo]:
         """How they fare."""
         return [structs.replace(info, rss_mb=round(rss_mb(info.pid), 1)) for info in self._shown]
@@ -130,6 +88,14 @@ class Supervisor:
             return False
         self._post(partial(self._restart, name, who))
         return True
+
+    def stand_in(self, name: str) -> StandIn:
+        """What gives another gateway leases of one. Raises ConfigurationError: none is stood in for."""
+        unit = self._units.get(name)
+        if unit is None or not isinstance(unit.lease, StandIn):
+            problem = f"no container {name!r} is stood in for here; its table needs stands_in_for"
+            raise ConfigurationError(where=f"container {name}", problem=problem)
+        return unit.lease
 
     def close(self) -> None:
         """End them, those first that others do not wait for; their state is saved before. Idempotent."""
@@ -153,28 +119,44 @@ class Supervisor:
 
     def _run(self) -> None:
         while not (self._closing and all(unit.gone for unit in self._units.values())):
-            due = min((min(unit.life.deadline, unit.save_at) for unit in self._units.values()), default=math.inf)
-            wait_s = None if due == math.inf else max(0.0, due - time.monotonic())
-            for key, _ in self._selector.select(wait_s):
+            due_s = min((unit.due_s for unit in self._units.values()), default=math.inf)
+            ready = self._selector.select(None if due_s == math.inf else max(0.0, due_s))
+            for unit in list(self._units.values()):  # one that has no lease any more is not started again
+                self._by_lease(unit)
+            for key, _ in ready:
                 key.data()
             while self._inbox:
                 self._inbox.popleft()()
             for unit in list(self._units.values()):
                 self._look(unit, time.monotonic())
-            self._shown = tuple(_info(unit) for unit in self._units.values())
+            self._shown = tuple(unit.info() for unit in self._units.values())
 
     def _rung(self) -> None:
         with contextlib.suppress(BlockingIOError):
             os.read(self._bell, 4096)
 
-    def _look(self, unit: _Unit, now: float) -> None:
+    def _by_lease(self, unit: Unit) -> bool:
+        """Have it end if it may not be here any more; returns whether it may."""
+        if unit.may_be_up():
+            unit.stay()
+            return True
+        lease, now = unit.lease, time.monotonic()
+        if lease is not None and unit.begun and not unit.given_up:
+            unit.begun = False
+            self._do(unit, unit.life.stop(now, lease.why, save=lease.term is None))
+        return False
+
+    def _look(self, unit: Unit, now: float) -> None:
+        may_be_up = self._by_lease(unit)
         if unit.leaving:
             if not unit.life.alive or not self._needed(unit):
                 self._do(unit, unit.life.stop(now, unit.leaving))
             if unit.gone and not self._closing:
                 del self._units[unit.child.name]
-        elif not unit.begun and all(self._has_been_up(name) for name in unit.child.terms.after):
+        elif unit.to_begin and may_be_up and all(self._has_been_up(name) for name in unit.child.terms.after):
             unit.begun = True
+            if unit.lease is not None:
+                self._told(unit, f"{unit.child.name} is for this host now")
             self._do(unit, unit.life.start(now))
         if unit.life.deadline <= now:
             self._do(unit, unit.life.due(now))
@@ -183,9 +165,10 @@ class Supervisor:
             self._save(unit)
 
     def _has_been_up(self, name: str) -> bool:
-        return name in self._units and self._units[name].was_up
+        unit = self._units.get(name)
+        return unit is not None and (unit.was_up or unit.elsewhere)
 
-    def _needed(self, unit: _Unit) -> bool:
+    def _needed(self, unit: Unit) -> bool:
         """Whether one that is to end before it is still there."""
         others = (other for other in self._units.values() if unit.child.name in other.child.terms.after)
         return any(other.leaving and other.life.alive for other in others)
@@ -197,16 +180,35 @@ class Supervisor:
         for name, child in children.items():
             unit = self._units.get(name)
             if unit is None:
-                self._units[name] = _Unit(child, self._grace_s)
+                unit = self._units[name] = Unit(child, self._grace_s)
+                unit.lease = self._leased(child)
                 continue
             same, was_leaving = unit.child.starts_like(child), bool(unit.leaving)
+            if unit.child.lease != child.lease:
+                unit.lease = self._leased(child)
+            elif isinstance(unit.lease, StandIn):
+                unit.lease.go_by(child)
             unit.child, unit.life.terms, unit.leaving = child, child.terms, ""
             if unit.begun and (was_leaving or not same):
                 self._do(unit, unit.life.start(time.monotonic()))
 
+    def _leased(self, child: Child) -> Leased | None:
+        lock = self._folder / "locks" / f"{self._member().name}.{child.name}.lock"
+        if child.terms.lease_from:
+            return Asking(child, self._member, self._post, self._complain, lock)
+        if child.terms.stands_in_for:
+            return StandIn(child, self._store, lock, partial(self._post, lambda: None))
+        return None
+
     def _restart(self, name: str, who: str) -> None:
         unit = self._units.get(name)
-        if unit is not None and not unit.leaving:
+        if unit is None or unit.leaving:
+            return
+        if unit.lease is not None and not unit.may_be_up():
+            self._do(
+                unit, unit.life.stop(time.monotonic(), unit.lease.why)
+            )  # if it was given up, it is asked for again
+        else:
             self._told(unit, f"{name} is started again, as {who} asks for it")
             unit.begun = True
             self._do(unit, unit.life.start(time.monotonic()))
@@ -218,7 +220,7 @@ class Supervisor:
 
     # --- doing what a life says
 
-    def _do(self, unit: _Unit, do: Do | None) -> None:
+    def _do(self, unit: Unit, do: Do | None) -> None:
         match do:
             case Do.LAUNCH:
                 self._launch(unit)
@@ -236,17 +238,18 @@ class Supervisor:
             case _:
                 pass
 
-    def _launch(self, unit: _Unit) -> None:
+    def _launch(self, unit: Unit) -> None:
         unit.boot, unit.furnished, unit.save_at = unit.boot + 1, None, math.inf
         try:
-            unit.process = Process(unit.child, self._folder / "logs")
+            lock, unit.told = (None, None) if unit.lease is None else (unit.lease.lock, unit.lease.term)
+            unit.process = Process(unit.child, self._folder / "logs", lock, unit.told)
         except OSError as none:
             self._ended(unit, f"there can be no process: {none}")
             return
         self._selector.register(unit.process.end, selectors.EVENT_READ, partial(self._died, unit))
         self._selector.register(unit.process.output, selectors.EVENT_READ, partial(self._heard, unit))
 
-    def _heard(self, unit: _Unit) -> None:
+    def _heard(self, unit: Unit) -> None:
         process = unit.process
         if process is None:  # it ended in the same round
             return
@@ -258,9 +261,10 @@ class Supervisor:
         if not more:
             self._selector.unregister(process.output)
         if started is not None:
-            self._job(unit, "furnish", partial(self._furnish, unit, unit.child, started))
+            load = partial(self._store.load, unit.child.name) if unit.lease is None else unit.lease.load
+            self._job(unit, "furnish", partial(self._furnish, unit, unit.child, started, load))
 
-    def _died(self, unit: _Unit) -> None:
+    def _died(self, unit: Unit) -> None:
         process, unit.process = unit.process, None
         if process is None:
             return
@@ -269,7 +273,7 @@ class Supervisor:
             self._selector.unregister(process.output)
         self._ended(unit, process.close())
 
-    def _ended(self, unit: _Unit, how: str) -> None:
+    def _ended(self, unit: Unit, how: str) -> None:
         life, name = unit.life, unit.child.name
         unit.boot, unit.furnished, unit.save_at = unit.boot + 1, None, math.inf
         do = life.ended(time.monotonic(), how)
@@ -288,7 +292,7 @@ class Supervisor:
 
     # --- asking them
 
-    def _ask(self, unit: _Unit) -> None:
+    def _ask(self, unit: Unit) -> None:
         terms, furnished, now = unit.child.terms, unit.furnished, time.monotonic()
         if unit.process is None or furnished is None:
             return
@@ -302,7 +306,7 @@ class Supervisor:
             return
         run.when_done(lambda run: self._post(partial(self._answered, unit, unit.boot, run)))
 
-    def _answered(self, unit: _Unit, boot: int, run: Run) -> None:
+    def _answered(self, unit: Unit, boot: int, run: Run) -> None:
         if boot != unit.boot:
             return
         error, now = run.exception(0), time.monotonic()
@@ -313,7 +317,7 @@ class Supervisor:
 
     # --- what takes its time, on threads of its own
 
-    def _job(self, unit: _Unit, what: str, work: Callable[[], Callable[[], None]]) -> None:
+    def _job(self, unit: Unit, what: str, work: Callable[[], Callable[[], None]]) -> None:
         """Have something done that waits; what comes of it counts only for the process that is there now."""
         boot = unit.boot
 
@@ -326,15 +330,15 @@ class Supervisor:
         self._jobs.add(thread)
         thread.start()
 
-    def _furnish(self, unit: _Unit, child: Child, started: Started) -> Callable[[], None]:
+    def _furnish(self, unit: Unit, child: Child, started: Started, load: Callable[[], Any]) -> Callable[[], None]:
         try:
-            furnished = furnish(self._member, child, started, self._store.load(child.name))
+            furnished = furnish(self._member, child, started, load())
         except Exception as wrong:  # noqa: BLE001 - what an object raises may come as its own type
             why = f"it came up, but: {wrong}"
             return lambda: self._do(unit, unit.life.fail(time.monotonic(), why))
         return lambda: self._up(unit, furnished)
 
-    def _up(self, unit: _Unit, furnished: Furnished) -> None:
+    def _up(self, unit: Unit, furnished: Furnished) -> None:
         unit.life.up(time.monotonic())
         if unit.life.state is not State.UP:
             return
@@ -345,45 +349,37 @@ class Supervisor:
         for problem in furnished.problems:
             self._told(unit, problem, bad=True)
 
-    def _save(self, unit: _Unit) -> None:
-        furnished, child = unit.furnished, unit.child
+    def _save(self, unit: Unit) -> None:
+        furnished = unit.furnished
         if furnished is None or not furnished.made:
             self._saved(unit)
             return
 
+        keep = partial(self._store.save, unit.child.name) if unit.lease is None else unit.lease.keep()
+
         def work() -> Callable[[], None]:
             began = time.time()
             states = save(self._member(), furnished)
-            kept = bool(states) and self._store.save(child.name, states)
+            kept = bool(states) and keep(states)
             whole = kept and states.keys() == furnished.made.keys()
             return partial(self._saved, unit, began if whole else 0.0)
 
         self._job(unit, "save", work)
 
-    def _saved(self, unit: _Unit, saved_at: float = 0.0) -> None:
+    def _saved(self, unit: Unit, saved_at: float = 0.0) -> None:
         now, unit.saved_at = time.monotonic(), saved_at or unit.saved_at
         if unit.life.state is State.STOPPING:
             self._do(unit, unit.life.saved(now))
         elif unit.furnished is not None and unit.furnished.made:
             unit.save_at = now + unit.child.terms.save_every_s
 
-    def _told(self, unit: _Unit, text: str, *, bad: bool = False) -> None:
+    def _complain(self, text: str) -> None:
+        self._tell(News(child="", state="", text=text, bad=True))
+
+    def _told(self, unit: Unit, text: str, *, bad: bool = False) -> None:
         self._tell(News(child=unit.child.name, state=unit.life.state.value, text=text, bad=bad))
 
 
 def _again(member: Container, handle: Handle) -> Handle:
     """The same service, asked from another container."""
     return member.handle(handle.key)
-
-
-def _info(unit: _Unit) -> ChildInfo:
-    pid = unit.process.pid if unit.process else 0
-    life = unit.life
-    return ChildInfo(
-        name=unit.child.name,
-        state=life.state.value,
-        pid=pid,
-        restarts=life.restarts,
-        why=life.why or unit.leaving,
-        saved_at=unit.saved_at,
-    )

@@ -10,6 +10,7 @@ from trade_gateway._parts import Around, Entry, Part, Tables, converted
 
 __all__ = ["Child", "Supervised", "read_children"]
 
+_LEASE_S: Final = 10.0
 _MISSES: Final = 4
 """So many questions in a row are not answered before a container counts as hung."""
 
@@ -28,6 +29,12 @@ class Supervised(Entry, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """How often the state of its providers is saved; also when it is stopped."""
     max_rss_mb: Annotated[float, Meta(gt=0)] | None = None
     """Who has more resident memory is ended; none: as much as there is."""
+    lease_from: str = ""
+    """A gateway of another host, without whose word it is not up here, and which has it up if this host is lost."""
+    stands_in_for: str = ""
+    """The gateway of another host whose container this is; it is up here while that one is lost."""
+    lease_s: Annotated[float, Meta(ge=2, le=600)] = _LEASE_S
+    """With ``stands_in_for``: how long that one has it after it was heard of last."""
 
     @property
     def question_s(self) -> float:
@@ -54,9 +61,17 @@ class Child(NamedTuple):
 
     def starts_like(self, other: "Child") -> bool:
         """Whether the two differ only in how they are looked after."""
-        mine, others = self.part, other.part
-        started = (list(mine.words), mine.environment, mine.entry.providers)
-        return started == (list(others.words), others.environment, others.entry.providers)
+        return self._started == other._started
+
+    @property
+    def _started(self) -> tuple[object, ...]:
+        words, environment, providers = list(self.part.words), self.part.environment, self.part.entry.providers
+        return (words, environment, providers, *self.lease)
+
+    @property
+    def lease(self) -> tuple[str, str]:
+        """Who it is leased from, whom it stands in for; both empty: neither."""
+        return self.terms.lease_from, self.terms.stands_in_for
 
 
 def read_children(
@@ -94,5 +109,22 @@ class _OfGateway(Tables):
             self.refuse(name, "host", "a gateway looks after containers of its own host; leave it out")
         if entry.gateway:
             self.refuse(name, "gateway", "is this file; a gateway looks after robots, providers, rules and doors")
+        if isinstance(entry, Supervised):
+            self._check_lease(name, entry)
         if self._certified and not entry.tls:
             self.refuse(name, "tls", f"missing; name the folder with its certificate: trade pki issue {name}")
+
+    def _check_lease(self, name: str, entry: Supervised) -> None:
+        key = "lease_from" if entry.lease_from else "stands_in_for"
+        if not getattr(entry, key):
+            if entry.lease_s != _LEASE_S:
+                self.refuse(name, "lease_s", "goes with stands_in_for; leave it out")
+            return
+        if entry.lease_from and entry.stands_in_for:
+            self.refuse(name, key, "of two gateways one leases it and the other one stands in; leave one of them out")
+        if entry.lease_from and entry.lease_s != _LEASE_S:
+            self.refuse(name, "lease_s", f"is for {entry.lease_from} to say; leave it out")
+        if entry.providers is None:
+            self.refuse(name, key, f"goes with providers; a {entry.kind} is pinned to its host; leave it out")
+        if entry.restart == "never":
+            self.refuse(name, "restart", f"does not go with {key}; leave one of them out")
