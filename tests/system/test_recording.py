@@ -220,6 +220,8 @@ def test_an_arm_that_is_replayed_in_a_second_simulation_goes_where_it_went_in_th
     assert [round(max(track.positions_rad), 1) for track in waved.tracks][:2] == [0.5, -1.3]
     found, _ = deviation(waved, 0.8, Motion("ada.right", waved.joints, second.tracks()), latest_s=PATIENCE_S)
     assert max(found.greatest_rad) <= TOLERANCE_RAD
+
+
 @pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM])
 def test_a_viewer_sees_live_what_a_recording_would_have(
     rosie_up: Callable[[], Rosie], run: Callable[..., Program], ending: signal.Signals
