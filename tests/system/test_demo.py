@@ -31,7 +31,7 @@ TOPICS = {
     *("/calls", "/locks", "/faults"),
 }
 PATIENT = (
-    "rate_hz = 50            # SYNCs per second\nwatchdog_s = 0.3",
+    "rate_hz = 50            # SYNCs per second\nstale_after_s = 0.5\nwatchdog_s = 0.3",
     "rate_hz = 50\nstale_after_s = 2\nwatchdog_s = 2",
 )
 TOLERANCE_RAD = 0.1
