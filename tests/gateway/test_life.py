@@ -79,8 +79,8 @@ def test_one_that_never_answers_is_told_to_leave_then_killed_and_started_again()
     assert (child.state, child.why) == (State.STOPPING, "it did not answer within 4 s")
     assert child.due(child.deadline) is Do.KILL
     assert child.deadline == math.inf
-    assert child.ended(50.0, "signal 9") is None
-    assert (child.state, child.why) == (State.WAITING, "it did not answer within 4 s")
+    assert child.ended(50.0, "crashed (signal 9)") is None
+    assert (child.state, child.why) == (State.WAITING, "it did not answer within 4 s; it crashed (signal 9)")
     assert child.due(child.deadline) is Do.LAUNCH
     assert child.restarts == 1
 
@@ -183,13 +183,13 @@ def test_one_that_is_not_up_in_time_is_ended_and_tried_again() -> None:
     child = life()
     child.start(0.0)
     assert child.due(child.deadline) is Do.LEAVE
-    child.ended(61.0, "code 0")
-    assert (child.state, child.why) == (State.WAITING, "it was not up within 60 s")
+    child.ended(61.0, "ended (exit code 0)")
+    assert (child.state, child.why) == (State.WAITING, "it was not up within 60 s; it ended (exit code 0)")
 
 
 def test_one_that_takes_too_much_memory_is_saved_ended_and_tried_again() -> None:
     child = up()
     assert child.fail(20.0, "it took 600 MB of memory") is Do.SAVE
     child.saved(20.0)
-    child.ended(21.0, "code 0")
-    assert (child.state, child.why) == (State.WAITING, "it took 600 MB of memory")
+    child.ended(21.0, "ended (exit code 0)")
+    assert (child.state, child.why) == (State.WAITING, "it took 600 MB of memory; it ended (exit code 0)")

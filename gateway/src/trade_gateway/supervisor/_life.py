@@ -153,6 +153,8 @@ class Life:
         after = self._after if self.state is State.STOPPING else _After.FAILED
         if self.state is not State.STOPPING:
             self.why = how
+        elif after is _After.FAILED:
+            self.why = f"{self.why}; it {how}"
         match after:
             case _After.STOPPED:
                 self._rest(State.STOPPED)
