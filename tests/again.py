@@ -4,6 +4,9 @@ The devices of these tests have deadlines of milliseconds. Drivers keep their pr
 up, and who shares a processor with other programs is held up now and then. So a failure counts only if nothing stood
 still: a process of its own looks at the clock, and the product's own words for being late count as well. What fails
 twice has failed. More than `_MOST` such tests fail the run: that is no accident any more.
+
+Two failures of each process may be without such a reason and still run once more: of thousands of tests one that waits
+for too little should not refuse a whole day. The summary shows them with what failed, for somebody to mend them.
 """
 
 import os
@@ -32,7 +35,7 @@ while os.getppid() == {{parent}}:
 """
 _KEY: Final = "ran again"
 _UNSTEADY: Final = "for no reason that is known, mend it: "
-_UNSTEADY_ONES: Final = 1
+_UNSTEADY_ONES: Final = 2
 
 
 class Clock:

@@ -65,10 +65,10 @@ def test_one_that_failed_without_such_a_reason_is_let_off_and_shown(tmp_path: Pa
     assert ">       assert not first" in said or ">   assert not first" in said
 
 
-def test_a_second_one_is_not(tmp_path: Path) -> None:
-    code, said = _run(tmp_path, "assert not first", 2)
+def test_a_third_one_is_not(tmp_path: Path) -> None:
+    code, said = _run(tmp_path, "assert not first", 3)
     assert code == 1
-    assert "1 failed, 1 passed" in said
+    assert "1 failed, 2 passed" in said
 
 
 def test_what_is_wrong_twice_has_failed(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from trade.errors import (
     ToleranceExceeded,
     TradeError,
 )
-from trade.testing import memory_system
+from trade.testing import MemorySystem, memory_system
 from trade_drivers import AttachedRobot, JointGroup, Tolerances, Trajectory, TrajectoryPoint, attach, parse
 from trade_hil_sim import DynamixelBus, Entry, events, motion_writes, writes
 from waiting import wait_until
@@ -124,6 +124,7 @@ def test_they_begin_together_and_arrive_together_at_their_own_goals(walker: Walk
     walker.legs.enable()
     mark = written_now()
     assert walker.legs.move_to(goals) == pytest.approx(goals, abs=0.04)
+    wait_until(walker.rests, "both legs rest")
     begun, ended = {}, {}
     for side, number, name in (("left", 1, "hip"), ("right", 1, "hip"), ("right", 2, "knee"), ("left", 2, "knee")):
         log = walker.log(side)
@@ -141,6 +142,7 @@ def test_a_slower_speed_takes_longer(walker: Walker) -> None:
     for goal, speed in ((0.4, 1.0), (0.0, 0.25)):
         mark = written_now()
         walker.legs.move_to([goal] * 4, speed)
+        wait_until(walker.rests, "both legs rest")
         log = walker.log("left")
         took.append(events(log, "at_rest", since=mark)[-1].t - events(log, "motion_started", since=mark)[0].t)
     assert took[1] > 2 * took[0]
@@ -271,15 +273,16 @@ def _far(walker: Walker, side: str, mark: float) -> list[tuple[int, float]]:
     return [(abs(goal_counts(entry) - 2048), entry.t) for entry in goals]
 
 
-def _announced(walker: Walker, driver: Container) -> None:
+def _announced(walker: Walker, driver: Container, system: MemorySystem) -> None:
     for group, provider in walker.attached.providers.items():
         driver.register(provider, group)
+    system.settle()
 
 
 def test_S11_a_joint_that_somebody_else_has_refuses_the_whole_group(walker: Walker) -> None:
     with memory_system() as system:
         driver, owner, other = (system.container(name) for name in ("driver", "owner", "other"))
-        _announced(walker, driver)
+        _announced(walker, driver, system)
         move = other.find(where(name="move_to", group="rosie.legs"))
         with owner.lock(where(group="rosie.left.knee")), pytest.raises(TradeError, match=r"left\.knee"):
             move([0.3] * 4)
@@ -290,7 +293,7 @@ def test_S11_a_joint_that_somebody_else_has_refuses_the_whole_group(walker: Walk
 def test_S08_a_stop_by_somebody_else_latches_on_both_buses(walker: Walker) -> None:
     with memory_system() as system:
         driver, mover, other = (system.container(name) for name in ("driver", "mover", "other"))
-        _announced(walker, driver)
+        _announced(walker, driver, system)
         run = mover.find(where(name="move_to", group="rosie.legs")).with_(deadline_s=20).start([1.4] * 4)
         for side in ("left", "right"):
             wait_until(lambda side=side: events(walker.log(side), "motion_started"), f"the {side} leg moves")

@@ -11,6 +11,7 @@ from drivers.tail_rig import TailRig, tail_rig
 from trade.errors import ConfigurationError
 from trade_drivers import load
 from trade_hil_sim.feetech import Servo
+from waiting import wait_until
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "servo_arm.toml"
 
@@ -107,6 +108,7 @@ def test_the_arm_of_the_examples_attaches_and_its_six_joints_arrive_together(rig
     assert arm.move_to(goals) == pytest.approx(goals, abs=0.03)
     told = rig.goals(since=mark)
     assert [entry.device_id for entry in told if entry.t == told[0].t] == [1, 2, 3, 4, 5, 6]  # in one packet
+    wait_until(lambda: all(rig.events("at_rest", i, mark) for i in range(1, 7)), "all joints rest")
     arrived = [rig.events("at_rest", i, mark)[-1].t for i in range(1, 7)]
     started = [rig.events("motion_started", i, mark)[0].t for i in range(1, 7)]
     assert max(arrived) - min(arrived) < 0.3 * (max(arrived) - min(started))

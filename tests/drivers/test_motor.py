@@ -49,6 +49,7 @@ def test_a_group_starts_in_one_packet_and_arrives_together(head: Rig, robot: Att
     assert group.move_to([-1.2, 0.3]) == pytest.approx([-1.2, 0.3], abs=0.03)
     first, second = head.goals(since=mark)
     assert first.t == second.t
+    wait_until(lambda: all(head.events("at_rest", i, mark) for i in (1, 2)), "both joints rest")
     started = [head.events("motion_started", i, mark)[0].t for i in (1, 2)]
     arrived = [head.events("at_rest", i, mark)[0].t for i in (1, 2)]
     duration = max(arrived) - min(started)
