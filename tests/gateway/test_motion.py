@@ -95,6 +95,18 @@ def test_what_never_moved_stays_as_it_is() -> None:
     assert moving(motion) == motion
 
 
+@pytest.mark.parametrize("shift_s", [0.0, 0.01, 0.02, 0.03])
+def test_what_came_to_rest_at_the_end_of_its_range_swings_nowhere_beyond_it(shift_s: float) -> None:
+    """Between the points, too: from 1.2 rad down to the end of the range at 0, and back up."""
+    limits = JointLimits(name="rosie.neck.pan", min_rad=0.0, max_rad=1.2, max_speed_rad_s=2.5, max_accel_rad_s2=20.0)
+    down = [(at / 50, 1.2 - profile(at / 50 - shift_s)) for at in range(100)]
+    up = [(2 + at / 50, profile(at / 50 - shift_s)) for at in range(100)]
+    motion = motion_of("rosie.head", [_state(1000.0 + at_s, position) for at_s, position in (*down, *up)])
+    way, _ = fitted(motion, 1.0, [limits])
+    assert min(point.positions_rad[0] for point in way.points) < 0.01
+    planned(way, GENEROUS, [limits])  # raises LimitExceeded otherwise
+
+
 def test_what_is_beyond_a_limit_is_refused() -> None:
     motion = motion_of("rosie.head", states(scale=1.5))
     with pytest.raises(LimitExceeded, match="angle"):
@@ -106,7 +118,7 @@ def test_what_is_beyond_a_limit_is_refused() -> None:
 def test_what_rested_at_the_end_of_its_range_may_go_there_again() -> None:
     motion = motion_of("rosie.head", [_state(at_s / 10, 1.402) for at_s in range(20)])
     way, _ = fitted(motion, 1.0, [LIMITS])
-    assert {position for point in way.points for position in point.positions_rad} == {1.4}
+    assert {position for point in way.points for position in point.positions_rad} == {1.398}
 
 
 def test_a_measurement_that_was_read_twice_counts_once() -> None:

@@ -23,6 +23,8 @@ _REACH_S: Final = 0.08
 """So far before and after a point measurements count for it."""
 _STEPS: Final = 8
 _NEAR_RAD: Final = 0.005
+_INSIDE_RAD: Final = 0.002
+"""So far the points keep off a limit: between them the way swings out a little."""
 _NOISE: Final = 0.95
 _SLOWER: Final = 0.99
 _SLOWEST: Final = 0.05
@@ -201,7 +203,7 @@ def trajectory(motion: Motion, speed: float, limits: Sequence[JointLimits] = ())
     Args:
         motion: what was recorded.
         speed: 1 is that of the recording; 0.5 takes twice as long.
-        limits: angles that are measured less than 5 mrad beyond them are taken for the limit.
+        limits: angles that are measured less than 5 mrad beyond them are taken for 2 mrad inside.
     """
     ranges = {limit.name: (limit.min_rad, limit.max_rad) for limit in limits}
     count = max(2, round(motion.duration_s / _STEP_S))
@@ -226,8 +228,9 @@ def trajectory(motion: Motion, speed: float, limits: Sequence[JointLimits] = ())
 def _inside(position_rad: float, ends: tuple[float, float] | None) -> float:
     if ends is None:
         return position_rad
-    inside = min(max(position_rad, ends[0]), ends[1])
-    return inside if abs(inside - position_rad) < _NEAR_RAD else position_rad
+    off = min(_INSIDE_RAD, (ends[1] - ends[0]) / 4)
+    inside = min(max(position_rad, ends[0] + off), ends[1] - off)
+    return inside if abs(inside - position_rad) < _NEAR_RAD + off else position_rad
 
 
 def deviation(motion: Motion, speed: float, measured: Motion, latest_s: float = 2.0) -> tuple[Deviation, float]:
