@@ -28,6 +28,7 @@ def test_a_fault_is_told_acknowledged_by_name_and_no_joint_is_left_without_its_r
     expect(veras.get_by_role("button")).to_have_count(0)
     hers.get_by_role("button", name="I have seen: rosie.neck.pan").click()
     expect(veras).to_contain_text("for anna")
+    anna = browsers.view("anna")
     anna.hold(anna.plus)
     expect(anna.message).to_have_text("That fault is in the way. When its cause is gone: Enable.")
     anna.page.mouse.up()
@@ -92,6 +93,17 @@ def test_text_can_be_read_against_what_is_behind_it(browsers: Browsers, bench: B
             assert [one for one in found if one["contrast"] < LEAST_CONTRAST] == []
         papers.add(chief.page.evaluate("getComputedStyle(document.body).backgroundColor"))
     assert len(papers) == 2  # both were there
+
+
+def test_a_button_can_be_read_while_it_is_held(browsers: Browsers) -> None:
+    """Under the pointer, too, which is where it is then."""
+    anna = browsers.view("anna")
+    anna.hold(anna.plus)
+    expect(anna.plus).to_have_attribute("aria-pressed", "true")
+    found = [one for one in anna.page.evaluate(CONTRASTS) if one["text"].startswith("+")]
+    anna.page.mouse.up()
+    assert found
+    assert [one for one in found if one["contrast"] < LEAST_CONTRAST] == []
 
 
 CONTRASTS = """() => {
