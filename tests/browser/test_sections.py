@@ -28,7 +28,6 @@ def test_a_fault_is_told_acknowledged_by_name_and_no_joint_is_left_without_its_r
     expect(veras.get_by_role("button")).to_have_count(0)
     hers.get_by_role("button", name="I have seen: rosie.neck.pan").click()
     expect(veras).to_contain_text("for anna")
-    anna = browsers.view("anna")
     anna.hold(anna.plus)
     expect(anna.message).to_have_text("That fault is in the way. When its cause is gone: Enable.")
     anna.page.mouse.up()

@@ -65,9 +65,11 @@ class Eye:
 
 
 @pytest.fixture
-def arm(there: Container) -> Arm:
+def arm(here: Container, there: Container) -> Arm:
+    """There, and known here."""
     provider = Arm()
     there.register(provider, "rosie.arm")
+    here.find(where(name="reach"), wait_s=20)
     return provider
 
 
