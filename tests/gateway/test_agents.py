@@ -12,17 +12,16 @@ import anyio
 import pytest
 from anyio.to_thread import run_sync
 from mcp import ClientSession, McpError
-from mcp.shared.memory import create_connected_server_and_client_session
+from mcp.shared.memory import create_client_server_memory_streams
 from mcp.types import CancelledNotification, CancelledNotificationParams, ClientNotification
 
 from trade import Container, Resource, service, where
 from trade._audit import Audit
 from trade.errors import AccessDenied, ConfigurationError, TradeError
 from trade.testing import MemorySystem, memory_system
-from trade_gateway.agents import Approvals, Tools
-from trade_gateway.agents._server import server_of
+from trade_gateway.agents import Approvals
+from trade_gateway.agents._server import converse
 from trade_gateway.agents._tools import TOOLS
-from trade_gateway.door._deeds import Deeds
 from trade_gateway.talk import read_lexicon
 from waiting import wait_until
 
@@ -163,15 +162,16 @@ class Client:
 
 
 @asynccontextmanager
-async def connected(container: Container, *, ask_first: tuple[str, ...] = ()) -> AsyncGenerator[Client]:
-    deeds = Deeds(container)
-    client = await run_sync(deeds.clients.open, container.address.identity)
-    tools = Tools(container, deeds, client, Approvals(container, ask_first), read_lexicon())
-    try:
-        async with create_connected_server_and_client_session(server_of(tools)) as session:
+async def connected(
+    container: Container, *, ask_first: tuple[str, ...] = (), twin: Any = None
+) -> AsyncGenerator[Client]:
+    async with create_client_server_memory_streams() as (ours, theirs), anyio.create_task_group() as tasks:
+        approvals = Approvals(container, ask_first)
+        tasks.start_soon(converse, container, approvals, read_lexicon(), twin, *theirs, lambda: None)
+        async with ClientSession(*ours) as session:
+            await session.initialize()
             yield Client(session)
-    finally:
-        await run_sync(client.close)
+        await ours[1].aclose()
 
 
 def run(scenario: Callable[..., Awaitable[None]], container: Container, **options: Any) -> None:
@@ -268,6 +268,34 @@ def test_what_an_agent_moves_stops_when_it_disconnects(robot: Robot, agent: Cont
     anyio.run(main)
     assert robot.head.stopped.wait(20)
     wait_until(lambda: agent.locks() == [])
+
+
+class StuckTwin:
+    """Nothing comes of what is tried on it until the test says so."""
+
+    def __init__(self) -> None:
+        self.tries = threading.Event()
+        self.go_on = threading.Event()
+
+    def call(self, *_: Any) -> None:
+        self.tries.set()
+        self.go_on.wait(60)
+
+
+def test_S03_a_dry_run_that_does_not_end_keeps_nothing_of_an_agent_that_is_gone(robot: Robot, agent: Container) -> None:
+    twin = StuckTwin()
+
+    async def main() -> None:
+        async with connected(agent, twin=twin) as client, anyio.create_task_group() as tasks:
+            await client("lock", group="rosie.head")
+            tasks.start_soon(partial(client, "dry_run", group="rosie.head", name="turn", args=[0.5]))
+            await run_sync(twin.tries.wait, 20)
+            tasks.cancel_scope.cancel()
+
+    anyio.run(main)
+    assert not twin.go_on.is_set()
+    wait_until(lambda: agent.locks() == [])
+    twin.go_on.set()
 
 
 def test_a_stop_needs_no_lock_and_ends_what_moves(robot: Robot, agent: Container) -> None:

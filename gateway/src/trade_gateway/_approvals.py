@@ -13,7 +13,8 @@ from trade_gateway._list import Json
 from trade_gateway._output import Output, complain
 from trade_gateway._system_choice import visitor
 
-_GROUP: Final = "approvals"
+GROUP: Final = "approvals"
+"""Where what waits is a service."""
 _COLUMNS: Final = ("id", "agent", "service", "arguments", "why", "waits")
 
 app = typer.Typer(
@@ -76,7 +77,7 @@ def _decide(context: typer.Context, name: str, word: str, *args: str) -> None:
 
 
 def _pending(container: Container) -> Iterator[tuple[Handle, dict[str, Any]]]:
-    for handle in container.services(where(name="pending", group=_GROUP)):
+    for handle in container.services(where(name="pending", group=GROUP)):
         try:
             for one in handle():
                 yield handle, {name: getattr(one, name) for name in ("id", "agent", "service", "args", "why", "until")}

@@ -9,15 +9,16 @@ from functools import partial
 from typing import Any, Final
 
 import msgspec
+from anyio.to_thread import run_sync
 from msgspec import Struct
 
 from trade import Container, Handle, current_call, service
 from trade.errors import AccessDenied, ConfigurationError
+from trade_gateway._approvals import GROUP
 from trade_gateway.agents._problems import NeedsApproval
 
-__all__ = ["GROUP", "Approvals", "Request"]
+__all__ = ["Approvals", "Request"]
 
-GROUP: Final = "approvals"
 _MOST: Final = 16
 _MOST_TEXT: Final = 2_000
 """Characters of the arguments that are shown; who cannot be shown all of them is not asked."""
@@ -62,6 +63,7 @@ class Approvals:
         self._guard = threading.Lock()
         self._waiting: dict[str, _Waiting] = {}
         self._offered = False
+        self._offering = asyncio.Lock()
 
     # --- services
 
@@ -128,7 +130,8 @@ class Approvals:
         text = msgspec.json.encode(args).decode()
         if len(text) > _MOST_TEXT:
             raise NeedsApproval(service=handle.label, reason="its arguments are too long to be shown to anybody")
-        self._offer(handle)
+        async with self._offering:
+            await run_sync(self._offer, handle)
         now, name, loop = time.time(), secrets.token_hex(3), asyncio.get_running_loop()
         said: asyncio.Future[str] = loop.create_future()
 

@@ -42,7 +42,7 @@ class NoTwin(CallerError, LookupError):
 
 @dataclass(kw_only=True, eq=False)
 class NotThatWay(CallerError, ValueError):
-    """That is not for this tool; nothing was done."""
+    """The arguments of a tool are wrong; nothing was done."""
 
     problem: str
 

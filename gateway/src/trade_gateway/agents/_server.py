@@ -10,9 +10,11 @@ from typing import Any, Final
 
 import anyio
 import msgspec
+from anyio.streams.memory import MemoryObjectReceiveStream, MemoryObjectSendStream
 from mcp import types
 from mcp.server.lowlevel import Server
 from mcp.server.stdio import stdio_server
+from mcp.shared.message import SessionMessage
 
 from trade import Container
 from trade_gateway.agents._approvals import Approvals
@@ -22,7 +24,10 @@ from trade_gateway.door import _messages as messages
 from trade_gateway.door._deeds import Deeds
 from trade_gateway.talk import Lexicon
 
-__all__ = ["serve", "server_of"]
+__all__ = ["converse", "serve"]
+
+Hears = MemoryObjectReceiveStream[SessionMessage | Exception]
+Says = MemoryObjectSendStream[SessionMessage]
 
 _TOLD: Final = """Robots as services. Look with `services` and `describe` first. Whatever moves something needs a lock \
 over its group (`lock`), may need a person's approval, and can be tried with `dry_run`, which moves nothing. Give \
@@ -42,19 +47,43 @@ async def serve(
         twin: for dry runs.
         leave: ends all that is the process's own; called when a signal ends it.
     """
+    async with stdio_server() as (hears, says):
+        await converse(container, approvals, lexicon, twin, hears, says, leave)
+
+
+async def converse(
+    container: Container,
+    approvals: Approvals,
+    lexicon: Lexicon,
+    twin: Twin | None,
+    hears: Hears,
+    says: Says,
+    leave: Callable[[], None],
+) -> None:
+    """As `serve`, over any two streams: what the agent moves stops once nothing more can be heard of it."""
     deeds = Deeds(container)
     client = await deeds.apart(deeds.clients.open, container.address.identity)
     tools = Tools(container, deeds, client, approvals, lexicon, twin)
-    server = server_of(tools)
-    try:
-        async with _signals(client.close, leave), stdio_server() as (hears, says):
-            await server.run(hears, says, server.create_initialization_options())
-    finally:
-        with anyio.CancelScope(shield=True):
-            await deeds.apart(client.close, stops=True)
+    server = _server_of(tools)
+    passed_on, heard = anyio.create_memory_object_stream[SessionMessage | Exception](0)
+
+    async def hear() -> None:
+        """Its end is the agent's end; the server would first wait for all that was asked of it."""
+        try:
+            async with hears, passed_on:
+                async for message in hears:
+                    await passed_on.send(message)
+        finally:
+            with anyio.CancelScope(shield=True):
+                await deeds.apart(client.close, stops=True)
+
+    async with _signals(client.close, leave), anyio.create_task_group() as tasks:
+        tasks.start_soon(hear)
+        await server.run(heard, says, server.create_initialization_options())
+        tasks.cancel_scope.cancel()
 
 
-def server_of(tools: Tools) -> "Server[Any, Any]":
+def _server_of(tools: Tools) -> "Server[Any, Any]":
     server: Server[Any, Any] = Server("trade", version=version("trade-gateway"), instructions=_TOLD)
 
     async def listed() -> list[types.Tool]:

@@ -14,8 +14,9 @@ from typing import Any, Final, cast
 import msgspec
 from msgspec import Struct
 
-from trade import Container, Handle, Settings, where
-from trade.errors import TradeError
+from trade import Container, Handle, Settings
+from trade.errors import NoSuchService, TradeError
+from trade_gateway._call import find
 from trade_gateway.agents._problems import NoTwin
 from trade_gateway.drill._actors import Actor, DrillFailed, bare_environment
 
@@ -74,7 +75,7 @@ class Twin:
         with self._lock:
             here = self._up()
             group, name = handle.key.domain, handle.name
-            tried = self._find(here, group, name)
+            tried = self._find(here, group, name, _SEEN_S)
             if tried is None:
                 raise NoTwin(reason=f"the twin of {self._robot.name} has no {handle.label}")
             placed = self._place(here, group, state)
@@ -141,16 +142,17 @@ class Twin:
         except TradeError:
             return None
 
-    def _find(self, here: Container, group: str, name: str) -> Handle | None:
-        wanted, until = where(name=name, group=group), time.monotonic() + _SEEN_S
-        while True:
-            found = [one for one in here.services(wanted) if group in (one.key.domain, *one.groups)]
-            if found or not self._process or here.services(where(group="*")) or time.monotonic() > until:
-                return found[0] if found else None
-            threading.Event().wait(0.05)
+    def _find(self, here: Container, group: str, name: str, wait_s: float = 0.0) -> Handle | None:
+        """Those of one provider are seen together: only the first is waited for."""
+        try:
+            return find(here, f"{group}.{name}", None, wait_s)
+        except NoSuchService:
+            return None
 
     def close(self) -> None:
-        """End it. Idempotent."""
+        """End it, whatever is tried there. Idempotent."""
+        if process := self._process:
+            process.kill()  # what is tried there ends by that
         with self._lock:
             self._end()
             shutil.rmtree(self._folder, ignore_errors=True)
