@@ -1,0 +1,1 @@
+"""ROS beside TRADE: topics, services, actions and joints of either, for the other."""

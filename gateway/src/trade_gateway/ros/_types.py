@@ -1,0 +1,269 @@
+"""ROS messages as dicts, and as bytes of ROS 1 or of ROS 2 (CDR), by the definitions of their types.
+
+A message is a dict of its fields: numbers, booleans, text, lists of them, messages in messages. ``uint8[]`` and
+``byte[]`` are ``bytes``. A time or duration is ``{"sec": ..., "nanosec": ...}``, as in ROS 2, for both.
+"""
+
+import struct
+from collections.abc import Iterable, Mapping
+from functools import cache
+from pathlib import Path
+from typing import Any, Final, Literal, NamedTuple
+
+import numpy as np
+from rosbags.interfaces import Nodetype
+from rosbags.serde import SerdeError
+from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
+
+from trade.errors import ConfigurationError
+
+__all__ = ["Field", "Message", "Types"]
+
+Message = dict[str, Any]
+
+_SHIPPED: Final = Path(__file__).parent / "definitions"
+_FILLER: Final = "structure_needs_at_least_one_member"
+"""What ROS 2 puts into a message without fields."""
+_PARTS: Final = {"srv": ("Request", "Response"), "action": ("Goal", "Result", "Feedback")}
+_TEXTS: Final = ("string", "wstring")
+_MALFORMED: Final = (
+    SerdeError,
+    ArithmeticError,
+    AssertionError,
+    AttributeError,
+    LookupError,
+    TypeError,
+    ValueError,
+    struct.error,
+)
+"""What reading and writing raise, whatever is wrong."""
+_OCTETS: Final = ("uint8", "byte", "octet", "char")
+
+
+class Field(NamedTuple):
+    """A field of a message."""
+
+    name: str
+    type: str
+    """``float64``, ``string``, ``std_msgs/msg/Header``: of one element, if there are several."""
+    many: bool
+    length: int
+    """Of an array of fixed length; 0: any."""
+
+
+class Types:
+    """The types one side of the bridge knows: the standard ones, those shipped here, those in the folders given."""
+
+    def __init__(self, ros: Literal[1, 2], folders: Iterable[Path] = ()) -> None:
+        """Args:
+            ros: whose bytes.
+            folders: each with packages as ROS lays them out: ``PACKAGE/msg/NAME.msg``, ``srv``, ``action``.
+
+        Raises:
+            ConfigurationError: a definition cannot be read.
+        """
+        self.ros: Final = ros
+        self._store = get_typestore(Stores.ROS1_NOETIC if ros == 1 else Stores.ROS2_JAZZY)
+        self._wholes: dict[str, tuple[str, ...]] = {}
+        for folder in (_SHIPPED / f"ros{ros}", *folders):
+            self._read(folder)
+        self._fields = cache(self._look_up)
+
+    # --- what there is
+
+    def fields(self, type_name: str) -> tuple[Field, ...]:
+        """Of a message type. Raises ConfigurationError: it is not known."""
+        return self._fields(type_name)
+
+    def parts(self, type_name: str) -> tuple[str, ...]:
+        """The message types that a service (request, response) or an action (goal, result, feedback) is made of.
+
+        Raises:
+            ConfigurationError: it is not known.
+        """
+        found = self._wholes.get(type_name)
+        if found is None:
+            raise ConfigurationError(where="ROS type", problem=_unknown(type_name, self._wholes))
+        return found
+
+    def definition(self, type_name: str) -> tuple[str, str]:
+        """Text of a message type with all it contains, and its MD5 sum, both as ROS 1 has them."""
+        self.fields(type_name)
+        return self._store.generate_msgdef(type_name, ros_version=1)
+
+    def hash(self, type_name: str) -> str:
+        """What ROS 2 names a message type's content by: ``RIHS01_...``."""
+        self.fields(type_name)
+        return self._store.hash_rihs01(type_name)
+
+    # --- values
+
+    def zero(self, type_name: str) -> Message:
+        """A message with nothing in it."""
+        return self.message(self.object(type_name, {}))
+
+    def to_bytes(self, type_name: str, message: Mapping[str, Any]) -> bytes:
+        """A message as it travels; fields left out are zero.
+
+        Raises:
+            ConfigurationError: it has a field that the type has not, or a value that does not fit.
+        """
+        made = self.object(type_name, message)
+        write = self._store.serialize_ros1 if self.ros == 1 else self._store.serialize_cdr
+        try:
+            return bytes(write(made, type_name))
+        except _MALFORMED as error:
+            raise ConfigurationError(where=type_name, problem=f"does not fit: {error}") from None
+
+    def from_bytes(self, type_name: str, data: bytes | memoryview) -> Message:
+        """A message that came.
+
+        Raises:
+            ValueError: these are not the bytes of one.
+        """
+        self.fields(type_name)
+        read = self._store.deserialize_ros1 if self.ros == 1 else self._store.deserialize_cdr
+        try:
+            return self.message(read(bytes(data), type_name))
+        except _MALFORMED as error:
+            raise ValueError(f"{len(data)} bytes are no {type_name}: {error}") from None
+
+    def object(self, type_name: str, message: Mapping[str, Any]) -> Any:
+        """The library's own object of a message."""
+        fields = self.fields(type_name)
+        if unknown := set(message) - {field.name for field in fields}:
+            known = ", ".join(field.name for field in fields)
+            raise ConfigurationError(where=type_name, problem=f"has no {', '.join(sorted(unknown))}; it has {known}")
+        values = {field.name: self._put(type_name, field, message.get(field.name)) for field in fields}
+        filled = {name: 0 for name, _ in self._store.fielddefs[type_name][1] if name == _FILLER}
+        return self._store.types[type_name](**values, **filled)
+
+    def message(self, made: Any) -> Message:
+        """The dict of such an object."""
+        return {field.name: self._take(field, getattr(made, field.name)) for field in self.fields(made.__msgtype__)}
+
+    # ---
+
+    def _put(self, of: str, field: Field, value: Any) -> Any:
+        try:
+            return self._put_many(field, value) if field.many else self._put_one(field.type, value)
+        except (TypeError, ValueError, OverflowError, AttributeError) as error:
+            raise ConfigurationError(where=f"{of}.{field.name}", problem=f"{value!r} does not fit: {error}") from None
+
+    def _put_many(self, field: Field, value: Any) -> Any:
+        given = [None] * field.length if value is None else value
+        if field.length and len(given) != field.length:
+            raise ValueError(f"it holds exactly {field.length}")
+        if "/" in field.type or field.type in _TEXTS:
+            return [self._put_one(field.type, one) for one in given]
+        if isinstance(given, (bytes, bytearray)):
+            return np.frombuffer(given, dtype=np.uint8)
+        return np.array([self._put_one(field.type, one) for one in given], dtype=_dtype(field.type))
+
+    def _put_one(self, kind: str, value: Any) -> Any:
+        if "/" in kind:
+            return self.object(kind, {} if value is None else value)
+        if kind in _TEXTS:
+            return "" if value is None else _text(value)
+        if kind == "bool":
+            return bool(value)
+        if kind.startswith("float"):
+            return 0.0 if value is None else float(value)
+        return 0 if value is None else _whole(kind, value)
+
+    def _take(self, field: Field, value: Any) -> Any:
+        if not field.many:
+            return self.message(value) if "/" in field.type else value
+        if "/" in field.type:
+            return [self.message(one) for one in value]
+        if field.type in _OCTETS and isinstance(value, np.ndarray):
+            return value.tobytes()
+        return value.tolist() if isinstance(value, np.ndarray) else list(value)
+
+    def _look_up(self, type_name: str) -> tuple[Field, ...]:
+        try:
+            found = self._store.fielddefs[type_name][1]
+        except KeyError:
+            raise ConfigurationError(where="ROS type", problem=_unknown(type_name, self._store.fielddefs)) from None
+        return tuple(_field(name, kind) for name, kind in found if name != _FILLER)
+
+    def _read(self, folder: Path) -> None:
+        if not folder.is_dir():
+            raise ConfigurationError(where=str(folder), problem="there is no such folder of ROS definitions")
+        for path in sorted(folder.glob("*/*/*.*")):
+            kind, package = path.parent.name, path.parent.parent.name
+            if path.suffix[1:] == kind and kind in ("msg", *_PARTS):
+                self._add(path, f"{package}/{kind}/{path.stem}", kind)
+
+    def _add(self, path: Path, type_name: str, kind: str) -> None:
+        names = [f"{type_name}_{part}" for part in _PARTS.get(kind, ())]
+        texts = _sections(path.read_text()) if names else [path.read_text()]
+        if names and len(texts) != len(names):
+            raise ConfigurationError(where=str(path), problem=f"has {len(texts)} parts of {len(names)}, between ---")
+        try:
+            for name, text in zip(names or [type_name], texts, strict=True):
+                if name not in self._store.fielddefs:
+                    # the library puts all below msg; in ROS 2 the name is part of the hash
+                    ((_, read),) = get_types_from_msg(
+                        text or _nothing(self.ros), name.replace(f"/{kind}/", "/msg/")
+                    ).items()
+                    self._store.register({name: read})
+        except TypesysError as error:
+            raise ConfigurationError(where=str(path), problem=f"cannot be read: {error}") from None
+        if names:
+            self._wholes[type_name] = tuple(names)
+
+
+def _nothing(ros: int) -> str:
+    """The text of a message without fields; in ROS 2 it is a byte long."""
+    return f"uint8 {_FILLER}\n" if ros == 2 else "\n"
+
+
+def _sections(text: str) -> list[str]:
+    parts: list[list[str]] = [[]]
+    for line in text.splitlines():
+        if line.strip() == "---":
+            parts.append([])
+        else:
+            parts[-1].append(line)
+    return ["\n".join(lines) + "\n" for lines in parts]
+
+
+def _field(name: str, kind: Any) -> Field:
+    match kind:
+        case (Nodetype.BASE, (base, _)):
+            return Field(name, base, many=False, length=0)
+        case (Nodetype.NAME, other):
+            return Field(name, other, many=False, length=0)
+        case (Nodetype.ARRAY, (inner, length)):
+            return Field(name, _field(name, inner).type, many=True, length=length)
+        case (_, (inner, _)):
+            return Field(name, _field(name, inner).type, many=True, length=0)
+        case _:
+            raise ConfigurationError(where=name, problem=f"is of a kind that is not known: {kind!r}")
+
+
+def _dtype(kind: str) -> Any:
+    return np.dtype("uint8" if kind in _OCTETS else kind)
+
+
+def _whole(kind: str, value: Any) -> int:
+    if isinstance(value, float) and not value.is_integer():
+        raise ValueError("it is no whole number")
+    number = int(value)
+    limits = np.iinfo(_dtype(kind))
+    if not limits.min <= number <= limits.max:
+        raise ValueError(f"it goes from {limits.min} to {limits.max}")
+    return number
+
+
+def _text(value: Any) -> str:
+    if not isinstance(value, str):
+        raise TypeError("it is no text")
+    return value
+
+
+def _unknown(type_name: str, known: Iterable[str]) -> str:
+    near = [name for name in known if name.rpartition("/")[2] == type_name.rpartition("/")[2]]
+    there = f"; there is {', '.join(near)}" if near else "; put its definition in a folder of types"
+    return f"{type_name} is not known{there}"
