@@ -1,0 +1,214 @@
+"""How a method's arguments become those of a C function, and what comes back; planned once, when it is declared."""
+
+# pyright: reportUnknownArgumentType=false, reportUnknownMemberType=false, reportUnknownVariableType=false
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields, is_dataclass
+from typing import Any, Final, NamedTuple, get_args, get_origin, get_type_hints
+
+from trade.errors import ConfigurationError
+
+__all__ = ["Passing", "plan"]
+
+_NONE: Final = type(None)
+_FLOATS: Final = ("float", "double", "long double")
+_TEXTS: Final = ("char *", "char const *")
+
+Into = Callable[[Any], Sequence[Any]]
+"""An argument as one or two of C's."""
+OutOf = Callable[[Any], Any]
+
+
+class _Back(NamedTuple):
+    """Something that C puts where a pointer leads."""
+
+    type: str
+    length: int
+    """Given to C after the pointer; 0: not asked for."""
+    read: OutOf
+
+
+class Passing(NamedTuple):
+    """The plan of one function."""
+
+    ffi: Any
+    into_c: Sequence[Into]
+    backs: Sequence[_Back]
+    returned: OutOf | None
+    """Of what it returns; None: that is not the result."""
+    has_status: bool
+
+    def into(self, first: Sequence[Any], args: Sequence[Any]) -> tuple[list[Any], list[Any]]:
+        """What the function is called with, and the places of it where something comes back."""
+        given = list(first)
+        for put, value in zip(self.into_c, args, strict=True):
+            given.extend(put(value))
+        places = [self.ffi.new(one.type) for one in self.backs]
+        for one, place in zip(self.backs, places, strict=True):
+            given.extend((place, one.length) if one.length else (place,))
+        return given, places
+
+    def out_of(self, returned: Any, places: Sequence[Any]) -> Any:
+        """The method's result."""
+        if self.returned is not None:
+            return self.returned(returned)
+        results = [one.read(place) for one, place in zip(self.backs, places, strict=True)]
+        return tuple(results) if len(results) > 1 else results[0] if results else None
+
+
+def plan(
+    ffi: Any,
+    where: str,
+    kind: Any,
+    hints: Mapping[str, Any],
+    *,
+    status: bool | None,
+    handle: bool,
+    lengths: Sequence[int],
+) -> Passing:
+    """See `CLibrary.function`; the hints are the method's, with its result. Raises ConfigurationError."""
+    planned = _Planning(ffi, where, list(kind.args)[handle:], list(lengths))
+    for name, hint in hints.items():
+        if name != "return":
+            planned.take(name, hint)
+    result = hints["return"]
+    returns_status = _python(kind.result) is int and (bool(planned.kinds) or result is _NONE)
+    has_status = returns_status if status is None else status
+    if has_status and _python(kind.result) is not int:
+        raise planned.wrong(f"it returns {kind.result.cname}, which is no status")
+    by_value = not planned.kinds and result is not _NONE
+    returned = planned.reads(kind.result, result, "its result") if by_value else None
+    return Passing(ffi, planned.into_c, [] if by_value else planned.give_back(result), returned, has_status)
+
+
+class _Planning:
+    """Goes through the parameters of both sides together."""
+
+    def __init__(self, ffi: Any, where: str, kinds: list[Any], lengths: list[int]) -> None:
+        self._ffi = ffi
+        self._where = where
+        self.kinds = kinds
+        """Of the C function, those not yet planned."""
+        self._lengths = lengths
+        self.into_c: list[Into] = []
+
+    def wrong(self, problem: str) -> ConfigurationError:
+        return ConfigurationError(where=self._where, problem=problem)
+
+    # --- what goes in
+
+    def take(self, name: str, hint: Any) -> None:
+        """The next parameter of the method."""
+        if not self.kinds:
+            raise self.wrong(f"the function has no parameter for {name}")
+        kind = self.kinds.pop(0)
+        put = self._several(kind, hint) if get_origin(hint) is list else self._one(kind, hint, name)
+        if put is None:
+            counted = "; that needs a pointer and a count after it" if get_origin(hint) is list else ""
+            raise self.wrong(f"{name} is {_named(hint)}, the function takes {kind.cname}{counted}")
+        self.into_c.append(put)
+
+    def _one(self, kind: Any, hint: Any, name: str) -> Into | None:
+        if hint is str and kind.cname in _TEXTS:
+            return lambda value: (self._ffi.new("char[]", _text(value)),)
+        if hint in (_python(kind), *((bool,) if _python(kind) is int else ())):
+            return lambda value: (value,)
+        if kind.kind != "struct" or not is_dataclass(hint):
+            return None
+        self._struct(kind, hint, name)
+        members, made = [field.name for field in fields(hint)], f"{kind.cname} *"
+        return lambda value: (self._ffi.new(made, {one: getattr(value, one) for one in members})[0],)
+
+    def _several(self, kind: Any, hint: Any) -> Into | None:
+        if kind.kind != "pointer" or not self._is_count() or get_args(hint) != (_python(kind.item),):
+            return None
+        self.kinds.pop(0)
+        made = f"{kind.item.cname}[]"
+
+        def put(values: Sequence[Any]) -> Sequence[Any]:
+            return self._ffi.new(made, list(values)), len(values)
+
+        return put
+
+    def _is_count(self) -> bool:
+        return bool(self.kinds) and _python(self.kinds[0]) is int
+
+    # --- what comes back
+
+    def give_back(self, result: Any) -> list[_Back]:
+        """All that is left comes back as the method's result says."""
+        backs: list[_Back] = []
+        several = get_origin(result) is tuple
+        wanted = [*get_args(result)] if several else [] if result is _NONE else [result]
+        while self.kinds:
+            if not wanted:
+                raise self.wrong(f"nothing is given for its parameter {self.kinds[0].cname}")
+            backs.append(self._back(self.kinds.pop(0), wanted.pop(0)))
+        if wanted or self._lengths:
+            raise self.wrong(f"the function gives {len(backs)} values back, the method returns {_named(result)}")
+        return backs
+
+    def _back(self, kind: Any, hint: Any) -> _Back:
+        if kind.kind != "pointer" or kind.item.kind not in ("primitive", "enum", "struct"):
+            raise self.wrong(f"nothing is given for its parameter {kind.cname}, and nothing can come back by that")
+        if get_origin(hint) is not list:
+            read = self.reads(kind.item, hint, "what comes back")
+
+            def first(place: Any) -> Any:
+                return read(place[0])
+
+            return _Back(f"{kind.item.cname} *", 0, first)
+        if not self._lengths:
+            raise self.wrong(f"say by out=... how many come back by its parameter {kind.cname}")
+        length, read = self._lengths.pop(0), self.reads(kind.item, get_args(hint)[0], "what comes back")
+        counted = self._is_count()
+        if counted:
+            self.kinds.pop(0)
+
+        def each(place: Any) -> list[Any]:
+            return [read(one) for one in place]
+
+        return _Back(f"{kind.item.cname}[{length}]", length if counted else 0, each)
+
+    def reads(self, kind: Any, hint: Any, what: str) -> OutOf:
+        """How a C value becomes a Python one."""
+        if hint is str and kind.cname in _TEXTS:
+            return lambda value: "" if value == self._ffi.NULL else self._ffi.string(value).decode(errors="replace")
+        if kind.kind == "struct" and is_dataclass(hint):
+            return self._struct(kind, hint, what)
+        if hint is bool and _python(kind) in (int, bool):
+            return bool
+        if _python(kind) is hint:
+            return _itself
+        raise self.wrong(f"{what} is {kind.cname}, which cannot be {_named(hint)}")
+
+    def _struct(self, kind: Any, hint: Any, what: str) -> OutOf:
+        has, wanted = dict(kind.fields or ()), get_type_hints(hint)
+        if missing := wanted.keys() - has.keys():
+            raise self.wrong(f"{kind.cname} has no {', '.join(sorted(missing))}, which {_named(hint)} has")
+        reads = {name: self.reads(has[name].type, one, f"{what}.{name}") for name, one in wanted.items()}
+        return lambda value: hint(**{name: read(getattr(value, name)) for name, read in reads.items()})
+
+
+def _python(kind: Any) -> type | None:
+    """The type that a number of C is in Python."""
+    if kind.kind == "enum":
+        return int
+    if kind.kind != "primitive" or kind.cname in ("char", "wchar_t"):
+        return None
+    return bool if kind.cname == "_Bool" else float if kind.cname in _FLOATS else int
+
+
+def _text(value: str) -> bytes:
+    data = value.encode()
+    if b"\0" in data:
+        raise ValueError("a text of C ends at the first zero byte; it may have none within")
+    return data
+
+
+def _itself(value: Any) -> Any:
+    return value
+
+
+def _named(hint: Any) -> str:
+    return hint.__name__ if isinstance(hint, type) and not get_args(hint) else str(hint)
