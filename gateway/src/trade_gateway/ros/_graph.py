@@ -46,7 +46,7 @@ class RosUnreachable(CallError, ConnectionError):
     what: str
     problem: str
 
-    def __str__(self) -> str:
+    def describe(self) -> str:
         return f"{self.what}: {self.problem}"
 
 
@@ -57,7 +57,7 @@ class RosRefused(CallerError):
     what: str
     problem: str
 
-    def __str__(self) -> str:
+    def describe(self) -> str:
         return f"{self.what}: {self.problem}"
 
 
