@@ -15,8 +15,8 @@ from trade._audit_chain import AuditRow
 from trade._audit_store import AuditStore
 from trade.errors import ConfigurationError
 from trade.testing import memory_system
+from trade_gateway.clients._records import newest
 from trade_gateway.door import Door, Tokens, add_token
-from trade_gateway.door._records import newest
 from waiting import wait_until
 
 POLICY = """

@@ -20,8 +20,8 @@ from trade import Container
 from trade_gateway.agents._approvals import Approvals
 from trade_gateway.agents._tools import TOOLS, Tools
 from trade_gateway.agents._twin import Twin
-from trade_gateway.door import _messages as messages
-from trade_gateway.door._deeds import Deeds
+from trade_gateway.clients import Deeds
+from trade_gateway.clients import _messages as messages
 from trade_gateway.talk import Lexicon
 
 __all__ = ["converse", "serve"]

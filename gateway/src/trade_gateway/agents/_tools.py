@@ -15,9 +15,8 @@ from trade.errors import LockLost, NoSuchService, TradeError
 from trade_gateway.agents._approvals import Approvals
 from trade_gateway.agents._problems import NeedsLock, NoSuchTool, NotThatWay, NoTwin
 from trade_gateway.agents._twin import Tried, Twin
-from trade_gateway.door import _messages as messages
-from trade_gateway.door._clients import Client
-from trade_gateway.door._deeds import Deeds
+from trade_gateway.clients import Client, Deeds
+from trade_gateway.clients import _messages as messages
 from trade_gateway.talk import Lexicon, Memory, Talk
 
 __all__ = ["TOOLS", "Tool", "Tools"]

@@ -6,7 +6,7 @@ from starlette.datastructures import Headers
 from starlette.types import Scope
 
 from trade.errors import AccessDenied
-from trade_gateway.door._judge import ANONYMOUS, Judge
+from trade_gateway.clients import ANONYMOUS, Judge
 from trade_gateway.door._problems import NotLetIn
 from trade_gateway.door._tokens import Tokens
 

@@ -8,7 +8,7 @@ from starlette.responses import Response
 from starlette.types import ASGIApp, Receive, Scope, Send
 from starlette.websockets import WebSocket
 
-from trade_gateway.door._messages import encoder
+from trade_gateway.clients._messages import encoder
 from trade_gateway.door._problems import MEDIA_TYPE, WrongDoor, problem_of
 
 LOOPBACK_NAMES: Final = frozenset({"127.0.0.1", "localhost", "[::1]"})

@@ -12,14 +12,13 @@ from starlette.responses import Response
 from starlette.routing import Route
 
 from trade.errors import InvalidResult, LockLost, TooLarge, TradeError
-from trade_gateway.door import _messages as messages
-from trade_gateway.door._clients import Client
-from trade_gateway.door._deeds import Deeds
+from trade_gateway.clients import Client, Deeds, NoSuchSession
+from trade_gateway.clients import _messages as messages
 from trade_gateway.door._entry import Entry
 from trade_gateway.door._gate import problem_response
 from trade_gateway.door._leases import Leases
 from trade_gateway.door._openapi import document
-from trade_gateway.door._problems import BadMessage, HttpError, NeedsSession, NoSuchSession, NotLetIn
+from trade_gateway.door._problems import BadMessage, HttpError, NeedsSession, NotLetIn
 
 MOST_BODY_BYTES: Final = 1 << 20
 SESSION: Final = "Trade-Session"

@@ -5,8 +5,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Final
 
-from trade_gateway.door._clients import Client
-from trade_gateway.door._deeds import Deeds
+from trade_gateway.clients import Client, Deeds
 
 _LOOK_EVERY_S: Final = 1.0
 """How soon a token that was taken back ends a session."""

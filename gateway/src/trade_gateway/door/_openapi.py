@@ -7,7 +7,7 @@ from typing import Any, Final, cast
 import msgspec
 
 from trade import Handle, HookInfo, LoadInfo, NotificationInfo
-from trade_gateway.door import _messages as messages
+from trade_gateway.clients import _messages as messages
 from trade_gateway.door._problems import MEDIA_TYPE, Problem
 
 Schema = dict[str, Any]

@@ -9,6 +9,7 @@ from msgspec import UNSET, Struct, UnsetType
 
 from trade import errors
 from trade.errors import CallerError, TradeError
+from trade_gateway.clients import NoAuditRecord, NoSuchSession, TooMany
 
 MEDIA_TYPE: Final = "application/problem+json"
 
@@ -35,17 +36,6 @@ class WrongDoor(CallerError, PermissionError):
 
 
 @dataclass(kw_only=True, eq=False)
-class TooMany(CallerError, BlockingIOError):
-    """More at once than the door takes from one, or from all; nothing was done."""
-
-    what: str
-    limit: int
-
-    def describe(self) -> str:
-        return f"there are {self.limit} {self.what} already, which is the limit; end some, or try again later"
-
-
-@dataclass(kw_only=True, eq=False)
 class NeedsSession(CallerError, LookupError):
     """What was asked for lives as long as its session, and a plain request has none that lasts."""
 
@@ -53,20 +43,6 @@ class NeedsSession(CallerError, LookupError):
 
     def describe(self) -> str:
         return f"{self.what} needs a session: POST /session and send its id as Trade-Session, or speak over /ws"
-
-
-@dataclass(kw_only=True, eq=False)
-class NoSuchSession(CallerError, LookupError):
-    """There is no such session of this client; nothing was done, and what it had set moving was told to stop."""
-
-    session: str
-    """How the id begins that was sent."""
-
-    def describe(self) -> str:
-        return (
-            f"this client has no session {self.session}...: it was closed, or nothing was heard of it within its "
-            "lease; POST /session opens another one"
-        )
 
 
 @dataclass(kw_only=True, eq=False)
@@ -110,6 +86,7 @@ _STATUS: Final[tuple[tuple[type[BaseException], HTTPStatus], ...]] = (
     (errors.NotInstantiable, HTTPStatus.FORBIDDEN),
     (errors.TooLarge, HTTPStatus.REQUEST_ENTITY_TOO_LARGE),
     (NoSuchSession, HTTPStatus.NOT_FOUND),
+    (NoAuditRecord, HTTPStatus.NOT_FOUND),
     (errors.SessionEnded, HTTPStatus.NOT_FOUND),
     (NeedsSession, HTTPStatus.BAD_REQUEST),
     (errors.NoSuchService, HTTPStatus.NOT_FOUND),

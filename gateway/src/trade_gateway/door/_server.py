@@ -20,8 +20,8 @@ from starlette.routing import WebSocketRoute
 from trade import Container
 from trade.errors import ConfigurationError
 from trade_gateway._hosts import in_url, is_loopback
+from trade_gateway.clients import Deeds
 from trade_gateway.dashboard import pages
-from trade_gateway.door._deeds import Deeds
 from trade_gateway.door._entry import Entry
 from trade_gateway.door._gate import LOOPBACK_NAMES, Gate
 from trade_gateway.door._http import SESSION, Http, broken, refused

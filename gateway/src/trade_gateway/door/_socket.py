@@ -12,13 +12,12 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from trade import Handle, Run
 from trade.errors import InvalidResult, LockLost, TradeError
-from trade_gateway.door import _messages as messages
-from trade_gateway.door._clients import Client
-from trade_gateway.door._deeds import Deeds
+from trade_gateway.clients import Client, Deeds, TooMany
+from trade_gateway.clients import _messages as messages
 from trade_gateway.door._entry import SUBPROTOCOL, Entry
 from trade_gateway.door._gate import problem_response
 from trade_gateway.door._leases import Leases
-from trade_gateway.door._problems import BadMessage, TooMany, problem_of
+from trade_gateway.door._problems import BadMessage, problem_of
 
 MOST_UNDER_WAY: Final = 64
 """Calls, streams and watches of one connection; stops do not count."""

@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Callable
 from typing import Final
 
-from trade_gateway.door._problems import TooMany
+from trade_gateway.clients._errors import TooMany
 
 MOST: Final = 64
 MOST_OF_ONE: Final = 16

@@ -28,11 +28,11 @@ from trade.errors import (
     TooManyServices,
     TradeError,
 )
-from trade_gateway.door import _messages as messages
-from trade_gateway.door._clients import Client, Clients, places
-from trade_gateway.door._judge import Judge
-from trade_gateway.door._overview import Overview
-from trade_gateway.door._quota import MOST, Quota
+from trade_gateway.clients import _messages as messages
+from trade_gateway.clients._clients import Client, Clients, places
+from trade_gateway.clients._judge import Judge
+from trade_gateway.clients._overview import Overview
+from trade_gateway.clients._quota import MOST, Quota
 
 _logger = logging.getLogger("trade")
 

@@ -1,4 +1,4 @@
-"""Clients of the door: each a session of its own, with its locks, calls and streams, which end with it (S03, S05)."""
+"""Clients: each a session of its own, with its locks, calls and streams, which end with it (S03, S05)."""
 
 import secrets
 import threading
@@ -10,7 +10,7 @@ from typing import Final
 from msgspec import Struct
 
 from trade import Container, Handle, Lock, Run, Session
-from trade_gateway.door._problems import NoSuchSession, TooMany
+from trade_gateway.clients._errors import NoSuchSession, TooMany
 
 MOST_CLIENTS: Final = 64
 MOST_OF_ONE: Final = 16

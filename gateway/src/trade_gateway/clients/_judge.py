@@ -1,4 +1,4 @@
-"""What the access policy lets a client of the door do.
+"""What the access policy lets a client do.
 
 The system knows the door alone: it judges every call as the door's. So the door judges first, by the same policy and
 with the client's name; and it offers nothing of the middleware's own functions, which would take its word for it.

@@ -5,11 +5,11 @@ from typing import Any, Final
 
 from trade import Container, HookInfo, LoadInfo, LogLine, LogReader, NotificationInfo, Span
 from trade_gateway._loads import loads
-from trade_gateway.door import _messages as messages
-from trade_gateway.door._calls import CallReader
-from trade_gateway.door._judge import Judge
-from trade_gateway.door._problems import HttpError
-from trade_gateway.door._records import newest
+from trade_gateway.clients import _messages as messages
+from trade_gateway.clients._calls import CallReader
+from trade_gateway.clients._errors import NoAuditRecord
+from trade_gateway.clients._judge import Judge
+from trade_gateway.clients._records import newest
 
 _ROWS: Final = 200
 """Of the audit records."""
@@ -19,10 +19,10 @@ Counted = Callable[..., Coroutine[Any, Any, Any]]
 
 
 class Overview:
-    """Of the door's system.
+    """Of the system that clients are let into.
 
     Args:
-        container: of the door.
+        container: that acts for them.
         judge: of its clients.
         counted: called with an identity, what to do, and with which arguments.
     """
@@ -45,11 +45,11 @@ class Overview:
         return messages.policy_view(self._judge.policy)
 
     async def audit(self, who: str) -> list[messages.AuditView]:
-        """The newest rows of the audit records of this host. Raises AccessDenied, HttpError."""
+        """The newest rows of the audit records of this host. Raises AccessDenied, NoAuditRecord."""
         self._judge.require_system(who, "administer", "audit")
         folder = self._container.settings.audit
         if folder is None:
-            raise HttpError(status=404, problem="no audit record is kept; TRADE_AUDIT=FOLDER keeps one")
+            raise NoAuditRecord
         return await self._counted(who, newest, folder, _ROWS)
 
     async def set_tracing(self, who: str, *, on: bool) -> list[str]:

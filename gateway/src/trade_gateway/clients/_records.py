@@ -9,7 +9,7 @@ import msgspec
 
 from trade.auditing import AuditRow, reading, records_in
 from trade.errors import ConfigurationError
-from trade_gateway.door._messages import AuditView
+from trade_gateway.clients._messages import AuditView
 
 
 def newest(folder: Path, most: int) -> list[AuditView]:
