@@ -2,8 +2,6 @@
 
 import json
 import threading
-from collections.abc import AsyncGenerator, Awaitable, Callable, Iterator
-from contextlib import asynccontextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -11,176 +9,14 @@ from typing import Any
 import anyio
 import pytest
 from anyio.to_thread import run_sync
-from mcp import ClientSession, McpError
-from mcp.shared.memory import create_client_server_memory_streams
-from mcp.types import CancelledNotification, CancelledNotificationParams, ClientNotification
+from mcp import McpError
 
-from trade import Container, Resource, service, where
+from agent_rig import Client, Robot, connected, run
+from trade import Container, where
 from trade._audit import Audit
-from trade.errors import AccessDenied, ConfigurationError, TradeError
-from trade.testing import MemorySystem, memory_system
-from trade_gateway.agents import Approvals
-from trade_gateway.agents._server import converse
+from trade.testing import MemorySystem
 from trade_gateway.agents._tools import TOOLS
-from trade_gateway.talk import read_lexicon
 from waiting import wait_until
-
-POLICY = """
-[roles.behaviour]
-read = ["*"]
-call = ["rosie"]
-lock = ["rosie"]
-register = ["approvals"]
-
-[roles.operator]
-read = ["*"]
-call = ["approvals"]
-administer = ["rosie.legs"]
-
-[roles.robot]
-register = ["rosie"]
-
-[identities]
-agent = ["behaviour"]
-reader = ["viewer"]
-ann = ["operator"]
-bob = ["visitor"]
-robot = ["robot"]
-
-[roles.viewer]
-read = ["rosie"]
-
-[roles.visitor]
-call = ["approvals"]
-read = ["approvals"]
-
-[approval]
-"agent*" = ["rosie.legs"]
-"""
-
-
-class Part:
-    """Moves until it is stopped, or to an angle at once."""
-
-    def __init__(self, name: str) -> None:
-        self.resources = (Resource(name),)
-        self.angle = 0.0
-        self.stopped = threading.Event()
-        self.goes = threading.Event()
-
-    @service(effect="read")
-    def state(self) -> dict[str, float]:
-        """Where it is."""
-        return {"position_rad": self.angle}
-
-    @service
-    def turn(self, angle_rad: float) -> float:
-        """Turn there."""
-        self.angle = angle_rad
-        return angle_rad
-
-    @service(cancel="stop")
-    def spin(self) -> None:
-        """Turn until stopped."""
-        self.resources[0].moving = True
-        self.goes.set()
-        self.stopped.wait(60)
-
-    @service(effect="stop")
-    def stop(self) -> None:
-        """Stop."""
-        self.resources[0].moving = False
-        self.stopped.set()
-
-
-class Robot:
-    def __init__(self, container: Container) -> None:
-        self.container = container
-        self.head, self.legs = Part("head"), Part("legs")
-        container.register(self.head, "rosie.head")
-        container.register(self.legs, "rosie.legs")
-
-
-@pytest.fixture
-def memory() -> Iterator[MemorySystem]:
-    with memory_system() as system:
-        yield system
-
-
-@pytest.fixture
-def robot(memory: MemorySystem) -> Robot:
-    return Robot(memory.container("robot", identity="robot"))
-
-
-@pytest.fixture
-def agent(memory: MemorySystem, robot: Robot) -> Container:
-    made = memory.container("agent", identity="agent")
-    memory.settle()
-    return made
-
-
-@pytest.fixture
-def governed(memory: MemorySystem, robot: Robot, agent: Container, tmp_path: Path) -> Path:
-    policy = tmp_path / "policy.toml"
-    policy.write_text(POLICY)
-    for container in (robot.container, agent):
-        container.load_policy(policy)
-    return policy
-
-
-class Said(Exception):
-    """The server refused."""
-
-
-class Client:
-    """The agent's side: what a tool answers, decoded; a refusal is an exception."""
-
-    def __init__(self, session: ClientSession) -> None:
-        self._session = session
-        self.progress: list[str] = []
-
-    async def __call__(self, tool: str, **arguments: Any) -> Any:
-        async def note(_count: float, _total: float | None, message: str | None) -> None:
-            self.progress.append(message or "")
-
-        answer = await self._session.call_tool(tool, arguments, progress_callback=note)
-        [content] = answer.content
-        assert content.type == "text"
-        if answer.isError:
-            raise Said(content.text)
-        return json.loads(content.text)
-
-    async def take_back(self) -> None:
-        """The call that was made last, as clients do when their user has enough of waiting."""
-        params = CancelledNotificationParams(requestId=self._session._request_id - 1)
-        await self._session.send_notification(ClientNotification(CancelledNotification(params=params)))
-
-    async def refused(self, tool: str, **arguments: Any) -> str:
-        with pytest.raises(Said) as said:
-            await self(tool, **arguments)
-        return str(said.value)
-
-
-@asynccontextmanager
-async def connected(
-    container: Container, *, ask_first: tuple[str, ...] = (), twin: Any = None
-) -> AsyncGenerator[Client]:
-    async with create_client_server_memory_streams() as (ours, theirs), anyio.create_task_group() as tasks:
-        approvals = Approvals(container, ask_first)
-        tasks.start_soon(converse, container, approvals, read_lexicon(), twin, *theirs, lambda: None)
-        async with ClientSession(*ours) as session:
-            await session.initialize()
-            yield Client(session)
-        await ours[1].aclose()
-
-
-def run(scenario: Callable[..., Awaitable[None]], container: Container, **options: Any) -> None:
-    async def main() -> None:
-        with anyio.fail_after(60):
-            async with connected(container, **options) as client:
-                await scenario(client)
-
-    anyio.run(main)
 
 
 def test_an_agent_looks_at_what_there_is(agent: Container) -> None:
@@ -347,94 +183,6 @@ def test_without_the_right_a_lock_is_not_enough(
     assert robot.head.angle == 0.0
 
 
-def _decide(by: Container, word: str, *more: str) -> None:
-    """As soon as something waits, say that word of it."""
-    found: list[Any] = []
-
-    def waits() -> bool:
-        handles = by.services(where(name="pending", group="approvals"))
-        found[:] = [(one, handle) for handle in handles for one in handle()]
-        return bool(found)
-
-    wait_until(waits)
-    [(one, handle)] = found
-    by.find(where(name=word, container=handle.container), wait_s=5)(one.id, *more)
-
-
-def test_what_is_marked_waits_for_a_persons_word(
-    memory: MemorySystem, robot: Robot, governed: Path, agent: Container
-) -> None:
-    person = memory.container("person", identity="ann")
-    person.load_policy(governed)
-    memory.settle()
-    call = {"group": "rosie.legs", "name": "turn", "args": [0.5], "why": "to go there"}
-
-    async def asks(client: Client) -> None:
-        assert (await client("describe", group="rosie.legs", name="turn"))["needs_approval"]
-        assert not (await client("describe", group="rosie.legs", name="state"))["needs_approval"]
-        await client("lock", group="rosie.legs")
-        async with anyio.create_task_group() as tasks:
-            tasks.start_soon(run_sync, lambda: _decide(person, "approve"))
-            assert await client("call", **call) == {"result": 0.5}
-        assert "waits for somebody's approval" in client.progress
-        async with anyio.create_task_group() as tasks:
-            tasks.start_soon(run_sync, lambda: _decide(person, "refuse", "somebody stands there"))
-            refusal = await client.refused("call", **{**call, "args": [0.7]})
-        assert "ann refused: somebody stands there" in refusal
-
-    run(asks, agent)
-    assert robot.legs.angle == 0.5
-
-
-def test_nobody_approves_for_himself_or_without_the_right(
-    memory: MemorySystem, robot: Robot, governed: Path, agent: Container
-) -> None:
-    bob, again = memory.container("bob", identity="bob"), memory.container("again", identity="agent")
-    for container in (bob, again):
-        container.load_policy(governed)
-    memory.settle()
-    refused: list[BaseException] = []
-
-    def approve(by: Container) -> None:
-        try:
-            _decide(by, "approve")
-        except TradeError as error:
-            refused.append(error)
-
-    async def asks(client: Client) -> None:
-        await client("lock", group="rosie.legs")
-        async with anyio.create_task_group() as tasks:
-
-            async def calls() -> None:
-                await client("call", group="rosie.legs", name="turn", args=[0.5])
-
-            tasks.start_soon(calls)
-            await run_sync(approve, bob)
-            await run_sync(approve, again)
-            [waiting] = bob.find(where(name="pending", group="approvals"), wait_s=5)()
-            said = await client.refused("call", group="approvals.agent", name="approve", args=[waiting.id])
-            assert "AccessDenied" in said
-            tasks.cancel_scope.cancel()
-
-    run(asks, agent)
-    assert [type(error) for error in refused] == [AccessDenied, AccessDenied]
-    assert robot.legs.angle == 0.0
-
-
-def test_without_a_policy_the_command_line_marks(memory: MemorySystem, robot: Robot, agent: Container) -> None:
-    person = memory.container("person", identity="ann")
-    memory.settle()
-
-    async def asks(client: Client) -> None:
-        await client("lock", group="rosie")
-        assert await client("call", group="rosie.head", name="turn", args=[0.2]) == {"result": 0.2}
-        async with anyio.create_task_group() as tasks:
-            tasks.start_soon(run_sync, lambda: _decide(person, "approve"))
-            assert await client("call", group="rosie.legs", name="turn", args=[0.5]) == {"result": 0.5}
-
-    run(asks, agent, ask_first=("rosie.legs",))
-
-
 def test_wrong_words_are_refused_and_say_what_is_right(agent: Container) -> None:
     async def errs(client: Client) -> None:
         assert "there is no tool 'fly'; there is services" in await client.refused("fly")
@@ -446,25 +194,6 @@ def test_wrong_words_are_refused_and_say_what_is_right(agent: Container) -> None
         assert "NoSuchService" in await client.refused("call", group="trade", name="estop")
 
     run(errs, agent)
-
-
-@pytest.mark.parametrize(
-    ("text", "problem"),
-    [
-        ('[approval]\n"agent" = "rosie"', "must be a list of texts"),
-        ('[approval]\n"a b" = ["rosie"]', "is no identity"),
-        ('[approval]\n"agent" = ["no group!"]', "is no group"),
-        ("approval = 1", "must be a table"),
-    ],
-)
-def test_a_mark_that_is_wrong_is_refused_with_the_policy(
-    agent: Container, tmp_path: Path, text: str, problem: str
-) -> None:
-    policy = tmp_path / "policy.toml"
-    head, _, _ = POLICY.partition("[approval]")
-    policy.write_text(f"{text}\n{head}" if text.startswith("approval") else f"{head}\n{text}\n")
-    with pytest.raises(ConfigurationError, match=problem):
-        agent.load_policy(policy)
 
 
 def test_P58_the_dialogue_of_trade_ask_is_the_same_over_the_protocol(agent: Container, robot: Robot) -> None:
