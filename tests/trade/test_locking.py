@@ -539,6 +539,12 @@ def test_re_entry_takes_nothing_twice_and_gives_nothing_back_early(robot: Robot)
 # --- S16 and S17: what is locked
 
 
+def test_a_single_handle_is_refused_with_what_to_write_instead(robot: Robot) -> None:
+    handle: Any = robot.find("a")
+    with pytest.raises(ConfigurationError, match=r"lock\(\[handle\]\)"):
+        robot.me.lock(handle).acquire()
+
+
 def test_S16_an_empty_selection_locks_nothing(robot: Robot) -> None:
     for nothing in ([], where(group="elsewhere"), where(group="robot", name="where_is_it")):
         with pytest.raises(ConfigurationError):

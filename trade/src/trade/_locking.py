@@ -130,8 +130,11 @@ def selected(which: Constraint | Iterable[Handle], select: Callable[[Constraint]
     """The services a lock is for: those given, or the actuating ones that match.
 
     Raises:
-        ConfigurationError: there are none, or a stop is among them.
+        ConfigurationError: there are none, a stop is among them, or it is one handle and no list.
     """
+    if isinstance(which, Handle):
+        problem = "is one service; give a list, lock([handle]), or a constraint, lock(where(...))"
+        raise ConfigurationError(where=which.label, problem=problem)
     if isinstance(which, Constraint):
         found = [handle for handle in select(which) if handle.effect == "actuate"]
         if not found:
