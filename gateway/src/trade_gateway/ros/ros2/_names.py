@@ -91,8 +91,16 @@ def node_token(domain_id: int, session: str, node: str) -> str:
     return f"{_ADMIN}/{domain_id}/{session}/0/0/{Kind.NODE.value}/{_of_node(node)}"
 
 
-def token(  # noqa: PLR0913
-    domain_id: int, session: str, number: int, kind: Kind, node: str, name: str, type_name: str, type_hash: str, qos: str
+def token(
+    domain_id: int,
+    session: str,
+    number: int,
+    kind: Kind,
+    node: str,
+    name: str,
+    type_name: str,
+    type_hash: str,
+    qos: str,
 ) -> str:
     """The token of an endpoint; its number is its own within the session, and not 0."""
     start = f"{_ADMIN}/{domain_id}/{session}/0/{number}/{kind.value}/{_of_node(node)}"
