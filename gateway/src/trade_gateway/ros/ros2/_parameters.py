@@ -95,7 +95,7 @@ def _value(told: Message) -> Any:
 
 def _typed(name: str, value: object, declared: int) -> Message:
     several = isinstance(value, list)
-    given = cast("list[Any]", value) if several else [value]
+    given: list[Any] = cast("list[Any]", value) if several else [value]
     number = _type_of(given, _OF_MANY if several else _OF_ONE, declared)
     if number is None:
         problem = (

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
-from trade_gateway.ros._graph import Answer, Closes, Goal, Heard, NodeTold, Outcome, Publisher, Pursuit
+from trade_gateway.ros._graph import Answer, Closes, Goal, Graph, Heard, NodeTold, Outcome, Publisher, Pursuit
 from trade_gateway.ros._types import Message, Types
 from trade_gateway.ros.ros2 import _parameters
 from trade_gateway.ros.ros2._goals import Action
@@ -21,7 +21,7 @@ __all__ = ["Ros2"]
 _Opened = TypeVar("_Opened", bound=Closes)
 
 
-class Ros2:
+class Ros2(Graph):
     """A `Graph` over the key space of rmw_zenoh.
 
     The name of a sender comes from the gid in its message, which is the hash of its liveliness token; it is empty for
@@ -101,7 +101,9 @@ class Ros2:
             RosUnreachable: nobody serves it, or it did not answer; then it was told to cancel it.
             ConfigurationError: the name or type is none, or the goal does not fit.
         """
-        return self._keep(Pursuing(self._node, name, type_name, goal, feedback))
+        pursuing = self._keep(Pursuing(self._node, name, type_name, feedback))
+        pursuing.begin(goal)
+        return pursuing
 
     def parameters(self, node: str, timeout_s: float) -> dict[str, Any]:
         """See `Graph`."""

@@ -1,0 +1,116 @@
+"""The router and other nodes of ROS 2 that the bridge is tried with, each a process of its own that can be killed."""
+
+import json
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any, Final
+
+from waiting import PATIENCE_S, wait_until
+
+HERE: Final = Path(__file__).parent
+DEFINITIONS: Final = HERE / "ros" / "ros2" / "definitions"
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+class Process:
+    """A script of the tests; it ends with the test, at the latest."""
+
+    def __init__(self, script: str, *arguments: object) -> None:
+        self.told: list[dict[str, Any]] = []
+        self._process = subprocess.Popen(
+            [sys.executable, str(HERE / script), *map(str, arguments)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        self._ready = threading.Event()
+        self._reading = threading.Thread(target=self._read, name=f"reads {script}", daemon=True)
+        self._reading.start()
+        assert self._ready.wait(PATIENCE_S), f"{script} did not start"
+
+    def ask(self, do: str, **arguments: object) -> None:
+        assert self._process.stdin is not None
+        self._process.stdin.write(json.dumps({"do": do, **arguments}) + "\n")
+        self._process.stdin.flush()
+
+    def hear(self, what: str, **told: object) -> dict[str, Any]:
+        """Wait until it tells something; what it told."""
+        wait_until(lambda: self.has(what, **told), f"it tells of {what} {told}; it told {self.told}")
+        return self.has(what, **told)[0]
+
+    def has(self, what: str, **told: object) -> list[dict[str, Any]]:
+        wanted = {"what": what, **told}.items()
+        return [each for each in list(self.told) if wanted <= each.items()]
+
+    def kill(self) -> None:
+        """As ``kill -9`` does. Idempotent."""
+        assert self._process.stdin is not None and self._process.stdout is not None
+        self._process.kill()
+        self._process.wait()
+        self._reading.join()
+        self._process.stdout.close()
+        with suppress(BrokenPipeError):
+            self._process.stdin.close()
+
+    close = kill
+
+    def _read(self) -> None:
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            if line.startswith("{"):
+                self.told.append(json.loads(line))
+            self._ready.set()
+
+
+class Router:
+    """Can be killed and started again at the same place."""
+
+    def __init__(self, port: int) -> None:
+        self._port = port
+        self.endpoint: Final = f"tcp/127.0.0.1:{port}"
+        self._process: Process | None = None
+
+    def start(self) -> None:
+        self._process = Process("ros2_router.py", self._port)
+
+    def kill(self) -> None:
+        if self._process is not None:
+            self._process.kill()
+            self._process = None
+
+
+def until_heard(say: Callable[[], object], heard: Callable[[], object]) -> None:
+    """A topic is heard from when both ends know of each other: until then it is said again."""
+
+    def once() -> object:
+        say()
+        threading.Event().wait(0.05)
+        return heard()
+
+    wait_until(once, "it is heard")
+
+
+@contextmanager
+def closing_all() -> Iterator[Callable[[Any], Any]]:
+    """Close what is handed to it, the last one first."""
+    opened: list[Any] = []
+    try:
+
+        def keep(it: Any) -> Any:
+            opened.append(it)
+            return it
+
+        yield keep
+    finally:
+        for each in reversed(opened):
+            each.close()
