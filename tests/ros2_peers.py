@@ -10,6 +10,10 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Final
 
+import zenoh
+
+from trade_gateway.ros.ros2 import Ros2
+from trade_gateway.ros.ros2._names import data_key
 from waiting import PATIENCE_S, wait_until
 
 HERE: Final = Path(__file__).parent
@@ -98,6 +102,19 @@ def until_heard(say: Callable[[], object], heard: Callable[[], object]) -> None:
         return heard()
 
     wait_until(once, "it is heard")
+
+
+def until_served(session: zenoh.Session | None, key: str) -> None:
+    """A service is there for somebody when the router knows of it."""
+    assert session is not None
+    querier = session.declare_querier(key, target=zenoh.QueryTarget.ALL_COMPLETE)
+    wait_until(lambda: querier.matching_status.matching, f"{key} is served")
+    querier.undeclare()
+
+
+def until_offered(graph: Ros2, name: str, type_name: str) -> None:
+    """The same for one of our graphs."""
+    until_served(graph._link.session, data_key(0, name, type_name, graph._node.hashes.service(type_name)))
 
 
 @contextmanager

@@ -8,6 +8,8 @@ input does.
 
 import json
 import sys
+import threading
+import time
 from typing import Any
 
 from zenoh_ros2_sdk import ROS2Publisher, ROS2ServiceClient, ROS2ServiceServer, ROS2Subscriber
@@ -31,6 +33,14 @@ def tell(what: str, **told: Any) -> None:
     print(json.dumps({"what": what, **told}), flush=True)
 
 
+def until_served(client: ROS2ServiceClient) -> None:
+    """As ``wait_for_service`` of ROS does, which the package lacks."""
+    deadline = time.monotonic() + 60
+    while not client.querier.matching_status.matching:
+        assert time.monotonic() < deadline, "nobody serves it"
+        threading.Event().wait(0.02)
+
+
 class Node:
     def __init__(self, port: int, name: str) -> None:
         self._common: dict[str, Any] = {"node_name": name, "router_port": port, "domain_id": 0}
@@ -50,27 +60,30 @@ class Node:
         self._kept.append(heard)
         tell("listening", topic=topic)
 
-    def serve(self, service: str, fails: bool = False, silent: bool = False) -> None:
+    def serve(self, service: str, fails: bool = False, hangs: bool = False) -> None:
         def add(request: Any) -> Any:
             tell("asked", a=request.a, b=request.b)
+            if hangs:
+                threading.Event().wait()
             if fails:
                 raise ValueError("no sums today")
             return server.response_msg_class(sum=request.a + request.b)
 
-        how = {"mode": "queue"} if silent else {"callback": add}
-        server = ROS2ServiceServer(service_name=service, **how, **ADD, **self._common)
+        server = ROS2ServiceServer(service_name=service, callback=add, **ADD, **self._common)
         self._kept.append(server)
         tell("serving", service=service)
 
     def add(self, service: str, a: int, b: int) -> None:
         client = ROS2ServiceClient(service_name=service, timeout=20.0, **ADD, **self._common)
         self._kept.append(client)
+        until_served(client)
         answer = client.call(a=a, b=b)
         tell("added", sum=None if answer is None else answer.sum)
 
     def parameter_types(self, node: str, names: list[str]) -> None:
         client = ROS2ServiceClient(service_name=f"{node}/get_parameter_types", timeout=20.0, **TYPES, **self._common)
         self._kept.append(client)
+        until_served(client)
         answer = client.call(names=names)
         tell("types", types=None if answer is None else [int(each) for each in answer.types])
 

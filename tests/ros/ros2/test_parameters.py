@@ -7,13 +7,19 @@ from typing import Any
 
 import pytest
 
-from ros2_peers import Router
+from ros2_peers import Router, until_offered
 from trade.errors import ConfigurationError
 from trade_gateway.ros._graph import RosRefused, RosUnreachable
 from trade_gateway.ros.ros2 import Ros2
 
 LONG_S = 60.0
 SRV = "rcl_interfaces/srv"
+SERVICES = {
+    "list_parameters": "ListParameters",
+    "get_parameters": "GetParameters",
+    "get_parameter_types": "GetParameterTypes",
+    "set_parameters": "SetParameters",
+}
 VALUES: dict[str, dict[str, Any]] = {
     "enabled": {"type": 1, "bool_value": True},
     "count": {"type": 2, "integer_value": -7},
@@ -34,16 +40,14 @@ class Offering:
     def __init__(self, graph: Ros2, node: str) -> None:
         self.set: list[dict[str, Any]] = []
         self.refusal = ""
-        offered = {
-            "list_parameters": ("ListParameters", lambda asked: {"result": {"names": list(VALUES)}}),
-            "get_parameters": ("GetParameters", lambda asked: {"values": [VALUES[name] for name in asked["names"]]}),
-            "get_parameter_types": (
-                "GetParameterTypes",
-                lambda asked: {"types": bytes(VALUES[name]["type"] for name in asked["names"])},
-            ),
-            "set_parameters": ("SetParameters", self._put),
+        answers: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
+            "list_parameters": lambda asked: {"result": {"names": list(VALUES)}},
+            "get_parameters": lambda asked: {"values": [VALUES[name] for name in asked["names"]]},
+            "get_parameter_types": lambda asked: {"types": bytes(VALUES[name]["type"] for name in asked["names"])},
+            "set_parameters": self._put,
         }
-        for name, (kind, answer) in offered.items():
+        for name, kind in SERVICES.items():
+            answer = answers[name]
             graph.serve(f"{node}/{name}", f"{SRV}/{kind}", lambda asked, _, answer=answer: answer(asked))
 
     def _put(self, asked: dict[str, Any]) -> dict[str, Any]:
@@ -52,8 +56,11 @@ class Offering:
 
 
 @pytest.fixture
-def offering(router: Router, open_graph: Callable[..., Ros2]) -> Offering:
-    return Offering(open_graph(router, node="/elsewhere"), "/camera")
+def offering(graph: Ros2, router: Router, open_graph: Callable[..., Ros2]) -> Offering:
+    offered = Offering(open_graph(router, node="/elsewhere"), "/camera")
+    for name, kind in SERVICES.items():
+        until_offered(graph, f"/camera/{name}", f"{SRV}/{kind}")
+    return offered
 
 
 def test_parameters_of_all_types_are_read(graph: Ros2, offering: Offering) -> None:
@@ -128,6 +135,9 @@ def test_a_node_without_the_services_is_unreachable(graph: Ros2) -> None:
 
 def test_our_own_node_has_none_and_says_so(graph: Ros2, router: Router, open_graph: Callable[..., Ros2]) -> None:
     asks = open_graph(router, node="/asks")
+    others = {"describe_parameters": "DescribeParameters", "set_parameters_atomically": "SetParametersAtomically"}
+    for name, kind in (SERVICES | others).items():
+        until_offered(asks, f"/trade/{name}", f"{SRV}/{kind}")
     assert asks.parameters("/trade", LONG_S) == {}
     with pytest.raises(RosRefused, match="this node has no parameters"):
         asks.set_parameter("/trade", "x", 1, LONG_S)

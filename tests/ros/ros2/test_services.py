@@ -6,12 +6,18 @@ from typing import Any
 
 import pytest
 
-from ros2_peers import Process, Router
+from ros2_peers import Process, Router, until_offered
 from trade_gateway.ros._graph import RosRefused, RosUnreachable
 from trade_gateway.ros.ros2 import Ros2
 
 ADD = "example_interfaces/srv/AddTwoInts"
 LONG_S = 60.0
+
+
+def call(graph: Ros2, name: str, request: dict[str, Any], timeout_s: float = LONG_S, type_name: str = ADD) -> Any:
+    """Call a service that is there."""
+    until_offered(graph, name, type_name)
+    return graph.call(name, type_name, request, timeout_s)
 
 
 def add(request: dict[str, Any], _who: str) -> dict[str, Any]:
@@ -27,14 +33,14 @@ def test_another_node_calls_a_service_of_ours(graph: Ros2, peer: Process) -> Non
 def test_we_call_a_service_of_another_node(graph: Ros2, peer: Process) -> None:
     peer.ask("serve", service="/add_theirs")
     peer.hear("serving", service="/add_theirs")
-    assert graph.call("/add_theirs", ADD, {"a": 40, "b": 2}, LONG_S) == {"sum": 42}
+    assert call(graph, "/add_theirs", {"a": 40, "b": 2}) == {"sum": 42}
     assert peer.has("asked", a=40, b=2)
 
 
 def test_a_service_is_told_which_node_asks(graph: Ros2, router: Router, open_graph: Callable[..., Ros2]) -> None:
     asked: list[str] = []
     graph.serve("/who", ADD, lambda _, who: asked.append(who) or {})
-    assert open_graph(router, node="/arm/asks").call("/who", ADD, {}, LONG_S) == {"sum": 0}
+    assert call(open_graph(router, node="/arm/asks"), "/who", {}) == {"sum": 0}
     assert asked == ["/arm/asks"]
 
 
@@ -42,7 +48,7 @@ def test_what_another_node_fails_with_is_a_refusal(graph: Ros2, peer: Process) -
     peer.ask("serve", service="/fails", fails=True)
     peer.hear("serving", service="/fails")
     with pytest.raises(RosRefused, match="no sums today"):
-        graph.call("/fails", ADD, {}, LONG_S)
+        call(graph, "/fails", {})
 
 
 def test_what_ours_fails_with_is_told_to_the_caller(
@@ -53,7 +59,7 @@ def test_what_ours_fails_with_is_told_to_the_caller(
 
     graph.serve("/refuses", ADD, fail)
     with pytest.raises(RosRefused, match="ValueError: the arm is locked"):
-        open_graph(router, node="/asks").call("/refuses", ADD, {}, LONG_S)
+        call(open_graph(router, node="/asks"), "/refuses", {})
 
 
 def test_a_service_that_nobody_offers_is_unreachable_at_once(graph: Ros2) -> None:
@@ -69,28 +75,29 @@ def test_a_service_of_another_type_is_not_that_service(graph: Ros2, peer: Proces
 
 
 def test_a_server_that_does_not_answer_is_not_waited_for_longer_than_asked(graph: Ros2, peer: Process) -> None:
-    peer.ask("serve", service="/silent", silent=True)
+    peer.ask("serve", service="/silent", hangs=True)
     peer.hear("serving", service="/silent")
     with pytest.raises(RosUnreachable, match=r"within 0\.2 s; whether it did what was asked is unknown"):
-        graph.call("/silent", ADD, {}, 0.2)
+        call(graph, "/silent", {}, 0.2)
 
 
 def test_a_server_that_is_killed_while_it_is_asked_is_noticed(
     graph: Ros2, router: Router, start_peer: Callable[..., Process]
 ) -> None:
     doomed = start_peer(router, "doomed")
-    doomed.ask("serve", service="/doomed", silent=True)
+    doomed.ask("serve", service="/doomed", hangs=True)
     doomed.hear("serving", service="/doomed")
     failed: list[str] = []
 
-    def call() -> None:
+    def ask() -> None:
         try:
-            graph.call("/doomed", ADD, {}, LONG_S)
+            call(graph, "/doomed", {})
         except RosUnreachable as unreachable:
             failed.append(str(unreachable))
 
-    calling = threading.Thread(target=call)
+    calling = threading.Thread(target=ask)
     calling.start()
+    doomed.hear("asked")
     doomed.kill()
     calling.join(LONG_S / 2)
     assert not calling.is_alive()
@@ -100,7 +107,7 @@ def test_a_server_that_is_killed_while_it_is_asked_is_noticed(
 def test_a_closed_service_is_offered_no_more(graph: Ros2, router: Router, open_graph: Callable[..., Ros2]) -> None:
     caller = open_graph(router, node="/asks")
     service = graph.serve("/short", ADD, add)
-    assert caller.call("/short", ADD, {"a": 1}, LONG_S) == {"sum": 1}
+    assert call(caller, "/short", {"a": 1}) == {"sum": 1}
     service.close()
     service.close()
     with pytest.raises(RosUnreachable):
@@ -111,7 +118,7 @@ def test_a_request_without_fields_and_an_empty_answer_pass(
     graph: Ros2, router: Router, open_graph: Callable[..., Ros2]
 ) -> None:
     graph.serve("/reset", "std_srvs/srv/Empty", lambda _request, _who: {})
-    assert open_graph(router, node="/asks").call("/reset", "std_srvs/srv/Empty", {}, LONG_S) == {}
+    assert call(open_graph(router, node="/asks"), "/reset", {}, type_name="std_srvs/srv/Empty") == {}
 
 
 def test_another_node_that_asks_for_our_parameters_is_answered(graph: Ros2, peer: Process) -> None:

@@ -105,7 +105,7 @@ class Pursuing:
 
     def _follow(self) -> None:
         last_seen = time.monotonic()
-        while not self._over.wait(_AGAIN_S):
+        while not self._over.is_set():
             try:
                 answer = self._get.call({"goal_id": uuid(self._id)}, _ASK_S)
             except RosUnreachable as unreachable:
@@ -117,6 +117,7 @@ class Pursuing:
                 self._finish(refused)
             else:
                 self._finish(self._read(answer))
+            self._over.wait(_AGAIN_S)
 
     def _abandon(self, why: RosUnreachable) -> None:
         """S05: whether it goes on is not known, so it is told to end, again and again for some time."""
