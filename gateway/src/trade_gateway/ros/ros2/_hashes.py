@@ -38,10 +38,10 @@ class Hashes:
         self._lock = threading.Lock()
 
     def message(self, type_name: str) -> str:
-        """Of a message. Raises ConfigurationError: it is not known, or it contains what ROS 2 has no hash for."""
+        """Of a message. Raises ConfigurationError: it, or what it contains, is not known."""
         with self._lock:
             self._describe(type_name)
-            return self._hash(type_name)
+            return self._described.hash_rihs01(type_name)
 
     def service(self, type_name: str) -> str:
         """Of a service, or of one that an action is made of. Raises ConfigurationError: it is not known."""
@@ -53,7 +53,7 @@ class Hashes:
             self._put(event, ("info", _name(_EVENT_INFO)), ("request", _few(request)), ("response", _few(response)))
             whole = (("request_message", request), ("response_message", response), ("event_message", event))
             self._put(type_name, *((field, _name(of)) for field, of in whole))
-            return self._hash(type_name)
+            return self._described.hash_rihs01(type_name)
 
     def learn_action(self, type_name: str) -> None:
         """Make known what ROS adds to an action, so that it can be written and read as bytes.
@@ -87,13 +87,6 @@ class Hashes:
 
     def _put(self, type_name: str, *fields: Described) -> None:
         self._described.fielddefs[type_name] = ([], list(fields))
-
-    def _hash(self, type_name: str) -> str:
-        try:
-            return self._described.hash_rihs01(type_name)
-        except KeyError as kind:
-            problem = f"has no hash: the library knows none for {kind}"
-            raise ConfigurationError(where=type_name, problem=problem) from None
 
 
 def _name(type_name: str) -> Any:
