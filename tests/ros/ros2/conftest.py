@@ -3,11 +3,15 @@
 from collections.abc import Callable, Iterator
 from typing import Any
 
+import hypothesis
 import pytest
 
 from ros2_peers import DEFINITIONS, Process, Router, closing_all, free_port
 from trade_gateway.ros.ros2 import Ros2
 from waiting import wait_until
+
+hypothesis.settings.register_profile("deterministic", deadline=None, derandomize=True, max_examples=60)
+hypothesis.settings.load_profile("deterministic")
 
 
 @pytest.fixture(scope="module")

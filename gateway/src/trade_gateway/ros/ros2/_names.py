@@ -113,18 +113,19 @@ def every_token(domain_id: int) -> str:
 
 
 def read_token(key: str) -> Seen | None:
-    """What a token says; None if it is not of rmw_zenoh, or of a version that is not known."""
+    """What a token says; None if it is not of rmw_zenoh. Parts that a later version adds at its end are left alone."""
     parts = key.split("/")
-    if len(parts) not in (_NODE_PARTS, _ENDPOINT_PARTS) or parts[0] != _ADMIN:
+    if len(parts) < _NODE_PARTS or parts[0] != _ADMIN:
         return None
     try:
         kind = Kind(parts[5])
     except ValueError:
         return None
-    if (kind is Kind.NODE) != (len(parts) == _NODE_PARTS):
+    if kind is not Kind.NODE and len(parts) < _ENDPOINT_PARTS:
         return None
     namespace, node = (part.replace("%", "/") for part in parts[7:9])
-    return Seen(parts[2], kind, f"{namespace.rstrip('/')}/{node}", "".join(parts[9:10]).replace("%", "/"))
+    name = "" if kind is Kind.NODE else parts[9].replace("%", "/")
+    return Seen(parts[2], kind, f"{namespace.rstrip('/')}/{node}", name)
 
 
 def gid(endpoint_token: str) -> bytes:
