@@ -104,6 +104,15 @@ def until_heard(say: Callable[[], object], heard: Callable[[], object]) -> None:
     wait_until(once, "it is heard")
 
 
+def raw_session(router: Router) -> zenoh.Session:
+    """Somebody at the router who knows nothing but keys and bytes."""
+    config = zenoh.Config()
+    config.insert_json5("mode", '"client"')
+    config.insert_json5("connect/endpoints", f'["{router.endpoint}"]')
+    config.insert_json5("scouting/multicast/enabled", "false")
+    return zenoh.open(config)
+
+
 def until_served(session: zenoh.Session | None, key: str) -> None:
     """A service is there for somebody when the router knows of it."""
     assert session is not None

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 import zenoh
 
-from ros2_peers import Router, until_served
+from ros2_peers import Router, raw_session, until_served
 from trade.errors import ConfigurationError
 from trade_gateway.ros._graph import Ended, Goal, Outcome, Pursuit, RosRefused, RosUnreachable
 from trade_gateway.ros.ros2 import Ros2
@@ -59,11 +59,7 @@ def numbers(*values: int) -> bytes:
 
 @pytest.fixture
 def raw(router: Router) -> Iterator[zenoh.Session]:
-    """Somebody at the router who knows nothing but keys and bytes."""
-    config = zenoh.Config()
-    config.insert_json5("mode", '"client"')
-    config.insert_json5("connect/endpoints", f'["{router.endpoint}"]')
-    with zenoh.open(config) as session:
+    with raw_session(router) as session:
         yield session
 
 

@@ -1,9 +1,13 @@
 """Who is there: nodes that come, go, die, and come again under the same name."""
 
+import threading
 from collections.abc import Callable
 
-from ros2_peers import Process, Router
+import pytest
+
+from ros2_peers import Process, Router, raw_session
 from trade_gateway.ros.ros2 import Ros2
+from trade_gateway.ros.ros2._names import gid
 from waiting import wait_until
 
 
@@ -65,6 +69,30 @@ def test_when_one_of_two_with_the_same_name_dies_the_name_is_told_gone_and_there
     wait_until(lambda: told.of("/twin") == [True, False, True], "the death of one is told")
     other.close()
     wait_until(lambda: told.of("/twin") == [True, False, True, False], "the death of the other is told")
+
+
+def test_who_speaks_before_its_token_is_there_is_waited_for(
+    graph: Ros2, router: Router, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("trade_gateway.ros.ros2._presence._INTRODUCTION_S", 60.0)
+    own = "@ros2_lv/0/abc/0/1/MP/%/%arm/early/%said/std_msgs::msg::dds_::String_/RIHS01_0/::,10:,:,:,,"
+    found: list[str] = []
+    asking = threading.Thread(target=lambda: found.append(graph._node.presence.node_of(gid(own))))
+    asking.start()
+    with raw_session(router) as session, session.liveliness().declare_token(own):
+        asking.join(60)
+    assert found == ["/arm/early"]
+
+
+def test_S07_strangers_are_waited_for_one_after_another_with_pauses(
+    graph: Ros2, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    presence = graph._node.presence
+    monkeypatch.setattr("trade_gateway.ros.ros2._presence._PAUSE_S", 1000.0)
+    monkeypatch.setattr("trade_gateway.ros.ros2._presence._INTRODUCTION_S", 0.01)
+    assert presence.node_of(b"one") == ""
+    monkeypatch.setattr("trade_gateway.ros.ros2._presence._INTRODUCTION_S", 1000.0)
+    assert [presence.node_of(each) for each in (b"one", b"two", b"three")] == ["", "", ""]
 
 
 def test_our_own_node_is_not_told_of(graph: Ros2, router: Router, open_graph: Callable[..., Ros2]) -> None:

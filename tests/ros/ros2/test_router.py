@@ -94,6 +94,11 @@ def test_what_is_no_name_of_a_node_is_refused(own_router: Router, node: str) -> 
         Ros2(own_router.endpoint, node=node)
 
 
+def test_a_domain_below_0_is_refused(own_router: Router) -> None:
+    with pytest.raises(ConfigurationError, match="must be 0 or more"):
+        Ros2(own_router.endpoint, domain_id=-1)
+
+
 def _answers(graph: Ros2, service: str) -> bool:
     try:
         return graph.call(service, ADD, {"a": 1, "b": 1}, LONG_S) == {"sum": 2}

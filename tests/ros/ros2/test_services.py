@@ -9,6 +9,8 @@ import pytest
 from ros2_peers import Process, Router, until_offered
 from trade_gateway.ros._graph import RosRefused, RosUnreachable
 from trade_gateway.ros.ros2 import Ros2
+from trade_gateway.ros.ros2._names import Kind
+from waiting import wait_until
 
 ADD = "example_interfaces/srv/AddTwoInts"
 LONG_S = 60.0
@@ -102,6 +104,20 @@ def test_a_server_that_is_killed_while_it_is_asked_is_noticed(
     calling.join(LONG_S / 2)
     assert not calling.is_alive()
     assert "no node serves it" in failed[0]
+
+
+def test_of_two_servers_of_one_name_one_is_asked(graph: Ros2, router: Router, open_graph: Callable[..., Ros2]) -> None:
+    """ROS 2 would ask both: what they do would be done twice."""
+    asked: list[str] = []
+    for number, node in enumerate(("/left", "/right")):
+        server = open_graph(router, node=node)
+        server.serve("/twice", ADD, lambda _, who, number=number: asked.append(who) or {"sum": number})
+    both = open_graph(router, node="/watches")
+    until_offered(graph, "/twice", ADD)
+    wait_until(lambda: both._node.presence._offered[Kind.SERVER, "/twice"] == 2, "both are there")
+    for _ in range(5):
+        call(graph, "/twice", {})
+    assert len(asked) == 5
 
 
 def test_a_closed_service_is_offered_no_more(graph: Ros2, router: Router, open_graph: Callable[..., Ros2]) -> None:

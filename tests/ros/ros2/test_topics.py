@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from ros2_peers import Process, Router, until_heard
+from ros2_peers import Process, Router, raw_session, until_heard
 from trade.errors import ConfigurationError
 from trade_gateway.ros.ros2 import Ros2
 from waiting import wait_until
@@ -110,15 +110,10 @@ def test_while_a_subscriber_is_busy_only_the_newest_wait(graph: Ros2, router: Ro
 
 
 def test_what_is_malformed_is_not_told(graph: Ros2, router: Router, caplog: pytest.LogCaptureFixture) -> None:
-    import zenoh
-
     heard = Heard()
     graph.subscribe("/broken", STRING, heard)
-    config = zenoh.Config()
-    config.insert_json5("mode", '"client"')
-    config.insert_json5("connect/endpoints", f'["{router.endpoint}"]')
     key = f"0/broken/std_msgs::msg::dds_::String_/{graph.types.hash(STRING)}"
-    with zenoh.open(config) as raw:
+    with raw_session(router) as raw:
         good = graph.types.to_bytes(STRING, {"data": "good"})
         raw.put(key, b"\0\1\0\0\xff\xff\xff\xff")
         until_heard(lambda: raw.put(key, good, attachment=b"what is this"), lambda: heard.all)

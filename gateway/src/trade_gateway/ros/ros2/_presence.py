@@ -24,6 +24,8 @@ __all__ = ["Presence", "Watching"]
 
 _INTRODUCTION_S: Final = 0.5
 """How long a first message waits for the token of its sender, which may come after it."""
+_PAUSE_S: Final = 5.0
+"""How soon after one that had none the next is waited for: strangers must not keep others from being heard (S07)."""
 _MOST_STRANGERS: Final = 1024
 
 
@@ -55,6 +57,7 @@ class Presence:
         self._nodes: Counter[str] = Counter()
         self._offered: Counter[tuple[Kind, str]] = Counter()
         self._strangers: set[bytes] = set()
+        self._waits_from = 0.0
         self._watching: list[Watching] = []
         self._declared = link.declare(partial(self._listen, every_token(domain_id)))
 
@@ -66,14 +69,11 @@ class Presence:
     def node_of(self, endpoint_gid: bytes) -> str:
         """The name of the node that an endpoint is of; empty if no token tells it. May wait, once for each stranger."""
         with self._changed:
-            found = self._node_of.get(endpoint_gid, "")
-            if found or endpoint_gid in self._strangers:
-                return found
-            self._wait_for(endpoint_gid, time.monotonic() + _INTRODUCTION_S)
-            found = self._node_of.get(endpoint_gid, "")
-            if not found and len(self._strangers) < _MOST_STRANGERS:
-                self._strangers.add(endpoint_gid)
-            return found
+            now = time.monotonic()
+            known = endpoint_gid in self._node_of or endpoint_gid in self._strangers
+            if not known and now >= self._waits_from:
+                self._wait_for(endpoint_gid, now + _INTRODUCTION_S)
+            return self._node_of.get(endpoint_gid, "")
 
     def offered(self, kind: Kind, name: str) -> bool:
         """Whether another session has such an endpoint."""
@@ -106,6 +106,9 @@ class Presence:
         while endpoint_gid not in self._node_of:
             left_s = deadline - time.monotonic()
             if left_s <= 0:
+                self._waits_from = time.monotonic() + _PAUSE_S
+                if len(self._strangers) < _MOST_STRANGERS:
+                    self._strangers.add(endpoint_gid)
                 return
             self._changed.wait(left_s)
 

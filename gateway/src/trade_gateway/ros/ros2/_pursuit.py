@@ -121,6 +121,8 @@ class Pursuing:
 
     def _abandon(self, why: RosUnreachable) -> None:
         """S05: whether it goes on is not known, so it is told to end, again and again for some time."""
+        if self._over.is_set():
+            return
         self._outcome = why
         self._over.set()
         threading.Thread(target=self._end, args=(why,), name=f"ros2 end {self._name}", daemon=True).start()

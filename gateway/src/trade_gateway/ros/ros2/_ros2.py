@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
+from trade.errors import ConfigurationError
 from trade_gateway.ros._graph import Answer, Closes, Goal, Graph, Heard, NodeTold, Outcome, Publisher, Pursuit
 from trade_gateway.ros._types import Message, Types
 from trade_gateway.ros.ros2 import _parameters
@@ -46,6 +47,8 @@ class Ros2(Graph):
         Raises:
             ConfigurationError: one of these is wrong.
         """
+        if domain_id < 0:
+            raise ConfigurationError(where="ROS domain", problem=f"{domain_id} must be 0 or more, as ROS_DOMAIN_ID is")
         self._types = Types(2, folders)
         self._link = Link(router)
         self._lock = threading.Lock()
