@@ -269,6 +269,23 @@ def test_a_goal_of_ours_is_canceled_by_its_id(graph: Ros2, raw: zenoh.Session) -
     assert server.of("cancel_goal")[0] == server.of("send_goal")[0][:20] + bytes(8)
 
 
+def test_S07_a_goal_that_is_canceled_without_a_router_is_canceled_when_there_is_one(
+    own_router: Router, open_graph: Callable[..., Ros2], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("trade_gateway.ros.ros2._pursuit._GONE_S", 1000.0)
+    own_router.start()
+    graph = open_graph(own_router)
+    with raw_session(own_router) as raw:
+        server = RawServer(raw, "cut_off", accepts=True, result=None)
+        pursuit = pursue(graph, "cut_off", 3)
+        own_router.kill()
+        wait_until(lambda: graph.healthy, "the loss is noticed")
+        pursuit.cancel()
+        own_router.start()
+        wait_until(lambda: server.of("cancel_goal"), "it is told to cancel it")
+        assert server.of("cancel_goal")[0] == server.of("send_goal")[0][:20] + bytes(8)
+
+
 def test_S05_goals_of_ours_are_canceled_when_our_graph_ends(graph: Ros2, raw: zenoh.Session) -> None:
     server = RawServer(raw, "orphaned", accepts=True, result=None)
     pursuit = pursue(graph, "orphaned", 3)

@@ -41,6 +41,7 @@ class Pursuing:
         self._name = name
         self._id = secrets.token_bytes(16)
         self._feedback = feedback
+        self._unwanted = False
         self._over = threading.Event()
         self._closed = threading.Event()
         self._outcome: Outcome | RosRefused | RosUnreachable | None = None
@@ -90,7 +91,8 @@ class Pursuing:
                 raise failure
 
     def cancel(self) -> None:
-        """See `Pursuit`."""
+        """See `Pursuit`. Asked for without a router, it is asked again when there is one."""
+        self._unwanted = True
         if not self._over.is_set():
             with contextlib.suppress(RosUnreachable):
                 self._stop.send({"goal_info": {"goal_id": uuid(self._id)}}, _CANCEL_S)
@@ -106,6 +108,8 @@ class Pursuing:
     def _follow(self) -> None:
         last_seen = time.monotonic()
         while not self._over.is_set():
+            if self._unwanted:
+                self.cancel()
             try:
                 answer = self._get.call({"goal_id": uuid(self._id)}, _ASK_S)
             except RosUnreachable as unreachable:
