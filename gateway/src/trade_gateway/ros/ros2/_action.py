@@ -1,0 +1,47 @@
+"""What both ends of an action of ROS 2 need.
+
+Facts, from the design article *Actions* of ROS 2 (design.ros2.org) and ``action_msgs``: an action ``/name`` is the
+services ``/name/_action/send_goal``, ``cancel_goal``, ``get_result`` and the topics ``feedback`` and ``status``, the
+last one latched. Goals are named by 16 random bytes, chosen by the client. ``get_result`` is answered when the goal has
+ended. A request to cancel names a goal, or a time up to which all were accepted, or neither: then it means all.
+"""
+
+from enum import IntEnum
+from typing import Any, Final
+
+from trade_gateway.ros._graph import Ended
+
+__all__ = ["ANY", "CANCEL", "ENDS", "STATUS", "Refusal", "Status", "uuid"]
+
+CANCEL: Final = "action_msgs/srv/CancelGoal"
+STATUS: Final = "action_msgs/msg/GoalStatusArray"
+ANY: Final = bytes(16)
+
+
+class Status(IntEnum):
+    """Of a goal: ``action_msgs/msg/GoalStatus``."""
+
+    UNKNOWN = 0
+    ACCEPTED = 1
+    EXECUTING = 2
+    CANCELING = 3
+    SUCCEEDED = 4
+    CANCELED = 5
+    ABORTED = 6
+
+
+class Refusal(IntEnum):
+    """Of a request to cancel: ``action_msgs/srv/CancelGoal``."""
+
+    NONE = 0
+    REJECTED = 1
+    UNKNOWN_GOAL = 2
+    GOAL_TERMINATED = 3
+
+
+ENDS: Final = {Ended.SUCCEEDED: Status.SUCCEEDED, Ended.CANCELED: Status.CANCELED, Ended.ABORTED: Status.ABORTED}
+
+
+def uuid(goal_id: bytes) -> dict[str, Any]:
+    """A ``unique_identifier_msgs/msg/UUID``."""
+    return {"uuid": goal_id}

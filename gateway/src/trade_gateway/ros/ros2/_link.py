@@ -1,0 +1,161 @@
+# pyright: reportUnknownMemberType=false
+"""The zenoh session at the router that ROS 2 runs (``rmw_zenohd``), apart from the sessions of TRADE.
+
+It is a client, not a peer as the nodes of ROS 2 are: their router does not pass on what one peer says to another
+(``peers_failover_brokering`` is off in its configuration), but it serves clients.
+
+zenoh declares everything again when it was cut off. But a client cannot be opened before its router is there: that is
+tried again and again here, and what has been asked for until then is declared once it is.
+"""
+
+import contextlib
+import json
+import secrets
+import threading
+from collections.abc import Callable, Sequence
+from typing import Any, Final, Protocol
+
+import zenoh
+
+from trade.errors import ConfigurationError
+
+__all__ = ["CLOSED", "Declared", "Link"]
+
+CLOSED: Final = (zenoh.ZError, RuntimeError)
+"""What zenoh raises for something closed already, and for something that another thread closes or uses right now."""
+_OPEN_MS: Final = 500
+_AGAIN_S: Final = 0.5
+_LEASE_MS: Final = 2000
+_END_S: Final = 5.0
+
+
+class Undeclares(Protocol):
+    """What zenoh gives for what is declared."""
+
+    def undeclare(self) -> Any: ...
+
+
+Declare = Callable[[zenoh.Session], Sequence[Undeclares]]
+
+
+class Declared:
+    """Something declared, or to be declared once there is a router."""
+
+    def __init__(self, link: "Link", declare: Declare) -> None:
+        self._link = link
+        self.declare: Final = declare
+        self.made: Sequence[Undeclares] = ()
+
+    def close(self) -> None:
+        """Take it back. Idempotent."""
+        for made in self._link.forget(self):
+            with contextlib.suppress(*CLOSED):
+                made.undeclare()
+
+
+class Link:
+    """See the module."""
+
+    def __init__(self, router: str) -> None:
+        """Raises ConfigurationError: that is no endpoint of zenoh."""
+        self.id: Final = f"{secrets.randbelow(15) + 1:x}{secrets.token_hex(15)}{secrets.randbelow(16):x}"
+        self._router = router
+        self._config = _configuration(router, self.id)
+        self._lock = threading.Lock()
+        self._declared: list[Declared] = []
+        self._session: zenoh.Session | None = None
+        self._closed = threading.Event()
+        self._opening = threading.Thread(target=self._open, name=f"ros2 {router}", daemon=True)
+        if not self._try_to_open():
+            self._opening.start()
+
+    @property
+    def problem(self) -> str:
+        """Empty, or what is wrong."""
+        session = self._session
+        with contextlib.suppress(*CLOSED):
+            if session is not None and list(session.info.routers_zid()):
+                return ""
+        return f"no zenoh router at {self._router}; is rmw_zenohd running?"
+
+    @property
+    def session(self) -> zenoh.Session | None:
+        """None before a router was there for the first time, and after the end."""
+        return self._session
+
+    def declare(self, declare: Declare) -> Declared:
+        """Have something declared, now or once there is a session.
+
+        Args:
+            declare: is given the session; returns what is to be undeclared, in this order. Called with a lock held.
+        """
+        declared = Declared(self, declare)
+        with self._lock:
+            self._declared.append(declared)
+            if self._session is not None:
+                declared.made = declare(self._session)
+        return declared
+
+    def forget(self, declared: Declared) -> Sequence[Undeclares]:
+        """What it had declared, to be undeclared; nothing the second time."""
+        with self._lock:
+            if declared in self._declared:
+                self._declared.remove(declared)
+            made, declared.made = declared.made, ()
+        return made
+
+    def close(self) -> None:
+        """End the session, and with it all that is declared. Idempotent."""
+        self._closed.set()
+        if self._opening.is_alive():
+            self._opening.join(_END_S)
+        with self._lock:
+            session, self._session = self._session, None
+            self._declared.clear()
+        if session is not None:
+            with contextlib.suppress(*CLOSED):
+                session.close()
+
+    def _open(self) -> None:
+        while not self._closed.wait(_AGAIN_S):
+            if self._try_to_open():
+                return
+
+    def _try_to_open(self) -> bool:
+        try:
+            session = zenoh.open(self._config)
+        except zenoh.ZError:
+            return False
+        with self._lock:
+            if not self._closed.is_set():
+                self._session = session
+                for declared in self._declared:
+                    declared.made = declared.declare(session)
+                return True
+        session.close()
+        return True
+
+
+def _configuration(router: str, session_id: str) -> zenoh.Config:
+    settings: dict[str, Any] = {
+        "id": session_id,
+        "mode": "client",
+        "connect/timeout_ms": _OPEN_MS,
+        "connect/exit_on_failure": False,
+        "connect/retry": {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2},
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        # what is latched is only found again by its time
+        "timestamping/enabled": True,
+        "transport/link/tx/lease": _LEASE_MS,
+        "transport/link/tx/keep_alive": 4,
+    }
+    config = zenoh.Config()
+    for key, value in settings.items():
+        config.insert_json5(key, json.dumps(value))
+    try:
+        config.insert_json5("connect/endpoints", json.dumps([router]))
+    except zenoh.ZError as bad:
+        problem = f"{bad}; it must be written like tcp/localhost:7447"
+        raise ConfigurationError(where=f"router {router!r}", problem=problem) from None
+    return config

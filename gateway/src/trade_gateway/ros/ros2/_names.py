@@ -1,0 +1,142 @@
+"""Names of ROS 2 as keys of zenoh, the way rmw_zenoh writes them.
+
+Facts, all from ros2/rmw_zenoh (``docs/design.md``, ``rmw_zenoh_cpp/src/detail/liveliness_utils.cpp``, ``qos.cpp``):
+
+- Topics and services are at ``<domain>/<name without its first slash>/<DDS type>/<type hash>``; the DDS type of
+  ``package/msg/Name`` is ``package::msg::dds_::Name_``.
+- Who is there is told by liveliness tokens: ``@ros2_lv/<domain>/<session>/<node id>/<entity id>/<kind>/<enclave>/
+  <namespace>/<node>``, and of an endpoint also ``/<name>/<DDS type>/<type hash>/<QoS>``. In all of these a slash is
+  written ``%``. Kinds are NN, MP, MS, SS, SC: node, publisher, subscription, service server and client.
+- QoS is ``reliability:durability:history,depth:deadline:lifespan:liveliness``, each empty where it is the default:
+  reliable, volatile, keep last, depth 42, no deadlines.
+- An endpoint's gid is the XXH3-128 of its token, seed 0, its lower half first, both in little-endian order.
+"""
+
+import re
+from enum import Enum
+from typing import Final, NamedTuple
+
+import xxhash
+
+from trade.errors import ConfigurationError
+
+__all__ = [
+    "Kind",
+    "Seen",
+    "absolute",
+    "data_key",
+    "dds_type",
+    "every_token",
+    "gid",
+    "node_token",
+    "read_token",
+    "token",
+]
+
+_ADMIN: Final = "@ros2_lv"
+_NAME: Final = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
+_TYPE: Final = re.compile(r"([a-z][a-z0-9_]*)/(msg|srv|action)/([A-Za-z][A-Za-z0-9_]*)")
+_NODE_PARTS: Final = 9
+_ENDPOINT_PARTS: Final = 13
+
+
+class Kind(Enum):
+    """Of a liveliness token."""
+
+    NODE = "NN"
+    PUBLISHER = "MP"
+    SUBSCRIPTION = "MS"
+    SERVER = "SS"
+    CLIENT = "SC"
+
+
+class Seen(NamedTuple):
+    """What a liveliness token says."""
+
+    session: str
+    kind: Kind
+    node: str
+    """Fully qualified: ``/arm/teleop``."""
+    name: str = ""
+    """Of the topic or service; a node has none."""
+
+
+def absolute(name: str) -> str:
+    """A name of a topic, service, action or node, unchanged.
+
+    Raises:
+        ConfigurationError: it is no absolute name of ROS.
+    """
+    if _NAME.fullmatch(name) is None or "__" in name:
+        raise ConfigurationError(where="ROS name", problem=f"{name!r} must be written /like/this_1: absolute")
+    return name
+
+
+def dds_type(type_name: str) -> str:
+    """``std_msgs/msg/String`` as ``std_msgs::msg::dds_::String_``. Raises ConfigurationError: it is no type's name."""
+    found = _TYPE.fullmatch(type_name)
+    if found is None:
+        raise ConfigurationError(where="ROS type", problem=f"{type_name!r} must be written package/msg/Name")
+    package, kind, name = found.groups()
+    return f"{package}::{kind}::dds_::{name}_"
+
+
+def data_key(domain_id: int, name: str, type_name: str, type_hash: str) -> str:
+    """Where a topic's messages go, or a service's requests."""
+    return f"{domain_id}/{absolute(name)[1:]}/{dds_type(type_name)}/{type_hash}"
+
+
+def node_token(domain_id: int, session: str, node: str) -> str:
+    """The token of the only node of a session."""
+    return f"{_ADMIN}/{domain_id}/{session}/0/0/{Kind.NODE.value}/{_of_node(node)}"
+
+
+def token(
+    domain_id: int,
+    session: str,
+    number: int,
+    kind: Kind,
+    node: str,
+    name: str,
+    type_name: str,
+    type_hash: str,
+    qos: str,
+) -> str:
+    """The token of an endpoint; its number is its own within the session, and not 0."""
+    start = f"{_ADMIN}/{domain_id}/{session}/0/{number}/{kind.value}/{_of_node(node)}"
+    return f"{start}/{_mangled(absolute(name))}/{dds_type(type_name)}/{type_hash}/{qos}"
+
+
+def every_token(domain_id: int) -> str:
+    """Matches all tokens of a domain."""
+    return f"{_ADMIN}/{domain_id}/**"
+
+
+def read_token(key: str) -> Seen | None:
+    """What a token says; None if it is not of rmw_zenoh. Parts that a later version adds at its end are left alone."""
+    parts = key.split("/")
+    if len(parts) < _NODE_PARTS or parts[0] != _ADMIN:
+        return None
+    try:
+        kind = Kind(parts[5])
+    except ValueError:
+        return None
+    if kind is not Kind.NODE and len(parts) < _ENDPOINT_PARTS:
+        return None
+    namespace, node = (part.replace("%", "/") for part in parts[7:9])
+    name = "" if kind is Kind.NODE else parts[9].replace("%", "/")
+    return Seen(parts[2], kind, f"{namespace.rstrip('/')}/{node}", name)
+
+
+def gid(endpoint_token: str) -> bytes:
+    """What an endpoint puts into each message, 16 bytes."""
+    return xxhash.xxh3_128_intdigest(endpoint_token.encode()).to_bytes(16, "little")
+
+
+def _of_node(node: str) -> str:
+    namespace, _, name = absolute(node).rpartition("/")
+    return f"%/{_mangled(namespace or '/')}/{name}"
+
+
+def _mangled(name: str) -> str:
+    return name.replace("/", "%")

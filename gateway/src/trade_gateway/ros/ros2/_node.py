@@ -1,0 +1,81 @@
+"""Our node in ROS 2, and what each topic and service of it needs."""
+
+import itertools
+import time
+from typing import Final, NamedTuple
+
+import zenoh
+
+from trade_gateway.ros._types import Types
+from trade_gateway.ros.ros2._attachment import Attachment
+from trade_gateway.ros.ros2._hashes import Hashes
+from trade_gateway.ros.ros2._link import Declared, Link
+from trade_gateway.ros.ros2._names import Kind, absolute, data_key, gid, node_token, token
+from trade_gateway.ros.ros2._presence import Presence
+
+__all__ = ["LATCHED", "USUAL", "Endpoint", "Node"]
+
+USUAL: Final = "::,10:,:,:,,"
+"""Reliable, volatile, keep last 10: what ROS 2 gives topics and services that ask for nothing else."""
+LATCHED: Final = ":1:,1:,:,:,,"
+"""Reliable, transient local, keep last 1."""
+
+
+class Endpoint(NamedTuple):
+    """A publisher, subscription, service server or client of ours."""
+
+    key: str
+    token: str
+    gid: bytes
+
+    def attachment(self, sequence: int) -> bytes:
+        """What goes beside something it says now."""
+        return Attachment(sequence, time.time_ns(), self.gid).to_bytes()
+
+
+class Node:
+    """Seen by others as soon as there is a router."""
+
+    def __init__(self, link: Link, domain_id: int, name: str, types: Types) -> None:
+        """Raises ConfigurationError: that is no name of a node."""
+        self.name: Final = absolute(name)
+        self.link: Final = link
+        self.types: Final = types
+        self.hashes: Final = Hashes(types)
+        self.presence: Final = Presence(link, domain_id)
+        self._domain_id = domain_id
+        self._numbers = itertools.count(1)
+        self._declared: Declared = link.declare(self._declare)
+
+    def topic(self, kind: Kind, name: str, type_name: str, qos: str) -> Endpoint:
+        """A publisher or subscription. Raises ConfigurationError: its name or type is none."""
+        return self._endpoint(kind, name, type_name, self.hashes.message(type_name), qos)
+
+    def service(self, kind: Kind, name: str, type_name: str) -> Endpoint:
+        """A service server or client. Raises ConfigurationError: its name or type is none."""
+        return self._endpoint(kind, name, type_name, self.hashes.service(type_name), USUAL)
+
+    def who(self, attachment: "zenoh.ZBytes | None") -> str:
+        """The node that sent something, by what was attached to it; empty if that does not tell. May wait shortly."""
+        if attachment is None:
+            return ""
+        try:
+            sender = Attachment.from_bytes(attachment.to_bytes()).gid
+        except ValueError:
+            return ""
+        return self.presence.node_of(sender)
+
+    def close(self) -> None:
+        """Be seen no more. Idempotent."""
+        self.presence.close()
+        self._declared.close()
+
+    def _endpoint(self, kind: Kind, name: str, type_name: str, type_hash: str, qos: str) -> Endpoint:
+        number = next(self._numbers)
+        own = token(self._domain_id, self.link.id, number, kind, self.name, name, type_name, type_hash, qos)
+        made = Endpoint(data_key(self._domain_id, name, type_name, type_hash), own, gid(own))
+        self.presence.introduce(made.gid, self.name)
+        return made
+
+    def _declare(self, session: zenoh.Session) -> list[zenoh.LivelinessToken]:
+        return [session.liveliness().declare_token(node_token(self._domain_id, self.link.id, self.name))]

@@ -1,0 +1,162 @@
+# pyright: reportUnknownMemberType=false
+"""Who is there, by liveliness tokens: nodes, what they offer, and which node an endpoint is of.
+
+A process that ends or is killed takes its tokens with it at once, as its connection to the router ends. One that
+freezes or is cut off is noticed by the router after the lease of its session, 60 s in the configuration that ROS 2
+ships. When our own router is gone, everybody is.
+"""
+
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable
+from functools import partial
+from typing import Final
+
+import zenoh
+
+from trade_gateway.ros._graph import NodeTold
+from trade_gateway.ros.ros2._link import Link
+from trade_gateway.ros.ros2._mailbox import Mailbox
+from trade_gateway.ros.ros2._names import Kind, Seen, every_token, gid, read_token
+
+__all__ = ["Presence", "Watching"]
+
+_INTRODUCTION_S: Final = 0.5
+"""How long a first message waits for the token of its sender, which may come after it."""
+_PAUSE_S: Final = 5.0
+"""How soon after one that had none the next is waited for: strangers must not keep others from being heard (S07)."""
+_MOST_STRANGERS: Final = 1024
+
+
+class Watching:
+    """Somebody told of nodes."""
+
+    def __init__(self, told: NodeTold, end: "Callable[[Watching], None]") -> None:
+        self._told = told
+        self._end = end
+        self.mailbox: Final = Mailbox[tuple[str, bool]]("ros2 nodes", self._tell)
+
+    def _tell(self, news: tuple[str, bool]) -> None:
+        self._told(*news)
+
+    def close(self) -> None:
+        """Tell no more. Idempotent."""
+        self._end(self)
+        self.mailbox.close()
+
+
+class Presence:
+    """Of one domain, as the router tells it."""
+
+    def __init__(self, link: Link, domain_id: int) -> None:
+        self._own = link.id
+        self._changed = threading.Condition()
+        self._seen: dict[str, Seen] = {}
+        self._node_of: dict[bytes, str] = {}
+        self._nodes: Counter[str] = Counter()
+        self._offered: Counter[tuple[Kind, str]] = Counter()
+        self._strangers: set[bytes] = set()
+        self._waits_from = 0.0
+        self._watching: list[Watching] = []
+        self._declared = link.declare(partial(self._listen, every_token(domain_id)))
+
+    def introduce(self, endpoint_gid: bytes, node: str) -> None:
+        """An endpoint of our own."""
+        with self._changed:
+            self._node_of[endpoint_gid] = node
+
+    def node_of(self, endpoint_gid: bytes) -> str:
+        """The name of the node that an endpoint is of; empty if no token tells it. May wait, once for each stranger."""
+        with self._changed:
+            now = time.monotonic()
+            known = endpoint_gid in self._node_of or endpoint_gid in self._strangers
+            if not known and now >= self._waits_from:
+                self._wait_for(endpoint_gid, now + _INTRODUCTION_S)
+            return self._node_of.get(endpoint_gid, "")
+
+    def offered(self, kind: Kind, name: str) -> bool:
+        """Whether another session has such an endpoint."""
+        with self._changed:
+            return self._offered[kind, name] > 0
+
+    def watch(self, told: NodeTold) -> Watching:
+        """See `Graph.watch_nodes`; our own node is not told of."""
+        watching = Watching(told, self._unwatch)
+        with self._changed:
+            self._watching.append(watching)
+            for node in self._nodes:
+                watching.mailbox.put((node, True))
+        return watching
+
+    def close(self) -> None:
+        """Listen no more. Idempotent."""
+        self._declared.close()
+        with self._changed:
+            watching = list(self._watching)
+        for each in watching:
+            each.close()
+
+    def _unwatch(self, watching: Watching) -> None:
+        with self._changed:
+            if watching in self._watching:
+                self._watching.remove(watching)
+
+    def _wait_for(self, endpoint_gid: bytes, deadline: float) -> None:
+        while endpoint_gid not in self._node_of:
+            left_s = deadline - time.monotonic()
+            if left_s <= 0:
+                self._waits_from = time.monotonic() + _PAUSE_S
+                if len(self._strangers) < _MOST_STRANGERS:
+                    self._strangers.add(endpoint_gid)
+                return
+            self._changed.wait(left_s)
+
+    def _listen(self, every: str, session: zenoh.Session) -> list[zenoh.Subscriber[None]]:
+        return [session.liveliness().declare_subscriber(every, self._heard, history=True)]
+
+    def _heard(self, sample: zenoh.Sample) -> None:
+        key = str(sample.key_expr)
+        seen = read_token(key)
+        if seen is None or seen.session == self._own:
+            return
+        with self._changed:
+            if sample.kind == zenoh.SampleKind.PUT:
+                self._came(key, seen)
+            else:
+                self._went(key)
+            self._changed.notify_all()
+
+    def _came(self, key: str, seen: Seen) -> None:
+        if key in self._seen:
+            return
+        self._seen[key] = seen
+        if seen.kind is Kind.NODE:
+            self._nodes[seen.node] += 1
+            if self._nodes[seen.node] == 1:
+                self._tell(seen.node, there=True)
+            return
+        endpoint_gid = gid(key)
+        self._offered[seen.kind, seen.name] += 1
+        self._node_of[endpoint_gid] = seen.node
+        self._strangers.discard(endpoint_gid)
+
+    def _went(self, key: str) -> None:
+        seen = self._seen.pop(key, None)
+        if seen is None:
+            return
+        if seen.kind is not Kind.NODE:
+            self._offered[seen.kind, seen.name] -= 1
+            del self._node_of[gid(key)]
+            return
+        self._nodes[seen.node] -= 1
+        self._tell(seen.node, there=False)
+        if self._nodes[seen.node]:
+            # of two with one name one has died: it counts, whoever is left
+            self._tell(seen.node, there=True)
+        else:
+            del self._nodes[seen.node]
+
+    def _tell(self, node: str, *, there: bool) -> None:
+        for watching in self._watching:
+            watching.mailbox.put((node, there))

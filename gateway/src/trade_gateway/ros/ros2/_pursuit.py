@@ -1,0 +1,160 @@
+"""A goal of ours at an action of theirs."""
+
+import contextlib
+import secrets
+import threading
+import time
+from collections.abc import Callable, Mapping
+from typing import Any, Final
+
+from trade_gateway.ros._graph import Ended, Outcome, RosRefused, RosUnreachable
+from trade_gateway.ros._types import Message
+from trade_gateway.ros.ros2._action import CANCEL, ENDS, Refusal, uuid
+from trade_gateway.ros.ros2._names import Kind
+from trade_gateway.ros.ros2._node import Node
+from trade_gateway.ros.ros2._services import Client
+from trade_gateway.ros.ros2._topics import TopicHeard
+
+__all__ = ["Pursuing"]
+
+_ACCEPT_S: Final = 5.0
+_CANCEL_S: Final = 5.0
+_ASK_S: Final = 30.0
+"""One question for the result; there is another one after it. ROS 2 itself asks once, without a deadline."""
+_ABANDON_S: Final = 10.0
+"""How long a goal that is given up, and may go on, is told to end."""
+_GONE_S: Final = 3.0
+"""How long a server may not be seen before it counts as gone: the router may be back by then."""
+_AGAIN_S: Final = 0.2
+_END_S: Final = 2.0
+
+_HOW: Final = {int(status): how for how, status in ENDS.items()}
+
+
+class Pursuing:
+    """Asks for its result until it is known, on a thread of its own."""
+
+    def __init__(self, node: Node, name: str, type_name: str, feedback: Callable[[Message], object] | None) -> None:
+        """Raises ConfigurationError: the name or type is none."""
+        node.hashes.learn_action(type_name)
+        self._node = node
+        self._name = name
+        self._id = secrets.token_bytes(16)
+        self._feedback = feedback
+        self._unwanted = False
+        self._over = threading.Event()
+        self._closed = threading.Event()
+        self._outcome: Outcome | RosRefused | RosUnreachable | None = None
+        start = f"{name}/_action"
+        self._send = Client(node, f"{start}/send_goal", f"{type_name}_SendGoal")
+        self._get = Client(node, f"{start}/get_result", f"{type_name}_GetResult")
+        self._stop = Client(node, f"{start}/cancel_goal", CANCEL)
+        self._hearing = (
+            None
+            if feedback is None
+            else TopicHeard(node, f"{start}/feedback", f"{type_name}_FeedbackMessage", self._heard, latched=False)
+        )
+        self._thread = threading.Thread(target=self._follow, name=f"ros2 pursuit {name}", daemon=True)
+
+    def begin(self, goal: Mapping[str, Any]) -> None:
+        """Send it.
+
+        Raises:
+            RosUnreachable: nobody serves the action, or it did not answer; then it is told to cancel the goal.
+            ConfigurationError: the goal does not fit.
+        """
+        try:
+            answer = self._send.call({"goal_id": uuid(self._id), "goal": goal}, _ACCEPT_S)
+        except RosRefused as refused:
+            self._finish(refused)
+            return
+        except RosUnreachable as unreachable:
+            self._abandon(unreachable)
+            raise
+        except BaseException:
+            self._finish(RosUnreachable(what=self._name, problem="the goal was not sent"))
+            raise
+        if answer["accepted"]:
+            self._thread.start()
+        else:
+            self._finish(RosRefused(what=self._name, problem="the goal was rejected"))
+
+    def wait(self, timeout_s: float) -> Outcome:
+        """See `Pursuit`."""
+        self._over.wait(timeout_s)
+        match self._outcome:
+            case Outcome() as outcome:
+                return outcome
+            case None:
+                raise RosUnreachable(what=self._name, problem=f"the goal has not ended within {timeout_s:g} s")
+            case failure:
+                raise failure
+
+    def cancel(self) -> None:
+        """See `Pursuit`. Asked for without a router, it is asked again when there is one."""
+        self._unwanted = True
+        if not self._over.is_set():
+            with contextlib.suppress(RosUnreachable):
+                self._stop.send({"goal_info": {"goal_id": uuid(self._id)}}, _CANCEL_S)
+
+    def close(self) -> None:
+        """Have it canceled, and follow it no longer. Idempotent."""
+        self._closed.set()
+        if not self._over.is_set():
+            with contextlib.suppress(RosUnreachable, RosRefused):
+                self._stop.call({"goal_info": {"goal_id": uuid(self._id)}}, _END_S)
+            self._finish(RosUnreachable(what=self._name, problem="the bridge to ROS was closed; the goal was canceled"))
+
+    def _follow(self) -> None:
+        last_seen = time.monotonic()
+        while not self._over.is_set():
+            if self._unwanted:
+                self.cancel()
+            try:
+                answer = self._get.call({"goal_id": uuid(self._id)}, _ASK_S)
+            except RosUnreachable as unreachable:
+                if self._node.presence.offered(Kind.SERVER, self._get.name):
+                    last_seen = time.monotonic()
+                elif time.monotonic() - last_seen > _GONE_S:
+                    self._abandon(RosUnreachable(what=self._name, problem=f"its server is gone: {unreachable.problem}"))
+            except RosRefused as refused:
+                self._finish(refused)
+            else:
+                self._finish(self._read(answer))
+            self._over.wait(_AGAIN_S)
+
+    def _abandon(self, why: RosUnreachable) -> None:
+        """S05: whether it goes on is not known, so it is told to end, again and again for some time."""
+        if self._over.is_set():
+            return
+        self._outcome = why
+        self._over.set()
+        threading.Thread(target=self._end, args=(why,), name=f"ros2 end {self._name}", daemon=True).start()
+
+    def _end(self, why: RosUnreachable) -> None:
+        deadline = time.monotonic() + _ABANDON_S
+        while time.monotonic() < deadline and not self._closed.wait(_AGAIN_S):
+            with contextlib.suppress(RosUnreachable, RosRefused):
+                code = self._stop.call({"goal_info": {"goal_id": uuid(self._id)}}, _END_S)["return_code"]
+                if code in (Refusal.NONE, Refusal.GOAL_TERMINATED):
+                    break
+        self._finish(why)
+
+    def _read(self, answer: Message) -> Outcome | RosUnreachable:
+        how: Ended | None = _HOW.get(answer["status"])
+        if how is None:
+            problem = "its server does not know the goal any more; was it started again?"
+            return RosUnreachable(what=self._name, problem=problem)
+        return Outcome(how, answer["result"])
+
+    def _heard(self, message: Message, _who: str) -> None:
+        if self._feedback is not None and message["goal_id"]["uuid"] == self._id and not self._over.is_set():
+            self._feedback(message["feedback"])
+
+    def _finish(self, outcome: Outcome | RosRefused | RosUnreachable) -> None:
+        if self._outcome is None:
+            self._outcome = outcome
+        self._over.set()
+        for each in (self._hearing, self._send, self._get, self._stop):
+            if each is not None:
+                each.close()

@@ -1,0 +1,198 @@
+# pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false, reportUnknownVariableType=false
+"""Services of ROS 2.
+
+Facts, from ros2/rmw_zenoh (``rmw_service_data.cpp``, ``rmw_client_data.cpp``): a service is a complete queryable at its
+key; the request is the query's payload, the response the reply's, both CDR, each with an attachment. ROS 2 has no way
+to say that a service failed: here it is an error reply of zenoh, which a client of ROS 2 logs, and goes on waiting.
+
+ROS 2 asks every server of a name and takes the first answer. Here one of them is asked: what they do is done once.
+"""
+
+import contextlib
+import itertools
+import logging
+import queue
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Final
+
+import zenoh
+
+from trade_gateway.ros._graph import Answer, RosRefused, RosUnreachable
+from trade_gateway.ros._types import Message
+from trade_gateway.ros.ros2._attachment import Attachment
+from trade_gateway.ros.ros2._link import CLOSED, Undeclares
+from trade_gateway.ros.ros2._mailbox import Mailbox
+from trade_gateway.ros.ros2._names import Kind
+from trade_gateway.ros.ros2._node import Endpoint, Node
+
+__all__ = ["Asked", "Client", "Server", "answering"]
+
+_MOST_WAITING: Final = 10
+_LATE_S: Final = 5.0
+"""S01: a request that waited longer for its turn is refused, not executed; who asked has given up."""
+_AFTER_S: Final = 5.0
+"""How much later than ours the deadline is that zenoh knows; only what ends by itself reaches that."""
+
+_log: Final = logging.getLogger("trade")
+
+
+class Asked:
+    """A request that came. It must be ended by one of its methods."""
+
+    def __init__(self, query: zenoh.Query, endpoint: Endpoint, node: Node, type_name: str) -> None:
+        self._query = query
+        self._endpoint = endpoint
+        self._node = node
+        self._type_name = type_name
+
+    def request(self) -> Message:
+        """What is asked. Raises ValueError: it is malformed."""
+        payload = self._query.payload
+        return self._node.types.from_bytes(f"{self._type_name}_Request", b"" if payload is None else payload.to_bytes())
+
+    def who(self) -> str:
+        """The node that asks, or empty. May wait shortly."""
+        return self._node.who(self._query.attachment)
+
+    def answer(self, response: Mapping[str, Any]) -> None:
+        """Give the response. Raises ConfigurationError: it does not fit the type."""
+        payload = self._node.types.to_bytes(f"{self._type_name}_Response", response)
+        with contextlib.suppress(*CLOSED), self._query:
+            self._query.reply(self._endpoint.key, payload, attachment=self._attachment(), express=True)
+
+    def refuse(self, problem: str) -> None:
+        """Say that it failed."""
+        with contextlib.suppress(*CLOSED), self._query:
+            self._query.reply_err(problem.encode())
+
+    def _attachment(self) -> bytes | None:
+        if self._query.attachment is None:
+            return None
+        try:
+            asked = Attachment.from_bytes(self._query.attachment.to_bytes())
+        except ValueError:
+            return None
+        return asked._replace(time_ns=time.time_ns()).to_bytes()
+
+
+class Server:
+    """A service of ours; each request is handled on its thread, one after another.
+
+    What waits too long is refused, unless it is to stop something.
+    """
+
+    def __init__(
+        self, node: Node, name: str, type_name: str, handle: Callable[[Asked], object], *, stops: bool = False
+    ) -> None:
+        self._endpoint = node.service(Kind.SERVER, name, type_name)
+        self._node = node
+        self._type_name = type_name
+        self._handle = handle
+        self._mailbox = Mailbox[Asked](
+            f"ros2 {name}",
+            self._try,
+            most=None if stops else _MOST_WAITING,
+            longest_s=float("inf") if stops else _LATE_S,
+            drop=self._late,
+        )
+        self._declared = node.link.declare(self._declare)
+
+    def close(self) -> None:
+        """Serve no more. Idempotent."""
+        self._declared.close()
+        self._mailbox.close()
+
+    def _declare(self, session: zenoh.Session) -> Sequence[Undeclares]:
+        queryable = session.declare_queryable(self._endpoint.key, self._put, complete=True)
+        return session.liveliness().declare_token(self._endpoint.token), queryable
+
+    def _put(self, query: zenoh.Query) -> None:
+        self._mailbox.put(Asked(query, self._endpoint, self._node, self._type_name))
+
+    def _late(self, asked: Asked) -> None:
+        asked.refuse("not executed: others were before it for too long, or the service has ended")
+
+    def _try(self, asked: Asked) -> None:
+        try:
+            self._handle(asked)
+        except Exception as failed:  # noqa: BLE001 - told to the caller, whatever it is
+            _log.warning("%s failed: %s", self._endpoint.key, failed)
+            asked.refuse(f"{type(failed).__name__}: {failed}")
+
+
+def answering(answer: Answer) -> Callable[[Asked], object]:
+    """Handles requests by a function that returns the response."""
+    return lambda asked: asked.answer(answer(asked.request(), asked.who()))
+
+
+class Client:
+    """A service of theirs."""
+
+    def __init__(self, node: Node, name: str, type_name: str) -> None:
+        self._endpoint = node.service(Kind.CLIENT, name, type_name)
+        self._node = node
+        self.name: Final = name
+        self._type_name = type_name
+        self._sequence = itertools.count(1)
+        self._declared = node.link.declare(self._declare)
+
+    def call(self, request: Mapping[str, Any], timeout_s: float) -> Message:
+        """See `Graph.call`."""
+        payload = self._node.types.to_bytes(f"{self._type_name}_Request", request)
+        answers: queue.SimpleQueue[zenoh.Reply | None] = queue.SimpleQueue()
+        cancel = self._ask(payload, timeout_s, answers.put, lambda: answers.put(None))
+        try:
+            reply = answers.get(timeout=max(0.0, timeout_s))
+        except queue.Empty:
+            problem = f"did not answer within {timeout_s:g} s; whether it did what was asked is unknown"
+            raise RosUnreachable(what=self.name, problem=problem) from None
+        finally:
+            cancel()
+        if reply is None:
+            nobody = f"no node serves it as {self._type_name}, or the one that does ended before it answered"
+            raise RosUnreachable(what=self.name, problem=self._node.link.problem or nobody)
+        return self._read(reply)
+
+    def send(self, request: Mapping[str, Any], timeout_s: float) -> None:
+        """Call it without waiting for the response. Raises RosUnreachable: no router."""
+        payload = self._node.types.to_bytes(f"{self._type_name}_Request", request)
+        self._ask(payload, timeout_s, lambda _: None, lambda: None)
+
+    def close(self) -> None:
+        """Be seen as its client no more. Idempotent."""
+        self._declared.close()
+
+    def _ask(
+        self, payload: bytes, timeout_s: float, told: Callable[[zenoh.Reply], object], ended: Callable[[], object]
+    ) -> Callable[[], object]:
+        session, problem = self._node.link.session, self._node.link.problem
+        if session is None or problem:
+            raise RosUnreachable(what=self.name, problem=problem)
+        cancellation = zenoh.CancellationToken()
+        try:
+            session.get(
+                self._endpoint.key,
+                zenoh.handlers.Callback(told, ended),
+                target=zenoh.QueryTarget.BEST_MATCHING,
+                consolidation=zenoh.ConsolidationMode.NONE,
+                timeout=timeout_s + _AFTER_S,
+                payload=payload,
+                attachment=self._endpoint.attachment(next(self._sequence)),
+                cancellation_token=cancellation,
+            )
+        except CLOSED as closed:
+            raise RosUnreachable(what=self.name, problem=f"the session ended: {closed}") from None
+        return cancellation.cancel
+
+    def _read(self, reply: zenoh.Reply) -> Message:
+        if reply.err is not None:
+            raise RosRefused(what=self.name, problem=reply.err.payload.to_bytes().decode(errors="replace"))
+        payload = b"" if reply.ok is None else reply.ok.payload.to_bytes()
+        try:
+            return self._node.types.from_bytes(f"{self._type_name}_Response", payload)
+        except ValueError as malformed:
+            raise RosRefused(what=self.name, problem=f"answered what cannot be read: {malformed}") from None
+
+    def _declare(self, session: zenoh.Session) -> Sequence[Undeclares]:
+        return [session.liveliness().declare_token(self._endpoint.token)]

@@ -1,0 +1,132 @@
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportCallIssue=false
+"""Topics of ROS 2.
+
+Facts, from ros2/rmw_zenoh (``rmw_publisher_data.cpp``, ``rmw_subscription_data.cpp``): a message is a put of its CDR
+with an attachment. A publisher that is transient local is an advanced one of zenoh with a cache of its depth, that can
+be detected and tells of what it sent last; a subscription that is transient local asks such caches.
+"""
+
+import contextlib
+import itertools
+import logging
+import threading
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
+
+import zenoh
+import zenoh.ext
+
+from trade_gateway.ros._graph import Heard
+from trade_gateway.ros.ros2._link import CLOSED, Undeclares
+from trade_gateway.ros.ros2._mailbox import Mailbox
+from trade_gateway.ros.ros2._names import Kind
+from trade_gateway.ros.ros2._node import LATCHED, USUAL, Node
+
+__all__ = ["Topic", "TopicHeard"]
+
+_DEPTH: Final = 10
+_LATE_S: Final = 1.0
+"""S01, S04: a message that waited longer for its subscriber, who was busy, is not told: it may be a command."""
+_HEARTBEAT_S: Final = 0.5
+
+_log: Final = logging.getLogger("trade")
+
+
+class Topic:
+    """One that is published."""
+
+    def __init__(self, node: Node, topic: str, type_name: str, *, latched: bool) -> None:
+        self._endpoint = node.topic(Kind.PUBLISHER, topic, type_name, LATCHED if latched else USUAL)
+        self._types = node.types
+        self._type_name = type_name
+        self._latched = latched
+        self._last: bytes | None = None
+        self._sequence = itertools.count(1)
+        self._sending = threading.Lock()
+        self._publisher: Any = None
+        self._declared = node.link.declare(self._declare)
+
+    def send(self, message: Mapping[str, Any]) -> None:
+        """See `Publisher`. Without a router only what is latched is kept, and only the last."""
+        payload = self._types.to_bytes(self._type_name, message)
+        with self._sending:
+            if self._latched:
+                self._last = payload
+            self._put(payload)
+
+    def close(self) -> None:
+        """Publish no more. Idempotent."""
+        self._declared.close()
+        with self._sending:
+            self._publisher = None
+
+    def _put(self, payload: bytes) -> None:
+        if self._publisher is not None:
+            with contextlib.suppress(*CLOSED):
+                self._publisher.put(payload, attachment=self._endpoint.attachment(next(self._sequence)))
+
+    def _declare(self, session: zenoh.Session) -> Sequence[Undeclares]:
+        publisher = self._advanced(session) if self._latched else self._plain(session)
+        token = session.liveliness().declare_token(self._endpoint.token)
+        with self._sending:
+            self._publisher = publisher
+            if self._last is not None:
+                self._put(self._last)
+        return token, publisher
+
+    def _plain(self, session: zenoh.Session) -> zenoh.Publisher:
+        return session.declare_publisher(
+            self._endpoint.key, congestion_control=zenoh.CongestionControl.DROP, express=True
+        )
+
+    def _advanced(self, session: zenoh.Session) -> Any:
+        return zenoh.ext.declare_advanced_publisher(
+            session,
+            self._endpoint.key,
+            congestion_control=zenoh.CongestionControl.DROP,
+            express=True,
+            cache=zenoh.ext.CacheConfig(1),
+            sample_miss_detection=zenoh.ext.MissDetectionConfig(sporadic_heartbeat=_HEARTBEAT_S),
+            publisher_detection=True,
+        )
+
+
+class TopicHeard:
+    """One that is subscribed to."""
+
+    def __init__(self, node: Node, topic: str, type_name: str, heard: Heard, *, latched: bool) -> None:
+        self._endpoint = node.topic(Kind.SUBSCRIPTION, topic, type_name, LATCHED if latched else USUAL)
+        self._node = node
+        self._type_name = type_name
+        self._heard = heard
+        self._latched = latched
+        longest_s = float("inf") if latched else _LATE_S
+        self._mailbox = Mailbox[zenoh.Sample](f"ros2 {topic}", self._tell, most=_DEPTH, longest_s=longest_s)
+        self._declared = node.link.declare(self._declare)
+
+    def close(self) -> None:
+        """Hear no more. Idempotent."""
+        self._declared.close()
+        self._mailbox.close()
+
+    def _tell(self, sample: zenoh.Sample) -> None:
+        try:
+            message = self._node.types.from_bytes(self._type_name, sample.payload.to_bytes())
+        except ValueError as malformed:
+            _log.warning("%s is not told: %s", sample.key_expr, malformed)
+            return
+        self._heard(message, self._node.who(sample.attachment))
+
+    def _declare(self, session: zenoh.Session) -> Sequence[Undeclares]:
+        token = session.liveliness().declare_token(self._endpoint.token)
+        if not self._latched:
+            return token, session.declare_subscriber(self._endpoint.key, self._mailbox.put)
+        subscriber: Any = zenoh.ext.declare_advanced_subscriber(
+            session,
+            self._endpoint.key,
+            self._mailbox.put,
+            history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1),
+            recovery=zenoh.ext.RecoveryConfig(heartbeat=True),
+            subscriber_detection=True,
+        )
+        return token, subscriber

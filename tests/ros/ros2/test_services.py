@@ -1,0 +1,142 @@
+"""Services, with clients and servers of zenoh-ros2-sdk at the other end."""
+
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from ros2_peers import Process, Router, until_offered
+from trade_gateway.ros._graph import RosRefused, RosUnreachable
+from trade_gateway.ros.ros2 import Ros2
+from trade_gateway.ros.ros2._names import Kind
+from waiting import wait_until
+
+ADD = "example_interfaces/srv/AddTwoInts"
+LONG_S = 60.0
+
+
+def call(graph: Ros2, name: str, request: dict[str, Any], timeout_s: float = LONG_S, type_name: str = ADD) -> Any:
+    """Call a service that is there."""
+    until_offered(graph, name, type_name)
+    return graph.call(name, type_name, request, timeout_s)
+
+
+def add(request: dict[str, Any], _who: str) -> dict[str, Any]:
+    return {"sum": request["a"] + request["b"]}
+
+
+def test_another_node_calls_a_service_of_ours(graph: Ros2, peer: Process) -> None:
+    graph.serve("/add_ours", ADD, add)
+    peer.ask("add", service="/add_ours", a=2, b=-3)
+    assert peer.hear("added")["sum"] == -1
+
+
+def test_we_call_a_service_of_another_node(graph: Ros2, peer: Process) -> None:
+    peer.ask("serve", service="/add_theirs")
+    peer.hear("serving", service="/add_theirs")
+    assert call(graph, "/add_theirs", {"a": 40, "b": 2}) == {"sum": 42}
+    assert peer.has("asked", a=40, b=2)
+
+
+def test_a_service_is_told_which_node_asks(graph: Ros2, router: Router, open_graph: Callable[..., Ros2]) -> None:
+    asked: list[str] = []
+    graph.serve("/who", ADD, lambda _, who: asked.append(who) or {})
+    assert call(open_graph(router, node="/arm/asks"), "/who", {}) == {"sum": 0}
+    assert asked == ["/arm/asks"]
+
+
+def test_what_another_node_fails_with_is_a_refusal(graph: Ros2, peer: Process) -> None:
+    peer.ask("serve", service="/fails", fails=True)
+    peer.hear("serving", service="/fails")
+    with pytest.raises(RosRefused, match="no sums today"):
+        call(graph, "/fails", {})
+
+
+def test_what_ours_fails_with_is_told_to_the_caller(
+    graph: Ros2, router: Router, open_graph: Callable[..., Ros2], caplog: pytest.LogCaptureFixture
+) -> None:
+    def fail(_request: dict[str, Any], _who: str) -> dict[str, Any]:
+        raise ValueError("the arm is locked")
+
+    graph.serve("/refuses", ADD, fail)
+    with pytest.raises(RosRefused, match="ValueError: the arm is locked"):
+        call(open_graph(router, node="/asks"), "/refuses", {})
+
+
+def test_a_service_that_nobody_offers_is_unreachable_at_once(graph: Ros2) -> None:
+    with pytest.raises(RosUnreachable, match="no node serves it"):
+        graph.call("/nobody", ADD, {}, LONG_S)
+
+
+def test_a_service_of_another_type_is_not_that_service(graph: Ros2, peer: Process) -> None:
+    peer.ask("serve", service="/other_type")
+    peer.hear("serving", service="/other_type")
+    with pytest.raises(RosUnreachable, match="no node serves it as std_srvs/srv/Trigger"):
+        graph.call("/other_type", "std_srvs/srv/Trigger", {}, LONG_S)
+
+
+def test_a_server_that_does_not_answer_is_not_waited_for_longer_than_asked(graph: Ros2, peer: Process) -> None:
+    peer.ask("serve", service="/silent", hangs=True)
+    peer.hear("serving", service="/silent")
+    with pytest.raises(RosUnreachable, match=r"within 0\.2 s; whether it did what was asked is unknown"):
+        call(graph, "/silent", {}, 0.2)
+
+
+def test_a_server_that_is_killed_while_it_is_asked_is_noticed(
+    graph: Ros2, router: Router, start_peer: Callable[..., Process]
+) -> None:
+    doomed = start_peer(router, "doomed")
+    doomed.ask("serve", service="/doomed", hangs=True)
+    doomed.hear("serving", service="/doomed")
+    failed: list[str] = []
+
+    def ask() -> None:
+        try:
+            call(graph, "/doomed", {})
+        except RosUnreachable as unreachable:
+            failed.append(str(unreachable))
+
+    calling = threading.Thread(target=ask)
+    calling.start()
+    doomed.hear("asked")
+    doomed.kill()
+    calling.join(LONG_S / 2)
+    assert not calling.is_alive()
+    assert "no node serves it" in failed[0]
+
+
+def test_of_two_servers_of_one_name_one_is_asked(graph: Ros2, router: Router, open_graph: Callable[..., Ros2]) -> None:
+    """ROS 2 would ask both: what they do would be done twice."""
+    asked: list[str] = []
+    for number, node in enumerate(("/left", "/right")):
+        server = open_graph(router, node=node)
+        server.serve("/twice", ADD, lambda _, who, number=number: asked.append(who) or {"sum": number})
+    both = open_graph(router, node="/watches")
+    until_offered(graph, "/twice", ADD)
+    wait_until(lambda: both._node.presence._offered[Kind.SERVER, "/twice"] == 2, "both are there")
+    for _ in range(5):
+        call(graph, "/twice", {})
+    assert len(asked) == 5
+
+
+def test_a_closed_service_is_offered_no_more(graph: Ros2, router: Router, open_graph: Callable[..., Ros2]) -> None:
+    caller = open_graph(router, node="/asks")
+    service = graph.serve("/short", ADD, add)
+    assert call(caller, "/short", {"a": 1}) == {"sum": 1}
+    service.close()
+    service.close()
+    with pytest.raises(RosUnreachable):
+        caller.call("/short", ADD, {}, LONG_S)
+
+
+def test_a_request_without_fields_and_an_empty_answer_pass(
+    graph: Ros2, router: Router, open_graph: Callable[..., Ros2]
+) -> None:
+    graph.serve("/reset", "std_srvs/srv/Empty", lambda _request, _who: {})
+    assert call(open_graph(router, node="/asks"), "/reset", {}, type_name="std_srvs/srv/Empty") == {}
+
+
+def test_another_node_that_asks_for_our_parameters_is_answered(graph: Ros2, peer: Process) -> None:
+    peer.ask("parameter_types", node="/trade", names=["use_sim_time", "other"])
+    assert peer.hear("types")["types"] == [0, 0]
