@@ -3,6 +3,8 @@
 from collections.abc import Callable
 from typing import Any
 
+import msgspec
+
 from trade import _dispatch, _estop, _estop_store, _locks, _ongoing, _resources, _wire
 from trade._announcing import Announcer
 from trade._deadman import Deadman
@@ -23,7 +25,7 @@ def _confirm_only(self: _estop.Estops, order: _wire.EstopOrder, who: str) -> Non
 def _any_version(decoder: Any, payload: bytes) -> Any:
     try:
         return decoder.decode(payload)
-    except Exception as bad:
+    except (msgspec.DecodeError, ValueError, RecursionError) as bad:
         raise _wire.Malformed(str(bad)) from None
 
 
@@ -31,12 +33,19 @@ def _no_renewal(self: _locks.LockTable, numbers: Any, identity: str) -> list[int
     return list(numbers)
 
 
+_run: Any = _dispatch.LocalService.run
+
+
+def _run_but_stops(self: _dispatch.LocalService, raw: Any, context: Any) -> Any:
+    return None if self.label == "peer.halt" else _run(self, raw, context)
+
+
 BREAK: dict[str, Callable[[], None]] = {
     "runs-late": _put(_dispatch.LocalService, "too_late", lambda self, expires_ns: False),
     "runs-twice": _put(_ongoing.Once, "begin", _as_if_new),
     "ignores-locks": _put(_resources.Resource, "check_lock", lambda self, tokens, caller, session="": None),
     "ignores-sessions": _put(Deadman, "session_ended", lambda self, session: None),
-    "ignores-stops": _put(_resources.Resource, "stop", lambda self, by, sessions=(), reason="": None),
+    "ignores-stops": _put(_dispatch.LocalService, "run", _run_but_stops),
     "never-latches": _put(_resources.Resource, "_is_of", lambda self, asking: True),
     "ignores-estops": _put(_estop.Estops, "take", _confirm_only),
     "forgets-estops": _put(_estop_store.EstopStore, "read", lambda self: []),

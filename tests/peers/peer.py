@@ -1,4 +1,4 @@
-"""A container for `trade conformance` in Python; with a rule's name it breaks that rule, so that the check of it fails."""
+"""A container for `trade conformance` in Python; with a rule's name it breaks that rule, so that its check fails."""
 
 import math
 import signal
@@ -7,8 +7,9 @@ import threading
 import time
 from typing import Any
 
-import trade
 from broken import BREAK
+
+import trade
 from trade import Handle, Resource, current_call, permit, service
 from trade.errors import LimitExceeded, MotionStopped
 
@@ -90,7 +91,9 @@ class Relay:
         """Call a service of another container, under a lock of these resources of it if there are any."""
         if not resources:
             return service(*args)
-        using = [one for one in trade.services() if set(resources) & set(one.record.info.uses) and one.effect == "actuate"]
+        using = [
+            one for one in trade.services() if set(resources) & set(one.record.info.uses) and one.effect == "actuate"
+        ]
         with trade.lock(using, purpose="relay", wait_s=0.0):
             return service(*args)
 

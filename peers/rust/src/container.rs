@@ -31,8 +31,8 @@ pub struct Container {
     robot: Mutex<Robot>,
     changed: Condvar,
     registry: Mutex<(u64, BTreeMap<String, Vec<u8>>)>,
-    /// Requests about e-stops that were heard, and what of each failed.
-    requests: Mutex<HashMap<String, String>>,
+    /// Requests about e-stops that were heard, and what of each failed; None while it is being done.
+    requests: Mutex<HashMap<String, Option<String>>>,
     store: Store,
     asking: Asking,
     running: AtomicUsize,
@@ -46,7 +46,7 @@ impl Container {
     pub fn new(session: Session, own: &str, store: Store, random: u64, learn: Sender<String>) -> Container {
         let chunks: Vec<&str> = own.split('/').collect();
         let estops = store.read();
-        let requests = estops.iter().map(|one| (one.id.clone(), String::new())).collect();
+        let requests = estops.iter().map(|one| (one.id.clone(), Some(String::new()))).collect();
         let hostname = std::fs::read_to_string("/proc/sys/kernel/hostname");
         Container {
             asking: Asking::new(session.clone(), own, random),
@@ -361,11 +361,12 @@ impl Container {
         let key = sample.key_expr().as_str();
         let Some(identity) = key.strip_prefix("estop/").filter(|identity| is_chunk(identity)) else { return };
         let Some(order) = EstopOrder::read(&sample.payload().to_bytes(), identity) else { return };
-        let known = self.requests.lock().unwrap().get(&order.request).cloned();
-        let problem = known.unwrap_or_else(|| match &order.opened {
-            Some(estop) => self.open(estop),
-            None => self.clear(&order),
-        });
+        let problem = match (self.first(&order.request), &order.opened) {
+            (Some(Some(problem)), _) => problem,
+            (Some(None), _) => return, // it is being done: the order comes again
+            (None, Some(estop)) => self.open(estop),
+            (None, None) => self.clear(&order),
+        };
         let put = self.session.put(format!("estop/{}", self.own), wire::estop_confirmed(&order.request, &problem));
         let _ = put.congestion_control(CongestionControl::Drop).priority(Priority::RealTime).express(true).wait();
     }
@@ -373,10 +374,20 @@ impl Container {
     /// Others have these open: take the union. One that was cleared here is not opened again.
     fn learnt(&self, told: &[Estop]) {
         for estop in told {
-            if !self.requests.lock().unwrap().contains_key(&estop.id) {
+            if self.first(&estop.id).is_none() {
                 self.open(estop);
             }
         }
+    }
+
+    /// None if this is asked for the first time, and then it is to be done; else how far it is.
+    fn first(&self, request: &str) -> Option<Option<String>> {
+        let mut requests = self.requests.lock().unwrap();
+        let known = requests.get(request).cloned();
+        if known.is_none() {
+            requests.insert(request.to_owned(), None);
+        }
+        known
     }
 
     /// Stop first, write it down then; the arm is at rest when the mutex is free again.
@@ -390,7 +401,7 @@ impl Container {
     fn clear(&self, order: &EstopOrder) -> String {
         self.robot().clear_estops(&order.cleared);
         for id in &order.cleared {
-            self.requests.lock().unwrap().entry(id.clone()).or_default(); // what still travels of it opens nothing
+            self.requests.lock().unwrap().insert(id.clone(), Some(String::new())); // what still travels of it opens nothing
         }
         let failed = order.cleared.iter().filter_map(|id| self.store.remove(id).err()).next();
         self.done(&order.request, failed.map_or(String::new(), |bad| format!("its note stays: {bad}")))
@@ -402,7 +413,7 @@ impl Container {
             let open: Vec<String> = self.store.read().into_iter().map(|one| one.id).collect();
             requests.retain(|id, _| open.contains(id));
         }
-        requests.insert(request.to_owned(), problem.clone());
+        requests.insert(request.to_owned(), Some(problem.clone()));
         drop(requests);
         self.announce(&[SYSTEM]);
         problem

@@ -151,5 +151,3 @@ def streams(stage: Stage) -> None:
 
 def _why(reply: Any) -> str:
     return str(error_of(reply)) if reply.status == Status.ERROR else ""
-
-

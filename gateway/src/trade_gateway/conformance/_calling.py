@@ -1,6 +1,8 @@
 """Checks of calls: what is answered, what is not run, and that nothing runs twice."""
 
 import math
+import signal
+import threading
 from typing import Any
 
 from trade import errors
@@ -8,7 +10,7 @@ from trade._wire import Status
 from trade_gateway.conformance._check import check
 from trade_gateway.conformance._judging import eventually, require
 from trade_gateway.conformance._stage import Stage
-from trade_gateway.conformance._voice import NEVER, SYSTEM, Voice, error_of
+from trade_gateway.conformance._voice import NEVER, SYSTEM, error_of
 
 
 @check("answers", "Messages")
@@ -29,7 +31,8 @@ def refuses_arguments(stage: Stage) -> None:
     arm = stage.peer.arm
     with stage.voice() as anna:
         began = stage.turns(anna)
-        for args in ((), ("far",), (1.0, 2.0), (None,), ([],)):
+        unfit: list[tuple[Any, ...]] = [(), ("far",), (1.0, 2.0), (None,), ([],)]
+        for args in unfit:
             found = error_of(anna.ask(arm, "turn", *args))
             require(isinstance(found, errors.InvalidArgument), f"turn{args} was refused with {found!r}")
         wrong = error_of(anna.ask(arm, "turn", by_name={"angle_deg": 1.0}))
@@ -62,7 +65,7 @@ def knows_not(stage: Stage) -> None:
 
 @check("late-is-never", "S01")
 def late_is_never(stage: Stage) -> None:
-    """A command whose expiry has passed, or that has none, is answered with status 3 and never runs; reading goes on."""
+    """A command whose expiry has passed, or that has none, is answered with status 3 and never runs."""
     arm = stage.peer.arm
     with stage.voice() as anna:
         began = stage.turns(anna)
@@ -73,6 +76,22 @@ def late_is_never(stage: Stage) -> None:
         reply = anna.ask(SYSTEM, "acquire", ["peer.arm"], {}, expires_ns=NEVER)
         require(reply.status == Status.EXPIRED, f"a late acquire was answered with status {reply.status}, not 3")
         require(anna.ask(arm, "echo", 1, expires_ns=NEVER).status == Status.OK, "echo without an expiry did not run")
+
+
+@check("late-when-frozen", "S01")
+def late_when_frozen(stage: Stage) -> None:
+    """A command that came in time to a process that stood still, and has expired when it goes on, never runs."""
+    arm, process = stage.peer.arm, stage.peer.process
+    with stage.voice() as anna:
+        began, expires_ns = stage.turns(anna), anna.expiry_ns(0.5)
+        process.send_signal(signal.SIGSTOP)
+        try:
+            call_id = anna.call(arm, "turn", 0.1, expires_ns=expires_ns)
+            threading.Event().wait(1.0)
+        finally:
+            process.send_signal(signal.SIGCONT)
+        require(anna.answer(call_id).status == Status.EXPIRED, "a turn that expired in a frozen process ran")
+        require(stage.turns(anna) == began, "a turn that expired in a frozen process began")
 
 
 @check("once", "S02")
@@ -149,15 +168,11 @@ def forged(stage: Stage) -> None:
     peer, arm = stage.peer, stage.peer.arm
     with stage.voice("anna") as anna, stage.voice("bob") as bob:
         began = stage.turns(anna)
-        dropped = [_in_the_name_of(anna, bob.session, arm)]
         here = f"{peer.address}/{'/'.join(arm)}"
-        for key in (f"call/anna/{peer.address}/**", f"call/*/{here}", f"call/anna/{peer.address}/*/*"):
-            dropped.append(anna.call(arm, "turn", 0.1, key=key))
+        keys = (f"call/anna/{peer.address}/**", f"call/*/{here}", f"call/anna/{peer.address}/*/*")
+        dropped = [anna.call(arm, "turn", 0.1, session=bob.session)]
+        dropped += [anna.call(arm, "turn", 0.1, key=key) for key in keys]
         require(anna.ask(arm, "echo", 1).status == Status.OK, "echo did not run")
         require(stage.turns(anna) == began, "a forged turn began")
         said = [reply.status for call_id in dropped for reply in anna.answers(call_id)]
         require(Status.OK not in said, "a forged call was answered as if it had run")
-
-
-def _in_the_name_of(anna: Voice, session: str, arm: tuple[str, str]) -> int:
-    return anna.call(arm, "turn", 0.1, session=session)

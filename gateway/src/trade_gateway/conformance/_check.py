@@ -1,7 +1,6 @@
 """One check: what is asked of a container, where that is said, and how it is found out."""
 
 from collections.abc import Callable
-from typing import Final
 
 from msgspec import Struct
 
@@ -20,16 +19,11 @@ class Check(Struct, frozen=True):
     """A function of the container's own provider, without which the check is left out."""
 
 
-CHECKS: Final[list[Check]] = []
-"""All of them, in the order they are made."""
+def check(name: str, rule: str, *, needs: str = "") -> Callable[[Callable[[Stage], None]], Check]:
+    """Make a check of a function; what it asks is the first line of its docstring."""
 
-
-def check(name: str, rule: str, *, needs: str = "") -> Callable[[Callable[[Stage], None]], Callable[[Stage], None]]:
-    """Put a function into the table; what it asks is the first line of its docstring."""
-
-    def put(does: Callable[[Stage], None]) -> Callable[[Stage], None]:
+    def make(does: Callable[[Stage], None]) -> Check:
         what = (does.__doc__ or "").strip().splitlines()[0].rstrip(".")
-        CHECKS.append(Check(name, what, rule, does, needs))
-        return does
+        return Check(name, what, rule, does, needs)
 
-    return put
+    return make

@@ -33,13 +33,16 @@ def conformance(
         _list(out)
         return
     if peer is None:
-        raise UsageError(where="--peer", problem="missing; name the command that starts a container, or --list the checks")
+        raise UsageError(
+            where="--peer", problem="missing; name the command that starts a container, or --list the checks"
+        )
     outcomes = run(peer, _chosen(only or []), lambda outcome: _tell(out, outcome))
     failed = [outcome.check for outcome in outcomes if outcome.outcome == FAILED]
     if failed:
         out.say(f"[bold red]failed[/]: {len(failed)} of {len(outcomes)}: {escape(', '.join(failed))}")
         raise typer.Exit(1)
-    out.say(f"[bold green]passed[/]: {len(outcomes)} checks")
+    left_out = [outcome.check for outcome in outcomes if outcome.outcome == LEFT_OUT]
+    out.say(f"[bold green]passed[/]: {len(outcomes) - len(left_out)} checks, {len(left_out)} left out")
 
 
 def _chosen(names: Sequence[str]) -> list[Check]:

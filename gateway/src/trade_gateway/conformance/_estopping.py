@@ -5,7 +5,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from trade import errors
+from trade import errors, where
 from trade._wire import (
     PROTOCOL,
     Estop,
@@ -19,7 +19,7 @@ from trade._wire import (
 )
 from trade_gateway.conformance._check import check
 from trade_gateway.conformance._judging import PATIENCE_S, eventually, require
-from trade_gateway.conformance._stage import Stage
+from trade_gateway.conformance._stage import GROUP, Stage
 from trade_gateway.conformance._voice import NEVER, SYSTEM, Voice, error_of
 
 _ALL_TOLD_S = 3.0
@@ -89,6 +89,22 @@ def estop(stage: Stage) -> None:
         require(not _told(stage), "an e-stop that was cleared is opened again by its own order")
         anna.result(SYSTEM, "resume", ["peer.arm"])
         anna.result(stage.peer.arm, "turn", stage.angle(anna))
+
+
+@check("estop-reported", "S09")
+def estop_reported(stage: Stage) -> None:
+    """An e-stop by a container of this project is reported as complete, and so is its clearing."""
+    arm = stage.peer.place("turn")
+    stage.container.find(where(name="halt", group=GROUP), wait_s=PATIENCE_S)
+    report = stage.container.estop("a check", limit_s=_ALL_TOLD_S)
+    try:
+        require(report.complete and "peer/peer" in report.confirmed, f"the report of an e-stop says {report}")
+    finally:
+        cleared = stage.container.estop_clear([report.id], limit_s=_ALL_TOLD_S)
+    require(cleared.complete, f"the report of the clearing says {cleared}")
+    stage.container.resume(where(name="turn", group=GROUP))
+    with stage.voice() as anna:
+        anna.result(arm, "turn", stage.angle(anna))
 
 
 @check("estop-forged", "E-stops")

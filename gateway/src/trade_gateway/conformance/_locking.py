@@ -2,15 +2,18 @@
 
 import threading
 
-from trade import errors
+import msgspec
+
+from trade import errors, where
+from trade._terms import LockInfo
 from trade._wire import Status, Token
 from trade_gateway.conformance._check import check
-from trade_gateway.conformance._judging import eventually, require
-from trade_gateway.conformance._stage import Stage
+from trade_gateway.conformance._judging import PATIENCE_S, NotHeld, eventually, require
+from trade_gateway.conformance._stage import GROUP, Stage
 from trade_gateway.conformance._voice import SYSTEM, Voice, error_of
 
 _ARM = ["peer.arm"]
-_LEASE_S = 0.6
+_LEASE_S = 1.0
 
 
 def _renew(who: Voice, lock: Token) -> dict[int, str]:
@@ -19,6 +22,13 @@ def _renew(who: Voice, lock: Token) -> dict[int, str]:
 
 def _release(who: Voice, lock: Token, lost: str = "") -> bool:
     return bool(who.result(SYSTEM, "release", lock.number, lost, stop=True))
+
+
+def _told(who: Voice) -> list[LockInfo]:
+    try:
+        return msgspec.convert(who.result(SYSTEM, "locks"), list[LockInfo])
+    except msgspec.ValidationError as bad:
+        raise NotHeld(f"what locks told cannot be read: {bad}") from None
 
 
 @check("locks", "S11")
@@ -47,19 +57,37 @@ def locks_told(stage: Stage) -> None:
     arm = stage.peer.arm
     with stage.voice("anna") as anna, stage.voice("bob") as bob:
         lock = stage.granted(anna, _ARM, purpose="a check", lease_s=20.0)
-        told = bob.result(SYSTEM, "locks")
-        require(isinstance(told, list) and len(told) == 1, f"locks told {told!r}")
-        info = told[0]
-        require(tuple(info["token"]) == (lock.epoch, lock.number), "locks tells another token than was granted")
-        require(list(info["resources"]) == _ARM, f"locks tells of {info['resources']!r}")
-        holder = info["holder"]
-        said = (holder["identity"], holder["session"], holder["purpose"])
-        require(said == ("anna", anna.session, "a check"), f"locks says that the holder is {holder!r}")
-        require(0 < info["left_s"] <= 20, f"locks says that {info['left_s']!r} s of a lease of 20 s are left")
+        told = _told(bob)
+        require(len(told) == 1, f"locks told {told!r}")
+        [info] = told
+        require(info.token == lock, "locks tells another token than was granted")
+        require(list(info.resources) == _ARM, f"locks tells of {info.resources!r}")
+        said = (info.holder.identity, info.holder.session, info.holder.purpose)
+        require(said == ("anna", anna.session, "a check"), f"locks says that the holder is {info.holder!r}")
+        require(0 < info.left_s <= 20, f"locks says that {info.left_s!r} s of a lease of 20 s are left")
         refused = error_of(bob.ask(arm, "turn", 0.1))
         require(isinstance(refused, errors.LockedByOther), f"a turn without the lock ended with {refused!r}")
-        require("anna" in str(refused) and "a check" in str(refused), f"the refusal does not say who and why: {refused}")
+        require(
+            "anna" in str(refused) and "a check" in str(refused), f"the refusal does not say who and why: {refused}"
+        )
         _release(anna, lock)
+
+
+@check("locked-by-ours", "S11")
+def locked_by_ours(stage: Stage) -> None:
+    """A container of this project locks its group as a whole, keeps the lock and turns the arm under it."""
+    ours = stage.container
+    turn = ours.find(where(name="turn", group=GROUP), wait_s=PATIENCE_S)
+    with stage.voice() as anna:
+        here_rad = stage.angle(anna)
+        with ours.lock(where(group=GROUP), purpose="a check", lease_s=_LEASE_S) as lock:
+            require("peer.arm" in lock.resources, f"what was locked is {lock.resources}")
+            threading.Event().wait(2 * _LEASE_S)
+            require(turn(here_rad) == here_rad, "turn answered something else")
+            require([info.token for info in ours.locks()] == list(lock.tokens()), f"the locks are {ours.locks()}")
+            refused = error_of(anna.ask(stage.peer.arm, "turn", here_rad))
+            require(isinstance(refused, errors.LockedByOther), f"a turn without the lock ended with {refused!r}")
+        anna.result(stage.peer.arm, "turn", here_rad)
 
 
 @check("one-owner", "S13")
@@ -77,8 +105,8 @@ def one_owner(stage: Stage) -> None:
         _release(anna, lock)
         reply = bob.answer(waiting)
         require(reply.status == Status.OK, f"who waited for its turn was answered with status {reply.status}")
-        for info in bob.result(SYSTEM, "locks"):
-            _release(bob, Token(*info["token"]))
+        for info in _told(bob):
+            _release(bob, info.token)
         unknown = error_of(stage.acquire(bob, ["peer.nothing"]))
         require(isinstance(unknown, errors.ServiceGone), f"acquire of an unknown resource ended with {unknown!r}")
 
@@ -101,8 +129,8 @@ def waits_for_motion(stage: Stage) -> None:
         anna.cancel(running, "peer.turn")
         reply = bob.answer(waiting)
         require(reply.status == Status.OK, f"acquire was answered with status {reply.status} when all was at rest")
-        for info in bob.result(SYSTEM, "locks"):
-            _release(bob, Token(*info["token"]))
+        for info in _told(bob):
+            _release(bob, info.token)
 
 
 @check("leases", "S12")
@@ -110,12 +138,12 @@ def leases(stage: Stage) -> None:
     """A lock lasts while it is renewed and falls with its lease; what moves under it stops; it never comes back."""
     arm = stage.peer.arm
     with stage.voice("anna") as anna, stage.voice("bob") as bob:
-        lock = stage.granted(anna, _ARM, lease_s=_LEASE_S * 3)
+        lock = stage.granted(anna, _ARM, lease_s=_LEASE_S * 2)
         for _ in range(8):  # longer than the lease
             threading.Event().wait(_LEASE_S / 2)
             require(not _renew(anna, lock), "a lock that was renewed is said to be over")
         running = stage.begin_turn(anna, tokens=[lock])
-        eventually(lambda: not bob.result(SYSTEM, "locks"), "a lock that was not renewed still holds")
+        eventually(lambda: not _told(bob), "a lock that was not renewed still holds")
         stage.require_rest(anna, "the lease of the lock it moved under ended")
         error_of(anna.answer(running))
         require(lock.number in _renew(anna, lock), "renew does not say that the lock is over")
@@ -130,7 +158,7 @@ def owner_ends(stage: Stage) -> None:
     with stage.voice("bob") as bob:
         with stage.voice("anna") as anna:
             stage.granted(anna, _ARM, lease_s=30.0)
-        eventually(lambda: not bob.result(SYSTEM, "locks"), "the lock of a session that has ended still holds")
+        eventually(lambda: not _told(bob), "the lock of a session that has ended still holds")
         bob.result(stage.peer.arm, "turn", stage.angle(bob))
 
 

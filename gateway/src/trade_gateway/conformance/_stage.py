@@ -4,6 +4,7 @@ import contextlib
 import os
 import secrets
 import shlex
+import shutil
 import subprocess
 import threading
 import time
@@ -11,11 +12,13 @@ from collections.abc import Callable, Generator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
+import msgspec
 from msgspec import Struct
 
 from trade import Container
 from trade._endpoints import free_endpoint
 from trade._settings import Settings
+from trade._terms import Granted
 from trade._transport import Answer, ChannelClosed
 from trade._wire import (
     ALIVE,
@@ -108,6 +111,10 @@ class Stage:
             raise ConfigurationError(where="--peer", problem=f"cannot be read as words: {bad}") from None
         if not self._command:
             raise ConfigurationError(where="--peer", problem="names no program; write the command that starts it")
+        if shutil.which(self._command[0]) is None:
+            raise ConfigurationError(
+                where="--peer", problem=f"cannot be started: there is no program {self._command[0]!r}"
+            )
         self._folder = folder
         self._system = f"conformance-{secrets.token_hex(4)}"
         self._credentials = ("conformance", secrets.token_hex(16))
@@ -322,8 +329,13 @@ class Stage:
     def granted(self, who: Voice, resources: Sequence[str], **terms: Any) -> Token:
         """Take a lock; raises NotHeld if it is not given."""
         found = who.result(SYSTEM, "acquire", list(resources), terms)
-        require(isinstance(found, dict) and found.get("token"), f"acquire answered {found!r}, not what was granted")
-        return Token(*found["token"])
+        try:
+            granted = msgspec.convert(found, Granted)
+        except msgspec.ValidationError as bad:
+            raise NotHeld(f"what acquire answered cannot be read: {bad}") from None
+        if granted.token is None or not set(resources) <= set(granted.resources):
+            raise NotHeld(f"acquire answered {found!r}, which is not what was asked for")
+        return granted.token
 
 
 def _is_boot(chunks: Sequence[str]) -> bool:
