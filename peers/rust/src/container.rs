@@ -34,6 +34,8 @@ pub struct Container {
     /// Requests about e-stops that were heard, and what of each failed; None while it is being done.
     requests: Mutex<HashMap<String, Option<String>>>,
     store: Store,
+    /// One at a time writes or removes notes, so that none outlives its clearing.
+    noting: Mutex<()>,
     asking: Asking,
     running: AtomicUsize,
     /// Containers to be asked which e-stops they have open.
@@ -60,6 +62,7 @@ impl Container {
             registry: Mutex::default(),
             requests: Mutex::new(requests),
             store,
+            noting: Mutex::default(),
             running: AtomicUsize::new(0),
             learn,
         }
@@ -394,16 +397,21 @@ impl Container {
     fn open(&self, estop: &Estop) -> String {
         self.robot().open_estop(estop);
         self.changed.notify_all();
-        let problem = self.store.write(estop).err().map_or(String::new(), |bad| format!("is not written down: {bad}"));
+        let noting = self.noting.lock().unwrap();
+        let written = if self.robot().is_open(&estop.id) { self.store.write(estop) } else { Ok(()) };
+        drop(noting);
+        let problem = written.err().map_or(String::new(), |bad| format!("is not written down: {bad}"));
         self.done(&estop.id, problem)
     }
 
     fn clear(&self, order: &EstopOrder) -> String {
+        let noting = self.noting.lock().unwrap();
         self.robot().clear_estops(&order.cleared);
         for id in &order.cleared {
             self.requests.lock().unwrap().insert(id.clone(), Some(String::new())); // what still travels of it opens nothing
         }
         let failed = order.cleared.iter().filter_map(|id| self.store.remove(id).err()).next();
+        drop(noting);
         self.done(&order.request, failed.map_or(String::new(), |bad| format!("its note stays: {bad}")))
     }
 

@@ -6,6 +6,8 @@ mod offers;
 mod once;
 mod robot;
 mod store;
+#[cfg(test)]
+mod vectors;
 mod wire;
 
 use container::Container;

@@ -475,6 +475,10 @@ impl Robot {
         self.estops.retain(|id, _| !ids.contains(id));
     }
 
+    pub fn is_open(&self, id: &str) -> bool {
+        self.estops.contains_key(id)
+    }
+
     pub fn open_estops(&self) -> Value {
         Value::Array(self.estops.values().map(Estop::value).collect())
     }
