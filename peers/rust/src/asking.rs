@@ -53,7 +53,8 @@ impl Asking {
 
     pub fn lost(&self, address: &str) {
         self.alive.lock().unwrap().remove(address);
-        self.waiting.lock().unwrap().retain(|_, (callee, _)| callee != address); // who waits hears that nobody answers
+        self.waiting.lock().unwrap().retain(|_, (callee, _)| callee != address);
+        // who waits hears that nobody answers
     }
 
     pub fn alive(&self, address: &str) -> bool {
@@ -93,7 +94,8 @@ impl Asking {
             let result = if asked_at.elapsed() < LEASE {
                 self.command(to, args, &inner, until)
             } else {
-                let fields = [("resources", array(resources.iter().map(String::as_str))), ("reason", "too late".into())];
+                let fields =
+                    [("resources", array(resources.iter().map(String::as_str))), ("reason", "too late".into())];
                 Err(Failure::new("LockLost", "the lock was not confirmed within its lease", fields))
             };
             drop(done);

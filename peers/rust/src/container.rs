@@ -1,56 +1,56 @@
-//! A container: there for others, asked what it offers, called, told of e-stops and of who is gone.
+//! A container: its state, and the calls that come to it. What else it hears is in `hearing.rs`.
 
 use crate::asking::Asking;
-use crate::offers::{entry, find, Effect, Service, PROVIDERS, SYSTEM};
+use crate::locks::Holder;
+use crate::offers::{find, Effect, Service, SYSTEM};
 use crate::once::{Answer, First, Key};
-use crate::robot::{self, clock_ns, Holder, Robot, TICK};
+use crate::robot::{self, clock_ns, Robot, TICK};
 use crate::store::Store;
-use crate::wire::{self, array, field, is_chunk, texts, Call, Estop, EstopOrder, Failure, Handle, Reply};
+use crate::wire::{self, array, field, is_chunk, texts, Call, Failure, Handle, Reply};
 use rmpv::Value;
 use std::collections::{BTreeMap, HashMap};
+use std::io;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::mpsc::Sender;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard};
 use std::time::{Duration, Instant};
-use zenoh::qos::{CongestionControl, Priority};
-use zenoh::query::{ConsolidationMode, Query, QueryTarget};
-use zenoh::sample::{Locality, Sample, SampleKind};
+use zenoh::qos::CongestionControl;
+use zenoh::sample::Sample;
 use zenoh::{Session, Wait};
 
 const MOST_AT_ONCE: usize = 64;
 const LOOK: Duration = Duration::from_millis(100);
-const MOST_REQUESTS: usize = 4096;
 
 pub struct Container {
-    session: Session,
-    identity: String,
-    name: String,
+    pub session: Session,
+    pub identity: String,
+    pub name: String,
     /// `<identity>/<container>/<epoch>`
-    own: String,
-    host: String,
-    robot: Mutex<Robot>,
-    changed: Condvar,
-    registry: Mutex<(u64, BTreeMap<String, Vec<u8>>)>,
+    pub own: String,
+    pub host: String,
+    pub robot: Mutex<Robot>,
+    pub changed: Condvar,
+    pub registry: Mutex<(u64, BTreeMap<String, Vec<u8>>)>,
     /// Requests about e-stops that were heard, and what of each failed; None while it is being done.
-    requests: Mutex<HashMap<String, Option<String>>>,
-    store: Store,
+    pub requests: Mutex<HashMap<String, Option<String>>>,
+    pub store: Store,
     /// One at a time writes or removes notes, so that none outlives its clearing.
-    noting: Mutex<()>,
-    asking: Asking,
-    running: AtomicUsize,
+    pub noting: Mutex<()>,
+    pub asking: Asking,
+    pub running: AtomicUsize,
     /// Containers to be asked which e-stops they have open.
-    learn: Sender<String>,
+    pub learn: Sender<String>,
 }
 
 type Result<T> = std::result::Result<T, Failure>;
 
 impl Container {
-    pub fn new(session: Session, own: &str, store: Store, random: u64, learn: Sender<String>) -> Container {
+    pub fn new(session: Session, own: &str, store: Store, random: u64, learn: Sender<String>) -> io::Result<Container> {
         let chunks: Vec<&str> = own.split('/').collect();
-        let estops = store.read();
+        let estops = store.read()?;
         let requests = estops.iter().map(|one| (one.id.clone(), Some(String::new()))).collect();
         let hostname = std::fs::read_to_string("/proc/sys/kernel/hostname");
-        Container {
+        Ok(Container {
             asking: Asking::new(session.clone(), own, random),
             session,
             identity: chunks[0].into(),
@@ -65,14 +65,14 @@ impl Container {
             noting: Mutex::default(),
             running: AtomicUsize::new(0),
             learn,
-        }
+        })
     }
 
     pub fn reply_key(&self) -> String {
         self.asking.reply_key()
     }
 
-    fn robot(&self) -> MutexGuard<'_, Robot> {
+    pub fn robot(&self) -> MutexGuard<'_, Robot> {
         self.robot.lock().unwrap()
     }
 
@@ -105,7 +105,8 @@ impl Container {
                 let me = self.clone();
                 std::thread::spawn(move || {
                     let late = call.expires_ns.is_none_or(|expires_ns| clock_ns() >= expires_ns);
-                    let answer = if late { (wire::EXPIRED, Value::Nil) } else { answer_of(me.run(service, &call, &caller)) };
+                    let answer =
+                        if late { (wire::EXPIRED, Value::Nil) } else { answer_of(me.run(service, &call, &caller)) };
                     me.ended(&call, &key, answer);
                     me.running.fetch_sub(1, Ordering::Relaxed);
                 });
@@ -136,7 +137,8 @@ impl Container {
     fn answer(&self, reply: &str, caller: &str, id: u64, (status, body): Answer) {
         let bytes = Reply { id, status, clock_ns: clock_ns(), body }.bytes();
         let put = self.session.put(format!("reply/{}/{caller}/{reply}", self.identity), bytes);
-        let _ = put.congestion_control(CongestionControl::Block).express(true).wait(); // who asked may be gone
+        let _ = put.congestion_control(CongestionControl::Block).express(true).wait();
+        // who asked may be gone
     }
 
     fn cancel(&self, call: &Call, caller: &str) -> Answer {
@@ -216,7 +218,11 @@ impl Container {
         let number = |name: &str, default: f64| field(terms, name).and_then(Value::as_f64).unwrap_or(default);
         let (lease_s, wait_s) = (number("lease_s", 2.0), number("wait_s", 0.0));
         if !(0.1..=60.0).contains(&lease_s) || !(0.0..=3600.0).contains(&wait_s) {
-            return Err(Failure::argument("trade.acquire", "terms", "must have a lease_s of 0.1 to 60, a wait_s to 3600"));
+            return Err(Failure::argument(
+                "trade.acquire",
+                "terms",
+                "must have a lease_s of 0.1 to 60, a wait_s to 3600",
+            ));
         }
         let holder = Holder {
             identity: caller.into(),
@@ -225,19 +231,20 @@ impl Container {
             delegates: field(terms, "delegates").and_then(texts).unwrap_or_default(),
             since: 0.0,
         };
-        let chain: Vec<Key> = call.calls.iter().map(|id| (caller.to_owned(), *id)).collect();
         let (asked, mut robot) = (Instant::now(), self.robot());
         let waiter = robot.queue(names, holder, terms, call)?;
         let token = loop {
             if waiter == 0 {
                 break Value::Nil; // it has all of them already
             }
-            let refused = match robot.granted(waiter, Duration::from_secs_f64(lease_s), &chain) {
+            let refused = match robot.granted(waiter, Duration::from_secs_f64(lease_s), &call.calls) {
                 Ok(token) => break token.value(),
                 Err(refused) => refused,
             };
             let left = Duration::from_secs_f64(wait_s).saturating_sub(asked.elapsed());
-            if left.is_zero() || robot.once.cancelled(&(caller.to_owned(), call.id)) {
+            let unwanted =
+                robot.once.cancelled(&(caller.to_owned(), call.id)) || robot.all_there(&call.sessions).is_err();
+            if left.is_zero() || unwanted {
                 robot.leave_queue(waiter);
                 return Err(refused);
             }
@@ -246,185 +253,6 @@ impl Container {
         let granted = if token.is_nil() { array::<Value>([]) } else { array(names.iter().map(String::as_str)) };
         let waited_s = asked.elapsed().as_secs_f64();
         Ok(wire::map([("token", token), ("resources", granted), ("waited_s", waited_s.into())]))
-    }
-
-    // --- the registry
-
-    /// Put or change the entries of these providers.
-    pub fn announce(&self, providers: &[(&str, &str)]) {
-        let mut registry = self.registry.lock().unwrap();
-        for provider in providers {
-            registry.0 += 1;
-            let estops = if *provider == SYSTEM { self.robot().open_estops() } else { array::<Value>([]) };
-            let key = format!("registry/{}/{}/{}", provider.0, self.own, provider.1);
-            let bytes = wire::encode(&entry(*provider, registry.0, &self.host, estops));
-            registry.1.insert(key.clone(), bytes.clone());
-            self.put(&key, bytes);
-        }
-    }
-
-    pub fn announce_all(&self) {
-        self.announce(&PROVIDERS);
-    }
-
-    /// Say how far it is.
-    pub fn beat(&self) {
-        let revision = self.registry.lock().unwrap().0;
-        self.put(&self.tally_key(), wire::tally(revision));
-    }
-
-    /// Answer what is offered: each entry that is asked for, the tally last.
-    pub fn asked(&self, query: &Query) {
-        let registry = self.registry.lock().unwrap();
-        let tally = (self.tally_key(), wire::tally(registry.0));
-        for (key, bytes) in registry.1.iter().map(|(key, bytes)| (key.clone(), bytes.clone())).chain([tally]) {
-            if zenoh::key_expr::KeyExpr::new(key.as_str()).is_ok_and(|key| query.key_expr().intersects(&key)) {
-                let _ = query.reply(key, bytes).wait(); // who asked may be gone
-            }
-        }
-    }
-
-    fn tally_key(&self) -> String {
-        format!("registry/trade/{}/tally", self.own)
-    }
-
-    fn put(&self, key: &str, bytes: Vec<u8>) {
-        let _ = self.session.put(key, bytes).congestion_control(CongestionControl::Block).express(true).wait();
-    }
-
-    // --- others
-
-    pub fn answered(&self, sample: &Sample) {
-        self.asking.heard(sample.key_expr().as_str(), &sample.payload().to_bytes());
-    }
-
-    /// A sign of life rose or fell.
-    pub fn presence(&self, sample: &Sample) {
-        let key = sample.key_expr().as_str();
-        let Some(session) = key.strip_prefix("alive/").filter(|session| session.split('/').all(is_chunk)) else { return };
-        let container = session.split('/').count() == 3;
-        if session == self.own || !(container || session.split('/').count() == 4) {
-            return;
-        }
-        match sample.kind() {
-            SampleKind::Put if container => {
-                self.asking.appeared(session);
-                self.robot().session_back(session);
-                let _ = self.learn.send(session.to_owned());
-            }
-            SampleKind::Put => {}
-            SampleKind::Delete => {
-                self.asking.lost(session);
-                self.robot().session_ended(session);
-            }
-        }
-        self.changed.notify_all();
-    }
-
-    /// Something was announced: of it this small container wants to know which e-stops are open.
-    pub fn announced(&self, sample: &Sample, known: &mut HashMap<String, u64>) {
-        let chunks: Vec<&str> = sample.key_expr().as_str().split('/').collect();
-        if chunks.len() != 6 || !chunks.iter().all(|chunk| is_chunk(chunk)) || chunks[2..5].join("/") == self.own {
-            return;
-        }
-        let (who, payload) = (chunks[2..5].join("/"), sample.payload().to_bytes());
-        match chunks[5] {
-            "system" => wire::told_estops(&payload).into_iter().for_each(|told| self.learnt(&told)),
-            "tally" => {
-                let Some(revision) = wire::read_tally(&payload) else { return };
-                if self.asking.alive(&who) && known.insert(who.clone(), revision) != Some(revision) {
-                    let _ = self.learn.send(who); // something of it may have been missed
-                }
-            }
-            _ => {}
-        }
-    }
-
-    /// Ask a container which e-stops it has open. Returns whether to ask it again.
-    pub fn ask(&self, who: &str) -> bool {
-        let get = self.session.get(format!("registry/trade/{who}/*")).target(QueryTarget::All);
-        let get = get.consolidation(ConsolidationMode::None).allowed_destination(Locality::Remote);
-        let Ok(replies) = get.timeout(Duration::from_secs(2)).wait() else { return false };
-        let mut whole = false;
-        while let Ok(reply) = replies.recv() {
-            let Ok(sample) = reply.result() else { continue };
-            let key = sample.key_expr().as_str();
-            if key == format!("registry/trade/{who}/system") {
-                wire::told_estops(&sample.payload().to_bytes()).into_iter().for_each(|told| self.learnt(&told));
-            }
-            whole |= key == format!("registry/trade/{who}/tally"); // what it tells last: nothing was cut off
-        }
-        !whole && self.asking.alive(who)
-    }
-
-    // --- e-stops
-
-    /// An order: done the first time, and confirmed each time.
-    pub fn ordered(&self, sample: &Sample) {
-        let key = sample.key_expr().as_str();
-        let Some(identity) = key.strip_prefix("estop/").filter(|identity| is_chunk(identity)) else { return };
-        let Some(order) = EstopOrder::read(&sample.payload().to_bytes(), identity) else { return };
-        let problem = match (self.first(&order.request), &order.opened) {
-            (Some(Some(problem)), _) => problem,
-            (Some(None), _) => return, // it is being done: the order comes again
-            (None, Some(estop)) => self.open(estop),
-            (None, None) => self.clear(&order),
-        };
-        let put = self.session.put(format!("estop/{}", self.own), wire::estop_confirmed(&order.request, &problem));
-        let _ = put.congestion_control(CongestionControl::Drop).priority(Priority::RealTime).express(true).wait();
-    }
-
-    /// Others have these open: take the union. One that was cleared here is not opened again.
-    fn learnt(&self, told: &[Estop]) {
-        for estop in told {
-            if self.first(&estop.id).is_none() {
-                self.open(estop);
-            }
-        }
-    }
-
-    /// None if this is asked for the first time, and then it is to be done; else how far it is.
-    fn first(&self, request: &str) -> Option<Option<String>> {
-        let mut requests = self.requests.lock().unwrap();
-        let known = requests.get(request).cloned();
-        if known.is_none() {
-            requests.insert(request.to_owned(), None);
-        }
-        known
-    }
-
-    /// Stop first, write it down then; the arm is at rest when the mutex is free again.
-    fn open(&self, estop: &Estop) -> String {
-        self.robot().open_estop(estop);
-        self.changed.notify_all();
-        let noting = self.noting.lock().unwrap();
-        let written = if self.robot().is_open(&estop.id) { self.store.write(estop) } else { Ok(()) };
-        drop(noting);
-        let problem = written.err().map_or(String::new(), |bad| format!("is not written down: {bad}"));
-        self.done(&estop.id, problem)
-    }
-
-    fn clear(&self, order: &EstopOrder) -> String {
-        let noting = self.noting.lock().unwrap();
-        self.robot().clear_estops(&order.cleared);
-        for id in &order.cleared {
-            self.requests.lock().unwrap().insert(id.clone(), Some(String::new())); // what still travels of it opens nothing
-        }
-        let failed = order.cleared.iter().filter_map(|id| self.store.remove(id).err()).next();
-        drop(noting);
-        self.done(&order.request, failed.map_or(String::new(), |bad| format!("its note stays: {bad}")))
-    }
-
-    fn done(&self, request: &str, problem: String) -> String {
-        let mut requests = self.requests.lock().unwrap();
-        if requests.len() >= MOST_REQUESTS {
-            let open: Vec<String> = self.store.read().into_iter().map(|one| one.id).collect();
-            requests.retain(|id, _| open.contains(id));
-        }
-        requests.insert(request.to_owned(), Some(problem.clone()));
-        drop(requests);
-        self.announce(&[SYSTEM]);
-        problem
     }
 
     // --- time

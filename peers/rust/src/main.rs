@@ -2,6 +2,8 @@
 
 mod asking;
 mod container;
+mod hearing;
+mod locks;
 mod offers;
 mod once;
 mod robot;
@@ -25,10 +27,14 @@ use zenoh::sample::{Locality, Sample};
 use zenoh::{Config, Session, Wait};
 
 const BEAT: Duration = Duration::from_secs(2);
-const AGAIN: Duration = Duration::from_millis(500);
+const AGAIN: Duration = Duration::from_millis(100);
 const CALLS_WAITING: usize = 4096;
 
 fn main() {
+    std::panic::set_hook(Box::new(|why| {
+        eprintln!("trade-peer: {why}");
+        std::process::abort(); // one that has lost a thread is to be gone: its sign of life falls
+    }));
     if let Err(why) = run() {
         eprintln!("trade-peer: {why}");
         std::process::exit(1);
@@ -37,6 +43,11 @@ fn main() {
 
 fn run() -> Result<(), Box<dyn Error + Send + Sync>> {
     let [system, identity, name] = [needed("TRADE_SYSTEM")?, needed("TRADE_IDENTITY")?, needed("TRADE_CONTAINER")?];
+    if env::var_os("TRADE_TLS").is_some() {
+        return Err(
+            "TRADE_TLS is set, and this example has no certificates: it joins systems of its own host only".into()
+        );
+    }
     for chunk in [&system, &identity, &name] {
         if !wire::is_chunk(chunk) {
             return Err(format!("{chunk:?} is no name; use letters, digits, . _ - (at most 80)").into());
@@ -46,7 +57,7 @@ fn run() -> Result<(), Box<dyn Error + Send + Sync>> {
     let own = format!("{identity}/{name}/{:016x}", random());
     let session = open(&system, &needed("TRADE_CONNECT")?, &needed("TRADE_CREDENTIALS")?)?;
     let (learn, to_learn) = channel::<String>();
-    let container = Arc::new(Container::new(session.clone(), &own, Store(state), random(), learn));
+    let container = Arc::new(Container::new(session.clone(), &own, Store(state), random(), learn)?);
 
     // Calls first, then the answers to what is offered, then the sign of life: who hears of a service can call it.
     let served = |kind: &str| session.declare_subscriber(format!("{kind}/*/{own}/**"));
@@ -63,11 +74,17 @@ fn run() -> Result<(), Box<dyn Error + Send + Sync>> {
     each("questions", &container, move || questions.recv(), |container, query| container.asked(&query));
     let mut known = HashMap::new();
     each("told", &container, move || told.recv(), move |container, sample| container.announced(&sample, &mut known));
-    each("learning", &container, move || to_learn.recv(), |container, who: String| {
-        while container.ask(&who) {
-            std::thread::sleep(AGAIN);
-        }
-    });
+    each(
+        "learning",
+        &container,
+        move || to_learn.recv(),
+        |container, who: String| {
+            if !container.ask(&who) {
+                std::thread::sleep(AGAIN);
+                container.ask_later(who); // behind the others
+            }
+        },
+    );
     let arm = container.clone();
     std::thread::Builder::new().name("arm".into()).spawn(move || arm.run_arm())?;
 

@@ -14,7 +14,10 @@ pub type Answer = (u64, Value);
 
 enum Entry {
     /// It runs; the reply keys of the same call, come again meanwhile.
-    Running { again: Vec<String>, cancelled: bool },
+    Running {
+        again: Vec<String>,
+        cancelled: bool,
+    },
     Ended(Answer),
 }
 

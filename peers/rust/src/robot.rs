@@ -1,10 +1,11 @@
-//! What is judged about motion, in one place and under one mutex: the arm, its locks, its stops, its e-stops.
+//! What is judged about motion, in one place and under one mutex: the arm, its stops, its e-stops; `locks.rs` has its locks.
 //!
 //! The arm is simulated: a thread moves it a step every five milliseconds. Before each step it looks whether what the
 //! turn was admitted under still holds, as a thread that writes to a bus would right before its bytes go out.
 
+use crate::locks::{locked, lost, Grant, Waiter};
 use crate::once::{Key, Once};
-use crate::wire::{array, map, Call, Estop, Failure, Token};
+use crate::wire::{Call, Estop, Failure, Token};
 use rmpv::Value;
 use std::collections::{BTreeMap, HashMap, HashSet, VecDeque};
 use std::sync::OnceLock;
@@ -18,61 +19,17 @@ const SPEED_RAD_S: f64 = 1.0;
 const MOST_RAD: f64 = 60.0;
 const REMEMBERED: usize = 4096;
 
-#[derive(Clone)]
-pub struct Holder {
-    pub identity: String,
-    pub session: String,
-    pub purpose: String,
-    pub delegates: Vec<String>,
-    pub since: f64,
-}
-
-impl Holder {
-    fn container(&self) -> &str {
-        self.session.split('/').nth(1).unwrap_or(&self.session)
-    }
-
-    fn value(&self) -> Value {
-        map([
-            ("identity", self.identity.as_str().into()),
-            ("container", self.container().into()),
-            ("session", self.session.as_str().into()),
-            ("purpose", self.purpose.as_str().into()),
-            ("since", self.since.into()),
-            ("delegates", array(self.delegates.iter().map(String::as_str))),
-        ])
-    }
-}
-
-struct Grant {
-    resources: Vec<&'static str>,
-    holder: Holder,
-    lease: Duration,
-    until: Instant,
-    uses: u64,
-    last_use: f64,
-}
-
-/// Who waits for a lock: for its turn, or, once that has come, for what still runs.
-pub struct Waiter {
-    number: u64,
-    priority: i64,
-    resources: Vec<&'static str>,
-    holder: Holder,
-    emptying: bool,
-}
-
 #[derive(Default)]
-struct Resource {
+pub struct Resource {
     /// The grant that holds now; 0 is none.
-    live: u64,
+    pub live: u64,
     /// Raised by every stop: what was admitted under a lower one is void.
-    stops: u64,
-    latch: Option<(String, String)>,
+    pub stops: u64,
+    pub latch: Option<(String, String)>,
     /// What is admitted and has not ended, and for whom.
-    calls: HashMap<Key, Vec<String>>,
+    pub calls: HashMap<Key, Vec<String>>,
     /// For whom it was moved last.
-    movers: Vec<String>,
+    pub movers: Vec<String>,
 }
 
 /// What a call was admitted under.
@@ -84,28 +41,28 @@ pub struct Permit {
     stops: u64,
 }
 
-struct Turn {
+pub struct Turn {
     permit: Permit,
     goal_rad: f64,
     expires_ns: i64,
 }
 
 pub struct Robot {
-    epoch: String,
+    pub epoch: String,
     pub once: Once,
     pub angle_rad: f64,
     pub began: u64,
-    turn: Option<Turn>,
+    pub turn: Option<Turn>,
     /// Turns that ended before their goal, and why, until their calls have heard of it.
-    failed: HashMap<Key, Failure>,
-    resources: BTreeMap<&'static str, Resource>,
-    grants: BTreeMap<u64, Grant>,
-    ended: BTreeMap<u64, String>,
-    waiting: Vec<Waiter>,
-    numbers: u64,
+    pub failed: HashMap<Key, Failure>,
+    pub resources: BTreeMap<&'static str, Resource>,
+    pub grants: BTreeMap<u64, Grant>,
+    pub ended: BTreeMap<u64, String>,
+    pub waiting: Vec<Waiter>,
+    pub numbers: u64,
     /// Sessions that are not there any more, the last few thousand.
-    gone: (HashSet<String>, VecDeque<String>),
-    estops: BTreeMap<String, Estop>,
+    pub gone: (HashSet<String>, VecDeque<String>),
+    pub estops: BTreeMap<String, Estop>,
 }
 
 impl Robot {
@@ -184,7 +141,7 @@ impl Robot {
     }
 
     /// Why a grant holds no more.
-    fn over(&self, number: u64) -> Option<String> {
+    pub fn over(&self, number: u64) -> Option<String> {
         match self.grants.get(&number) {
             Some(grant) if grant.until > Instant::now() => None,
             Some(_) => Some("its lease ended".into()),
@@ -192,7 +149,7 @@ impl Robot {
         }
     }
 
-    fn all_there(&self, sessions: &[String]) -> Result<(), Failure> {
+    pub fn all_there(&self, sessions: &[String]) -> Result<(), Failure> {
         let whole = |session: &String| session.split('/').take(3).collect::<Vec<_>>().join("/");
         match sessions.iter().find(|one| self.gone.0.contains(*one) || self.gone.0.contains(&whole(one))) {
             None => Ok(()),
@@ -203,7 +160,7 @@ impl Robot {
         }
     }
 
-    fn resource(&mut self, name: &str) -> &mut Resource {
+    pub fn resource(&mut self, name: &str) -> &mut Resource {
         self.resources.get_mut(name).expect("asked for by its own name")
     }
 
@@ -316,153 +273,6 @@ impl Robot {
         }
     }
 
-    // --- locks
-
-    /// Stand in the queue for these; those the call has already are left out. Returns its number, or 0 if it has all.
-    pub fn queue(&mut self, names: &[String], holder: Holder, terms: &Value, call: &Call) -> Result<u64, Failure> {
-        self.all_there(&call.sessions)?;
-        let mut resources = vec![];
-        for name in names {
-            let Some((known, resource)) = self.resources.get_key_value(name.as_str()) else {
-                return Err(Failure::service_gone(name, "there is no such resource here"));
-            };
-            if !call.tokens.iter().any(|one| one.epoch == self.epoch && one.number == resource.live) {
-                resources.push(*known);
-            }
-        }
-        if resources.is_empty() {
-            return Ok(0);
-        }
-        self.numbers += 1;
-        let priority = crate::wire::field(terms, "priority").and_then(Value::as_i64).unwrap_or(0);
-        let behind = self.waiting.iter().position(|one| !one.emptying && one.priority < priority);
-        let waiter = Waiter { number: self.numbers, priority, resources, holder, emptying: false };
-        self.waiting.insert(behind.unwrap_or(self.waiting.len()), waiter);
-        Ok(self.numbers)
-    }
-
-    /// Whether a waiter has come to have what it waits for: then it is out of the queue, and has this grant.
-    pub fn granted(&mut self, waiter: u64, lease: Duration, chain: &[Key]) -> Result<Token, Failure> {
-        let at = self.waiting.iter().position(|one| one.number == waiter).expect("it is taken out by this alone");
-        let one = &self.waiting[at];
-        self.all_there(std::slice::from_ref(&one.holder.session))?;
-        if !one.emptying {
-            let session = &one.holder.session;
-            for name in &one.resources {
-                if let Some(grant) = self.grants.get(&self.resources[name].live) {
-                    return Err(locked(name, &grant.holder, session));
-                }
-                let before = self.waiting[..at].iter().chain(self.waiting[at..].iter().filter(|other| other.emptying));
-                if let Some(other) = before.into_iter().find(|other| other.resources.contains(name)) {
-                    return Err(locked(name, &other.holder, session));
-                }
-            }
-            self.waiting[at].emptying = true; // from now on nobody else is let in
-        }
-        for name in &self.waiting[at].resources {
-            let resource = &self.resources[name];
-            if resource.calls.keys().any(|key| !chain.contains(key)) {
-                let who = Holder { purpose: "a call that has not ended".into(), ..self.waiting[at].holder.clone() };
-                return Err(locked(name, &who, ""));
-            }
-        }
-        let Waiter { number, resources, mut holder, .. } = self.waiting.remove(at);
-        holder.since = now_s();
-        for name in &resources {
-            self.resource(name).live = number;
-        }
-        let until = Instant::now() + lease;
-        self.grants.insert(number, Grant { resources, holder, lease, until, uses: 0, last_use: 0.0 });
-        Ok(Token { epoch: self.epoch.clone(), number })
-    }
-
-    /// It waits no more.
-    pub fn leave_queue(&mut self, waiter: u64) {
-        self.waiting.retain(|one| one.number != waiter);
-    }
-
-    /// Begin leases anew. Returns those that hold no more, or are another's, and why.
-    pub fn renew(&mut self, numbers: &[u64], identity: &str) -> Vec<(u64, String)> {
-        let mut not = vec![];
-        for number in numbers {
-            if let Some(why) = self.over(*number) {
-                not.push((*number, why));
-                continue;
-            }
-            let grant = self.grants.get_mut(number).expect("it is not over");
-            if grant.holder.identity == identity {
-                grant.until = Instant::now() + grant.lease;
-            } else {
-                not.push((*number, "it is another's".into()));
-            }
-        }
-        not
-    }
-
-    /// Give a grant back; with a reason for which it is lost, what moves under it stops. Returns whether it held.
-    pub fn release(&mut self, number: u64, identity: &str, lost: &str) -> bool {
-        if !self.grants.get(&number).is_some_and(|grant| grant.holder.identity == identity) {
-            return false;
-        }
-        if lost.is_empty() { self.end(number, "it was given back").is_some() } else { self.lose(number, lost) }
-    }
-
-    /// Take a grant away: what moves under it stops.
-    pub fn lose(&mut self, number: u64, why: &str) -> bool {
-        let Some(grant) = self.end(number, why) else { return false };
-        if grant.resources.contains(&ARM) && !self.resources[ARM].calls.is_empty() {
-            self.stop("trade", &[], why);
-        }
-        true
-    }
-
-    fn end(&mut self, number: u64, why: &str) -> Option<Grant> {
-        let grant = self.grants.remove(&number)?;
-        self.ended.insert(number, why.to_owned());
-        while self.ended.len() > REMEMBERED {
-            self.ended.pop_first();
-        }
-        for name in &grant.resources {
-            self.resource(name).live = 0;
-        }
-        Some(grant)
-    }
-
-    /// What is locked, as `locks` tells it.
-    pub fn locks(&self, container: &str) -> Value {
-        let told = self.grants.iter().map(|(number, grant)| {
-            let shares = |one: &&Waiter| one.resources.iter().any(|name| grant.resources.contains(name));
-            let owner = |one: &Waiter| format!("{}/{}", one.holder.identity, one.holder.container());
-            map([
-                ("token", Token { epoch: self.epoch.clone(), number: *number }.value()),
-                ("container", container.into()),
-                ("resources", array(grant.resources.iter().copied())),
-                ("holder", grant.holder.value()),
-                ("left_s", grant.until.saturating_duration_since(Instant::now()).as_secs_f64().into()),
-                ("uses", grant.uses.into()),
-                ("last_use", grant.last_use.into()),
-                ("waiting", array(self.waiting.iter().filter(shares).map(owner))),
-            ])
-        });
-        Value::Array(told.collect())
-    }
-
-    /// Let these move again after a stop. Returns which were stopped.
-    pub fn resume(&mut self, names: &[String], caller: &str, sessions: &[String]) -> Result<Value, Failure> {
-        for name in names {
-            let Some((known, resource)) = self.resources.get_key_value(name.as_str()) else {
-                return Err(Failure::service_gone(name, "there is no such resource here"));
-            };
-            if let Some(Grant { holder, .. }) = self.grants.get(&resource.live) {
-                let may = caller == holder.identity || holder.delegates.iter().any(|one| one == caller);
-                if !(may && sessions.contains(&holder.session)) {
-                    return Err(locked(known, holder, &sessions[0]));
-                }
-            }
-        }
-        Ok(array(names.iter().filter(|name| self.resource(name).latch.take().is_some()).map(String::as_str)))
-    }
-
     // --- e-stops
 
     /// Everything stops, and nothing begins before this is cleared.
@@ -488,23 +298,6 @@ fn stopped(name: &str, by: &str, reason: &str, estop: bool) -> Failure {
     let fields =
         [("resource", name.into()), ("by", by.into()), ("reason", reason.into()), ("estop", Value::from(estop))];
     Failure::new("Stopped", format!("{name} was stopped by {by}: {reason}"), fields)
-}
-
-fn lost(name: &str, why: &str) -> Failure {
-    let fields = [("resources", array([name])), ("reason", why.into())];
-    Failure::new("LockLost", format!("the lock of {name} is lost: {why}"), fields)
-}
-
-fn locked(name: &str, holder: &Holder, session: &str) -> Failure {
-    let owner = format!("{}/{}", holder.identity, holder.container());
-    let fields = [
-        ("resources", array([name])),
-        ("owner", owner.as_str().into()),
-        ("purpose", holder.purpose.as_str().into()),
-        ("since", holder.since.into()),
-        ("own", (holder.session == session).into()),
-    ];
-    Failure::new("LockedByOther", format!("{name} is locked by {owner} for {:?}", holder.purpose), fields)
 }
 
 /// The monotonic clock by which calls expire here; begins with the process.

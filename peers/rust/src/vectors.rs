@@ -31,7 +31,9 @@ fn meaning(value: &Value) -> Json {
         Value::Map(fields) if fields.iter().all(|(name, _)| name.is_str()) => {
             fields.iter().map(|(name, value)| (name.as_str().unwrap().to_owned(), meaning(value))).collect()
         }
-        Value::Map(fields) => json!({ "$map": fields.iter().map(|(k, v)| [meaning(k), meaning(v)]).collect::<Vec<_>>() }),
+        Value::Map(fields) => {
+            json!({ "$map": fields.iter().map(|(k, v)| [meaning(k), meaning(v)]).collect::<Vec<_>>() })
+        }
         Value::Ext(kind, data) => json!({ "$extension": [kind, hex(data)] }),
     }
 }

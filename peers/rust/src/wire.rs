@@ -4,6 +4,7 @@ use rmpv::Value;
 
 pub const VERSION: u64 = 1;
 const DEEPEST: usize = 100;
+const MOST_BYTES: usize = 65 << 20;
 
 /// Statuses of a reply.
 pub const OK: u64 = 0;
@@ -21,6 +22,9 @@ pub fn is_chunk(text: &str) -> bool {
 
 /// One MessagePack value and nothing after it; None for anything else.
 pub fn decode(payload: &[u8]) -> Option<Value> {
+    if payload.len() > MOST_BYTES {
+        return None;
+    }
     let mut rest = payload;
     let value = rmpv::decode::read_value_with_max_depth(&mut rest, DEEPEST).ok()?;
     rest.is_empty().then_some(value)
