@@ -135,7 +135,7 @@ impl Robot {
 
     /// Give a grant back; with a reason for which it is lost, what moves under it stops. Returns whether it held.
     pub fn release(&mut self, number: u64, identity: &str, lost: &str) -> bool {
-        if !self.grants.get(&number).is_some_and(|grant| grant.holder.identity == identity) {
+        if self.grants.get(&number).is_none_or(|grant| grant.holder.identity != identity) {
             return false;
         }
         if lost.is_empty() {
