@@ -40,6 +40,13 @@ def _run_but_stops(self: _dispatch.LocalService, raw: Any, context: Any) -> Any:
     return None if self.label == "peer.halt" else _run(self, raw, context)
 
 
+_encode: Any = _dispatch.Signature.encode_result
+
+
+def _nonsense(self: Any, label: str, result: Any) -> bytes:
+    return b"\xc0" if label == "peer.angle" else _encode(self, label, result)
+
+
 BREAK: dict[str, Callable[[], None]] = {
     "runs-late": _put(_dispatch.LocalService, "too_late", lambda self, expires_ns: False),
     "runs-twice": _put(_ongoing.Once, "begin", _as_if_new),
@@ -54,6 +61,7 @@ BREAK: dict[str, Callable[[], None]] = {
     "ignores-cancels": _put(_ongoing.Ongoing, "cancel", lambda self: None),
     "endless-leases": _put(_locks.LockTable, "expire", lambda self: None),
     "grants-what-moves": _put(_locks.LockTable, "_running", lambda self, waiter: None),
+    "answers-nonsense": _put(_dispatch.Signature, "encode_result", _nonsense),
     "tells-no-tally": _put(Announcer, "beat", lambda self: None),
 }
 """By name, what breaks it: called before the container begins."""

@@ -27,6 +27,7 @@ NOTICED_BY = {
     "ignores-cancels": "cancels",
     "endless-leases": "leases",
     "grants-what-moves": "waits-for-motion",
+    "answers-nonsense": "turns",
     "tells-no-tally": "tells-late",
 }
 """What is broken, and which check has to fail."""

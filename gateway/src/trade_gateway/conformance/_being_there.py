@@ -6,7 +6,8 @@ from typing import Final
 from trade._wire import ServiceInfo, Tally, decode_tally, is_chunk, registry_key, tally_key
 from trade_gateway.conformance._check import check
 from trade_gateway.conformance._judging import NotHeld, eventually, require
-from trade_gateway.conformance._stage import GROUP, Offer, Stage
+from trade_gateway.conformance._peer import GROUP, Offer
+from trade_gateway.conformance._stage import Stage
 from trade_gateway.conformance._voice import NEVER, SYSTEM
 
 ARM: Final = {

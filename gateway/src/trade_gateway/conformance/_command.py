@@ -1,5 +1,6 @@
 """``trade conformance --peer COMMAND``: does a container in another language keep the rules?"""
 
+import signal
 from collections.abc import Sequence
 from typing import Annotated
 
@@ -36,6 +37,7 @@ def conformance(
         raise UsageError(
             where="--peer", problem="missing; name the command that starts a container, or --list the checks"
         )
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that nobody is left behind
     outcomes = run(peer, _chosen(only or []), lambda outcome: _tell(out, outcome))
     failed = [outcome.check for outcome in outcomes if outcome.outcome == FAILED]
     if failed:

@@ -19,7 +19,8 @@ from trade._wire import (
 )
 from trade_gateway.conformance._check import check
 from trade_gateway.conformance._judging import PATIENCE_S, eventually, require
-from trade_gateway.conformance._stage import GROUP, Stage
+from trade_gateway.conformance._peer import GROUP
+from trade_gateway.conformance._stage import Stage
 from trade_gateway.conformance._voice import NEVER, SYSTEM, Voice, error_of
 
 _ALL_TOLD_S = 3.0

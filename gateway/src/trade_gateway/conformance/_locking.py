@@ -9,7 +9,8 @@ from trade._terms import LockInfo
 from trade._wire import Status, Token
 from trade_gateway.conformance._check import check
 from trade_gateway.conformance._judging import PATIENCE_S, NotHeld, eventually, require
-from trade_gateway.conformance._stage import GROUP, Stage
+from trade_gateway.conformance._peer import GROUP
+from trade_gateway.conformance._stage import Stage
 from trade_gateway.conformance._voice import SYSTEM, Voice, error_of
 
 _ARM = ["peer.arm"]

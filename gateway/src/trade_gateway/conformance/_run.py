@@ -69,4 +69,6 @@ def _judge(stage: Stage, one: Check) -> tuple[str, str]:
         return FAILED, str(why)
     except (TradeError, TimeoutError) as error:
         return FAILED, f"{type(error).__name__}: {error}"
+    except (TypeError, ValueError, LookupError, AttributeError) as error:  # what it answers may be anything
+        return FAILED, f"what it answered cannot be read: {type(error).__name__}: {error}"
     return OK, ""

@@ -8,12 +8,11 @@ import shutil
 import subprocess
 import threading
 import time
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
 import msgspec
-from msgspec import Struct
 
 from trade import Container
 from trade._endpoints import free_endpoint
@@ -23,82 +22,23 @@ from trade._transport import Answer, ChannelClosed
 from trade._wire import (
     ALIVE,
     Address,
-    Malformed,
-    ProviderInfo,
     Token,
-    decode_provider,
-    decode_tally,
     is_chunk,
     registry_key,
 )
 from trade._zenoh import ZenohTransport, configuration
 from trade.errors import ConfigurationError
-from trade_gateway.conformance._judging import PATIENCE_S, SLACK_S, STOPPED_S, NotHeld, eventually, require
-from trade_gateway.conformance._voice import NEVER, SYSTEM, Place, Voice
+from trade_gateway.conformance._judging import SLACK_S, STOPPED_S, NotHeld, eventually, require
+from trade_gateway.conformance._peer import Peer
+from trade_gateway.conformance._voice import NEVER, SYSTEM, Voice
 
 IDENTITY: Final = "peer"
 NAME: Final = "peer"
-GROUP: Final = "peer"
 _GOODBYE_S: Final = 5.0
 _START_S: Final = 30.0
-_OFFERED_S: Final = 5.0
 _STILL_S: Final = 0.15
 _LOOK_S: Final = 0.05
 _LAST_LINES: Final = 12
-
-
-class Offer(Struct, frozen=True):
-    """What a container answers when it is asked what it offers."""
-
-    entries: dict[Place, ProviderInfo]
-    tally: int
-    """The revision as of which that is; -1: it does not say."""
-    last: str
-    """The last chunk of the key that was told last."""
-    keys: tuple[str, ...]
-
-
-class Peer:
-    """The container under test, in one of its boots."""
-
-    def __init__(self, stage: "Stage", process: "subprocess.Popen[bytes]", address: Address) -> None:
-        self._stage = stage
-        self.process: Final = process
-        self.address: Final = address
-        self._places: dict[str, Place] = {}
-
-    @property
-    def alive(self) -> bool:
-        """Whether its process runs and its sign of life stands."""
-        return self.process.poll() is None and self._stage.seen(self.address)
-
-    @property
-    def arm(self) -> Place:
-        """Where its arm is."""
-        return self.place("turn")
-
-    def place(self, service: str) -> Place:
-        """Who in group ``peer`` offers a service of that name; raises NotHeld if nobody does."""
-        if service not in self._places:  # it may be a moment before all is offered
-            eventually(lambda: self._learn(service), f"it offers no {service} in the group {GROUP}", _OFFERED_S)
-        return self._places[service]
-
-    def _learn(self, wanted: str) -> bool:
-        for place, info in self.offer().entries.items():
-            if place[0] == GROUP:
-                self._places.update((one.name, place) for one in info.services)
-        return wanted in self._places
-
-    def offer(self) -> Offer:
-        """Ask what it offers; raises NotHeld if that is not answered."""
-        found = self._stage.ask(registry_key("*", self.address, "*"))
-        require(found, "it does not answer the question what it offers")
-        return _offer(found[0])
-
-    def says(self, name: str) -> bool:
-        """Whether its own provider has that function."""
-        own = self.offer().entries.get(SYSTEM)
-        return own is not None and any(service.name == name for service in own.services)
 
 
 class Stage:
@@ -208,7 +148,7 @@ class Stage:
             _end(process)
             raise
         [address] = set(self.boots()) - known
-        self._peer = Peer(self, process, address)
+        self._peer = Peer(process, address, self.ask, self.seen)
         eventually(lambda: self.ask(registry_key("*", address, "*")), "it does not answer what it offers")
         return self._peer
 
@@ -346,22 +286,6 @@ def _without_ours(environment: Mapping[str, str]) -> dict[str, str]:
     return {name: value for name, value in environment.items() if not name.startswith("TRADE_") or "RUNTIME" in name}
 
 
-def _offer(answer: Answer) -> Offer:
-    entries: dict[Place, ProviderInfo] = {}
-    tally = -1
-    for message in answer.messages:
-        _, domain, *_, provider = message.key.split("/")
-        try:
-            if (domain, provider) == ("trade", "tally"):
-                tally = decode_tally(message.payload or b"").revision
-            else:
-                entries[domain, provider] = decode_provider(message.payload or b"")
-        except Malformed as bad:
-            raise NotHeld(f"what it tells of {domain}/{provider} cannot be read: {bad}") from None
-    keys = tuple(message.key for message in answer.messages)
-    return Offer(entries, tally, keys[-1].rpartition("/")[2], keys)
-
-
 def _end(process: "subprocess.Popen[bytes]") -> None:
     process.terminate()
     try:
@@ -369,7 +293,3 @@ def _end(process: "subprocess.Popen[bytes]") -> None:
     except subprocess.TimeoutExpired:
         process.kill()
         process.wait()
-
-
-Does = Callable[[Stage], None]
-__all__ = ["GROUP", "PATIENCE_S", "Does", "Offer", "Peer", "Stage"]
