@@ -90,7 +90,9 @@ impl Container {
         };
         if service.effect == Effect::Read || urgent {
             let answer = answer_of(self.run(service, &call, &caller));
-            return self.answer(&call.reply, &caller, call.id, answer);
+            let me = self.clone(); // the next stop does not wait for who does not read its answers
+            std::thread::spawn(move || me.answer(&call.reply, &caller, call.id, answer));
+            return;
         }
         let key = (caller.clone(), call.id);
         let first = self.robot().once.begin(&key, &call.reply, &service.label());

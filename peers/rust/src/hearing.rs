@@ -5,6 +5,7 @@ use crate::offers::{entry, PROVIDERS, SYSTEM};
 use crate::wire::{self, array, is_chunk, Estop, EstopOrder};
 use rmpv::Value;
 use std::collections::HashMap;
+use std::sync::Arc;
 use std::time::Duration;
 use zenoh::qos::{CongestionControl, Priority};
 use zenoh::query::{ConsolidationMode, Query, QueryTarget};
@@ -130,18 +131,28 @@ impl Container {
 
     // --- e-stops
 
-    /// An order: done the first time, and confirmed each time.
-    pub fn ordered(&self, sample: &Sample) {
+    /// An order: done the first time, and confirmed each time. Everything stops before anything else is done.
+    pub fn ordered(self: &Arc<Self>, sample: &Sample) {
         let key = sample.key_expr().as_str();
         let Some(identity) = key.strip_prefix("estop/").filter(|identity| is_chunk(identity)) else { return };
         let Some(order) = EstopOrder::read(&sample.payload().to_bytes(), identity) else { return };
-        let problem = match (self.first(&order.request), &order.opened) {
-            (Some(Some(problem)), _) => problem,
-            (Some(None), _) => return, // it is being done: the order comes again
-            (None, Some(estop)) => self.open(estop),
-            (None, None) => self.clear(&order),
-        };
-        let put = self.session.put(format!("estop/{}", self.own), wire::estop_confirmed(&order.request, &problem));
+        match self.first(&order.request) {
+            Some(Some(problem)) => return self.confirm(&order.request, &problem),
+            Some(None) => return, // it is being done: the order comes again
+            None => order.opened.iter().for_each(|estop| self.stop_all(estop)),
+        }
+        let me = self.clone(); // the next order does not wait for a disk, or for who does not read
+        std::thread::spawn(move || {
+            let problem = match &order.opened {
+                Some(estop) => me.note(estop),
+                None => me.clear(&order),
+            };
+            me.confirm(&order.request, &problem);
+        });
+    }
+
+    fn confirm(&self, request: &str, problem: &str) {
+        let put = self.session.put(format!("estop/{}", self.own), wire::estop_confirmed(request, problem));
         let _ = put.congestion_control(CongestionControl::Drop).priority(Priority::RealTime).express(true).wait();
     }
 
@@ -149,7 +160,8 @@ impl Container {
     fn learnt(&self, told: &[Estop]) {
         for estop in told {
             if self.first(&estop.id).is_none() {
-                self.open(estop);
+                self.stop_all(estop);
+                self.note(estop);
             }
         }
     }
@@ -164,10 +176,14 @@ impl Container {
         known
     }
 
-    /// Stop first, write it down then; the arm is at rest when the mutex is free again.
-    fn open(&self, estop: &Estop) -> String {
+    /// The arm is at rest when the mutex is free again.
+    fn stop_all(&self, estop: &Estop) {
         self.robot().open_estop(estop);
         self.changed.notify_all();
+    }
+
+    /// Write it down unless it is cleared meanwhile, and tell of it. Returns what went wrong.
+    fn note(&self, estop: &Estop) -> String {
         let noting = self.noting.lock().unwrap();
         let written = if self.robot().is_open(&estop.id) { self.store.write(estop) } else { Ok(()) };
         drop(noting);
