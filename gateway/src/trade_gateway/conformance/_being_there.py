@@ -57,8 +57,9 @@ def offers(stage: Stage) -> None:
 @check("describes", "Messages")
 def describes(stage: Stage) -> None:
     """The services of group peer and the functions of its own provider are described as agreed."""
+    places = {name: stage.peer.place(name) for name in ARM}
     offer = stage.peer.offer()
-    arm = {name: _services(offer, stage.peer.place(name))[name] for name in ARM}
+    arm = {name: _services(offer, place)[name] for name, place in places.items()}
     for name, (effect, parameters) in ARM.items():
         found = arm[name]
         require(found.effect == effect, f"{name} has the effect {found.effect!r}, not {effect!r}")
