@@ -34,10 +34,10 @@ demo: $(UV) ## a simulated robot looks, walks and grips for behaviours beyond a 
 test: $(UV) ## the whole test suite; in parts; the others run also when one fails
 	@failed=; part() { code=0; $(RUN) pytest "$$@" $(ARGS) || code=$$?; \
 	  case $$code in 0|5) ;; 1) failed=1 ;; *) exit $$code ;; esac; }; \
-	part -n 2 --dist loadfile --ignore tests/drivers --ignore tests/complaints --ignore tests/system --ignore tests/bench --ignore tests/chaos --ignore tests/browser; \
+	part -n 2 --dist loadfile --ignore tests/drivers --ignore tests/complaints --ignore tests/system --ignore tests/bench --ignore tests/chaos --ignore tests/browser --ignore tests/peers; \
 	part -n 2 --dist loadfile tests/system tests/bench tests/chaos --ignore tests/system/test_demo.py; \
 	part -n 2 --dist loadfile tests/drivers tests/complaints; \
-	part tests/browser tests/system/test_demo.py; \
+	part tests/browser tests/peers tests/system/test_demo.py; \
 	test -z "$$failed"
 
 test-socketcan: $(UV) ## the CAN suites on kernel interfaces; where the kernel has none, inside User-Mode Linux

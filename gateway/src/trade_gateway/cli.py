@@ -41,6 +41,7 @@ _COMMANDS: Final = {
     "calibrate": (_HARDWARE, "_calibrate:calibrate"),
     "doctor": (_HARDWARE, "_doctor:doctor"),
     "drill": (_HARDWARE, "_drill:drill"),
+    "conformance": (_OPERATION, "conformance._command:conformance"),
     "services": (_SERVICES, "_list:services"),
     "containers": (_SERVICES, "_list:containers"),
     "call": (_SERVICES, "_call:call"),

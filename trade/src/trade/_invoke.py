@@ -159,7 +159,8 @@ class LocalTarget:
 class RemoteTarget:
     """A service of another container, with everything about calling it that can be decided beforehand."""
 
-    def __init__(self, record: Record, caller: Caller, codec: Codec) -> None:
+    def __init__(self, record: Record, caller: Caller, codec: Codec, known: ServiceInfo | None = None) -> None:
+        """``known`` describes the result, if that is not to be what the callee says of it."""
         address, key = record.key.address, record.key
         self._label = record.label
         self._info: ServiceInfo = record.info
@@ -169,7 +170,7 @@ class RemoteTarget:
         self._is_stop = record.info.effect == "stop"
         self._publisher = caller.publisher(address, key.domain, key.provider, stop=self._is_stop)
         self._clock = caller.publisher(address, DOMAIN, PROVIDER, stop=False)
-        self._decode = result_decoder(codec, record.info)
+        self._decode = result_decoder(codec, known or record.info)
         self._decode_any = codec.decoder(Any)
         self._traceable = traceable(key)
 

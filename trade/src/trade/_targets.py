@@ -10,8 +10,9 @@ from trade._handle import Handle
 from trade._invoke import LocalTarget, RemoteTarget, container_closed
 from trade._providers import Providers
 from trade._registry import Change, Record, Registry, gone_to
+from trade._system import DOMAIN, PROVIDER
 from trade._transport import ChannelClosed
-from trade._wire import Address, ServiceKey
+from trade._wire import Address, ServiceInfo, ServiceKey
 from trade.errors import AccessDenied, ServiceGone
 
 Target = LocalTarget | RemoteTarget
@@ -81,13 +82,24 @@ class Targets:
     def _make(self, record: Record) -> Target | None:
         if not record.local:
             try:
-                return RemoteTarget(record, self._caller, self._codec)
+                return RemoteTarget(record, self._caller, self._codec, self._our_own(record))
             except ChannelClosed:  # closed meanwhile
                 raise container_closed(self._own) from None
         service = self._providers.lookup(f"{record.key.domain}/{record.key.provider}", record.key.name)
         if service is None:  # deregistered since we looked
             return None
         return LocalTarget(service, self._codec, self._own, self._session, self._caller.new_id)
+
+    def _our_own(self, record: Record) -> ServiceInfo | None:
+        """How this container describes a function of the middleware that another one has, too.
+
+        What it answers is known here, whatever that one says of it: it may be written in another language.
+        """
+        key = record.key
+        if (key.domain, key.provider) != (DOMAIN, PROVIDER):
+            return None
+        service = self._providers.services_at(f"{DOMAIN}/{PROVIDER}").get(key.name)
+        return None if service is None else service.info
 
     def gone(self, handle: Handle) -> ServiceGone:
         """Why a handle leads nowhere."""

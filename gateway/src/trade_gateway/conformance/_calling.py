@@ -1,0 +1,178 @@
+"""Checks of calls: what is answered, what is not run, and that nothing runs twice."""
+
+import math
+import signal
+import threading
+from typing import Any
+
+from trade import errors
+from trade._wire import Status
+from trade_gateway.conformance._check import check
+from trade_gateway.conformance._judging import eventually, require
+from trade_gateway.conformance._stage import Stage
+from trade_gateway.conformance._voice import NEVER, SYSTEM, error_of
+
+
+@check("answers", "Messages")
+def answers(stage: Stage) -> None:
+    """echo answers with what it was given, of every kind, by place and by name."""
+    values: list[Any] = [None, True, -1, 2**63 - 1, -(2**63), 0.25, "häß", b"\x00\xff", [1, [2]], {"a": {"b": []}}]
+    with stage.voice() as anna:
+        for value in [*values, "x" * 70_000]:
+            for how in ({}, {"by_name": {"value": value}}):
+                args = () if how else (value,)
+                said = anna.result(stage.peer.arm, "echo", *args, expires_ns=NEVER, **how)
+                require(said == value and type(said) is type(value), f"echo({value!r}) answered {said!r}"[:200])
+
+
+@check("refuses-arguments", "Messages")
+def refuses_arguments(stage: Stage) -> None:
+    """Arguments that do not fit, or are beyond a limit, are refused with an error of ours, and nothing runs."""
+    arm = stage.peer.arm
+    with stage.voice() as anna:
+        began = stage.turns(anna)
+        unfit: list[tuple[Any, ...]] = [(), ("far",), (1.0, 2.0), (None,), ([],)]
+        for args in unfit:
+            found = error_of(anna.ask(arm, "turn", *args))
+            require(isinstance(found, errors.InvalidArgument), f"turn{args} was refused with {found!r}")
+        wrong = error_of(anna.ask(arm, "turn", by_name={"angle_deg": 1.0}))
+        require(isinstance(wrong, errors.InvalidArgument), f"turn(angle_deg=...) was refused with {wrong!r}")
+        for angle_rad in (math.nan, math.inf, -math.inf, 1e9):
+            error_of(anna.ask(arm, "turn", angle_rad))
+        require(stage.turns(anna) == began, "a turn with wrong arguments began")
+
+
+@check("knows-not", "Messages")
+def knows_not(stage: Stage) -> None:
+    """An unknown service or provider is answered with status 4; so is a stop on a call's key and a call on a stop's."""
+    arm = stage.peer.arm
+    with stage.voice() as anna:
+        began = stage.turns(anna)
+        wrong: list[tuple[tuple[str, str], str, tuple[Any, ...], bool]] = [
+            (arm, "fly", (), False),
+            ((arm[0], "nobody"), "echo", (1,), False),
+            (("elsewhere", arm[1]), "echo", (1,), False),
+            (arm, "halt", (), False),
+            (arm, "turn", (0.1,), True),
+            (SYSTEM, "fly", (), True),
+        ]
+        for place, service, args, stop in wrong:
+            reply = anna.ask(place, service, *args, stop=stop)
+            where = f"{'/'.join(place)} {service} on a {'stop' if stop else 'call'} key"
+            require(reply.status == Status.GONE, f"{where} was answered with status {reply.status}, not 4")
+        require(stage.turns(anna) == began, "a turn that was sent as a stop began")
+
+
+@check("late-is-never", "S01")
+def late_is_never(stage: Stage) -> None:
+    """A command whose expiry has passed, or that has none, is answered with status 3 and never runs."""
+    arm = stage.peer.arm
+    with stage.voice() as anna:
+        began = stage.turns(anna)
+        for expires_ns in (anna.expiry_ns(-0.001), anna.expiry_ns(-3600.0), 0, NEVER):
+            reply = anna.ask(arm, "turn", 0.1, expires_ns=expires_ns)
+            require(reply.status == Status.EXPIRED, f"a late turn was answered with status {reply.status}, not 3")
+        require(stage.turns(anna) == began, "a turn that came too late began")
+        reply = anna.ask(SYSTEM, "acquire", ["peer.arm"], {}, expires_ns=NEVER)
+        require(reply.status == Status.EXPIRED, f"a late acquire was answered with status {reply.status}, not 3")
+        require(anna.ask(arm, "echo", 1, expires_ns=NEVER).status == Status.OK, "echo without an expiry did not run")
+
+
+@check("late-when-frozen", "S01")
+def late_when_frozen(stage: Stage) -> None:
+    """A command that came in time to a process that stood still, and has expired when it goes on, never runs."""
+    arm, process = stage.peer.arm, stage.peer.process
+    with stage.voice() as anna:
+        began, expires_ns = stage.turns(anna), anna.expiry_ns(0.5)
+        process.send_signal(signal.SIGSTOP)
+        try:
+            call_id = anna.call(arm, "turn", 0.1, expires_ns=expires_ns)
+            threading.Event().wait(1.0)
+        finally:
+            process.send_signal(signal.SIGCONT)
+        require(anna.answer(call_id).status == Status.EXPIRED, "a turn that expired in a frozen process ran")
+        require(stage.turns(anna) == began, "a turn that expired in a frozen process began")
+
+
+@check("once", "S02")
+def once(stage: Stage) -> None:
+    """The same actuating call again, while it runs or later, gets the same answer and does not run again."""
+    arm = stage.peer.arm
+    with stage.voice() as anna:
+        began, expires_ns = stage.turns(anna), anna.expiry_ns()
+        goal_rad = stage.angle(anna) + (0.5 if stage.angle(anna) < 0 else -0.5)
+        call_id = anna.call(arm, "turn", goal_rad, expires_ns=expires_ns)
+        eventually(lambda: stage.turns(anna) > began, "a turn did not begin")
+        anna.call(arm, "turn", goal_rad, call_id=call_id, expires_ns=expires_ns)
+        eventually(lambda: len(anna.answers(call_id)) > 1, "the same call, sent again while it ran, has no answer")
+        anna.call(arm, "turn", goal_rad, call_id=call_id, expires_ns=expires_ns)
+        eventually(lambda: len(anna.answers(call_id)) > 2, "the same call, sent again later, has no answer")
+        bodies = {(reply.status, bytes(reply.body)) for reply in anna.answers(call_id)}
+        require(len(bodies) == 1, "the same call was answered differently")
+        require(stage.turns(anna) == began + 1, f"one call began {stage.turns(anna) - began} turns")
+
+
+@check("once-for-each", "S02")
+def once_for_each(stage: Stage) -> None:
+    """Calls of the same id by two callers are two calls."""
+    with stage.voice("anna") as anna, stage.voice("bob") as bob:
+        began, call_id = stage.turns(anna), anna.new_id()
+        here_rad = stage.angle(anna)
+        for who in (anna, bob):
+            who.result(stage.peer.arm, "turn", here_rad, call_id=call_id)
+        require(stage.turns(anna) == began + 2, "a call of one caller was taken for that of another")
+
+
+@check("cancels", "Once")
+def cancels(stage: Stage) -> None:
+    """A cancelled turn ends with an error and rests; one cancelled before it came never begins."""
+    arm = stage.peer.arm
+    with stage.voice() as anna:
+        running = stage.begin_turn(anna)
+        require(anna.cancel(running, "peer.turn").status == Status.OK, "a cancel was not answered with status 0")
+        error_of(anna.answer(running))
+        stage.require_rest(anna, "its cancelling")
+        began, unborn = stage.turns(anna), anna.new_id()
+        require(anna.cancel(unborn, "peer.turn").status == Status.OK, "a cancel was not answered with status 0")
+        found = error_of(anna.ask(arm, "turn", 0.1, call_id=unborn))
+        require(isinstance(found, errors.Cancelled), f"a call that was cancelled before it came ended with {found!r}")
+        require(stage.turns(anna) == began, "a turn that was cancelled before it came began")
+
+
+@check("cancels-own-only", "Once")
+def cancels_own_only(stage: Stage) -> None:
+    """Only the caller of a call can cancel it."""
+    with stage.voice("anna") as anna, stage.voice("bob") as bob:
+        running = stage.begin_turn(anna)
+        bob.cancel(running, "peer.turn")
+        require(stage.moves(anna) and not anna.answers(running), "bob cancelled a call of anna")
+        anna.cancel(running, "peer.turn")
+        anna.answer(running)
+
+
+@check("versions", "Versions")
+def versions(stage: Stage) -> None:
+    """A call of another version is dropped without an answer; one with more fields than are known is taken."""
+    arm = stage.peer.arm
+    with stage.voice() as anna:
+        began = stage.turns(anna)
+        unread = [anna.call(arm, "turn", 0.1, version=version) for version in (0, 2, 255)]
+        require(anna.ask(arm, "echo", 1, appended=[{"later": 1}, 2]).status == Status.OK, "a longer call did not run")
+        require(stage.turns(anna) == began, "a turn of another version of the protocol began")
+        require(not any(map(anna.answers, unread)), "a call of another version was answered")
+
+
+@check("forged", "Keys")
+def forged(stage: Stage) -> None:
+    """A call in the name of another's session, or to a pattern of keys, does not run."""
+    peer, arm = stage.peer, stage.peer.arm
+    with stage.voice("anna") as anna, stage.voice("bob") as bob:
+        began = stage.turns(anna)
+        here = f"{peer.address}/{'/'.join(arm)}"
+        keys = (f"call/anna/{peer.address}/**", f"call/*/{here}", f"call/anna/{peer.address}/*/*")
+        dropped = [anna.call(arm, "turn", 0.1, session=bob.session)]
+        dropped += [anna.call(arm, "turn", 0.1, key=key) for key in keys]
+        require(anna.ask(arm, "echo", 1).status == Status.OK, "echo did not run")
+        require(stage.turns(anna) == began, "a forged turn began")
+        said = [reply.status for call_id in dropped for reply in anna.answers(call_id)]
+        require(Status.OK not in said, "a forged call was answered as if it had run")

@@ -1,0 +1,70 @@
+"""``trade conformance --peer COMMAND``: does a container in another language keep the rules?"""
+
+import signal
+from collections.abc import Sequence
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+
+from trade_gateway._list import Json
+from trade_gateway._output import Output, UsageError
+from trade_gateway.conformance import CHECKS, FAILED, LEFT_OUT, OK, Check, Outcome, run
+
+_COLOURS = {OK: "green", FAILED: "bold red", LEFT_OUT: "yellow"}
+
+
+def conformance(
+    peer: Annotated[
+        str | None, typer.Option(metavar="COMMAND", help="Starts the container to be checked; words as in a shell.")
+    ] = None,
+    only: Annotated[list[str] | None, typer.Option(metavar="CHECK", help="Only this check; again for another.")] = None,
+    listed: Annotated[bool, typer.Option("--list", help="Only say which checks there are.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Start a container written in whatever language, and check from outside that it keeps the rules.
+
+    It runs in a system of its own on this host and is told by the environment where that is; docs/wire-protocol.md says
+    which services it offers for this. The exit code is 1 if a check fails.
+
+    For example: trade conformance --peer peers/rust/target/debug/trade-peer
+    """
+    out = Output(as_json=as_json)
+    if listed:
+        _list(out)
+        return
+    if peer is None:
+        raise UsageError(
+            where="--peer", problem="missing; name the command that starts a container, or --list the checks"
+        )
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that nobody is left behind
+    outcomes = run(peer, _chosen(only or []), lambda outcome: _tell(out, outcome))
+    failed = [outcome.check for outcome in outcomes if outcome.outcome == FAILED]
+    if failed:
+        out.say(f"[bold red]failed[/]: {len(failed)} of {len(outcomes)}: {escape(', '.join(failed))}")
+        raise typer.Exit(1)
+    left_out = [outcome.check for outcome in outcomes if outcome.outcome == LEFT_OUT]
+    out.say(f"[bold green]passed[/]: {len(outcomes) - len(left_out)} checks, {len(left_out)} left out")
+
+
+def _chosen(names: Sequence[str]) -> list[Check]:
+    """The checks asked for, in the order of the table. Raises UsageError."""
+    known = [one.name for one in CHECKS]
+    if unknown := [name for name in names if name not in known]:
+        raise UsageError(where=f"--only {unknown[0]}", problem=f"there is no such check; there is {', '.join(known)}")
+    return [one for one in CHECKS if not names or one.name in names]
+
+
+def _list(out: Output) -> None:
+    if out.as_json:
+        out.data([{"check": one.name, "rule": one.rule, "what": one.what} for one in CHECKS])
+        return
+    out.table(("CHECK", "RULE", "WHAT"), [(one.name, one.rule, one.what) for one in CHECKS])
+
+
+def _tell(out: Output, outcome: Outcome) -> None:
+    if out.as_json:
+        out.data(outcome)
+        return
+    why = f": {escape(outcome.why)}" if outcome.why else ""
+    out.say(f"[{_COLOURS[outcome.outcome]}]{outcome.outcome:<8}[/] {outcome.check:<20} {escape(outcome.what)}{why}")

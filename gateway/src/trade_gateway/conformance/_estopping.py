@@ -1,0 +1,168 @@
+"""Checks of the e-stop: obeyed, confirmed, kept over a restart, learnt by who joins, cleared."""
+
+import secrets
+import time
+from collections.abc import Callable
+from typing import Any
+
+from trade import errors, where
+from trade._wire import (
+    PROTOCOL,
+    Estop,
+    EstopConfirmed,
+    EstopOrder,
+    Malformed,
+    decode_estop_confirmed,
+    encode_message,
+    estop_confirmed_key,
+    estop_key,
+)
+from trade_gateway.conformance._check import check
+from trade_gateway.conformance._judging import PATIENCE_S, eventually, require
+from trade_gateway.conformance._peer import GROUP
+from trade_gateway.conformance._stage import Stage
+from trade_gateway.conformance._voice import NEVER, SYSTEM, Voice, error_of
+
+_ALL_TOLD_S = 3.0
+
+
+def _open(who: Voice, reason: str = "a check") -> EstopOrder:
+    name = secrets.token_hex(4)
+    return EstopOrder(PROTOCOL, name, Estop(name, who.session, reason, time.time()))
+
+
+def _cleared(*orders: EstopOrder) -> EstopOrder:
+    return EstopOrder(PROTOCOL, secrets.token_hex(4), None, tuple(order.request for order in orders))
+
+
+def _order(stage: Stage, who: Voice, order: EstopOrder) -> EstopConfirmed:
+    """Put an order until it is confirmed; raises NotHeld if it is not."""
+    address = stage.peer.address
+    with stage.listening(estop_confirmed_key(address)) as heard:
+        found: list[EstopConfirmed] = []
+
+        def confirmed() -> bool:
+            who.put(estop_key(who.identity), encode_message(order), urgent=True)
+            found[:] = [one for one in map(_confirmation, list(heard)) if one and one.request == order.request]
+            return bool(found)
+
+        eventually(confirmed, "an e-stop's order is not confirmed", PATIENCE_S)
+        return found[0]
+
+
+def _confirmation(message: Any) -> EstopConfirmed | None:
+    try:
+        return decode_estop_confirmed(message.payload or b"")
+    except Malformed:
+        return None
+
+
+def _told(stage: Stage) -> tuple[str, ...]:
+    return tuple(estop.id for estop in stage.peer.offer().entries[SYSTEM].estops)
+
+
+def _require_stopped(stage: Stage, who: Voice, when: str) -> None:
+    began = stage.turns(who)
+    refused = error_of(who.ask(stage.peer.arm, "turn", 0.1))
+    require(isinstance(refused, errors.Stopped) and refused.estop, f"a turn {when} ended with {refused!r}")
+    require(stage.turns(who) == began, f"a turn began {when}")
+
+
+@check("estop", "S09")
+def estop(stage: Stage) -> None:
+    """An e-stop stops all, is told and confirmed; nothing moves before it is cleared, and reading goes on."""
+    with stage.voice("anna") as anna, stage.voice("bob") as bob:
+        running, order = stage.begin_turn(anna), _open(bob)
+        try:
+            confirmed = _order(stage, bob, order)
+            require(confirmed.problem == "", f"it says that something of an e-stop failed: {confirmed.problem}")
+            require(not stage.moves(anna), "the arm moves after the e-stop was confirmed")
+            error_of(anna.answer(running))
+            _require_stopped(stage, anna, "while an e-stop is open")
+            require(order.request in _told(stage), "its entry does not tell which e-stops are open")
+            require(_order(stage, bob, order).problem == "", "an order that comes again is not confirmed again")
+            require(anna.ask(stage.peer.arm, "echo", 1, expires_ns=NEVER).status == 0, "reading ended with an e-stop")
+        finally:
+            cleared = _order(stage, bob, _cleared(order))
+        require(cleared.problem == "", f"it says that the clearing failed: {cleared.problem}")
+        eventually(lambda: not _told(stage), "its entry still tells of an e-stop that was cleared")
+        _order(stage, bob, order)
+        require(not _told(stage), "an e-stop that was cleared is opened again by its own order")
+        anna.result(SYSTEM, "resume", ["peer.arm"])
+        anna.result(stage.peer.arm, "turn", stage.angle(anna))
+
+
+@check("estop-reported", "S09")
+def estop_reported(stage: Stage) -> None:
+    """An e-stop by a container of this project is reported as complete, and so is its clearing."""
+    arm = stage.peer.place("turn")
+    stage.container.find(where(name="halt", group=GROUP), wait_s=PATIENCE_S)
+    report = stage.container.estop("a check", limit_s=_ALL_TOLD_S)
+    try:
+        require(report.complete and "peer/peer" in report.confirmed, f"the report of an e-stop says {report}")
+    finally:
+        cleared = stage.container.estop_clear([report.id], limit_s=_ALL_TOLD_S)
+    require(cleared.complete, f"the report of the clearing says {cleared}")
+    stage.container.resume(where(name="turn", group=GROUP))
+    with stage.voice() as anna:
+        anna.result(arm, "turn", stage.angle(anna))
+
+
+@check("estop-forged", "E-stops")
+def estop_forged(stage: Stage) -> None:
+    """An order in the name of another identity, or of another version, is dropped."""
+    with stage.voice("anna") as anna, stage.voice("bob") as bob:
+        forged, later = _open(anna), _open(bob)
+        later.v = PROTOCOL + 1
+        for order in (forged, later):
+            bob.put(estop_key("bob"), encode_message(order), urgent=True)
+        anna.result(stage.peer.arm, "turn", stage.angle(anna))
+        require(not _told(stage), "a forged e-stop is open")
+
+
+@check("estop-kept", "S09")
+def estop_kept(stage: Stage) -> None:
+    """An e-stop is still open after a kill and a restart, even if others have cleared it meanwhile."""
+    order = _with_voice(stage, lambda bob: _ordered(stage, bob))
+    stage.kill()
+    stage.container.estop_clear([order.request], limit_s=_ALL_TOLD_S)
+    with stage.voice("anna") as anna:  # which starts it
+        try:
+            require(order.request in _told(stage), "after its restart it knows nothing of the e-stop that was open")
+            _require_stopped(stage, anna, "after a restart, with an e-stop open")
+        finally:
+            _order(stage, anna, _cleared(order))
+        anna.result(stage.peer.arm, "turn", stage.angle(anna))
+
+
+@check("estop-learnt", "S09")
+def estop_learnt(stage: Stage) -> None:
+    """Who joins while an e-stop is open elsewhere takes it up."""
+    order = _with_voice(stage, lambda bob: _ordered(stage, bob))
+    stage.kill()
+    stage.start(forgetful=True)
+    with stage.voice("anna") as anna:
+        try:
+            eventually(lambda: order.request in _told(stage), "it does not take up an e-stop that others have open")
+            _require_stopped(stage, anna, "with an e-stop open elsewhere")
+        finally:
+            _order(stage, anna, _cleared(order))
+        eventually(lambda: not stage.container.estops(), "the e-stop is not cleared")
+        anna.result(stage.peer.arm, "turn", stage.angle(anna))
+
+
+def _ordered(stage: Stage, who: Voice) -> EstopOrder:
+    """An e-stop that is open in the container under test, and in ours."""
+    order = _open(who)
+    _order(stage, who, order)
+
+    def everywhere() -> bool:
+        return any(one.id == order.request for one in stage.container._parts.estopping.open_here())
+
+    eventually(everywhere, "the suite's own container did not hear the e-stop")
+    return order
+
+
+def _with_voice(stage: Stage, does: Callable[[Voice], EstopOrder]) -> EstopOrder:
+    with stage.voice("bob") as bob:
+        return does(bob)

@@ -1,0 +1,195 @@
+"""Checks of locks: who has one is alone, under a lease; who loses it, stops."""
+
+import threading
+
+import msgspec
+
+from trade import errors, where
+from trade._terms import LockInfo
+from trade._wire import Status, Token
+from trade_gateway.conformance._check import check
+from trade_gateway.conformance._judging import PATIENCE_S, NotHeld, eventually, require
+from trade_gateway.conformance._peer import GROUP
+from trade_gateway.conformance._stage import Stage
+from trade_gateway.conformance._voice import SYSTEM, Voice, error_of
+
+_ARM = ["peer.arm"]
+_LEASE_S = 1.0
+
+
+def _renew(who: Voice, lock: Token) -> dict[int, str]:
+    return dict(who.result(SYSTEM, "renew", [lock.number], stop=True))
+
+
+def _release(who: Voice, lock: Token, lost: str = "") -> bool:
+    return bool(who.result(SYSTEM, "release", lock.number, lost, stop=True))
+
+
+def _told(who: Voice) -> list[LockInfo]:
+    try:
+        return msgspec.convert(who.result(SYSTEM, "locks"), list[LockInfo])
+    except msgspec.ValidationError as bad:
+        raise NotHeld(f"what locks told cannot be read: {bad}") from None
+
+
+@check("locks", "S11")
+def locks(stage: Stage) -> None:
+    """Under a lock only calls that show it run; reading goes on; given back, it is free."""
+    arm, here = stage.peer.arm, stage.peer.address
+    with stage.voice("anna") as anna, stage.voice("bob") as bob:
+        lock = stage.granted(anna, _ARM, purpose="a check", lease_s=20.0)
+        require(lock.epoch == here.epoch, f"the token's epoch is {lock.epoch}, not that of the container")
+        began, here_rad = stage.turns(anna), stage.angle(anna)
+        for who, tokens in ((bob, ()), (anna, ()), (bob, (lock,)), (bob, (Token(here.epoch, lock.number + 1),))):
+            refused = error_of(who.ask(arm, "turn", here_rad, tokens=tokens))
+            require(
+                isinstance(refused, (errors.LockedByOther, errors.LockLost)), f"a turn without the lock: {refused!r}"
+            )
+        require(stage.turns(anna) == began, "a turn began without the lock")
+        anna.result(arm, "turn", here_rad, tokens=[lock])
+        require(stage.turns(anna) == began + 1, "the turn under the lock did not begin")
+        require(_release(anna, lock), "the lock was not given back")
+        bob.result(arm, "turn", here_rad)
+
+
+@check("locks-told", "S11")
+def locks_told(stage: Stage) -> None:
+    """locks tells what is held, by whom and for what; a refusal names the owner."""
+    arm = stage.peer.arm
+    with stage.voice("anna") as anna, stage.voice("bob") as bob:
+        lock = stage.granted(anna, _ARM, purpose="a check", lease_s=20.0)
+        told = _told(bob)
+        require(len(told) == 1, f"locks told {told!r}")
+        [info] = told
+        require(info.token == lock, "locks tells another token than was granted")
+        require(list(info.resources) == _ARM, f"locks tells of {info.resources!r}")
+        said = (info.holder.identity, info.holder.session, info.holder.purpose)
+        require(said == ("anna", anna.session, "a check"), f"locks says that the holder is {info.holder!r}")
+        require(0 < info.left_s <= 20, f"locks says that {info.left_s!r} s of a lease of 20 s are left")
+        refused = error_of(bob.ask(arm, "turn", 0.1))
+        require(isinstance(refused, errors.LockedByOther), f"a turn without the lock ended with {refused!r}")
+        require(
+            "anna" in str(refused) and "a check" in str(refused), f"the refusal does not say who and why: {refused}"
+        )
+        _release(anna, lock)
+
+
+@check("locked-by-ours", "S11")
+def locked_by_ours(stage: Stage) -> None:
+    """A container of this project locks its group as a whole, keeps the lock and turns the arm under it."""
+    ours = stage.container
+    turn = ours.find(where(name="turn", group=GROUP), wait_s=PATIENCE_S)
+    with stage.voice() as anna:
+        here_rad = stage.angle(anna)
+        with ours.lock(where(group=GROUP), purpose="a check", lease_s=_LEASE_S) as lock:
+            require("peer.arm" in lock.resources, f"what was locked is {lock.resources}")
+            threading.Event().wait(2 * _LEASE_S)
+            require(turn(here_rad) == here_rad, "turn answered something else")
+            require([info.token for info in ours.locks()] == list(lock.tokens()), f"the locks are {ours.locks()}")
+            refused = error_of(anna.ask(stage.peer.arm, "turn", here_rad))
+            require(isinstance(refused, errors.LockedByOther), f"a turn without the lock ended with {refused!r}")
+        anna.result(stage.peer.arm, "turn", here_rad)
+
+
+@check("one-owner", "S13")
+def one_owner(stage: Stage) -> None:
+    """A second one is refused at once, or waits for its turn as long as it says; nobody releases another one's."""
+    with stage.voice("anna") as anna, stage.voice("bob") as bob:
+        lock = stage.granted(anna, _ARM, lease_s=20.0)
+        refused = error_of(stage.acquire(bob, _ARM))
+        require(isinstance(refused, errors.LockedByOther), f"acquire of a locked resource ended with {refused!r}")
+        require(not _release(bob, lock), "bob gave back the lock of anna")
+        require(_renew(bob, lock), "bob renewed the lock of anna")
+        waiting = bob.call(SYSTEM, "acquire", _ARM, {"wait_s": 6.0, "lease_s": 20.0})
+        threading.Event().wait(0.2)
+        require(not bob.answers(waiting), "acquire did not wait for its turn")
+        _release(anna, lock)
+        reply = bob.answer(waiting)
+        require(reply.status == Status.OK, f"who waited for its turn was answered with status {reply.status}")
+        for info in _told(bob):
+            _release(bob, info.token)
+        unknown = error_of(stage.acquire(bob, ["peer.nothing"]))
+        require(isinstance(unknown, errors.ServiceGone), f"acquire of an unknown resource ended with {unknown!r}")
+
+
+@check("waits-for-motion", "S13")
+def waits_for_motion(stage: Stage) -> None:
+    """What moves is not granted before it rests; while it is waited for, no new call is let in."""
+    arm = stage.peer.arm
+    with stage.voice("anna") as anna, stage.voice("bob") as bob:
+        running = stage.begin_turn(anna)
+        refused = error_of(stage.acquire(bob, _ARM))
+        require(isinstance(refused, errors.LockedByOther), f"acquire of what moves ended with {refused!r}")
+        waiting = bob.call(SYSTEM, "acquire", _ARM, {"wait_s": 7.0, "lease_s": 20.0})
+        threading.Event().wait(0.2)
+        began = stage.turns(anna)
+        shut_out = error_of(anna.ask(arm, "turn", 0.1))
+        require(isinstance(shut_out, errors.LockedByOther), f"a turn while a lock is waited for: {shut_out!r}")
+        require(stage.turns(anna) == began, "a turn began while a lock was waited for")
+        require(not bob.answers(waiting), "what moves was granted")
+        anna.cancel(running, "peer.turn")
+        reply = bob.answer(waiting)
+        require(reply.status == Status.OK, f"acquire was answered with status {reply.status} when all was at rest")
+        for info in _told(bob):
+            _release(bob, info.token)
+
+
+@check("leases", "S12")
+def leases(stage: Stage) -> None:
+    """A lock lasts while it is renewed and falls with its lease; what moves under it stops; it never comes back."""
+    arm = stage.peer.arm
+    with stage.voice("anna") as anna, stage.voice("bob") as bob:
+        lock = stage.granted(anna, _ARM, lease_s=_LEASE_S * 2)
+        for _ in range(8):  # longer than the lease
+            threading.Event().wait(_LEASE_S / 2)
+            require(not _renew(anna, lock), "a lock that was renewed is said to be over")
+        running = stage.begin_turn(anna, tokens=[lock])
+        eventually(lambda: not _told(bob), "a lock that was not renewed still holds")
+        stage.require_rest(anna, "the lease of the lock it moved under ended")
+        error_of(anna.answer(running))
+        require(lock.number in _renew(anna, lock), "renew does not say that the lock is over")
+        refused = error_of(anna.ask(arm, "turn", 0.1, tokens=[lock]))
+        require(isinstance(refused, errors.LockLost), f"a turn under a lock that is over ended with {refused!r}")
+        bob.result(arm, "turn", stage.angle(bob))
+
+
+@check("owner-ends", "S12")
+def owner_ends(stage: Stage) -> None:
+    """A lock falls with the session that has it."""
+    with stage.voice("bob") as bob:
+        with stage.voice("anna") as anna:
+            stage.granted(anna, _ARM, lease_s=30.0)
+        eventually(lambda: not _told(bob), "the lock of a session that has ended still holds")
+        bob.result(stage.peer.arm, "turn", stage.angle(bob))
+
+
+@check("lost-stops", "S14")
+def lost_stops(stage: Stage) -> None:
+    """What moves under a lock stops when that is broken, or given back as lost."""
+    with stage.voice("anna") as anna, stage.voice("bob") as bob:
+        for how in ("broken", "lost"):
+            lock = stage.granted(anna, _ARM, lease_s=30.0)
+            stage.begin_turn(anna, tokens=[lock])
+            if how == "broken":
+                require(bob.result(SYSTEM, "break_lock", lock.number, "a check", stop=True), "the lock was not broken")
+            else:
+                require(_release(anna, lock, "a part of it is gone"), "the lock was not given back")
+            stage.require_rest(anna, f"the lock it moved under was {how}")
+            refused = error_of(anna.ask(stage.peer.arm, "turn", 0.1, tokens=[lock]))
+            require(isinstance(refused, errors.LockLost), f"a turn under a lock that was {how} ended with {refused!r}")
+
+
+@check("stop-needs-no-lock", "S07")
+def stop_needs_no_lock(stage: Stage) -> None:
+    """A stop gets through whoever has the lock."""
+    with stage.voice("anna") as anna, stage.voice("bob") as bob:
+        lock = stage.granted(anna, _ARM, lease_s=30.0)
+        stage.begin_turn(anna, tokens=[lock])
+        try:
+            bob.result(stage.peer.arm, "halt", stop=True)
+            stage.require_rest(anna, "a stop by one without the lock")
+            refused = error_of(bob.ask(SYSTEM, "resume", _ARM))
+            require(isinstance(refused, errors.LockedByOther), f"resume by one without the lock ended with {refused!r}")
+        finally:
+            anna.result(SYSTEM, "resume", _ARM)
+            _release(anna, lock)

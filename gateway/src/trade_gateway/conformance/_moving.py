@@ -1,0 +1,107 @@
+"""Checks of motion: it stops when it is told to, and with whoever set it going."""
+
+from trade import errors
+from trade._wire import Status
+from trade_gateway.conformance._check import check
+from trade_gateway.conformance._judging import require
+from trade_gateway.conformance._stage import Stage
+from trade_gateway.conformance._voice import NEVER, SYSTEM, error_of
+
+
+@check("turns", "Writing a container in another language")
+def turns(stage: Stage) -> None:
+    """A turn moves the arm, and is answered when it is there."""
+    with stage.voice() as anna:
+        goal_rad = stage.angle(anna) + (0.3 if stage.angle(anna) < 0 else -0.3)
+        said = anna.result(stage.peer.arm, "turn", goal_rad)
+        require(said == goal_rad and stage.angle(anna) == goal_rad, f"turn({goal_rad}) answered {said}")
+
+
+@check("stops", "S07")
+def stops(stage: Stage) -> None:
+    """halt stops the arm at once; the turn it ends is answered with an error. It needs no expiry."""
+    arm = stage.peer.arm
+    with stage.voice() as anna:
+        running = stage.begin_turn(anna)
+        require(anna.ask(arm, "halt", stop=True, expires_ns=NEVER).status == Status.OK, "halt was not answered with 0")
+        stage.require_rest(anna, "halt")
+        error_of(anna.answer(running))
+        anna.result(arm, "turn", stage.angle(anna))  # one's own stop does not latch
+
+
+@check("stops-late", "S07")
+def stops_late(stage: Stage) -> None:
+    """A stop runs however late it is."""
+    with stage.voice() as anna:
+        stage.begin_turn(anna)
+        status = anna.ask(stage.peer.arm, "halt", stop=True, expires_ns=anna.expiry_ns(-3600.0)).status
+        require(status == Status.OK, f"a stop of an hour ago was answered with status {status}")
+        stage.require_rest(anna, "a stop of an hour ago")
+
+
+@check("stop-latches", "S08")
+def stop_latches(stage: Stage) -> None:
+    """After a stop by somebody else nothing moves before resume; reading goes on."""
+    arm = stage.peer.arm
+    with stage.voice("anna") as anna, stage.voice("bob") as bob:
+        running = stage.begin_turn(anna)
+        bob.result(arm, "halt", stop=True)
+        try:
+            stage.require_rest(anna, "a stop by somebody else")
+            error_of(anna.answer(running))
+            began = stage.turns(anna)
+            refused = error_of(anna.ask(arm, "turn", 0.1))
+            require(isinstance(refused, errors.Stopped), f"a turn after somebody else's stop ended with {refused!r}")
+            require(stage.turns(anna) == began, "a turn began after somebody else's stop")
+        finally:
+            resumed = anna.result(SYSTEM, "resume", ["peer.arm"])
+        require(list(resumed) == ["peer.arm"], f"resume answered {resumed!r}, not which it let move again")
+        anna.result(arm, "turn", stage.angle(anna))
+
+
+@check("session-ends", "S05")
+def session_ends(stage: Stage) -> None:
+    """When the session of a client ends, what it set moving stops; the end of another one stops nothing."""
+    with stage.voice("anna") as anna:
+        with stage.voice("bob") as bob, stage.voice("carol"):
+            stage.begin_turn(bob)
+        stage.require_rest(anna, "the session that set it moving has ended")
+        running = stage.begin_turn(anna)
+        with stage.voice("bob") as bob:
+            stage.angle(bob)
+        require(stage.moves(anna) and not anna.answers(running), "it stopped when the session of another one ended")
+        anna.cancel(running, "peer.turn")
+        anna.answer(running)
+
+
+@check("caller-ends", "S05")
+def caller_ends(stage: Stage) -> None:
+    """When the container of a caller ends, what its clients set moving stops."""
+    with stage.voice("anna") as anna:
+        with stage.voice("bob", client="") as bob:
+            stage.begin_turn(bob)
+        stage.require_rest(anna, "the container that set it moving has ended")
+
+
+@check("behalf-ends", "S03")
+def behalf_ends(stage: Stage) -> None:
+    """A motion stops as well when a session ends on whose behalf the call was made."""
+    with stage.voice("anna") as anna:
+        with stage.voice("bob") as bob:
+            stage.begin_turn(anna, sessions=[bob.session])
+        stage.require_rest(anna, "the session on whose behalf it moved has ended")
+
+
+@check("too-late-for-ended", "S05")
+def too_late_for_ended(stage: Stage) -> None:
+    """What comes for a session that has ended does not begin."""
+    with stage.voice("anna") as anna:
+        bob = stage.voice("bob")
+        bob.result(stage.peer.arm, "turn", stage.angle(anna))
+        stage.begin_turn(bob)
+        bob.close()
+        stage.require_rest(anna, "the session that set it moving has ended")
+        began = stage.turns(anna)
+        refused = error_of(anna.ask(stage.peer.arm, "turn", 0.1, sessions=[bob.session]))
+        require(isinstance(refused, errors.SessionEnded), f"a turn for a session that has ended ended with {refused!r}")
+        require(stage.turns(anna) == began, "a turn for a session that has ended began")

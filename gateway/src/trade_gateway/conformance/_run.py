@@ -1,0 +1,74 @@
+"""Running the checks one after the other, each on a container that is at rest."""
+
+import logging
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Final
+
+from msgspec import Struct
+
+from trade.errors import TradeError
+from trade_gateway.conformance._check import Check
+from trade_gateway.conformance._judging import NotHeld
+from trade_gateway.conformance._stage import Stage
+
+OK: Final = "ok"
+FAILED: Final = "failed"
+LEFT_OUT: Final = "left out"
+
+
+class Outcome(Struct, frozen=True):
+    """How one check ended."""
+
+    check: str
+    what: str
+    rule: str
+    outcome: str
+    """``ok``, ``failed`` or ``left out``."""
+    why: str = ""
+    took_s: float = 0.0
+
+
+def run(command: str, checks: Sequence[Check], told: Callable[[Outcome], None]) -> list[Outcome]:
+    """Start the container under test and run the checks on it.
+
+    Args:
+        command: starts it; words as in a shell, without one.
+        checks: which.
+        told: called with each outcome when it is known.
+
+    Raises:
+        ConfigurationError: there is no such program.
+    """
+    outcomes: list[Outcome] = []
+    logging.getLogger("trade").setLevel(logging.CRITICAL)  # what our own container drops here is meant to be dropped
+    with tempfile.TemporaryDirectory(prefix="trade-conformance-") as folder, Stage(command, Path(folder)) as stage:
+        for outcome in _each(stage, checks):
+            outcomes.append(outcome)
+            told(outcome)
+    return outcomes
+
+
+def _each(stage: Stage, checks: Sequence[Check]) -> Iterator[Outcome]:
+    for one in checks:
+        begun = time.monotonic()
+        outcome, why = _judge(stage, one)
+        if outcome == FAILED:
+            stage.dismiss()  # the next one begins with one that nothing was done to
+        yield Outcome(one.name, one.what, one.rule, outcome, why, round(time.monotonic() - begun, 3))
+
+
+def _judge(stage: Stage, one: Check) -> tuple[str, str]:
+    try:
+        if one.needs and not stage.peer.says(one.needs):
+            return LEFT_OUT, f"its own provider has no {one.needs}"
+        one.does(stage)
+    except NotHeld as why:
+        return FAILED, str(why)
+    except (TradeError, TimeoutError) as error:
+        return FAILED, f"{type(error).__name__}: {error}"
+    except (TypeError, ValueError, LookupError, AttributeError) as error:  # what it answers may be anything
+        return FAILED, f"what it answered cannot be read: {type(error).__name__}: {error}"
+    return OK, ""

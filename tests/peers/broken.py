@@ -1,0 +1,67 @@
+"""Containers that break one rule each: what `trade conformance` has to notice."""
+
+from collections.abc import Callable
+from typing import Any
+
+import msgspec
+
+from trade import _dispatch, _estop, _estop_store, _locks, _ongoing, _resources, _wire
+from trade._announcing import Announcer
+from trade._deadman import Deadman
+
+
+def _put(where: Any, name: str, instead: Any) -> Callable[[], None]:
+    return lambda: setattr(where, name, instead)
+
+
+def _as_if_new(self: _ongoing.Once, call: _wire.Call, ongoing: _ongoing.Ongoing) -> _ongoing.Ongoing:
+    return ongoing
+
+
+def _confirm_only(self: _estop.Estops, order: _wire.EstopOrder, who: str) -> None:
+    self._confirm(order.request, "")
+
+
+def _any_version(decoder: Any, payload: bytes) -> Any:
+    try:
+        return decoder.decode(payload)
+    except (msgspec.DecodeError, ValueError, RecursionError) as bad:
+        raise _wire.Malformed(str(bad)) from None
+
+
+def _no_renewal(self: _locks.LockTable, numbers: Any, identity: str) -> list[int]:
+    return list(numbers)
+
+
+_run: Any = _dispatch.LocalService.run
+
+
+def _run_but_stops(self: _dispatch.LocalService, raw: Any, context: Any) -> Any:
+    return None if self.label == "peer.halt" else _run(self, raw, context)
+
+
+_encode: Any = _dispatch.Signature.encode_result
+
+
+def _nonsense(self: Any, label: str, result: Any) -> bytes:
+    return b"\xc0" if label == "peer.angle" else _encode(self, label, result)
+
+
+BREAK: dict[str, Callable[[], None]] = {
+    "runs-late": _put(_dispatch.LocalService, "too_late", lambda self, expires_ns: False),
+    "runs-twice": _put(_ongoing.Once, "begin", _as_if_new),
+    "ignores-locks": _put(_resources.Resource, "check_lock", lambda self, tokens, caller, session="": None),
+    "ignores-sessions": _put(Deadman, "session_ended", lambda self, session: None),
+    "ignores-stops": _put(_dispatch.LocalService, "run", _run_but_stops),
+    "never-latches": _put(_resources.Resource, "_is_of", lambda self, asking: True),
+    "ignores-estops": _put(_estop.Estops, "take", _confirm_only),
+    "forgets-estops": _put(_estop_store.EstopStore, "read", lambda self: []),
+    "learns-no-estops": _put(_estop.Estops, "learn", lambda self, estops: None),
+    "any-version": _put(_wire, "_decoded", _any_version),
+    "ignores-cancels": _put(_ongoing.Ongoing, "cancel", lambda self: None),
+    "endless-leases": _put(_locks.LockTable, "expire", lambda self: None),
+    "grants-what-moves": _put(_locks.LockTable, "_running", lambda self, waiter: None),
+    "answers-nonsense": _put(_dispatch.Signature, "encode_result", _nonsense),
+    "tells-no-tally": _put(Announcer, "beat", lambda self: None),
+}
+"""By name, what breaks it: called before the container begins."""

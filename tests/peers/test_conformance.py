@@ -1,0 +1,104 @@
+"""`trade conformance`: this project's own container passes it, and who breaks a rule fails the check of that rule."""
+
+import json
+import runpy
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from trade_gateway.conformance import CHECKS
+
+PEER = Path(__file__).with_name("peer.py")
+NOTICED_BY = {
+    "runs-late": "late-is-never",
+    "runs-twice": "once",
+    "ignores-locks": "locks",
+    "ignores-sessions": "session-ends",
+    "ignores-stops": "stops",
+    "never-latches": "stop-latches",
+    "ignores-estops": "estop",
+    "forgets-estops": "estop-kept",
+    "learns-no-estops": "estop-learnt",
+    "any-version": "versions",
+    "ignores-cancels": "cancels",
+    "endless-leases": "leases",
+    "grants-what-moves": "waits-for-motion",
+    "answers-nonsense": "turns",
+    "tells-no-tally": "tells-late",
+}
+"""What is broken, and which check has to fail."""
+
+
+def conformance(*words: str) -> "subprocess.CompletedProcess[str]":
+    command = [sys.executable, "-m", "trade_gateway", "conformance", *words]
+    return subprocess.run(command, capture_output=True, text=True, timeout=500, check=False)
+
+
+def told(ended: "subprocess.CompletedProcess[str]") -> list[dict[str, Any]]:
+    return [json.loads(line) for line in ended.stdout.splitlines()]
+
+
+def start(*words: str) -> str:
+    return f"{sys.executable} {PEER} {' '.join(words)}"
+
+
+def failed(outcomes: Sequence[dict[str, Any]]) -> dict[str, str]:
+    return {one["check"]: one["why"] for one in outcomes if one["outcome"] == "failed"}
+
+
+@pytest.mark.timeout(600)
+def test_a_container_of_this_project_passes_every_check() -> None:
+    ended = conformance("--peer", start(), "--json")
+    outcomes = told(ended)
+    assert failed(outcomes) == {}
+    assert [one["check"] for one in outcomes] == [one.name for one in CHECKS]
+    assert {one["outcome"] for one in outcomes} == {"ok"}
+    assert ended.returncode == 0
+
+
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize("broken", NOTICED_BY)
+def test_who_breaks_a_rule_fails_its_check(broken: str) -> None:
+    ended = conformance("--peer", start(broken), "--only", "presence", "--only", NOTICED_BY[broken], "--json")
+    assert list(failed(told(ended))) == [NOTICED_BY[broken]], ended.stdout
+    assert ended.returncode == 1
+
+
+def test_every_way_to_break_a_rule_is_tried() -> None:
+    assert set(runpy.run_path(str(PEER.with_name("broken.py")))["BREAK"]) == set(NOTICED_BY)
+
+
+def test_a_command_that_ends_fails_what_it_is_asked_and_says_what_it_said() -> None:
+    ended = conformance("--peer", f"{sys.executable} -c 'raise SystemExit(\"no robot today\")'", "--only", "presence")
+    assert ended.returncode == 1
+    assert "no robot today" in " ".join(ended.stdout.split())
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--peer", "no-such-program-anywhere"], "cannot be started"),
+        (["--peer", ""], "names no program"),
+        (["--peer", "'"], "cannot be read as words"),
+    ],
+)
+def test_a_command_that_cannot_be_started_is_an_error(words: list[str], said: str) -> None:
+    ended = conformance(*words)
+    assert ended.returncode == 1
+    assert said in " ".join(ended.stderr.split())
+
+
+def test_an_unknown_check_and_a_missing_command_are_mistakes_of_the_words() -> None:
+    assert conformance("--peer", "true", "--only", "no-such-check").returncode == 2
+    assert conformance().returncode == 2
+
+
+def test_the_checks_are_listed_with_their_rules() -> None:
+    listed = told(conformance("--list", "--json"))[0]
+    assert [one["check"] for one in listed] == [one.name for one in CHECKS]
+    assert all(one["rule"] and one["what"] for one in listed)
+    assert len({one.name for one in CHECKS}) == len(CHECKS)
