@@ -121,6 +121,22 @@ def test_a_closed_subscription_hears_nothing_and_another_goes_on(graph: Ros1) ->
     assert "b" not in first
 
 
+def test_a_topic_that_is_closed_and_opened_at_once_is_heard_at_both_ends(graph: Ros1, stand: Stand) -> None:
+    peer = stand.peer("arm")
+    peer.do("hear", "/state", "std_msgs/String")
+    peer.do("advertise", "/orders", "std_msgs/String", True)
+    peer.do("send", "/orders", {"data": "go"})
+    for number in range(5):
+        heard: list[str] = []
+        topic = graph.advertise("/state", TEXT, latched=True)
+        orders = graph.subscribe("/orders", TEXT, lambda message, who, heard=heard: heard.append(message["data"]))
+        topic.send({"data": str(number)})
+        peer.wait_for("heard", lambda told, number=number: told["data"] == str(number))
+        wait_until(lambda heard=heard: heard, "it was heard here")
+        orders.close()
+        topic.close()
+
+
 def test_what_does_not_fit_is_refused_where_it_is_sent(graph: Ros1) -> None:
     with pytest.raises(ConfigurationError, match="has no dada"):
         graph.advertise("/text", TEXT).send({"dada": "x"})

@@ -35,7 +35,7 @@ class ActionTypes(NamedTuple):
 def message_head(types: Types, type_name: str) -> Head:
     """What a frame tells of a message type. Raises ConfigurationError: it is not known."""
     text, checked = types.definition(type_name)
-    return {"type": _plain(type_name), "md5": checked, "text": _plain_text(type_name, text)}
+    return {"type": _plain(type_name), "md5": checked, "text": text}
 
 
 def service_head(types: Types, type_name: str) -> Head:
@@ -47,13 +47,15 @@ def service_head(types: Types, type_name: str) -> Head:
 
 
 def action_types(types: Types, type_name: str) -> ActionTypes:
-    """The messages around goal, result and feedback, which nobody defines. Raises ConfigurationError: not known."""
+    """The messages around goal, result and feedback, as ROS 1 names them. Raises ConfigurationError: not known."""
+    package, _, action = type_name.split("/")
     made: list[str] = []
-    for part, (_, (field, beside, beside_type)) in zip(types.parts(type_name), _AROUND.items(), strict=True):
-        name = part.replace(f"{type_name}_", f"{type_name}_Action")
-        fields = {"header": "std_msgs/msg/Header", beside: beside_type, field: part}
-        types._store.register({name: ([], [(field, (Nodetype.NAME, kind)) for field, kind in fields.items()])})
-        made.append(name)
+    for part, (suffix, (field, beside, beside_type)) in zip(types.parts(type_name), _AROUND.items(), strict=True):
+        inner, outer = f"{package}/msg/{action}{suffix}", f"{package}/msg/{action}Action{suffix}"
+        fields = {"header": "std_msgs/msg/Header", beside: beside_type, field: inner}
+        types._store.register({inner: types._store.fielddefs[part]})
+        types._store.register({outer: ([], [(name, (Nodetype.NAME, kind)) for name, kind in fields.items()])})
+        made.append(outer)
     return ActionTypes(*made)
 
 
@@ -61,14 +63,6 @@ def _plain(type_name: str) -> str:
     """``std_srvs/srv/Trigger_Request`` is ``std_srvs/TriggerRequest`` in ROS 1."""
     package, kind, name = type_name.split("/")
     return f"{package}/{name}" if kind == "msg" else f"{package}/{name.replace('_', '')}"
-
-
-def _plain_text(type_name: str, text: str) -> str:
-    package, kind, name = type_name.split("/")
-    if kind == "msg":
-        return text
-    whole = name.rpartition("_")[0]
-    return text.replace(f"{package}/{kind}/{whole}_", f"{package}/{whole}")
 
 
 def _checked_text(types: Types, type_name: str) -> str:

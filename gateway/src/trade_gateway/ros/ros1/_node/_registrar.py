@@ -39,7 +39,7 @@ class Registrar:
         self._handler = handler
         self._peers = peers
         self._healthy = healthy
-        self._done: set[Entry] = set()
+        self._done: dict[Entry, Any] = {}
         self._asked: dict[tuple[str, str], float] = {}
         self._turn = threading.Lock()
         self._wake = threading.Event()
@@ -57,9 +57,9 @@ class Registrar:
         if not self._turn.acquire(timeout=timeout_s):
             return
         try:
-            for entry, (_, uri) in _open().items():
-                if entry in self._done and time.monotonic() < deadline:
-                    self._unregister(entry, uri)
+            for entry in list(self._done):
+                if time.monotonic() < deadline:
+                    self._unregister(entry)
         except (Unreachable, Refused):
             pass
         finally:
@@ -99,26 +99,28 @@ class Registrar:
             return ""
         return uri if uri != self._handler.uri and is_there(uri, self._node) else ""
 
-    def _register(self, wanted: dict[Entry, tuple[str, str]], listed: set[Entry]) -> None:
-        for entry, (what, uri) in wanted.items():
+    def _register(self, wanted: dict[Entry, tuple[str, Any]], listed: set[Entry]) -> None:
+        for entry, (what, opened) in wanted.items():
             if self._ended:
                 return
-            if entry in self._done and entry in listed:
+            if self._done.get(entry) is opened and entry in listed:
                 continue
+            if self._done.pop(entry, opened) is not opened:
+                self._unregister(entry)  # closed and opened meanwhile: who was connected must be told to connect again
             kind, name = entry
-            arguments = (name, uri, self._handler.uri) if kind == "service" else (name, what, self._handler.uri)
-            told = ask(self._master, _REGISTER[kind], self._node, *arguments)
-            self._done.add(entry)
+            told = ask(self._master, _REGISTER[kind], self._node, name, what, self._handler.uri)
+            self._done[entry] = opened
             if kind == "heard":
                 self._handler.reg_man.publisher_update(name, told)
-        for entry in self._done - set(_open()):
-            # a service is unregistered by its address, which is that of all our services
-            self._unregister(entry, ROSRPC + "{}:{}".format(*get_tcpros_server_address()))
-            self._done.discard(entry)
+        for entry in set(self._done) - set(_open()):
+            self._unregister(entry)
+            del self._done[entry]
 
-    def _unregister(self, entry: Entry, uri: str) -> None:
+    def _unregister(self, entry: Entry) -> None:
         kind, name = entry
-        ask(self._master, _UNREGISTER[kind], self._node, name, uri if kind == "service" else self._handler.uri)
+        # a service is unregistered by its address, which is that of all our services
+        uri = ROSRPC + "{}:{}".format(*get_tcpros_server_address()) if kind == "service" else self._handler.uri
+        ask(self._master, _UNREGISTER[kind], self._node, name, uri)
 
     def _see(self, state: Any) -> None:
         names = {name for entries in state for _, nodes in entries for name in nodes} - {self._node}
@@ -141,12 +143,14 @@ class Registrar:
                 self._handler.reg_man.publisher_update(topic, lost)
 
 
-def _open() -> dict[Entry, tuple[str, str]]:
-    """What this node has open: type (of topics), address (of services)."""
-    topics = get_topic_manager()
-    found = {("topic", name): (kind, "") for name, kind in topics.get_publications()}
-    found.update({("heard", name): (kind, "") for name, kind in topics.get_subscriptions()})
-    found.update({("service", name): ("", uri) for name, uri in get_service_manager().get_services()})
+def _open() -> dict[Entry, tuple[str, Any]]:
+    """What this node has open: its type (of a service: its address), and the very thing."""
+    topics, services = get_topic_manager(), get_service_manager()
+    with topics.lock:
+        found = {("topic", name): (made.type, made) for name, made in topics.pubs.items()}
+        found.update({("heard", name): (made.type, made) for name, made in topics.subs.items()})
+    with services.lock:
+        found.update({("service", name): (made.uri, made) for name, made in services.map.items()})
     return found
 
 
