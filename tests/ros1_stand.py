@@ -11,13 +11,14 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 
 from waiting import wait_until
 
 PYTHON = "/usr/bin/python3"
 _PEER = Path(__file__).parent / "ros" / "ros1" / "peer.py"
-_NEEDED = "import rospy, rosmaster, actionlib, sensor_msgs.msg, std_srvs.srv"
+_NEEDED = "import rospy, rosmaster, actionlib, move_base_msgs.msg, sensor_msgs.msg, std_srvs.srv, trajectory_msgs.msg"
 _END_S = 30.0
 
 
@@ -136,6 +137,19 @@ class Stand:
         assert self._master.poll() is None, "the master has ended"
         with socket.socket() as tried:
             return tried.connect_ex(("127.0.0.1", self._port)) == 0
+
+
+def our_node() -> psutil.Process:
+    """The child that is our node."""
+    (found,) = [child for child in psutil.Process().children() if "/trade" in _words(child)]
+    return found
+
+
+def _words(process: psutil.Process) -> list[str]:
+    try:
+        return process.cmdline()
+    except psutil.NoSuchProcess:  # or it is one that has ended
+        return []
 
 
 def _free_port() -> int:

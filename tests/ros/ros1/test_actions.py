@@ -7,7 +7,7 @@ import pytest
 
 from ros1_stand import Peer, Stand
 from trade_gateway.ros._graph import Ended, Goal, Outcome, Pursuit, RosRefused, RosUnreachable
-from trade_gateway.ros.ros1 import Ros1
+from trade_gateway.ros.ros1 import Ros1, _action_client
 from waiting import PATIENCE_S, wait_until
 
 TEST = "actionlib/action/Test"
@@ -63,7 +63,8 @@ def test_a_goal_that_is_rejected_is_refused(graph: Ros1, stand: Stand) -> None:
         pursue(graph, 1).wait(PATIENCE_S)
 
 
-def test_an_action_that_nobody_serves_is_unreachable(graph: Ros1) -> None:
+def test_an_action_that_nobody_serves_is_unreachable(graph: Ros1, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_action_client, "_THERE_S", 0.2)
     with pytest.raises(RosUnreachable, match="/move: nobody serves this action"):
         pursue(graph, 1)
 

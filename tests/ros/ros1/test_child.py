@@ -10,7 +10,7 @@ from typing import Any
 import psutil
 import pytest
 
-from ros1_stand import Stand
+from ros1_stand import Stand, our_node
 from trade_gateway.ros.ros1 import Ros1, _child
 from trade_gateway.ros.ros1._child import environment
 from waiting import wait_until
@@ -67,11 +67,11 @@ def test_our_node_ends_when_its_parent_is_killed(stand: Stand) -> None:
 def test_our_node_that_stands_still_is_ended_and_started_again(
     stand: Stand, start_ros1: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(_child, "_SILENT_S", 4.0)
+    monkeypatch.setattr(_child, "_SILENT_S", 3.0)
     monkeypatch.setattr(_child, "_END_S", 0.5)
     graph: Ros1 = start_ros1()
     wait_until(lambda: not graph.healthy, "the master knows of us")
-    (before,) = [child for child in psutil.Process().children() if "/trade" in child.cmdline()]
+    before = our_node()
     before.send_signal(signal.SIGSTOP)
     wait_until(lambda: not before.is_running(), "it is ended")
     wait_until(lambda: not graph.healthy, "all is well again")
@@ -85,6 +85,5 @@ def test_nothing_is_written_beside_the_program_of_our_node(stand: Stand, graph: 
 
 def test_a_port_of_ours_is_open_on_loopback_only(stand: Stand, graph: Ros1) -> None:
     graph.serve("/lights", "std_srvs/srv/Trigger", lambda request, who: {})
-    (node,) = [child for child in psutil.Process().children() if "/trade" in child.cmdline()]
-    listening = [at.laddr.ip for at in node.net_connections() if at.status == psutil.CONN_LISTEN]
+    listening = [at.laddr.ip for at in our_node().net_connections() if at.status == psutil.CONN_LISTEN]
     assert set(listening) == {"127.0.0.1"}

@@ -4,10 +4,9 @@ import signal
 from pathlib import Path
 from typing import Any
 
-import psutil
 import pytest
 
-from ros1_stand import Stand
+from ros1_stand import Stand, our_node
 from trade.errors import ConfigurationError
 from trade_gateway.ros._graph import Ended, Goal, Outcome, RosUnreachable
 from trade_gateway.ros.ros1 import Ros1
@@ -17,11 +16,6 @@ TEXT = "std_msgs/msg/String"
 TRIGGER = "std_srvs/srv/Trigger"
 
 
-def our_node() -> psutil.Process:
-    (found,) = [child for child in psutil.Process().children() if "/trade" in child.cmdline()]
-    return found
-
-
 class Watch:
     def __init__(self, graph: Ros1) -> None:
         self.told: list[tuple[str, bool]] = []
@@ -29,6 +23,13 @@ class Watch:
 
     def until(self, name: str, there: bool) -> None:
         wait_until(lambda: (name, there) in self.told, f"{name} is told of: {self.told}")
+
+
+def answers(graph: Ros1) -> bool:
+    try:
+        return graph.call("/lights", TRIGGER, {}, PATIENCE_S)["success"]
+    except RosUnreachable:
+        return False
 
 
 # --- nodes
@@ -111,6 +112,19 @@ def test_a_master_that_was_killed_and_started_again_is_told_everything_again(gra
     watch.until("/old", there=False)
 
 
+def test_a_master_that_was_replaced_while_nobody_looked_is_told_everything_again(graph: Ros1, stand: Stand) -> None:
+    graph.serve("/lights", TRIGGER, lambda request, who: {"success": True})
+    wait_until(lambda: answers(graph), "its service is found")
+    node = our_node()
+    node.suspend()
+    stand.kill_master()
+    stand.start_master()
+    node.resume()
+    peer = stand.peer("arm")
+    peer.do("call", "/lights", "std_srvs/Trigger", {})
+    assert peer.wait_for("called")["success"]
+
+
 def test_a_master_that_comes_late_is_found(stand: Stand, start_ros1: Any) -> None:
     stand.kill_master()
     graph = start_ros1()
@@ -122,7 +136,8 @@ def test_a_master_that_comes_late_is_found(stand: Stand, start_ros1: Any) -> Non
     peer = stand.peer("arm")
     peer.do("hear", "/state", "std_msgs/String")
     assert peer.wait_for("heard")["data"] == "early"
-    assert graph.call("/lights", TRIGGER, {}, PATIENCE_S)["success"]
+    wait_until(lambda: not graph.healthy, "it is found")
+    wait_until(lambda: answers(graph), "its service is found")
 
 
 # --- our node
@@ -149,7 +164,7 @@ def test_our_node_that_was_killed_is_started_again_with_everything_that_was_open
     peer.do("advertise", "/orders", "std_msgs/String", True)
     peer.do("send", "/orders", {"data": "go"})
     wait_until(lambda: heard == ["go"], "the subscription is open again")
-    assert graph.call("/lights", TRIGGER, {}, PATIENCE_S)["success"]
+    wait_until(lambda: answers(graph), "its service is found")
 
 
 def test_a_goal_survives_the_death_of_our_node(graph: Ros1, stand: Stand) -> None:
@@ -187,7 +202,7 @@ def test_our_node_ends_with_its_parent_and_leaves_nothing_at_the_master(stand: S
     first.serve("/lights", TRIGGER, lambda request, who: {"success": True})
     wait_until(lambda: not first.healthy, "the master knows of us")
     second = start_ros1(node="/other")
-    assert second.call("/lights", TRIGGER, {}, PATIENCE_S)["success"]
+    wait_until(lambda: answers(second), "its service is found")
     first.close()
     first.close()
     assert first.healthy

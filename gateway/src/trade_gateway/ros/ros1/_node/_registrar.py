@@ -83,7 +83,6 @@ class Registrar:
             self._see(state)
             self._connect(state[0])
         except Unreachable as problem:
-            self._done.clear()
             return f"no master at {self._master}: {problem}"
         except Refused as problem:
             return f"the master at {self._master}: {problem}"
