@@ -7,6 +7,7 @@ from collections.abc import Iterator
 
 import pytest
 
+from trade_gateway.ros.ros1._node import _frames
 from trade_gateway.ros.ros1._node._frames import Channel, Head
 from waiting import PATIENCE_S, wait_until
 
@@ -65,6 +66,21 @@ def test_who_waits_to_read_is_woken_by_the_end_of_its_own_side(pair: Pair) -> No
     reader.join(PATIENCE_S)
     assert not reader.is_alive()
     other.put({"op": "late"})
+
+
+def test_what_is_too_large_is_left_out_and_all_else_goes_on(
+    pair: Pair, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(_frames, "_LARGEST", 1000)
+    one, other = pair
+    heard, reader = read(other)
+    one.put({"n": 1}, bytes(1001))
+    one.put({"n": 2}, bytes(1000))
+    wait_until(lambda: heard, "it came")
+    assert [head["n"] for head, _ in heard] == [2]
+    assert "1001 bytes" in caplog.text
+    one.close()
+    reader.join(PATIENCE_S)
 
 
 def test_what_is_no_frame_ends_the_channel() -> None:

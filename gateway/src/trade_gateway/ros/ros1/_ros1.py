@@ -9,7 +9,18 @@ from pathlib import Path
 from typing import Any, Final, cast
 
 from trade.errors import ConfigurationError
-from trade_gateway.ros._graph import Answer, Closes, Goal, Heard, NodeTold, Outcome, Publisher, Pursuit, RosRefused
+from trade_gateway.ros._graph import (
+    Answer,
+    Closes,
+    Goal,
+    Graph,
+    Heard,
+    NodeTold,
+    Outcome,
+    Publisher,
+    Pursuit,
+    RosRefused,
+)
 from trade_gateway.ros._types import Message, Types
 from trade_gateway.ros.ros1._action_client import ActionClient
 from trade_gateway.ros.ros1._action_server import ActionServer
@@ -52,7 +63,7 @@ class _Closing:
             step()
 
 
-class Ros1:
+class Ros1(Graph):
     """A ROS 1 system, as a node of it. See `Graph`."""
 
     def __init__(

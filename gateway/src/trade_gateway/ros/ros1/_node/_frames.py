@@ -19,7 +19,7 @@ Heard = Callable[[Head, bytes], object]
 
 _LENGTHS = struct.Struct("<II")
 _LARGEST = 256 << 20
-"""Bytes of a frame; above is no frame, but a stream that went wrong."""
+"""Bytes of a frame's body; above is no frame, but a stream that went wrong."""
 _log = logging.getLogger("trade.ros1")
 
 
@@ -36,6 +36,9 @@ class Channel:
 
     def put(self, head: Head, body: bytes = b"", *, key: str = "", most: int = 0) -> None:
         """Have a frame sent; of those with this key, this many wait at most (0: any number). Nothing after the end."""
+        if len(body) > _LARGEST:
+            _log.error("a message of %s bytes was left out: %s", len(body), head)
+            return
         with self._ready:
             if self._closed:
                 return
@@ -52,8 +55,8 @@ class Channel:
         try:
             while True:
                 head_size, body_size = _LENGTHS.unpack(self._exactly(_LENGTHS.size))
-                if head_size + body_size > _LARGEST:
-                    _log.error("a frame of %s bytes: not from the other end's program", head_size + body_size)
+                if max(head_size, body_size) > _LARGEST:
+                    _log.error("a frame of %s bytes: not from the other end's program", max(head_size, body_size))
                     return
                 head = json.loads(self._exactly(head_size))
                 heard(head, self._exactly(body_size))
