@@ -142,10 +142,10 @@ def test_what_does_not_fit_is_refused_where_it_is_sent(graph: Ros1) -> None:
         graph.advertise("/text", TEXT).send({"dada": "x"})
 
 
-@pytest.mark.parametrize("name", ["text", "/", "/a b", "/1st", "/a/", ""])
-def test_a_name_that_is_none_of_ros_is_refused(graph: Ros1, name: str) -> None:
-    with pytest.raises(ConfigurationError, match="is no global name"):
-        graph.advertise(name, TEXT)
+def test_a_name_that_is_none_of_ros_is_refused(graph: Ros1) -> None:
+    for name in ("text", "/", "/a b", "/1st", "/a/", "", "/a\n"):
+        with pytest.raises(ConfigurationError, match="is no global name"):
+            graph.advertise(name, TEXT)
 
 
 def test_a_topic_cannot_be_of_two_types_here(graph: Ros1) -> None:
