@@ -71,10 +71,11 @@ class Child:
             self._words.clear()
             problem = self._live()
             said = f": {self._words[-1]}" if self._words else ""
-            self.problem = f"the node of ROS 1 {problem}{said}"
+            before, self.problem = self.problem, f"the node of ROS 1 {problem}{said}"
             if self._closed.is_set():
                 return
-            _log.warning("%s; it is started again", self.problem)
+            if self.problem != before:
+                _log.warning("%s; it is started again", self.problem)
             steady = time.monotonic() - began > _STEADY_S
             pause_s = _FIRST_PAUSE_S if steady else min(2 * pause_s, _LAST_PAUSE_S)
             self._closed.wait(pause_s)
