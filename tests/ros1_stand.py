@@ -26,7 +26,8 @@ def need_ros1() -> None:
     """Skip where there is no ROS 1, and fail there in CI."""
     try:
         tried = subprocess.run([PYTHON, "-c", _NEEDED], capture_output=True, timeout=60, check=False)
-        said = tried.stderr.decode().strip().rpartition("\n")[2] if tried.returncode else ""
+        why = tried.stderr.decode().strip().rpartition("\n")[2] or f"{PYTHON} ends with {tried.returncode}"
+        said = why if tried.returncode else ""
     except OSError as error:
         said = str(error)
     if said:
