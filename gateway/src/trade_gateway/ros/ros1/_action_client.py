@@ -1,0 +1,186 @@
+"""Goals of ours at an action of theirs: five topics, as the wire description of actionlib has them.
+
+Source: "actionlib/DetailedDescription" on wiki.ros.org, and the constants of actionlib_msgs/GoalStatus.
+"""
+
+import itertools
+import threading
+import time
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future, InvalidStateError
+from concurrent.futures import TimeoutError as NotYet
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any, Final
+
+from trade_gateway.ros._graph import Ended, Outcome, RosRefused, RosUnreachable
+from trade_gateway.ros._types import Message
+from trade_gateway.ros.ros1._status import ENDED, Status, now
+from trade_gateway.ros.ros1._wire import action_types
+
+if TYPE_CHECKING:
+    from trade_gateway.ros.ros1._ros1 import Ros1
+
+__all__ = ["ActionClient"]
+
+_THERE_S: Final = 5.0
+"""For an action to show up, as its client meets it for the first time."""
+_LOOK_S: Final = 0.05
+_SILENT_S: Final = 10.0
+"""Servers tell the state of their goals several times a second."""
+_RESULT_S: Final = 5.0
+"""From the state that says the end to the result; they travel on connections of their own."""
+_QUEUE: Final = 100
+_HOW: Final = {
+    Status.SUCCEEDED: Ended.SUCCEEDED,
+    Status.PREEMPTED: Ended.CANCELED,
+    Status.RECALLED: Ended.CANCELED,
+    Status.ABORTED: Ended.ABORTED,
+}
+
+
+class _Goal:
+    """One goal of ours. See `Pursuit`."""
+
+    def __init__(self, client: "ActionClient", number: str, feedback: Callable[[Message], object] | None) -> None:
+        self._client = client
+        self._number = number
+        self.feedback = feedback
+        self.server = ""
+        self.end: Future[Outcome] = Future()
+        self.known = False
+        self.heard_at = time.monotonic()
+        self.ended_at: float | None = None
+
+    def wait(self, timeout_s: float) -> Outcome:
+        deadline = time.monotonic() + timeout_s
+        while True:
+            left_s = deadline - time.monotonic()
+            try:
+                return self.end.result(max(min(left_s, 0.5), 0))
+            except NotYet:
+                if left_s <= 0:
+                    raise self._client.unreachable(f"nothing was heard of its end within {timeout_s:.3g} s") from None
+            self._judge_silence()
+
+    def cancel(self) -> None:
+        self._client.cancel(self._number)
+
+    def fail(self, error: Exception) -> None:
+        """It is known to have no result."""
+        with suppress(InvalidStateError):
+            self.end.set_exception(error)
+
+    def _judge_silence(self) -> None:
+        if time.monotonic() - self.heard_at > _SILENT_S:
+            self.fail(self._client.unreachable(f"its server {self.server} has told nothing of it for {_SILENT_S:g} s"))
+
+
+class ActionClient:
+    """All our goals at one action; its topics stay open until `close`."""
+
+    def __init__(self, graph: "Ros1", name: str, type_name: str) -> None:
+        types = action_types(graph.types, type_name)
+        self.type_name: Final = type_name
+        self._graph = graph
+        self._name = name
+        self._numbers = itertools.count(1)
+        self._lock = threading.Lock()
+        self._goals: dict[str, _Goal] = {}
+        self._goal = graph.publish(f"{name}/goal", types.goal, latched=False, most=_QUEUE)
+        self._cancel = graph.publish(f"{name}/cancel", "actionlib_msgs/msg/GoalID", latched=False, most=_QUEUE)
+        heard = {
+            "status": ("actionlib_msgs/msg/GoalStatusArray", self._status),
+            "feedback": (types.feedback, self._feedback),
+            "result": (types.result, self._result),
+        }
+        opened = [graph.hear(f"{name}/{topic}", kind, told, most=_QUEUE) for topic, (kind, told) in heard.items()]
+        self._ends = [self._goal.opened, self._cancel.opened, *(one for one, _ in opened)]
+        self._steps = [step for _, steps in opened for step in steps]
+
+    def pursue(self, goal: Mapping[str, Any], feedback: Callable[[Message], object] | None) -> _Goal:
+        """Send a goal. Raises RosUnreachable: nobody serves it."""
+        number = f"{self._graph.node}-{next(self._numbers)}-{time.time():.9f}"
+        sent = {"header": {"stamp": now()}, "goal_id": {"id": number, "stamp": now()}, "goal": goal}
+        pursued = _Goal(self, number, feedback)
+        pursued.server = self._server()
+        pursued.heard_at = time.monotonic()
+        with self._lock:
+            self._goals[number] = pursued
+        pursued.end.add_done_callback(lambda _: self._goals.pop(number, None))
+        self._goal.send(sent)
+        return pursued
+
+    def cancel(self, number: str) -> None:
+        """Ask for the end of a goal."""
+        self._cancel.send({"id": number})
+
+    def unreachable(self, problem: str) -> RosUnreachable:
+        """An error of this action."""
+        return RosUnreachable(what=self._name, problem=problem)
+
+    def close(self) -> None:
+        """Idempotent."""
+        for step in (*self._steps, self._goal.close, self._cancel.close):
+            step()
+        for goal in self._all():
+            goal.fail(self.unreachable("it was closed here"))
+
+    def _server(self) -> str:
+        """The node that has all five topics."""
+        deadline = time.monotonic() + _THERE_S
+        while True:
+            left_s = deadline - time.monotonic()
+            ends = self._graph.connected(self._name, self._ends, max(left_s, 0.5))
+            if servers := ends[0].intersection(*ends[1:]):
+                return min(servers)
+            if left_s <= 0:
+                raise self.unreachable("nobody serves this action")
+            threading.Event().wait(_LOOK_S)
+
+    def _all(self) -> list[_Goal]:
+        with self._lock:
+            return list(self._goals.values())
+
+    # --- what is heard
+
+    def gone(self, name: str) -> None:
+        """A node is gone. That our own one is says nothing of theirs, and is not told here."""
+        for goal in self._all():
+            if goal.server == name:
+                goal.fail(self.unreachable(f"its server {name} is gone"))
+
+    def _status(self, message: Message, who: str) -> None:
+        states = {one["goal_id"]["id"]: Status(one["status"]) for one in message["status_list"]}
+        at = time.monotonic()
+        for number, goal in list(self._goals.items()):
+            if goal.server == who:
+                self._judge(goal, states.get(number), at)
+
+    def _judge(self, goal: _Goal, state: Status | None, at: float) -> None:
+        if state is None and goal.known:
+            goal.fail(self.unreachable(f"its server {goal.server} knows of it no more"))
+        elif state is not None:
+            goal.known, goal.heard_at = True, at
+            if state in ENDED:
+                goal.ended_at = goal.ended_at or at
+                if at - goal.ended_at > _RESULT_S:
+                    goal.fail(self.unreachable(f"it has ended ({state.name}), and its result was not heard"))
+
+    def _feedback(self, message: Message, _: str) -> None:
+        goal = self._goals.get(message["status"]["goal_id"]["id"])
+        if goal is not None and goal.feedback is not None:
+            goal.feedback(message["feedback"])
+
+    def _result(self, message: Message, _: str) -> None:
+        status = message["status"]
+        goal = self._goals.get(status["goal_id"]["id"])
+        if goal is None:
+            return
+        state = Status(status["status"])
+        if how := _HOW.get(state):
+            with suppress(InvalidStateError):
+                goal.end.set_result(Outcome(how, message["result"], status["text"]))
+        elif state is Status.REJECTED:
+            goal.fail(RosRefused(what=self._name, problem=status["text"] or "the goal was rejected"))
+        else:
+            goal.fail(self.unreachable(f"its server calls it {state.name}: {status['text']}"))

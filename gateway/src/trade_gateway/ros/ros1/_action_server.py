@@ -1,0 +1,245 @@
+"""An action of ours: five topics, as the wire description of actionlib has them.
+
+One goal runs, one waits for its end; who comes later takes the waiting one's place and has the running one canceled.
+Source: "actionlib/DetailedDescription" on wiki.ros.org; there, too, what a cancel without an id or with a time means.
+"""
+
+import itertools
+import logging
+import threading
+import time
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, Final
+
+from trade.errors import ConfigurationError
+from trade_gateway.ros._graph import Ended, Goal, Outcome
+from trade_gateway.ros._types import Message
+from trade_gateway.ros.ros1._status import ENDED, Status, Time, now
+from trade_gateway.ros.ros1._wire import action_types
+
+if TYPE_CHECKING:
+    from trade_gateway.ros.ros1._ros1 import Ros1
+
+__all__ = ["ActionServer"]
+
+_EVERY_S: Final = 0.2
+_KEPT_S: Final = 5.0
+"""States of goals that have ended, and of cancels whose goal has not come, are told for so long."""
+_END_S: Final = 2.0
+_QUEUE: Final = 100
+_MOST: Final = 100
+"""Goals whose state is told."""
+_HOW: Final = {
+    Ended.SUCCEEDED: Status.SUCCEEDED,
+    Ended.CANCELED: Status.PREEMPTED,
+    Ended.ABORTED: Status.ABORTED,
+}
+_NEVER: Final[Time] = {"sec": 0, "nanosec": 0}
+_log: Final = logging.getLogger("trade.ros1")
+
+
+class _Taken:
+    """A goal that came. See `Goal`; changed under the server's lock."""
+
+    def __init__(self, server: "ActionServer", goal_id: Message, message: Message, client: str) -> None:
+        self._server = server
+        self._tells: list[Callable[[], object]] = []
+        self._canceled = False
+        self.goal_id = goal_id
+        self.message = message
+        self.client = client
+        self.status = Status.PENDING
+        self.text = ""
+        self.ended_at = 0.0
+
+    def feedback(self, message: Mapping[str, Any]) -> None:
+        self._server.feedback(self, message)
+
+    def when_canceled(self, tell: Callable[[], object]) -> None:
+        with self._server.lock:
+            if not self._canceled:
+                self._tells.append(tell)
+                return
+        tell()
+
+    def cancel(self) -> None:
+        """It is to end."""
+        with self._server.lock:
+            tells, self._tells, self._canceled = self._tells, [], True
+            if self.status is Status.ACTIVE:
+                self.status = Status.PREEMPTING
+        for tell in tells:
+            try:
+                tell()
+            except Exception:  # noqa: BLE001 - it is somebody else's
+                _log.exception("the cancel of a goal failed")
+
+    @property
+    def state(self) -> Message:
+        """As its client is told."""
+        return {"goal_id": self.goal_id, "status": int(self.status), "text": self.text}
+
+
+class ActionServer:
+    """See the module."""
+
+    def __init__(self, graph: "Ros1", name: str, type_name: str, do: Callable[[Goal], Outcome]) -> None:
+        types = action_types(graph.types, type_name)
+        self._name = name
+        self._do = do
+        self._numbers = itertools.count(1)
+        self._node = graph.node
+        self.lock = threading.RLock()
+        self._goals: dict[str, _Taken] = {}
+        self._early: dict[str, float] = {}
+        self._running: _Taken | None = None
+        self._waiting: _Taken | None = None
+        self._cancels_until = (0, 0)
+        self._closed = threading.Event()
+        self._idle = threading.Condition(self.lock)
+        # who connects while a result is on its way, as after a restart of our node, hears it yet
+        self._result = graph.publish(f"{name}/result", types.result, latched=True, most=_QUEUE)
+        self._feedback = graph.publish(f"{name}/feedback", types.feedback, latched=False, most=_QUEUE)
+        self._status = graph.publish(f"{name}/status", "actionlib_msgs/msg/GoalStatusArray", latched=True, most=_QUEUE)
+        _, cancels = graph.hear(f"{name}/cancel", "actionlib_msgs/msg/GoalID", self._cancel_came, most=_QUEUE)
+        _, goals = graph.hear(f"{name}/goal", types.goal, self._goal_came, most=_QUEUE)
+        self._ends = (*cancels, *goals, self._result.close, self._feedback.close, self._status.close)
+        threading.Thread(target=self._tell_often, name=f"trade-ros1{name}/status", daemon=True).start()
+
+    def feedback(self, goal: _Taken, message: Mapping[str, Any]) -> None:
+        """Tell the client how far its goal is."""
+        with self.lock:
+            state = goal.state
+        if goal.status not in ENDED:
+            self._feedback.send({"header": {"stamp": now()}, "status": state, "feedback": message})
+
+    def close(self) -> None:
+        """Cancel what runs, give it two seconds to end, and withdraw. Idempotent."""
+        with self.lock:
+            self._closed.set()
+            running, waiting, self._waiting = self._running, self._waiting, None
+        if waiting is not None:
+            self._end(waiting, Status.RECALLED, {}, "the action is withdrawn")
+        if running is not None:
+            running.cancel()
+            with self._idle:
+                self._idle.wait_for(lambda: self._running is None, _END_S)
+        for end in self._ends:
+            end()
+
+    # --- what comes
+
+    def _goal_came(self, message: Message, who: str) -> None:
+        goal_id = message["goal_id"]
+        if not goal_id["id"]:
+            goal_id = {"id": f"{self._node}-{next(self._numbers)}-{time.time():.9f}", "stamp": goal_id["stamp"]}
+        taken = _Taken(self, goal_id, message["goal"], who)
+        with self.lock:
+            if goal_id["id"] in self._goals or self._closed.is_set():
+                return  # sent twice
+            self._goals[goal_id["id"]] = taken
+            recalled = self._is_recalled(goal_id)
+            replaced, before = None, self._running
+            if not recalled:
+                replaced, self._waiting = self._waiting, taken
+        if recalled:
+            self._end(taken, Status.RECALLED, {}, "it was canceled before it came")
+            return
+        if replaced is not None:
+            self._end(replaced, Status.RECALLED, {}, "another goal took its place")
+        if before is not None:
+            before.cancel()
+        self._next()
+
+    def _is_recalled(self, goal_id: Message) -> bool:
+        stamp = _of(goal_id["stamp"])
+        return self._early.pop(goal_id["id"], None) is not None or (0, 0) < stamp <= self._cancels_until
+
+    def _cancel_came(self, message: Message, _: str) -> None:
+        number, until = message["id"], _of(message["stamp"])
+        with self.lock:
+            self._cancels_until = max(self._cancels_until, until)
+            meant = [
+                goal for goal in self._goals.values() if goal.status not in ENDED and _is_meant(goal, number, until)
+            ]
+            if number and number not in self._goals:
+                self._early[number] = time.monotonic()
+        for goal in meant:
+            self._cancel(goal)
+
+    def _cancel(self, goal: _Taken) -> None:
+        with self.lock:
+            waits = self._waiting is goal
+            if waits:
+                self._waiting = None
+        if waits:
+            self._end(goal, Status.RECALLED, {}, "")
+        else:
+            goal.cancel()
+            self._tell()
+
+    # --- what is done
+
+    def _next(self) -> None:
+        with self.lock:
+            if self._running is not None or self._waiting is None:
+                return
+            self._running, self._waiting = self._waiting, None
+            self._running.status = Status.ACTIVE
+            run = threading.Thread(target=self._run, args=(self._running,), name=f"trade-ros1{self._name}", daemon=True)
+        self._tell()
+        run.start()
+
+    def _run(self, goal: _Taken) -> None:
+        try:
+            outcome = self._do(goal)
+            self._end(goal, _HOW[outcome.how], outcome.result, outcome.text)
+        except Exception as error:  # noqa: BLE001 - whatever it is, the client must hear of an end
+            self._end(goal, Status.ABORTED, {}, str(error) or type(error).__name__)
+        finally:
+            with self._idle:
+                self._running = None
+                self._idle.notify_all()
+            self._next()
+
+    def _end(self, goal: _Taken, status: Status, result: Mapping[str, Any], text: str) -> None:
+        state = {"goal_id": goal.goal_id, "status": int(status), "text": text}
+        made = {"header": {"stamp": now()}, "status": state, "result": result}
+        try:
+            self._result.send(made)
+        except ConfigurationError as error:
+            status, text = Status.ABORTED, f"its result cannot be told: {error}"
+            self._result.send({**made, "status": {**state, "status": int(status), "text": text}, "result": {}})
+        with self.lock:
+            goal.status, goal.text, goal.ended_at = status, text, time.monotonic()
+        self._tell()
+
+    # --- what is told
+
+    def _tell_often(self) -> None:
+        while not self._closed.wait(_EVERY_S):
+            self._tell()
+
+    def _tell(self) -> None:
+        with self.lock:
+            old = time.monotonic() - _KEPT_S
+            self._goals = {
+                number: goal
+                for number, goal in itertools.islice(reversed(self._goals.items()), _MOST)
+                if goal.status not in ENDED or goal.ended_at > old
+            }
+            self._goals = dict(reversed(self._goals.items()))
+            self._early = {number: at for number, at in self._early.items() if at > old}
+            states = [goal.state for goal in self._goals.values()]
+            self._status.send({"header": {"stamp": now()}, "status_list": states})
+
+
+def _is_meant(goal: _Taken, number: str, until: tuple[int, int]) -> bool:
+    """A cancel with an id means that goal; with a time, all of that time and before; with neither, all."""
+    if not number and until == (0, 0):
+        return True
+    return goal.goal_id["id"] == number or (0, 0) < _of(goal.goal_id["stamp"]) <= until
+
+
+def _of(stamp: Message) -> tuple[int, int]:
+    return stamp["sec"], stamp["nanosec"]

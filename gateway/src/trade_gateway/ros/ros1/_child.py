@@ -1,0 +1,148 @@
+"""Our node as a process: started, read, and started again whenever it ends."""
+
+import logging
+import os
+import socket
+import subprocess
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+from typing import IO, Final
+from urllib.parse import urlparse
+
+from trade_gateway.ros.ros1._node._frames import Channel, Head
+
+__all__ = ["Child"]
+
+_log: Final = logging.getLogger("trade.ros1")
+_HERE: Final = str(Path(__file__).parent)
+_START: Final = "import runpy, sys; sys.path.append(sys.argv.pop(1)); runpy.run_module('_node', run_name='__main__')"
+_SILENT_S: Final = 15.0
+"""It tells its health twice a second; one that is silent for so long is ended."""
+_END_S: Final = 4.0
+"""For unregistering."""
+_FIRST_PAUSE_S: Final = 0.2
+_LAST_PAUSE_S: Final = 5.0
+_STEADY_S: Final = 10.0
+"""One that lived so long is started again at once."""
+
+
+class Child:
+    """The process. `came` is told of the channel of each new one, `gone` of its end, `heard` of its frames."""
+
+    def __init__(
+        self,
+        *,
+        master: str,
+        node: str,
+        python: str,
+        ip: str,
+        came: Callable[[Channel], object],
+        gone: Callable[[], object],
+        heard: Callable[[Head, bytes], object],
+    ) -> None:
+        self._command = [python, "-B", "-c", _START, _HERE]
+        self._arguments = [master, node]
+        self._environment = environment(master, ip)
+        self._told = came, gone, heard
+        self._closed = threading.Event()
+        self._lock = threading.Lock()
+        self._channel: Channel | None = None
+        self._words: deque[str] = deque(maxlen=1)
+        self.problem = "the node of ROS 1 is starting"
+        self._thread = threading.Thread(target=self._run, name="trade-ros1", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Idempotent; waits for its end, which unregisters it."""
+        self._closed.set()
+        with self._lock:
+            if self._channel is not None:
+                self._channel.close()
+        if threading.current_thread() is not self._thread:
+            self._thread.join(_END_S + 2)
+
+    def _run(self) -> None:
+        pause_s = _FIRST_PAUSE_S
+        while not self._closed.is_set():
+            began = time.monotonic()
+            self._words.clear()
+            problem = self._live()
+            said = f": {self._words[-1]}" if self._words else ""
+            before, self.problem = self.problem, f"the node of ROS 1 {problem}{said}"
+            if self._closed.is_set():
+                return
+            if self.problem != before:
+                _log.warning("%s; it is started again", self.problem)
+            steady = time.monotonic() - began > _STEADY_S
+            pause_s = _FIRST_PAUSE_S if steady else min(2 * pause_s, _LAST_PAUSE_S)
+            self._closed.wait(pause_s)
+
+    def _live(self) -> str:
+        """One life; returns how it ended."""
+        came, gone, heard = self._told
+        ours, its = socket.socketpair()
+        with ours:
+            try:
+                with its:
+                    process = self._start(its)
+            except OSError as error:
+                return f"cannot be started: {error}"
+            words = threading.Thread(target=self._listen, args=(process.stderr,), name="trade-ros1-words", daemon=True)
+            words.start()
+            ours.settimeout(_SILENT_S)
+            channel = Channel(ours, "trade-ros1")
+            with self._lock:
+                self._channel = channel
+            try:
+                if not self._closed.is_set():
+                    came(channel)
+                    channel.read(heard)
+            finally:
+                channel.close()
+                with self._lock:
+                    self._channel = None
+                gone()
+                code = _ended(process)
+                words.join(_END_S)
+        return f"has ended ({code})"
+
+    def _start(self, its: socket.socket) -> "subprocess.Popen[bytes]":
+        return subprocess.Popen(  # noqa: S603 - the Python that was named, and our own program
+            [*self._command, str(its.fileno()), *self._arguments],
+            env=self._environment,
+            pass_fds=[its.fileno()],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+        )
+
+    def _listen(self, words: IO[bytes]) -> None:
+        with words:
+            for line in words:
+                if text := line.decode(errors="replace").strip():
+                    self._words.append(text)
+                    _log.info("node of ROS 1: %s", text)
+
+
+def environment(master: str, ip: str) -> dict[str, str]:
+    """Of the child. Where the master is on this host and nobody says otherwise, the node listens on loopback only."""
+    made = {name: value for name, value in os.environ.items() if name != "PYTHONHOME"}
+    made["ROS_MASTER_URI"] = master
+    named = [name for name in ("ROS_IP", "ROS_HOSTNAME") if made.get(name)]
+    host = urlparse(master).hostname or ""
+    if ip or (not named and (host == "localhost" or host.startswith("127."))):
+        for name in named:
+            del made[name]
+        made["ROS_IP"] = ip or "127.0.0.1"
+    return made
+
+
+def _ended(process: "subprocess.Popen[bytes]") -> int:
+    try:
+        return process.wait(_END_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        return process.wait(_END_S)

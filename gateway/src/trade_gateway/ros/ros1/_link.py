@@ -1,0 +1,214 @@
+"""What is open in our node, and what it was asked: kept here, so that a node that died is told everything again."""
+
+import itertools
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import Future
+from concurrent.futures import TimeoutError as NotYet
+from dataclasses import dataclass
+from typing import Any, Final, NamedTuple
+
+from trade_gateway.ros._graph import RosRefused, RosUnreachable
+from trade_gateway.ros.ros1._child import Child
+from trade_gateway.ros.ros1._node._frames import Channel, Head
+
+__all__ = ["Link", "Opened"]
+
+_AT_ONCE: Final = 16
+"""Questions under way; each holds a thread of the node."""
+_MARGIN_S: Final = 0.5
+"""The node itself tells that time is up; it is given so long to."""
+_GONE: Final = "our node of ROS 1 ended meanwhile; whether it was done is not known"
+
+
+class _Answer(NamedTuple):
+    head: Head
+    body: bytes
+
+
+@dataclass(eq=False)
+class Opened:
+    """A topic or service that is open in the node."""
+
+    link: "Link"
+    number: int
+    head: Head
+    told: Callable[[Head, bytes], object]
+    most: int = 0
+    last: bytes | None = None
+    """Of a latched topic."""
+
+    def send(self, body: bytes) -> None:
+        """Publish."""
+        self.link.message(self, body)
+
+    def close(self) -> None:
+        """Idempotent."""
+        self.link.close_one(self)
+
+
+class Link:
+    """Frames to the node and from it. `node` is told of nodes, `alone` that ours has ended and sees none any more."""
+
+    def __init__(
+        self,
+        *,
+        master: str,
+        node: str,
+        python: str,
+        ip: str,
+        told: Callable[[str, bool], object],
+        alone: Callable[[], object],
+    ) -> None:
+        self._told = told
+        self._alone = alone
+        self._numbers = itertools.count(1)
+        self._state = threading.Condition()
+        self._channel: Channel | None = None
+        self._open: dict[int, Opened] = {}
+        self._asked: dict[int, Future[_Answer]] = {}
+        self._turns = threading.BoundedSemaphore(_AT_ONCE)
+        self._closed = False
+        self._problem: str | None = None
+        self._child = Child(
+            master=master, node=node, python=python, ip=ip, came=self._came, gone=self._gone, heard=self._heard
+        )
+
+    @property
+    def healthy(self) -> str:
+        """Empty, or what is wrong."""
+        if self._closed:
+            return "it was closed"
+        problem = self._problem
+        return self._child.problem if problem is None else problem
+
+    # --- what is open
+
+    def open(self, head: Head, told: Callable[[Head, bytes], object], most: int = 0) -> Opened:
+        """Open a topic or service, now and in each node that comes; `told` hears its frames."""
+        number = next(self._numbers)
+        opened = Opened(self, number, {**head, "id": number, "most": most}, told, most)
+        with self._state:
+            self._open[number] = opened
+            self._put(opened.head)
+        return opened
+
+    def names(self, op: str, name: str) -> list[Head]:
+        """What is open so, under this name."""
+        with self._state:
+            return [one.head for one in self._open.values() if one.head["op"] == op and one.head["name"] == name]
+
+    def message(self, opened: Opened, body: bytes) -> None:
+        with self._state:
+            if opened.number in self._open:
+                opened.last = body if opened.head["latched"] else None
+                self._put({"op": "message", "id": opened.number}, body, key=f"m{opened.number}", most=opened.most)
+
+    def close_one(self, opened: Opened) -> None:
+        with self._state:
+            if self._open.pop(opened.number, None) is not None:
+                self._put({"op": "close", "id": opened.number})
+
+    def reply(self, asked: int, body: bytes, problem: str = "") -> None:
+        """Answer a request."""
+        with self._state:
+            self._put({"op": "reply", "ask": asked, "problem": problem}, body)
+
+    # --- what is asked
+
+    def ask(self, what: str, head: Head, body: bytes, timeout_s: float) -> tuple[Any, bytes]:
+        """Ask the node.
+
+        Raises:
+            RosUnreachable, RosRefused: about `what`.
+        """
+        deadline = time.monotonic() + timeout_s
+        if not self._turns.acquire(timeout=max(timeout_s, 0)):
+            raise RosUnreachable(what=what, problem=f"{_AT_ONCE} others are being asked, and none has answered")
+        try:
+            number, answered = self._ask(what, head, body, deadline)
+            try:
+                answer = answered.result(max(deadline - time.monotonic(), 0) + _MARGIN_S)
+            except NotYet:
+                raise RosUnreachable(what=what, problem=f"no answer within {timeout_s:.3g} s") from None
+            finally:
+                with self._state:
+                    self._asked.pop(number, None)
+        finally:
+            self._turns.release()
+        return _judged(what, answer)
+
+    def _ask(self, what: str, head: Head, body: bytes, deadline: float) -> tuple[int, "Future[_Answer]"]:
+        number = next(self._numbers)
+        answered: Future[_Answer] = Future()
+        with self._state:
+            left_s = max(deadline - time.monotonic(), 0)
+            if not self._state.wait_for(lambda: self._channel or self._closed, left_s) or self._closed:
+                raise RosUnreachable(what=what, problem=self.healthy)
+            self._asked[number] = answered
+            left_s = max(deadline - time.monotonic(), 0.05)
+            self._put({**head, "ask": number, "timeout_s": left_s}, body)
+        return number, answered
+
+    def close(self) -> None:
+        """Idempotent."""
+        with self._state:
+            self._closed = True
+            self._open.clear()
+            self._state.notify_all()
+        self._child.close()
+
+    # --- the node
+
+    def _put(self, head: Head, body: bytes = b"", *, key: str = "", most: int = 0) -> None:
+        if self._channel is not None:
+            self._channel.put(head, body, key=key, most=most)
+
+    def _came(self, channel: Channel) -> None:
+        with self._state:
+            self._channel = channel
+            for opened in self._open.values():
+                self._put(opened.head)
+                if opened.last is not None:
+                    self._put({"op": "message", "id": opened.number}, opened.last)
+            self._state.notify_all()
+
+    def _gone(self) -> None:
+        with self._state:
+            self._channel, self._problem = None, None
+            lost = list(self._asked.values())
+            self._asked.clear()
+        for answered in lost:
+            answered.set_result(_Answer({"failed": "unreachable", "problem": _GONE}, b""))
+        self._alone()
+
+    def _heard(self, head: Head, body: bytes) -> None:
+        match head["op"]:
+            case "health":
+                self._problem = head["problem"]
+            case "node":
+                self._told(head["name"], head["there"])
+            case "answer":
+                with self._state:
+                    answered = self._asked.pop(head["ask"], None)
+                if answered is not None:
+                    answered.set_result(_Answer(head, body))
+            case _:
+                with self._state:
+                    opened = self._open.get(head["id"])
+                if opened is not None:
+                    opened.told(head, body)
+                elif head["op"] == "request":
+                    self.reply(head["ask"], b"", "it is not offered any more")
+
+
+def _judged(what: str, answer: _Answer) -> tuple[Any, bytes]:
+    head, body = answer
+    match head["failed"]:
+        case "unreachable":
+            raise RosUnreachable(what=what, problem=head["problem"])
+        case "refused":
+            raise RosRefused(what=what, problem=head["problem"])
+        case _:
+            return head["value"], body

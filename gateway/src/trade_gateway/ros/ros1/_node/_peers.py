@@ -1,0 +1,134 @@
+"""Which nodes are there: a connection to the slave API of each is held open, and its end is the sign.
+
+A process that is killed closes its sockets at once; of a host that is cut off, keepalive probes tell within 3 s.
+"""
+
+from __future__ import annotations
+
+import selectors
+import socket
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+from typing import Callable
+from urllib.parse import urlparse
+
+__all__ = ["Peers"]
+
+_CONNECT_S = 1.0
+_AGAIN_S = 2.0
+"""Between attempts at an address where nobody answered."""
+_SHORT_S = 1.0
+"""A connection that ends sooner is not tried again at once."""
+_LOOK_S = 0.5
+_PROBES = (("TCP_KEEPIDLE", 1), ("TCP_KEEPINTVL", 1), ("TCP_KEEPCNT", 2), ("TCP_USER_TIMEOUT", 3000))
+
+
+class _Held:
+    def __init__(self, name: str, uri: str, sock: socket.socket) -> None:
+        self.name = name
+        self.uri = uri
+        self.sock = sock
+        self.since = time.monotonic()
+
+
+class Peers:
+    """Nodes by name; `told` is called with a name and whether it is there, each change once."""
+
+    def __init__(self, told: Callable[[str, bool], object]) -> None:
+        self._told = told
+        self._lock = threading.Lock()
+        self._held: dict[str, _Held] = {}
+        self._there: set[str] = set()
+        self._trying: set[str] = set()
+        self._failed: dict[str, tuple[str, float]] = {}
+        self._selector = selectors.DefaultSelector()
+        self._pool = ThreadPoolExecutor(8, thread_name_prefix="peers")
+        threading.Thread(target=self._look, name="peers", daemon=True).start()
+
+    def uri(self, name: str) -> str | None:
+        """Where a node is that is there."""
+        with self._lock:
+            held = self._held.get(name)
+            return held.uri if held else None
+
+    def seeks(self, name: str) -> bool:
+        """Whether it is worth looking up where this node is."""
+        with self._lock:
+            return name not in self._held and name not in self._trying
+
+    def at(self, name: str, uri: str) -> None:
+        """A node is said to be at this address."""
+        with self._lock:
+            failed, when = self._failed.get(name, ("", 0.0))
+            if name in self._held or name in self._trying:
+                return
+            if failed == uri and time.monotonic() - when < _AGAIN_S:
+                return
+            self._trying.add(name)
+        self._pool.submit(self._try, name, uri, 0.0)
+
+    def only(self, names: set[str]) -> None:
+        """Forget failures of nodes that nobody speaks of any more."""
+        with self._lock:
+            for name in set(self._failed) - names:
+                del self._failed[name]
+
+    def _try(self, name: str, uri: str, wait_s: float) -> None:
+        time.sleep(wait_s)
+        sock = _connected(uri)
+        with self._lock:
+            self._trying.discard(name)
+            if sock is None:
+                self._failed[name] = (uri, time.monotonic())
+            else:
+                self._held[name] = held = _Held(name, uri, sock)
+                self._selector.register(sock, selectors.EVENT_READ, held)
+            self._tell(name, sock is not None)
+
+    def _tell(self, name: str, there: bool) -> None:
+        if there != (name in self._there):
+            (self._there.add if there else self._there.discard)(name)
+            self._told(name, there)
+
+    def _look(self) -> None:
+        while True:
+            # what is registered meanwhile is seen by the call that is under way (epoll), the timeout is for the others
+            for key, _ in self._selector.select(_LOOK_S) if self._selector.get_map() else ():
+                if _ended(key.data.sock):
+                    self._lost(key.data)
+            if not self._selector.get_map():
+                time.sleep(0.05)
+
+    def _lost(self, held: _Held) -> None:
+        with self._lock:
+            self._selector.unregister(held.sock)
+            held.sock.close()
+            del self._held[held.name]
+            self._trying.add(held.name)
+        # a server may close what is idle; a process that is gone refuses at once
+        short = time.monotonic() - held.since < _SHORT_S
+        self._pool.submit(self._try, held.name, held.uri, 0.3 if short else 0.0)
+
+
+def _connected(uri: str) -> socket.socket | None:
+    try:
+        at = urlparse(uri)
+        sock = socket.create_connection((at.hostname, at.port or 80), _CONNECT_S)
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        for option, value in _PROBES:
+            if hasattr(socket, option):
+                sock.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), value)
+        sock.setblocking(False)
+    except (OSError, ValueError):
+        return None
+    return sock
+
+
+def _ended(sock: socket.socket) -> bool:
+    try:
+        return not sock.recv(4096)
+    except BlockingIOError:
+        return False
+    except OSError:
+        return True

@@ -1,0 +1,232 @@
+"""The `Graph` of ROS 1: types are coded here, everything else is done by our node in a child process."""
+
+import os
+import re
+import threading
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, cast
+
+from trade.errors import ConfigurationError
+from trade_gateway.ros._graph import (
+    Answer,
+    Closes,
+    Goal,
+    Graph,
+    Heard,
+    NodeTold,
+    Outcome,
+    Publisher,
+    Pursuit,
+    RosRefused,
+)
+from trade_gateway.ros._types import Message, Types
+from trade_gateway.ros.ros1._action_client import ActionClient
+from trade_gateway.ros.ros1._action_server import ActionServer
+from trade_gateway.ros.ros1._lane import Lane
+from trade_gateway.ros.ros1._link import Link, Opened
+from trade_gateway.ros.ros1._node._frames import Head
+from trade_gateway.ros.ros1._nodes import Nodes
+from trade_gateway.ros.ros1._service import Served
+from trade_gateway.ros.ros1._wire import message_head, service_head
+
+__all__ = ["Ros1"]
+
+_NAME: Final = re.compile(r"(/[A-Za-z]\w*)+", re.ASCII)
+_MASTER: Final = "http://localhost:11311"
+_NEWEST: Final = 10
+"""Messages of a topic that wait at each place where they do."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Published:
+    types: Types
+    type_name: str
+    opened: Opened
+
+    def send(self, message: Mapping[str, Any]) -> None:
+        self.opened.send(self.types.to_bytes(self.type_name, message))
+
+    def close(self) -> None:
+        self.opened.close()
+
+
+@dataclass(frozen=True, eq=False)
+class _Closing:
+    """Something open that ends by these steps; each may be done twice."""
+
+    steps: tuple[Callable[[], object], ...]
+
+    def close(self) -> None:
+        for step in self.steps:
+            step()
+
+
+class Ros1(Graph):
+    """A ROS 1 system, as a node of it. See `Graph`."""
+
+    def __init__(
+        self,
+        master: str = "",
+        node: str = "/trade",
+        python: str = "/usr/bin/python3",
+        folders: Iterable[Path] = (),
+        ip: str = "",
+    ) -> None:
+        """Returns at once; `healthy` says when the master knows of it.
+
+        Args:
+            master: where the master is; else as ``ROS_MASTER_URI`` says, or ``http://localhost:11311``.
+            node: our name in ROS.
+            python: one that has rospy.
+            folders: with definitions of types, see `Types`.
+            ip: address under which others find us (``ROS_IP``). Left out, it is as the environment says (``ROS_IP``,
+                ``ROS_HOSTNAME``); else loopback where the master is on loopback, and whatever ROS picks where not.
+
+        Raises:
+            ConfigurationError: a name is none of ROS, or a definition cannot be read.
+        """
+        self._types = Types(1, folders)
+        self._nodes = Nodes()
+        self._lock = threading.RLock()
+        self._clients: dict[str, ActionClient] = {}
+        self._open: set[Closes] = set()
+        self.node: Final = _name(node, "node")
+        master = master or os.environ.get("ROS_MASTER_URI", "") or _MASTER
+        self._link = Link(master=master, node=node, python=python, ip=ip, told=self._node, alone=self._nodes.none)
+
+    @property
+    def types(self) -> Types:
+        return self._types
+
+    @property
+    def healthy(self) -> str:
+        return self._link.healthy
+
+    # --- topics
+
+    def advertise(self, topic: str, type_name: str, *, latched: bool = False) -> Publisher:
+        return self.publish(topic, type_name, latched=latched, most=_NEWEST)
+
+    def publish(self, topic: str, type_name: str, *, latched: bool, most: int) -> _Published:
+        """As `advertise`; so many messages wait at most, the newest."""
+        head = self._topic("publish", topic, type_name)
+        return _Published(self._types, type_name, self._link.open({**head, "latched": latched}, _nothing, most))
+
+    def subscribe(self, topic: str, type_name: str, heard: Heard) -> Closes:
+        return self._closing(self.hear(topic, type_name, heard, most=_NEWEST)[1])
+
+    def hear(
+        self, topic: str, type_name: str, heard: Heard, *, most: int
+    ) -> tuple[Opened, tuple[Callable[[], object], ...]]:
+        """As `subscribe`; so many messages wait at most, the newest."""
+        head = self._topic("subscribe", topic, type_name)
+        lane = Lane(f"trade-ros1{topic}", most)
+
+        def came(told: Head, body: bytes) -> None:
+            lane.put(lambda: heard(self._types.from_bytes(type_name, body), told["who"]))
+
+        opened = self._link.open(head, came, most)
+        return opened, (opened.close, lane.close)
+
+    # --- services
+
+    def serve(self, name: str, type_name: str, answer: Answer) -> Closes:
+        head = {**service_head(self._types, type_name), "op": "serve", "name": _name(name, "service")}
+        if self._link.names("serve", name):
+            raise ConfigurationError(where=name, problem="is offered already, by this very node")
+        served = Served(self._types, name, type_name, answer, self._link.reply)
+        opened = self._link.open(head, served.came)
+        return self._closing((served.close, opened.close))
+
+    def call(self, name: str, type_name: str, request: Mapping[str, Any], timeout_s: float) -> Message:
+        asked, response = self._types.parts(type_name)
+        head = {**service_head(self._types, type_name), "op": "call", "name": _name(name, "service")}
+        _, body = self._link.ask(name, head, self._types.to_bytes(asked, request), timeout_s)
+        return self._types.from_bytes(response, body)
+
+    # --- actions
+
+    def act(self, name: str, type_name: str, do: Callable[[Goal], Outcome]) -> Closes:
+        return self._closing((ActionServer(self, _name(name, "action"), type_name, do).close,))
+
+    def pursue(
+        self, name: str, type_name: str, goal: Mapping[str, Any], feedback: Callable[[Message], object] | None = None
+    ) -> Pursuit:
+        with self._lock:
+            client = self._clients.get(name)
+            if client is None or client.type_name != type_name:
+                client = self._clients[name] = ActionClient(self, _name(name, "action"), type_name)
+        return client.pursue(goal, feedback)
+
+    def connected(self, what: str, opened: Iterable[Opened], timeout_s: float) -> list[set[str]]:
+        """The nodes at the other ends of each of these topics. Raises RosUnreachable."""
+        asked = {"op": "connected", "ids": [one.number for one in opened]}
+        return [set(names) for names in self._link.ask(what, asked, b"", timeout_s)[0]]
+
+    # --- parameters, nodes
+
+    def parameters(self, node: str, timeout_s: float) -> dict[str, Any]:
+        value, _ = self._link.ask(node, {"op": "parameters", "name": node}, b"", timeout_s)
+        return _flat(cast("Message", value)) if isinstance(value, dict) else {"": value}
+
+    def set_parameter(self, node: str, name: str, value: Any, timeout_s: float) -> None:
+        at = f"{node.rstrip('/')}/{name.lstrip('/')}"
+        if not isinstance(value, (bool, int, float, str, list, dict)):
+            raise RosRefused(what=at, problem=f"{value!r} is no parameter of ROS")
+        self._link.ask(at, {"op": "set_parameter", "name": at, "value": value}, b"", timeout_s)
+
+    def watch_nodes(self, told: NodeTold) -> Closes:
+        return self._closing((self._nodes.watch(told),))
+
+    def close(self) -> None:
+        with self._lock:
+            opened, self._open = self._open, set()
+            clients, self._clients = self._clients, {}
+        for one in (*opened, *clients.values()):
+            one.close()
+        self._link.close()
+
+    # ---
+
+    def _topic(self, op: str, topic: str, type_name: str) -> Head:
+        head = {**message_head(self._types, type_name), "op": op, "name": _name(topic, "topic")}
+        for other in self._link.names("publish", topic) + self._link.names("subscribe", topic):
+            if other["md5"] != head["md5"]:
+                raise ConfigurationError(where=topic, problem=f"is open as {other['type']} already, by this very node")
+        return head
+
+    def _node(self, name: str, there: bool) -> None:
+        self._nodes.told(name, there)
+        if not there:
+            for client in list(self._clients.values()):
+                client.gone(name)
+
+    def _closing(self, steps: tuple[Callable[[], object], ...]) -> Closes:
+        closing = _Closing((*steps, lambda: self._open.discard(closing)))
+        with self._lock:
+            self._open.add(closing)
+        return closing
+
+
+def _nothing(told: Head, body: bytes) -> None:
+    """Of a topic that is published nothing is heard."""
+
+
+def _name(name: str, of: str) -> str:
+    if not _NAME.fullmatch(name):
+        raise ConfigurationError(
+            where=f"ROS {of} {name!r}", problem="is no global name of ROS, as /arm/joint_states is"
+        )
+    return name
+
+
+def _flat(tree: Mapping[str, Any], above: str = "") -> dict[str, Any]:
+    """Parameters by their whole names; an empty namespace has none."""
+    found: dict[str, Any] = {}
+    for name, value in tree.items():
+        found.update(
+            _flat(cast("Message", value), f"{above}{name}/") if isinstance(value, dict) else {f"{above}{name}": value}
+        )
+    return found

@@ -1,0 +1,35 @@
+"""States of a goal: the constants of actionlib_msgs/GoalStatus."""
+
+import time
+from enum import IntEnum
+from typing import Final
+
+__all__ = ["ENDED", "Status", "Time", "now"]
+
+Time = dict[str, int]
+
+
+class Status(IntEnum):
+    """Of a goal, as its server tells."""
+
+    PENDING = 0
+    ACTIVE = 1
+    PREEMPTED = 2
+    SUCCEEDED = 3
+    ABORTED = 4
+    REJECTED = 5
+    PREEMPTING = 6
+    RECALLING = 7
+    RECALLED = 8
+    LOST = 9
+
+
+ENDED: Final = frozenset(
+    {Status.PREEMPTED, Status.SUCCEEDED, Status.ABORTED, Status.REJECTED, Status.RECALLED, Status.LOST}
+)
+
+
+def now() -> Time:
+    """The time of day."""
+    seconds, nanoseconds = divmod(time.time_ns(), 1_000_000_000)
+    return {"sec": seconds, "nanosec": nanoseconds}

@@ -1,0 +1,221 @@
+"""Actions of either side, with the actionlib of ROS 1 at the other."""
+
+import threading
+from typing import Any
+
+import pytest
+
+from ros1_stand import Peer, Stand
+from trade_gateway.ros._graph import Ended, Goal, Outcome, Pursuit, RosRefused, RosUnreachable
+from trade_gateway.ros.ros1 import Ros1, _action_client
+from waiting import PATIENCE_S, wait_until
+
+TEST = "actionlib/action/Test"
+FOR_EVER, ABORTS, HANGS = 0, -1, -2
+SUCCEEDED, PREEMPTED, ABORTED, RECALLED = 3, 2, 4, 8
+
+
+def server(stand: Stand, name: str = "mover", deed: str = "act") -> Peer:
+    peer = stand.peer(name)
+    peer.do(deed, "/move")
+    peer.wait_for("did")
+    return peer
+
+
+def pursue(graph: Ros1, goal: int, heard: list[int] | None = None) -> Pursuit:
+    def feedback(message: dict[str, Any]) -> None:
+        if heard is not None:
+            heard.append(message["feedback"])
+
+    return graph.pursue("/move", TEST, {"goal": goal}, feedback)
+
+
+# --- theirs
+
+
+def test_a_goal_is_pursued_to_its_end_with_feedback(graph: Ros1, stand: Stand) -> None:
+    server(stand)
+    heard: list[int] = []
+    outcome = pursue(graph, 20, heard).wait(PATIENCE_S)
+    assert outcome == Outcome(Ended.SUCCEEDED, {"result": 20}, "there")
+    assert heard  # feedback and result come on connections of their own, so the last of it may be late
+    assert heard == list(range(1, len(heard) + 1))
+
+
+def test_a_goal_is_canceled(graph: Ros1, stand: Stand) -> None:
+    server(stand)
+    heard: list[int] = []
+    goal = pursue(graph, FOR_EVER, heard)
+    wait_until(lambda: heard, "it runs")
+    goal.cancel()
+    outcome = goal.wait(PATIENCE_S)
+    assert (outcome.how, outcome.text) == (Ended.CANCELED, "as you wish")
+
+
+def test_a_goal_that_the_server_aborts_says_so(graph: Ros1, stand: Stand) -> None:
+    server(stand)
+    assert pursue(graph, ABORTS).wait(PATIENCE_S) == Outcome(Ended.ABORTED, {"result": ABORTS}, "too far")
+
+
+def test_a_goal_that_is_rejected_is_refused(graph: Ros1, stand: Stand) -> None:
+    server(stand, deed="reject")
+    with pytest.raises(RosRefused, match="/move: not now"):
+        pursue(graph, 1).wait(PATIENCE_S)
+
+
+def test_an_action_that_nobody_serves_is_unreachable(graph: Ros1, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_action_client, "_THERE_S", 0.2)
+    with pytest.raises(RosUnreachable, match="/move: nobody serves this action"):
+        pursue(graph, 1)
+
+
+def test_a_goal_whose_end_does_not_come_in_time_is_given_up_and_can_be_canceled_yet(graph: Ros1, stand: Stand) -> None:
+    server(stand)
+    goal = pursue(graph, FOR_EVER)
+    with pytest.raises(RosUnreachable, match="nothing was heard of its end within"):
+        goal.wait(0.05)
+    goal.cancel()
+    assert goal.wait(PATIENCE_S).how is Ended.CANCELED
+
+
+def test_a_goal_whose_server_is_killed_is_told_and_the_next_server_takes_goals(graph: Ros1, stand: Stand) -> None:
+    heard: list[int] = []
+    first = server(stand)
+    goal = pursue(graph, HANGS, heard)
+    wait_until(lambda: heard, "it runs")
+    first.end()
+    with pytest.raises(RosUnreachable, match="server /mover is gone"):
+        goal.wait(PATIENCE_S)
+    server(stand)
+    assert pursue(graph, 2).wait(PATIENCE_S).how is Ended.SUCCEEDED
+
+
+# --- ours
+
+
+def client(stand: Stand, goal: int, name: str = "planner") -> Peer:
+    peer = stand.peer(name)
+    peer.do("pursue", "/move", goal)
+    return peer
+
+
+class Mover:
+    """What an action of ours does: as the goal says, and until it is canceled."""
+
+    def __init__(self) -> None:
+        self.came: list[tuple[int, str]] = []
+        self.canceled: list[int] = []
+        self.go_on = threading.Event()
+        self.go_on.set()
+
+    def do(self, goal: Goal) -> Outcome:
+        number = goal.message["goal"]
+        self.came.append((number, goal.client))
+        ends = threading.Event()
+        goal.when_canceled(ends.set)
+        if number == FOR_EVER:
+            assert ends.wait(PATIENCE_S)
+            self.canceled.append(number)
+            return Outcome(Ended.CANCELED, {"result": 1}, "stopped")
+        if number == ABORTS:
+            raise RuntimeError("a joint is stuck")
+        for step in range(1, number + 1):
+            goal.feedback({"feedback": step})
+        assert self.go_on.wait(PATIENCE_S)
+        return Outcome(Ended.SUCCEEDED, {"result": number}, "done")
+
+
+@pytest.fixture
+def mover(graph: Ros1) -> Mover:
+    made = Mover()
+    graph.act("/move", TEST, made.do)
+    return made
+
+
+def test_a_client_has_its_goal_done_with_feedback(mover: Mover, stand: Stand) -> None:
+    mover.go_on.clear()
+    peer = client(stand, 3)
+    wait_until(lambda: peer.all("feedback") == [1, 2, 3], "its feedback was heard")
+    mover.go_on.set()
+    assert peer.wait_for("done") == {"goal": 3, "state": SUCCEEDED, "result": 3, "text": "done"}
+    assert mover.came == [(3, "/planner")]
+
+
+def test_a_client_cancels_its_goal(mover: Mover, stand: Stand) -> None:
+    peer = client(stand, FOR_EVER)
+    peer.wait_for("active")
+    peer.do("cancel", "/move")
+    assert peer.wait_for("done") == {"goal": FOR_EVER, "state": PREEMPTED, "result": 1, "text": "stopped"}
+
+
+def test_a_client_is_told_of_what_fails(mover: Mover, stand: Stand) -> None:
+    told = client(stand, ABORTS).wait_for("done")
+    assert (told["state"], told["text"]) == (ABORTED, "a joint is stuck")
+
+
+def test_a_result_that_does_not_fit_ends_the_goal_as_aborted(graph: Ros1, stand: Stand) -> None:
+    graph.act("/move", TEST, lambda goal: Outcome(Ended.SUCCEEDED, {"resolt": 1}))
+    told = client(stand, 1).wait_for("done")
+    assert told["state"] == ABORTED
+    assert "has no resolt" in told["text"]
+
+
+def test_a_later_goal_of_whomever_ends_the_one_before_and_is_done(mover: Mover, stand: Stand) -> None:
+    first = client(stand, FOR_EVER, "first")
+    first.wait_for("active")
+    second = client(stand, 2, "second")
+    assert second.wait_for("done")["state"] == SUCCEEDED
+    assert first.wait_for("done")["state"] == PREEMPTED
+    assert mover.came == [(FOR_EVER, "/first"), (2, "/second")]
+
+
+def test_a_goal_that_waits_for_the_end_of_another_is_recalled_by_the_next(graph: Ros1, stand: Stand) -> None:
+    go_on = threading.Event()
+    done: list[int] = []
+
+    def do(goal: Goal) -> Outcome:
+        done.append(goal.message["goal"])
+        assert go_on.wait(PATIENCE_S)
+        return Outcome(Ended.SUCCEEDED, {})
+
+    graph.act("/move", TEST, do)
+    peers: list[Peer] = []
+    for number in (1, 2, 3):
+        peers.append(client(stand, number, f"client{number}"))
+        if number < 3:
+            wait_until(lambda: _states(graph, stand) >= len(peers), "it is known")
+    assert peers[1].wait_for("done")["state"] == RECALLED
+    go_on.set()
+    assert peers[0].wait_for("done")["state"] == SUCCEEDED
+    assert peers[2].wait_for("done")["state"] == SUCCEEDED
+    assert done == [1, 3]
+
+
+def _states(graph: Ros1, stand: Stand) -> int:
+    """How many goals the action tells of."""
+    seen: list[int] = []
+    heard = graph.subscribe(
+        "/move/status", "actionlib_msgs/msg/GoalStatusArray", lambda told, who: seen.append(len(told["status_list"]))
+    )
+    wait_until(lambda: seen, "its state is told")
+    heard.close()
+    return seen[-1]
+
+
+def test_an_action_that_is_withdrawn_ends_what_runs(graph: Ros1, stand: Stand) -> None:
+    mover = Mover()
+    action = graph.act("/move", TEST, mover.do)
+    peer = client(stand, FOR_EVER)
+    peer.wait_for("active")
+    action.close()
+    action.close()
+    assert mover.canceled == [FOR_EVER]
+
+
+def test_the_two_ends_of_ours_understand_each_other(mover: Mover, graph: Ros1) -> None:
+    heard: list[int] = []
+    assert pursue(graph, 3, heard).wait(PATIENCE_S) == Outcome(Ended.SUCCEEDED, {"result": 3}, "done")
+    goal = pursue(graph, FOR_EVER)
+    wait_until(lambda: (FOR_EVER, "/trade") in mover.came, "it runs")
+    goal.cancel()
+    assert goal.wait(PATIENCE_S).how is Ended.CANCELED

@@ -1,0 +1,32 @@
+"""Which nodes are there: what the end of a connection means."""
+
+import subprocess
+import sys
+
+PROGRAM = """
+import socket, sys, threading, time
+from trade_gateway.ros.ros1._node._peers import Peers
+told, closed = [], []
+server = socket.create_server(("127.0.0.1", 0))
+def serve():
+    while len(closed) < 4:
+        came, _ = server.accept()
+        came.close()
+        closed.append(time.monotonic())
+    kept, _ = server.accept()
+    server.close()
+    kept.close()
+threading.Thread(target=serve, daemon=True).start()
+peers = Peers(lambda name, there: told.append((name, there)))
+uri = "http://127.0.0.1:%d/" % server.getsockname()[1]
+peers.at("/arm", uri)
+deadline = time.monotonic() + 60
+while len(told) < 2 and time.monotonic() < deadline:
+    time.sleep(0.01)
+print(told, len(closed), peers.uri("/arm"), flush=True)
+"""
+
+
+def test_a_node_that_closes_what_is_idle_is_there_until_it_listens_no_more() -> None:
+    ran = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, timeout=100, check=True)
+    assert ran.stdout.strip() == "[('/arm', True), ('/arm', False)] 4 None"

@@ -1,0 +1,143 @@
+"""Services of either side, called by the other; parameters."""
+
+import threading
+
+import pytest
+
+from ros1_stand import Stand, our_node
+from trade.errors import ConfigurationError
+from trade_gateway.ros._graph import RosRefused, RosUnreachable
+from trade_gateway.ros._types import Message
+from trade_gateway.ros.ros1 import Ros1
+from waiting import wait_until
+
+TRIGGER = "std_srvs/srv/Trigger"
+SET_BOOL = "std_srvs/srv/SetBool"
+
+
+def test_a_service_of_theirs_is_called(graph: Ros1, stand: Stand) -> None:
+    peer = stand.peer("gripper")
+    peer.do("serve", "/close", "std_srvs/SetBool")
+    peer.wait_for("did")
+    assert graph.call("/close", SET_BOOL, {"data": True}, 30) == {"success": True, "message": "/trade asked True"}
+
+
+def test_what_a_service_of_theirs_fails_with_is_told(graph: Ros1, stand: Stand) -> None:
+    peer = stand.peer("gripper")
+    peer.do("serve", "/close", "std_srvs/Trigger", "fail")
+    peer.wait_for("did")
+    with pytest.raises(RosRefused, match="it is stuck"):
+        graph.call("/close", TRIGGER, {}, 30)
+
+
+def test_a_service_of_another_type_is_refused(graph: Ros1, stand: Stand) -> None:
+    peer = stand.peer("gripper")
+    peer.do("serve", "/close", "std_srvs/Trigger")
+    peer.wait_for("did")
+    with pytest.raises(RosRefused, match="md5sum"):
+        graph.call("/close", SET_BOOL, {"data": True}, 30)
+
+
+def test_a_service_that_nobody_offers_is_unreachable(graph: Ros1) -> None:
+    with pytest.raises(RosUnreachable, match="/close: nobody offers it"):
+        graph.call("/close", TRIGGER, {}, 30)
+
+
+def test_a_service_whose_node_was_killed_is_unreachable(graph: Ros1, stand: Stand) -> None:
+    peer = stand.peer("gripper")
+    peer.do("serve", "/close", "std_srvs/Trigger")
+    peer.wait_for("did")
+    peer.end()
+    with pytest.raises(RosUnreachable):
+        graph.call("/close", TRIGGER, {}, 30)
+
+
+def test_a_service_that_never_answers_is_given_up_and_others_are_not_held_up(graph: Ros1, stand: Stand) -> None:
+    peer = stand.peer("gripper")
+    peer.do("serve", "/hang", "std_srvs/Trigger", "hang")
+    peer.do("serve", "/close", "std_srvs/Trigger")
+    wait_until(lambda: len(peer.all("did")) == 2)
+    failures: list[Exception] = []
+    threads = our_node().num_threads()
+
+    def hang() -> None:
+        try:
+            graph.call("/hang", TRIGGER, {}, 1)
+        except RosUnreachable as error:
+            failures.append(error)
+
+    callers = [threading.Thread(target=hang) for _ in range(40)]
+    for caller in callers:
+        caller.start()
+    for caller in callers:
+        caller.join(60)
+    assert len(failures) == 40
+    wait_until(lambda: our_node().num_threads() < threads + 10, "our node waits no more, either")
+    assert any("no answer within" in str(failure) for failure in failures)
+    assert graph.call("/close", TRIGGER, {}, 30)["success"]
+
+
+def test_a_node_calls_a_service_of_ours(graph: Ros1, stand: Stand) -> None:
+    graph.serve("/lights", SET_BOOL, lambda request, who: {"success": request["data"], "message": f"for {who}"})
+    peer = stand.peer("caller")
+    peer.do("call", "/lights", "std_srvs/SetBool", {"data": True})
+    assert peer.wait_for("called") == {"success": True, "message": "for /caller"}
+
+
+def test_a_node_is_told_what_a_service_of_ours_fails_with(graph: Ros1, stand: Stand) -> None:
+    def fail(request: Message, who: str) -> Message:
+        raise RuntimeError("the bulb is gone")
+
+    graph.serve("/lights", TRIGGER, fail)
+    peer = stand.peer("caller")
+    peer.do("call", "/lights", "std_srvs/Trigger", {})
+    assert "the bulb is gone" in peer.wait_for("failed")
+
+
+def test_requests_are_answered_one_after_the_other_and_are_told_when_the_service_is_withdrawn(
+    graph: Ros1, stand: Stand
+) -> None:
+    begun, go_on = threading.Semaphore(0), threading.Event()
+
+    def slow(request: Message, who: str) -> Message:
+        begun.release()
+        assert go_on.wait(60)
+        return {"success": True}
+
+    served = graph.serve("/lights", TRIGGER, slow)
+    peer = stand.peer("caller")
+    for _ in range(2):
+        peer.do("call", "/lights", "std_srvs/Trigger", {})
+    assert begun.acquire(timeout=60)
+    assert not begun.acquire(timeout=0.2)
+    served.close()
+    served.close()
+    wait_until(lambda: len(peer.all("failed")) == 2, "both callers were told")
+    go_on.set()
+    with pytest.raises(RosUnreachable):
+        wait_until(lambda: not graph.call("/lights", TRIGGER, {}, 30), "the master forgot it")
+
+
+def test_a_service_is_offered_once(graph: Ros1) -> None:
+    graph.serve("/lights", TRIGGER, lambda request, who: {}).close()
+    graph.serve("/lights", TRIGGER, lambda request, who: {})
+    with pytest.raises(ConfigurationError, match="is offered already"):
+        graph.serve("/lights", TRIGGER, lambda request, who: {})
+
+
+def test_parameters_of_a_namespace_are_read_and_set(graph: Ros1) -> None:
+    graph.set_parameter("/arm", "limits/speed", 0.5, 30)
+    graph.set_parameter("/arm", "joints", ["pan", "tilt"], 30)
+    graph.set_parameter("/arm", "enabled", True, 30)
+    assert graph.parameters("/arm", 30) == {"limits/speed": 0.5, "joints": ["pan", "tilt"], "enabled": True}
+
+
+def test_a_namespace_without_parameters_is_refused(graph: Ros1) -> None:
+    with pytest.raises(RosRefused, match="/leg"):
+        graph.parameters("/leg", 30)
+
+
+def test_a_value_that_ros_has_no_word_for_is_refused(graph: Ros1) -> None:
+    for value in (None, 2**40, [None], object()):
+        with pytest.raises(RosRefused, match="/arm/x"):
+            graph.set_parameter("/arm", "x", value, 30)
