@@ -1,0 +1,92 @@
+"""The bridge: one container of ours that is one node of theirs, with what a file says mapped between the two."""
+
+import contextlib
+from collections.abc import Callable
+from contextlib import ExitStack
+from typing import Final
+
+from msgspec import Struct
+
+from trade import Container, service
+from trade_gateway.ros._file import RosFile
+from trade_gateway.ros._following import Following, Mapping
+from trade_gateway.ros._graph import Graph
+from trade_gateway.ros._nodes import Nodes
+from trade_gateway.ros._to_ros_services import LocksToRos, ServicesToRos
+
+__all__ = ["GROUP", "Bridge", "Bridged"]
+
+GROUP: Final = "ros"
+"""Of what the bridge tells of itself."""
+
+
+class Bridged(Struct, frozen=True):
+    """What a bridge has up."""
+
+    to_ros: dict[str, str]
+    """By kind and name in ROS (``service /rosie/head/stop``), the service of ours."""
+    from_ros: dict[str, list[str]]
+    """By what it is in ROS, the groups it is offered in."""
+    nodes: list[str]
+    """Those of ROS that have a session here now."""
+    problems: list[str]
+    """What is not up, and why."""
+
+
+class Bridge:
+    """Maps until it is closed.
+
+    Args:
+        container: ours; it is the bridge's identity.
+        graph: theirs.
+        file: what is mapped.
+        say: told in a line what comes up, goes, or cannot be.
+
+    Raises:
+        ConfigurationError: a type is not known, or does not fit.
+        AccessDenied: the policy does not let this container register group ``ros``, or one that the file names.
+    """
+
+    def __init__(self, container: Container, graph: Graph, file: RosFile, say: Callable[[str], object]) -> None:
+        self._container = container
+        self._say = say
+        self._leaving = ExitStack()
+        with contextlib.ExitStack() as failing:
+            failing.callback(self.close)
+            container.register(self, GROUP)
+            self._leaving.callback(container.deregister, self)
+            self._nodes = Nodes(container, graph, file.ros.grace_s, self._heard)
+            self._leaving.callback(self._nodes.close)
+            self._following = Following(container, self._mappings(graph, file), say)
+            self._leaving.callback(self._following.close)
+            failing.pop_all()
+
+    def _mappings(self, graph: Graph, file: RosFile) -> list[Mapping]:
+        out, nodes = file.to_ros, self._nodes
+        return [
+            *(ServicesToRos(entry, graph, nodes) for entry in out.service),
+            *(LocksToRos(entry, graph, nodes, self._container) for entry in out.lock),
+        ]
+
+    def settled(self, timeout_s: float) -> bool:
+        """Wait until what is there already was mapped. Returns whether it was."""
+        return self._following.settled(timeout_s)
+
+    @service(effect="read")
+    def bridged(self) -> Bridged:
+        """What is up, for whom, and what is not."""
+        opened = {f"{place.kind} {place.name}": handle.label for place, handle in self._following.opened()}
+        return Bridged(opened, {}, self._nodes.names(), self._following.problems())
+
+    def _heard(self, problem: str) -> None:
+        """ROS is lost, or back."""
+        if problem:
+            self._container.set_health(self, f"ROS is lost: {problem}; what its nodes moved was stopped")
+            self._say(f"ROS is lost: {problem}; what its nodes moved stops, and their locks fall")
+        else:
+            self._container.set_health(self)
+            self._say("ROS is back")
+
+    def close(self) -> None:
+        """What nodes of ROS move stops, and nothing is mapped any more. Idempotent."""
+        self._leaving.close()
