@@ -41,10 +41,9 @@ def test_services_come_and_go_with_their_providers(stand: Stand) -> None:
 def test_a_type_of_ones_own_carries_arguments_and_results_by_name(stand: Stand) -> None:
     folder = stand.folder / "types" / "my_robot" / "srv"
     folder.mkdir(parents=True)
-    (folder / "Turn.srv").write_text(
-        "float64 angle_rad\nfloat64 speed\n---\nbool success\nstring message\nfloat64 at\n"
-    )
-    stand.ros.__init__(folders=[stand.folder / "types"])  # type: ignore[misc]
+    words = ["float64 angle_rad", "float64 speed", "---", "bool success", "string message", "float64 at"]
+    (folder / "Turn.srv").write_text("\n".join(words))
+    stand.ros = MemoryRos(folders=[stand.folder / "types"])
     stand.up(
         '[[to_ros.service]]\nservice = "rosie.head.turn"\ntype = "my_robot/srv/Turn"\nname = "/look"\n'
         'args = { speed_rad_s = "speed" }\n'

@@ -12,7 +12,9 @@ from trade_gateway.ros._file import RosFile
 from trade_gateway.ros._following import Following, Mapping
 from trade_gateway.ros._graph import Graph
 from trade_gateway.ros._nodes import Nodes
+from trade_gateway.ros._to_ros_commands import CommandsToRos
 from trade_gateway.ros._to_ros_services import LocksToRos, ServicesToRos
+from trade_gateway.ros._to_ros_streams import JointStatesToRos, StreamsToRos, Topics
 
 __all__ = ["GROUP", "Bridge", "Bridged"]
 
@@ -62,10 +64,13 @@ class Bridge:
             failing.pop_all()
 
     def _mappings(self, graph: Graph, file: RosFile) -> list[Mapping]:
-        out, nodes = file.to_ros, self._nodes
+        out, nodes, topics = file.to_ros, self._nodes, Topics(graph)
         return [
             *(ServicesToRos(entry, graph, nodes) for entry in out.service),
             *(LocksToRos(entry, graph, nodes, self._container) for entry in out.lock),
+            *(CommandsToRos(entry, graph, nodes, self._container, self._say) for entry in out.command),
+            *(StreamsToRos(entry, topics, graph, self._container) for entry in out.stream),
+            *(JointStatesToRos(entry, topics, self._container) for entry in out.joint_states),
         ]
 
     def settled(self, timeout_s: float) -> bool:

@@ -24,6 +24,8 @@ UNKNOWN: Final = ""
 _LOOK_EVERY_S: Final = 0.1
 _UNSEEN_S: Final = 5.0
 """Who was heard but is not among the nodes that ROS tells of is gone so long after it was heard last."""
+_FORGOTTEN_S: Final = 2.0
+"""So long nothing is done for a node that has ended: what comes then was sent before."""
 _WAIT_S: Final = 0.5
 """For a lock: what somebody has just let go of."""
 _LATE_S: Final = 5.0
@@ -110,6 +112,8 @@ class Nodes:
         self._tell = told
         self._guests: dict[str, Guest] = {}
         self._there: set[str] = set()
+        self._gone: dict[str, float] = {}
+        """When which has ended, of those that had a session."""
         self._guard = threading.Lock()
         self._lost = ""
         self._lost_at: float | None = None
@@ -126,12 +130,16 @@ class Nodes:
             stops: it wants to stop something, which it always may.
 
         Raises:
-            RosUnreachable: nobody would see it die.
+            RosUnreachable: nobody would see it die, or it just has.
         """
         with self._guard:
             if self._lost and not stops:
                 problem = f"{self._lost}; nobody would see {who or 'a node'} die, so nothing is done for it until then"
                 raise RosUnreachable(what="ROS", problem=problem)
+            if time.monotonic() - self._gone.get(who, -_FORGOTTEN_S) < _FORGOTTEN_S and not stops:
+                raise RosUnreachable(
+                    what=who, problem="it has just ended; what was still under way from it is not done"
+                )
             guest = self._guests.get(who)
             if guest is None or guest.client.closed:
                 guest = self._guests[who] = self._opened(who)
@@ -153,6 +161,9 @@ class Nodes:
         with self._guard:
             (self._there.add if there else self._there.discard)(name)
             gone = None if there else self._guests.pop(name, None)
+            self._gone.pop(name, None)
+            if gone is not None:
+                self._gone[name] = time.monotonic()
         if gone is not None:
             _logger.info("%s is gone: what it moved stops, its locks fall", name)
             gone.client.close()
@@ -169,6 +180,7 @@ class Nodes:
         self._lost_at = None if not problem else now if self._lost_at is None else self._lost_at
         lost = problem if self._lost_at is not None and now - self._lost_at >= self._grace_s else ""
         with self._guard:
+            self._gone = {name: at for name, at in self._gone.items() if now - at < _FORGOTTEN_S}
             changed, self._lost = bool(lost) != bool(self._lost), lost
             all_of_them = changed and bool(lost)  # later there are only some that stop something
             gone = [one for one in self._guests.values() if all_of_them or self._unseen(one, now)]

@@ -177,10 +177,10 @@ def _at(value: Any, path: str) -> Any:
     found: Any = value
     for word in path.split("."):
         try:
-            found = cast("Any", found)[int(word) if isinstance(found, list) else word]
+            found = found[int(word) if isinstance(found, list) else word]
         except (LookupError, TypeError, ValueError):
             raise ConfigurationError(where=path, problem=f"is not in {_text(value)[:80]}") from None
-    return cast("Any", found)
+    return found
 
 
 def _put(message: Message, path: str, value: Any) -> None:
