@@ -42,6 +42,10 @@ def ros(
         return
     room.planned(read, file)  # what is wrong with its types is said before anything is joined
     choice: SystemChoice = context.obj
+
+    def say(line: str) -> None:
+        out.say(escape(line))
+
     if detach:
         detach_now(out, choice.settings(name))
         return
@@ -56,7 +60,7 @@ def ros(
             complain("there is no policy: every node of that ROS may call what the file maps; see docs/ros.md")
         graph = room.join(read, file)
         try:
-            bridge = room.Bridge(container, graph, read, lambda line: out.say(escape(line)))
+            bridge = room.Bridge(container, graph, read, say)
             try:
                 bridge.settled(_UP_WITHIN_S)
                 settle()

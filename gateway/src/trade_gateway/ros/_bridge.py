@@ -15,6 +15,7 @@ from trade_gateway.ros._nodes import Nodes
 from trade_gateway.ros._to_ros_commands import CommandsToRos
 from trade_gateway.ros._to_ros_services import LocksToRos, ServicesToRos
 from trade_gateway.ros._to_ros_streams import JointStatesToRos, StreamsToRos, Topics
+from trade_gateway.ros._to_ros_trajectories import TrajectoriesToRos
 
 __all__ = ["GROUP", "Bridge", "Bridged"]
 
@@ -71,6 +72,7 @@ class Bridge:
             *(CommandsToRos(entry, graph, nodes, self._container, self._say) for entry in out.command),
             *(StreamsToRos(entry, topics, graph, self._container) for entry in out.stream),
             *(JointStatesToRos(entry, topics, self._container) for entry in out.joint_states),
+            *(TrajectoriesToRos(entry, graph, nodes, self._container) for entry in out.trajectory),
         ]
 
     def settled(self, timeout_s: float) -> bool:
