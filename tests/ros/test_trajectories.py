@@ -19,7 +19,7 @@ ACTION = "control_msgs/action/FollowJointTrajectory"
 ARM = '[[to_ros.trajectory]]\ngroup = "rosie.arm"\naction = "/arm/follow"\n'
 
 
-class Arm(FakeJoints):
+class Limb(FakeJoints):
     def __init__(self, stand: Stand) -> None:
         super().__init__("rosie.arm.a", "rosie.arm.b")
         stand.robot.container.register(self, "rosie.arm")
@@ -28,7 +28,7 @@ class Arm(FakeJoints):
 
 @pytest.fixture
 def arm(stand: Stand) -> Any:
-    made = Arm(stand)
+    made = Limb(stand)
     yield made
     made.stopped.set()
 
@@ -50,7 +50,7 @@ def ended(node: MemoryGraph, asked: dict[str, Any]) -> Outcome:
     return node.pursue("/arm/follow", ACTION, asked).wait(PATIENCE_S)
 
 
-def test_a_goal_is_followed_to_its_end(stand: Stand, arm: Arm) -> None:
+def test_a_goal_is_followed_to_its_end(stand: Stand, arm: Limb) -> None:
     stand.up(ARM)
     outcome = ended(stand.node(), TO_THERE)
     assert (outcome.how, outcome.result["error_code"]) == (Ended.SUCCEEDED, 0)
@@ -61,14 +61,14 @@ def test_a_goal_is_followed_to_its_end(stand: Stand, arm: Arm) -> None:
     assert stand.container.locks() == []
 
 
-def test_the_first_point_is_where_the_joints_are_if_the_goal_begins_later(stand: Stand, arm: Arm) -> None:
+def test_the_first_point_is_where_the_joints_are_if_the_goal_begins_later(stand: Stand, arm: Limb) -> None:
     arm.at = [0.25, 0.0]
     stand.up(ARM)
     assert ended(stand.node(), goal((1.0, [0.5, 0.5]))).how is Ended.SUCCEEDED
     assert [track.curve.at(0.0)[0] for track in arm.plans[0].tracks] == [0.25, 0.0]
 
 
-def test_joints_may_be_in_any_order_and_have_names_of_their_own(stand: Stand, arm: Arm) -> None:
+def test_joints_may_be_in_any_order_and_have_names_of_their_own(stand: Stand, arm: Limb) -> None:
     stand.up(ARM + 'joints = { shoulder = "rosie.arm.a" }\n')
     asked = goal((0.0, [0.0, 0.0]), (2.0, [-0.5, 0.5]), names=("b", "shoulder"))
     assert ended(stand.node(), asked).how is Ended.SUCCEEDED
@@ -89,7 +89,7 @@ def test_joints_may_be_in_any_order_and_have_names_of_their_own(stand: Stand, ar
     ],
 )
 def test_a_goal_that_is_wrong_is_refused_as_published_and_nothing_moves(
-    stand: Stand, arm: Arm, asked: dict[str, Any], code: int, says: str
+    stand: Stand, arm: Limb, asked: dict[str, Any], code: int, says: str
 ) -> None:
     stand.up(ARM)
     outcome = ended(stand.node(), asked)
@@ -106,7 +106,7 @@ def test_a_goal_that_is_wrong_is_refused_as_published_and_nothing_moves(
         (DeviceFault(device="a", bus="can0", fault="hot"), -1),
     ],
 )
-def test_what_fails_on_the_way_is_told_as_published(stand: Stand, arm: Arm, error: Exception, code: int) -> None:
+def test_what_fails_on_the_way_is_told_as_published(stand: Stand, arm: Limb, error: Exception, code: int) -> None:
     arm.error = error
     stand.up(ARM)
     outcome = ended(stand.node(), TO_THERE)
@@ -114,7 +114,7 @@ def test_what_fails_on_the_way_is_told_as_published(stand: Stand, arm: Arm, erro
     assert type(error).__name__ in outcome.result["error_string"]
 
 
-def test_the_tightest_tolerance_holds_for_all(stand: Stand, arm: Arm) -> None:
+def test_the_tightest_tolerance_holds_for_all(stand: Stand, arm: Limb) -> None:
     stand.up(ARM)
     tolerance = [{"name": "a", "position": 0.1}, {"name": "b", "position": 0.05, "velocity": 1.0}]
     off = [{"name": "a", "position": -1.0}]
@@ -124,7 +124,7 @@ def test_the_tightest_tolerance_holds_for_all(stand: Stand, arm: Arm) -> None:
     assert (told.path_rad, told.goal_rad, told.goal_time_s) == (0.05, 0.03, 2.5)
 
 
-def test_canceling_a_goal_stops_and_gives_the_lock_back(stand: Stand, arm: Arm) -> None:
+def test_canceling_a_goal_stops_and_gives_the_lock_back(stand: Stand, arm: Limb) -> None:
     arm.hold = True
     stand.up(ARM)
     pursuit = stand.node().pursue("/arm/follow", ACTION, TO_THERE)
@@ -137,7 +137,7 @@ def test_canceling_a_goal_stops_and_gives_the_lock_back(stand: Stand, arm: Arm) 
     assert stand.container.locks() == []
 
 
-def test_a_goal_that_takes_the_place_of_another_one_is_not_stopped_with_it(stand: Stand, arm: Arm) -> None:
+def test_a_goal_that_takes_the_place_of_another_one_is_not_stopped_with_it(stand: Stand, arm: Limb) -> None:
     arm.hold = True
     stand.up(ARM)
     node = stand.node()
@@ -150,7 +150,7 @@ def test_a_goal_that_takes_the_place_of_another_one_is_not_stopped_with_it(stand
     assert arm.at == pytest.approx([0.3, 0.3])
 
 
-def test_S03_a_goal_ends_with_its_node(stand: Stand, arm: Arm) -> None:
+def test_S03_a_goal_ends_with_its_node(stand: Stand, arm: Limb) -> None:
     arm.hold = True
     stand.up(ARM)
     stand.node("/planner").pursue("/arm/follow", ACTION, TO_THERE)
@@ -160,7 +160,7 @@ def test_S03_a_goal_ends_with_its_node(stand: Stand, arm: Arm) -> None:
     wait_until(lambda: stand.container.locks() == [])
 
 
-def test_what_others_have_locked_no_goal_moves(stand: Stand, arm: Arm) -> None:
+def test_what_others_have_locked_no_goal_moves(stand: Stand, arm: Limb) -> None:
     stand.up(ARM)
     person = stand.memory.container("person")
     stand.memory.settle()
@@ -172,7 +172,7 @@ def test_what_others_have_locked_no_goal_moves(stand: Stand, arm: Arm) -> None:
     assert arm.plans == []
 
 
-def test_S09_an_e_stop_ends_a_goal(stand: Stand, arm: Arm) -> None:
+def test_S09_an_e_stop_ends_a_goal(stand: Stand, arm: Limb) -> None:
     arm.hold = True
     stand.up(ARM)
     pursuit = stand.node().pursue("/arm/follow", ACTION, TO_THERE)
@@ -184,19 +184,19 @@ def test_S09_an_e_stop_ends_a_goal(stand: Stand, arm: Arm) -> None:
     stand.robot.container.estop_clear([report.id])
 
 
-def test_what_is_said_of_the_way_is_feedback(stand: Stand, arm: Arm) -> None:
+def test_what_is_said_of_the_way_is_feedback(stand: Stand, arm: Limb) -> None:
+    heard: list[Any] = []
+
     def told(plan: Any) -> list[float]:
         plan.course.note("rosie.arm.a", 0.125)
         plan.course.ready(time.monotonic_ns())
-        plan.course.report(time.monotonic_ns())
+        wait_until(lambda: plan.course.report(time.monotonic_ns()) or heard)
         return arm.at
 
     arm.stream = told  # type: ignore[method-assign]
     stand.up(ARM)
-    heard: list[Any] = []
     pursuit = stand.node().pursue("/arm/follow", ACTION, TO_THERE, heard.append)
     assert pursuit.wait(PATIENCE_S).how is Ended.SUCCEEDED
-    wait_until(lambda: heard)
     assert heard[0]["joint_names"] == ["a", "b"]
     assert heard[0]["error"]["positions"] == [-0.125, 0.0]
 

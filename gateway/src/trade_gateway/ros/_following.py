@@ -7,8 +7,9 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Final, NamedTuple, Protocol
 
 from trade import Constraint, Container, Handle, where
-from trade.errors import ConfigurationError, TradeError
+from trade.errors import ConfigurationError
 from trade_gateway.ros._graph import Closes
+from trade_gateway.ros._words import failure
 
 __all__ = ["Following", "Mapping", "Place", "named_services"]
 
@@ -142,8 +143,8 @@ class Following:
             return
         try:
             self._open[key] = self._mappings[key.entry].open(key.place, key.handle)
-        except TradeError as error:
-            self._note(key, f"{key.handle.label} is not there as {key.place.name}: {error}")
+        except Exception as error:  # noqa: BLE001 - one that cannot be mapped keeps no other from it
+            self._note(key, f"{key.handle.label} is not there as {key.place.name}: {failure(error)}")
             return
         self._failed.pop(key, None)
         self._say(f"{key.place.kind} {key.place.name} is {key.handle.label}")

@@ -70,10 +70,10 @@ def joints_of(container: Container, handle: Handle) -> list[str]:
     """Full names of the joints a service is about, in the order of its values. Raises what asking for them does."""
     told = beside(container, handle, "limits").with_(deadline_s=_TOLD_WITHIN_S)()
     limits: Any = msgspec.to_builtins(told)
-    if "Arm" in handle.kinds:
-        limits = limits["joints"]
-    several = cast("list[Any]", limits) if isinstance(limits, list) else [limits]
-    return [one["name"] for one in several]
+    if isinstance(limits, dict):  # of an arm, or of one joint
+        whole = cast("dict[str, Any]", limits)
+        limits = whole.get("joints", [whole])
+    return [one["name"] for one in cast("list[dict[str, Any]]", limits)]
 
 
 def measured(joints: Sequence[str], state: Any) -> Measured:

@@ -1,5 +1,6 @@
 """Joints and arms of ours as an action FollowJointTrajectory: what MoveIt and others move robots by."""
 
+import logging
 import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -9,6 +10,7 @@ from typing import Any, Final
 import msgspec
 
 from trade import Constraint, Container, Handle, Run, where
+from trade.errors import SessionEnded
 from trade_gateway.ros._file import TrajectoryEntry
 from trade_gateway.ros._following import Place
 from trade_gateway.ros._goals import (
@@ -29,6 +31,8 @@ from trade_gateway.ros._nodes import Nodes
 from trade_gateway.ros._words import ros_stamp
 
 __all__ = ["TrajectoriesToRos"]
+
+_logger = logging.getLogger("trade")
 
 _MORE_S: Final = 15.0
 """A call has so much more time than what it moves takes."""
@@ -141,14 +145,23 @@ class _Canceling:
         """It is to end."""
         with self._guard:
             self.asked, end = True, self._end
-        end()
+        _try(end)
 
     def ends(self, end: Callable[[], object]) -> None:
         """This ends it."""
         with self._guard:
             self._end, now = end, self.asked
         if now:
-            end()
+            _try(end)
+
+
+def _try(end: Callable[[], object]) -> None:
+    try:
+        end()
+    except SessionEnded:  # and with it what it moved
+        pass
+    except Exception:
+        _logger.exception("a goal that was canceled could not be ended")
 
 
 def _wait(run: Run, deadline_s: float, canceling: _Canceling) -> None:
