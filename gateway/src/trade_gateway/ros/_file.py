@@ -206,6 +206,9 @@ class FromPublish(_Offered, frozen=True, kw_only=True):
     effect: Literal["note", "actuate"]
     stop: dict[str, Any] | None = None
     """With ``actuate``: the message that ends what it moves."""
+    valid_s: Annotated[float, Meta(ge=0, le=1)] = 0.5
+    """So long each holds, then ``stop`` is published, unless another one comes before; 0: what it asks for has an end
+    of its own, and ``stop`` is published when its session ends."""
 
 
 class FromJoints(_Strict, frozen=True, kw_only=True):
