@@ -116,9 +116,8 @@ class Bridge:
     @service(effect="read")
     def bridged(self) -> Bridged:
         """What is up, for whom, and what is not."""
-        opened = {f"{place.kind} {place.name}": handle.label for place, handle in self._following.opened()}
         offered = {one.where: one.groups for one in self._offered}
-        return Bridged(opened, offered, self._nodes.names(), self._following.problems())
+        return Bridged(self._following.opened(), offered, self._nodes.names(), self._following.problems())
 
     def _heard(self, problem: str) -> None:
         """ROS is lost, or back."""

@@ -28,6 +28,8 @@ class Place(NamedTuple):
     kind: str
     """``service``, ``action``, ``command`` or ``topic``; of all but the last there is one of a name."""
     name: str
+    what: str = ""
+    """For people, if it is more than one service of ours."""
 
 
 class Mapping(Protocol):
@@ -51,6 +53,11 @@ class _Key(NamedTuple):
     entry: int
     place: Place
     handle: Handle
+
+    @property
+    def what(self) -> str:
+        """What is there, for people."""
+        return self.place.what or self.handle.label
 
 
 class Following:
@@ -81,9 +88,9 @@ class Following:
         """Wait until what is there already was opened. Returns whether it was."""
         return self._first.wait(timeout_s)
 
-    def opened(self) -> list[tuple[Place, Handle]]:
-        """What is open."""
-        return [(key.place, key.handle) for key in list(self._open)]
+    def opened(self) -> dict[str, str]:
+        """What is open, by kind and name: what it is here."""
+        return {f"{key.place.kind} {key.place.name}": key.what for key in list(self._open)}
 
     def problems(self) -> list[str]:
         """What is not, and why."""
@@ -103,7 +110,7 @@ class Following:
         wanted = self._wanted()
         for key in [key for key in self._open if key not in wanted]:
             self._open.pop(key).close()
-            self._say(f"{key.place.kind} {key.place.name} is gone, as {key.handle.label} is")
+            self._say(f"{key.place.kind} {key.place.name} is gone, as {key.what} is")
         present = {(key.entry, key.place, key.handle) for key in wanted}
         for failed in [one for one in self._failed if one[1] is not None and one not in present]:
             del self._failed[failed]
@@ -113,7 +120,7 @@ class Following:
 
     def _wanted(self) -> dict[_Key, None]:
         wanted: dict[_Key, None] = {}
-        claimed: dict[Place, _Key] = {(key.place): key for key in self._open if key.place.kind != "topic"}
+        claimed = {key.place[:2]: key for key in self._open if key.place.kind != "topic"}
         for number, mapping in enumerate(self._mappings):
             found = [one for one in self._container.services(mapping.of) if self._is_for_ros(one)]
             try:
@@ -124,12 +131,12 @@ class Following:
                 continue
             for place, handle in places:
                 key = _Key(number, place, handle)
-                holder = claimed.get(place)
+                holder = claimed.get(place[:2])
                 if place.kind != "topic" and holder is not None and holder != key and holder.handle.alive:
-                    self._note(key, f"{handle.label} is not there as {place.name}, which {holder.handle.label} is")
+                    self._note(key, f"{key.what} is not there as {place.name}, which {holder.what} is")
                     continue
                 if place.kind != "topic":
-                    claimed[place] = key
+                    claimed[place[:2]] = key
                 wanted[key] = None
         return wanted
 
@@ -144,10 +151,10 @@ class Following:
         try:
             self._open[key] = self._mappings[key.entry].open(key.place, key.handle)
         except Exception as error:  # noqa: BLE001 - one that cannot be mapped keeps no other from it
-            self._note(key, f"{key.handle.label} is not there as {key.place.name}: {failure(error)}")
+            self._note(key, f"{key.what} is not there as {key.place.name}: {failure(error)}")
             return
         self._failed.pop(key, None)
-        self._say(f"{key.place.kind} {key.place.name} is {key.handle.label}")
+        self._say(f"{key.place.kind} {key.place.name} is {key.what}")
 
     def _note(self, key: tuple[int, Place | None, Handle | None], text: str) -> None:
         before, _ = self._failed.get(key, ("", 0.0))

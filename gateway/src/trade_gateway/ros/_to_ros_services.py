@@ -96,7 +96,8 @@ class LocksToRos:
     def places(self, found: Sequence[Handle]) -> Iterable[tuple[Place, Handle]]:
         first = next((handle for handle in found if handle.effect == "actuate"), None)
         if first is not None:
-            yield Place("service", self._entry.name or ros_path(self._entry.group, "lock")), first
+            name = self._entry.name or ros_path(self._entry.group, "lock")
+            yield Place("service", name, f"a lock over {self._entry.group}"), first
 
     def open(self, place: Place, handle: Handle) -> Closes:  # noqa: ARG002 - it is of a whole group
         told = Told(self._graph.types, self._graph.types.parts(_SET_BOOL)[1])

@@ -148,10 +148,9 @@ class _Pump:
     def _note(self, error: Exception) -> None:
         if self._closing or type(error) is TimeoutError:  # nothing came for a moment
             return
-        text = failure(error)
-        if text != self._problem:
-            _logger.warning("nothing is published on %s: %s", self._place[0], text)
-        self._problem = text
+        if type(error).__name__ != self._problem:  # its text has times in it
+            _logger.warning("nothing is published on %s: %s", self._place[0], failure(error))
+        self._problem = type(error).__name__
 
     def close(self) -> None:
         self._closing = True
