@@ -147,6 +147,23 @@ def test_nobody_knows_whom_a_lock_would_belong_to_that_an_unknown_node_takes(sta
     assert stand.trigger(stand.node(), "/rosie/head/state")["success"]
 
 
+def test_S03_a_node_that_ros_does_not_list_counts_as_gone_soon(stand: Stand, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("trade_gateway.ros._nodes._UNSEEN_S", 0.2)
+    stand.up(LOCKS)
+    ghost = stand.ros.graph("/ghost", seen=False)
+    assert stand.set_bool(ghost, "/rosie/head/lock", True)["success"]
+    wait_until(lambda: stand.container.locks() == [])
+    assert stand.set_bool(stand.node(), "/rosie/head/lock", True)["success"]
+
+
+def test_nodes_that_ros_does_not_tell_apart_are_one_client(stand: Stand) -> None:
+    bridge = stand.up(TRIGGERS + SWITCHES)
+    stand.ros.anonymous = True
+    assert stand.set_bool(stand.node("/one"), "/rosie/head/power", True)["success"]
+    assert stand.trigger(stand.node("/other"), "/rosie/head/stop")["success"]
+    assert bridge.bridged().nodes == ["a node of ROS that is not known"]
+
+
 def test_while_a_node_moves_something_it_is_locked_against_others(stand: Stand) -> None:
     stand.up(TRIGGERS)
     spins, _ = apart(lambda: stand.trigger(stand.node(), "/rosie/head/spin"))

@@ -96,6 +96,27 @@ def test_S09_an_e_stop_reaches_what_moves_in_ros(stand: Stand) -> None:
     stand.robot.container.estop_clear([report.id])
 
 
+def test_what_does_not_answer_in_time_is_stopped_as_it_may_move(stand: Stand) -> None:
+    lab = Lab(stand)
+    lab.waits = True
+    stand.up(DOOR + "deadline_s = 0.2\n")
+    with pytest.raises(RosUnreachable, match="no answer within"):
+        found(stand, "lab", "door")(True)
+    assert lab.stopped.is_set()
+    assert stand.container.locks() == []
+
+
+def test_what_ros_refuses_does_not_count_as_moving(stand: Stand) -> None:
+    stand.node("/lab").serve("/lab/door", "std_srvs/srv/SetBool", lambda request, who: {"success": 1 / 0})
+    stand.up(DOOR)
+    with pytest.raises(RosRefused, match="division by zero"):
+        found(stand, "lab", "door")(True)
+    person = stand.memory.container("person")
+    stand.memory.settle()
+    with person.lock(where(group="lab"), wait_s=0):  # nobody waits until it rests
+        pass
+
+
 def test_a_stop_that_ros_refuses_is_an_error(stand: Stand) -> None:
     lab = Lab(stand)
     lab._stop = lambda request, who: {"success": False, "message": "jammed"}  # type: ignore[method-assign]

@@ -62,6 +62,9 @@ def service_from_ros(entry: FromService, graph: Graph, records: Records) -> Offe
             except RosUnreachable:  # it may have begun all the same
                 stop({})
                 raise
+            except BaseException:
+                resource.moving = False
+                raise
             resource.moving = False
         return result
 
