@@ -103,7 +103,7 @@ class _Limb:
                 if canceling.asked:
                     return _outcome(Ended.CANCELED, SUCCESSFUL, "canceled before it began")
                 run = guest.begin(self._follow, args, deadline_s, admitted)
-                run.on_progress(lambda told: self._tell(goal, told))
+                run.on_progress(lambda told: _try(lambda: self._tell(goal, told)))
                 canceling.ends(lambda: guest.client.cancel(run))
                 _wait(run, deadline_s, canceling)
         except Exception as error:  # noqa: BLE001 - whatever went wrong, its client is told
@@ -161,7 +161,7 @@ def _try(end: Callable[[], object]) -> None:
     except SessionEnded:  # and with it what it moved
         pass
     except Exception:
-        _logger.exception("a goal that was canceled could not be ended")
+        _logger.exception("a goal could not be told of, or ended")
 
 
 def _wait(run: Run, deadline_s: float, canceling: _Canceling) -> None:
