@@ -48,6 +48,7 @@ _COMMANDS: Final = {
     "stream": (_SERVICES, "_stream:stream"),
     "ask": (_SERVICES, "_ask:ask"),
     "mcp": (_SERVICES, "_mcp:mcp"),
+    "ros": (_ROBOTS, "_ros:ros"),
     "lock": (_MOTION, "_lock:lock"),
     "locks": (_MOTION, "_locks:locks"),
     "unlock": (_MOTION, "_locks:unlock"),

@@ -1,0 +1,218 @@
+"""Joints of theirs, which a topic tells of and an action moves, as a provider of ours."""
+
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, Final
+
+import msgspec
+from msgspec import Struct
+
+from trade import Meta, Resource, current_call, permit, progress, service
+from trade.errors import DeviceFault, InvalidArgument, MotionStopped
+from trade_drivers import Trajectory
+from trade_gateway.ros._file import FromJoints
+from trade_gateway.ros._from_ros import Offered
+from trade_gateway.ros._goals import ACTION, goal_of
+from trade_gateway.ros._graph import Ended, Graph, Outcome, Pursuit, RosRefused, RosUnreachable
+from trade_gateway.ros._types import Message
+
+__all__ = ["RosJoint", "RosJoints", "joints_from_ros"]
+
+_JOINT_STATE: Final = "sensor_msgs/msg/JointState"
+_STOPPED_WITHIN_S: Final = 1.8
+"""Within what the end of a session allows (S05)."""
+_MARGIN_S: Final = 0.1
+_LONGEST_S: Final = 3600.0
+_PEAK: Final = 1.5
+"""How much quicker than its mean a cubic curve from rest to rest is at its quickest."""
+_SHORTEST_S: Final = 0.2
+
+Position = Annotated[float, Meta(description="joint angle in rad")]
+
+
+class RosJoint(Struct, frozen=True, kw_only=True):
+    """What was last heard of one joint."""
+
+    name: str
+    """Ours: ``lab.arm.shoulder``."""
+    position_rad: float
+    velocity_rad_s: float | None
+    """None: the topic does not tell."""
+    effort_nm: float | None
+    age_s: float
+    """How long ago that was heard."""
+
+
+class RosJoints:
+    """Joints of ROS; values are in the order of ``joints()``. Their limits are known to ROS alone."""
+
+    def __init__(self, entry: FromJoints, graph: Graph) -> None:
+        self._entry = entry
+        self._graph = graph
+        self._names = [f"{entry.groups[0]}.{name}" for name in entry.joints]
+        self.resources: Final = tuple(Resource(name) for name in self._names)
+        self._heard: dict[str, tuple[float, float | None, float | None, float]] = {}
+        self._began = time.monotonic()
+        self._guard = threading.Lock()
+        self._active: Pursuit | None = None
+        self._subscription = graph.subscribe(entry.topic, _JOINT_STATE, self._hear)
+
+    def _hear(self, message: Message, _who: str) -> None:
+        now = time.monotonic()
+        for number, name in enumerate(message["name"][: len(message["position"])]):
+            values = [_nth(message[field], number) for field in ("velocity", "effort")]
+            self._heard[name] = (message["position"][number], values[0], values[1], now)
+
+    @service(effect="read")
+    def joints(self) -> list[str]:
+        """The names of the joints, in the order of all values."""
+        return list(self._names)
+
+    @service(effect="read")
+    def state(self) -> list[RosJoint]:
+        """What was last heard of every joint; RosUnreachable if that is too old for one of them."""
+        now, told = time.monotonic(), list[RosJoint]()
+        for theirs, own in zip(self._entry.joints, self._names, strict=True):
+            position, velocity, effort, at = self._heard.get(theirs, (0.0, None, None, None))
+            silent_s = now - (self._began if at is None else at)
+            if at is None or silent_s > self._entry.stale_after_s:
+                problem = f"nothing was heard of {theirs} for {silent_s:.3g} s; is the node up that publishes it?"
+                raise RosUnreachable(what=self._entry.topic, problem=problem)
+            told.append(
+                RosJoint(name=own, position_rad=position, velocity_rad_s=velocity, effort_nm=effort, age_s=silent_s)
+            )
+        return told
+
+    @service(cancel="stop")
+    def move_to(self, positions_rad: list[Position], speed_rad_s: float | None = None) -> list[float]:
+        """Move all joints to angles, so that they arrive together; the angles heard at the end.
+
+        Raises:
+            InvalidArgument: not as many as there are joints, or no speed.
+            RosUnreachable: nobody knows where they are, or nobody serves the action.
+            RosRefused: it was rejected.
+            DeviceFault: it was aborted, or nobody heard whether it has ended.
+            MotionStopped: it was stopped, or its call's deadline came first.
+        """
+        if len(positions_rad) != len(self._names):
+            problem = f"{len(positions_rad)} for {len(self._names)} joints"
+            raise InvalidArgument(service="move_to", argument="positions_rad", problem=problem)
+        fastest = self._entry.max_speed_rad_s
+        speed = fastest if speed_rad_s is None else speed_rad_s
+        if not 0 < speed <= fastest:
+            problem = f"{speed:g} is not above 0 and at most {fastest:g}"
+            raise InvalidArgument(service="move_to", argument="speed_rad_s", problem=problem)
+        way = max(abs(to - one.position_rad) for to, one in zip(positions_rad, self.state(), strict=True))
+        still = [0.0] * len(self._names)
+        at_s = max(_SHORTEST_S, _PEAK * way / speed)
+        return self._pursue([{"time_from_start_s": at_s, "positions_rad": positions_rad, "velocities_rad_s": still}])
+
+    @service(cancel="stop")
+    def follow(self, trajectory: Trajectory) -> list[float]:
+        """Go through angles at given times; the angles heard at the end. Limits are kept by ROS. Raises like move_to.
+
+        Args:
+            trajectory: of all joints, in any order.
+        """
+        if sorted(trajectory.joints) != sorted(self._names):
+            problem = f"is for {', '.join(trajectory.joints) or 'no joints'}; it takes one for {', '.join(self._names)}"
+            raise InvalidArgument(service="follow", argument="trajectory.joints", problem=problem)
+        order = [trajectory.joints.index(name) for name in self._names]
+        points: list[Mapping[str, Any]] = []
+        for point in trajectory.points:
+            for angles in (point.positions_rad, point.velocities_rad_s or point.positions_rad):
+                if len(angles) != len(order):
+                    problem = f"a point has {len(angles)} values for {len(order)} joints"
+                    raise InvalidArgument(service="follow", argument="trajectory.points", problem=problem)
+            told: Message = msgspec.to_builtins(point)
+            told["positions_rad"] = [point.positions_rad[column] for column in order]
+            if point.velocities_rad_s is not None:
+                told["velocities_rad_s"] = [point.velocities_rad_s[column] for column in order]
+            points.append(told)
+        return self._pursue(points)
+
+    @service(effect="stop")
+    def stop(self) -> None:
+        """Cancel what this bridge asked of the action; DeviceFault if its end is not heard.
+
+        What others in ROS ask of it goes on.
+        """
+        with self._guard:
+            active = self._active
+        if active is None:
+            return
+        self._cancel(active)
+        self._rest(active)
+
+    def _cancel(self, pursuit: Pursuit) -> None:
+        """Raises DeviceFault: its end was not heard; it counts as moving then."""
+        pursuit.cancel()
+        try:
+            pursuit.wait(_STOPPED_WITHIN_S)
+        except RosRefused:  # it has never begun
+            return
+        except RosUnreachable as silent:
+            fault = f"told to stop, but its end was not heard: {silent}"
+            raise DeviceFault(device=self._entry.groups[0], bus=self._entry.action, fault=fault) from None
+
+    def _pursue(self, points: Sequence[Mapping[str, Any]]) -> list[float]:
+        goal = goal_of(self._entry.joints, points)
+        with permit(self.resources) as permitted:
+            before = self._active
+            if before is not None:  # ours: another move takes over, and its end is awaited by who asked for it
+                before.cancel()
+            with self._guard:
+                permitted.gate()
+                self._active = pursuit = self._graph.pursue(self._entry.action, ACTION, goal, progress)
+                for resource in self.resources:
+                    resource.moving = True
+            outcome = self._ended(pursuit)
+        self._check(outcome)
+        return [one.position_rad for one in self.state()]
+
+    def _ended(self, pursuit: Pursuit) -> Outcome:
+        call, device = current_call(), self._entry.groups[0]
+        if call is not None:
+            call.on_cancel(pursuit.cancel)
+        left_s = None if call is None else call.remaining_s
+        try:
+            outcome = pursuit.wait(_LONGEST_S if left_s is None else max(0.0, left_s - _MARGIN_S))
+        except RosRefused:
+            self._rest(pursuit)
+            raise
+        except RosUnreachable as silent:
+            self._cancel(pursuit)
+            self._rest(pursuit)
+            raise MotionStopped(device=device, reason=f"its goal was canceled: {silent}") from None
+        self._rest(pursuit)
+        return outcome
+
+    def _check(self, outcome: Outcome) -> None:
+        device, text = self._entry.groups[0], outcome.text or str(outcome.result.get("error_string", ""))
+        if outcome.how is Ended.CANCELED:
+            raise MotionStopped(device=device, reason=text or "its goal was canceled")
+        code = outcome.result.get("error_code", 0)
+        if outcome.how is Ended.ABORTED or code:
+            raise DeviceFault(device=device, bus=self._entry.action, fault=f"{text or 'aborted'} (error code {code})")
+
+    def _rest(self, pursuit: Pursuit) -> None:
+        with self._guard:
+            if self._active is pursuit:
+                self._active = None
+                for resource in self.resources:
+                    resource.moving = False
+
+    def close(self) -> None:
+        """Hear nothing any more."""
+        self._subscription.close()
+
+
+def _nth(values: Sequence[float], number: int) -> float | None:
+    return values[number] if number < len(values) else None
+
+
+def joints_from_ros(entry: FromJoints, graph: Graph) -> Offered:
+    """``[[from_ros.joints]]``. Raises ConfigurationError."""
+    made = RosJoints(entry, graph)
+    return Offered(f"action {entry.action}", entry.groups, made, made.close)

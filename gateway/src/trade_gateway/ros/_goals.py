@@ -1,0 +1,164 @@
+"""Goals of FollowJointTrajectory in our words, and our errors in theirs. No input or output.
+
+Fields, units and error codes are those of control_msgs (``FollowJointTrajectory.action``, ``JointTolerance.msg``).
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
+
+from trade.errors import InvalidArgument, ToleranceExceeded
+from trade_gateway.ros._joints import JointNames
+from trade_gateway.ros._types import Message
+from trade_gateway.ros._words import failure, ros_stamp, seconds
+
+__all__ = [
+    "ACTION",
+    "GOAL_TOLERANCE_VIOLATED",
+    "INVALID_GOAL",
+    "INVALID_JOINTS",
+    "OLD_HEADER_TIMESTAMP",
+    "PATH_TOLERANCE_VIOLATED",
+    "SUCCESSFUL",
+    "Unacceptable",
+    "code_of",
+    "goal_of",
+    "lasts_s",
+    "starts_late",
+    "text_of",
+    "tolerances_of",
+    "trajectory_of",
+]
+
+ACTION: Final = "control_msgs/action/FollowJointTrajectory"
+SUCCESSFUL: Final = 0
+INVALID_GOAL: Final = -1
+INVALID_JOINTS: Final = -2
+OLD_HEADER_TIMESTAMP: Final = -3
+PATH_TOLERANCE_VIOLATED: Final = -4
+GOAL_TOLERANCE_VIOLATED: Final = -5
+
+_CLOCKS_S: Final = 1.0
+"""So far may the clock of who stamps a goal be from ours."""
+
+
+class Unacceptable(Exception):
+    """A goal that is refused before anything moves."""
+
+    def __init__(self, code: int, problem: str) -> None:
+        super().__init__(problem)
+        self.code = code
+        """As in its result."""
+
+
+def starts_late(goal: Message, now_s: float) -> None:
+    """A goal begins now. Raises Unacceptable: its header says that it began long ago, or begins later."""
+    stamp = goal["trajectory"]["header"]["stamp"]
+    if not (stamp["sec"] or stamp["nanosec"]):
+        return
+    late_s = now_s - seconds(stamp)
+    if late_s > _CLOCKS_S:
+        problem = f"it was to begin {late_s:.3g} s ago; stamp it 0 to begin at once"
+        raise Unacceptable(OLD_HEADER_TIMESTAMP, problem)
+    if late_s < -_CLOCKS_S:
+        problem = f"it is to begin in {-late_s:.3g} s, and nothing is kept until later; stamp it 0 to begin at once"
+        raise Unacceptable(INVALID_GOAL, problem)
+
+
+def trajectory_of(goal: Message, names: JointNames, here: Mapping[str, float] | None) -> dict[str, Any]:
+    """A goal's trajectory as ours.
+
+    Args:
+        goal: the whole of it.
+        names: of the joints there are.
+        here: where they are, by our name: put first where the first point comes later. None: it must not.
+
+    Raises:
+        Unacceptable: other joints, or points that lack angles.
+    """
+    said: Sequence[str] = goal["trajectory"]["joint_names"]
+    if sorted(said) != sorted(names.ours):
+        problem = f"it is for {', '.join(said) or 'no joints'}; all of {', '.join(names.ours)} belong in it"
+        raise Unacceptable(INVALID_JOINTS, problem)
+    if goal.get("multi_dof_trajectory", {}).get("points"):
+        raise Unacceptable(INVALID_GOAL, "multi_dof_trajectory has points; joints of one degree of freedom are moved")
+    points = [_point(point, said) for point in goal["trajectory"]["points"]]
+    if not points:
+        raise Unacceptable(INVALID_GOAL, "it has no points; cancel a goal to stop, or call the stop service")
+    joints = [names.ours[name] for name in said]
+    if points[0]["time_from_start_s"] > 0:
+        if here is None:
+            raise Unacceptable(INVALID_GOAL, "its first point must be at 0 s")
+        first: dict[str, Any] = {"time_from_start_s": 0.0, "positions_rad": [here[joint] for joint in joints]}
+        if "velocities_rad_s" in points[0]:
+            first["velocities_rad_s"] = [0.0] * len(joints)
+        points.insert(0, first)
+    return {"joints": joints, "points": points}
+
+
+def _point(point: Message, names: Sequence[str]) -> dict[str, Any]:
+    for field in ("positions", "velocities"):
+        if len(point[field]) not in ((len(names),) if field == "positions" else (0, len(names))):
+            problem = f"a point has {len(point[field])} {field} for {len(names)} joints"
+            raise Unacceptable(INVALID_GOAL, problem)
+    told: dict[str, Any] = {
+        "time_from_start_s": seconds(point["time_from_start"]),
+        "positions_rad": point["positions"],
+    }
+    return told | ({"velocities_rad_s": point["velocities"]} if point["velocities"] else {})
+
+
+def lasts_s(trajectory: Mapping[str, Any]) -> float:
+    """Of ours, to its last point, in seconds."""
+    return trajectory["points"][-1]["time_from_start_s"]
+
+
+def tolerances_of(goal: Message) -> dict[str, float]:
+    """How far joints may be off, by our words: the tightest of a goal's holds for all; what it leaves out is default.
+
+    Those of speed and acceleration are not looked at, and none can be switched off (-1).
+    """
+    told: dict[str, float] = {}
+    for ours, theirs in (("path_rad", "path_tolerance"), ("goal_rad", "goal_tolerance")):
+        if said := [one["position"] for one in goal[theirs] if one["position"] > 0]:
+            told[ours] = min(said)
+    if (time_s := seconds(goal["goal_time_tolerance"])) > 0:
+        told["goal_time_s"] = time_s
+    return told
+
+
+def code_of(error: BaseException) -> int:
+    """The error code that says most of an error; what it is stands in the text beside it."""
+    if isinstance(error, Unacceptable):
+        return error.code
+    if isinstance(error, ToleranceExceeded):
+        return {"path": PATH_TOLERANCE_VIOLATED, "goal": GOAL_TOLERANCE_VIOLATED}.get(error.what, INVALID_GOAL)
+    if isinstance(error, InvalidArgument) and error.argument == "trajectory.joints":
+        return INVALID_JOINTS
+    return INVALID_GOAL
+
+
+def text_of(error: BaseException) -> str:
+    """The text beside it."""
+    return str(error) if isinstance(error, Unacceptable) else failure(error)
+
+
+def goal_of(joints: Sequence[str], points: Sequence[Mapping[str, Any]]) -> Message:
+    """A goal for joints of theirs.
+
+    Args:
+        joints: their names.
+        points: as in our trajectories, in the order of the joints.
+    """
+    return {
+        "trajectory": {
+            "joint_names": list(joints),
+            "points": [
+                {
+                    "positions": list(point["positions_rad"]),
+                    "velocities": list(point.get("velocities_rad_s") or ()),
+                    "time_from_start": ros_stamp(point["time_from_start_s"]),
+                }
+                for point in points
+            ],
+        }
+    }

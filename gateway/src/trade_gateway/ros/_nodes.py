@@ -1,0 +1,206 @@
+"""Nodes of ROS as clients: each has a session of its own, which ends when the node does (S03).
+
+ROS tells of nodes that go. If it is lost itself nobody does, and then all of them count as gone after a short grace.
+"""
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from typing import Any, Final
+
+from trade import Container, Handle, Run
+from trade.errors import Cancelled
+from trade_gateway.door._clients import Client
+from trade_gateway.ros._graph import Graph, RosUnreachable
+from trade_gateway.ros._locking import Grips
+
+__all__ = ["UNKNOWN", "Guest", "Nodes"]
+
+_logger = logging.getLogger("trade")
+
+UNKNOWN: Final = ""
+"""Whoever ROS does not tell apart: they are one client together."""
+_LOOK_EVERY_S: Final = 0.1
+_UNSEEN_S: Final = 5.0
+"""Who was heard but is not among the nodes that ROS tells of is gone so long after it was heard last."""
+_FORGOTTEN_S: Final = 2.0
+"""So long nothing is done for a node that has ended: what comes then was sent before."""
+_WAIT_S: Final = 0.5
+"""For a lock: what somebody has just let go of."""
+_LATE_S: Final = 5.0
+"""Beyond a call's deadline, when its end must have been told."""
+
+
+class Guest:
+    """One node of ROS; its methods wait."""
+
+    def __init__(self, container: Container, client: Client, who: str) -> None:
+        self._container = container
+        self.client: Final = client
+        self.who: Final = who
+        """Its name; empty: nobody knows."""
+        self.grips: Final = Grips(container, client)
+        self.heard_at = time.monotonic()
+
+    @property
+    def named(self) -> str:
+        """For people."""
+        return self.who or "a node of ROS that is not known"
+
+    def call(self, handle: Handle, args: dict[str, Any], deadline_s: float, wait_s: float = _WAIT_S) -> Any:
+        """Call a service of ours and wait; what moves is under a lock meanwhile. Raises what the call does."""
+        if handle.effect != "actuate":
+            return self._ended(self.begin(handle, args, deadline_s), deadline_s)
+        admitted = self.client.admit(handle)
+        with self.grips.hold([handle], f"a call of {self.named}", wait_s):
+            return self._ended(self.begin(handle, args, deadline_s, admitted), deadline_s)
+
+    def begin(self, handle: Handle, args: dict[str, Any], deadline_s: float, admitted: int | None = None) -> Run:
+        """Call without waiting, under the locks there are.
+
+        Args:
+            handle: what to call.
+            args: by name.
+            deadline_s: how long it may take.
+            admitted: what `Client.admit` said when it was asked for; by default that is now.
+
+        Raises:
+            Cancelled: a stop was asked for meanwhile.
+            SessionEnded: the node is gone.
+        """
+        client = self.client
+        number = client.admit(handle) if admitted is None else admitted
+
+        def start() -> Run:
+            return self._container.begin(handle, (), args, deadline_s)
+
+        with client.speaking():
+            if handle.effect == "stop":
+                client.stopping(number, start)
+            elif handle.effect == "actuate" and client.overtaken(number):
+                raise Cancelled(service=handle.label)
+            run = start()
+            if handle.effect == "actuate":
+                client.stop_again(number)
+        if handle.effect != "stop":
+            client.note(run)
+        return run
+
+    def _ended(self, run: Run, deadline_s: float) -> Any:
+        try:
+            return run.result(deadline_s + _LATE_S)
+        finally:
+            if not run.done():
+                self.client.cancel(run)
+
+
+class Nodes:
+    """Those that have asked for something.
+
+    Args:
+        container: the bridge's.
+        graph: the ROS system.
+        grace_s: how long that may be lost before all nodes count as gone.
+        told: called with what is wrong with the ROS system, or nothing, whenever that changes.
+    """
+
+    def __init__(self, container: Container, graph: Graph, grace_s: float, told: Callable[[str], object]) -> None:
+        self._container = container
+        self._graph = graph
+        self._grace_s = grace_s
+        self._tell = told
+        self._guests: dict[str, Guest] = {}
+        self._there: set[str] = set()
+        self._gone: dict[str, float] = {}
+        """When which has ended, of those that had a session."""
+        self._guard = threading.Lock()
+        self._lost = ""
+        self._lost_at: float | None = None
+        self._closing = threading.Event()
+        self._watch = graph.watch_nodes(self._node)
+        self._thread = threading.Thread(target=self._look_on, name="trade-ros-nodes", daemon=True)
+        self._thread.start()
+
+    def guest(self, who: str, *, stops: bool = False) -> Guest:
+        """The client that a node is.
+
+        Args:
+            who: its name, as ROS says it.
+            stops: it wants to stop something, which it always may.
+
+        Raises:
+            RosUnreachable: nobody would see it die, or it just has.
+        """
+        with self._guard:
+            if self._lost and not stops:
+                problem = f"{self._lost}; nobody would see {who or 'a node'} die, so nothing is done for it until then"
+                raise RosUnreachable(what="ROS", problem=problem)
+            if time.monotonic() - self._gone.get(who, -_FORGOTTEN_S) < _FORGOTTEN_S and not stops:
+                raise RosUnreachable(
+                    what=who, problem="it has just ended; what was still under way from it is not done"
+                )
+            guest = self._guests.get(who)
+            if guest is None or guest.client.closed:
+                guest = self._guests[who] = self._opened(who)
+            guest.heard_at = time.monotonic()
+            return guest
+
+    def _opened(self, who: str) -> Guest:
+        session = self._container.open_session(who.strip("/") or "unknown")
+        return Guest(self._container, Client(self._container.address.identity, session, lambda _: None), who)
+
+    def names(self) -> list[str]:
+        """Of the nodes that have a session now."""
+        with self._guard:
+            return sorted(guest.named for guest in self._guests.values() if not guest.client.closed)
+
+    # --- who is gone
+
+    def _node(self, name: str, there: bool) -> None:
+        with self._guard:
+            (self._there.add if there else self._there.discard)(name)
+            gone = None if there else self._guests.pop(name, None)
+            self._gone.pop(name, None)
+            if gone is not None:
+                self._gone[name] = time.monotonic()
+        if gone is not None:
+            _logger.info("%s is gone: what it moved stops, its locks fall", name)
+            gone.client.close()
+
+    def _look_on(self) -> None:
+        while not self._closing.wait(_LOOK_EVERY_S):
+            try:
+                self._look()
+            except Exception:
+                _logger.exception("nodes of ROS could not be looked after")
+
+    def _look(self) -> None:
+        problem, now = self._graph.healthy, time.monotonic()
+        self._lost_at = None if not problem else now if self._lost_at is None else self._lost_at
+        lost = problem if self._lost_at is not None and now - self._lost_at >= self._grace_s else ""
+        with self._guard:
+            self._gone = {name: at for name, at in self._gone.items() if now - at < _FORGOTTEN_S}
+            changed, self._lost = bool(lost) != bool(self._lost), lost
+            all_of_them = changed and bool(lost)  # later there are only some that stop something
+            gone = [one for one in self._guests.values() if all_of_them or self._unseen(one, now)]
+            for guest in gone:
+                del self._guests[guest.who]
+        for guest in gone:
+            guest.client.close()
+        if changed:
+            self._tell(lost)
+
+    def _unseen(self, guest: Guest, now: float) -> bool:
+        unseen = bool(self._lost) or guest.who not in (UNKNOWN, *self._there)
+        return unseen and now - guest.heard_at > _UNSEEN_S
+
+    def close(self) -> None:
+        """All count as gone. Idempotent."""
+        self._closing.set()
+        self._watch.close()
+        self._thread.join()
+        with self._guard:
+            guests, self._guests = list(self._guests.values()), {}
+        for guest in guests:
+            guest.client.close()

@@ -1,0 +1,144 @@
+"""Services of ours, and locks over them, as services of ROS."""
+
+from collections.abc import Iterable, Sequence
+from typing import Final, NamedTuple
+
+from trade import Constraint, Container, Handle, Lock, where
+from trade.errors import ConfigurationError
+from trade_gateway.door._clients import Client
+from trade_gateway.ros._file import LockService, ServiceEntry
+from trade_gateway.ros._following import Place, named_services
+from trade_gateway.ros._graph import Answer, Closes, Graph, RosRefused
+from trade_gateway.ros._nodes import UNKNOWN, Nodes
+from trade_gateway.ros._types import Message
+from trade_gateway.ros._words import Asked, Told, ros_path
+
+__all__ = ["LocksToRos", "ServicesToRos"]
+
+_SET_BOOL: Final = "std_srvs/srv/SetBool"
+
+
+class _Taken(NamedTuple):
+    """A lock of a node."""
+
+    client: Client
+    """The session it is of."""
+    lock: Lock
+    name: str
+    """What the client calls it."""
+
+
+class ServicesToRos:
+    """``[[to_ros.service]]``: a call in ROS is one of ours, in the session of the node that makes it."""
+
+    def __init__(self, entry: ServiceEntry, graph: Graph, nodes: Nodes) -> None:
+        """Raises ConfigurationError: the type is not known."""
+        self._entry = entry
+        self._graph = graph
+        self._nodes = nodes
+        self._request, response = graph.types.parts(entry.type)
+        self._told = Told(graph.types, response)
+
+    @property
+    def of(self) -> Constraint:
+        group, _, name = self._entry.service.rpartition(".")
+        return where(group=self._entry.group or group or None, name=name or None)
+
+    def places(self, found: Sequence[Handle]) -> Iterable[tuple[Place, Handle]]:
+        entry = self._entry
+        if entry.service:
+            for handle in named_services(entry.service, found):
+                yield Place("service", entry.name or ros_path(handle.key.domain, handle.name)), handle
+            return
+        for handle in found:
+            if handle.name in (entry.names or (handle.name,)) and self._fits(handle):
+                yield Place("service", ros_path(handle.key.domain, handle.name)), handle
+
+    def _fits(self, handle: Handle) -> bool:
+        try:
+            self._asked(handle)
+        except ConfigurationError:
+            return False
+        return True
+
+    def _asked(self, handle: Handle) -> Asked:
+        asked = Asked(self._graph.types, self._request, handle, self._entry.args)
+        if asked.unused:
+            problem = f"says {', '.join(asked.unused)}, and nothing is made of that; it is {handle.signature}"
+            raise ConfigurationError(where=f"{self._entry.type} for {handle.label}", problem=problem)
+        return asked
+
+    def open(self, place: Place, handle: Handle) -> Closes:
+        asked, told, deadline_s = self._asked(handle), self._told, self._entry.deadline_s
+
+        def answer(request: Message, who: str) -> Message:
+            guest = self._nodes.guest(who, stops=handle.effect == "stop")
+            return told(guest.call(handle, asked(request), deadline_s))
+
+        return self._graph.serve(place.name, self._entry.type, answering(told, answer))
+
+
+class LocksToRos:
+    """``[[to_ros.lock]]``: a node takes a lock in its session and gives it back; it falls when the node is gone."""
+
+    def __init__(self, entry: LockService, graph: Graph, nodes: Nodes, container: Container) -> None:
+        self._entry = entry
+        self._graph = graph
+        self._nodes = nodes
+        self._container = container
+        self._taken: dict[str, _Taken] = {}
+        """By node."""
+
+    @property
+    def of(self) -> Constraint:
+        return where(group=self._entry.group)
+
+    def places(self, found: Sequence[Handle]) -> Iterable[tuple[Place, Handle]]:
+        first = next((handle for handle in found if handle.effect == "actuate"), None)
+        if first is not None:
+            name = self._entry.name or ros_path(self._entry.group, "lock")
+            yield Place("service", name, f"a lock over {self._entry.group}"), first
+
+    def open(self, place: Place, handle: Handle) -> Closes:  # noqa: ARG002 - it is of a whole group
+        told = Told(self._graph.types, self._graph.types.parts(_SET_BOOL)[1])
+
+        def answer(request: Message, who: str) -> Message:
+            text = self._take(who) if request["data"] else self._give_back(who)
+            return {"success": True, "message": text}
+
+        return self._graph.serve(place.name, _SET_BOOL, answering(told, answer))
+
+    def _take(self, who: str) -> str:
+        if who == UNKNOWN:
+            problem = "ROS does not say who asks, so nobody would see its owner die; a lock needs a node that is known"
+            raise RosRefused(what=f"lock of {self._entry.group}", problem=problem)
+        guest, before = self._nodes.guest(who), self._taken.get(who)
+        client, wanted = guest.client, where(group=self._entry.group)
+        if before is not None and before.client is client and before.lock.held:
+            return f"it has {', '.join(before.lock.resources)}"
+        self._give_back(who)
+        client.locking()
+        handles = [one for one in self._container.services(wanted) if one.effect == "actuate"]
+        with client.session.use():
+            purpose = f"of {who}, a node of ROS"
+            lock = self._container.lock(wanted, purpose=purpose, wait_s=self._entry.wait_s).acquire()
+        self._taken[who] = _Taken(client, lock, client.keep(lock, handles))
+        client.session.check()
+        return ", ".join(lock.resources)
+
+    def _give_back(self, who: str) -> str:
+        taken = self._taken.pop(who, None)
+        given_back = taken is not None and not taken.client.closed and taken.client.unlock(taken.name)
+        return "given back" if given_back else "it had none"
+
+
+def answering(told: Told, answer: Answer) -> Answer:
+    """The same, with what goes wrong said in the response where that has words for it."""
+
+    def guarded(request: Message, who: str) -> Message:
+        try:
+            return answer(request, who)
+        except Exception as error:  # noqa: BLE001 - whatever a provider raises is what the node is told
+            return told.failed(error)
+
+    return guarded

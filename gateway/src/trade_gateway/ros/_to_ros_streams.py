@@ -1,0 +1,159 @@
+"""What services of ours read, as topics of ROS."""
+
+import logging
+import threading
+from collections.abc import Callable, Iterable, Sequence
+from typing import Final
+
+from trade import Constraint, Container, Handle, Sample, Stream, where
+from trade_gateway.ros._file import JointStates, StreamEntry
+from trade_gateway.ros._following import Place, named_services
+from trade_gateway.ros._graph import Closes, Graph, Publisher
+from trade_gateway.ros._joints import LIMBS, JointNames, joints_of, limbs, measured
+from trade_gateway.ros._types import Message
+from trade_gateway.ros._words import Told, failure, ros_stamp
+
+__all__ = ["JointStatesToRos", "StreamsToRos", "Topics"]
+
+_logger = logging.getLogger("trade")
+
+_LOOK_EVERY_S: Final = 0.5
+_JOINT_STATE: Final = "sensor_msgs/msg/JointState"
+_HEALTHY: Final = "healthy"
+
+
+class Topics:
+    """Topics that are published, each once however many entries fill it."""
+
+    def __init__(self, graph: Graph) -> None:
+        self._graph = graph
+        self._guard = threading.Lock()
+        self._shared: dict[tuple[str, str], tuple[Publisher, int]] = {}
+
+    def take(self, topic: str, type_name: str) -> Publisher:
+        """Publish it from now on. Raises what `Graph.advertise` does."""
+        with self._guard:
+            shared = self._shared.get((topic, type_name))
+            publisher, users = shared or (self._graph.advertise(topic, type_name), 0)
+            self._shared[topic, type_name] = (publisher, users + 1)
+            return publisher
+
+    def leave(self, topic: str, type_name: str) -> None:
+        """One less fills it; with the last it ends."""
+        with self._guard:
+            publisher, users = self._shared.pop((topic, type_name))
+            if users > 1:
+                self._shared[topic, type_name] = (publisher, users - 1)
+                return
+        publisher.close()
+
+
+class StreamsToRos:
+    """``[[to_ros.stream]]``."""
+
+    def __init__(self, entry: StreamEntry, topics: Topics, graph: Graph, container: Container) -> None:
+        """Raises ConfigurationError: the type is not known, or has no such fields."""
+        self._entry = entry
+        self._topics = topics
+        self._container = container
+        self._told = Told(graph.types, entry.type, entry.fields)
+
+    @property
+    def of(self) -> Constraint:
+        group, _, name = self._entry.service.rpartition(".")
+        return where(group=group or None, name=name)
+
+    def places(self, found: Sequence[Handle]) -> Iterable[tuple[Place, Handle]]:
+        for handle in named_services(self._entry.service, found):
+            yield Place("topic", self._entry.topic), handle
+
+    def open(self, place: Place, handle: Handle) -> Closes:
+        entry, told = self._entry, self._told
+        stream = self._container.stream(handle, hz=entry.hz)
+        return _Pump(stream, self._topics, place.name, entry.type, lambda sample: told(sample.value, sample.at))
+
+
+class JointStatesToRos:
+    """``[[to_ros.joint_states]]``: what is old, silent or not healthy is not published."""
+
+    def __init__(self, entry: JointStates, topics: Topics, container: Container) -> None:
+        self._entry = entry
+        self._topics = topics
+        self._container = container
+
+    @property
+    def of(self) -> Constraint:
+        return where(group=self._entry.group, name="state") & LIMBS
+
+    def places(self, found: Sequence[Handle]) -> Iterable[tuple[Place, Handle]]:
+        for handle in limbs(found, self._entry.group, "state"):
+            yield Place("topic", self._entry.topic), handle
+
+    def open(self, place: Place, handle: Handle) -> Closes:
+        entry, joints = self._entry, joints_of(self._container, handle)
+        named = {theirs: own for theirs, own in entry.joints.items() if own in joints}
+        names = JointNames(joints, short=entry.names == "last", named=named)
+        theirs = {own: name for name, own in names.ours.items()}
+
+        def message(sample: Sample) -> Message | None:
+            if handle.health != _HEALTHY:
+                return None
+            now = measured(joints, sample.value)
+            return {
+                "header": {"stamp": ros_stamp(sample.at - now.age_s)},
+                "name": [theirs[own] for own in now.names],
+                "position": list(now.positions_rad),
+                "velocity": list(now.velocities_rad_s),
+            }
+
+        stream = self._container.stream(handle, hz=entry.hz)
+        return _Pump(stream, self._topics, place.name, _JOINT_STATE, message)
+
+
+class _Pump:
+    """Publishes what a stream brings; what cannot be read is left out, and said once."""
+
+    def __init__(
+        self,
+        stream: Stream,
+        topics: Topics,
+        topic: str,
+        type_name: str,
+        message: Callable[[Sample], Message | None],
+    ) -> None:
+        self._stream = stream
+        self._topics = topics
+        self._place = (topic, type_name)
+        self._message = message
+        self._problem = ""
+        self._closing = False
+        try:
+            self._publisher = topics.take(topic, type_name)
+        except BaseException:
+            stream.close()
+            raise
+        self._thread = threading.Thread(target=self._run, name="trade-ros-stream", daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        while not (self._closing or self._stream.ended):
+            try:
+                message = self._message(self._stream.next(_LOOK_EVERY_S))
+                if message is not None:
+                    self._publisher.send(message)
+                self._problem = ""
+            except Exception as error:  # noqa: BLE001 - what a service raises ends no topic
+                self._note(error)
+
+    def _note(self, error: Exception) -> None:
+        if self._closing or type(error) is TimeoutError:  # nothing came for a moment
+            return
+        if type(error).__name__ != self._problem:  # its text has times in it
+            _logger.warning("nothing is published on %s: %s", self._place[0], failure(error))
+        self._problem = type(error).__name__
+
+    def close(self) -> None:
+        self._closing = True
+        self._stream.close()
+        self._thread.join()
+        self._topics.leave(*self._place)

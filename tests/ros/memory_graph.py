@@ -1,0 +1,312 @@
+"""A ROS system in memory: nodes with graphs of their own, real bytes between them, and deaths on command."""
+
+import queue
+import threading
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+from trade_gateway.ros._graph import (
+    Answer,
+    Ended,
+    Goal,
+    Heard,
+    NodeTold,
+    Outcome,
+    RosRefused,
+    RosUnreachable,
+)
+from trade_gateway.ros._types import Message, Types
+
+PATIENCE_S = 60.0
+
+
+class MemoryRos:
+    """The system; `graph` gives a node's view of it."""
+
+    def __init__(self, version: Literal[1, 2] = 2, folders: Iterable[Path] = ()) -> None:
+        self.types = Types(version, folders)
+        self.guard = threading.RLock()
+        self.nodes: dict[str, MemoryGraph] = {}
+        self.topics: dict[str, list[_Subscription]] = {}
+        self.latched: dict[str, tuple[bytes, str]] = {}
+        self.services: dict[str, _Service] = {}
+        self.actions: dict[str, _Action] = {}
+        self.parameters: dict[str, dict[str, Any]] = {}
+        self.watchers: list[_Watch] = []
+        self.problem = ""
+        """Why nobody can be seen any more; empty: all is well."""
+        self.anonymous = False
+        """Whether nobody is told who sends and calls."""
+
+    def graph(self, node: str, *, seen: bool = True) -> "MemoryGraph":
+        """A node; ``seen``: those who watch are told of it."""
+        made = MemoryGraph(self, node)
+        with self.guard:
+            self.nodes[node] = made
+        if seen:
+            self.tell(node, True)
+        return made
+
+    def kill(self, node: str) -> None:
+        """It dies: all of it is gone at once, and those who watch hear of it."""
+        self.nodes[node].close()
+
+    def tell(self, node: str, there: bool) -> None:
+        for watch in list(self.watchers):
+            watch.told(node, there)
+
+    def who(self, node: str) -> str:
+        return "" if self.anonymous else node
+
+    def close(self) -> None:
+        for graph in list(self.nodes.values()):
+            graph.close()
+
+
+class MemoryGraph:
+    """One node's."""
+
+    def __init__(self, ros: MemoryRos, node: str) -> None:
+        self._ros = ros
+        self.node = node
+        self._open: list[Any] = []
+        self.closed = False
+
+    @property
+    def types(self) -> Types:
+        return self._ros.types
+
+    @property
+    def healthy(self) -> str:
+        return self._ros.problem
+
+    def _keep(self, made: Any) -> Any:
+        self._open.append(made)
+        return made
+
+    def advertise(self, topic: str, type_name: str, *, latched: bool = False) -> "_Publisher":
+        self.types.fields(type_name)
+        return self._keep(_Publisher(self._ros, self, topic, type_name, latched))
+
+    def subscribe(self, topic: str, type_name: str, heard: Heard) -> "_Subscription":
+        return self._keep(_Subscription(self._ros, topic, type_name, heard))
+
+    def serve(self, name: str, type_name: str, answer: Answer) -> "_Service":
+        assert name not in self._ros.services, f"{name} is served twice"
+        return self._keep(_Service(self._ros, name, type_name, answer))
+
+    def call(self, name: str, type_name: str, request: Mapping[str, Any], timeout_s: float) -> Message:
+        found = self._ros.services.get(name)
+        if found is None or self.closed:
+            raise RosUnreachable(what=name, problem="nobody serves it")
+        return found.call(type_name, request, self._ros.who(self.node), timeout_s)
+
+    def act(self, name: str, type_name: str, do: Callable[[Goal], Outcome]) -> "_Action":
+        assert name not in self._ros.actions, f"{name} is served twice"
+        return self._keep(_Action(self._ros, name, type_name, do))
+
+    def pursue(
+        self, name: str, type_name: str, goal: Mapping[str, Any], feedback: Callable[[Message], object] | None = None
+    ) -> "_Pursuit":
+        found = self._ros.actions.get(name)
+        if found is None:
+            raise RosUnreachable(what=name, problem="nobody serves it")
+        return found.begin(type_name, goal, self._ros.who(self.node), feedback)
+
+    def parameters(self, node: str, timeout_s: float) -> dict[str, Any]:
+        if node not in self._ros.parameters:
+            raise RosUnreachable(what=node, problem="it is not there")
+        return dict(self._ros.parameters[node])
+
+    def set_parameter(self, node: str, name: str, value: Any, timeout_s: float) -> None:
+        if name not in self.parameters(node, timeout_s):
+            raise RosRefused(what=node, problem=f"it has no parameter {name}")
+        self._ros.parameters[node][name] = value
+
+    def watch_nodes(self, told: NodeTold) -> "_Watch":
+        made = self._keep(_Watch(self._ros, told))
+        for node in list(self._ros.nodes):
+            told(node, True)
+        return made
+
+    def close(self) -> None:
+        if self.closed:
+            return
+        self.closed = True
+        with self._ros.guard:
+            self._ros.nodes.pop(self.node, None)
+        for one in reversed(self._open):
+            one.close()
+        self._ros.tell(self.node, False)
+
+
+class _Watch:
+    def __init__(self, ros: MemoryRos, told: NodeTold) -> None:
+        self._ros, self.told = ros, told
+        ros.watchers.append(self)
+
+    def close(self) -> None:
+        if self in self._ros.watchers:
+            self._ros.watchers.remove(self)
+
+
+class _Publisher:
+    def __init__(self, ros: MemoryRos, graph: MemoryGraph, topic: str, type_name: str, latched: bool) -> None:
+        self._ros, self._graph, self.topic, self._type, self._latched = ros, graph, topic, type_name, latched
+        self.closed = False
+
+    def send(self, message: Mapping[str, Any]) -> None:
+        data = self._ros.types.to_bytes(self._type, message)
+        if self.closed:
+            return
+        who = self._ros.who(self._graph.node)
+        with self._ros.guard:
+            if self._latched:
+                self._ros.latched[self.topic] = (data, who)
+            for one in self._ros.topics.get(self.topic, []):
+                one.waiting.put((data, who))
+
+    def close(self) -> None:
+        self.closed = True
+
+
+class _Subscription:
+    def __init__(self, ros: MemoryRos, topic: str, type_name: str, heard: Heard) -> None:
+        self._ros, self.topic, self._type, self._heard = ros, topic, type_name, heard
+        self.waiting: queue.SimpleQueue[tuple[bytes, str] | None] = queue.SimpleQueue()
+        with ros.guard:
+            ros.topics.setdefault(topic, []).append(self)
+            if topic in ros.latched:
+                self.waiting.put(ros.latched[topic])
+        self._thread = threading.Thread(target=self._run, name="memory-ros-topic", daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        while (one := self.waiting.get()) is not None:
+            self._heard(self._ros.types.from_bytes(self._type, one[0]), one[1])
+
+    def close(self) -> None:
+        with self._ros.guard:
+            if self in self._ros.topics[self.topic]:
+                self._ros.topics[self.topic].remove(self)
+        self.waiting.put(None)
+        if threading.current_thread() is not self._thread:
+            self._thread.join(PATIENCE_S)
+
+
+class _Service:
+    def __init__(self, ros: MemoryRos, name: str, type_name: str, answer: Answer) -> None:
+        self._ros, self.name, self._answer = ros, name, answer
+        self._request, self._response = ros.types.parts(type_name)
+        self._type = type_name
+        self._one_at_a_time = threading.Lock()
+        ros.services[name] = self
+
+    def call(self, type_name: str, request: Mapping[str, Any], who: str, timeout_s: float) -> Message:
+        assert type_name == self._type, f"{self.name} is {self._type}"
+        types, asked = self._ros.types, self._ros.types.to_bytes(self._request, request)
+        said: queue.SimpleQueue[Message | Exception] = queue.SimpleQueue()
+
+        def run() -> None:
+            try:
+                with self._one_at_a_time:
+                    told = self._answer(types.from_bytes(self._request, asked), who)
+                said.put(types.from_bytes(self._response, types.to_bytes(self._response, told)))
+            except Exception as error:  # noqa: BLE001 - it is told to who asked
+                said.put(error)
+
+        threading.Thread(target=run, name="memory-ros-service", daemon=True).start()
+        try:
+            answered = said.get(timeout=timeout_s)
+        except queue.Empty:
+            raise RosUnreachable(what=self.name, problem=f"no answer within {timeout_s} s") from None
+        if isinstance(answered, Exception):
+            raise RosRefused(what=self.name, problem=str(answered))
+        return answered
+
+    def close(self) -> None:
+        self._ros.services.pop(self.name, None)
+
+
+class _Action:
+    def __init__(self, ros: MemoryRos, name: str, type_name: str, do: Callable[[Goal], Outcome]) -> None:
+        self.ros, self.name, self.do = ros, name, do
+        self.parts = ros.types.parts(type_name)
+        self._type = type_name
+        self._last: _Pursuit | None = None
+        ros.actions[name] = self
+
+    def begin(
+        self, type_name: str, goal: Mapping[str, Any], who: str, feedback: Callable[[Message], object] | None
+    ) -> "_Pursuit":
+        assert type_name == self._type, f"{self.name} is {self._type}"
+        types = self.ros.types
+        message = types.from_bytes(self.parts[0], types.to_bytes(self.parts[0], goal))
+        before, self._last = self._last, _Pursuit(self, message, who, feedback)
+        if before is not None:
+            before.cancel()
+        return self._last.begin()
+
+    def close(self) -> None:
+        self.ros.actions.pop(self.name, None)
+        if self._last is not None:
+            self._last.cancel()
+
+
+class _Pursuit:
+    """Both sides of a goal."""
+
+    def __init__(
+        self, action: _Action, message: Message, client: str, feedback: Callable[[Message], object] | None
+    ) -> None:
+        self._action, self.message, self.client, self._feedback = action, message, client, feedback
+        self._tells: list[Callable[[], object]] = []
+        self._ended: queue.SimpleQueue[Outcome | Exception] = queue.SimpleQueue()
+        self._guard = threading.Lock()
+        self.canceled = False
+
+    def begin(self) -> "_Pursuit":
+        threading.Thread(target=self._run, name="memory-ros-goal", daemon=True).start()
+        return self
+
+    def _run(self) -> None:
+        types, result = self._action.ros.types, self._action.parts[1]
+        try:
+            outcome = self._action.do(self)
+            told = types.from_bytes(result, types.to_bytes(result, outcome.result))
+            self._ended.put(Outcome(outcome.how, told, outcome.text))
+        except Exception as error:  # noqa: BLE001 - it is told to who asked
+            self._ended.put(Outcome(Ended.ABORTED, types.zero(result), str(error)))
+
+    def feedback(self, message: Mapping[str, Any]) -> None:
+        types, part = self._action.ros.types, self._action.parts[2]
+        told = types.from_bytes(part, types.to_bytes(part, message))
+        if self._feedback is not None:
+            self._feedback(told)
+
+    def when_canceled(self, tell: Callable[[], object]) -> None:
+        with self._guard:
+            self._tells.append(tell)
+            now = self.canceled
+        if now:
+            tell()
+
+    def wait(self, timeout_s: float) -> Outcome:
+        try:
+            ended = self._ended.get(timeout=timeout_s)
+        except queue.Empty:
+            raise RosUnreachable(what=self._action.name, problem=f"no end within {timeout_s} s") from None
+        if isinstance(ended, Exception):
+            raise ended
+        self._ended.put(ended)
+        return ended
+
+    def cancel(self) -> None:
+        with self._guard:
+            if self.canceled:
+                return
+            self.canceled = True
+            tells = list(self._tells)
+        for tell in tells:
+            threading.Thread(target=tell, name="memory-ros-cancel", daemon=True).start()
