@@ -5,7 +5,7 @@ from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 
 from trade import Container, Handle
-from trade_gateway.door._clients import Client, Place, places
+from trade_gateway.clients._clients import Client, Place, places
 
 __all__ = ["Grips"]
 

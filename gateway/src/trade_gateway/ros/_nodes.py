@@ -11,7 +11,7 @@ from typing import Any, Final
 
 from trade import Container, Handle, Run
 from trade.errors import Cancelled
-from trade_gateway.door._clients import Client
+from trade_gateway.clients._clients import Client
 from trade_gateway.ros._graph import Graph, RosUnreachable
 from trade_gateway.ros._locking import Grips
 

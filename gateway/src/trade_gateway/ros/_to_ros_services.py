@@ -5,7 +5,7 @@ from typing import Final, NamedTuple
 
 from trade import Constraint, Container, Handle, Lock, where
 from trade.errors import ConfigurationError
-from trade_gateway.door._clients import Client
+from trade_gateway.clients._clients import Client
 from trade_gateway.ros._file import LockService, ServiceEntry
 from trade_gateway.ros._following import Place, named_services
 from trade_gateway.ros._graph import Answer, Closes, Graph, RosRefused
