@@ -21,6 +21,12 @@ ADD = {
     "request_definition": "int64 a\nint64 b\n",
     "response_definition": "int64 sum\n",
 }
+FLOAT = {"msg_type": "std_msgs/msg/Float64", "msg_definition": "float64 data\n"}
+SET_BOOL = {
+    "srv_type": "std_srvs/srv/SetBool",
+    "request_definition": "bool data\n",
+    "response_definition": "bool success\nstring message\n",
+}
 TYPES = {
     "srv_type": "rcl_interfaces/srv/GetParameterTypes",
     "request_definition": "string[] names\n",
@@ -51,6 +57,27 @@ class Node:
         if topic not in self._publishers:
             self._publishers[topic] = ROS2Publisher(topic=topic, **STRING, **self._common)
         self._publishers[topic].publish(data=data)
+
+    def repeat(self, topic: str, value: float, hz: float) -> None:
+        """Say a number again and again, as a joystick does, for as long as this process lives."""
+        publisher = ROS2Publisher(topic=topic, **FLOAT, **self._common)
+
+        def say() -> None:
+            while True:
+                publisher.publish(data=value)
+                time.sleep(1 / hz)
+
+        threading.Thread(target=say, daemon=True).start()
+
+    def set_bool(self, service: str, data: bool) -> None:
+        client = ROS2ServiceClient(service_name=service, timeout=20.0, **SET_BOOL, **self._common)
+        self._kept.append(client)
+        until_served(client)
+        answer = client.call(data=data)
+        if answer is None:
+            tell("unanswered", service=service)
+        else:
+            tell("set", success=answer.success, message=answer.message)
 
     def listen(self, topic: str, latched: bool = False) -> None:
         qos = {"qos": LATCHED} if latched else {}

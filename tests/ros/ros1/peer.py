@@ -3,6 +3,7 @@
 import json
 import sys
 import threading
+import time
 
 import actionlib
 import roslib.message
@@ -74,6 +75,18 @@ def advertise(topic, kind, latched=False) -> None:
 
 def send(topic, values) -> None:
     opened[topic].publish(filled(opened[topic].data_class, values))
+
+
+def repeat(topic, value, hz) -> None:
+    """Say a number again and again, as a joystick does, for as long as this process lives."""
+    advertise(topic, "std_msgs/Float64")
+
+    def say() -> None:
+        while True:
+            send(topic, {"data": value})
+            time.sleep(1 / hz)
+
+    threading.Thread(target=say, daemon=True).start()
 
 
 def hear(topic, kind) -> None:
