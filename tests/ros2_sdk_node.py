@@ -58,6 +58,12 @@ class Node:
             self._publishers[topic] = ROS2Publisher(topic=topic, **STRING, **self._common)
         self._publishers[topic].publish(data=data)
 
+    def listen_to_numbers(self, topic: str) -> None:
+        heard = ROS2Subscriber(
+            topic=topic, callback=lambda it: tell("heard", topic=topic, data=it.data), **FLOAT, **self._common
+        )
+        self._kept.append(heard)
+
     def repeat(self, topic: str, value: float, hz: float) -> None:
         """Say a number again and again, as a joystick does, for as long as this process lives."""
         publisher = ROS2Publisher(topic=topic, **FLOAT, **self._common)

@@ -89,7 +89,7 @@ class CGripper:
 
 
 def main() -> None:
-    gripper = CGripper(port="gripper.log")
+    gripper = CGripper(port=str(Path(__file__).with_name("gripper.log")))
     trade.register(gripper, "rosie.hand")
     print("rosie.hand is there; Ctrl-C ends it", flush=True)
     try:

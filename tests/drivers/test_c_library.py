@@ -1,8 +1,6 @@
 """A compiled C library as services (examples/c_gripper): what goes in, what comes back, and what it refuses to be."""
 
-import os
 import shutil
-import subprocess
 import sys
 from collections.abc import Iterator
 from importlib.util import module_from_spec, spec_from_file_location
@@ -11,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from compiling import library
 from trade import Handle, where
 from trade.errors import ConfigurationError, InvalidArgument, LockedByOther, TradeError
 from trade.testing import MemorySystem, memory_system
@@ -60,26 +59,10 @@ void crash(void);
 
 
 @pytest.fixture(scope="module")
-def compiler() -> str:
-    found = shutil.which("cc")
-    if found is None:
-        reason = "there is no C compiler (Debian: apt-get install gcc libc6-dev)"
-        pytest.fail(reason) if os.environ.get("CI") == "true" else pytest.skip(reason)
-    return found
-
-
-def compile_c(compiler: str, source: Path, library: Path) -> Path:
-    subprocess.run(
-        [compiler, "-shared", "-fPIC", "-O2", "-Wall", "-Werror", "-o", library, source], check=True, timeout=100
-    )
-    return library
-
-
-@pytest.fixture(scope="module")
-def example(compiler: str, tmp_path_factory: pytest.TempPathFactory) -> Any:
+def example(tmp_path_factory: pytest.TempPathFactory) -> Any:
     """The module of the example, beside its compiled library."""
     folder = tmp_path_factory.mktemp("c_gripper")
-    compile_c(compiler, EXAMPLE / "gripper.c", folder / "libgripper.so")
+    library(EXAMPLE / "gripper.c", folder / "libgripper.so")
     spec = spec_from_file_location("c_gripper_example", shutil.copy(EXAMPLE / "gripper.py", folder))
     assert spec is not None
     assert spec.loader is not None
@@ -89,10 +72,10 @@ def example(compiler: str, tmp_path_factory: pytest.TempPathFactory) -> Any:
 
 
 @pytest.fixture(scope="module")
-def lib(compiler: str, tmp_path_factory: pytest.TempPathFactory) -> CLibrary:
+def lib(tmp_path_factory: pytest.TempPathFactory) -> CLibrary:
     folder = tmp_path_factory.mktemp("more")
     (folder / "more.c").write_text(MORE)
-    return CLibrary(compile_c(compiler, folder / "more.c", folder / "libmore.so"), MORE_HEADER)
+    return CLibrary(library(folder / "more.c", folder / "libmore.so"), MORE_HEADER)
 
 
 class Hand:
@@ -235,7 +218,7 @@ def test_a_text_with_a_zero_byte_is_refused(lib: CLibrary) -> None:
         method(lib, "greet", greet)("a\0b")
 
 
-def test_which_status_means_failure_can_be_said(compiler: str, lib: CLibrary) -> None:
+def test_which_status_means_failure_can_be_said(lib: CLibrary) -> None:
     positive = CLibrary(lib.path, MORE_HEADER, failed=lambda status: status > 0)
 
     def check(self: object, status: int) -> None: ...

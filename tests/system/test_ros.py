@@ -4,14 +4,17 @@ The nodes are rospy of the distribution; a package of other hands that speaks rm
 a node of our own that says so as rmw_zenoh does. The judge of motion is the simulator's log.
 """
 
+import shutil
 import time
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Protocol
 
 import pytest
 
 import trade
+from compiling import library
 from ros1_stand import Peer, need_ros1
 from ros1_stand import Stand as Ros1Stand
 from ros2_peers import Process, Router, free_port
@@ -21,6 +24,7 @@ from trade_hil_sim import events, writes
 from waiting import wait_until
 
 FAR_RAD = 1.2
+EXAMPLE = Path(__file__).parents[2] / "examples" / "c_gripper"
 HALFWAY_RAD = 0.6
 """Where a joint that is not stopped gets to long after everything that stops it should have."""
 FILE = """
@@ -138,8 +142,11 @@ class Ros2System:
         self.kill_core = self._router.kill
 
     def node(self, name: str) -> Node:
+        return Ros2Node(self.process(name))
+
+    def process(self, name: str) -> Process:
         self._nodes.append(Process(self.script, self._port, name))
-        return Ros2Node(self._nodes[-1])
+        return self._nodes[-1]
 
     def close(self) -> None:
         for node in self._nodes:
@@ -192,6 +199,15 @@ class Bridged:
 
     def told_nothing(self, since: float) -> bool:
         return not writes(self.bench.sim.entries(), device_id=1, register="goal_position", since=since)
+
+
+@pytest.fixture
+def c_gripper(tmp_path: Path) -> Path:
+    """The program of examples/c_gripper, beside its compiled library."""
+    folder = tmp_path / "c_gripper"
+    folder.mkdir()
+    library(EXAMPLE / "gripper.c", folder / "libgripper.so")
+    return shutil.copy(EXAMPLE / "gripper.py", folder)
 
 
 @pytest.fixture
@@ -317,3 +333,62 @@ def test_what_a_node_publishes_is_a_service_that_says_when_it_is_stale(bridged: 
     wait_until(stale, "it is stale")
     bridged.ros.node("base").repeat("/battery", 23.0, 20)
     wait_until(says(23.0), "the next one is told")
+
+
+MIXED_1 = """
+[ros]
+{ros}
+
+[[from_ros.topic]]
+topic = "/battery"
+type = "std_msgs/msg/Float64"
+groups = ["base.battery"]
+name = "voltage"
+
+[[to_ros.lock]]
+group = "rosie.hand"
+"""
+MIXED_2 = """
+[ros]
+{ros}
+
+[[to_ros.stream]]
+service = "base.battery.voltage"
+topic = "/battery_of_ros1"
+type = "std_msgs/msg/Float64"
+hz = 10
+
+[[to_ros.stream]]
+service = "rosie.hand.state"
+topic = "/width"
+type = "std_msgs/msg/Float64"
+fields = {{ data = "width_m" }}
+"""
+
+
+def test_P08_c_python_ros_1_and_ros_2_are_side_by_side_in_one_system(run: Run, tmp_path: Path, c_gripper: Path) -> None:
+    with ExitStack() as undo:
+        one, two = Ros1System(tmp_path), Ros2OfOthers(tmp_path)
+        for ros, text, name in ((one, MIXED_1, "one"), (two, MIXED_2, "two")):
+            undo.callback(ros.close)
+            ros.start_core()
+            (tmp_path / f"{name}.toml").write_text(text.format(ros=ros.settings))
+        assert "rosie.hand is there" in run(c_gripper).line()
+        for name in ("one", "two"):
+            program = run("-m", "trade_gateway", "ros", tmp_path / f"{name}.toml", "--name", name)
+            while "bridged:" not in program.line():
+                pass
+        base, screen = one.node("base"), two.process("screen")
+        base.repeat("/battery", 24.5, 20)
+        screen.ask("listen_to_numbers", topic="/battery_of_ros1")
+        screen.ask("listen_to_numbers", topic="/width")
+        screen.hear("heard", topic="/battery_of_ros1", data=24.5)
+        success, said = base.set_bool("/rosie/hand/lock", True)
+        assert success, said
+        move = trade.find(where(name="move_to", group="rosie.hand"), wait_s=30)
+        with pytest.raises(errors.LockedByOther, match="/base"):
+            move(0.08)
+        success, said = base.set_bool("/rosie/hand/lock", False)
+        assert success, said
+        move(0.08)
+        screen.hear("heard", topic="/width", data=0.08)
