@@ -89,8 +89,8 @@ class MemoryGraph:
         self.types.fields(type_name)
         return self._keep(_Publisher(self._ros, self, topic, type_name, latched))
 
-    def subscribe(self, topic: str, type_name: str, heard: Heard) -> "_Subscription":
-        return self._keep(_Subscription(self._ros, topic, type_name, heard))
+    def subscribe(self, topic: str, type_name: str, heard: Heard, *, latched: bool = False) -> "_Subscription":
+        return self._keep(_Subscription(self._ros, topic, type_name, heard, latched=latched))
 
     def serve(self, name: str, type_name: str, answer: Answer) -> "_Service":
         assert name not in self._ros.services, f"{name} is served twice"
@@ -172,12 +172,12 @@ class _Publisher:
 
 
 class _Subscription:
-    def __init__(self, ros: MemoryRos, topic: str, type_name: str, heard: Heard) -> None:
+    def __init__(self, ros: MemoryRos, topic: str, type_name: str, heard: Heard, *, latched: bool) -> None:
         self._ros, self.topic, self._type, self._heard = ros, topic, type_name, heard
         self.waiting: queue.SimpleQueue[tuple[bytes, str] | None] = queue.SimpleQueue()
         with ros.guard:
             ros.topics.setdefault(topic, []).append(self)
-            if topic in ros.latched:
+            if latched and topic in ros.latched:
                 self.waiting.put(ros.latched[topic])
         self._thread = threading.Thread(target=self._run, name="memory-ros-topic", daemon=True)
         self._thread.start()

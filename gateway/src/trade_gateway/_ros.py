@@ -100,6 +100,6 @@ def _room() -> Any:
     try:
         from trade_gateway import ros as room  # noqa: PLC0415 - loads what the other commands do not need
     except ImportError as missing:
-        problem = f"needs {missing.name}; pip install 'trade-gateway[ros,http]'"
+        problem = f"needs {missing.name}; pip install 'trade-gateway[ros]'"
         raise ConfigurationError(where="trade ros", problem=problem) from None
     return room

@@ -65,8 +65,26 @@ def test_the_last_message_of_a_latched_topic_of_theirs_is_heard(graph: Ros1, sta
     peer.do("send", "/map", {"data": "kept"})
     peer.wait_for("did", lambda what: what == "send")
     heard: list[Any] = []
-    graph.subscribe("/map", TEXT, lambda message, who: heard.append((message["data"], who)))
+    graph.subscribe("/map", TEXT, lambda message, who: heard.append((message["data"], who)), latched=True)
     wait_until(lambda: heard == [("kept", "/mapper")], "it was heard")
+
+
+def test_S01_what_was_published_before_is_no_command(graph: Ros1, stand: Stand) -> None:
+    peer = stand.peer("pilot")
+    peer.do("advertise", "/go", "std_msgs/String", True)
+    peer.do("send", "/go", {"data": "old"})
+    peer.wait_for("did", lambda what: what == "send")
+    heard: list[str] = []
+    graph.subscribe("/go", TEXT, lambda message, _who: heard.append(message["data"]))
+    graph.subscribe("/go", TEXT, lambda message, _who: heard.append(message["data"]))
+
+    def said() -> bool:
+        peer.do("send", "/go", {"data": "new"})
+        threading.Event().wait(0.05)
+        return len(heard) > 1
+
+    wait_until(said, "what is sent now was heard")
+    assert set(heard) == {"new"}
 
 
 def test_a_listener_that_stands_still_holds_up_nobody(graph: Ros1, stand: Stand) -> None:
@@ -129,7 +147,9 @@ def test_a_topic_that_is_closed_and_opened_at_once_is_heard_at_both_ends(graph: 
     for number in range(5):
         heard: list[str] = []
         topic = graph.advertise("/state", TEXT, latched=True)
-        orders = graph.subscribe("/orders", TEXT, lambda message, who, heard=heard: heard.append(message["data"]))
+        orders = graph.subscribe(
+            "/orders", TEXT, lambda message, who, heard=heard: heard.append(message["data"]), latched=True
+        )
         topic.send({"data": str(number)})
         peer.wait_for("heard", lambda told, number=number: told["data"] == str(number))
         wait_until(lambda heard=heard: heard, "it was heard here")

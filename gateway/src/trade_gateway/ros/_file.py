@@ -196,6 +196,8 @@ class FromTopic(_Offered, frozen=True, kw_only=True):
     topic: _RosName
     type: _Type
     stale_after_s: _Seconds = 1.0
+    latched: bool = False
+    """Its publisher keeps the last message for who comes later, such as a map: that is told however old it is."""
 
 
 class FromPublish(_Offered, frozen=True, kw_only=True):

@@ -96,15 +96,16 @@ def topic_from_ros(entry: FromTopic, graph: Graph, records: Records) -> Offered:
     def read(_: dict[str, Any]) -> Any:
         message, at = (latest or [({}, began)])[0]
         silent_s = time.monotonic() - at
-        if not latest or silent_s > entry.stale_after_s:
+        if not latest or (silent_s > entry.stale_after_s and not entry.latched):
             problem = f"nothing was heard for {silent_s:.3g} s; is the node up that publishes it?"
             raise RosUnreachable(what=entry.topic, problem=problem)
         return records.record(entry.type, message)
 
     name = entry.name or entry.topic.rpartition("/")[2]
-    doc = f"The latest message of {entry.topic} in ROS ({entry.type}), {entry.stale_after_s:g} s old at most."
+    age = "however old" if entry.latched else f"{entry.stale_after_s:g} s old at most"
+    doc = f"The latest message of {entry.topic} in ROS ({entry.type}), {age}."
     made = provider("RosTopic", [Method(name, doc, {}, frozenset(), kind, "read", read)])
-    subscription = graph.subscribe(entry.topic, entry.type, heard)
+    subscription = graph.subscribe(entry.topic, entry.type, heard, latched=entry.latched)
     return Offered(f"topic {entry.topic}", entry.groups, made, subscription.close)
 
 

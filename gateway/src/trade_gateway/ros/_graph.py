@@ -141,8 +141,11 @@ class Graph(Protocol):
         """Publish a topic; latched: who comes later is given the last message."""
         ...
 
-    def subscribe(self, topic: str, type_name: str, heard: Heard) -> Closes:
-        """Hear a topic."""
+    def subscribe(self, topic: str, type_name: str, heard: Heard, *, latched: bool = False) -> Closes:
+        """Hear a topic; latched: also what was published before, if its publisher keeps that.
+
+        Otherwise that is not told: an old command would be taken for a new one.
+        """
         ...
 
     def serve(self, name: str, type_name: str, answer: Answer) -> Closes:

@@ -114,14 +114,14 @@ class Ros1(Graph):
         head = self._topic("publish", topic, type_name)
         return _Published(self._types, type_name, self._link.open({**head, "latched": latched}, _nothing, most))
 
-    def subscribe(self, topic: str, type_name: str, heard: Heard) -> Closes:
-        return self._closing(self.hear(topic, type_name, heard, most=_NEWEST)[1])
+    def subscribe(self, topic: str, type_name: str, heard: Heard, *, latched: bool = False) -> Closes:
+        return self._closing(self.hear(topic, type_name, heard, most=_NEWEST, latched=latched)[1])
 
     def hear(
-        self, topic: str, type_name: str, heard: Heard, *, most: int
+        self, topic: str, type_name: str, heard: Heard, *, most: int, latched: bool = True
     ) -> tuple[Opened, tuple[Callable[[], object], ...]]:
         """As `subscribe`; so many messages wait at most, the newest."""
-        head = self._topic("subscribe", topic, type_name)
+        head = {**self._topic("subscribe", topic, type_name), "latched": latched}
         lane = Lane(f"trade-ros1{topic}", most)
 
         def came(told: Head, body: bytes) -> None:

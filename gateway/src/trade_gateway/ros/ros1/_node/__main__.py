@@ -86,10 +86,15 @@ class Node:
             publisher.publish(_filled(publisher.data_class, body))
 
     def _subscribe(self, head: Head, _: bytes) -> None:
-        number, most = head["id"], head["most"]
+        number, most, latched = head["id"], head["most"], head["latched"]
+        met = f"trade/{number}"
 
         def came(message: Any) -> None:
-            told = {"op": "heard", "id": number, "who": message._connection_header.get("callerid", "")}
+            header = message._connection_header  # one object for all messages of a connection
+            if not latched and header.get("latching") == "1" and met not in header:
+                header[met] = "1"  # ROS does not say whether the first one is as old as its publisher
+                return
+            told = {"op": "heard", "id": number, "who": header.get("callerid", "")}
             self._channel.put(told, message._buff, key=str(number), most=most)
 
         self._opened(head, rospy.Subscriber(head["name"], self._class(head), came, tcp_nodelay=True))
