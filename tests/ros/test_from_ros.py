@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 
+from ros.memory_graph import MemoryGraph
 from ros.robots import PATIENCE_S, Stand, apart
 from trade import Handle, where
 from trade.errors import ConfigurationError, DeviceFault, InvalidArgument, MotionStopped, Stopped
@@ -278,6 +279,29 @@ def test_a_stop_cancels_the_goal_and_the_call_says_so(stand: Stand, arm: RosArm)
     assert arm.goes.wait(PATIENCE_S)
     found(stand, "lab.arm", "stop")()
     assert arm.canceled.is_set()
+    moves.join(PATIENCE_S)
+    assert isinstance(ended[0], MotionStopped)
+
+
+def test_S07_a_stop_waits_for_no_goal_that_is_on_its_way_and_cancels_it_when_it_arrives(
+    stand: Stand, arm: RosArm, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    arm.holds = True
+    sending, arrive, pursue = threading.Event(), threading.Event(), MemoryGraph.pursue
+
+    def slowly(*words: Any) -> Any:
+        sending.set()
+        arrive.wait(PATIENCE_S)
+        return pursue(*words)
+
+    monkeypatch.setattr(MemoryGraph, "pursue", slowly)
+    moves, ended = apart(lambda: found(stand, "lab.arm", "move_to").with_(deadline_s=PATIENCE_S)([0.5, 0.5]))
+    assert sending.wait(PATIENCE_S)
+    with pytest.raises(DeviceFault, match="on its way"):
+        found(stand, "lab.arm", "stop")()
+    assert not arrive.is_set()
+    arrive.set()
+    assert arm.canceled.wait(PATIENCE_S)
     moves.join(PATIENCE_S)
     assert isinstance(ended[0], MotionStopped)
 

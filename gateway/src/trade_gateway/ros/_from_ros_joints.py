@@ -8,7 +8,7 @@ from typing import Annotated, Any, Final
 import msgspec
 from msgspec import Struct
 
-from trade import Meta, Resource, current_call, permit, progress, service
+from trade import Meta, Permit, Resource, current_call, permit, progress, service
 from trade.errors import DeviceFault, InvalidArgument, MotionStopped
 from trade_drivers import Trajectory
 from trade_gateway.ros._file import FromJoints
@@ -54,8 +54,11 @@ class RosJoints:
         self.resources: Final = tuple(Resource(name) for name in self._names)
         self._heard: dict[str, tuple[float, float | None, float | None, float]] = {}
         self._began = time.monotonic()
-        self._guard = threading.Lock()
+        self._guard = threading.Condition()
         self._active: Pursuit | None = None
+        self._sending = 0
+        """Goals that are on their way to the action."""
+        self._stops = 0
         self._subscription = graph.subscribe(entry.topic, _JOINT_STATE, self._hear)
 
     def _hear(self, message: Message, _who: str) -> None:
@@ -139,11 +142,15 @@ class RosJoints:
         What others in ROS ask of it goes on.
         """
         with self._guard:
+            self._stops += 1
             active = self._active
-        if active is None:
-            return
-        self._cancel(active)
-        self._rest(active)
+        if active is not None:
+            self._cancel(active)
+            self._rest(active)
+        with self._guard:
+            if not self._guard.wait_for(lambda: not self._sending, _STOPPED_WITHIN_S):
+                fault = "a goal is on its way there; it is canceled as soon as it has arrived"
+                raise DeviceFault(device=self._entry.groups[0], bus=self._entry.action, fault=fault)
 
     def _cancel(self, pursuit: Pursuit) -> None:
         """Raises DeviceFault: its end was not heard; it counts as moving then."""
@@ -162,14 +169,40 @@ class RosJoints:
             before = self._active
             if before is not None:  # ours: another move takes over, and its end is awaited by who asked for it
                 before.cancel()
-            with self._guard:
-                permitted.gate()
-                self._active = pursuit = self._graph.pursue(self._entry.action, ACTION, goal, progress)
-                for resource in self.resources:
-                    resource.moving = True
+            pursuit = self._sent(goal, permitted)
             outcome = self._ended(pursuit)
         self._check(outcome)
         return [one.position_rad for one in self.state()]
+
+    def _sent(self, goal: Message, permitted: Permit) -> Pursuit:
+        """Nobody waits for it who stops: a stop that comes meanwhile cancels it as soon as it has arrived."""
+        with self._guard:
+            permitted.gate()
+            stops, self._sending = self._stops, self._sending + 1
+            for resource in self.resources:
+                resource.moving = True
+        rests = True
+        try:
+            pursuit = self._graph.pursue(self._entry.action, ACTION, goal, progress)
+            rests = False
+            with self._guard:
+                overtaken = self._stops != stops
+                self._active = self._active if overtaken else pursuit
+            if not overtaken:
+                return pursuit
+            self._cancel(pursuit)
+            rests = True
+        finally:
+            self._arrived(rests=rests)
+        raise MotionStopped(device=self._entry.groups[0], reason="it was stopped before its goal had arrived")
+
+    def _arrived(self, *, rests: bool) -> None:
+        with self._guard:
+            self._sending -= 1
+            if rests and not self._sending and self._active is None:
+                for resource in self.resources:
+                    resource.moving = False
+            self._guard.notify_all()
 
     def _ended(self, pursuit: Pursuit) -> Outcome:
         call, device = current_call(), self._entry.groups[0]
