@@ -33,8 +33,9 @@ __all__ = [
 
 Heard = Callable[[Message, str], object]
 """Told of a message, and of the name of the node that sent it (``/teleop``; empty if ROS does not say)."""
-Answer = Callable[[Message, str], Message]
-"""Given a request and the caller's name, returns the response; what it raises is told to the caller as a failure."""
+Answer = Callable[[Message, str, float], Message]
+"""Given a request, the caller's name and when it came (``time.monotonic()``, before it waited for anything), returns the
+response; what it raises is told to the caller as a failure."""
 NodeTold = Callable[[str, bool], object]
 """Told of a node by name, and whether it is there (or is gone, or can no longer be seen)."""
 
@@ -105,6 +106,11 @@ class Goal(Protocol):
         """Name of the node that sent it."""
         ...
 
+    @property
+    def came_at(self) -> float:
+        """When it came, by ``time.monotonic()``, before it waited for anything."""
+        ...
+
     def feedback(self, message: Mapping[str, Any]) -> None:
         """Tell how far it is."""
         ...
@@ -148,12 +154,14 @@ class Graph(Protocol):
         """
         ...
 
-    def serve(self, name: str, type_name: str, answer: Answer) -> Closes:
-        """Offer a service."""
+    def serve(self, name: str, type_name: str, answer: Answer, *, stops: bool = False) -> Closes:
+        """Offer a service; stops: each request is answered at once, on a thread of its own, and waits for no other."""
         ...
 
-    def call(self, name: str, type_name: str, request: Mapping[str, Any], timeout_s: float) -> Message:
-        """Call a service of theirs.
+    def call(
+        self, name: str, type_name: str, request: Mapping[str, Any], timeout_s: float, *, stops: bool = False
+    ) -> Message:
+        """Call a service of theirs; stops: however many other calls are under way.
 
         Raises:
             RosUnreachable: it is not there, or did not answer in time.
