@@ -32,7 +32,11 @@ gripper_t *gripper_open(const char *port) {
 }
 
 void gripper_close(gripper_t *g) {
-    gripper_stop(g);
+    const struct timespec step = {0, (long)(STEP_S * 1e9)};
+    while (g->moving) {
+        gripper_stop(g);
+        nanosleep(&step, NULL);
+    }
     fclose(g->port);
     free(g);
 }
@@ -56,9 +60,10 @@ int gripper_move(gripper_t *g, double width_m, double speed_m_s) {
         double left_m = width_m - g->width_m;
         step(g, left_m > by_m ? g->width_m + by_m : left_m < -by_m ? g->width_m - by_m : width_m);
     }
+    int result = g->stopped ? STOPPED : 0;
     g->speed_m_s = 0;
     g->moving = 0;
-    return g->stopped ? STOPPED : 0;
+    return result;
 }
 
 int gripper_stop(gripper_t *g) {

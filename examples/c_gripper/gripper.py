@@ -95,6 +95,7 @@ def main() -> None:
     try:
         threading.Event().wait()
     except KeyboardInterrupt:
+        trade.deregister(gripper)  # what moves stops
         trade.close()
         gripper.close()
 

@@ -3,6 +3,7 @@
 import shutil
 import sys
 from collections.abc import Iterator
+from dataclasses import dataclass
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ from typing import Any
 import pytest
 
 from compiling import library
-from trade import Handle, where
+from trade import Handle, service, where
 from trade.errors import ConfigurationError, InvalidArgument, LockedByOther, TradeError
 from trade.testing import MemorySystem, memory_system
 from trade_drivers.clibrary import CFunctionFailed, CLibrary
@@ -20,7 +21,9 @@ EXAMPLE = Path(__file__).parents[2] / "examples" / "c_gripper"
 MORE = r"""
 #include <stdint.h>
 #include <stdbool.h>
+#include <stdatomic.h>
 #include <stddef.h>
+#include <time.h>
 typedef struct { double x, y; } pair_t;
 typedef enum { RED, GREEN } colour_t;
 double length(pair_t p) { return p.x + p.y; }
@@ -39,6 +42,14 @@ void fill(double *into) { for (int i = 0; i < 3; i++) into[i] = i; }
 colour_t other(colour_t c) { return c == RED ? GREEN : RED; }
 int fails_above(int status) { return status; }
 void crash(void) { *(volatile int *)0 = 0; }
+bool works(bool well) { return well; }
+float half(float of) { return of / 2; }
+int with_mode(const double *of, int mode, size_t n) { return (int)n + mode + (of != NULL); }
+colour_t paint(void) { return GREEN; }
+static void rest(long ms) { struct timespec s = {0, ms * 1000000}; nanosleep(&s, NULL); }
+static atomic_int told;
+int go(void) { rest(200); told = 0; for (int i = 0; i < 20000 && !told; i++) rest(1); return told ? -2 : 0; }
+int halt(void) { told = 1; return 0; }
 """
 MORE_HEADER = """
 typedef struct { double x, y; } pair_t;
@@ -55,6 +66,12 @@ colour_t other(colour_t c);
 int fails_above(int status);
 int missing(void);
 void crash(void);
+bool works(bool well);
+float half(float of);
+int with_mode(const double *of, int mode, size_t n);
+colour_t paint(void);
+int go(void);
+int halt(void);
 """
 
 
@@ -161,6 +178,11 @@ def test_S11_who_has_locked_the_hand_moves_it_and_nobody_else_does(hand: Hand) -
     assert hand.widths_m[-1] == 0.0845
 
 
+@dataclass
+class OnlyX:
+    x: float
+
+
 class More:
     """What `MORE` offers, by the simplest of methods."""
 
@@ -170,8 +192,6 @@ def method(lib: CLibrary, name: str, declared: Any, **how: Any) -> Any:
 
 
 def test_numbers_texts_structs_and_arrays(lib: CLibrary, example: Any) -> None:
-    from dataclasses import dataclass
-
     @dataclass
     class Pair:
         x: float
@@ -229,7 +249,46 @@ def test_which_status_means_failure_can_be_said(lib: CLibrary) -> None:
     method(lib, "fails_above", check, status=False)(-3)
 
 
-def unfit_cases() -> list[Any]:
+def test_false_is_a_failure(lib: CLibrary) -> None:
+    def works(self: object, well: bool) -> None: ...
+
+    method(lib, "works", works)(True)
+    with pytest.raises(CFunctionFailed):
+        method(lib, "works", works)(False)
+
+
+def test_a_number_that_a_float_of_c_cannot_hold_is_refused(lib: CLibrary) -> None:
+    def half(self: object, of: float) -> float: ...
+
+    assert method(lib, "half", half)(3.0) == 1.5
+    with pytest.raises(InvalidArgument, match="more than a float"):
+        method(lib, "half", half)(1e300)
+
+
+class Slow:
+    """Begins late, and forgets then whatever it was told before."""
+
+    def __init__(self, lib: CLibrary) -> None:
+        def go(self: object) -> None: ...
+        def halt(self: object) -> None: ...
+
+        kind = type(self)
+        kind.go = service(uses="it", cancel="halt")(lib.function("go")(go))  # type: ignore[attr-defined]
+        kind.halt = service(effect="stop", uses="it")(lib.function("halt")(halt))  # type: ignore[attr-defined]
+
+
+def test_S08_a_stop_that_comes_while_a_function_begins_stops_it_all_the_same(lib: CLibrary) -> None:
+    with memory_system() as system:
+        system.container("driver").register(Slow(lib), "slow")
+        me = system.container("me")
+        run = me.find(where(name="go", group="slow"), wait_s=20).with_(deadline_s=60).start()
+        wait_until(lambda: lib._moving)
+        me.find(where(name="halt", group="slow"), wait_s=20)()
+        with pytest.raises(TradeError):
+            run.result(10)
+
+
+def unfit_cases() -> list[Any]:  # noqa: C901 - one small method for each
     def too_many(self: object, n: int, m: int) -> int: ...
     def too_few(self: object) -> int: ...
     def wrong_type(self: object, n: str) -> int: ...
@@ -238,6 +297,9 @@ def unfit_cases() -> list[Any]:
     def no_list(self: object, of: list[float]) -> float: ...
     def array(self: object) -> list[float]: ...
     def void(self: object) -> int: ...
+    def mode(self: object, of: list[float]) -> int: ...
+    def part(self: object, p: OnlyX) -> float: ...
+    def paint(self: object) -> None: ...
 
     return [
         pytest.param("next", too_many, "no parameter for m", id="too many"),
@@ -248,6 +310,9 @@ def unfit_cases() -> list[Any]:
         pytest.param("minmax", no_list, "nothing is given for its parameter double \\*", id="one of two results"),
         pytest.param("fill", array, "out=", id="array without a length"),
         pytest.param("crash", void, "cannot be int", id="nothing returned"),
+        pytest.param("with_mode", mode, "nothing is given for its parameter size_t", id="a count too many"),
+        pytest.param("length", part, "OnlyX has no y", id="a member is missing"),
+        pytest.param("paint", paint, "say by failed=", id="a status that is never below zero"),
         pytest.param("missing", void, "no such function", id="not in the library"),
         pytest.param("undeclared", void, "no such function", id="not in the header"),
     ]

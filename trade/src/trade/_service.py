@@ -12,7 +12,7 @@ from trade._predicates import parse_achieved
 from trade._wire import Scalar
 from trade.errors import ConfigurationError
 
-__all__ = ["Effect", "ServiceMark", "marked_methods", "service"]
+__all__ = ["Effect", "ServiceMark", "effect_of", "marked_methods", "service"]
 
 Effect = Literal["read", "note", "actuate", "stop"]
 
@@ -119,6 +119,12 @@ def marked_methods(cls: type, interfaces: Sequence[type] = ()) -> dict[str, tupl
                 found[name] = (mark, function)
     _check(cls, found)
     return found
+
+
+def effect_of(function: Callable[..., Any]) -> Effect | None:
+    """What a method does, by its mark; None: it is no service."""
+    mark = getattr(function, _MARK, None)
+    return mark.effect if isinstance(mark, ServiceMark) else None
 
 
 def kinds_of(cls: type, interfaces: Sequence[type] = ()) -> tuple[str, ...]:

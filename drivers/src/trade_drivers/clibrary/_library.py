@@ -1,19 +1,27 @@
 """A C library and its functions as methods."""
 
 import inspect
-from collections.abc import Callable, Sequence
+import threading
+import time
+from collections.abc import Callable, Generator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import wraps
 from os import PathLike, fspath
 from pathlib import Path
 from typing import Any, Final, TypeVar, get_type_hints
 
-from trade.errors import ConfigurationError, DeviceError, InvalidArgument
-from trade_drivers.clibrary._passing import Passing, plan
+from trade import current_call
+from trade._service import effect_of
+from trade.errors import ConfigurationError, DeadlineExceeded, DeviceError, InvalidArgument
+from trade_drivers.clibrary._passing import Passing, is_never_negative, plan
 
 __all__ = ["CFunctionFailed", "CLibrary"]
 
 Method = TypeVar("Method", bound=Callable[..., Any])
+
+_AGAIN_S: Final = 0.005
+_STOPPED_WITHIN_S: Final = 2.0
 
 
 @dataclass(kw_only=True, eq=False)
@@ -34,6 +42,10 @@ class CLibrary:
     the interpreter's lock: other threads run on, and calls of one library may come at the same time. A service that
     must not run beside another one is marked ``serial=True``; a stop never waits for it, so what a library does when
     it is told to stop in the middle of another call has to be known.
+
+    Right before a function is called, whether its call may still begin is looked at once more (S01, S08). A function
+    that stops is called again while one that moves, and was let in before, still runs: between that last look and the
+    first line of the other function no library can be told to stop.
     """
 
     def __init__(
@@ -41,7 +53,7 @@ class CLibrary:
         path: str | PathLike[str],
         header: str,
         *,
-        failed: Callable[[int], bool] = lambda status: status < 0,
+        failed: Callable[[int], bool] | None = None,
         text: str | None = None,
     ) -> None:
         """Open it.
@@ -49,7 +61,8 @@ class CLibrary:
         Args:
             path: of the shared library; a bare name is looked for as the system's loader does.
             header: declarations of what is used, without preprocessor lines; types, structs and functions.
-            failed: whether a status means failure, of functions that return one.
+            failed: whether a status means failure, of functions that return one; by default one below zero does, and
+                false.
             text: a function that makes a text of a status, ``const char *name(int)``.
 
         Raises:
@@ -57,6 +70,10 @@ class CLibrary:
         """
         self.path: Final = fspath(path)
         self._failed = failed
+        self._moving: set[int] = set()
+        """Calls of functions that move something: before their last look, until they have returned."""
+        self._moves = 0
+        self._guard = threading.Lock()
         self._text = text
         self.ffi: Final[Any] = _ffi(header, self.path)
         try:
@@ -77,8 +94,8 @@ class CLibrary:
 
         Args:
             name: of the C function.
-            status: whether what it returns says if it failed; by default, if it returns an integer that is not the
-                method's result.
+            status: whether what it returns says if it failed; by default, if it returns something that is not the
+                method's result. False: it says something else, which is thrown away.
             handle: attribute of the object that is the function's first argument, such as what ``open`` returned.
             out: how many elements come back, of each array.
 
@@ -100,6 +117,11 @@ class CLibrary:
                 )
             lengths = (out,) if isinstance(out, int) else out
             passing = plan(self.ffi, where, kind, wanted, status=status, handle=handle is not None, lengths=lengths)
+            if passing.has_status and self._failed is None and is_never_negative(kind.result):
+                problem = (
+                    f"it returns {kind.result.cname}, which is never below zero: say by failed= which mean failure"
+                )
+                raise ConfigurationError(where=where, problem=problem)
             return self._method(method, name, call, passing, handle)
 
         return decorate
@@ -125,16 +147,56 @@ class CLibrary:
             first = () if handle is None else (getattr(this, handle),)
             try:
                 put, places = passing.into(first, given)
-                returned = call(*put)
+                returned = self._stop(call, put) if effect_of(calls) == "stop" else self._let_in(call, put)
             except (OverflowError, TypeError, ValueError) as bad:
                 raise InvalidArgument(service=method.__name__, argument="", problem=str(bad)) from None
-            if passing.has_status and self._failed(returned):
+            if passing.has_status and self._has_failed(returned):
                 raise CFunctionFailed(
                     device=name, bus=Path(self.path).name, status=returned, text=self._text_of(returned)
                 )
             return passing.out_of(returned, places)
 
         return calls  # pyright: ignore[reportReturnType] - it has the signature of the method
+
+    def _has_failed(self, status: int) -> bool:
+        if self._failed is not None:
+            return self._failed(status)
+        return status is False or status < 0
+
+    # --- what moves, and what stops it
+
+    def _let_in(self, call: Callable[..., Any], put: Sequence[Any]) -> Any:
+        """Raises DeadlineExceeded, MotionStopped, LockLost, LockedByOther: it must not begin any more."""
+        asked = current_call()
+        if asked is None or asked.permit is None:
+            return call(*put)
+        with self._noted():
+            if asked.expires_ns is not None and time.monotonic_ns() >= asked.expires_ns:
+                raise DeadlineExceeded(service=asked.service, deadline_s=0.0)
+            asked.permit.gate()
+            return call(*put)
+
+    @contextmanager
+    def _noted(self) -> Generator[None]:
+        with self._guard:
+            self._moves += 1
+            number = self._moves
+            self._moving.add(number)
+        try:
+            yield
+        finally:
+            with self._guard:
+                self._moving.discard(number)
+
+    def _stop(self, call: Callable[..., Any], put: Sequence[Any]) -> Any:
+        """Until what was let in before has returned, for some time at most; what it returned last counts."""
+        with self._guard:
+            before = set(self._moving)
+        until, returned = time.monotonic() + _STOPPED_WITHIN_S, call(*put)
+        while before & self._moving and time.monotonic() < until:
+            threading.Event().wait(_AGAIN_S)
+            returned = call(*put)
+        return returned
 
     def _text_of(self, status: int) -> str:
         if self._text is None:

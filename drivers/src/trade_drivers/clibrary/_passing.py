@@ -4,11 +4,12 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, is_dataclass
+from math import isfinite
 from typing import Any, Final, NamedTuple, get_args, get_origin, get_type_hints
 
 from trade.errors import ConfigurationError
 
-__all__ = ["Passing", "plan"]
+__all__ = ["Passing", "is_never_negative", "plan"]
 
 _NONE: Final = type(None)
 _FLOATS: Final = ("float", "double", "long double")
@@ -72,10 +73,11 @@ def plan(
         if name != "return":
             planned.take(name, hint)
     result = hints["return"]
-    returns_status = _python(kind.result) is int and (bool(planned.kinds) or result is _NONE)
-    has_status = returns_status if status is None else status
-    if has_status and _python(kind.result) is not int:
-        raise planned.wrong(f"it returns {kind.result.cname}, which is no status")
+    returns_more = kind.result.kind != "void" and (bool(planned.kinds) or result is _NONE)
+    has_status = returns_more if status is None else status
+    if has_status and _python(kind.result) not in (int, bool):
+        remedy = "; status=False throws it away" if status is None else ""
+        raise planned.wrong(f"it returns {kind.result.cname}, which is no status{remedy}")
     by_value = not planned.kinds and result is not _NONE
     returned = planned.reads(kind.result, result, "its result") if by_value else None
     return Passing(ffi, planned.into_c, [] if by_value else planned.give_back(result), returned, has_status)
@@ -111,13 +113,25 @@ class _Planning:
     def _one(self, kind: Any, hint: Any, name: str) -> Into | None:
         if hint is str and kind.cname in _TEXTS:
             return lambda value: (self._ffi.new("char[]", _text(value)),)
+        if kind.cname == "float" and hint is float:
+            return lambda value: (_fits(value, self._ffi.cast("float", value)),)
         if hint in (_python(kind), *((bool,) if _python(kind) is int else ())):
             return lambda value: (value,)
         if kind.kind != "struct" or not is_dataclass(hint):
             return None
         self._struct(kind, hint, name)
         members, made = [field.name for field in fields(hint)], f"{kind.cname} *"
-        return lambda value: (self._ffi.new(made, {one: getattr(value, one) for one in members})[0],)
+        if missing := [one for one, _ in kind.fields or () if one not in members]:
+            raise self.wrong(f"{_named(hint)} has no {', '.join(missing)}, which {kind.cname} has")
+
+        def put(value: Any) -> Sequence[Any]:
+            told = {one: getattr(value, one) for one in members}
+            struct = self._ffi.new(made, told)
+            for one, number in told.items():
+                _fits(number, getattr(struct, one))
+            return (struct[0],)
+
+        return put
 
     def _several(self, kind: Any, hint: Any) -> Into | None:
         if kind.kind != "pointer" or not self._is_count() or get_args(hint) != (_python(kind.item),):
@@ -126,12 +140,15 @@ class _Planning:
         made = f"{kind.item.cname}[]"
 
         def put(values: Sequence[Any]) -> Sequence[Any]:
-            return self._ffi.new(made, list(values)), len(values)
+            array = self._ffi.new(made, list(values))
+            for value, held in zip(values, array, strict=True):
+                _fits(value, held)
+            return array, len(values)
 
         return put
 
     def _is_count(self) -> bool:
-        return bool(self.kinds) and _python(self.kinds[0]) is int
+        return bool(self.kinds) and self.kinds[0].kind == "primitive" and _python(self.kinds[0]) is int
 
     # --- what comes back
 
@@ -197,6 +214,20 @@ def _python(kind: Any) -> type | None:
     if kind.kind != "primitive" or kind.cname in ("char", "wchar_t"):
         return None
     return bool if kind.cname == "_Bool" else float if kind.cname in _FLOATS else int
+
+
+def is_never_negative(kind: Any) -> bool:
+    """Whether no value of a C type of numbers is below zero, so that none can be told for a failure by that."""
+    if kind.kind == "enum":
+        return min(kind.elements, default=0) >= 0
+    return kind.cname.startswith(("uint", "unsigned")) or kind.cname == "size_t"
+
+
+def _fits(value: Any, held: Any) -> Any:
+    """The value. Raises OverflowError: as a float of C it is infinite."""
+    if isinstance(value, float) and isfinite(value) and not isfinite(float(held)):
+        raise OverflowError(f"{value} is more than a float of C holds")
+    return value
 
 
 def _text(value: str) -> bytes:
