@@ -1,7 +1,9 @@
 """A ROS system in memory: nodes with graphs of their own, real bytes between them, and deaths on command."""
 
+import contextlib
 import queue
 import threading
+import time
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, Literal
@@ -92,11 +94,13 @@ class MemoryGraph:
     def subscribe(self, topic: str, type_name: str, heard: Heard, *, latched: bool = False) -> "_Subscription":
         return self._keep(_Subscription(self._ros, topic, type_name, heard, latched=latched))
 
-    def serve(self, name: str, type_name: str, answer: Answer) -> "_Service":
+    def serve(self, name: str, type_name: str, answer: Answer, *, stops: bool = False) -> "_Service":
         assert name not in self._ros.services, f"{name} is served twice"
-        return self._keep(_Service(self._ros, name, type_name, answer))
+        return self._keep(_Service(self._ros, name, type_name, answer, stops=stops))
 
-    def call(self, name: str, type_name: str, request: Mapping[str, Any], timeout_s: float) -> Message:
+    def call(
+        self, name: str, type_name: str, request: Mapping[str, Any], timeout_s: float, *, stops: bool = False
+    ) -> Message:
         found = self._ros.services.get(name)
         if found is None or self.closed:
             raise RosUnreachable(what=name, problem="nobody serves it")
@@ -196,22 +200,28 @@ class _Subscription:
 
 
 class _Service:
-    def __init__(self, ros: MemoryRos, name: str, type_name: str, answer: Answer) -> None:
+    def __init__(self, ros: MemoryRos, name: str, type_name: str, answer: Answer, *, stops: bool) -> None:
         self._ros, self.name, self._answer = ros, name, answer
         self._request, self._response = ros.types.parts(type_name)
         self._type = type_name
-        self._one_at_a_time = threading.Lock()
+        self.asked = self.answered = 0
+        self._turn = contextlib.nullcontext() if stops else threading.Lock()
         ros.services[name] = self
 
     def call(self, type_name: str, request: Mapping[str, Any], who: str, timeout_s: float) -> Message:
         assert type_name == self._type, f"{self.name} is {self._type}"
         types, asked = self._ros.types, self._ros.types.to_bytes(self._request, request)
         said: queue.SimpleQueue[Message | Exception] = queue.SimpleQueue()
+        came_at = time.monotonic()
+        self.asked += 1
 
         def run() -> None:
             try:
-                with self._one_at_a_time:
-                    told = self._answer(types.from_bytes(self._request, asked), who)
+                with self._turn:
+                    try:
+                        told = self._answer(types.from_bytes(self._request, asked), who, came_at)
+                    finally:
+                        self.answered += 1
                 said.put(types.from_bytes(self._response, types.to_bytes(self._response, told)))
             except Exception as error:  # noqa: BLE001 - it is told to who asked
                 said.put(error)
@@ -265,6 +275,7 @@ class _Pursuit:
         self._ended: queue.SimpleQueue[Outcome | Exception] = queue.SimpleQueue()
         self._guard = threading.Lock()
         self.canceled = False
+        self.came_at = time.monotonic()
 
     def begin(self) -> "_Pursuit":
         threading.Thread(target=self._run, name="memory-ros-goal", daemon=True).start()

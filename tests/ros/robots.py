@@ -25,6 +25,7 @@ class Part:
         self.goes = threading.Event()
         self.stops = 0
         self.commands: list[float] = []
+        self.spins = 0
         self.silent = False
         self.takes_over = False
         """A command ends the one before it, as drivers do; else each is done at once."""
@@ -66,6 +67,7 @@ class Part:
     @service(cancel="stop")
     def spin(self) -> None:
         """Turn until stopped."""
+        self.spins += 1
         self.resources[0].moving = True
         self.goes.set()
         self.stopped.wait(PATIENCE_S)

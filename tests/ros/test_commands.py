@@ -72,7 +72,7 @@ def test_S03_what_is_under_way_from_a_node_that_has_ended_moves_nothing(stand: S
     late = Stick(stand, "/teleop-again")
     late.graph.node = "/teleop"  # its last words, which were on the way
     late.say(0.2)
-    wait_until(lambda: any("it has just ended" in line for line in stand.said))
+    wait_until(lambda: any("it has ended" in line for line in stand.said))
     assert stand.robot.head.commands == [0.1]
 
 

@@ -36,14 +36,14 @@ class Lab:
         self.graph.serve("/lab/door", "std_srvs/srv/SetBool", self._move)
         self.graph.serve("/lab/stop", TRIGGER, self._stop)
 
-    def _move(self, request: Any, who: str) -> Any:
+    def _move(self, request: Any, who: str, came_at: float) -> Any:
         self.asked.append((request, who))
         self.goes.set()
         if self.waits:
             self.stopped.wait(PATIENCE_S)
         return {"success": True, "message": "moved"}
 
-    def _stop(self, request: Any, who: str) -> Any:
+    def _stop(self, request: Any, who: str, came_at: float) -> Any:
         self.stopped.set()
         return {"success": True}
 
@@ -108,7 +108,7 @@ def test_what_does_not_answer_in_time_is_stopped_as_it_may_move(stand: Stand) ->
 
 
 def test_what_ros_refuses_does_not_count_as_moving(stand: Stand) -> None:
-    stand.node("/lab").serve("/lab/door", "std_srvs/srv/SetBool", lambda request, who: {"success": 1 / 0})
+    stand.node("/lab").serve("/lab/door", "std_srvs/srv/SetBool", lambda request, who, _at: {"success": 1 / 0})
     stand.up(DOOR)
     with pytest.raises(RosRefused, match="division by zero"):
         found(stand, "lab", "door")(True)
@@ -120,7 +120,7 @@ def test_what_ros_refuses_does_not_count_as_moving(stand: Stand) -> None:
 
 def test_a_stop_that_ros_refuses_is_an_error(stand: Stand) -> None:
     lab = Lab(stand)
-    lab._stop = lambda request, who: {"success": False, "message": "jammed"}  # type: ignore[method-assign]
+    lab._stop = lambda request, who, _at: {"success": False, "message": "jammed"}  # type: ignore[method-assign]
     stand.ros.services.pop("/lab/stop")
     lab.graph.serve("/lab/stop", TRIGGER, lab._stop)
     stand.up(DOOR)

@@ -69,8 +69,10 @@ class Client:
 
     def admit(self, handle: Handle) -> int:
         """A call was asked for; returns the number of stops so far, which it raises if it is one."""
-        self._stops += handle.effect == "stop"
-        return self._stops
+        stops = handle.effect == "stop"
+        with self._guard:
+            self._stops += stops
+            return self._stops
 
     def overtaken(self, admitted: int) -> bool:
         """Whether a stop was asked for after that number was given: what had not begun by then must not (S08)."""

@@ -81,6 +81,7 @@ class Bridge:
             self._offer(graph, file)
             self._following = Following(container, self._mappings(graph, file), say)
             self._leaving.callback(self._following.close)
+            self._leaving.callback(self._nodes.close)  # before all else: what they move stops, and nothing begins
             failing.pop_all()
 
     def _mappings(self, graph: Graph, file: RosFile) -> list[Mapping]:

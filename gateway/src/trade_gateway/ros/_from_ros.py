@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any, Final
 
 from trade import Container, Resource, current_call, permit
+from trade.errors import MotionStopped
 from trade_gateway.ros._file import FromParameters, FromPublish, FromService, FromTopic
 from trade_gateway.ros._graph import Graph, RosRefused, RosUnreachable
 from trade_gateway.ros._offering import Method, Records, plain, provider
@@ -14,6 +15,9 @@ from trade_gateway.ros._types import Message
 __all__ = ["Offered", "parameters_from_ros", "publisher_from_ros", "service_from_ros", "topic_from_ros"]
 
 _STOPPED_WITHIN_S: Final = 2.0
+_STOPS_OWED: Final = 10
+_STOP_AGAIN_S: Final = 0.2
+"""As long as nodes take to connect again."""
 
 
 class Offered:
@@ -47,41 +51,71 @@ def service_from_ros(entry: FromService, graph: Graph, records: Records) -> Offe
     parameters, optional = records.parameters(asked)
     returns = records.of(answered) if graph.types.fields(answered) else None
     name = entry.name or entry.service.rpartition("/")[2]
-    resources = [Resource(f"{entry.groups[0]}.{name}")] if entry.effect == "actuate" else []
+    doc = f"{entry.service} of ROS ({entry.type})."
 
     def call(args: dict[str, Any]) -> Any:
         return records.record(answered, graph.call(entry.service, entry.type, plain(args), _left_s(entry.deadline_s)))
 
-    def actuate(args: dict[str, Any]) -> Any:
-        [resource] = resources
-        with permit(resources) as permitted:
-            permitted.gate()
-            resource.moving = True
+    if entry.effect != "actuate":
+        methods = [Method(name, doc, parameters, optional, returns, entry.effect, call)]
+        return Offered(f"service {entry.service}", entry.groups, provider("RosService", methods), _nothing)
+    motion = _Motion(entry, graph, Resource(f"{entry.groups[0]}.{name}"), call)
+    methods = [
+        Method(name, doc, parameters, optional, returns, "actuate", motion.begin, "stop"),
+        Method("stop", f"{entry.stop} of ROS.", {}, frozenset(), None, "stop", motion.stop),
+    ]
+    made = provider("RosService", methods, [motion.resource])
+    return Offered(f"service {entry.service}", entry.groups, made, _nothing)
+
+
+class _Motion:
+    """What a service of theirs moves, until it has answered or the one that stops it has."""
+
+    def __init__(
+        self, entry: FromService, graph: Graph, resource: Resource, call: Callable[[dict[str, Any]], Any]
+    ) -> None:
+        self.resource: Final = resource
+        self._entry = entry
+        self._graph = graph
+        self._call = call
+        self._guard = threading.Lock()
+        self._stops = 0
+
+    def begin(self, args: dict[str, Any]) -> Any:
+        """Call it. A stop that comes meanwhile may arrive there before, so it is then told again."""
+        with permit([self.resource]) as permitted:
+            with self._guard:
+                permitted.gate()
+                before = self._stops
+                self.resource.moving = True
             try:
-                result = call(args)
+                result = self._call(args)
             except RosUnreachable:  # it may have begun all the same
-                stop({})
+                self._tell_stop()
                 raise
             except BaseException:
-                resource.moving = False
+                self.resource.moving = False
                 raise
-            resource.moving = False
+            with self._guard:
+                stopped = self._stops != before
+            if stopped:
+                self._tell_stop()
+                raise MotionStopped(device=self.resource.name, reason="it was stopped")
+            self.resource.moving = False
         return result
 
-    def stop(_: dict[str, Any]) -> None:
-        told = graph.call(entry.stop, entry.stop_type, {}, _STOPPED_WITHIN_S)
+    def stop(self, _: dict[str, Any]) -> None:
+        """Call the service that stops."""
+        with self._guard:
+            self._stops += 1
+        self._tell_stop()
+
+    def _tell_stop(self) -> None:
+        entry = self._entry
+        told = self._graph.call(entry.stop, entry.stop_type, {}, _STOPPED_WITHIN_S, stops=True)
         if told.get("success") is False:
             raise RosRefused(what=entry.stop, problem=str(told.get("message", "")) or "it was not stopped")
-        for resource in resources:
-            resource.moving = False
-
-    doc = f"{entry.service} of ROS ({entry.type})."
-    does = actuate if resources else call
-    cancel = "stop" if resources else None
-    methods = [Method(name, doc, parameters, optional, returns, entry.effect, does, cancel)]
-    if resources:
-        methods.append(Method("stop", f"{entry.stop} of ROS.", {}, frozenset(), None, "stop", stop))
-    return Offered(f"service {entry.service}", entry.groups, provider("RosService", methods, resources), _nothing)
+        self.resource.moving = False
 
 
 def topic_from_ros(entry: FromTopic, graph: Graph, records: Records) -> Offered:
@@ -123,7 +157,7 @@ def publisher_from_ros(entry: FromPublish, graph: Graph, records: Records) -> Of
     if entry.stop is None:
         methods = [Method(name, doc, parameters, optional, None, "note", send)]
         return Offered(f"topic {entry.topic}", entry.groups, provider("RosPublisher", methods), publisher.close)
-    setpoint = _SetPoint(Resource(f"{entry.groups[0]}.{name}"), publisher.send, entry.stop, entry.valid_s)
+    setpoint = _SetPoint(Resource(f"{entry.groups[0]}.{name}"), publisher.send, entry, graph)
     holds = f" It holds for {entry.valid_s:g} s." if entry.valid_s else ""
     methods = [
         Method(name, doc + holds, parameters, optional, None, "actuate", setpoint.send, "stop"),
@@ -139,41 +173,64 @@ def publisher_from_ros(entry: FromPublish, graph: Graph, records: Records) -> Of
 
 
 class _SetPoint:
-    """What is published and moves something, until the message that stops it."""
+    """What is published and moves something, until the message that stops it.
 
-    def __init__(self, resource: Resource, send: Callable[[Message], object], stop: Message, valid_s: float) -> None:
+    While ROS is lost nobody hears that message. It is then owed: published again and again until ROS has been back for
+    some time; until then what it moves counts as moving.
+    """
+
+    def __init__(self, resource: Resource, send: Callable[[Message], object], entry: FromPublish, graph: Graph) -> None:
         self.resource: Final = resource
         self._send = send
-        self._stop = stop
-        self._valid_s = valid_s
+        self._topic = entry.topic
+        self._stop = entry.stop or {}
+        self._valid_s = entry.valid_s
+        self._graph = graph
         self._guard = threading.Lock()
         self._timer: threading.Timer | None = None
+        self._owed = 0
 
     def send(self, args: dict[str, Any]) -> None:
         """Publish it, and what stops when its time is over, unless another one comes before."""
         with permit([self.resource]) as permitted, self._guard:
             permitted.gate()
             self._still()
+            self._owed = 0
             self.resource.moving = True
             self._send(plain(args))
             if self._valid_s:
-                self._timer = threading.Timer(self._valid_s, self._over)
-                self._timer.name, self._timer.daemon = "trade-ros-setpoint", True
-                self._timer.start()
+                self._later(self._valid_s)
 
     def stop(self, _: dict[str, Any]) -> None:
-        """Publish what stops."""
+        """Publish what stops; RosUnreachable while ROS is lost: it is published as soon as that is back."""
         with self._guard:
             self._still()
-            self._send(self._stop)
-            self.resource.moving = False
+            problem = self._halted()
+        if problem:
+            told = f"{problem}; what stops is published as soon as it is back"
+            raise RosUnreachable(what=self._topic, problem=told)
 
     def _over(self) -> None:
         with self._guard:
             if threading.current_thread() is self._timer:  # no other came meanwhile
                 self._timer = None
-                self._send(self._stop)
-                self.resource.moving = False
+                self._halted()
+
+    def _halted(self) -> str:
+        """Publish what stops; what is wrong with ROS, if nobody may have heard that. Under the guard."""
+        self._send(self._stop)
+        problem = self._graph.healthy
+        self._owed = _STOPS_OWED if problem else max(0, self._owed - 1)
+        if self._owed:
+            self._later(_STOP_AGAIN_S)
+        else:
+            self.resource.moving = False
+        return problem
+
+    def _later(self, after_s: float) -> None:
+        self._timer = threading.Timer(after_s, self._over)
+        self._timer.name, self._timer.daemon = "trade-ros-setpoint", True
+        self._timer.start()
 
     def _still(self) -> None:
         timer, self._timer = self._timer, None

@@ -34,8 +34,8 @@ __all__ = [
 Heard = Callable[[Message, str], object]
 """Told of a message, and of the name of the node that sent it (``/teleop``; empty if ROS does not say)."""
 Answer = Callable[[Message, str, float], Message]
-"""Given a request, the caller's name and when it came (``time.monotonic()``, before it waited for anything), returns the
-response; what it raises is told to the caller as a failure."""
+"""Given a request, the caller's name and when it came (``time.monotonic()``, before it waited for anything), returns
+the response; what it raises is told to the caller as a failure."""
 NodeTold = Callable[[str, bool], object]
 """Told of a node by name, and whether it is there (or is gone, or can no longer be seen)."""
 

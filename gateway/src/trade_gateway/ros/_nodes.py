@@ -26,6 +26,8 @@ _UNSEEN_S: Final = 5.0
 """Who was heard but is not among the nodes that ROS tells of is gone so long after it was heard last."""
 _FORGOTTEN_S: Final = 2.0
 """So long nothing is done for a node that has ended: what comes then was sent before."""
+_REMEMBERED_S: Final = 60.0
+"""What came before a node ended is refused for so long; nothing waits longer for its turn."""
 _WAIT_S: Final = 0.5
 """For a lock: what somebody has just let go of."""
 _LATE_S: Final = 5.0
@@ -42,27 +44,38 @@ class Guest:
         """Its name; empty: nobody knows."""
         self.grips: Final = Grips(container, client)
         self.heard_at = time.monotonic()
+        self.stopped_at = 0.0
+        """When its last stop came: what came before that must not begin any more (S08)."""
 
     @property
     def named(self) -> str:
         """For people."""
         return self.who or "a node of ROS that is not known"
 
-    def call(self, handle: Handle, args: dict[str, Any], deadline_s: float, wait_s: float = _WAIT_S) -> Any:
-        """Call a service of ours and wait; what moves is under a lock meanwhile. Raises what the call does."""
+    def call(self, handle: Handle, args: dict[str, Any], deadline_s: float, came_at: float) -> Any:
+        """Call a service of ours and wait; what moves is under a lock meanwhile. Raises as `begin`, and as the call."""
         if handle.effect != "actuate":
-            return self._ended(self.begin(handle, args, deadline_s), deadline_s)
+            return self._ended(self.begin(handle, args, deadline_s, came_at), deadline_s)
         admitted = self.client.admit(handle)
-        with self.grips.hold([handle], f"a call of {self.named}", wait_s):
-            return self._ended(self.begin(handle, args, deadline_s, admitted), deadline_s)
+        with self.grips.hold([handle], f"a call of {self.named}", _WAIT_S):
+            return self._ended(self.begin(handle, args, deadline_s, came_at, admitted), deadline_s)
 
-    def begin(self, handle: Handle, args: dict[str, Any], deadline_s: float, admitted: int | None = None) -> Run:
+    def begin(
+        self,
+        handle: Handle,
+        args: dict[str, Any],
+        deadline_s: float,
+        came_at: float | None,
+        admitted: int | None = None,
+    ) -> Run:
         """Call without waiting, under the locks there are.
 
         Args:
             handle: what to call.
             args: by name.
             deadline_s: how long it may take.
+            came_at: when the node asked for it (``time.monotonic()``), before it waited for anything; None: the bridge
+                itself asks.
             admitted: what `Client.admit` said when it was asked for; by default that is now.
 
         Raises:
@@ -70,7 +83,11 @@ class Guest:
             SessionEnded: the node is gone.
         """
         client = self.client
+        if handle.effect == "stop" and came_at is not None:
+            self.stopped_at = max(self.stopped_at, came_at)
         number = client.admit(handle) if admitted is None else admitted
+        if handle.effect == "actuate" and came_at is not None and came_at <= self.stopped_at:
+            raise Cancelled(service=handle.label)
 
         def start() -> Run:
             return self._container.begin(handle, (), args, deadline_s)
@@ -113,7 +130,7 @@ class Nodes:
         self._guests: dict[str, Guest] = {}
         self._there: set[str] = set()
         self._gone: dict[str, float] = {}
-        """When which has ended, of those that had a session."""
+        """When which has ended, lately."""
         self._guard = threading.Lock()
         self._lost = ""
         self._lost_at: float | None = None
@@ -122,29 +139,36 @@ class Nodes:
         self._thread = threading.Thread(target=self._look_on, name="trade-ros-nodes", daemon=True)
         self._thread.start()
 
-    def guest(self, who: str, *, stops: bool = False) -> Guest:
+    def guest(self, who: str, came_at: float, *, stops: bool = False) -> Guest:
         """The client that a node is.
 
         Args:
             who: its name, as ROS says it.
+            came_at: when it asked for something, by ``time.monotonic()``.
             stops: it wants to stop something, which it always may.
 
         Raises:
-            RosUnreachable: nobody would see it die, or it just has.
+            RosUnreachable: nobody would see it die, or it has since; or the bridge is leaving.
         """
         with self._guard:
+            if self._closing.is_set() and not stops:
+                raise RosUnreachable(what="the bridge", problem="it is leaving; nothing is begun any more")
             if self._lost and not stops:
                 problem = f"{self._lost}; nobody would see {who or 'a node'} die, so nothing is done for it until then"
                 raise RosUnreachable(what="ROS", problem=problem)
-            if time.monotonic() - self._gone.get(who, -_FORGOTTEN_S) < _FORGOTTEN_S and not stops:
-                raise RosUnreachable(
-                    what=who, problem="it has just ended; what was still under way from it is not done"
-                )
+            if self._is_of_the_dead(who, came_at) and not stops:
+                raise RosUnreachable(what=who, problem="it has ended; what was still under way from it is not done")
             guest = self._guests.get(who)
             if guest is None or guest.client.closed:
                 guest = self._guests[who] = self._opened(who)
             guest.heard_at = time.monotonic()
             return guest
+
+    def _is_of_the_dead(self, who: str, came_at: float) -> bool:
+        gone_at = self._gone.get(who)
+        if gone_at is None:
+            return False
+        return came_at <= gone_at or (who not in self._there and time.monotonic() - gone_at < _FORGOTTEN_S)
 
     def _opened(self, who: str) -> Guest:
         session = self._container.open_session(who.strip("/") or "unknown")
@@ -161,8 +185,7 @@ class Nodes:
         with self._guard:
             (self._there.add if there else self._there.discard)(name)
             gone = None if there else self._guests.pop(name, None)
-            self._gone.pop(name, None)
-            if gone is not None:
+            if not there:
                 self._gone[name] = time.monotonic()
         if gone is not None:
             _logger.info("%s is gone: what it moved stops, its locks fall", name)
@@ -180,7 +203,7 @@ class Nodes:
         self._lost_at = None if not problem else now if self._lost_at is None else self._lost_at
         lost = problem if self._lost_at is not None and now - self._lost_at >= self._grace_s else ""
         with self._guard:
-            self._gone = {name: at for name, at in self._gone.items() if now - at < _FORGOTTEN_S}
+            self._gone = {name: at for name, at in self._gone.items() if now - at < _REMEMBERED_S}
             changed, self._lost = bool(lost) != bool(self._lost), lost
             all_of_them = changed and bool(lost)  # later there are only some that stop something
             gone = [one for one in self._guests.values() if all_of_them or self._unseen(one, now)]

@@ -13,6 +13,7 @@ from typing import Final, NamedTuple
 
 from trade import Constraint, Container, Handle, Run, where
 from trade.errors import ConfigurationError, TradeError
+from trade_gateway.clients._clients import Client
 from trade_gateway.ros._file import Command
 from trade_gateway.ros._following import Place, named_services
 from trade_gateway.ros._graph import Closes, Graph
@@ -55,6 +56,9 @@ class CommandsToRos:
 
     def open(self, place: Place, handle: Handle) -> Closes:
         entry = self._entry
+        if handle.effect == "stop":
+            problem = "a stop is for everybody at any time, a topic hears one node at a time: say [[to_ros.service]]"
+            raise ConfigurationError(where=handle.label, problem=problem)
         asked = Asked(self._graph.types, entry.type, handle, entry.args, entry.fixed)
         stops = stops_of(self._container, handle) if handle.effect == "actuate" else []
         if handle.effect == "actuate" and not stops:
@@ -103,6 +107,8 @@ class _Taking:
         self._heard_at = 0.0
         self._closing = False
         self._guest: Guest | None = None
+        self._told_by: Client | None = None
+        """Who tells it that it has ended."""
         self._grip = ExitStack()
         self._runs: list[Run] = []
         self._problem = ("", 0.0)
@@ -175,15 +181,18 @@ class _Taking:
         """Make a call of it; whatever it raises ends all."""
         if time.monotonic() - command.at >= self._entry.deadman_s:
             return
-        guest = self._nodes.guest(command.who)
+        guest = self._nodes.guest(command.who, command.at)
         if self._handle.effect == "actuate" and self._guest is not guest:
             self._grip.close()
             hold = guest.grips.hold([self._handle], f"commands of {guest.named} on {self._entry.topic}", 0.0)
             self._grip.enter_context(hold)
         if self._guest is not guest:
             self._guest = guest
-            guest.client.when_closed(self._wake)
-        run = guest.begin(self._handle, self._asked(command.message), self._entry.deadline_s, command.admitted)
+            if self._told_by is not guest.client:
+                self._told_by = guest.client
+                guest.client.when_closed(self._wake)
+        words, deadline_s = self._asked(command.message), self._entry.deadline_s
+        run = guest.begin(self._handle, words, deadline_s, command.at, command.admitted)
         self._runs.append(run)
         run.when_done(lambda _: self._wake())
 
@@ -209,7 +218,7 @@ class _Taking:
         runs: list[Run] = []
         for stop in self._stops:
             try:
-                runs.append(guest.begin(stop, {}, _STOPPED_WITHIN_S))
+                runs.append(guest.begin(stop, {}, _STOPPED_WITHIN_S, None))
             except TradeError:
                 _logger.exception("%s; %s could not be called", reason, stop.label)
         for run in runs:

@@ -71,11 +71,13 @@ class ServicesToRos:
     def open(self, place: Place, handle: Handle) -> Closes:
         asked, told, deadline_s = self._asked(handle), self._told, self._entry.deadline_s
 
-        def answer(request: Message, who: str) -> Message:
-            guest = self._nodes.guest(who, stops=handle.effect == "stop")
-            return told(guest.call(handle, asked(request), deadline_s))
+        stops = handle.effect == "stop"
 
-        return self._graph.serve(place.name, self._entry.type, answering(told, answer))
+        def answer(request: Message, who: str, came_at: float) -> Message:
+            guest = self._nodes.guest(who, came_at, stops=stops)
+            return told(guest.call(handle, asked(request), deadline_s, came_at))
+
+        return self._graph.serve(place.name, self._entry.type, answering(told, answer), stops=stops)
 
 
 class LocksToRos:
@@ -102,17 +104,17 @@ class LocksToRos:
     def open(self, place: Place, handle: Handle) -> Closes:  # noqa: ARG002 - it is of a whole group
         told = Told(self._graph.types, self._graph.types.parts(_SET_BOOL)[1])
 
-        def answer(request: Message, who: str) -> Message:
-            text = self._take(who) if request["data"] else self._give_back(who)
+        def answer(request: Message, who: str, came_at: float) -> Message:
+            text = self._take(who, came_at) if request["data"] else self._give_back(who)
             return {"success": True, "message": text}
 
         return self._graph.serve(place.name, _SET_BOOL, answering(told, answer))
 
-    def _take(self, who: str) -> str:
+    def _take(self, who: str, came_at: float) -> str:
         if who == UNKNOWN:
             problem = "ROS does not say who asks, so nobody would see its owner die; a lock needs a node that is known"
             raise RosRefused(what=f"lock of {self._entry.group}", problem=problem)
-        guest, before = self._nodes.guest(who), self._taken.get(who)
+        guest, before = self._nodes.guest(who, came_at), self._taken.get(who)
         client, wanted = guest.client, where(group=self._entry.group)
         if before is not None and before.client is client and before.lock.held:
             return f"it has {', '.join(before.lock.resources)}"
@@ -122,9 +124,14 @@ class LocksToRos:
         with client.session.use():
             purpose = f"of {who}, a node of ROS"
             lock = self._container.lock(wanted, purpose=purpose, wait_s=self._entry.wait_s).acquire()
-        self._taken[who] = _Taken(client, lock, client.keep(lock, handles))
+        taken = self._taken[who] = _Taken(client, lock, client.keep(lock, handles))
+        client.when_closed(lambda: self._forget(who, taken))
         client.session.check()
         return ", ".join(lock.resources)
+
+    def _forget(self, who: str, taken: _Taken) -> None:
+        if self._taken.get(who) is taken:
+            del self._taken[who]
 
     def _give_back(self, who: str) -> str:
         taken = self._taken.pop(who, None)
@@ -135,9 +142,9 @@ class LocksToRos:
 def answering(told: Told, answer: Answer) -> Answer:
     """The same, with what goes wrong said in the response where that has words for it."""
 
-    def guarded(request: Message, who: str) -> Message:
+    def guarded(request: Message, who: str, came_at: float) -> Message:
         try:
-            return answer(request, who)
+            return answer(request, who, came_at)
         except Exception as error:  # noqa: BLE001 - whatever a provider raises is what the node is told
             return told.failed(error)
 

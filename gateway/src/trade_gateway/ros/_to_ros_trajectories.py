@@ -92,7 +92,7 @@ class _Limb:
     def _carried_out(self, goal: Goal, canceling: "_Canceling") -> Outcome:
         try:
             starts_late(goal.message, time.time())
-            guest = self._nodes.guest(goal.client)
+            guest = self._nodes.guest(goal.client, goal.came_at)
             trajectory = trajectory_of(goal.message, self._names, self._here(goal))
             args = {"trajectory": trajectory, "tolerances": tolerances_of(goal.message)}
             deadline_s = lasts_s(trajectory) + _MORE_S
@@ -102,7 +102,7 @@ class _Limb:
                 held.enter_context(guest.grips.hold([self._follow], purpose, _WAIT_S))
                 if canceling.asked:
                     return _outcome(Ended.CANCELED, SUCCESSFUL, "canceled before it began")
-                run = guest.begin(self._follow, args, deadline_s, admitted)
+                run = guest.begin(self._follow, args, deadline_s, goal.came_at, admitted)
                 run.on_progress(lambda told: _try(lambda: self._tell(goal, told)))
                 canceling.ends(lambda: guest.client.cancel(run))
                 _wait(run, deadline_s, canceling)
