@@ -134,6 +134,13 @@ def test_messages_survive_the_wire(message: Any) -> None:
     assert encode_message(decode(encode_message(message))) == encode_message(message)
 
 
+def test_an_effect_that_is_not_known_counts_as_actuating() -> None:
+    odd = ServiceInfo(name="turn", signature="turn()", effect="servo")
+    told = ProviderInfo(revision=1, groups=("rosie",), kind="Arm", host="here", pid=1, services=(odd,))
+    [read] = decode_provider(encode_message(told)).services
+    assert read.effect == "actuate"
+
+
 @pytest.mark.parametrize("status", [-1, 9, 99])
 def test_a_reply_of_an_unknown_status_is_malformed(status: int) -> None:
     with pytest.raises(Malformed):

@@ -7,10 +7,11 @@ import anyio
 import pytest
 from anyio.to_thread import run_sync
 
-from agent_rig import POLICY, Client, Robot, run
-from trade import Container, where
+from agent_rig import POLICY, Client, Part, Robot, run
+from trade import Container, service, where
 from trade.errors import AccessDenied, ConfigurationError, TradeError
 from trade.testing import MemorySystem
+from trade_gateway.agents import Approvals
 from waiting import wait_until
 
 
@@ -86,6 +87,36 @@ def test_nobody_approves_for_himself_or_without_the_right(
     run(asks, agent)
     assert [type(error) for error in refused] == [AccessDenied, AccessDenied]
     assert robot.legs.angle == 0.0
+
+
+class Joint:
+    """A joint of the head, in a group of its own."""
+
+    def __init__(self, part: Part) -> None:
+        self.resources = part.resources
+        self.angles: list[float] = []
+
+    @service
+    def move_to(self, angle: float) -> None:
+        self.angles.append(angle)
+
+    @service(effect="stop")
+    def stop(self) -> None: ...
+
+
+def test_what_is_marked_is_asked_for_whichever_service_moves_it(
+    memory: MemorySystem, robot: Robot, agent: Container
+) -> None:
+    joint, alias = Joint(robot.head), Part("lamp")
+    robot.container.register(joint, "rosie.neck.pan")
+    robot.container.register(alias, ["lab.lamp", "rosie.head"])
+    memory.settle()
+    approvals = Approvals(agent, ("rosie.head",))
+    found = {(one.key.domain, one.name): one for one in agent.services(where())}
+    assert approvals.needed(found["rosie.neck.pan", "move_to"])
+    assert approvals.needed(found["lab.lamp", "turn"])
+    assert not approvals.needed(found["rosie.neck.pan", "stop"])
+    assert not approvals.needed(found["rosie.legs", "turn"])
 
 
 def test_without_a_policy_the_command_line_marks(memory: MemorySystem, robot: Robot, agent: Container) -> None:

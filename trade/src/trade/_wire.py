@@ -199,6 +199,7 @@ class Parameter(Struct, frozen=True, array_like=True, gc=False):
     positional_only: bool = False
 
 
+_EFFECTS: Final = frozenset(["read", "note", "actuate", "stop"])
 NO_SCHEMA: Final = Raw(msgspec.msgpack.encode({}))
 
 
@@ -354,7 +355,12 @@ def decode_provider(payload: bytes) -> ProviderInfo:
 
 def _service(data: bytes) -> ServiceInfo:
     known = _services.get(data)
-    return known if known is not None else _services.setdefault(data, _service_decoder.decode(data))
+    return known if known is not None else _services.setdefault(data, _understood(_service_decoder.decode(data)))
+
+
+def _understood(info: ServiceInfo) -> ServiceInfo:
+    """What has an effect that is not known, of a later version or another language, may move something."""
+    return info if info.effect in _EFFECTS else structs.replace(info, effect="actuate")
 
 
 def decode_tally(payload: bytes) -> Tally:

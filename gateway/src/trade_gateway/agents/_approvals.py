@@ -12,10 +12,11 @@ import msgspec
 from anyio.to_thread import run_sync
 from msgspec import Struct
 
-from trade import Container, Handle, current_call, service
+from trade import Container, Handle, current_call, service, where
 from trade.errors import AccessDenied, ConfigurationError
 from trade_gateway._approvals import GROUP
 from trade_gateway.agents._problems import NeedsApproval
+from trade_gateway.clients import places
 
 __all__ = ["Approvals", "Request"]
 
@@ -116,10 +117,22 @@ class Approvals:
     # --- asking
 
     def needed(self, handle: Handle) -> bool:
-        """Whether somebody has to say yes before the agent may call that."""
-        if handle.effect not in ("actuate", "note"):
+        """Whether somebody has to say yes before the agent may call that.
+
+        What a marked group moves is asked for whichever service moves it: the head also as two joints of the neck.
+        """
+        if handle.effect in ("read", "stop"):
             return False
-        domain = handle.key.domain
+        if self._is_marked(handle):
+            return True
+        own = places([handle])
+        others = (one for one in self._container.services(where()) if one.effect == "actuate")
+        return any(not own.isdisjoint(places([one])) and self._is_marked(one) for one in others)
+
+    def _is_marked(self, handle: Handle) -> bool:
+        return any(self._marks(group) for group in dict.fromkeys((handle.key.domain, *handle.groups)))
+
+    def _marks(self, domain: str) -> bool:
         if any(domain == group or domain.startswith(f"{group}.") for group in self._ask_first):
             return True
         policy = self._container.access.policy

@@ -239,6 +239,8 @@ class Tools:
             reader = self._find(handle.key.domain, "state", handle.container)
         except TradeError:
             return None
+        if reader.effect != "read":  # some other service of that name
+            return None
         run = await self._deeds.begin(self._client, reader, messages.CallBody(), self._client.admit(reader))
         await run.settled()
         return run.result(0)

@@ -2,7 +2,6 @@
 
 import secrets
 import threading
-from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from typing import Final
@@ -17,7 +16,6 @@ MOST_OF_ONE: Final = 16
 """Sessions of one identity that last; those of single requests do not count."""
 MOST_LOCKS: Final = 16
 """Of one session."""
-_STOPS_KEPT: Final = 16
 
 Place = tuple[object, str]
 """A resource, and the container that judges it."""
@@ -45,7 +43,8 @@ class Client:
         self._guard = threading.Lock()
         self._leaving = False
         self._stops = 0
-        self._stopping: deque[tuple[int, Callable[[], object]]] = deque(maxlen=_STOPS_KEPT)
+        self._stopping: dict[object, tuple[int, Callable[[], object]]] = {}
+        """The last of each stop service."""
         self._told: list[Callable[[], object]] = []
 
     @property
@@ -78,13 +77,13 @@ class Client:
         """Whether a stop was asked for after that number was given: what had not begun by then must not (S08)."""
         return self._stops != admitted
 
-    def stopping(self, admitted: int, again: Callable[[], object]) -> None:
+    def stopping(self, admitted: int, handle: Handle, again: Callable[[], object]) -> None:
         """A stop of that number is about to be sent, by this."""
-        self._stopping.append((admitted, again))
+        self._stopping[handle.key] = admitted, again
 
     def stop_again(self, admitted: int) -> None:
         """A call of that number was sent, perhaps after a stop that was asked for later: that has the last word."""
-        for number, again in list(self._stopping):
+        for number, again in list(self._stopping.values()):
             if number > admitted:
                 again()
 

@@ -131,7 +131,7 @@ class Deeds:
         begin = partial(self._container.begin, handle, args, kwargs, body.deadline_s)
         with client.speaking():
             if handle.effect == "stop":
-                client.stopping(admitted, begin)
+                client.stopping(admitted, handle, begin)
             elif handle.effect == "actuate" and client.overtaken(admitted):
                 raise Cancelled(service=handle.label)
             run = begin()

@@ -94,7 +94,7 @@ class Guest:
 
         with client.speaking():
             if handle.effect == "stop":
-                client.stopping(number, start)
+                client.stopping(number, handle, start)
             elif handle.effect == "actuate" and client.overtaken(number):
                 raise Cancelled(service=handle.label)
             run = start()
