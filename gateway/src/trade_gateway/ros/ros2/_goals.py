@@ -25,7 +25,7 @@ _log: Final = logging.getLogger("trade")
 class Pursued(Goal):
     """A goal that somebody has sent."""
 
-    def __init__(self, action: "Action", goal_id: bytes, message: Message, client: str) -> None:
+    def __init__(self, action: "Action", goal_id: bytes, message: Message, client: str, came_at: float) -> None:
         self.id: Final = goal_id
         self.stamp_ns: Final = time.time_ns()
         self.status = Status.ACCEPTED
@@ -35,6 +35,7 @@ class Pursued(Goal):
         self._action = action
         self._message = message
         self._client = client
+        self._came_at = came_at
         self._lock = threading.Lock()
         self._canceled = False
         self._tell: list[Callable[[], object]] = []
@@ -46,6 +47,10 @@ class Pursued(Goal):
     @property
     def client(self) -> str:
         return self._client
+
+    @property
+    def came_at(self) -> float:
+        return self._came_at
 
     def feedback(self, message: Mapping[str, Any]) -> None:
         """See `Goal`. Raises ConfigurationError: it does not fit the type."""
@@ -115,7 +120,7 @@ class Action:
     def _accept(self, asked: Asked) -> None:
         request = asked.request()
         goal_id = request["goal_id"]["uuid"]
-        goal = Pursued(self, goal_id, request["goal"], asked.who())
+        goal = Pursued(self, goal_id, request["goal"], asked.who(), asked.came_at)
         with self._lock:
             taken = not self._closed and goal_id not in self._goals
             before = self._going()

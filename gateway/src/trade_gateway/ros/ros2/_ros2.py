@@ -79,11 +79,19 @@ class Ros2(Graph):
         """
         return self._keep(TopicHeard(self._node, topic, type_name, heard, latched=latched))
 
-    def serve(self, name: str, type_name: str, answer: Answer) -> Closes:
+    def serve(self, name: str, type_name: str, answer: Answer, *, stops: bool = False) -> Closes:
         """See `Graph`. Raises ConfigurationError: its name or type is none."""
-        return self._keep(Server(self._node, name, type_name, answering(answer)))
+        return self._keep(Server(self._node, name, type_name, answering(answer), stops=stops))
 
-    def call(self, name: str, type_name: str, request: Mapping[str, Any], timeout_s: float) -> Message:
+    def call(
+        self,
+        name: str,
+        type_name: str,
+        request: Mapping[str, Any],
+        timeout_s: float,
+        *,
+        stops: bool = False,  # noqa: ARG002 - no call waits for another here
+    ) -> Message:
         """See `Graph`. Raises also ConfigurationError: the name or type is none, or the request does not fit."""
         with self._lock:
             client = self._clients.get((name, type_name))

@@ -45,6 +45,7 @@ class Asked:
         self._endpoint = endpoint
         self._node = node
         self._type_name = type_name
+        self.came_at: Final = time.monotonic()
 
     def request(self) -> Message:
         """What is asked. Raises ValueError: it is malformed."""
@@ -123,7 +124,7 @@ class Server:
 
 def answering(answer: Answer) -> Callable[[Asked], object]:
     """Handles requests by a function that returns the response."""
-    return lambda asked: asked.answer(answer(asked.request(), asked.who()))
+    return lambda asked: asked.answer(answer(asked.request(), asked.who(), asked.came_at))
 
 
 class Client:
