@@ -84,6 +84,40 @@ def test_who_speaks_before_its_token_is_there_is_waited_for(
     assert found == ["/arm/early"]
 
 
+EARLY = "@ros2_lv/0/abc/0/1/MP/%/%arm/early/%said/std_msgs::msg::dds_::String_/RIHS01_0/::,10:,:,:,,"
+
+
+def come_and_go(graph: Ros2, router: Router, token: str) -> None:
+    """An endpoint is seen, and its end."""
+    presence = graph._node.presence
+    with raw_session(router) as session, session.liveliness().declare_token(token):
+        wait_until(lambda: token in presence._seen, "it is seen")
+    wait_until(lambda: token not in presence._seen, "its end is seen")
+
+
+def test_S06_who_has_just_ended_keeps_its_name_for_a_while(
+    graph: Ros2, router: Router, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    presence = graph._node.presence
+    monkeypatch.setattr("trade_gateway.ros.ros2._presence._ENDED_S", 1000.0)
+    come_and_go(graph, router, EARLY)
+    assert presence.known(gid(EARLY)) == presence.node_of(gid(EARLY)) == "/arm/early"
+    monkeypatch.setattr("trade_gateway.ros.ros2._presence._ENDED_S", 0.0)
+    come_and_go(graph, router, EARLY)
+    assert presence.known(gid(EARLY)) == ""
+
+
+def test_S07_of_those_that_ended_only_the_last_ones_keep_their_names(
+    graph: Ros2, router: Router, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("trade_gateway.ros.ros2._presence._ENDED_S", 1000.0)
+    monkeypatch.setattr("trade_gateway.ros.ros2._presence._MOST_ENDED", 2)
+    tokens = [EARLY.replace("/0/1/MP", f"/0/{number}/MP") for number in (1, 2, 3)]
+    for token in tokens:
+        come_and_go(graph, router, token)
+    assert [graph._node.presence.known(gid(token)) for token in tokens] == ["", "/arm/early", "/arm/early"]
+
+
 def test_S07_strangers_are_waited_for_one_after_another_with_pauses(
     graph: Ros2, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -12,6 +12,7 @@ from ros2_peers import Process, Router, until_offered
 from trade_gateway.ros._graph import RosRefused, RosUnreachable
 from trade_gateway.ros.ros2 import Ros2
 from trade_gateway.ros.ros2._names import Kind
+from trade_gateway.ros.ros2._services import Client
 from waiting import wait_until
 
 ADD = "example_interfaces/srv/AddTwoInts"
@@ -158,6 +159,42 @@ def test_a_request_without_fields_and_an_empty_answer_pass(
 def test_another_node_that_asks_for_our_parameters_is_answered(graph: Ros2, peer: Process) -> None:
     peer.ask("parameter_types", node="/trade", names=["use_sim_time", "other"])
     assert peer.hear("types")["types"] == [0, 0]
+
+
+@pytest.mark.parametrize("kept_s", [1000.0, 0.0], ids=["asked_unseen", "asked_seen"])
+def test_S06_a_request_of_a_node_that_died_while_it_waited_is_told_with_its_name(
+    graph: Ros2, router: Router, open_graph: Callable[..., Ros2], monkeypatch: pytest.MonkeyPatch, kept_s: float
+) -> None:
+    """It is known by when it came; and if its token came only after it, by what is kept of those that ended."""
+    monkeypatch.setattr("trade_gateway.ros.ros2._presence._ENDED_S", kept_s)
+    asked: list[str] = []
+    busy, go_on = threading.Event(), threading.Event()
+
+    def answer(_request: dict[str, Any], who: str, _came_at: float) -> dict[str, Any]:
+        asked.append(who)
+        busy.set()
+        assert go_on.wait(LONG_S)
+        return {}
+
+    server = graph.serve("/last_words", ADD, answer)
+    presence = graph._node.presence
+    first, doomed = open_graph(router, node="/first"), open_graph(router, node="/doomed")
+    with calling(first, "/last_words", 1):
+        assert busy.wait(LONG_S)
+        until_offered(doomed, "/last_words", ADD)
+        client = Client(doomed._node, "/last_words", ADD)
+        wait_until(lambda: presence.known(client._endpoint.gid), "it is seen")
+        if kept_s:  # its token has not come yet
+            monkeypatch.setattr(presence, "known", lambda _gid: "")
+        client.send({}, LONG_S)
+        wait_until(lambda: server._mailbox._waiting, "its request waits")
+        monkeypatch.undo()
+        monkeypatch.setattr("trade_gateway.ros.ros2._presence._ENDED_S", kept_s)
+        doomed.close()
+        wait_until(lambda: client._endpoint.gid not in presence._node_of, "its end is seen")
+        go_on.set()
+    wait_until(lambda: len(asked) == 2, "its request has its turn")
+    assert asked == ["/first", "/doomed"]
 
 
 def test_S01_a_service_is_told_when_its_request_came_not_when_its_turn_came(

@@ -20,7 +20,6 @@ import zenoh
 
 from trade_gateway.ros._graph import Answer, RosRefused, RosUnreachable
 from trade_gateway.ros._types import Message
-from trade_gateway.ros.ros2._attachment import Attachment
 from trade_gateway.ros.ros2._link import CLOSED, Undeclares
 from trade_gateway.ros.ros2._mailbox import Mailbox
 from trade_gateway.ros.ros2._names import Kind
@@ -45,6 +44,7 @@ class Asked:
         self._endpoint = endpoint
         self._node = node
         self._type_name = type_name
+        self._sender = node.sender(query.attachment)
         self.came_at: Final = time.monotonic()
 
     def request(self) -> Message:
@@ -54,7 +54,7 @@ class Asked:
 
     def who(self) -> str:
         """The node that asks, or empty. May wait shortly."""
-        return self._node.who(self._query.attachment)
+        return self._sender.name()
 
     def answer(self, response: Mapping[str, Any]) -> None:
         """Give the response. Raises ConfigurationError: it does not fit the type."""
@@ -68,13 +68,8 @@ class Asked:
             self._query.reply_err(problem.encode())
 
     def _attachment(self) -> bytes | None:
-        if self._query.attachment is None:
-            return None
-        try:
-            asked = Attachment.from_bytes(self._query.attachment.to_bytes())
-        except ValueError:
-            return None
-        return asked._replace(time_ns=time.time_ns()).to_bytes()
+        asked = self._sender.attached
+        return None if asked is None else asked._replace(time_ns=time.time_ns()).to_bytes()
 
 
 class Server:
