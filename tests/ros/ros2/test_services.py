@@ -219,3 +219,25 @@ def test_S01_a_service_is_told_when_its_request_came_not_when_its_turn_came(
         go_on.set()
     first_at, second_at = came
     assert began_at <= first_at <= second_at <= second_waits_at
+
+
+def test_S01_a_stop_waits_for_no_other_that_hangs_and_for_nobodys_name(
+    graph: Ros2, router: Router, open_graph: Callable[..., Ros2], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("trade_gateway.ros.ros2._presence._INTRODUCTION_S", 1000.0)
+    monkeypatch.setattr("trade_gateway.ros.ros2._services._LATE_S", -1.0)  # not even its age counts
+    presence = graph._node.presence
+    monkeypatch.setattr(presence, "known", lambda _gid: "")
+    presence._waits_from = 0.0
+    asked: list[str] = []
+    both = threading.Barrier(2)
+
+    def answer(_request: dict[str, Any], who: str, _came_at: float) -> dict[str, Any]:
+        both.wait(LONG_S)
+        asked.append(who)
+        return {}
+
+    graph.serve("/halt", ADD, answer, stops=True)
+    with calling(open_graph(router, node="/asks"), "/halt", 2):
+        pass
+    assert asked == ["", ""]

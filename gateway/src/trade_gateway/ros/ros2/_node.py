@@ -42,11 +42,12 @@ class Sender:
         self._presence = presence
         self._name = "" if self.attached is None else presence.known(self.attached.gid)
 
-    def name(self) -> str:
-        """Of its node; empty if nothing tells it. May wait shortly."""
+    def name(self, *, waits: bool = True) -> str:
+        """Of its node; empty if nothing tells it. May wait shortly for that."""
         if self._name or self.attached is None:
             return self._name
-        return self._presence.node_of(self.attached.gid)
+        look = self._presence.node_of if waits else self._presence.known
+        return look(self.attached.gid)
 
 
 def _read(attachment: zenoh.ZBytes) -> Attachment | None:

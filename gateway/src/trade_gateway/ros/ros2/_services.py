@@ -20,6 +20,7 @@ import zenoh
 
 from trade_gateway.ros._graph import Answer, RosRefused, RosUnreachable
 from trade_gateway.ros._types import Message
+from trade_gateway.ros.ros2._at_once import AtOnce
 from trade_gateway.ros.ros2._link import CLOSED, Undeclares
 from trade_gateway.ros.ros2._mailbox import Mailbox
 from trade_gateway.ros.ros2._names import Kind
@@ -30,6 +31,8 @@ __all__ = ["Asked", "Client", "Server", "answering"]
 _MOST_WAITING: Final = 10
 _LATE_S: Final = 5.0
 """S01: a request that waited longer for its turn is refused, not executed; who asked has given up."""
+_MOST_STOPS: Final = 64
+"""How many stops of one service are answered at a time; more wait, but none is refused for that (S01, S07)."""
 _AFTER_S: Final = 5.0
 """How much later than ours the deadline is that zenoh knows; only what ends by itself reaches that."""
 
@@ -39,12 +42,16 @@ _log: Final = logging.getLogger("trade")
 class Asked:
     """A request that came. It must be ended by one of its methods."""
 
-    def __init__(self, query: zenoh.Query, endpoint: Endpoint, node: Node, type_name: str) -> None:
+    def __init__(
+        self, query: zenoh.Query, endpoint: Endpoint, node: Node, type_name: str, *, stops: bool = False
+    ) -> None:
+        """stops: it waits for nothing, not even for the name of who asks."""
         self._query = query
         self._endpoint = endpoint
         self._node = node
         self._type_name = type_name
         self._sender = node.sender(query.attachment)
+        self._stops = stops
         self.came_at: Final = time.monotonic()
 
     def request(self) -> Message:
@@ -53,8 +60,8 @@ class Asked:
         return self._node.types.from_bytes(f"{self._type_name}_Request", b"" if payload is None else payload.to_bytes())
 
     def who(self) -> str:
-        """The node that asks, or empty. May wait shortly."""
-        return self._sender.name()
+        """The node that asks, or empty. May wait shortly, unless it is a stop."""
+        return self._sender.name(waits=not self._stops)
 
     def answer(self, response: Mapping[str, Any]) -> None:
         """Give the response. Raises ConfigurationError: it does not fit the type."""
@@ -73,9 +80,9 @@ class Asked:
 
 
 class Server:
-    """A service of ours; each request is handled on its thread, one after another.
+    """A service of ours; each request is handled on its thread, one after another, and refused if it waits too long.
 
-    What waits too long is refused, unless it is to stop something.
+    One that is to stop something is handled at once, on a thread of its own, and never refused for its age.
     """
 
     def __init__(
@@ -85,12 +92,11 @@ class Server:
         self._node = node
         self._type_name = type_name
         self._handle = handle
-        self._mailbox = Mailbox[Asked](
-            f"ros2 {name}",
-            self._try,
-            most=None if stops else _MOST_WAITING,
-            longest_s=float("inf") if stops else _LATE_S,
-            drop=self._late,
+        self._stops = stops
+        self._mailbox: Mailbox[Asked] | AtOnce[Asked] = (
+            AtOnce(f"ros2 {name}", self._try, most=_MOST_STOPS, drop=self._late)
+            if stops
+            else Mailbox(f"ros2 {name}", self._try, most=_MOST_WAITING, longest_s=_LATE_S, drop=self._late)
         )
         self._declared = node.link.declare(self._declare)
 
@@ -104,7 +110,7 @@ class Server:
         return session.liveliness().declare_token(self._endpoint.token), queryable
 
     def _put(self, query: zenoh.Query) -> None:
-        self._mailbox.put(Asked(query, self._endpoint, self._node, self._type_name))
+        self._mailbox.put(Asked(query, self._endpoint, self._node, self._type_name, stops=self._stops))
 
     def _late(self, asked: Asked) -> None:
         asked.refuse("not executed: others were before it for too long, or the service has ended")
