@@ -108,8 +108,11 @@ class Ros2(Graph):
     ) -> Pursuit:
         """See `Graph`; waits up to 5 s for the goal to be accepted. What has not ended at our end is canceled.
 
+        A goal whose acceptance is not heard of may begin any time: it is told to end for some seconds, and has not
+        ended before; `Pursuit.wait` raises RosUnreachable then, and says whether it was canceled.
+
         Raises:
-            RosUnreachable: nobody serves it, or it did not answer; then it was told to cancel it.
+            RosUnreachable: nobody serves it: it was not sent.
             ConfigurationError: the name or type is none, or the goal does not fit.
         """
         pursuing = self._keep(Pursuing(self._node, name, type_name, feedback))

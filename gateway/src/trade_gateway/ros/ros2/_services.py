@@ -14,7 +14,7 @@ import logging
 import queue
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import zenoh
 
@@ -26,7 +26,7 @@ from trade_gateway.ros.ros2._mailbox import Mailbox
 from trade_gateway.ros.ros2._names import Kind
 from trade_gateway.ros.ros2._node import Endpoint, Node
 
-__all__ = ["Asked", "Client", "Server", "answering"]
+__all__ = ["Asked", "Client", "Server", "Unanswered", "answering"]
 
 _MOST_WAITING: Final = 10
 _LATE_S: Final = 5.0
@@ -128,6 +128,14 @@ def answering(answer: Answer) -> Callable[[Asked], object]:
     return lambda asked: asked.answer(answer(asked.request(), asked.who(), asked.came_at))
 
 
+class Unanswered(NamedTuple):
+    """There was no response."""
+
+    problem: str
+    sent: bool
+    """It may have come to somebody, and be done."""
+
+
 class Client:
     """A service of theirs."""
 
@@ -141,19 +149,36 @@ class Client:
 
     def call(self, request: Mapping[str, Any], timeout_s: float) -> Message:
         """See `Graph.call`."""
+        answer = self.ask(request, timeout_s)
+        if isinstance(answer, Unanswered):
+            raise RosUnreachable(what=self.name, problem=answer.problem)
+        return answer
+
+    def ask(self, request: Mapping[str, Any], timeout_s: float) -> Message | Unanswered:
+        """The same for who must know whether it was sent.
+
+        Raises:
+            RosRefused: it failed.
+            ConfigurationError: the request does not fit.
+        """
         payload = self._node.types.to_bytes(f"{self._type_name}_Request", request)
         answers: queue.SimpleQueue[zenoh.Reply | None] = queue.SimpleQueue()
-        cancel = self._ask(payload, timeout_s, answers.put, lambda: answers.put(None))
+        was_there = self._is_there()
+        try:
+            cancel = self._ask(payload, timeout_s, answers.put, lambda: answers.put(None))
+        except RosUnreachable as unreachable:
+            return Unanswered(unreachable.problem, sent=False)
         try:
             reply = answers.get(timeout=max(0.0, timeout_s))
         except queue.Empty:
             problem = f"did not answer within {timeout_s:g} s; whether it did what was asked is unknown"
-            raise RosUnreachable(what=self.name, problem=problem) from None
+            return Unanswered(problem, sent=True)
         finally:
             cancel()
         if reply is None:
             nobody = f"no node serves it as {self._type_name}, or the one that does ended before it answered"
-            raise RosUnreachable(what=self.name, problem=self._node.link.problem or nobody)
+            cut_off = self._node.link.problem
+            return Unanswered(cut_off or nobody, sent=bool(cut_off) or was_there or self._is_there())
         return self._read(reply)
 
     def send(self, request: Mapping[str, Any], timeout_s: float) -> None:
@@ -164,6 +189,9 @@ class Client:
     def close(self) -> None:
         """Be seen as its client no more. Idempotent."""
         self._declared.close()
+
+    def _is_there(self) -> bool:
+        return self._node.presence.offered(Kind.SERVER, self.name)
 
     def _ask(
         self, payload: bytes, timeout_s: float, told: Callable[[zenoh.Reply], object], ended: Callable[[], object]
