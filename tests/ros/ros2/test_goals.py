@@ -6,6 +6,7 @@ Keys have the type hashes that ``rosidl`` made for ``example_interfaces/action/F
 
 import struct
 import threading
+import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -138,14 +139,52 @@ def test_a_client_may_ask_for_the_result_before_there_is_one(graph: Ros2, raw: z
 
 
 def test_a_goal_is_canceled_by_its_id(graph: Ros2, raw: zenoh.Session) -> None:
-    graph.act("/fib3", FIBONACCI, Doing())
+    doing = Doing()
+    graph.act("/fib3", FIBONACCI, doing)
     ask(raw, "fib3", "send_goal", ID + struct.pack("<i", 1))
+    wait_until(lambda: doing.goals, "it has begun")
     answer = ask(raw, "fib3", "cancel_goal", ID + bytes(8))
     assert answer[0] == 0
     assert answer[4:24] == b"\1\0\0\0" + ID
     assert ask(raw, "fib3", "get_result", ID) == b"\5\0\0\0" + numbers(1)
     assert ask(raw, "fib3", "cancel_goal", ID + bytes(8)) == b"\3\0\0\0" + bytes(4)  # it has ended
     assert ask(raw, "fib3", "cancel_goal", OTHER + bytes(8)) == b"\2\0\0\0" + bytes(4)  # not known
+
+
+@pytest.fixture
+def introduced(graph: Ros2, monkeypatch: pytest.MonkeyPatch) -> Iterator[threading.Event]:
+    """Who sends our graph something is a stranger whose token comes when the test sets this."""
+    comes = threading.Event()
+    monkeypatch.setattr(graph._node.presence, "known", lambda _gid: "")
+    monkeypatch.setattr(graph._node.presence, "node_of", lambda _gid: comes.wait(LONG_S) and "/late")
+    yield comes
+    comes.set()
+
+
+@pytest.mark.parametrize("which", [ID + bytes(8), bytes(24)], ids=["it", "all"])
+def test_S01_a_goal_that_is_canceled_while_its_sender_is_waited_for_is_not_begun(
+    graph: Ros2, raw: zenoh.Session, introduced: threading.Event, which: bytes
+) -> None:
+    doing = Doing()
+    graph.act("/fib9", FIBONACCI, doing)
+    assert ask(raw, "fib9", "send_goal", ID + struct.pack("<i", 1))[0] == 1
+    assert ask(raw, "fib9", "cancel_goal", which)[:24] == b"\0\0\0\0\1\0\0\0" + ID
+    introduced.set()
+    assert ask(raw, "fib9", "get_result", ID) == b"\5\0\0\0" + numbers()
+    assert not doing.goals
+
+
+def test_S01_a_goal_begins_with_its_sender_known(graph: Ros2, raw: zenoh.Session, introduced: threading.Event) -> None:
+    doing = Doing()
+    action = graph.act("/fib10", FIBONACCI, doing)
+    began_at = time.monotonic()
+    assert ask(raw, "fib10", "send_goal", ID + struct.pack("<i", 1))[0] == 1
+    answered_at = time.monotonic()
+    introduced.set()
+    wait_until(lambda: doing.goals, "it has begun")
+    assert doing.goals[0].client == "/late"
+    assert began_at <= doing.goals[0].came_at <= answered_at
+    action.close()
 
 
 @pytest.mark.parametrize(("second", "ends"), [(2**31 - 1, True), (1, False)])
@@ -395,6 +434,7 @@ def test_a_later_goal_cancels_the_one_before(graph: Ros2, other: Ros2) -> None:
     doing = Doing()
     graph.act("/one_at_a_time", FIBONACCI, doing)
     first = pursue(other, "one_at_a_time", 1)
+    wait_until(lambda: doing.goals, "the first has begun")
     second = pursue(other, "one_at_a_time", 2)
     assert first.wait(LONG_S) == Outcome(Ended.CANCELED, {"sequence": [1]})
     doing.go_on.set()
