@@ -7,7 +7,7 @@ import pytest
 
 from ros2_peers import Process, Router, raw_session
 from trade_gateway.ros.ros2 import Ros2
-from trade_gateway.ros.ros2._names import gid
+from trade_gateway.ros.ros2._names import Kind, gid
 from waiting import wait_until
 
 
@@ -105,6 +105,14 @@ def test_S06_who_has_just_ended_keeps_its_name_for_a_while(
     monkeypatch.setattr("trade_gateway.ros.ros2._presence._ENDED_S", 0.0)
     come_and_go(graph, router, EARLY)
     assert presence.known(gid(EARLY)) == ""
+
+
+def test_S07_of_what_was_offered_nothing_is_kept(graph: Ros2, router: Router) -> None:
+    presence = graph._node.presence
+    come_and_go(graph, router, EARLY)
+    assert (Kind.PUBLISHER, "/said") not in presence._offered
+    assert not presence.offered(Kind.PUBLISHER, "/said")
+    assert (Kind.PUBLISHER, "/said") not in presence._offered  # nor by asking
 
 
 def test_S07_of_those_that_ended_only_the_last_ones_keep_their_names(

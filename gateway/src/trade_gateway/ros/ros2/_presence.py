@@ -165,6 +165,8 @@ class Presence:
             return
         if seen.kind is not Kind.NODE:
             self._offered[seen.kind, seen.name] -= 1
+            if not self._offered[seen.kind, seen.name]:
+                del self._offered[seen.kind, seen.name]
             self._remember(gid(key))
             return
         self._nodes[seen.node] -= 1
