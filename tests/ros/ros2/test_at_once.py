@@ -22,7 +22,7 @@ class Hanging:
             assert self.go_on.wait(60)
 
 
-def test_S01_one_that_hangs_delays_no_other() -> None:
+def test_S07_one_that_hangs_delays_no_other() -> None:
     hanging = Hanging("first", "second")
     at_once = AtOnce[str]("test", hanging, most=3, drop=lambda _: None)
     for item in ("first", "second", "third", "fourth"):
@@ -32,7 +32,7 @@ def test_S01_one_that_hangs_delays_no_other() -> None:
     at_once.close()
 
 
-def test_S07_there_are_only_so_many_threads_and_who_waits_is_told_after_all() -> None:
+def test_there_are_only_so_many_threads_and_who_waits_is_told_after_all() -> None:
     hanging, dropped = Hanging("first", "second"), []
     at_once = AtOnce[str]("test", hanging, most=2, drop=dropped.append)
     for item in ("first", "second", "third", "fourth"):

@@ -95,7 +95,7 @@ def come_and_go(graph: Ros2, router: Router, token: str) -> None:
     wait_until(lambda: token not in presence._seen, "its end is seen")
 
 
-def test_S06_who_has_just_ended_keeps_its_name_for_a_while(
+def test_S05_who_has_just_ended_keeps_its_name_for_a_while(
     graph: Ros2, router: Router, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     presence = graph._node.presence
@@ -107,7 +107,7 @@ def test_S06_who_has_just_ended_keeps_its_name_for_a_while(
     assert presence.known(gid(EARLY)) == ""
 
 
-def test_S07_of_what_was_offered_nothing_is_kept(graph: Ros2, router: Router) -> None:
+def test_of_what_was_offered_nothing_is_kept(graph: Ros2, router: Router) -> None:
     presence = graph._node.presence
     come_and_go(graph, router, EARLY)
     assert (Kind.PUBLISHER, "/said") not in presence._offered
@@ -115,7 +115,7 @@ def test_S07_of_what_was_offered_nothing_is_kept(graph: Ros2, router: Router) ->
     assert (Kind.PUBLISHER, "/said") not in presence._offered  # nor by asking
 
 
-def test_S07_of_those_that_ended_only_the_last_ones_keep_their_names(
+def test_of_those_that_ended_only_the_last_ones_keep_their_names(
     graph: Ros2, router: Router, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("trade_gateway.ros.ros2._presence._ENDED_S", 1000.0)

@@ -162,7 +162,7 @@ def test_another_node_that_asks_for_our_parameters_is_answered(graph: Ros2, peer
 
 
 @pytest.mark.parametrize("kept_s", [1000.0, 0.0], ids=["asked_unseen", "asked_seen"])
-def test_S06_a_request_of_a_node_that_died_while_it_waited_is_told_with_its_name(
+def test_S05_a_request_of_a_node_that_died_while_it_waited_is_told_with_its_name(
     graph: Ros2, router: Router, open_graph: Callable[..., Ros2], monkeypatch: pytest.MonkeyPatch, kept_s: float
 ) -> None:
     """It is known by when it came; and if its token came only after it, by what is kept of those that ended."""
@@ -221,7 +221,7 @@ def test_S01_a_service_is_told_when_its_request_came_not_when_its_turn_came(
     assert began_at <= first_at <= second_at <= second_waits_at
 
 
-def test_S01_a_stop_waits_for_no_other_that_hangs_and_for_nobodys_name(
+def test_S07_a_stop_waits_for_no_other_that_hangs_and_for_nobodys_name(
     graph: Ros2, router: Router, open_graph: Callable[..., Ros2], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("trade_gateway.ros.ros2._presence._INTRODUCTION_S", 1000.0)

@@ -32,7 +32,7 @@ _MOST_WAITING: Final = 10
 _LATE_S: Final = 5.0
 """S01: a request that waited longer for its turn is refused, not executed; who asked has given up."""
 _MOST_STOPS: Final = 64
-"""How many stops of one service are answered at a time; more wait, but none is refused for that (S01, S07)."""
+"""How many stops of one service are answered at a time; more wait, but none is refused for that (S07)."""
 _AFTER_S: Final = 5.0
 """How much later than ours the deadline is that zenoh knows; only what ends by itself reaches that."""
 
