@@ -6,6 +6,7 @@ Keys have the type hashes that ``rosidl`` made for ``example_interfaces/action/F
 
 import struct
 import threading
+import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -16,6 +17,7 @@ from ros2_peers import Router, raw_session, until_served
 from trade.errors import ConfigurationError
 from trade_gateway.ros._graph import Ended, Goal, Outcome, Pursuit, RosRefused, RosUnreachable
 from trade_gateway.ros.ros2 import Ros2
+from trade_gateway.ros.ros2._names import Kind
 from waiting import wait_until
 
 FIBONACCI = "example_interfaces/action/Fibonacci"
@@ -137,14 +139,52 @@ def test_a_client_may_ask_for_the_result_before_there_is_one(graph: Ros2, raw: z
 
 
 def test_a_goal_is_canceled_by_its_id(graph: Ros2, raw: zenoh.Session) -> None:
-    graph.act("/fib3", FIBONACCI, Doing())
+    doing = Doing()
+    graph.act("/fib3", FIBONACCI, doing)
     ask(raw, "fib3", "send_goal", ID + struct.pack("<i", 1))
+    wait_until(lambda: doing.goals, "it has begun")
     answer = ask(raw, "fib3", "cancel_goal", ID + bytes(8))
     assert answer[0] == 0
     assert answer[4:24] == b"\1\0\0\0" + ID
     assert ask(raw, "fib3", "get_result", ID) == b"\5\0\0\0" + numbers(1)
     assert ask(raw, "fib3", "cancel_goal", ID + bytes(8)) == b"\3\0\0\0" + bytes(4)  # it has ended
     assert ask(raw, "fib3", "cancel_goal", OTHER + bytes(8)) == b"\2\0\0\0" + bytes(4)  # not known
+
+
+@pytest.fixture
+def introduced(graph: Ros2, monkeypatch: pytest.MonkeyPatch) -> Iterator[threading.Event]:
+    """Who sends our graph something is a stranger whose token comes when the test sets this."""
+    comes = threading.Event()
+    monkeypatch.setattr(graph._node.presence, "known", lambda _gid: "")
+    monkeypatch.setattr(graph._node.presence, "node_of", lambda _gid: comes.wait(LONG_S) and "/late")
+    yield comes
+    comes.set()
+
+
+@pytest.mark.parametrize("which", [ID + bytes(8), bytes(24)], ids=["it", "all"])
+def test_S01_a_goal_that_is_canceled_while_its_sender_is_waited_for_is_not_begun(
+    graph: Ros2, raw: zenoh.Session, introduced: threading.Event, which: bytes
+) -> None:
+    doing = Doing()
+    graph.act("/fib9", FIBONACCI, doing)
+    assert ask(raw, "fib9", "send_goal", ID + struct.pack("<i", 1))[0] == 1
+    assert ask(raw, "fib9", "cancel_goal", which)[:24] == b"\0\0\0\0\1\0\0\0" + ID
+    introduced.set()
+    assert ask(raw, "fib9", "get_result", ID) == b"\5\0\0\0" + numbers()
+    assert not doing.goals
+
+
+def test_S01_a_goal_begins_with_its_sender_known(graph: Ros2, raw: zenoh.Session, introduced: threading.Event) -> None:
+    doing = Doing()
+    action = graph.act("/fib10", FIBONACCI, doing)
+    began_at = time.monotonic()
+    assert ask(raw, "fib10", "send_goal", ID + struct.pack("<i", 1))[0] == 1
+    answered_at = time.monotonic()
+    introduced.set()
+    wait_until(lambda: doing.goals, "it has begun")
+    assert doing.goals[0].client == "/late"
+    assert began_at <= doing.goals[0].came_at <= answered_at
+    action.close()
 
 
 @pytest.mark.parametrize(("second", "ends"), [(2**31 - 1, True), (1, False)])
@@ -201,8 +241,8 @@ class RawServer:
         self.asked: list[tuple[str, bytes]] = []
         self._held: list[zenoh.Query] = []
         self._session = session
-        self._action = action
-        self._answers = {
+        self.action = action
+        self._answers: dict[str, bytes | None] = {
             "send_goal": bytes([accepts]) + bytes(11),
             "cancel_goal": bytes(8),
             "get_result": result,
@@ -219,12 +259,23 @@ class RawServer:
         if answer is None:
             self._held.append(query)
             return
+        if not answer:  # as if it had died of the question
+            query.drop()
+            return
         if part == "send_goal":
             goal_id = query.payload.to_bytes()[4:20]
             for each in (OTHER, goal_id):
-                self._session.put(key(self._action, "feedback"), CDR + each + numbers(each[0]), attachment=ATTACHMENT)
+                self._session.put(key(self.action, "feedback"), CDR + each + numbers(each[0]), attachment=ATTACHMENT)
         query.reply(str(query.key_expr), CDR + answer, attachment=ATTACHMENT)
         query.drop()
+
+    def end(self, status: int) -> None:
+        """Answer who asks for the result, from now on."""
+        self._answers["get_result"] = bytes([status, 0, 0, 0]) + numbers()
+        for query in self._held:
+            if "get_result" in str(query.key_expr):
+                query.reply(str(query.key_expr), CDR + self._answers["get_result"], attachment=ATTACHMENT)
+            query.drop()
 
     def of(self, part: str) -> list[bytes]:
         return [payload for asked, payload in self.asked if asked == part]
@@ -299,11 +350,63 @@ def test_S05_a_goal_whose_acceptance_is_not_heard_of_is_canceled(
     graph: Ros2, raw: zenoh.Session, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("trade_gateway.ros.ros2._pursuit._ACCEPT_S", 0.1)
+    monkeypatch.setattr("trade_gateway.ros.ros2._pursuit._ABANDON_S", LONG_S)
     server = RawServer(raw, "deaf", accepts=True, result=None)
-    server._answers["send_goal"] = None  # type: ignore[assignment]
-    with pytest.raises(RosUnreachable, match="whether it did what was asked is unknown"):
-        pursue(graph, "deaf", 3)
-    wait_until(lambda: server.of("cancel_goal"), "it is told to cancel it")
+    server._answers["send_goal"] = None
+    pursuit = pursue(graph, "deaf", 3)
+    wait_until(lambda: server.of("get_result"), "it is told to cancel it, and asked for its end")
+    assert server.of("cancel_goal")[0] == server.of("send_goal")[0][:20] + bytes(8)
+    assert server.of("get_result")[0] == server.of("send_goal")[0][:20]
+    with pytest.raises(RosUnreachable, match=r"has not ended within 0\.1 s"):
+        pursuit.wait(0.1)  # the arm may still move
+    server.end(5)
+    with pytest.raises(RosUnreachable, match="what was asked is unknown; it was canceled, and has ended"):
+        pursuit.wait(LONG_S)
+
+
+def test_S05_a_goal_that_may_have_begun_can_be_canceled_by_who_sent_it_too(
+    graph: Ros2, raw: zenoh.Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("trade_gateway.ros.ros2._pursuit._ACCEPT_S", 0.1)
+    monkeypatch.setattr("trade_gateway.ros.ros2._pursuit._AGAIN_S", 1000.0)  # once by itself
+    server = RawServer(raw, "mute", accepts=True, result=None)
+    server._answers |= {"send_goal": None, "cancel_goal": b"\2" + bytes(7)}  # it does not know the goal yet
+    pursuit = pursue(graph, "mute", 3)
+    wait_until(lambda: len(server.of("cancel_goal")) == 1, "it is told to cancel it")
+    pursuit.cancel()
+    wait_until(lambda: len(server.of("cancel_goal")) == 2, "it is told again")
+
+
+@pytest.mark.parametrize(
+    ("name", "answers", "end"),
+    [
+        ("unheard", {"send_goal": None}, "it was told to end, but its end is not known"),
+        (
+            "unknown",
+            {"send_goal": None, "cancel_goal": b"\2" + bytes(7)},
+            "it could not be canceled, and its end is not known",
+        ),
+        ("ended", {"send_goal": None, "cancel_goal": b"\3" + bytes(7)}, "it was canceled, and has ended"),
+        ("dropped", {"send_goal": b""}, "it was told to end, but its end is not known"),
+    ],
+    ids=["unheard", "unknown_there", "ended_there", "server_ended"],
+)
+def test_S05_of_a_goal_whose_end_is_not_heard_of_it_is_said_what_is_known(
+    graph: Ros2,
+    raw: zenoh.Session,
+    monkeypatch: pytest.MonkeyPatch,
+    name: str,
+    answers: dict[str, bytes | None],
+    end: str,
+) -> None:
+    monkeypatch.setattr("trade_gateway.ros.ros2._pursuit._ACCEPT_S", 0.5)
+    monkeypatch.setattr("trade_gateway.ros.ros2._pursuit._ABANDON_S", 3.0)
+    server = RawServer(raw, name, accepts=True, result=None)
+    server._answers |= answers
+    pursuit = pursue(graph, server.action, 3)
+    with pytest.raises(RosUnreachable, match=end):
+        pursuit.wait(LONG_S)
+    assert server.of("send_goal")
     assert server.of("cancel_goal")[0] == server.of("send_goal")[0][:20] + bytes(8)
 
 
@@ -331,6 +434,7 @@ def test_a_later_goal_cancels_the_one_before(graph: Ros2, other: Ros2) -> None:
     doing = Doing()
     graph.act("/one_at_a_time", FIBONACCI, doing)
     first = pursue(other, "one_at_a_time", 1)
+    wait_until(lambda: doing.goals, "the first has begun")
     second = pursue(other, "one_at_a_time", 2)
     assert first.wait(LONG_S) == Outcome(Ended.CANCELED, {"sequence": [1]})
     doing.go_on.set()
@@ -358,7 +462,9 @@ def test_an_action_that_is_closed_cancels_its_goals_and_tells_their_end(graph: R
     action.close()
     action.close()
     assert pursuit.wait(LONG_S).how is Ended.CANCELED
-    with pytest.raises(RosUnreachable):
+    served = "/closing/_action/send_goal"
+    wait_until(lambda: not other._node.presence.offered(Kind.SERVER, served), "the end of the action is seen")
+    with pytest.raises(RosUnreachable, match="no node serves it"):
         other.pursue("/closing", FIBONACCI, {"order": 1})
 
 

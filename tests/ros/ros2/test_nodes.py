@@ -7,7 +7,7 @@ import pytest
 
 from ros2_peers import Process, Router, raw_session
 from trade_gateway.ros.ros2 import Ros2
-from trade_gateway.ros.ros2._names import gid
+from trade_gateway.ros.ros2._names import Kind, gid
 from waiting import wait_until
 
 
@@ -82,6 +82,48 @@ def test_who_speaks_before_its_token_is_there_is_waited_for(
     with raw_session(router) as session, session.liveliness().declare_token(own):
         asking.join(60)
     assert found == ["/arm/early"]
+
+
+EARLY = "@ros2_lv/0/abc/0/1/MP/%/%arm/early/%said/std_msgs::msg::dds_::String_/RIHS01_0/::,10:,:,:,,"
+
+
+def come_and_go(graph: Ros2, router: Router, token: str) -> None:
+    """An endpoint is seen, and its end."""
+    presence = graph._node.presence
+    with raw_session(router) as session, session.liveliness().declare_token(token):
+        wait_until(lambda: token in presence._seen, "it is seen")
+    wait_until(lambda: token not in presence._seen, "its end is seen")
+
+
+def test_S05_who_has_just_ended_keeps_its_name_for_a_while(
+    graph: Ros2, router: Router, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    presence = graph._node.presence
+    monkeypatch.setattr("trade_gateway.ros.ros2._presence._ENDED_S", 1000.0)
+    come_and_go(graph, router, EARLY)
+    assert presence.known(gid(EARLY)) == presence.node_of(gid(EARLY)) == "/arm/early"
+    monkeypatch.setattr("trade_gateway.ros.ros2._presence._ENDED_S", 0.0)
+    come_and_go(graph, router, EARLY)
+    assert presence.known(gid(EARLY)) == ""
+
+
+def test_of_what_was_offered_nothing_is_kept(graph: Ros2, router: Router) -> None:
+    presence = graph._node.presence
+    come_and_go(graph, router, EARLY)
+    assert (Kind.PUBLISHER, "/said") not in presence._offered
+    assert not presence.offered(Kind.PUBLISHER, "/said")
+    assert (Kind.PUBLISHER, "/said") not in presence._offered  # nor by asking
+
+
+def test_of_those_that_ended_only_the_last_ones_keep_their_names(
+    graph: Ros2, router: Router, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("trade_gateway.ros.ros2._presence._ENDED_S", 1000.0)
+    monkeypatch.setattr("trade_gateway.ros.ros2._presence._MOST_ENDED", 2)
+    tokens = [EARLY.replace("/0/1/MP", f"/0/{number}/MP") for number in (1, 2, 3)]
+    for token in tokens:
+        come_and_go(graph, router, token)
+    assert [graph._node.presence.known(gid(token)) for token in tokens] == ["", "/arm/early", "/arm/early"]
 
 
 def test_S07_strangers_are_waited_for_one_after_another_with_pauses(

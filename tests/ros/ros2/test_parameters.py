@@ -48,7 +48,7 @@ class Offering:
         }
         for name, kind in SERVICES.items():
             answer = answers[name]
-            graph.serve(f"{node}/{name}", f"{SRV}/{kind}", lambda asked, _, answer=answer: answer(asked))
+            graph.serve(f"{node}/{name}", f"{SRV}/{kind}", lambda asked, _who, _at, answer=answer: answer(asked))
 
     def _put(self, asked: dict[str, Any]) -> dict[str, Any]:
         self.set += asked["parameters"]

@@ -22,7 +22,7 @@ def test_what_was_asked_for_before_there_is_a_router_works_once_it_is_there(
     graph = open_graph(own_router)
     heard: list[str] = []
     graph.subscribe("/from_them", STRING, lambda message, _: heard.append(message["data"]))
-    graph.serve("/add", ADD, lambda request, _: {"sum": request["a"] + request["b"]})
+    graph.serve("/add", ADD, lambda request, _who, _at: {"sum": request["a"] + request["b"]})
     latched = graph.advertise("/latched", STRING, latched=True)
     latched.send({"data": "said before there was a router"})
     assert "no zenoh router" in graph.healthy
@@ -49,7 +49,7 @@ def test_a_router_that_was_killed_and_started_again_finds_all_as_it_was(
     graph.watch_nodes(lambda node, there: nodes.append(there) if node == "/sdk" else None)
     graph.subscribe("/from_them", STRING, lambda message, _: heard.append(message["data"]))
     publisher = graph.advertise("/from_us", STRING)
-    graph.serve("/add_ours", ADD, lambda request, _: {"sum": request["a"] + request["b"]})
+    graph.serve("/add_ours", ADD, lambda request, _who, _at: {"sum": request["a"] + request["b"]})
     peer.ask("listen", topic="/from_us")
     peer.ask("serve", service="/add_theirs")
     peer.hear("serving")

@@ -25,16 +25,18 @@ _log: Final = logging.getLogger("trade")
 class Pursued(Goal):
     """A goal that somebody has sent."""
 
-    def __init__(self, action: "Action", goal_id: bytes, message: Message, client: str) -> None:
+    def __init__(self, action: "Action", goal_id: bytes, message: Message, came_at: float) -> None:
         self.id: Final = goal_id
         self.stamp_ns: Final = time.time_ns()
         self.status = Status.ACCEPTED
         self.outcome: Outcome | None = None
         self.waiting: Final[list[Asked]] = []
         self.thread: threading.Thread | None = None
+        self.of = ""
+        """Its client; not known before it is begun."""
         self._action = action
         self._message = message
-        self._client = client
+        self._came_at = came_at
         self._lock = threading.Lock()
         self._canceled = False
         self._tell: list[Callable[[], object]] = []
@@ -45,7 +47,11 @@ class Pursued(Goal):
 
     @property
     def client(self) -> str:
-        return self._client
+        return self.of
+
+    @property
+    def came_at(self) -> float:
+        return self._came_at
 
     def feedback(self, message: Mapping[str, Any]) -> None:
         """See `Goal`. Raises ConfigurationError: it does not fit the type."""
@@ -59,6 +65,12 @@ class Pursued(Goal):
                 return
         tell()
 
+    @property
+    def canceled(self) -> bool:
+        """Whether its end was asked for."""
+        with self._lock:
+            return self._canceled
+
     def cancel(self) -> None:
         """Tell those who asked to be. Idempotent."""
         with self._lock:
@@ -68,7 +80,7 @@ class Pursued(Goal):
             try:
                 tell()
             except Exception:  # noqa: BLE001 - the others are to be told, too
-                _log.exception("the end of a goal that %s asked for could not be told", self._client or "a client")
+                _log.exception("the end of a goal that %s asked for could not be told", self.of or "a client")
 
     def info(self) -> dict[str, Any]:
         """A ``action_msgs/msg/GoalInfo``."""
@@ -113,9 +125,10 @@ class Action:
     # --- what clients ask
 
     def _accept(self, asked: Asked) -> None:
+        """S01: it can be canceled as soon as it is here; the name of who sent it is waited for only after that."""
         request = asked.request()
         goal_id = request["goal_id"]["uuid"]
-        goal = Pursued(self, goal_id, request["goal"], asked.who())
+        goal = Pursued(self, goal_id, request["goal"], asked.came_at)
         with self._lock:
             taken = not self._closed and goal_id not in self._goals
             before = self._going()
@@ -124,7 +137,7 @@ class Action:
         asked.answer({"accepted": taken, "stamp": stamp(goal.stamp_ns)})
         if taken:
             goal.thread = threading.Thread(
-                target=self._pursue, args=(goal, before), name=f"ros2 goal {self._name}", daemon=True
+                target=self._pursue, args=(goal, before, asked), name=f"ros2 goal {self._name}", daemon=True
             )
             goal.thread.start()
 
@@ -152,7 +165,7 @@ class Action:
 
     # --- what is done
 
-    def _pursue(self, goal: Pursued, before: list[Pursued]) -> None:
+    def _pursue(self, goal: Pursued, before: list[Pursued], asked: Asked) -> None:
         with self._lock:
             goal.status = max(goal.status, Status.EXECUTING)
             for other in before:
@@ -161,8 +174,9 @@ class Action:
         for other in before:
             other.cancel()
         self._tell_status()
+        goal.of = asked.who()
         try:
-            self._end(goal, self._do(goal))
+            self._end(goal, Outcome(Ended.CANCELED, {}) if goal.canceled else self._do(goal))
         except Exception:  # noqa: BLE001 - its client is told that it failed
             _log.exception("a goal of %s failed", self._name)
             self._end(goal, Outcome(Ended.ABORTED, {}))

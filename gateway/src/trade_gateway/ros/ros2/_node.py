@@ -13,7 +13,7 @@ from trade_gateway.ros.ros2._link import Declared, Link
 from trade_gateway.ros.ros2._names import Kind, absolute, data_key, gid, node_token, token
 from trade_gateway.ros.ros2._presence import Presence
 
-__all__ = ["LATCHED", "USUAL", "Endpoint", "Node"]
+__all__ = ["LATCHED", "USUAL", "Endpoint", "Node", "Sender"]
 
 USUAL: Final = "::,10:,:,:,,"
 """Reliable, volatile, keep last 10: what ROS 2 gives topics and services that ask for nothing else."""
@@ -31,6 +31,30 @@ class Endpoint(NamedTuple):
     def attachment(self, sequence: int) -> bytes:
         """What goes beside something it says now."""
         return Attachment(sequence, time.time_ns(), self.gid).to_bytes()
+
+
+class Sender:
+    """Who sent something, by what was attached to it. Looked up when it comes: its sender may be gone soon."""
+
+    def __init__(self, presence: Presence, attachment: "zenoh.ZBytes | None") -> None:
+        self.attached: Final = None if attachment is None else _read(attachment)
+        """None: nothing, or nothing that can be read."""
+        self._presence = presence
+        self._name = "" if self.attached is None else presence.known(self.attached.gid)
+
+    def name(self, *, waits: bool = True) -> str:
+        """Of its node; empty if nothing tells it. May wait shortly for that."""
+        if self._name or self.attached is None:
+            return self._name
+        look = self._presence.node_of if waits else self._presence.known
+        return look(self.attached.gid)
+
+
+def _read(attachment: zenoh.ZBytes) -> Attachment | None:
+    try:
+        return Attachment.from_bytes(attachment.to_bytes())
+    except ValueError:
+        return None
 
 
 class Node:
@@ -55,15 +79,9 @@ class Node:
         """A service server or client. Raises ConfigurationError: its name or type is none."""
         return self._endpoint(kind, name, type_name, self.hashes.service(type_name), USUAL)
 
-    def who(self, attachment: "zenoh.ZBytes | None") -> str:
-        """The node that sent something, by what was attached to it; empty if that does not tell. May wait shortly."""
-        if attachment is None:
-            return ""
-        try:
-            sender = Attachment.from_bytes(attachment.to_bytes()).gid
-        except ValueError:
-            return ""
-        return self.presence.node_of(sender)
+    def sender(self, attachment: "zenoh.ZBytes | None") -> Sender:
+        """Of something that has just come with that attached. Does not wait."""
+        return Sender(self.presence, attachment)
 
     def close(self) -> None:
         """Be seen no more. Idempotent."""

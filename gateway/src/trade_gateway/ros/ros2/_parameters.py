@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, Final, cast
 
 from trade.errors import ConfigurationError
-from trade_gateway.ros._graph import RosRefused
+from trade_gateway.ros._graph import Answer, RosRefused
 from trade_gateway.ros._types import Message
 from trade_gateway.ros.ros2._node import Node
 from trade_gateway.ros.ros2._services import Server, answering
@@ -80,8 +80,8 @@ class NoParameters:
 _NONE_TO_SET: Final = {"successful": False, "reason": "this node has no parameters"}
 
 
-def _by(answer: Callable[[Message], Message]) -> Callable[[Message, str], Message]:
-    return lambda asked, _: answer(asked)
+def _by(answer: Callable[[Message], Message]) -> Answer:
+    return lambda asked, _who, _came_at: answer(asked)
 
 
 def _snake(name: str) -> str:

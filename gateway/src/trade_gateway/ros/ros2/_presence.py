@@ -27,6 +27,9 @@ _INTRODUCTION_S: Final = 0.5
 _PAUSE_S: Final = 5.0
 """How soon after one that had none the next is waited for: strangers must not keep others from being heard (S07)."""
 _MOST_STRANGERS: Final = 1024
+_ENDED_S: Final = 10.0
+"""How long an endpoint that ended keeps its name: what it sent before, and waits for its turn, is told with it."""
+_MOST_ENDED: Final = 4096
 
 
 class Watching:
@@ -54,6 +57,8 @@ class Presence:
         self._changed = threading.Condition()
         self._seen: dict[str, Seen] = {}
         self._node_of: dict[bytes, str] = {}
+        self._ended: dict[bytes, tuple[str, float]] = {}
+        """Nodes of endpoints that ended, and until when they are told; the oldest first."""
         self._nodes: Counter[str] = Counter()
         self._offered: Counter[tuple[Kind, str]] = Counter()
         self._strangers: set[bytes] = set()
@@ -70,10 +75,15 @@ class Presence:
         """The name of the node that an endpoint is of; empty if no token tells it. May wait, once for each stranger."""
         with self._changed:
             now = time.monotonic()
-            known = endpoint_gid in self._node_of or endpoint_gid in self._strangers
+            known = self._named(endpoint_gid) or endpoint_gid in self._strangers
             if not known and now >= self._waits_from:
                 self._wait_for(endpoint_gid, now + _INTRODUCTION_S)
-            return self._node_of.get(endpoint_gid, "")
+            return self._named(endpoint_gid)
+
+    def known(self, endpoint_gid: bytes) -> str:
+        """The same without waiting: empty also if its token has not come yet."""
+        with self._changed:
+            return self._named(endpoint_gid)
 
     def offered(self, kind: Kind, name: str) -> bool:
         """Whether another session has such an endpoint."""
@@ -102,8 +112,15 @@ class Presence:
             if watching in self._watching:
                 self._watching.remove(watching)
 
+    def _named(self, endpoint_gid: bytes) -> str:
+        there = self._node_of.get(endpoint_gid)
+        if there is not None:
+            return there
+        ended, until = self._ended.get(endpoint_gid, ("", 0.0))
+        return ended if time.monotonic() < until else ""
+
     def _wait_for(self, endpoint_gid: bytes, deadline: float) -> None:
-        while endpoint_gid not in self._node_of:
+        while not self._named(endpoint_gid):
             left_s = deadline - time.monotonic()
             if left_s <= 0:
                 self._waits_from = time.monotonic() + _PAUSE_S
@@ -139,6 +156,7 @@ class Presence:
         endpoint_gid = gid(key)
         self._offered[seen.kind, seen.name] += 1
         self._node_of[endpoint_gid] = seen.node
+        self._ended.pop(endpoint_gid, None)
         self._strangers.discard(endpoint_gid)
 
     def _went(self, key: str) -> None:
@@ -147,7 +165,9 @@ class Presence:
             return
         if seen.kind is not Kind.NODE:
             self._offered[seen.kind, seen.name] -= 1
-            del self._node_of[gid(key)]
+            if not self._offered[seen.kind, seen.name]:
+                del self._offered[seen.kind, seen.name]
+            self._remember(gid(key))
             return
         self._nodes[seen.node] -= 1
         self._tell(seen.node, there=False)
@@ -156,6 +176,14 @@ class Presence:
             self._tell(seen.node, there=True)
         else:
             del self._nodes[seen.node]
+
+    def _remember(self, endpoint_gid: bytes) -> None:
+        now = time.monotonic()
+        self._ended[endpoint_gid] = self._node_of.pop(endpoint_gid), now + _ENDED_S
+        for oldest, (_, until) in list(self._ended.items()):
+            if until > now and len(self._ended) <= _MOST_ENDED:
+                break
+            del self._ended[oldest]
 
     def _tell(self, node: str, *, there: bool) -> None:
         for watching in self._watching:

@@ -12,7 +12,7 @@ from trade_gateway.ros._types import Message
 from trade_gateway.ros.ros2._action import CANCEL, ENDS, Refusal, uuid
 from trade_gateway.ros.ros2._names import Kind
 from trade_gateway.ros.ros2._node import Node
-from trade_gateway.ros.ros2._services import Client
+from trade_gateway.ros.ros2._services import Client, Unanswered
 from trade_gateway.ros.ros2._topics import TopicHeard
 
 __all__ = ["Pursuing"]
@@ -40,6 +40,7 @@ class Pursuing:
         self._node = node
         self._name = name
         self._id = secrets.token_bytes(16)
+        self._this: Final = {"goal_info": {"goal_id": uuid(self._id)}}
         self._feedback = feedback
         self._unwanted = False
         self._over = threading.Event()
@@ -57,24 +58,27 @@ class Pursuing:
         self._thread = threading.Thread(target=self._follow, name=f"ros2 pursuit {name}", daemon=True)
 
     def begin(self, goal: Mapping[str, Any]) -> None:
-        """Send it.
+        """Send it. If what came of it is not heard, it is told to end, and has not ended before that has.
 
         Raises:
-            RosUnreachable: nobody serves the action, or it did not answer; then it is told to cancel the goal.
+            RosUnreachable: nobody serves the action: it was not sent.
             ConfigurationError: the goal does not fit.
         """
         try:
-            answer = self._send.call({"goal_id": uuid(self._id), "goal": goal}, _ACCEPT_S)
+            answer = self._send.ask({"goal_id": uuid(self._id), "goal": goal}, _ACCEPT_S)
         except RosRefused as refused:
             self._finish(refused)
             return
-        except RosUnreachable as unreachable:
-            self._abandon(unreachable)
-            raise
         except BaseException:
             self._finish(RosUnreachable(what=self._name, problem="the goal was not sent"))
             raise
-        if answer["accepted"]:
+        if isinstance(answer, Unanswered):
+            unheard = RosUnreachable(what=self._name, problem=answer.problem)
+            if not answer.sent and not self._is_there():
+                self._finish(unheard)
+                raise unheard
+            self._abandon(unheard)
+        elif answer["accepted"]:
             self._thread.start()
         else:
             self._finish(RosRefused(what=self._name, problem="the goal was rejected"))
@@ -95,14 +99,14 @@ class Pursuing:
         self._unwanted = True
         if not self._over.is_set():
             with contextlib.suppress(RosUnreachable):
-                self._stop.send({"goal_info": {"goal_id": uuid(self._id)}}, _CANCEL_S)
+                self._stop.send(self._this, _CANCEL_S)
 
     def close(self) -> None:
         """Have it canceled, and follow it no longer. Idempotent."""
         self._closed.set()
         if not self._over.is_set():
             with contextlib.suppress(RosUnreachable, RosRefused):
-                self._stop.call({"goal_info": {"goal_id": uuid(self._id)}}, _END_S)
+                self._stop.call(self._this, _END_S)
             self._finish(RosUnreachable(what=self._name, problem="the bridge to ROS was closed; the goal was canceled"))
 
     def _follow(self) -> None:
@@ -116,29 +120,51 @@ class Pursuing:
                 if self._node.presence.offered(Kind.SERVER, self._get.name):
                     last_seen = time.monotonic()
                 elif time.monotonic() - last_seen > _GONE_S:
-                    self._abandon(RosUnreachable(what=self._name, problem=f"its server is gone: {unreachable.problem}"))
+                    self._gone(f"its server is gone: {unreachable.problem}")
             except RosRefused as refused:
                 self._finish(refused)
             else:
                 self._finish(self._read(answer))
             self._over.wait(_AGAIN_S)
 
+    def _is_there(self) -> bool:
+        """Whether somebody serves the action after all, who is told to cancel the goal by this."""
+        try:
+            answer = self._stop.ask(self._this, _END_S)
+        except RosRefused:
+            return True
+        return not isinstance(answer, Unanswered) or answer.sent
+
+    def _gone(self, problem: str) -> None:
+        if not self._over.is_set():
+            self._outcome = why = RosUnreachable(what=self._name, problem=problem)
+            self._over.set()
+            self._abandon(why)
+
     def _abandon(self, why: RosUnreachable) -> None:
         """S05: whether it goes on is not known, so it is told to end, again and again for some time."""
-        if self._over.is_set():
-            return
-        self._outcome = why
-        self._over.set()
         threading.Thread(target=self._end, args=(why,), name=f"ros2 end {self._name}", daemon=True).start()
 
     def _end(self, why: RosUnreachable) -> None:
         deadline = time.monotonic() + _ABANDON_S
-        while time.monotonic() < deadline and not self._closed.wait(_AGAIN_S):
-            with contextlib.suppress(RosUnreachable, RosRefused):
-                code = self._stop.call({"goal_info": {"goal_id": uuid(self._id)}}, _END_S)["return_code"]
-                if code in (Refusal.NONE, Refusal.GOAL_TERMINATED):
-                    break
-        self._finish(why)
+        told, ended = False, False
+        while not ended and time.monotonic() < deadline and not self._closed.is_set():
+            refusal = None if told else self._told_to_end()
+            told = told or refusal is Refusal.NONE
+            ended = refusal is Refusal.GOAL_TERMINATED or (told and self._has_ended(deadline - time.monotonic()))
+            if not ended:
+                self._closed.wait(_AGAIN_S)
+        self._finish(RosUnreachable(what=self._name, problem=f"{why.problem}; {_end_of(told=told, ended=ended)}"))
+
+    def _told_to_end(self) -> Refusal | None:
+        with contextlib.suppress(RosUnreachable, RosRefused, ValueError):
+            return Refusal(self._stop.call(self._this, _END_S)["return_code"])
+        return None
+
+    def _has_ended(self, timeout_s: float) -> bool:
+        with contextlib.suppress(RosUnreachable, RosRefused):
+            return self._get.call({"goal_id": uuid(self._id)}, max(_AGAIN_S, timeout_s))["status"] in _HOW
+        return False
 
     def _read(self, answer: Message) -> Outcome | RosUnreachable:
         how: Ended | None = _HOW.get(answer["status"])
@@ -158,3 +184,11 @@ class Pursuing:
         for each in (self._hearing, self._send, self._get, self._stop):
             if each is not None:
                 each.close()
+
+
+def _end_of(*, told: bool, ended: bool) -> str:
+    if ended:
+        return "it was canceled, and has ended"
+    if told:
+        return "it was told to end, but its end is not known"
+    return "it could not be canceled, and its end is not known"

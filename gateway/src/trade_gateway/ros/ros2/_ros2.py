@@ -79,11 +79,19 @@ class Ros2(Graph):
         """
         return self._keep(TopicHeard(self._node, topic, type_name, heard, latched=latched))
 
-    def serve(self, name: str, type_name: str, answer: Answer) -> Closes:
+    def serve(self, name: str, type_name: str, answer: Answer, *, stops: bool = False) -> Closes:
         """See `Graph`. Raises ConfigurationError: its name or type is none."""
-        return self._keep(Server(self._node, name, type_name, answering(answer)))
+        return self._keep(Server(self._node, name, type_name, answering(answer), stops=stops))
 
-    def call(self, name: str, type_name: str, request: Mapping[str, Any], timeout_s: float) -> Message:
+    def call(
+        self,
+        name: str,
+        type_name: str,
+        request: Mapping[str, Any],
+        timeout_s: float,
+        *,
+        stops: bool = False,  # noqa: ARG002 - no call waits for another here
+    ) -> Message:
         """See `Graph`. Raises also ConfigurationError: the name or type is none, or the request does not fit."""
         with self._lock:
             client = self._clients.get((name, type_name))
@@ -100,8 +108,11 @@ class Ros2(Graph):
     ) -> Pursuit:
         """See `Graph`; waits up to 5 s for the goal to be accepted. What has not ended at our end is canceled.
 
+        A goal whose acceptance is not heard of may begin any time: it is told to end for some seconds, and has not
+        ended before; `Pursuit.wait` raises RosUnreachable then, and says whether it was canceled.
+
         Raises:
-            RosUnreachable: nobody serves it, or it did not answer; then it was told to cancel it.
+            RosUnreachable: nobody serves it: it was not sent.
             ConfigurationError: the name or type is none, or the goal does not fit.
         """
         pursuing = self._keep(Pursuing(self._node, name, type_name, feedback))

@@ -14,23 +14,25 @@ import logging
 import queue
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import zenoh
 
 from trade_gateway.ros._graph import Answer, RosRefused, RosUnreachable
 from trade_gateway.ros._types import Message
-from trade_gateway.ros.ros2._attachment import Attachment
+from trade_gateway.ros.ros2._at_once import AtOnce
 from trade_gateway.ros.ros2._link import CLOSED, Undeclares
 from trade_gateway.ros.ros2._mailbox import Mailbox
 from trade_gateway.ros.ros2._names import Kind
 from trade_gateway.ros.ros2._node import Endpoint, Node
 
-__all__ = ["Asked", "Client", "Server", "answering"]
+__all__ = ["Asked", "Client", "Server", "Unanswered", "answering"]
 
 _MOST_WAITING: Final = 10
 _LATE_S: Final = 5.0
 """S01: a request that waited longer for its turn is refused, not executed; who asked has given up."""
+_MOST_STOPS: Final = 64
+"""How many stops of one service are answered at a time; more wait, but none is refused for that (S07)."""
 _AFTER_S: Final = 5.0
 """How much later than ours the deadline is that zenoh knows; only what ends by itself reaches that."""
 
@@ -40,11 +42,17 @@ _log: Final = logging.getLogger("trade")
 class Asked:
     """A request that came. It must be ended by one of its methods."""
 
-    def __init__(self, query: zenoh.Query, endpoint: Endpoint, node: Node, type_name: str) -> None:
+    def __init__(
+        self, query: zenoh.Query, endpoint: Endpoint, node: Node, type_name: str, *, stops: bool = False
+    ) -> None:
+        """stops: it waits for nothing, not even for the name of who asks."""
         self._query = query
         self._endpoint = endpoint
         self._node = node
         self._type_name = type_name
+        self._sender = node.sender(query.attachment)
+        self._stops = stops
+        self.came_at: Final = time.monotonic()
 
     def request(self) -> Message:
         """What is asked. Raises ValueError: it is malformed."""
@@ -52,8 +60,8 @@ class Asked:
         return self._node.types.from_bytes(f"{self._type_name}_Request", b"" if payload is None else payload.to_bytes())
 
     def who(self) -> str:
-        """The node that asks, or empty. May wait shortly."""
-        return self._node.who(self._query.attachment)
+        """The node that asks, or empty. May wait shortly, unless it is a stop."""
+        return self._sender.name(waits=not self._stops)
 
     def answer(self, response: Mapping[str, Any]) -> None:
         """Give the response. Raises ConfigurationError: it does not fit the type."""
@@ -67,19 +75,14 @@ class Asked:
             self._query.reply_err(problem.encode())
 
     def _attachment(self) -> bytes | None:
-        if self._query.attachment is None:
-            return None
-        try:
-            asked = Attachment.from_bytes(self._query.attachment.to_bytes())
-        except ValueError:
-            return None
-        return asked._replace(time_ns=time.time_ns()).to_bytes()
+        asked = self._sender.attached
+        return None if asked is None else asked._replace(time_ns=time.time_ns()).to_bytes()
 
 
 class Server:
-    """A service of ours; each request is handled on its thread, one after another.
+    """A service of ours; each request is handled on its thread, one after another, and refused if it waits too long.
 
-    What waits too long is refused, unless it is to stop something.
+    One that is to stop something is handled at once, on a thread of its own, and never refused for its age.
     """
 
     def __init__(
@@ -89,12 +92,11 @@ class Server:
         self._node = node
         self._type_name = type_name
         self._handle = handle
-        self._mailbox = Mailbox[Asked](
-            f"ros2 {name}",
-            self._try,
-            most=None if stops else _MOST_WAITING,
-            longest_s=float("inf") if stops else _LATE_S,
-            drop=self._late,
+        self._stops = stops
+        self._mailbox: Mailbox[Asked] | AtOnce[Asked] = (
+            AtOnce(f"ros2 {name}", self._try, most=_MOST_STOPS, drop=self._late)
+            if stops
+            else Mailbox(f"ros2 {name}", self._try, most=_MOST_WAITING, longest_s=_LATE_S, drop=self._late)
         )
         self._declared = node.link.declare(self._declare)
 
@@ -108,7 +110,7 @@ class Server:
         return session.liveliness().declare_token(self._endpoint.token), queryable
 
     def _put(self, query: zenoh.Query) -> None:
-        self._mailbox.put(Asked(query, self._endpoint, self._node, self._type_name))
+        self._mailbox.put(Asked(query, self._endpoint, self._node, self._type_name, stops=self._stops))
 
     def _late(self, asked: Asked) -> None:
         asked.refuse("not executed: others were before it for too long, or the service has ended")
@@ -123,7 +125,15 @@ class Server:
 
 def answering(answer: Answer) -> Callable[[Asked], object]:
     """Handles requests by a function that returns the response."""
-    return lambda asked: asked.answer(answer(asked.request(), asked.who()))
+    return lambda asked: asked.answer(answer(asked.request(), asked.who(), asked.came_at))
+
+
+class Unanswered(NamedTuple):
+    """There was no response."""
+
+    problem: str
+    sent: bool
+    """It may have come to somebody, and be done."""
 
 
 class Client:
@@ -139,19 +149,36 @@ class Client:
 
     def call(self, request: Mapping[str, Any], timeout_s: float) -> Message:
         """See `Graph.call`."""
+        answer = self.ask(request, timeout_s)
+        if isinstance(answer, Unanswered):
+            raise RosUnreachable(what=self.name, problem=answer.problem)
+        return answer
+
+    def ask(self, request: Mapping[str, Any], timeout_s: float) -> Message | Unanswered:
+        """The same for who must know whether it was sent.
+
+        Raises:
+            RosRefused: it failed.
+            ConfigurationError: the request does not fit.
+        """
         payload = self._node.types.to_bytes(f"{self._type_name}_Request", request)
         answers: queue.SimpleQueue[zenoh.Reply | None] = queue.SimpleQueue()
-        cancel = self._ask(payload, timeout_s, answers.put, lambda: answers.put(None))
+        was_there = self._is_there()
+        try:
+            cancel = self._ask(payload, timeout_s, answers.put, lambda: answers.put(None))
+        except RosUnreachable as unreachable:
+            return Unanswered(unreachable.problem, sent=False)
         try:
             reply = answers.get(timeout=max(0.0, timeout_s))
         except queue.Empty:
             problem = f"did not answer within {timeout_s:g} s; whether it did what was asked is unknown"
-            raise RosUnreachable(what=self.name, problem=problem) from None
+            return Unanswered(problem, sent=True)
         finally:
             cancel()
         if reply is None:
             nobody = f"no node serves it as {self._type_name}, or the one that does ended before it answered"
-            raise RosUnreachable(what=self.name, problem=self._node.link.problem or nobody)
+            cut_off = self._node.link.problem
+            return Unanswered(cut_off or nobody, sent=bool(cut_off) or was_there or self._is_there())
         return self._read(reply)
 
     def send(self, request: Mapping[str, Any], timeout_s: float) -> None:
@@ -162,6 +189,9 @@ class Client:
     def close(self) -> None:
         """Be seen as its client no more. Idempotent."""
         self._declared.close()
+
+    def _is_there(self) -> bool:
+        return self._node.presence.offered(Kind.SERVER, self.name)
 
     def _ask(
         self, payload: bytes, timeout_s: float, told: Callable[[zenoh.Reply], object], ended: Callable[[], object]

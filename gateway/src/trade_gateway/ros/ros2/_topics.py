@@ -20,7 +20,7 @@ from trade_gateway.ros._graph import Heard
 from trade_gateway.ros.ros2._link import CLOSED, Undeclares
 from trade_gateway.ros.ros2._mailbox import Mailbox
 from trade_gateway.ros.ros2._names import Kind
-from trade_gateway.ros.ros2._node import LATCHED, USUAL, Node
+from trade_gateway.ros.ros2._node import LATCHED, USUAL, Node, Sender
 
 __all__ = ["Topic", "TopicHeard"]
 
@@ -28,6 +28,8 @@ _DEPTH: Final = 10
 _LATE_S: Final = 1.0
 """S01, S04: a message that waited longer for its subscriber, who was busy, is not told: it may be a command."""
 _HEARTBEAT_S: Final = 0.5
+
+_Came = tuple[zenoh.Sample, Sender]
 
 _log: Final = logging.getLogger("trade")
 
@@ -101,7 +103,7 @@ class TopicHeard:
         self._heard = heard
         self._latched = latched
         longest_s = float("inf") if latched else _LATE_S
-        self._mailbox = Mailbox[zenoh.Sample](f"ros2 {topic}", self._tell, most=_DEPTH, longest_s=longest_s)
+        self._mailbox = Mailbox[_Came](f"ros2 {topic}", self._tell, most=_DEPTH, longest_s=longest_s)
         self._declared = node.link.declare(self._declare)
 
     def close(self) -> None:
@@ -109,22 +111,26 @@ class TopicHeard:
         self._declared.close()
         self._mailbox.close()
 
-    def _tell(self, sample: zenoh.Sample) -> None:
+    def _put(self, sample: zenoh.Sample) -> None:
+        self._mailbox.put((sample, self._node.sender(sample.attachment)))
+
+    def _tell(self, came: _Came) -> None:
+        sample, sender = came
         try:
             message = self._node.types.from_bytes(self._type_name, sample.payload.to_bytes())
         except ValueError as malformed:
             _log.warning("%s is not told: %s", sample.key_expr, malformed)
             return
-        self._heard(message, self._node.who(sample.attachment))
+        self._heard(message, sender.name())
 
     def _declare(self, session: zenoh.Session) -> Sequence[Undeclares]:
         token = session.liveliness().declare_token(self._endpoint.token)
         if not self._latched:
-            return token, session.declare_subscriber(self._endpoint.key, self._mailbox.put)
+            return token, session.declare_subscriber(self._endpoint.key, self._put)
         subscriber: Any = zenoh.ext.declare_advanced_subscriber(
             session,
             self._endpoint.key,
-            self._mailbox.put,
+            self._put,
             history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1),
             recovery=zenoh.ext.RecoveryConfig(heartbeat=True),
             subscriber_detection=True,
