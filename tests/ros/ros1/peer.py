@@ -77,6 +77,13 @@ def send(topic, values) -> None:
     opened[topic].publish(filled(opened[topic].data_class, values))
 
 
+def meet(topic) -> None:
+    """Wait until somebody hears a topic of ours."""
+    while not opened[topic].get_num_connections():
+        time.sleep(0.01)
+    tell("met", topic)
+
+
 def repeat(topic, value, hz) -> None:
     """Say a number again and again, as a joystick does, for as long as this process lives."""
     advertise(topic, "std_msgs/Float64")

@@ -1,6 +1,8 @@
 """Actions of either side, with the actionlib of ROS 1 at the other."""
 
+import itertools
 import threading
+import time
 from typing import Any
 
 import pytest
@@ -104,6 +106,7 @@ class Mover:
 
     def __init__(self) -> None:
         self.came: list[tuple[int, str]] = []
+        self.times: list[float] = []
         self.canceled: list[int] = []
         self.go_on = threading.Event()
         self.go_on.set()
@@ -111,6 +114,7 @@ class Mover:
     def do(self, goal: Goal) -> Outcome:
         number = goal.message["goal"]
         self.came.append((number, goal.client))
+        self.times.append(goal.came_at)
         ends = threading.Event()
         goal.when_canceled(ends.set)
         if number == FOR_EVER:
@@ -134,11 +138,29 @@ def mover(graph: Ros1) -> Mover:
 
 def test_a_client_has_its_goal_done_with_feedback(mover: Mover, stand: Stand) -> None:
     mover.go_on.clear()
+    began = time.monotonic()
     peer = client(stand, 3)
     wait_until(lambda: peer.all("feedback") == [1, 2, 3], "its feedback was heard")
     mover.go_on.set()
     assert peer.wait_for("done") == {"goal": 3, "state": SUCCEEDED, "result": 3, "text": "done"}
     assert mover.came == [(3, "/planner")]
+    assert began < mover.times[0] < time.monotonic()
+
+
+def test_a_goal_that_was_published_before_is_not_done_again(mover: Mover, stand: Stand) -> None:
+    peer = stand.peer("planner")
+    peer.do("advertise", "/move/goal", "actionlib/TestActionGoal", True)
+    peer.do("send", "/move/goal", {"goal_id": {"id": "old"}, "goal": {"goal": 3}})
+    peer.do("meet", "/move/goal")
+    peer.wait_for("met")
+    numbers = itertools.count(1)
+
+    def send_another() -> bool:
+        peer.do("send", "/move/goal", {"goal_id": {"id": f"new-{next(numbers)}"}, "goal": {"goal": 4}})
+        return bool(mover.came)
+
+    wait_until(send_another, "a new one is done")
+    assert set(mover.came) == {(4, "/planner")}
 
 
 def test_a_client_cancels_its_goal(mover: Mover, stand: Stand) -> None:

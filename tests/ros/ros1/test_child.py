@@ -19,7 +19,7 @@ LIVES = """
 import sys, time
 from trade_gateway.ros.ros1 import Ros1
 graph = Ros1(sys.argv[1])
-graph.serve("/lights", "std_srvs/srv/Trigger", lambda request, who: {})
+graph.serve("/lights", "std_srvs/srv/Trigger", lambda request, who, at: {})
 while graph.healthy:
     time.sleep(0.01)
 print("well", flush=True)
@@ -84,6 +84,6 @@ def test_nothing_is_written_beside_the_program_of_our_node(stand: Stand, graph: 
 
 
 def test_a_port_of_ours_is_open_on_loopback_only(stand: Stand, graph: Ros1) -> None:
-    graph.serve("/lights", "std_srvs/srv/Trigger", lambda request, who: {})
+    graph.serve("/lights", "std_srvs/srv/Trigger", lambda request, who, at: {})
     listening = [at.laddr.ip for at in our_node().net_connections() if at.status == psutil.CONN_LISTEN]
     assert set(listening) == {"127.0.0.1"}

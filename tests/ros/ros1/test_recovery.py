@@ -86,7 +86,7 @@ def test_a_master_that_was_killed_and_started_again_is_told_everything_again(gra
     topic.send({"data": "kept"})
     heard: list[str] = []
     graph.subscribe("/orders", TEXT, lambda message, who: heard.append(message["data"]))
-    graph.serve("/lights", TRIGGER, lambda request, who: {"success": True})
+    graph.serve("/lights", TRIGGER, lambda request, who, at: {"success": True})
     watch = Watch(graph)
     old = stand.peer("old")
     watch.until("/old", there=True)
@@ -113,7 +113,7 @@ def test_a_master_that_was_killed_and_started_again_is_told_everything_again(gra
 
 
 def test_a_master_that_was_replaced_while_nobody_looked_is_told_everything_again(graph: Ros1, stand: Stand) -> None:
-    graph.serve("/lights", TRIGGER, lambda request, who: {"success": True})
+    graph.serve("/lights", TRIGGER, lambda request, who, at: {"success": True})
     wait_until(lambda: answers(graph), "its service is found")
     node = our_node()
     node.suspend()
@@ -128,7 +128,7 @@ def test_a_master_that_was_replaced_while_nobody_looked_is_told_everything_again
 def test_a_master_that_comes_late_is_found(stand: Stand, start_ros1: Any) -> None:
     stand.kill_master()
     graph = start_ros1()
-    graph.serve("/lights", TRIGGER, lambda request, who: {"success": True})
+    graph.serve("/lights", TRIGGER, lambda request, who, at: {"success": True})
     topic = graph.advertise("/state", TEXT, latched=True)
     topic.send({"data": "early"})
     wait_until(lambda: graph.healthy.startswith("no master at"), "it says so")
@@ -148,7 +148,7 @@ def test_our_node_that_was_killed_is_started_again_with_everything_that_was_open
     graph.subscribe("/orders", TEXT, lambda message, who: heard.append(message["data"]))
     topic = graph.advertise("/state", TEXT, latched=True)
     topic.send({"data": "kept"})
-    graph.serve("/lights", TRIGGER, lambda request, who: {"success": True})
+    graph.serve("/lights", TRIGGER, lambda request, who, at: {"success": True})
     peer = stand.peer("arm")
     watch = Watch(graph)
     watch.until("/arm", there=True)
@@ -199,7 +199,7 @@ def test_a_result_that_comes_while_our_node_is_dead_is_told(graph: Ros1, stand: 
 
 def test_our_node_ends_with_its_parent_and_leaves_nothing_at_the_master(stand: Stand, start_ros1: Any) -> None:
     first = start_ros1()
-    first.serve("/lights", TRIGGER, lambda request, who: {"success": True})
+    first.serve("/lights", TRIGGER, lambda request, who, at: {"success": True})
     wait_until(lambda: not first.healthy, "the master knows of us")
     second = start_ros1(node="/other")
     wait_until(lambda: answers(second), "its service is found")

@@ -78,14 +78,14 @@ def test_a_service_that_never_answers_is_given_up_and_others_are_not_held_up(gra
 
 
 def test_a_node_calls_a_service_of_ours(graph: Ros1, stand: Stand) -> None:
-    graph.serve("/lights", SET_BOOL, lambda request, who: {"success": request["data"], "message": f"for {who}"})
+    graph.serve("/lights", SET_BOOL, lambda request, who, at: {"success": request["data"], "message": f"for {who}"})
     peer = stand.peer("caller")
     peer.do("call", "/lights", "std_srvs/SetBool", {"data": True})
     assert peer.wait_for("called") == {"success": True, "message": "for /caller"}
 
 
 def test_a_node_is_told_what_a_service_of_ours_fails_with(graph: Ros1, stand: Stand) -> None:
-    def fail(request: Message, who: str) -> Message:
+    def fail(request: Message, who: str, at: float) -> Message:
         raise RuntimeError("the bulb is gone")
 
     graph.serve("/lights", TRIGGER, fail)
@@ -99,7 +99,7 @@ def test_requests_are_answered_one_after_the_other_and_are_told_when_the_service
 ) -> None:
     begun, go_on = threading.Semaphore(0), threading.Event()
 
-    def slow(request: Message, who: str) -> Message:
+    def slow(request: Message, who: str, at: float) -> Message:
         begun.release()
         assert go_on.wait(60)
         return {"success": True}
@@ -119,10 +119,10 @@ def test_requests_are_answered_one_after_the_other_and_are_told_when_the_service
 
 
 def test_a_service_is_offered_once(graph: Ros1) -> None:
-    graph.serve("/lights", TRIGGER, lambda request, who: {}).close()
-    graph.serve("/lights", TRIGGER, lambda request, who: {})
+    graph.serve("/lights", TRIGGER, lambda request, who, at: {}).close()
+    graph.serve("/lights", TRIGGER, lambda request, who, at: {})
     with pytest.raises(ConfigurationError, match="is offered already"):
-        graph.serve("/lights", TRIGGER, lambda request, who: {})
+        graph.serve("/lights", TRIGGER, lambda request, who, at: {})
 
 
 def test_parameters_of_a_namespace_are_read_and_set(graph: Ros1) -> None:

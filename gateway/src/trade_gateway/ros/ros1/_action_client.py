@@ -149,9 +149,8 @@ class ActionClient:
             if goal.server == name:
                 goal.fail(self.unreachable(f"its server {name} is gone"))
 
-    def _status(self, message: Message, who: str) -> None:
+    def _status(self, message: Message, who: str, at: float) -> None:
         states = {one["goal_id"]["id"]: Status(one["status"]) for one in message["status_list"]}
-        at = time.monotonic()
         for number, goal in list(self._goals.items()):
             if goal.server == who:
                 self._judge(goal, states.get(number), at)
@@ -166,12 +165,12 @@ class ActionClient:
                 if at - goal.ended_at > _RESULT_S:
                     goal.fail(self.unreachable(f"it has ended ({state.name}), and its result was not heard"))
 
-    def _feedback(self, message: Message, _: str) -> None:
+    def _feedback(self, message: Message, _: str, __: float) -> None:
         goal = self._goals.get(message["status"]["goal_id"]["id"])
         if goal is not None and goal.feedback is not None:
             goal.feedback(message["feedback"])
 
-    def _result(self, message: Message, _: str) -> None:
+    def _result(self, message: Message, _: str, __: float) -> None:
         status = message["status"]
         goal = self._goals.get(status["goal_id"]["id"])
         if goal is None:

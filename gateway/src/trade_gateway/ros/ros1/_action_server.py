@@ -41,13 +41,14 @@ _log: Final = logging.getLogger("trade.ros1")
 class _Taken:
     """A goal that came. See `Goal`; changed under the server's lock."""
 
-    def __init__(self, server: "ActionServer", goal_id: Message, message: Message, client: str) -> None:
+    def __init__(self, server: "ActionServer", goal_id: Message, message: Message, client: str, at: float) -> None:
         self._server = server
         self._tells: list[Callable[[], object]] = []
         self._canceled = False
         self.goal_id = goal_id
         self.message = message
         self.client = client
+        self.came_at = at
         self.status = Status.PENDING
         self.text = ""
         self.ended_at = 0.0
@@ -102,7 +103,8 @@ class ActionServer:
         self._feedback = graph.publish(f"{name}/feedback", types.feedback, latched=False, most=_QUEUE)
         self._status = graph.publish(f"{name}/status", "actionlib_msgs/msg/GoalStatusArray", latched=True, most=_QUEUE)
         _, cancels = graph.hear(f"{name}/cancel", "actionlib_msgs/msg/GoalID", self._cancel_came, most=_QUEUE)
-        _, goals = graph.hear(f"{name}/goal", types.goal, self._goal_came, most=_QUEUE)
+        # what was published before is no goal: it may be as old as its publisher
+        _, goals = graph.hear(f"{name}/goal", types.goal, self._goal_came, most=_QUEUE, latched=False)
         self._ends = (*cancels, *goals, self._result.close, self._feedback.close, self._status.close)
         threading.Thread(target=self._tell_often, name=f"trade-ros1{name}/status", daemon=True).start()
 
@@ -129,11 +131,11 @@ class ActionServer:
 
     # --- what comes
 
-    def _goal_came(self, message: Message, who: str) -> None:
+    def _goal_came(self, message: Message, who: str, at: float) -> None:
         goal_id = message["goal_id"]
         if not goal_id["id"]:
             goal_id = {"id": f"{self._node}-{next(self._numbers)}-{time.time():.9f}", "stamp": goal_id["stamp"]}
-        taken = _Taken(self, goal_id, message["goal"], who)
+        taken = _Taken(self, goal_id, message["goal"], who, at)
         with self.lock:
             if goal_id["id"] in self._goals or self._closed.is_set():
                 return  # sent twice
@@ -155,7 +157,7 @@ class ActionServer:
         stamp = _of(goal_id["stamp"])
         return self._early.pop(goal_id["id"], None) is not None or (0, 0) < stamp <= self._cancels_until
 
-    def _cancel_came(self, message: Message, _: str) -> None:
+    def _cancel_came(self, message: Message, _: str, __: float) -> None:
         number, until = message["id"], _of(message["stamp"])
         with self.lock:
             self._cancels_until = max(self._cancels_until, until)

@@ -35,6 +35,8 @@ __all__ = ["Ros1"]
 
 _NAME: Final = re.compile(r"(/[A-Za-z]\w*)+", re.ASCII)
 _MASTER: Final = "http://localhost:11311"
+HeardAt = Callable[[Message, str, float], object]
+"""As `Heard`; told, too, when the message came, by ``time.monotonic()``."""
 _NEWEST: Final = 10
 """Messages of a topic that wait at each place where they do."""
 
@@ -115,17 +117,20 @@ class Ros1(Graph):
         return _Published(self._types, type_name, self._link.open({**head, "latched": latched}, _nothing, most))
 
     def subscribe(self, topic: str, type_name: str, heard: Heard, *, latched: bool = False) -> Closes:
-        return self._closing(self.hear(topic, type_name, heard, most=_NEWEST, latched=latched)[1])
+        def came(message: Message, who: str, _: float) -> None:
+            heard(message, who)
+
+        return self._closing(self.hear(topic, type_name, came, most=_NEWEST, latched=latched)[1])
 
     def hear(
-        self, topic: str, type_name: str, heard: Heard, *, most: int, latched: bool = True
+        self, topic: str, type_name: str, heard: HeardAt, *, most: int, latched: bool = True
     ) -> tuple[Opened, tuple[Callable[[], object], ...]]:
-        """As `subscribe`; so many messages wait at most, the newest."""
+        """As `subscribe`; so many messages wait at most, the newest. Our node and we have one monotonic clock."""
         head = {**self._topic("subscribe", topic, type_name), "latched": latched}
         lane = Lane(f"trade-ros1{topic}", most)
 
         def came(told: Head, body: bytes) -> None:
-            lane.put(lambda: heard(self._types.from_bytes(type_name, body), told["who"]))
+            lane.put(lambda: heard(self._types.from_bytes(type_name, body), told["who"], told["at"]))
 
         opened = self._link.open(head, came, most)
         return opened, (opened.close, lane.close)

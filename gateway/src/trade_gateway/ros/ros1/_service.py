@@ -40,7 +40,7 @@ class Served:
         if full:
             self._reply(asked, b"", f"{_MOST} requests wait already")
         else:
-            self._lane.put(lambda: self._do(asked, body, head["who"]))
+            self._lane.put(lambda: self._do(asked, body, head["who"], head["at"]))
 
     def close(self) -> None:
         """Whoever waits is told. Idempotent."""
@@ -50,9 +50,9 @@ class Served:
         for asked in waiting:
             self._reply(asked, b"", "the service was withdrawn")
 
-    def _do(self, asked: int, body: bytes, who: str) -> None:
+    def _do(self, asked: int, body: bytes, who: str, at: float) -> None:
         try:
-            given = self._answer(self._types.from_bytes(self._request, body), who)
+            given = self._answer(self._types.from_bytes(self._request, body), who, at)
             answer, problem = self._types.to_bytes(self._response, given), ""
         except Exception as error:  # noqa: BLE001 - whatever it is, it is the caller's to know
             answer, problem = b"", str(error) or type(error).__name__

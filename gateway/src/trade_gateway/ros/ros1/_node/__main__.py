@@ -94,7 +94,7 @@ class Node:
             if not latched and header.get("latching") == "1" and met not in header:
                 header[met] = "1"  # ROS does not say whether the first one is as old as its publisher
                 return
-            told = {"op": "heard", "id": number, "who": header.get("callerid", "")}
+            told = {"op": "heard", "id": number, "who": header.get("callerid", ""), "at": time.monotonic()}
             self._channel.put(told, message._buff, key=str(number), most=most)
 
         self._opened(head, rospy.Subscriber(head["name"], self._class(head), came, tcp_nodelay=True))
@@ -128,7 +128,8 @@ class Node:
             self._asked += 1
             asked = self._asked
             self._replies[asked] = replied, reply
-        self._channel.put({"op": "request", "id": number, "ask": asked, "who": who}, body)
+        told = {"op": "request", "id": number, "ask": asked, "who": who, "at": time.monotonic()}
+        self._channel.put(told, body)
         came = replied.wait(_REPLY_S)
         with self._lock:
             self._replies.pop(asked, None)
