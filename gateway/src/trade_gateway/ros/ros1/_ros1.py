@@ -137,18 +137,20 @@ class Ros1(Graph):
 
     # --- services
 
-    def serve(self, name: str, type_name: str, answer: Answer) -> Closes:
+    def serve(self, name: str, type_name: str, answer: Answer, *, stops: bool = False) -> Closes:
         head = {**service_head(self._types, type_name), "op": "serve", "name": _name(name, "service")}
         if self._link.names("serve", name):
             raise ConfigurationError(where=name, problem="is offered already, by this very node")
-        served = Served(self._types, name, type_name, answer, self._link.reply)
+        served = Served(self._types, name, type_name, answer, self._link.reply, stops=stops)
         opened = self._link.open(head, served.came)
         return self._closing((served.close, opened.close))
 
-    def call(self, name: str, type_name: str, request: Mapping[str, Any], timeout_s: float) -> Message:
+    def call(
+        self, name: str, type_name: str, request: Mapping[str, Any], timeout_s: float, *, stops: bool = False
+    ) -> Message:
         asked, response = self._types.parts(type_name)
         head = {**service_head(self._types, type_name), "op": "call", "name": _name(name, "service")}
-        _, body = self._link.ask(name, head, self._types.to_bytes(asked, request), timeout_s)
+        _, body = self._link.ask(name, head, self._types.to_bytes(asked, request), timeout_s, stops=stops)
         return self._types.from_bytes(response, body)
 
     # --- actions
