@@ -55,6 +55,7 @@ def pursued(server, goal) -> None:
     while goal.goal in (FOR_EVER, HANGS) or steps < goal.goal:
         if server.is_preempt_requested() and goal.goal != HANGS:
             server.set_preempted(TestResult(steps), "as you wish")
+            tell("preempted", goal.goal)
             return
         steps += 1
         server.publish_feedback(TestFeedback(steps))

@@ -1,13 +1,15 @@
 """Actions of either side, with the actionlib of ROS 1 at the other."""
 
 import itertools
+import os
+import signal
 import threading
 import time
 from typing import Any
 
 import pytest
 
-from ros1_stand import Peer, Stand
+from ros1_stand import Peer, Stand, our_node
 from trade_gateway.ros._graph import Ended, Goal, Outcome, Pursuit, RosRefused, RosUnreachable
 from trade_gateway.ros.ros1 import Ros1, _action_client
 from waiting import PATIENCE_S, wait_until
@@ -90,6 +92,73 @@ def test_a_goal_whose_server_is_killed_is_told_and_the_next_server_takes_goals(g
         goal.wait(PATIENCE_S)
     server(stand)
     assert pursue(graph, 2).wait(PATIENCE_S).how is Ended.SUCCEEDED
+
+
+class Lossy:
+    """A publisher whose first messages are lost, as they are while nobody is connected yet."""
+
+    def __init__(self, real: Any, lost: int) -> None:
+        self.real = real
+        self.lost = lost
+
+    def send(self, message: Any) -> None:
+        if self.lost:
+            self.lost -= 1
+        else:
+            self.real.send(message)
+
+    def close(self) -> None:
+        self.real.close()
+
+
+def test_a_cancel_that_is_lost_is_sent_again(graph: Ros1, stand: Stand, monkeypatch: pytest.MonkeyPatch) -> None:
+    peer = server(stand)
+    goal = pursue(graph, FOR_EVER)
+    client = graph._clients["/move"]
+    monkeypatch.setattr(client, "_cancel", Lossy(client._cancel, 3))
+    goal.cancel()
+    assert goal.wait(PATIENCE_S).how is Ended.CANCELED
+    peer.wait_for("preempted")
+
+
+def test_a_goal_is_canceled_while_our_node_is_dead(graph: Ros1, stand: Stand) -> None:
+    server(stand)
+    heard: list[int] = []
+    goal = pursue(graph, FOR_EVER, heard)
+    wait_until(lambda: heard, "it runs")
+    our_node().kill()
+    goal.cancel()
+    assert goal.wait(PATIENCE_S).how is Ended.CANCELED
+
+
+def test_a_goal_that_was_given_up_is_canceled_when_its_server_is_heard_again(
+    graph: Ros1, stand: Stand, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    peer = server(stand)
+    heard: list[int] = []
+    goal = pursue(graph, FOR_EVER, heard)
+    wait_until(lambda: heard, "it runs")
+    client = graph._clients["/move"]
+    monkeypatch.setattr(client, "_cancel", Lossy(client._cancel, 1))
+    peer.freeze()
+    monkeypatch.setattr(_action_client, "_SILENT_S", 1.0)
+    with pytest.raises(RosUnreachable, match="has told nothing of it"):
+        goal.wait(PATIENCE_S)
+    os.kill(peer.pid, signal.SIGCONT)
+    peer.wait_for("preempted")
+
+
+def test_what_goes_on_is_canceled_as_we_close(graph: Ros1, stand: Stand) -> None:
+    peer = server(stand)
+    heard: list[int] = []
+    goal = pursue(graph, FOR_EVER, heard)
+    wait_until(lambda: heard, "it runs")
+    client = graph._clients["/move"]
+    graph.close()
+    peer.wait_for("preempted")
+    assert goal.wait(0).how is Ended.CANCELED
+    with pytest.raises(RosUnreachable):
+        client.pursue({"goal": 1}, None)
 
 
 # --- ours

@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +12,10 @@ import psutil
 import pytest
 
 from ros1_stand import Stand, our_node
+from trade_gateway.ros._graph import RosUnreachable
 from trade_gateway.ros.ros1 import Ros1, _child
 from trade_gateway.ros.ros1._child import environment
-from waiting import wait_until
+from waiting import PATIENCE_S, wait_until
 
 LIVES = """
 import sys, time
@@ -62,6 +64,21 @@ def test_our_node_ends_when_its_parent_is_killed(stand: Stand) -> None:
         parent.kill()
         parent.communicate(timeout=60)
     wait_until(lambda: not node.is_running() or node.status() == psutil.STATUS_ZOMBIE, "it ends")
+
+
+def test_a_signal_that_is_meant_for_us_does_not_end_our_node(graph: Ros1) -> None:
+    graph.serve("/lights", "std_srvs/srv/Trigger", lambda request, who, at: {"success": True})
+    node = our_node()
+    for signal_ in (signal.SIGINT, signal.SIGTERM):
+        node.send_signal(signal_)
+
+    def answers() -> bool:
+        with suppress(RosUnreachable):
+            return graph.call("/lights", "std_srvs/srv/Trigger", {}, PATIENCE_S)["success"]
+        return False
+
+    wait_until(answers, "our node does its work")
+    assert our_node() == node
 
 
 def test_our_node_that_stands_still_is_ended_and_started_again(

@@ -191,6 +191,8 @@ class Ros1(Graph):
         with self._lock:
             opened, self._open = self._open, set()
             clients, self._clients = self._clients, {}
+        for client in clients.values():
+            client.cancel_all()
         for one in (*opened, *clients.values()):
             one.close()
         self._link.close()

@@ -227,12 +227,12 @@ def _started(master: str, name: str) -> Any:
 
 def main() -> None:
     """Until the socket is closed, or the master has us shut down."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # it is meant for TRADE, which tells us
+    for meant_for_trade in (signal.SIGINT, signal.SIGTERM):  # which has things to say yet, and ends us by the socket
+        signal.signal(meant_for_trade, signal.SIG_IGN)
     logging.basicConfig(level=logging.ERROR, stream=sys.stderr, format="%(message).300s")
     number, master, name = sys.argv[1:]
     rospy.names.reload_mappings([])
     channel = Channel(socket.socket(fileno=int(number)), "ros1")
-    signal.signal(signal.SIGTERM, lambda *_: channel.close())
     rospy.core.add_preshutdown_hook(lambda reason: (sys.stderr.write(reason + "\n"), channel.close()))
     node = Node(channel, master, name)
     channel.read(node.heard)
