@@ -6,6 +6,7 @@ import threading
 import time
 
 import actionlib
+import genpy
 import roslib.message
 import rospy
 import yaml
@@ -29,8 +30,8 @@ def filled(kind, values):
     message = kind()
     for name, value in values.items():
         inner = getattr(message, name)
-        is_message = isinstance(inner, roslib.message.Message)
-        setattr(message, name, filled(type(inner), value) if is_message else value)
+        is_filled = isinstance(inner, (roslib.message.Message, genpy.TVal))
+        setattr(message, name, filled(type(inner), value) if is_filled else value)
     return message
 
 

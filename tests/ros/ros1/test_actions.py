@@ -239,6 +239,22 @@ def test_a_client_cancels_its_goal(mover: Mover, stand: Stand) -> None:
     assert peer.wait_for("done") == {"goal": FOR_EVER, "state": PREEMPTED, "result": 1, "text": "stopped"}
 
 
+def test_a_goal_without_a_time_is_met_by_a_cancel_of_all_until_now(mover: Mover, stand: Stand) -> None:
+    peer = stand.peer("planner")
+    peer.do("advertise", "/move/goal", "actionlib/TestActionGoal")
+    peer.do("meet", "/move/goal")
+    peer.wait_for("met")
+    peer.do("send", "/move/goal", {"goal_id": {"id": "timeless"}, "goal": {"goal": FOR_EVER}})
+    wait_until(lambda: mover.came, "it runs")
+    other = stand.peer("stopper")
+    other.do("advertise", "/move/cancel", "actionlib_msgs/GoalID")
+    other.do("meet", "/move/cancel")
+    other.wait_for("met")
+    seconds, nanoseconds = divmod(time.time_ns(), 1_000_000_000)
+    other.do("send", "/move/cancel", {"stamp": {"secs": seconds, "nsecs": nanoseconds}})
+    wait_until(lambda: mover.canceled, "it is canceled")
+
+
 def test_a_client_is_told_of_what_fails(mover: Mover, stand: Stand) -> None:
     told = client(stand, ABORTS).wait_for("done")
     assert (told["state"], told["text"]) == (ABORTED, "a joint is stuck")

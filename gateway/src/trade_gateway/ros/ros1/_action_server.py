@@ -2,6 +2,7 @@
 
 One goal runs, one waits for its end; who comes later takes the waiting one's place and has the running one canceled.
 Source: "actionlib/DetailedDescription" on wiki.ros.org; there, too, what a cancel without an id or with a time means.
+As with actionlib's own servers, a goal without a time has that of its arrival, so that a cancel with a time meets it.
 """
 
 import itertools
@@ -14,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 from trade.errors import ConfigurationError
 from trade_gateway.ros._graph import Ended, Goal, Outcome
 from trade_gateway.ros._types import Message
-from trade_gateway.ros.ros1._status import ENDED, Status, Time, now
+from trade_gateway.ros.ros1._status import ENDED, Status, Time, day, now
 from trade_gateway.ros.ros1._wire import action_types
 
 if TYPE_CHECKING:
@@ -132,15 +133,15 @@ class ActionServer:
     # --- what comes
 
     def _goal_came(self, message: Message, who: str, at: float) -> None:
-        goal_id = message["goal_id"]
-        if not goal_id["id"]:
-            goal_id = {"id": f"{self._node}-{next(self._numbers)}-{time.time():.9f}", "stamp": goal_id["stamp"]}
+        number = message["goal_id"]["id"] or f"{self._node}-{next(self._numbers)}-{time.time():.9f}"
+        sent = _of(message["goal_id"]["stamp"])
+        goal_id: Message = {"id": number, "stamp": day(at) if sent == (0, 0) else message["goal_id"]["stamp"]}
         taken = _Taken(self, goal_id, message["goal"], who, at)
         with self.lock:
-            if goal_id["id"] in self._goals or self._closed.is_set():
+            if number in self._goals or self._closed.is_set():
                 return  # sent twice
-            self._goals[goal_id["id"]] = taken
-            recalled = self._is_recalled(goal_id)
+            self._goals[number] = taken
+            recalled = self._is_recalled(number, sent)
             replaced, before = None, self._running
             if not recalled:
                 replaced, self._waiting = self._waiting, taken
@@ -153,9 +154,8 @@ class ActionServer:
             before.cancel()
         self._next()
 
-    def _is_recalled(self, goal_id: Message) -> bool:
-        stamp = _of(goal_id["stamp"])
-        return self._early.pop(goal_id["id"], None) is not None or (0, 0) < stamp <= self._cancels_until
+    def _is_recalled(self, number: str, sent: tuple[int, int]) -> bool:
+        return self._early.pop(number, None) is not None or (0, 0) < sent <= self._cancels_until
 
     def _cancel_came(self, message: Message, _: str, __: float) -> None:
         number, until = message["id"], _of(message["stamp"])
