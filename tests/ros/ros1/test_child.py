@@ -2,11 +2,13 @@
 
 import os
 import signal
+import socket
 import subprocess
 import sys
+import threading
+import time
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 import psutil
 import pytest
@@ -15,6 +17,8 @@ from ros1_stand import Stand, our_node
 from trade_gateway.ros._graph import RosUnreachable
 from trade_gateway.ros.ros1 import Ros1, _child
 from trade_gateway.ros.ros1._child import environment
+from trade_gateway.ros.ros1._node import _heart
+from trade_gateway.ros.ros1._node._frames import Channel, Head
 from waiting import PATIENCE_S, wait_until
 
 LIVES = """
@@ -81,17 +85,33 @@ def test_a_signal_that_is_meant_for_us_does_not_end_our_node(graph: Ros1) -> Non
     assert our_node() == node
 
 
-def test_our_node_that_stands_still_is_ended_and_started_again(
-    stand: Stand, start_ros1: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(_child, "_SILENT_S", 3.0)
-    monkeypatch.setattr(_child, "_END_S", 0.5)
-    graph: Ros1 = start_ros1()
-    wait_until(lambda: not graph.healthy, "the master knows of us")
+def test_our_node_that_stands_still_is_ended_at_once_and_started_again(graph: Ros1) -> None:
     before = our_node()
+    began = time.monotonic()
     before.send_signal(signal.SIGSTOP)
+    wait_until(lambda: "stood still" in graph.healthy, "it is told")
+    assert time.monotonic() - began < 12
     wait_until(lambda: not before.is_running(), "it is ended")
     wait_until(lambda: not graph.healthy, "all is well again")
+
+
+def test_a_heart_beats_whatever_others_wait_for_until_no_work_is_done_at_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_heart, "_EVERY_S", 0.01)
+    ours, theirs = socket.socketpair()
+    heard: list[Head] = []
+    with ours, theirs:
+        channel, other = Channel(ours, "ours"), Channel(theirs, "theirs")
+        reader = threading.Thread(target=other.read, args=(lambda head, body: heard.append(head),))
+        reader.start()
+        heart = _heart.Heart(channel)
+        wait_until(lambda: len(heard) > 3, "it beats")
+        assert {head["op"] for head in heard} == {"alive"}
+        monkeypatch.setattr(_heart, "_STUCK_S", 0.0)
+        heart.thread.join(PATIENCE_S)
+        assert not heart.thread.is_alive()
+        channel.close()
+        other.close()
+        reader.join(PATIENCE_S)
 
 
 def test_nothing_is_written_beside_the_program_of_our_node(stand: Stand, graph: Ros1) -> None:

@@ -31,6 +31,7 @@ import rospy.names
 
 from ._calls import call
 from ._frames import Channel, Head
+from ._heart import Heart
 from ._master import Unreachable, ask
 from ._peers import Peers
 from ._registrar import Registrar
@@ -45,6 +46,7 @@ class Node:
 
     def __init__(self, channel: Channel, master: str, name: str) -> None:
         self._channel = channel
+        self._heart = Heart(channel)
         self._master = master
         self._name = name
         self._open: dict[int, Any] = {}
@@ -72,6 +74,7 @@ class Node:
         self._registrar.end(_END_S)
 
     def _healthy(self, problem: str) -> None:
+        self._heart.worked()
         self._channel.put({"op": "health", "problem": problem}, key="health", most=1)
 
     # --- topics
