@@ -69,7 +69,7 @@ def test_who_begins_to_watch_is_told_of_those_that_are_there_and_who_ends_of_non
 
 def test_a_publisher_that_was_killed_and_started_again_is_heard_again(graph: Ros1, stand: Stand) -> None:
     heard: list[str] = []
-    graph.subscribe("/state", TEXT, lambda message, who: heard.append(message["data"]))
+    graph.subscribe("/state", TEXT, lambda message, who: heard.append(message["data"]), latched=True)
     for life in ("one", "two"):
         peer = stand.peer("arm")
         peer.do("advertise", "/state", "std_msgs/String", True)
@@ -85,7 +85,7 @@ def test_a_master_that_was_killed_and_started_again_is_told_everything_again(gra
     topic = graph.advertise("/state", TEXT, latched=True)
     topic.send({"data": "kept"})
     heard: list[str] = []
-    graph.subscribe("/orders", TEXT, lambda message, who: heard.append(message["data"]))
+    graph.subscribe("/orders", TEXT, lambda message, who: heard.append(message["data"]), latched=True)
     graph.serve("/lights", TRIGGER, lambda request, who, at: {"success": True})
     watch = Watch(graph)
     old = stand.peer("old")
@@ -145,7 +145,7 @@ def test_a_master_that_comes_late_is_found(stand: Stand, start_ros1: Any) -> Non
 
 def test_our_node_that_was_killed_is_started_again_with_everything_that_was_open(graph: Ros1, stand: Stand) -> None:
     heard: list[str] = []
-    graph.subscribe("/orders", TEXT, lambda message, who: heard.append(message["data"]))
+    graph.subscribe("/orders", TEXT, lambda message, who: heard.append(message["data"]), latched=True)
     topic = graph.advertise("/state", TEXT, latched=True)
     topic.send({"data": "kept"})
     graph.serve("/lights", TRIGGER, lambda request, who, at: {"success": True})
