@@ -6,6 +6,7 @@ import threading
 import time
 
 import actionlib
+import genpy
 import roslib.message
 import rospy
 import yaml
@@ -29,8 +30,8 @@ def filled(kind, values):
     message = kind()
     for name, value in values.items():
         inner = getattr(message, name)
-        is_message = isinstance(inner, roslib.message.Message)
-        setattr(message, name, filled(type(inner), value) if is_message else value)
+        is_filled = isinstance(inner, (roslib.message.Message, genpy.TVal))
+        setattr(message, name, filled(type(inner), value) if is_filled else value)
     return message
 
 
@@ -55,6 +56,7 @@ def pursued(server, goal) -> None:
     while goal.goal in (FOR_EVER, HANGS) or steps < goal.goal:
         if server.is_preempt_requested() and goal.goal != HANGS:
             server.set_preempted(TestResult(steps), "as you wish")
+            tell("preempted", goal.goal)
             return
         steps += 1
         server.publish_feedback(TestFeedback(steps))
@@ -75,6 +77,13 @@ def advertise(topic, kind, latched=False) -> None:
 
 def send(topic, values) -> None:
     opened[topic].publish(filled(opened[topic].data_class, values))
+
+
+def meet(topic) -> None:
+    """Wait until somebody hears a topic of ours."""
+    while not opened[topic].get_num_connections():
+        time.sleep(0.01)
+    tell("met", topic)
 
 
 def repeat(topic, value, hz) -> None:

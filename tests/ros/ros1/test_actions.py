@@ -1,11 +1,15 @@
 """Actions of either side, with the actionlib of ROS 1 at the other."""
 
+import itertools
+import os
+import signal
 import threading
+import time
 from typing import Any
 
 import pytest
 
-from ros1_stand import Peer, Stand
+from ros1_stand import Peer, Stand, our_node
 from trade_gateway.ros._graph import Ended, Goal, Outcome, Pursuit, RosRefused, RosUnreachable
 from trade_gateway.ros.ros1 import Ros1, _action_client
 from waiting import PATIENCE_S, wait_until
@@ -90,6 +94,73 @@ def test_a_goal_whose_server_is_killed_is_told_and_the_next_server_takes_goals(g
     assert pursue(graph, 2).wait(PATIENCE_S).how is Ended.SUCCEEDED
 
 
+class Lossy:
+    """A publisher whose first messages are lost, as they are while nobody is connected yet."""
+
+    def __init__(self, real: Any, lost: int) -> None:
+        self.real = real
+        self.lost = lost
+
+    def send(self, message: Any) -> None:
+        if self.lost:
+            self.lost -= 1
+        else:
+            self.real.send(message)
+
+    def close(self) -> None:
+        self.real.close()
+
+
+def test_a_cancel_that_is_lost_is_sent_again(graph: Ros1, stand: Stand, monkeypatch: pytest.MonkeyPatch) -> None:
+    peer = server(stand)
+    goal = pursue(graph, FOR_EVER)
+    client = graph._clients["/move"]
+    monkeypatch.setattr(client, "_cancel", Lossy(client._cancel, 3))
+    goal.cancel()
+    assert goal.wait(PATIENCE_S).how is Ended.CANCELED
+    peer.wait_for("preempted")
+
+
+def test_a_goal_is_canceled_while_our_node_is_dead(graph: Ros1, stand: Stand) -> None:
+    server(stand)
+    heard: list[int] = []
+    goal = pursue(graph, FOR_EVER, heard)
+    wait_until(lambda: heard, "it runs")
+    our_node().kill()
+    goal.cancel()
+    assert goal.wait(PATIENCE_S).how is Ended.CANCELED
+
+
+def test_a_goal_that_was_given_up_is_canceled_when_its_server_is_heard_again(
+    graph: Ros1, stand: Stand, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    peer = server(stand)
+    heard: list[int] = []
+    goal = pursue(graph, FOR_EVER, heard)
+    wait_until(lambda: heard, "it runs")
+    client = graph._clients["/move"]
+    monkeypatch.setattr(client, "_cancel", Lossy(client._cancel, 1))
+    peer.freeze()
+    monkeypatch.setattr(_action_client, "_SILENT_S", 1.0)
+    with pytest.raises(RosUnreachable, match="has told nothing of it"):
+        goal.wait(PATIENCE_S)
+    os.kill(peer.pid, signal.SIGCONT)
+    peer.wait_for("preempted")
+
+
+def test_what_goes_on_is_canceled_as_we_close(graph: Ros1, stand: Stand) -> None:
+    peer = server(stand)
+    heard: list[int] = []
+    goal = pursue(graph, FOR_EVER, heard)
+    wait_until(lambda: heard, "it runs")
+    client = graph._clients["/move"]
+    graph.close()
+    peer.wait_for("preempted")
+    assert goal.wait(0).how is Ended.CANCELED
+    with pytest.raises(RosUnreachable):
+        client.pursue({"goal": 1}, None)
+
+
 # --- ours
 
 
@@ -104,6 +175,7 @@ class Mover:
 
     def __init__(self) -> None:
         self.came: list[tuple[int, str]] = []
+        self.times: list[float] = []
         self.canceled: list[int] = []
         self.go_on = threading.Event()
         self.go_on.set()
@@ -111,6 +183,7 @@ class Mover:
     def do(self, goal: Goal) -> Outcome:
         number = goal.message["goal"]
         self.came.append((number, goal.client))
+        self.times.append(goal.came_at)
         ends = threading.Event()
         goal.when_canceled(ends.set)
         if number == FOR_EVER:
@@ -134,11 +207,29 @@ def mover(graph: Ros1) -> Mover:
 
 def test_a_client_has_its_goal_done_with_feedback(mover: Mover, stand: Stand) -> None:
     mover.go_on.clear()
+    began = time.monotonic()
     peer = client(stand, 3)
     wait_until(lambda: peer.all("feedback") == [1, 2, 3], "its feedback was heard")
     mover.go_on.set()
     assert peer.wait_for("done") == {"goal": 3, "state": SUCCEEDED, "result": 3, "text": "done"}
     assert mover.came == [(3, "/planner")]
+    assert began < mover.times[0] < time.monotonic()
+
+
+def test_a_goal_that_was_published_before_is_not_done_again(mover: Mover, stand: Stand) -> None:
+    peer = stand.peer("planner")
+    peer.do("advertise", "/move/goal", "actionlib/TestActionGoal", True)
+    peer.do("send", "/move/goal", {"goal_id": {"id": "old"}, "goal": {"goal": 3}})
+    peer.do("meet", "/move/goal")
+    peer.wait_for("met")
+    numbers = itertools.count(1)
+
+    def send_another() -> bool:
+        peer.do("send", "/move/goal", {"goal_id": {"id": f"new-{next(numbers)}"}, "goal": {"goal": 4}})
+        return bool(mover.came)
+
+    wait_until(send_another, "a new one is done")
+    assert set(mover.came) == {(4, "/planner")}
 
 
 def test_a_client_cancels_its_goal(mover: Mover, stand: Stand) -> None:
@@ -146,6 +237,22 @@ def test_a_client_cancels_its_goal(mover: Mover, stand: Stand) -> None:
     peer.wait_for("active")
     peer.do("cancel", "/move")
     assert peer.wait_for("done") == {"goal": FOR_EVER, "state": PREEMPTED, "result": 1, "text": "stopped"}
+
+
+def test_a_goal_without_a_time_is_met_by_a_cancel_of_all_until_now(mover: Mover, stand: Stand) -> None:
+    peer = stand.peer("planner")
+    peer.do("advertise", "/move/goal", "actionlib/TestActionGoal")
+    peer.do("meet", "/move/goal")
+    peer.wait_for("met")
+    peer.do("send", "/move/goal", {"goal_id": {"id": "timeless"}, "goal": {"goal": FOR_EVER}})
+    wait_until(lambda: mover.came, "it runs")
+    other = stand.peer("stopper")
+    other.do("advertise", "/move/cancel", "actionlib_msgs/GoalID")
+    other.do("meet", "/move/cancel")
+    other.wait_for("met")
+    seconds, nanoseconds = divmod(time.time_ns(), 1_000_000_000)
+    other.do("send", "/move/cancel", {"stamp": {"secs": seconds, "nsecs": nanoseconds}})
+    wait_until(lambda: mover.canceled, "it is canceled")
 
 
 def test_a_client_is_told_of_what_fails(mover: Mover, stand: Stand) -> None:

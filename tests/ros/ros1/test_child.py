@@ -2,24 +2,30 @@
 
 import os
 import signal
+import socket
 import subprocess
 import sys
+import threading
+import time
+from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 import psutil
 import pytest
 
 from ros1_stand import Stand, our_node
+from trade_gateway.ros._graph import RosUnreachable
 from trade_gateway.ros.ros1 import Ros1, _child
 from trade_gateway.ros.ros1._child import environment
-from waiting import wait_until
+from trade_gateway.ros.ros1._node import _heart
+from trade_gateway.ros.ros1._node._frames import Channel, Head
+from waiting import PATIENCE_S, wait_until
 
 LIVES = """
 import sys, time
 from trade_gateway.ros.ros1 import Ros1
 graph = Ros1(sys.argv[1])
-graph.serve("/lights", "std_srvs/srv/Trigger", lambda request, who: {})
+graph.serve("/lights", "std_srvs/srv/Trigger", lambda request, who, at: {})
 while graph.healthy:
     time.sleep(0.01)
 print("well", flush=True)
@@ -64,17 +70,48 @@ def test_our_node_ends_when_its_parent_is_killed(stand: Stand) -> None:
     wait_until(lambda: not node.is_running() or node.status() == psutil.STATUS_ZOMBIE, "it ends")
 
 
-def test_our_node_that_stands_still_is_ended_and_started_again(
-    stand: Stand, start_ros1: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(_child, "_SILENT_S", 3.0)
-    monkeypatch.setattr(_child, "_END_S", 0.5)
-    graph: Ros1 = start_ros1()
-    wait_until(lambda: not graph.healthy, "the master knows of us")
+def test_a_signal_that_is_meant_for_us_does_not_end_our_node(graph: Ros1) -> None:
+    graph.serve("/lights", "std_srvs/srv/Trigger", lambda request, who, at: {"success": True})
+    node = our_node()
+    for signal_ in (signal.SIGINT, signal.SIGTERM):
+        node.send_signal(signal_)
+
+    def answers() -> bool:
+        with suppress(RosUnreachable):
+            return graph.call("/lights", "std_srvs/srv/Trigger", {}, PATIENCE_S)["success"]
+        return False
+
+    wait_until(answers, "our node does its work")
+    assert our_node() == node
+
+
+def test_our_node_that_stands_still_is_ended_at_once_and_started_again(graph: Ros1) -> None:
     before = our_node()
+    began = time.monotonic()
     before.send_signal(signal.SIGSTOP)
+    wait_until(lambda: "stood still" in graph.healthy, "it is told")
+    assert time.monotonic() - began < 12
     wait_until(lambda: not before.is_running(), "it is ended")
     wait_until(lambda: not graph.healthy, "all is well again")
+
+
+def test_a_heart_beats_whatever_others_wait_for_until_no_work_is_done_at_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_heart, "_EVERY_S", 0.01)
+    ours, theirs = socket.socketpair()
+    heard: list[Head] = []
+    with ours, theirs:
+        channel, other = Channel(ours, "ours"), Channel(theirs, "theirs")
+        reader = threading.Thread(target=other.read, args=(lambda head, body: heard.append(head),))
+        reader.start()
+        heart = _heart.Heart(channel)
+        wait_until(lambda: len(heard) > 3, "it beats")
+        assert {head["op"] for head in heard} == {"alive"}
+        monkeypatch.setattr(_heart, "_STUCK_S", 0.0)
+        heart.thread.join(PATIENCE_S)
+        assert not heart.thread.is_alive()
+        channel.close()
+        other.close()
+        reader.join(PATIENCE_S)
 
 
 def test_nothing_is_written_beside_the_program_of_our_node(stand: Stand, graph: Ros1) -> None:
@@ -84,6 +121,6 @@ def test_nothing_is_written_beside_the_program_of_our_node(stand: Stand, graph: 
 
 
 def test_a_port_of_ours_is_open_on_loopback_only(stand: Stand, graph: Ros1) -> None:
-    graph.serve("/lights", "std_srvs/srv/Trigger", lambda request, who: {})
+    graph.serve("/lights", "std_srvs/srv/Trigger", lambda request, who, at: {})
     listening = [at.laddr.ip for at in our_node().net_connections() if at.status == psutil.CONN_LISTEN]
     assert set(listening) == {"127.0.0.1"}

@@ -26,7 +26,42 @@ while len(told) < 2 and time.monotonic() < deadline:
 print(told, len(closed), peers.uri("/arm"), flush=True)
 """
 
+BESIDE_STALE = """
+import os, socket, threading, time
+from trade_gateway.ros.ros1._node._peers import Peers
+told, asked, forever = [], [], threading.Event()
+real = socket.getaddrinfo
+def look_up(host, *rest, **named):
+    if host != "127.0.0.1" and told:
+        asked.append(host)
+        forever.wait()
+    return real("127.0.0.1" if host == "arm.example" else host, *rest, **named)
+socket.getaddrinfo = look_up
+server = socket.create_server(("127.0.0.1", 0))
+peers = Peers(lambda name, there: told.append((name, there)))
+deadline = time.monotonic() + 60
+def wait(true):
+    while not true() and time.monotonic() < deadline:
+        time.sleep(0.01)
+peers.at("/arm", "http://arm.example:%d/" % server.getsockname()[1])
+wait(lambda: told)
+for number in range(100):
+    peers.at("/stale%d" % number, "http://stale%d.example:1/" % number)
+wait(lambda: len(asked) >= 8)
+kept, _ = server.accept()
+server.close()
+kept.close()
+wait(lambda: len(told) > 1)
+print(told, flush=True)
+os._exit(0)
+"""
+
 
 def test_a_node_that_closes_what_is_idle_is_there_until_it_listens_no_more() -> None:
     ran = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, timeout=100, check=True)
     assert ran.stdout.strip() == "[('/arm', True), ('/arm', False)] 4 None"
+
+
+def test_a_death_is_told_however_many_stale_nodes_there_are_and_no_name_is_looked_up_for_it() -> None:
+    ran = subprocess.run([sys.executable, "-c", BESIDE_STALE], capture_output=True, text=True, timeout=100, check=True)
+    assert ran.stdout.strip() == "[('/arm', True), ('/arm', False)]"

@@ -69,7 +69,7 @@ def test_who_begins_to_watch_is_told_of_those_that_are_there_and_who_ends_of_non
 
 def test_a_publisher_that_was_killed_and_started_again_is_heard_again(graph: Ros1, stand: Stand) -> None:
     heard: list[str] = []
-    graph.subscribe("/state", TEXT, lambda message, who: heard.append(message["data"]))
+    graph.subscribe("/state", TEXT, lambda message, who: heard.append(message["data"]), latched=True)
     for life in ("one", "two"):
         peer = stand.peer("arm")
         peer.do("advertise", "/state", "std_msgs/String", True)
@@ -85,8 +85,8 @@ def test_a_master_that_was_killed_and_started_again_is_told_everything_again(gra
     topic = graph.advertise("/state", TEXT, latched=True)
     topic.send({"data": "kept"})
     heard: list[str] = []
-    graph.subscribe("/orders", TEXT, lambda message, who: heard.append(message["data"]))
-    graph.serve("/lights", TRIGGER, lambda request, who: {"success": True})
+    graph.subscribe("/orders", TEXT, lambda message, who: heard.append(message["data"]), latched=True)
+    graph.serve("/lights", TRIGGER, lambda request, who, at: {"success": True})
     watch = Watch(graph)
     old = stand.peer("old")
     watch.until("/old", there=True)
@@ -113,7 +113,7 @@ def test_a_master_that_was_killed_and_started_again_is_told_everything_again(gra
 
 
 def test_a_master_that_was_replaced_while_nobody_looked_is_told_everything_again(graph: Ros1, stand: Stand) -> None:
-    graph.serve("/lights", TRIGGER, lambda request, who: {"success": True})
+    graph.serve("/lights", TRIGGER, lambda request, who, at: {"success": True})
     wait_until(lambda: answers(graph), "its service is found")
     node = our_node()
     node.suspend()
@@ -128,7 +128,7 @@ def test_a_master_that_was_replaced_while_nobody_looked_is_told_everything_again
 def test_a_master_that_comes_late_is_found(stand: Stand, start_ros1: Any) -> None:
     stand.kill_master()
     graph = start_ros1()
-    graph.serve("/lights", TRIGGER, lambda request, who: {"success": True})
+    graph.serve("/lights", TRIGGER, lambda request, who, at: {"success": True})
     topic = graph.advertise("/state", TEXT, latched=True)
     topic.send({"data": "early"})
     wait_until(lambda: graph.healthy.startswith("no master at"), "it says so")
@@ -145,10 +145,10 @@ def test_a_master_that_comes_late_is_found(stand: Stand, start_ros1: Any) -> Non
 
 def test_our_node_that_was_killed_is_started_again_with_everything_that_was_open(graph: Ros1, stand: Stand) -> None:
     heard: list[str] = []
-    graph.subscribe("/orders", TEXT, lambda message, who: heard.append(message["data"]))
+    graph.subscribe("/orders", TEXT, lambda message, who: heard.append(message["data"]), latched=True)
     topic = graph.advertise("/state", TEXT, latched=True)
     topic.send({"data": "kept"})
-    graph.serve("/lights", TRIGGER, lambda request, who: {"success": True})
+    graph.serve("/lights", TRIGGER, lambda request, who, at: {"success": True})
     peer = stand.peer("arm")
     watch = Watch(graph)
     watch.until("/arm", there=True)
@@ -199,7 +199,7 @@ def test_a_result_that_comes_while_our_node_is_dead_is_told(graph: Ros1, stand: 
 
 def test_our_node_ends_with_its_parent_and_leaves_nothing_at_the_master(stand: Stand, start_ros1: Any) -> None:
     first = start_ros1()
-    first.serve("/lights", TRIGGER, lambda request, who: {"success": True})
+    first.serve("/lights", TRIGGER, lambda request, who, at: {"success": True})
     wait_until(lambda: not first.healthy, "the master knows of us")
     second = start_ros1(node="/other")
     wait_until(lambda: answers(second), "its service is found")

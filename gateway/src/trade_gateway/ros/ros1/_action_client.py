@@ -1,5 +1,7 @@
 """Goals of ours at an action of theirs: five topics, as the wire description of actionlib has them.
 
+A cancel may be lost on its way, so a goal that is not wanted any more is canceled until its server says that it heard.
+
 Source: "actionlib/DetailedDescription" on wiki.ros.org, and the constants of actionlib_msgs/GoalStatus.
 """
 
@@ -9,9 +11,11 @@ import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, InvalidStateError
 from concurrent.futures import TimeoutError as NotYet
+from concurrent.futures import wait as wait_for
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any, Final
 
+from trade.errors import ConfigurationError
 from trade_gateway.ros._graph import Ended, Outcome, RosRefused, RosUnreachable
 from trade_gateway.ros._types import Message
 from trade_gateway.ros.ros1._status import ENDED, Status, now
@@ -29,7 +33,17 @@ _SILENT_S: Final = 10.0
 """Servers tell the state of their goals several times a second."""
 _RESULT_S: Final = 5.0
 """From the state that says the end to the result; they travel on connections of their own."""
+_EVERY_S: Final = 0.5
+"""Goals are looked at, as their servers may be silent."""
+_AGAIN_S: Final = 0.2
+"""From a cancel to the next one of the same goal."""
+_END_S: Final = 2.0
+"""For goals to end that are canceled as we close."""
+_MOST: Final = 100
+"""Goals that are remembered as unwanted."""
 _QUEUE: Final = 100
+_GOES_ON: Final = frozenset({Status.PENDING, Status.ACTIVE})
+"""States of a goal whose server has heard of no cancel."""
 _HOW: Final = {
     Status.SUCCEEDED: Ended.SUCCEEDED,
     Status.PREEMPTED: Ended.CANCELED,
@@ -43,7 +57,7 @@ class _Goal:
 
     def __init__(self, client: "ActionClient", number: str, feedback: Callable[[Message], object] | None) -> None:
         self._client = client
-        self._number = number
+        self.number = number
         self.feedback = feedback
         self.server = ""
         self.end: Future[Outcome] = Future()
@@ -52,27 +66,23 @@ class _Goal:
         self.ended_at: float | None = None
 
     def wait(self, timeout_s: float) -> Outcome:
-        deadline = time.monotonic() + timeout_s
-        while True:
-            left_s = deadline - time.monotonic()
-            try:
-                return self.end.result(max(min(left_s, 0.5), 0))
-            except NotYet:
-                if left_s <= 0:
-                    raise self._client.unreachable(f"nothing was heard of its end within {timeout_s:.3g} s") from None
-            self._judge_silence()
+        try:
+            return self.end.result(max(timeout_s, 0))
+        except NotYet:
+            raise self._client.unreachable(f"nothing was heard of its end within {timeout_s:.3g} s") from None
 
     def cancel(self) -> None:
-        self._client.cancel(self._number)
+        self._client.cancel(self.number)
 
     def fail(self, error: Exception) -> None:
         """It is known to have no result."""
         with suppress(InvalidStateError):
             self.end.set_exception(error)
 
-    def _judge_silence(self) -> None:
-        if time.monotonic() - self.heard_at > _SILENT_S:
-            self.fail(self._client.unreachable(f"its server {self.server} has told nothing of it for {_SILENT_S:g} s"))
+    def give_up(self, problem: str) -> None:
+        """Nobody here follows it any more; should it go on over there, it is to end."""
+        self.cancel()
+        self.fail(self._client.unreachable(problem))
 
 
 class ActionClient:
@@ -86,6 +96,9 @@ class ActionClient:
         self._numbers = itertools.count(1)
         self._lock = threading.Lock()
         self._goals: dict[str, _Goal] = {}
+        self._unwanted: dict[str, float] = {}
+        self._closing = False
+        self._closed = threading.Event()
         self._goal = graph.publish(f"{name}/goal", types.goal, latched=False, most=_QUEUE)
         self._cancel = graph.publish(f"{name}/cancel", "actionlib_msgs/msg/GoalID", latched=False, most=_QUEUE)
         heard = {
@@ -96,6 +109,7 @@ class ActionClient:
         opened = [graph.hear(f"{name}/{topic}", kind, told, most=_QUEUE) for topic, (kind, told) in heard.items()]
         self._ends = [self._goal.opened, self._cancel.opened, *(one for one, _ in opened)]
         self._steps = [step for _, steps in opened for step in steps]
+        threading.Thread(target=self._look_often, name=f"trade-ros1{name}/goals", daemon=True).start()
 
     def pursue(self, goal: Mapping[str, Any], feedback: Callable[[Message], object] | None) -> _Goal:
         """Send a goal. Raises RosUnreachable: nobody serves it."""
@@ -105,21 +119,42 @@ class ActionClient:
         pursued.server = self._server()
         pursued.heard_at = time.monotonic()
         with self._lock:
+            if self._closing:
+                raise self.unreachable("it was closed here")
             self._goals[number] = pursued
+            try:
+                self._goal.send(sent)
+            except ConfigurationError:
+                del self._goals[number]
+                raise
         pursued.end.add_done_callback(lambda _: self._goals.pop(number, None))
-        self._goal.send(sent)
         return pursued
 
     def cancel(self, number: str) -> None:
-        """Ask for the end of a goal."""
-        self._cancel.send({"id": number})
+        """Ask for the end of a goal, and remember that it is not wanted."""
+        with self._lock:
+            self._unwanted[number] = time.monotonic()
+            while len(self._unwanted) > _MOST:
+                del self._unwanted[next(iter(self._unwanted))]
+            self._cancel.send({"id": number})
 
     def unreachable(self, problem: str) -> RosUnreachable:
         """An error of this action."""
         return RosUnreachable(what=self._name, problem=problem)
 
+    def cancel_all(self) -> None:
+        """Take no more goals, and ask for the end of those that go on."""
+        with self._lock:
+            self._closing = True
+            numbers = list({**self._unwanted, **self._goals})
+        for number in numbers:
+            self.cancel(number)
+
     def close(self) -> None:
-        """Idempotent."""
+        """Cancel what goes on, give it two seconds to end, and leave. Idempotent."""
+        self.cancel_all()
+        wait_for([goal.end for goal in self._all()], _END_S)
+        self._closed.set()
         for step in (*self._steps, self._goal.close, self._cancel.close):
             step()
         for goal in self._all():
@@ -141,17 +176,43 @@ class ActionClient:
         with self._lock:
             return list(self._goals.values())
 
+    # --- what is not heard
+
+    def _look_often(self) -> None:
+        while not self._closed.wait(_EVERY_S):
+            for goal in self._all():
+                self._look(goal)
+
+    def _look(self, goal: _Goal) -> None:
+        silent_s = time.monotonic() - goal.heard_at
+        if silent_s > _SILENT_S:
+            goal.give_up(f"its server {goal.server} has told nothing of it for {_SILENT_S:g} s")
+        elif silent_s > _EVERY_S:
+            self._cancel_again(goal.number)
+
+    def _cancel_again(self, number: str) -> None:
+        """Where it is not wanted; the cancel before may be lost."""
+        with self._lock:
+            sent_at = self._unwanted.get(number)
+        if sent_at is not None and time.monotonic() - sent_at > _AGAIN_S:
+            self.cancel(number)
+
     # --- what is heard
 
     def gone(self, name: str) -> None:
         """A node is gone. That our own one is says nothing of theirs, and is not told here."""
         for goal in self._all():
             if goal.server == name:
-                goal.fail(self.unreachable(f"its server {name} is gone"))
+                goal.give_up(f"its server {name} is gone")
 
-    def _status(self, message: Message, who: str) -> None:
+    def _status(self, message: Message, who: str, at: float) -> None:
         states = {one["goal_id"]["id"]: Status(one["status"]) for one in message["status_list"]}
-        at = time.monotonic()
+        for number, state in states.items():
+            if state in _GOES_ON:
+                self._cancel_again(number)
+            elif state in ENDED:
+                with self._lock:
+                    self._unwanted.pop(number, None)
         for number, goal in list(self._goals.items()):
             if goal.server == who:
                 self._judge(goal, states.get(number), at)
@@ -166,12 +227,12 @@ class ActionClient:
                 if at - goal.ended_at > _RESULT_S:
                     goal.fail(self.unreachable(f"it has ended ({state.name}), and its result was not heard"))
 
-    def _feedback(self, message: Message, _: str) -> None:
+    def _feedback(self, message: Message, _: str, __: float) -> None:
         goal = self._goals.get(message["status"]["goal_id"]["id"])
         if goal is not None and goal.feedback is not None:
             goal.feedback(message["feedback"])
 
-    def _result(self, message: Message, _: str) -> None:
+    def _result(self, message: Message, _: str, __: float) -> None:
         status = message["status"]
         goal = self._goals.get(status["goal_id"]["id"])
         if goal is None:

@@ -2,6 +2,7 @@
 
 One goal runs, one waits for its end; who comes later takes the waiting one's place and has the running one canceled.
 Source: "actionlib/DetailedDescription" on wiki.ros.org; there, too, what a cancel without an id or with a time means.
+As with actionlib's own servers, a goal without a time has that of its arrival, so that a cancel with a time meets it.
 """
 
 import itertools
@@ -14,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 from trade.errors import ConfigurationError
 from trade_gateway.ros._graph import Ended, Goal, Outcome
 from trade_gateway.ros._types import Message
-from trade_gateway.ros.ros1._status import ENDED, Status, Time, now
+from trade_gateway.ros.ros1._status import ENDED, Status, Time, day, now
 from trade_gateway.ros.ros1._wire import action_types
 
 if TYPE_CHECKING:
@@ -41,13 +42,14 @@ _log: Final = logging.getLogger("trade.ros1")
 class _Taken:
     """A goal that came. See `Goal`; changed under the server's lock."""
 
-    def __init__(self, server: "ActionServer", goal_id: Message, message: Message, client: str) -> None:
+    def __init__(self, server: "ActionServer", goal_id: Message, message: Message, client: str, at: float) -> None:
         self._server = server
         self._tells: list[Callable[[], object]] = []
         self._canceled = False
         self.goal_id = goal_id
         self.message = message
         self.client = client
+        self.came_at = at
         self.status = Status.PENDING
         self.text = ""
         self.ended_at = 0.0
@@ -102,7 +104,8 @@ class ActionServer:
         self._feedback = graph.publish(f"{name}/feedback", types.feedback, latched=False, most=_QUEUE)
         self._status = graph.publish(f"{name}/status", "actionlib_msgs/msg/GoalStatusArray", latched=True, most=_QUEUE)
         _, cancels = graph.hear(f"{name}/cancel", "actionlib_msgs/msg/GoalID", self._cancel_came, most=_QUEUE)
-        _, goals = graph.hear(f"{name}/goal", types.goal, self._goal_came, most=_QUEUE)
+        # what was published before is no goal: it may be as old as its publisher
+        _, goals = graph.hear(f"{name}/goal", types.goal, self._goal_came, most=_QUEUE, latched=False)
         self._ends = (*cancels, *goals, self._result.close, self._feedback.close, self._status.close)
         threading.Thread(target=self._tell_often, name=f"trade-ros1{name}/status", daemon=True).start()
 
@@ -129,16 +132,16 @@ class ActionServer:
 
     # --- what comes
 
-    def _goal_came(self, message: Message, who: str) -> None:
-        goal_id = message["goal_id"]
-        if not goal_id["id"]:
-            goal_id = {"id": f"{self._node}-{next(self._numbers)}-{time.time():.9f}", "stamp": goal_id["stamp"]}
-        taken = _Taken(self, goal_id, message["goal"], who)
+    def _goal_came(self, message: Message, who: str, at: float) -> None:
+        number = message["goal_id"]["id"] or f"{self._node}-{next(self._numbers)}-{time.time():.9f}"
+        sent = _of(message["goal_id"]["stamp"])
+        goal_id: Message = {"id": number, "stamp": day(at) if sent == (0, 0) else message["goal_id"]["stamp"]}
+        taken = _Taken(self, goal_id, message["goal"], who, at)
         with self.lock:
-            if goal_id["id"] in self._goals or self._closed.is_set():
+            if number in self._goals or self._closed.is_set():
                 return  # sent twice
-            self._goals[goal_id["id"]] = taken
-            recalled = self._is_recalled(goal_id)
+            self._goals[number] = taken
+            recalled = self._is_recalled(number, sent)
             replaced, before = None, self._running
             if not recalled:
                 replaced, self._waiting = self._waiting, taken
@@ -151,11 +154,10 @@ class ActionServer:
             before.cancel()
         self._next()
 
-    def _is_recalled(self, goal_id: Message) -> bool:
-        stamp = _of(goal_id["stamp"])
-        return self._early.pop(goal_id["id"], None) is not None or (0, 0) < stamp <= self._cancels_until
+    def _is_recalled(self, number: str, sent: tuple[int, int]) -> bool:
+        return self._early.pop(number, None) is not None or (0, 0) < sent <= self._cancels_until
 
-    def _cancel_came(self, message: Message, _: str) -> None:
+    def _cancel_came(self, message: Message, _: str, __: float) -> None:
         number, until = message["id"], _of(message["stamp"])
         with self.lock:
             self._cancels_until = max(self._cancels_until, until)

@@ -19,8 +19,10 @@ __all__ = ["Child"]
 _log: Final = logging.getLogger("trade.ros1")
 _HERE: Final = str(Path(__file__).parent)
 _START: Final = "import runpy, sys; sys.path.append(sys.argv.pop(1)); runpy.run_module('_node', run_name='__main__')"
-_SILENT_S: Final = 15.0
-"""It tells its health twice a second; one that is silent for so long is ended."""
+_SILENT_S: Final = 3.0
+"""It tells twice a second that it lives; one that is silent for so long is ended."""
+_START_S: Final = 15.0
+"""For its first sign of life."""
 _END_S: Final = 4.0
 """For unregistering."""
 _FIRST_PAUSE_S: Final = 0.2
@@ -92,22 +94,29 @@ class Child:
                 return f"cannot be started: {error}"
             words = threading.Thread(target=self._listen, args=(process.stderr,), name="trade-ros1-words", daemon=True)
             words.start()
-            ours.settimeout(_SILENT_S)
+            ours.settimeout(_START_S)
             channel = Channel(ours, "trade-ros1")
+            signs = _Signs(ours, heard)
+            stood_still = ""
             with self._lock:
                 self._channel = channel
             try:
                 if not self._closed.is_set():
                     came(channel)
-                    channel.read(heard)
+                    channel.read(signs.heard)
+                    stood_still = signs.missing
             finally:
                 channel.close()
                 with self._lock:
                     self._channel = None
+                if stood_still and not self._closed.is_set():
+                    _log.warning("the node of ROS 1 %s; it is ended", stood_still)
+                    self.problem = f"the node of ROS 1 {stood_still}"
+                    process.kill()
                 gone()
                 code = _ended(process)
                 words.join(_END_S)
-        return f"has ended ({code})"
+        return stood_still or f"has ended ({code})"
 
     def _start(self, its: socket.socket) -> "subprocess.Popen[bytes]":
         return subprocess.Popen(  # noqa: S603 - the Python that was named, and our own program
@@ -125,6 +134,30 @@ class Child:
                 if text := line.decode(errors="replace").strip():
                     self._words.append(text)
                     _log.info("node of ROS 1: %s", text)
+
+
+class _Signs:
+    """Of life, among what it tells."""
+
+    def __init__(self, sock: socket.socket, heard: Callable[[Head, bytes], object]) -> None:
+        self._sock = sock
+        self._heard = heard
+        self._patience_s = _START_S
+        self._at = time.monotonic()
+
+    def heard(self, head: Head, body: bytes) -> None:
+        if head["op"] == "alive":
+            self._patience_s = _SILENT_S
+            self._sock.settimeout(_SILENT_S)
+        else:
+            self._heard(head, body)
+        self._at = time.monotonic()
+
+    @property
+    def missing(self) -> str:
+        """Empty, or for how long there were none."""
+        late = time.monotonic() - self._at >= self._patience_s
+        return f"stood still: it told nothing for {self._patience_s:g} s" if late else ""
 
 
 def environment(master: str, ip: str) -> dict[str, str]:

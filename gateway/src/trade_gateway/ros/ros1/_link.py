@@ -117,26 +117,31 @@ class Link:
 
     # --- what is asked
 
-    def ask(self, what: str, head: Head, body: bytes, timeout_s: float) -> tuple[Any, bytes]:
-        """Ask the node.
+    def ask(self, what: str, head: Head, body: bytes, timeout_s: float, *, stops: bool = False) -> tuple[Any, bytes]:
+        """Ask the node; what stops something takes no turn.
 
         Raises:
             RosUnreachable, RosRefused: about `what`.
         """
         deadline = time.monotonic() + timeout_s
+        if stops:
+            return self._answered(what, head, body, timeout_s, deadline)
         if not self._turns.acquire(timeout=max(timeout_s, 0)):
             raise RosUnreachable(what=what, problem=f"{_AT_ONCE} others are being asked, and none has answered")
         try:
-            number, answered = self._ask(what, head, body, deadline)
-            try:
-                answer = answered.result(max(deadline - time.monotonic(), 0) + _MARGIN_S)
-            except NotYet:
-                raise RosUnreachable(what=what, problem=f"no answer within {timeout_s:.3g} s") from None
-            finally:
-                with self._state:
-                    self._asked.pop(number, None)
+            return self._answered(what, head, body, timeout_s, deadline)
         finally:
             self._turns.release()
+
+    def _answered(self, what: str, head: Head, body: bytes, timeout_s: float, deadline: float) -> tuple[Any, bytes]:
+        number, answered = self._ask(what, head, body, deadline)
+        try:
+            answer = answered.result(max(deadline - time.monotonic(), 0) + _MARGIN_S)
+        except NotYet:
+            raise RosUnreachable(what=what, problem=f"no answer within {timeout_s:.3g} s") from None
+        finally:
+            with self._state:
+                self._asked.pop(number, None)
         return _judged(what, answer)
 
     def _ask(self, what: str, head: Head, body: bytes, deadline: float) -> tuple[int, "Future[_Answer]"]:

@@ -35,6 +35,8 @@ __all__ = ["Ros1"]
 
 _NAME: Final = re.compile(r"(/[A-Za-z]\w*)+", re.ASCII)
 _MASTER: Final = "http://localhost:11311"
+HeardAt = Callable[[Message, str, float], object]
+"""As `Heard`; told, too, when the message came, by ``time.monotonic()``."""
 _NEWEST: Final = 10
 """Messages of a topic that wait at each place where they do."""
 
@@ -115,35 +117,40 @@ class Ros1(Graph):
         return _Published(self._types, type_name, self._link.open({**head, "latched": latched}, _nothing, most))
 
     def subscribe(self, topic: str, type_name: str, heard: Heard, *, latched: bool = False) -> Closes:
-        return self._closing(self.hear(topic, type_name, heard, most=_NEWEST, latched=latched)[1])
+        def came(message: Message, who: str, _: float) -> None:
+            heard(message, who)
+
+        return self._closing(self.hear(topic, type_name, came, most=_NEWEST, latched=latched)[1])
 
     def hear(
-        self, topic: str, type_name: str, heard: Heard, *, most: int, latched: bool = True
+        self, topic: str, type_name: str, heard: HeardAt, *, most: int, latched: bool = True
     ) -> tuple[Opened, tuple[Callable[[], object], ...]]:
-        """As `subscribe`; so many messages wait at most, the newest."""
+        """As `subscribe`; so many messages wait at most, the newest. Our node and we have one monotonic clock."""
         head = {**self._topic("subscribe", topic, type_name), "latched": latched}
         lane = Lane(f"trade-ros1{topic}", most)
 
         def came(told: Head, body: bytes) -> None:
-            lane.put(lambda: heard(self._types.from_bytes(type_name, body), told["who"]))
+            lane.put(lambda: heard(self._types.from_bytes(type_name, body), told["who"], told["at"]))
 
         opened = self._link.open(head, came, most)
         return opened, (opened.close, lane.close)
 
     # --- services
 
-    def serve(self, name: str, type_name: str, answer: Answer) -> Closes:
+    def serve(self, name: str, type_name: str, answer: Answer, *, stops: bool = False) -> Closes:
         head = {**service_head(self._types, type_name), "op": "serve", "name": _name(name, "service")}
         if self._link.names("serve", name):
             raise ConfigurationError(where=name, problem="is offered already, by this very node")
-        served = Served(self._types, name, type_name, answer, self._link.reply)
+        served = Served(self._types, name, type_name, answer, self._link.reply, stops=stops)
         opened = self._link.open(head, served.came)
         return self._closing((served.close, opened.close))
 
-    def call(self, name: str, type_name: str, request: Mapping[str, Any], timeout_s: float) -> Message:
+    def call(
+        self, name: str, type_name: str, request: Mapping[str, Any], timeout_s: float, *, stops: bool = False
+    ) -> Message:
         asked, response = self._types.parts(type_name)
         head = {**service_head(self._types, type_name), "op": "call", "name": _name(name, "service")}
-        _, body = self._link.ask(name, head, self._types.to_bytes(asked, request), timeout_s)
+        _, body = self._link.ask(name, head, self._types.to_bytes(asked, request), timeout_s, stops=stops)
         return self._types.from_bytes(response, body)
 
     # --- actions
@@ -184,6 +191,8 @@ class Ros1(Graph):
         with self._lock:
             opened, self._open = self._open, set()
             clients, self._clients = self._clients, {}
+        for client in clients.values():
+            client.cancel_all()
         for one in (*opened, *clients.values()):
             one.close()
         self._link.close()

@@ -1,8 +1,9 @@
-"""A service of ours: requests one after the other, and every one of them is answered."""
+"""A service of ours: requests one after the other, or each at once, and every one of them is answered."""
 
 import threading
+import time
 from collections.abc import Callable
-from typing import Final
+from typing import Final, NamedTuple
 
 from trade_gateway.ros._graph import Answer
 from trade_gateway.ros._types import Types
@@ -13,51 +14,97 @@ __all__ = ["Served"]
 
 _MOST: Final = 32
 """Requests that wait."""
+_LATE_S: Final = 5.0
+"""A request that waited longer for its turn is refused, not executed; who asked has given up."""
+_AT_ONCE: Final = 64
+"""Threads of a service that stops something. Whoever comes when all are taken is answered yet, in order."""
 
 Reply = Callable[[int, bytes, str], object]
 """Given the number of a request, the bytes of its response, and what failed instead."""
 
 
-class Served:
-    """See the module."""
+class _Request(NamedTuple):
+    asked: int
+    body: bytes
+    who: str
+    at: float
 
-    def __init__(self, types: Types, name: str, type_name: str, answer: Answer, reply: Reply) -> None:
+
+class Served:
+    """See the module. One that `stops` something refuses no request for its age or for the number that waits."""
+
+    def __init__(
+        self, types: Types, name: str, type_name: str, answer: Answer, reply: Reply, *, stops: bool = False
+    ) -> None:
         self._types = types
         self._request, self._response = types.parts(type_name)
         self._answer = answer
         self._reply = reply
+        self._stops = stops
+        self._name = f"trade-ros1{name}"
         self._lock = threading.Lock()
+        self._closed = False
         self._waiting: set[int] = set()
-        self._lane = Lane(f"trade-ros1{name}")
+        self._threads = 0
+        self._lane = Lane(self._name)
 
     def came(self, head: Head, body: bytes) -> None:
         """A request."""
-        asked = head["ask"]
+        request = _Request(head["ask"], body, head["who"], head["at"])
         with self._lock:
-            full = len(self._waiting) >= _MOST
-            if not full:
-                self._waiting.add(asked)
-        if full:
-            self._reply(asked, b"", f"{_MOST} requests wait already")
-        else:
-            self._lane.put(lambda: self._do(asked, body, head["who"]))
+            refused = "the service was withdrawn" if self._closed else ""
+            if not self._stops and len(self._waiting) >= _MOST:
+                refused = refused or f"{_MOST} requests wait already"
+            if not refused:
+                self._waiting.add(request.asked)
+            alone = self._stops and not refused and self._threads < _AT_ONCE
+            self._threads += alone
+        if refused:
+            self._reply(request.asked, b"", refused)
+        elif not (alone and self._begun(request)):
+            self._lane.put(lambda: self._do(request))
 
     def close(self) -> None:
         """Whoever waits is told. Idempotent."""
         self._lane.close()
         with self._lock:
+            self._closed = True
             waiting, self._waiting = self._waiting, set()
         for asked in waiting:
             self._reply(asked, b"", "the service was withdrawn")
 
-    def _do(self, asked: int, body: bytes, who: str) -> None:
+    def _begun(self, request: _Request) -> bool:
+        """Whether a thread of its own answers it."""
         try:
-            given = self._answer(self._types.from_bytes(self._request, body), who)
-            answer, problem = self._types.to_bytes(self._response, given), ""
+            threading.Thread(target=self._do_alone, args=(request,), name=self._name, daemon=True).start()
+        except RuntimeError:  # there can be no more threads
+            self._ended()
+            return False
+        return True
+
+    def _do_alone(self, request: _Request) -> None:
+        try:
+            self._do(request)
+        finally:
+            self._ended()
+
+    def _ended(self) -> None:
+        with self._lock:
+            self._threads -= 1
+
+    def _do(self, request: _Request) -> None:
+        try:
+            answer, problem = self._answered(request), ""
         except Exception as error:  # noqa: BLE001 - whatever it is, it is the caller's to know
             answer, problem = b"", str(error) or type(error).__name__
         with self._lock:
-            waited = asked in self._waiting
-            self._waiting.discard(asked)
+            waited = request.asked in self._waiting
+            self._waiting.discard(request.asked)
         if waited:
-            self._reply(asked, answer, problem)
+            self._reply(request.asked, answer, problem)
+
+    def _answered(self, request: _Request) -> bytes:
+        if not self._stops and time.monotonic() - request.at > _LATE_S:
+            raise TimeoutError("not executed: others were before it for too long")
+        given = self._answer(self._types.from_bytes(self._request, request.body), request.who, request.at)
+        return self._types.to_bytes(self._response, given)

@@ -4,7 +4,7 @@ import time
 from enum import IntEnum
 from typing import Final
 
-__all__ = ["ENDED", "Status", "Time", "now"]
+__all__ = ["ENDED", "Status", "Time", "day", "now"]
 
 Time = dict[str, int]
 
@@ -31,5 +31,14 @@ ENDED: Final = frozenset(
 
 def now() -> Time:
     """The time of day."""
-    seconds, nanoseconds = divmod(time.time_ns(), 1_000_000_000)
-    return {"sec": seconds, "nanosec": nanoseconds}
+    return _day(time.time_ns())
+
+
+def day(at: float) -> Time:
+    """The time of day that it was at a time of ``time.monotonic()``."""
+    return _day(time.time_ns() - int((time.monotonic() - at) * 1e9))
+
+
+def _day(nanoseconds: int) -> Time:
+    seconds, rest = divmod(nanoseconds, 1_000_000_000)
+    return {"sec": seconds, "nanosec": rest}

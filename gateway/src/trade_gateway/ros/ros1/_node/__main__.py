@@ -31,6 +31,7 @@ import rospy.names
 
 from ._calls import call
 from ._frames import Channel, Head
+from ._heart import Heart
 from ._master import Unreachable, ask
 from ._peers import Peers
 from ._registrar import Registrar
@@ -45,6 +46,7 @@ class Node:
 
     def __init__(self, channel: Channel, master: str, name: str) -> None:
         self._channel = channel
+        self._heart = Heart(channel)
         self._master = master
         self._name = name
         self._open: dict[int, Any] = {}
@@ -72,6 +74,7 @@ class Node:
         self._registrar.end(_END_S)
 
     def _healthy(self, problem: str) -> None:
+        self._heart.worked()
         self._channel.put({"op": "health", "problem": problem}, key="health", most=1)
 
     # --- topics
@@ -94,7 +97,7 @@ class Node:
             if not latched and header.get("latching") == "1" and met not in header:
                 header[met] = "1"  # ROS does not say whether the first one is as old as its publisher
                 return
-            told = {"op": "heard", "id": number, "who": header.get("callerid", "")}
+            told = {"op": "heard", "id": number, "who": header.get("callerid", ""), "at": time.monotonic()}
             self._channel.put(told, message._buff, key=str(number), most=most)
 
         self._opened(head, rospy.Subscriber(head["name"], self._class(head), came, tcp_nodelay=True))
@@ -128,7 +131,8 @@ class Node:
             self._asked += 1
             asked = self._asked
             self._replies[asked] = replied, reply
-        self._channel.put({"op": "request", "id": number, "ask": asked, "who": who}, body)
+        told = {"op": "request", "id": number, "ask": asked, "who": who, "at": time.monotonic()}
+        self._channel.put(told, body)
         came = replied.wait(_REPLY_S)
         with self._lock:
             self._replies.pop(asked, None)
@@ -226,12 +230,12 @@ def _started(master: str, name: str) -> Any:
 
 def main() -> None:
     """Until the socket is closed, or the master has us shut down."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # it is meant for TRADE, which tells us
+    for meant_for_trade in (signal.SIGINT, signal.SIGTERM):  # which has things to say yet, and ends us by the socket
+        signal.signal(meant_for_trade, signal.SIG_IGN)
     logging.basicConfig(level=logging.ERROR, stream=sys.stderr, format="%(message).300s")
     number, master, name = sys.argv[1:]
     rospy.names.reload_mappings([])
     channel = Channel(socket.socket(fileno=int(number)), "ros1")
-    signal.signal(signal.SIGTERM, lambda *_: channel.close())
     rospy.core.add_preshutdown_hook(lambda reason: (sys.stderr.write(reason + "\n"), channel.close()))
     node = Node(channel, master, name)
     channel.read(node.heard)

@@ -30,6 +30,7 @@ class _Held:
         self.uri = uri
         self.sock = sock
         self.since = time.monotonic()
+        self.address = _address(sock, uri)
 
 
 class Peers:
@@ -66,7 +67,7 @@ class Peers:
             if failed == uri and time.monotonic() - when < _AGAIN_S:
                 return
             self._trying.add(name)
-        self._pool.submit(self._try, name, uri, 0.0)
+        self._pool.submit(self._try, name, uri)
 
     def only(self, names: set[str]) -> None:
         """Forget failures of nodes that nobody speaks of any more."""
@@ -74,9 +75,20 @@ class Peers:
             for name in set(self._failed) - names:
                 del self._failed[name]
 
-    def _try(self, name: str, uri: str, wait_s: float) -> None:
+    def _try(self, name: str, uri: str) -> None:
+        try:
+            at = urlparse(uri)
+            sock = _connected((at.hostname or "", at.port or 80))
+        except ValueError:
+            sock = None
+        self._tried(name, uri, sock)
+
+    def _try_again(self, held: _Held, wait_s: float) -> None:
+        """Where it was: no name is looked up."""
         time.sleep(wait_s)
-        sock = _connected(uri)
+        self._tried(held.name, held.uri, _connected(held.address))
+
+    def _tried(self, name: str, uri: str, sock: socket.socket | None) -> None:
         with self._lock:
             self._trying.discard(name)
             if sock is None:
@@ -107,14 +119,28 @@ class Peers:
             del self._held[held.name]
             self._trying.add(held.name)
         # a server may close what is idle; a process that is gone refuses at once
-        short = time.monotonic() - held.since < _SHORT_S
-        self._pool.submit(self._try, held.name, held.uri, 0.3 if short else 0.0)
+        wait_s = 0.3 if time.monotonic() - held.since < _SHORT_S else 0.0
+        # not in the pool, where addresses wait at which nobody may answer: a death is told at once
+        again = threading.Thread(target=self._try_again, args=(held, wait_s), name="peers-lost", daemon=True)
+        try:
+            again.start()
+        except RuntimeError:  # there can be no more threads
+            self._try_again(held, wait_s)
 
 
-def _connected(uri: str) -> socket.socket | None:
+def _address(sock: socket.socket, uri: str) -> tuple[str, int]:
+    """Where the other end is, as a number."""
     try:
+        host, port = sock.getpeername()[:2]
+    except OSError:  # it has ended already
         at = urlparse(uri)
-        sock = socket.create_connection((at.hostname, at.port or 80), _CONNECT_S)
+        return at.hostname or "", at.port or 80
+    return host, port
+
+
+def _connected(address: tuple[str, int]) -> socket.socket | None:
+    try:
+        sock = socket.create_connection(address, _CONNECT_S)
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
         for option, value in _PROBES:
             if hasattr(socket, option):
