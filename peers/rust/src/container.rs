@@ -86,18 +86,16 @@ impl Container {
         let Some(service) = service else {
             let cancels = urgent && place == (SYSTEM.0.into(), SYSTEM.1.into()) && call.service == "cancel";
             let answer = if cancels { self.cancel(&call, &caller) } else { (wire::GONE, Value::Nil) };
-            return self.answer(&call.reply, &caller, call.id, answer);
+            return self.answer_apart(call, caller, answer);
         };
         if service.effect == Effect::Read || urgent {
             let answer = answer_of(self.run(service, &call, &caller));
-            let me = self.clone(); // the next stop does not wait for who does not read its answers
-            std::thread::spawn(move || me.answer(&call.reply, &caller, call.id, answer));
-            return;
+            return self.answer_apart(call, caller, answer);
         }
         let key = (caller.clone(), call.id);
         let first = self.robot().once.begin(&key, &call.reply, &service.label());
         match first {
-            First::Ended(answer) => self.answer(&call.reply, &caller, call.id, answer),
+            First::Ended(answer) => self.answer_apart(call, caller, answer),
             First::Runs => {}
             First::Yes if self.running.load(Ordering::Relaxed) >= MOST_AT_ONCE => {
                 self.ended(&call, &key, (wire::BUSY, Value::Nil));
@@ -134,6 +132,12 @@ impl Container {
         for reply in again.iter().chain([&call.reply]) {
             self.answer(reply, &key.0, call.id, answer.clone());
         }
+    }
+
+    /// On a thread of its own: the next stop does not wait for who does not read its answers.
+    fn answer_apart(self: &Arc<Self>, call: Call, caller: String, answer: Answer) {
+        let me = self.clone();
+        std::thread::spawn(move || me.answer(&call.reply, &caller, call.id, answer));
     }
 
     fn answer(&self, reply: &str, caller: &str, id: u64, (status, body): Answer) {
