@@ -18,6 +18,14 @@ def _as_if_new(self: _ongoing.Once, call: _wire.Call, ongoing: _ongoing.Ongoing)
     return ongoing
 
 
+_end: Any = _ongoing.Once.end
+
+
+def _end_in_64_bits(self: _ongoing.Once, ongoing: Any, call: _wire.Call, answer: Any, *, keep: bool) -> Any:
+    wrapped = ((call.expires_ns or 0) + _ongoing.GRACE_NS + 2**63) % 2**64 - 2**63
+    return _end(self, ongoing, msgspec.structs.replace(call, expires_ns=wrapped - _ongoing.GRACE_NS), answer, keep=keep)
+
+
 def _confirm_only(self: _estop.Estops, order: _wire.EstopOrder, who: str) -> None:
     self._confirm(order.request, "")
 
@@ -50,6 +58,7 @@ def _nonsense(self: Any, label: str, result: Any) -> bytes:
 BREAK: dict[str, Callable[[], None]] = {
     "runs-late": _put(_dispatch.LocalService, "too_late", lambda self, expires_ns: False),
     "runs-twice": _put(_ongoing.Once, "begin", _as_if_new),
+    "forgets-the-latest": _put(_ongoing.Once, "end", _end_in_64_bits),
     "ignores-locks": _put(_resources.Resource, "check_lock", lambda self, tokens, caller, session="": None),
     "ignores-sessions": _put(Deadman, "session_ended", lambda self, session: None),
     "ignores-stops": _put(_dispatch.LocalService, "run", _run_but_stops),

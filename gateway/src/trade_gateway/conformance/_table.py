@@ -20,6 +20,7 @@ CHECKS: Final[tuple[Check, ...]] = (
     _calling.late_is_never,
     _calling.late_when_frozen,
     _calling.once,
+    _calling.once_for_ever,
     _calling.once_for_each,
     _calling.cancels,
     _calling.cancels_own_only,
