@@ -6,11 +6,11 @@ import threading
 from typing import Any, Final
 
 from trade import errors
-from trade._wire import Status
+from trade._wire import CANCEL, Status
 from trade_gateway.conformance._check import check
 from trade_gateway.conformance._judging import eventually, require
 from trade_gateway.conformance._stage import Stage
-from trade_gateway.conformance._voice import NEVER, SYSTEM, error_of
+from trade_gateway.conformance._voice import DEADLINE_S, NEVER, SYSTEM, error_of
 
 _LATEST_NS: Final = 2**63 - 1
 
@@ -147,9 +147,10 @@ def cancels(stage: Stage) -> None:
     arm = stage.peer.arm
     with stage.voice() as anna:
         running = stage.begin_turn(anna)
-        require(anna.cancel(running, "peer.turn").status == Status.OK, "a cancel was not answered with status 0")
+        with stage.stopping(anna, "its cancelling"):
+            cancelling = anna.call(SYSTEM, CANCEL, running, "peer.turn", DEADLINE_S, stop=True)
+        require(anna.answer(cancelling).status == Status.OK, "a cancel was not answered with status 0")
         error_of(anna.answer(running))
-        stage.require_rest(anna, "its cancelling")
         began, unborn = stage.turns(anna), anna.new_id()
         require(anna.cancel(unborn, "peer.turn").status == Status.OK, "a cancel was not answered with status 0")
         found = error_of(anna.ask(arm, "turn", 0.1, call_id=unborn))

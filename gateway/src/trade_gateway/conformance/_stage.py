@@ -256,12 +256,27 @@ class Stage:
         threading.Event().wait(_LOOK_S)
         return self.angle(who) != before
 
-    def require_rest(self, who: Voice, after: str) -> None:
-        """Raises NotHeld unless it comes to rest in time, and stays there."""
-        begun = time.monotonic()
-        eventually(lambda: not self.moves(who), f"the arm still moves after {after};", STOPPED_S + SLACK_S)
-        took_s = time.monotonic() - begun
-        where = self.angle(who)
+    @contextlib.contextmanager
+    def stopping(self, who: Voice, after: str) -> Generator[None, None, None]:
+        """Raises NotHeld unless the arm rests in time, from when what stops it is begun, and stays there.
+
+        What stops it is not to wait for its answer: an answer may come later than the arm has to rest.
+        """
+        since = time.monotonic()
+        yield
+        self.require_rest(who, after, since)
+
+    def require_rest(self, who: Voice, after: str, since: float) -> None:
+        """Raises NotHeld unless the arm rests in time, from that moment of time.monotonic(), and stays there."""
+        limit_s, before = STOPPED_S + SLACK_S, self.angle(who)
+        while True:
+            took_s = time.monotonic() - since
+            require(took_s < limit_s, f"the arm is not seen at rest after {after} within {limit_s:g} s")
+            threading.Event().wait(_LOOK_S)
+            where = self.angle(who)
+            if where == before:
+                break
+            before = where
         threading.Event().wait(_STILL_S)
         require(self.angle(who) == where, f"the arm moves again after {after}, at rest for {took_s:.1f} s")
 
