@@ -98,13 +98,15 @@ def signal_group(process: "subprocess.Popen[bytes]", number: int) -> bool:
 def end_group(process: "subprocess.Popen[bytes]") -> None:
     """Ask a process and all that it started to end, and see to it that they do."""
     until = time.monotonic() + _GOODBYE_S
-    signal_group(process, signal.SIGTERM)
-    signal_group(process, signal.SIGCONT)  # what stands still hears nothing
-    with contextlib.suppress(subprocess.TimeoutExpired):
-        process.wait(_GOODBYE_S)
-    while signal_group(process, 0) and time.monotonic() < until:  # a shell may end before what it started
-        threading.Event().wait(_LOOK_S)
-    signal_group(process, signal.SIGKILL)
+    try:
+        signal_group(process, signal.SIGTERM)
+        signal_group(process, signal.SIGCONT)  # what stands still hears nothing
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(_GOODBYE_S)
+        while signal_group(process, 0) and time.monotonic() < until:  # a shell may end before what it started
+            threading.Event().wait(_LOOK_S)
+    finally:
+        signal_group(process, signal.SIGKILL)
     process.wait()
 
 
