@@ -1,7 +1,9 @@
 """`trade conformance`: this project's own container passes it, and who breaks a rule fails the check of that rule."""
 
 import json
+import os
 import runpy
+import select
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -16,9 +18,16 @@ PEER = Path(__file__).with_name("peer.py")
 NOTICED_BY = {
     "runs-late": "late-is-never",
     "runs-twice": "once",
+    "forgets-the-latest": "once-for-ever",
     "ignores-locks": "locks",
     "ignores-sessions": "session-ends",
     "ignores-stops": "stops",
+    "stops-late": "stops",
+    "stops-in-line": "stop-beside-waiting",
+    "trusts-its-namesakes": "stop-latches-own",
+    "ignores-epochs": "locks",
+    "outlives-its-caller": "calls-no-longer",
+    "believes-any-estop": "estop-forged",
     "never-latches": "stop-latches",
     "ignores-estops": "estop",
     "forgets-estops": "estop-kept",
@@ -70,6 +79,25 @@ def test_who_breaks_a_rule_fails_its_check(broken: str) -> None:
 
 def test_every_way_to_break_a_rule_is_tried() -> None:
     assert set(runpy.run_path(str(PEER.with_name("broken.py")))["BREAK"]) == set(NOTICED_BY)
+
+
+@pytest.mark.parametrize("signs", ["one sign of life", "none"])
+def test_a_shell_that_starts_it_leaves_nothing_behind(signs: str, tmp_path: Path) -> None:
+    inherited = tmp_path / "inherited"  # its reader sees the end once all have ended who were started
+    os.mkfifo(inherited)
+    reader = os.open(inherited, os.O_RDONLY | os.O_NONBLOCK)
+    begin = f"exec {start()}" if signs == "one sign of life" else "exit 0"
+    script = tmp_path / "begin.sh"
+    script.write_text(f"exec 9> {inherited}\necho began >&9\nsleep 1000 &\n({begin}) &\nwait $!\n", encoding="utf-8")
+    try:
+        ended = conformance("--peer", f"sh {script}", "--only", "presence", "--only", "restarts", "--json")
+        began = os.read(reader, 1000)
+        heard, _, _ = select.select([reader], [], [], 30.0)
+        assert (heard, os.read(reader, 1)) == ([reader], b"")
+    finally:
+        os.close(reader)
+    assert set(began.split()) == {b"began"}
+    assert bool(failed(told(ended))) == (signs == "none"), ended.stdout
 
 
 def test_a_command_that_ends_fails_what_it_is_asked_and_says_what_it_said() -> None:

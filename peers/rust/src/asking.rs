@@ -1,6 +1,6 @@
 //! Calls of others: their clock asked first, the expiry never later than it is meant, locks renewed while they are used.
 
-use crate::robot::clock_ns;
+use crate::robot::clock_ns_at;
 use crate::wire::{self, array, field, map, Call, Failure, Handle, Reply, Token};
 use rmpv::Value;
 use std::collections::{HashMap, HashSet};
@@ -76,8 +76,7 @@ impl Asking {
 
     /// Call a service for a call, under a lock of these resources of its container if there are any.
     pub fn relay(&self, to: &Handle, resources: &[String], args: Value, outer: &Call) -> Result<Value, Failure> {
-        let left_ns = outer.expires_ns.unwrap_or(0) - clock_ns();
-        let until = Instant::now() + Duration::from_nanos(left_ns.max(0) as u64);
+        let until = moment(outer.expires_ns.unwrap_or(0), Instant::now());
         let mut inner = self.call("", array::<Value>([]));
         inner.sessions.extend(outer.sessions.iter().cloned());
         inner.calls = [&[outer.id][..], &outer.calls].concat();
@@ -129,9 +128,7 @@ impl Asking {
     fn command(&self, to: &Handle, args: Value, for_: &Call, until: Instant) -> Result<Value, Failure> {
         let clock = self.call("clock", array::<Value>([]));
         let answer = self.send(&system(to, "clock"), &clock, false, until)?;
-        let their_offset_ns = answer.clock_ns - clock_ns();
-        let left_ns = until.saturating_duration_since(Instant::now()).as_nanos() as i64;
-        let expires_ns = Some(clock_ns() + left_ns + their_offset_ns);
+        let expires_ns = Some(expiry_ns(until, answer.clock_ns, Instant::now()));
         let call = Call { id: self.new_id(), service: to.name.clone(), args, expires_ns, ..for_.clone() };
         body(self.send(to, &call, false, until)?, &to.name)
     }
@@ -183,6 +180,18 @@ impl Asking {
     }
 }
 
+/// When an expiry of our clock is, seen from now.
+fn moment(expires_ns: i64, now: Instant) -> Instant {
+    let left_ns = expires_ns.saturating_sub(clock_ns_at(now)).max(0);
+    now + Duration::from_nanos(left_ns as u64)
+}
+
+/// A moment in the clock of the callee, which it read before now: what its answer took makes it earlier, never later.
+fn expiry_ns(until: Instant, their_clock_ns: i64, now: Instant) -> i64 {
+    let left_ns = until.saturating_duration_since(now).as_nanos();
+    their_clock_ns.saturating_add(i64::try_from(left_ns).unwrap_or(i64::MAX))
+}
+
 fn body(reply: Reply, service: &str) -> Result<Value, Failure> {
     let named = [("service", Value::from(service))];
     match reply.status {
@@ -202,4 +211,28 @@ fn body(reply: Reply, service: &str) -> Result<Value, Failure> {
 
 fn system(of: &Handle, name: &str) -> Handle {
     Handle { domain: "trade".into(), provider: "system".into(), name: name.into(), ..of.clone() }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_expiry_is_moved_by_the_time_that_is_left() {
+        let now = Instant::now();
+        let until = moment(clock_ns_at(now) + 2_000_000_000, now);
+        assert_eq!(until, now + Duration::from_secs(2));
+        assert_eq!(expiry_ns(until, 500, now + Duration::from_secs(1)), 1_000_000_500);
+        assert_eq!(expiry_ns(until, 500, now + Duration::from_secs(3)), 500);
+    }
+
+    #[test]
+    fn extreme_values_of_others_are_the_latest_and_the_earliest_moment() {
+        let now = Instant::now();
+        assert_eq!(moment(i64::MIN, now), now);
+        let latest = moment(i64::MAX, now);
+        assert_eq!(expiry_ns(latest, i64::MAX, now), i64::MAX);
+        assert!(expiry_ns(latest, i64::MIN, now) < 0);
+        assert_eq!(expiry_ns(now, i64::MIN, now), i64::MIN);
+    }
 }

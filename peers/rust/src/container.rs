@@ -86,18 +86,16 @@ impl Container {
         let Some(service) = service else {
             let cancels = urgent && place == (SYSTEM.0.into(), SYSTEM.1.into()) && call.service == "cancel";
             let answer = if cancels { self.cancel(&call, &caller) } else { (wire::GONE, Value::Nil) };
-            return self.answer(&call.reply, &caller, call.id, answer);
+            return self.answer_apart(call, caller, answer);
         };
         if service.effect == Effect::Read || urgent {
             let answer = answer_of(self.run(service, &call, &caller));
-            let me = self.clone(); // the next stop does not wait for who does not read its answers
-            std::thread::spawn(move || me.answer(&call.reply, &caller, call.id, answer));
-            return;
+            return self.answer_apart(call, caller, answer);
         }
         let key = (caller.clone(), call.id);
         let first = self.robot().once.begin(&key, &call.reply, &service.label());
         match first {
-            First::Ended(answer) => self.answer(&call.reply, &caller, call.id, answer),
+            First::Ended(answer) => self.answer_apart(call, caller, answer),
             First::Runs => {}
             First::Yes if self.running.load(Ordering::Relaxed) >= MOST_AT_ONCE => {
                 self.ended(&call, &key, (wire::BUSY, Value::Nil));
@@ -134,6 +132,12 @@ impl Container {
         for reply in again.iter().chain([&call.reply]) {
             self.answer(reply, &key.0, call.id, answer.clone());
         }
+    }
+
+    /// On a thread of its own: the next stop does not wait for who does not read its answers.
+    fn answer_apart(self: &Arc<Self>, call: Call, caller: String, answer: Answer) {
+        let me = self.clone();
+        std::thread::spawn(move || me.answer(&call.reply, &caller, call.id, answer));
     }
 
     fn answer(&self, reply: &str, caller: &str, id: u64, (status, body): Answer) {
@@ -281,4 +285,65 @@ fn answer_of(result: Result<Value>) -> Answer {
 
 fn names(value: &Value, service: &str) -> Result<Vec<String>> {
     texts(value).ok_or_else(|| Failure::argument(service, "resources", "must be texts"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::sync::mpsc::{channel, RecvTimeoutError};
+    use zenoh::Config;
+
+    const OWN: &str = "peer/peer/0123456789abcdef";
+    const PATIENCE: Duration = Duration::from_secs(30);
+
+    fn alone() -> Session {
+        let mut config = Config::default();
+        for (key, value) in [("listen/endpoints", "[]"), ("scouting/multicast/enabled", "false")] {
+            config.insert_json5(key, value).unwrap();
+        }
+        zenoh::open(config).wait().unwrap()
+    }
+
+    fn stop(id: u64, service: &str, args: Value) -> Vec<u8> {
+        let (reply, sessions) = ("suite/r".into(), vec!["anna/suite/e/1".into()]);
+        let (chain, calls, tokens) = (vec![], vec![], vec![]);
+        Call { id, service: service.into(), reply, sessions, expires_ns: None, chain, args, calls, tokens }.bytes()
+    }
+
+    #[test]
+    fn no_stop_waits_for_who_does_not_read_its_answers() {
+        let session = alone();
+        let folder = std::env::temp_dir().join(format!("trade-peer-test-{}", std::process::id()));
+        let (learn, _learning) = channel();
+        let container = Arc::new(Container::new(session.clone(), OWN, Store(folder.clone()), 1, learn).unwrap());
+        std::fs::remove_dir_all(folder).unwrap();
+        let (answered, answers) = channel();
+        let (go_on, held) = channel::<()>();
+        let held = Mutex::new(held);
+        let reading = session.declare_subscriber("reply/**").callback(move |_| {
+            let _ = answered.send(());
+            let _ = held.lock().unwrap().recv(); // until who may go on is dropped
+        });
+        let _reading = reading.wait().unwrap();
+        let stops = session.declare_subscriber(format!("stop/*/{OWN}/**")).wait().unwrap();
+
+        let cancelled = Value::Array(vec![7.into(), "peer.turn".into(), 1.0.into()]);
+        for (service, place, args) in [
+            ("cancel", "trade/system", cancelled),
+            ("fly", "trade/system", array::<Value>([])),
+            ("halt", "peer/arm", array::<Value>([])),
+        ] {
+            session.put(format!("stop/anna/{OWN}/{place}"), stop(1, service, args)).wait().unwrap();
+            let (sample, me) = (stops.recv().unwrap(), container.clone());
+            let (done, ended) = channel::<()>();
+            std::thread::spawn(move || {
+                me.called(&sample);
+                drop(done);
+            });
+            assert_eq!(ended.recv_timeout(PATIENCE), Err(RecvTimeoutError::Disconnected), "{service} waits");
+            answers.recv_timeout(PATIENCE).expect("it is answered, to who does not read");
+        }
+        assert_eq!(container.robot().resources[robot::ARM].stops, 1);
+        drop(go_on);
+    }
 }

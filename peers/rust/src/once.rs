@@ -61,7 +61,7 @@ impl Once {
     /// How it ended. Returns where else that is to be told.
     pub fn end(&mut self, key: &Key, answer: &Answer, bytes: usize, until_ns: i64, now_ns: i64) -> Vec<String> {
         let was = self.calls.insert(key.clone(), Entry::Ended(answer.clone()));
-        self.until.insert((until_ns.max(now_ns) + GRACE_NS, key.clone()));
+        self.until.insert((until_ns.max(now_ns).saturating_add(GRACE_NS), key.clone()));
         self.kept.push_back((key.clone(), bytes));
         self.bytes += bytes;
         self.tidy(now_ns);
@@ -78,7 +78,7 @@ impl Once {
             Some(Entry::Ended(_)) => {}
             None => {
                 self.calls.insert(key.clone(), Entry::Ended((ERROR, Failure::cancelled(service).0)));
-                self.until.insert((now_ns + keep_ns + GRACE_NS, key.clone()));
+                self.until.insert((now_ns.saturating_add(keep_ns).saturating_add(GRACE_NS), key.clone()));
                 self.tidy(now_ns);
             }
         }
@@ -110,5 +110,33 @@ impl Once {
                 *highest = key.1.max(*highest);
             }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::wire::OK;
+
+    const NOW_NS: i64 = 1_000_000_000;
+
+    fn key() -> Key {
+        ("anna".into(), 7)
+    }
+
+    #[test]
+    fn what_never_expires_is_kept_and_does_not_run_again() {
+        let mut once = Once::default();
+        assert!(matches!(once.begin(&key(), "a/r", "peer.turn"), First::Yes));
+        once.end(&key(), &(OK, 1.into()), 1, i64::MAX, NOW_NS);
+        once.end(&("bob".into(), 8), &(OK, 2.into()), 1, i64::MIN, NOW_NS); // tidies
+        assert!(matches!(once.begin(&key(), "a/r", "peer.turn"), First::Ended((OK, _))));
+    }
+
+    #[test]
+    fn what_is_cancelled_for_ever_before_it_came_never_begins() {
+        let mut once = Once::default();
+        once.cancel(&key(), "peer.turn", i64::MAX, NOW_NS);
+        assert!(matches!(once.begin(&key(), "a/r", "peer.turn"), First::Ended((ERROR, _))));
     }
 }

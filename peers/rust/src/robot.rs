@@ -302,8 +302,12 @@ fn stopped(name: &str, by: &str, reason: &str, estop: bool) -> Failure {
 
 /// The monotonic clock by which calls expire here; begins with the process.
 pub fn clock_ns() -> i64 {
+    clock_ns_at(Instant::now())
+}
+
+pub fn clock_ns_at(moment: Instant) -> i64 {
     static BEGAN: OnceLock<Instant> = OnceLock::new();
-    BEGAN.get_or_init(Instant::now).elapsed().as_nanos() as i64 + 1
+    moment.saturating_duration_since(*BEGAN.get_or_init(|| moment)).as_nanos() as i64 + 1
 }
 
 pub fn now_s() -> f64 {

@@ -12,9 +12,10 @@ from trade._wire import ServiceKey, Status
 from trade_gateway.conformance._check import check
 from trade_gateway.conformance._judging import eventually, require
 from trade_gateway.conformance._stage import Stage
-from trade_gateway.conformance._voice import Voice, error_of
+from trade_gateway.conformance._voice import DEADLINE_S, Voice, error_of
 
 _EXTENSION = 1
+_SHORT_S = 2.0
 
 
 class Run(NamedTuple):
@@ -75,8 +76,8 @@ def _handle(stage: Stage, name: str) -> msgspec.msgpack.Ext:
     return msgspec.msgpack.Ext(_EXTENSION, msgspec.msgpack.encode(key))
 
 
-def _relay(stage: Stage, who: Voice, name: str, resources: list[str], args: list[Any]) -> int:
-    return who.call(stage.peer.place("relay"), "relay", _handle(stage, name), resources, args)
+def _relay(stage: Stage, who: Voice, name: str, resources: list[str], args: list[Any], **how: Any) -> int:
+    return who.call(stage.peer.place("relay"), "relay", _handle(stage, name), resources, args, **how)
 
 
 @check("calls", "Expiry")
@@ -95,7 +96,21 @@ def calls(stage: Stage) -> None:
         require(anna.session in run.sessions, "its call does not say on whose behalf it is made")
         require(call_id in run.calls, "its call does not name the one that led to it")
         require(run.chain[-1:] and run.chain[-1].endswith("relay"), f"the chain of its call is {run.chain}")
-        require(run.remaining_s is not None and run.remaining_s < 8, "its call outlives the one that led to it")
+        require(
+            run.remaining_s is not None and run.remaining_s < DEADLINE_S, "its call outlives the one that led to it"
+        )
+
+
+@check("calls-no-longer", "Expiry")
+def calls_no_longer(stage: Stage) -> None:
+    """What it calls expires no later than the call that led to it, however early or late that is."""
+    with stage.voice() as anna, _lathe(stage) as lathe:
+        for expires_ns in (anna.expiry_ns(_SHORT_S), 2**63 - 1):
+            reply = anna.answer(_relay(stage, anna, "cut", [], [1.0], expires_ns=expires_ns))
+            require(reply.status == Status.OK, f"relay was answered with status {reply.status}: {_why(reply)}")
+        early, late = (run.remaining_s for run in lathe.runs)
+        require(early is not None and early < _SHORT_S, f"of {_SHORT_S:g} s, {early} s are left to what it called")
+        require(late is not None and late > _SHORT_S, f"of all the time there is, {late} s are left to what it called")
 
 
 @check("passes-errors", "Messages")

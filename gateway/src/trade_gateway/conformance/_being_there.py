@@ -128,7 +128,7 @@ def restarts(stage: Stage) -> None:
 def leaves(stage: Stage) -> None:
     """On SIGTERM it ends by itself, and its sign of life falls."""
     peer = stage.peer
-    peer.process.send_signal(signal.SIGTERM)
+    peer.signal(signal.SIGTERM)
     eventually(lambda: peer.process.poll() is not None, "it does not end on SIGTERM")
     eventually(lambda: not stage.seen(peer.address), "its sign of life stands after its end")
 

@@ -3,14 +3,16 @@
 import math
 import signal
 import threading
-from typing import Any
+from typing import Any, Final
 
 from trade import errors
-from trade._wire import Status
+from trade._wire import CANCEL, Status
 from trade_gateway.conformance._check import check
 from trade_gateway.conformance._judging import eventually, require
 from trade_gateway.conformance._stage import Stage
-from trade_gateway.conformance._voice import NEVER, SYSTEM, error_of
+from trade_gateway.conformance._voice import DEADLINE_S, NEVER, SYSTEM, error_of
+
+_LATEST_NS: Final = 2**63 - 1
 
 
 @check("answers", "Messages")
@@ -81,15 +83,15 @@ def late_is_never(stage: Stage) -> None:
 @check("late-when-frozen", "S01")
 def late_when_frozen(stage: Stage) -> None:
     """A command that came in time to a process that stood still, and has expired when it goes on, never runs."""
-    arm, process = stage.peer.arm, stage.peer.process
+    peer, arm = stage.peer, stage.peer.arm
     with stage.voice() as anna:
         began, expires_ns = stage.turns(anna), anna.expiry_ns(0.5)
-        process.send_signal(signal.SIGSTOP)
+        peer.signal(signal.SIGSTOP)
         try:
             call_id = anna.call(arm, "turn", 0.1, expires_ns=expires_ns)
             threading.Event().wait(1.0)
         finally:
-            process.send_signal(signal.SIGCONT)
+            peer.signal(signal.SIGCONT)
         require(anna.answer(call_id).status == Status.EXPIRED, "a turn that expired in a frozen process ran")
         require(stage.turns(anna) == began, "a turn that expired in a frozen process began")
 
@@ -112,6 +114,22 @@ def once(stage: Stage) -> None:
         require(stage.turns(anna) == began + 1, f"one call began {stage.turns(anna) - began} turns")
 
 
+@check("once-for-ever", "S02")
+def once_for_ever(stage: Stage) -> None:
+    """A call with the latest expiry that there can be is answered, does not run again, and harms nobody."""
+    peer, arm = stage.peer, stage.peer.arm
+    with stage.voice() as anna:
+        began, here_rad, call_id = stage.turns(anna), stage.angle(anna), anna.new_id()
+        for times in (1, 2):
+            anna.call(arm, "turn", here_rad, call_id=call_id, expires_ns=_LATEST_NS)
+            sent = f"a call that never expires, sent {times} times, was not answered each time"
+            eventually(lambda times=times: len(anna.answers(call_id)) >= times, sent)
+            require(peer.alive, f"a call that never expires killed it: {stage.last_words()}")
+        statuses = [reply.status for reply in anna.answers(call_id)]
+        require(statuses == [Status.OK] * 2, f"a call that never expires was answered with status {statuses}")
+        require(stage.turns(anna) == began + 1, f"one call that never expires began {stage.turns(anna) - began} turns")
+
+
 @check("once-for-each", "S02")
 def once_for_each(stage: Stage) -> None:
     """Calls of the same id by two callers are two calls."""
@@ -129,9 +147,10 @@ def cancels(stage: Stage) -> None:
     arm = stage.peer.arm
     with stage.voice() as anna:
         running = stage.begin_turn(anna)
-        require(anna.cancel(running, "peer.turn").status == Status.OK, "a cancel was not answered with status 0")
+        with stage.stopping(anna, "its cancelling"):
+            cancelling = anna.call(SYSTEM, CANCEL, running, "peer.turn", DEADLINE_S, stop=True)
+        require(anna.answer(cancelling).status == Status.OK, "a cancel was not answered with status 0")
         error_of(anna.answer(running))
-        stage.require_rest(anna, "its cancelling")
         began, unborn = stage.turns(anna), anna.new_id()
         require(anna.cancel(unborn, "peer.turn").status == Status.OK, "a cancel was not answered with status 0")
         found = error_of(anna.ask(arm, "turn", 0.1, call_id=unborn))

@@ -24,6 +24,7 @@ from trade_gateway.conformance._stage import Stage
 from trade_gateway.conformance._voice import NEVER, SYSTEM, Voice, error_of
 
 _ALL_TOLD_S = 3.0
+_WATCHED_S = 0.5
 
 
 def _open(who: Voice, reason: str = "a check") -> EstopOrder:
@@ -74,9 +75,11 @@ def estop(stage: Stage) -> None:
     with stage.voice("anna") as anna, stage.voice("bob") as bob:
         running, order = stage.begin_turn(anna), _open(bob)
         try:
+            since = time.monotonic()
             confirmed = _order(stage, bob, order)
             require(confirmed.problem == "", f"it says that something of an e-stop failed: {confirmed.problem}")
             require(not stage.moves(anna), "the arm moves after the e-stop was confirmed")
+            stage.require_rest(anna, "an e-stop", since)
             error_of(anna.answer(running))
             _require_stopped(stage, anna, "while an e-stop is open")
             require(order.request in _told(stage), "its entry does not tell which e-stops are open")
@@ -110,14 +113,21 @@ def estop_reported(stage: Stage) -> None:
 
 @check("estop-forged", "E-stops")
 def estop_forged(stage: Stage) -> None:
-    """An order in the name of another identity, or of another version, is dropped."""
+    """An order in the name of another identity, or of another version, is dropped: the arm goes on."""
     with stage.voice("anna") as anna, stage.voice("bob") as bob:
-        forged, later = _open(anna), _open(bob)
+        running, forged, later = stage.begin_turn(anna), _open(anna), _open(bob)
         later.v = PROTOCOL + 1
         for order in (forged, later):
             bob.put(estop_key("bob"), encode_message(order), urgent=True)
-        anna.result(stage.peer.arm, "turn", stage.angle(anna))
-        require(not _told(stage), "a forged e-stop is open")
+        until = time.monotonic() + _WATCHED_S
+        while True:  # it may take a moment until something comes of it
+            last = time.monotonic() >= until
+            require(not _told(stage), "a forged e-stop is open")
+            require(stage.moves(anna) and not anna.answers(running), "a forged e-stop stopped the arm")
+            if last:
+                break
+        anna.cancel(running, "peer.turn")
+        anna.answer(running)
 
 
 @check("estop-kept", "S09")

@@ -9,8 +9,8 @@ PATIENCE_S: Final = 10.0
 """How long anything may take that has no limit of its own."""
 STOPPED_S: Final = 2.0
 """What moves comes to rest within this (S05)."""
-SLACK_S: Final = 1.5
-"""What the suite allows itself, on a busy machine, for seeing it."""
+SLACK_S: Final = 3.0
+"""What the suite allows itself, on a busy machine, for saying so and seeing it."""
 _LOOK_S: Final = 0.02
 
 

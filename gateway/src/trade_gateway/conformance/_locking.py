@@ -1,6 +1,7 @@
 """Checks of locks: who has one is alone, under a lease; who loses it, stops."""
 
 import threading
+import time
 
 import msgspec
 
@@ -11,10 +12,11 @@ from trade_gateway.conformance._check import check
 from trade_gateway.conformance._judging import PATIENCE_S, NotHeld, eventually, require
 from trade_gateway.conformance._peer import GROUP
 from trade_gateway.conformance._stage import Stage
-from trade_gateway.conformance._voice import SYSTEM, Voice, error_of
+from trade_gateway.conformance._voice import SYSTEM, Voice, body_of, error_of
 
 _ARM = ["peer.arm"]
 _LEASE_S = 1.0
+_MANY = 100
 
 
 def _renew(who: Voice, lock: Token) -> dict[int, str]:
@@ -40,7 +42,9 @@ def locks(stage: Stage) -> None:
         lock = stage.granted(anna, _ARM, purpose="a check", lease_s=20.0)
         require(lock.epoch == here.epoch, f"the token's epoch is {lock.epoch}, not that of the container")
         began, here_rad = stage.turns(anna), stage.angle(anna)
-        for who, tokens in ((bob, ()), (anna, ()), (bob, (lock,)), (bob, (Token(here.epoch, lock.number + 1),))):
+        elsewhere = Token("0" * len(here.epoch), lock.number)  # a number alone says nothing
+        unknown = Token(here.epoch, lock.number + 1)
+        for who, tokens in ((bob, ()), (anna, ()), (bob, (lock,)), (bob, (unknown,)), (anna, (elsewhere,))):
             refused = error_of(who.ask(arm, "turn", here_rad, tokens=tokens))
             require(
                 isinstance(refused, (errors.LockedByOther, errors.LockLost)), f"a turn without the lock: {refused!r}"
@@ -144,13 +148,40 @@ def leases(stage: Stage) -> None:
             threading.Event().wait(_LEASE_S / 2)
             require(not _renew(anna, lock), "a lock that was renewed is said to be over")
         running = stage.begin_turn(anna, tokens=[lock])
+        require(not _renew(anna, lock), "a lock that was renewed is said to be over")
+        over = time.monotonic() + _LEASE_S * 2  # not later: what is renewed is answered
+        stage.require_rest(anna, "the lease of the lock it moved under ended", over)
         eventually(lambda: not _told(bob), "a lock that was not renewed still holds")
-        stage.require_rest(anna, "the lease of the lock it moved under ended")
         error_of(anna.answer(running))
         require(lock.number in _renew(anna, lock), "renew does not say that the lock is over")
         refused = error_of(anna.ask(arm, "turn", 0.1, tokens=[lock]))
         require(isinstance(refused, errors.LockLost), f"a turn under a lock that is over ended with {refused!r}")
         bob.result(arm, "turn", stage.angle(bob))
+
+
+@check("stop-beside-waiting", "S07")
+def stop_beside_waiting(stage: Stage) -> None:
+    """A stop gets through, in its time, while a hundred wait for a lock; they wait no more when their session ends."""
+    with stage.voice("anna") as anna:
+        lock = stage.granted(anna, _ARM, lease_s=30.0)
+        running = stage.begin_turn(anna, tokens=[lock])
+        with stage.voice("bob") as bob:
+            asked = [bob.call(SYSTEM, "acquire", _ARM, {"wait_s": 7.0}) for _ in range(_MANY)]
+            eventually(
+                lambda: _waiting(anna) + sum(bool(bob.answers(one)) for one in asked) >= _MANY, "not all are heard"
+            )
+            require(_waiting(anna), "nobody waits for a lock that is held")
+            with stage.stopping(anna, "a stop, while many wait for a lock"):
+                halting = anna.call(stage.peer.arm, "halt", stop=True)
+            body_of(anna.answer(halting), "halt")
+            error_of(anna.answer(running))
+        eventually(lambda: not _waiting(anna), "who waited for a lock and has ended waits on")
+        require(_release(anna, lock), "the lock was not given back")
+        anna.result(stage.peer.arm, "turn", stage.angle(anna))
+
+
+def _waiting(who: Voice) -> int:
+    return sum(len(info.waiting) for info in _told(who))
 
 
 @check("owner-ends", "S12")
@@ -170,11 +201,13 @@ def lost_stops(stage: Stage) -> None:
         for how in ("broken", "lost"):
             lock = stage.granted(anna, _ARM, lease_s=30.0)
             stage.begin_turn(anna, tokens=[lock])
-            if how == "broken":
-                require(bob.result(SYSTEM, "break_lock", lock.number, "a check", stop=True), "the lock was not broken")
-            else:
-                require(_release(anna, lock, "a part of it is gone"), "the lock was not given back")
-            stage.require_rest(anna, f"the lock it moved under was {how}")
+            with stage.stopping(anna, f"the lock it moved under was {how}"):
+                if how == "broken":
+                    asked = bob.call(SYSTEM, "break_lock", lock.number, "a check", stop=True)
+                else:
+                    asked = anna.call(SYSTEM, "release", lock.number, "a part of it is gone", stop=True)
+            answer = (bob if how == "broken" else anna).answer(asked)
+            require(body_of(answer, "its end"), f"the lock was not {how}")
             refused = error_of(anna.ask(stage.peer.arm, "turn", 0.1, tokens=[lock]))
             require(isinstance(refused, errors.LockLost), f"a turn under a lock that was {how} ended with {refused!r}")
 
@@ -186,8 +219,9 @@ def stop_needs_no_lock(stage: Stage) -> None:
         lock = stage.granted(anna, _ARM, lease_s=30.0)
         stage.begin_turn(anna, tokens=[lock])
         try:
-            bob.result(stage.peer.arm, "halt", stop=True)
-            stage.require_rest(anna, "a stop by one without the lock")
+            with stage.stopping(anna, "a stop by one without the lock"):
+                halting = bob.call(stage.peer.arm, "halt", stop=True)
+            body_of(bob.answer(halting), "halt")
             refused = error_of(bob.ask(SYSTEM, "resume", _ARM))
             require(isinstance(refused, errors.LockedByOther), f"resume by one without the lock ended with {refused!r}")
         finally:

@@ -5,7 +5,7 @@ from trade._wire import Status
 from trade_gateway.conformance._check import check
 from trade_gateway.conformance._judging import require
 from trade_gateway.conformance._stage import Stage
-from trade_gateway.conformance._voice import NEVER, SYSTEM, error_of
+from trade_gateway.conformance._voice import NEVER, SYSTEM, Voice, body_of, error_of
 
 
 @check("turns", "Writing a container in another language")
@@ -23,8 +23,9 @@ def stops(stage: Stage) -> None:
     arm = stage.peer.arm
     with stage.voice() as anna:
         running = stage.begin_turn(anna)
-        require(anna.ask(arm, "halt", stop=True, expires_ns=NEVER).status == Status.OK, "halt was not answered with 0")
-        stage.require_rest(anna, "halt")
+        with stage.stopping(anna, "halt"):
+            halting = anna.call(arm, "halt", stop=True, expires_ns=NEVER)
+        require(anna.answer(halting).status == Status.OK, "halt was not answered with status 0")
         error_of(anna.answer(running))
         anna.result(arm, "turn", stage.angle(anna))  # one's own stop does not latch
 
@@ -34,29 +35,41 @@ def stops_late(stage: Stage) -> None:
     """A stop runs however late it is."""
     with stage.voice() as anna:
         stage.begin_turn(anna)
-        status = anna.ask(stage.peer.arm, "halt", stop=True, expires_ns=anna.expiry_ns(-3600.0)).status
+        with stage.stopping(anna, "a stop of an hour ago"):
+            halting = anna.call(stage.peer.arm, "halt", stop=True, expires_ns=anna.expiry_ns(-3600.0))
+        status = anna.answer(halting).status
         require(status == Status.OK, f"a stop of an hour ago was answered with status {status}")
-        stage.require_rest(anna, "a stop of an hour ago")
 
 
 @check("stop-latches", "S08")
 def stop_latches(stage: Stage) -> None:
     """After a stop by somebody else nothing moves before resume; reading goes on."""
-    arm = stage.peer.arm
     with stage.voice("anna") as anna, stage.voice("bob") as bob:
-        running = stage.begin_turn(anna)
-        bob.result(arm, "halt", stop=True)
-        try:
-            stage.require_rest(anna, "a stop by somebody else")
-            error_of(anna.answer(running))
-            began = stage.turns(anna)
-            refused = error_of(anna.ask(arm, "turn", 0.1))
-            require(isinstance(refused, errors.Stopped), f"a turn after somebody else's stop ended with {refused!r}")
-            require(stage.turns(anna) == began, "a turn began after somebody else's stop")
-        finally:
-            resumed = anna.result(SYSTEM, "resume", ["peer.arm"])
-        require(list(resumed) == ["peer.arm"], f"resume answered {resumed!r}, not which it let move again")
-        anna.result(arm, "turn", stage.angle(anna))
+        _latches(stage, anna, bob, "somebody else's stop")
+
+
+@check("stop-latches-own", "S08")
+def stop_latches_own(stage: Stage) -> None:
+    """So it is after a stop by another session of the same identity: it may be another person, or program."""
+    with stage.voice("anna") as anna, stage.voice("anna", client="2") as other:
+        _latches(stage, anna, other, "a stop by another session of the same identity")
+
+
+def _latches(stage: Stage, anna: Voice, other: Voice, stop: str) -> None:
+    arm, running = stage.peer.arm, stage.begin_turn(anna)
+    try:
+        with stage.stopping(anna, stop):
+            halting = other.call(arm, "halt", stop=True)
+        body_of(other.answer(halting), "halt")
+        error_of(anna.answer(running))
+        began = stage.turns(anna)
+        refused = error_of(anna.ask(arm, "turn", 0.1))
+        require(isinstance(refused, errors.Stopped), f"a turn after {stop} ended with {refused!r}")
+        require(stage.turns(anna) == began, f"a turn began after {stop}")
+    finally:
+        resumed = anna.result(SYSTEM, "resume", ["peer.arm"])
+    require(list(resumed) == ["peer.arm"], f"resume answered {resumed!r}, not which it let move again")
+    anna.result(arm, "turn", stage.angle(anna))
 
 
 @check("session-ends", "S05")
@@ -65,7 +78,8 @@ def session_ends(stage: Stage) -> None:
     with stage.voice("anna") as anna:
         with stage.voice("bob") as bob, stage.voice("carol"):
             stage.begin_turn(bob)
-        stage.require_rest(anna, "the session that set it moving has ended")
+            with stage.stopping(anna, "the session that set it moving has ended"):
+                bob.close()
         running = stage.begin_turn(anna)
         with stage.voice("bob") as bob:
             stage.angle(bob)
@@ -77,19 +91,19 @@ def session_ends(stage: Stage) -> None:
 @check("caller-ends", "S05")
 def caller_ends(stage: Stage) -> None:
     """When the container of a caller ends, what its clients set moving stops."""
-    with stage.voice("anna") as anna:
-        with stage.voice("bob", client="") as bob:
-            stage.begin_turn(bob)
-        stage.require_rest(anna, "the container that set it moving has ended")
+    with stage.voice("anna") as anna, stage.voice("bob", client="") as bob:
+        stage.begin_turn(bob)
+        with stage.stopping(anna, "the container that set it moving has ended"):
+            bob.close()
 
 
 @check("behalf-ends", "S03")
 def behalf_ends(stage: Stage) -> None:
     """A motion stops as well when a session ends on whose behalf the call was made."""
-    with stage.voice("anna") as anna:
-        with stage.voice("bob") as bob:
-            stage.begin_turn(anna, sessions=[bob.session])
-        stage.require_rest(anna, "the session on whose behalf it moved has ended")
+    with stage.voice("anna") as anna, stage.voice("bob") as bob:
+        stage.begin_turn(anna, sessions=[bob.session])
+        with stage.stopping(anna, "the session on whose behalf it moved has ended"):
+            bob.close()
 
 
 @check("too-late-for-ended", "S05")
@@ -99,8 +113,8 @@ def too_late_for_ended(stage: Stage) -> None:
         bob = stage.voice("bob")
         bob.result(stage.peer.arm, "turn", stage.angle(anna))
         stage.begin_turn(bob)
-        bob.close()
-        stage.require_rest(anna, "the session that set it moving has ended")
+        with stage.stopping(anna, "the session that set it moving has ended"):
+            bob.close()
         began = stage.turns(anna)
         refused = error_of(anna.ask(stage.peer.arm, "turn", 0.1, sessions=[bob.session]))
         require(isinstance(refused, errors.SessionEnded), f"a turn for a session that has ended ended with {refused!r}")

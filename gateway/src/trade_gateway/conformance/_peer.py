@@ -1,6 +1,11 @@
 """The container under test, in one of its boots: whether it is there, and what it says that it offers."""
 
+import contextlib
+import os
+import signal
 import subprocess
+import threading
+import time
 from collections.abc import Callable
 from typing import Final
 
@@ -13,6 +18,8 @@ from trade_gateway.conformance._voice import SYSTEM, Place
 
 GROUP: Final = "peer"
 _OFFERED_S: Final = 5.0
+_GOODBYE_S: Final = 5.0
+_LOOK_S: Final = 0.02
 
 
 class Offer(Struct, frozen=True):
@@ -47,6 +54,10 @@ class Peer:
         """Whether its process runs and its sign of life stands."""
         return self.process.poll() is None and self._seen(self.address)
 
+    def signal(self, number: int) -> None:
+        """Tell the process and all that it started; nothing if none of them is left."""
+        signal_group(self.process, number)
+
     @property
     def arm(self) -> Place:
         """Where its arm is."""
@@ -74,6 +85,29 @@ class Peer:
         """Whether its own provider has that function."""
         own = self.offer().entries.get(SYSTEM)
         return own is not None and any(service.name == name for service in own.services)
+
+
+def signal_group(process: "subprocess.Popen[bytes]", number: int) -> bool:
+    """A signal for a process begun in a session of its own, and all that it started. Returns whether any is left."""
+    with contextlib.suppress(ProcessLookupError, PermissionError):  # the latter: those left have ended, unreaped
+        os.killpg(process.pid, number)
+        return True
+    return False
+
+
+def end_group(process: "subprocess.Popen[bytes]") -> None:
+    """Ask a process and all that it started to end, and see to it that they do."""
+    until = time.monotonic() + _GOODBYE_S
+    try:
+        signal_group(process, signal.SIGTERM)
+        signal_group(process, signal.SIGCONT)  # what stands still hears nothing
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(_GOODBYE_S)
+        while signal_group(process, 0) and time.monotonic() < until:  # a shell may end before what it started
+            threading.Event().wait(_LOOK_S)
+    finally:
+        signal_group(process, signal.SIGKILL)
+    process.wait()
 
 
 def _offer(answer: Answer) -> Offer:

@@ -5,6 +5,7 @@ import os
 import secrets
 import shlex
 import shutil
+import signal
 import subprocess
 import threading
 import time
@@ -29,12 +30,11 @@ from trade._wire import (
 from trade._zenoh import ZenohTransport, configuration
 from trade.errors import ConfigurationError
 from trade_gateway.conformance._judging import SLACK_S, STOPPED_S, NotHeld, eventually, require
-from trade_gateway.conformance._peer import Peer
+from trade_gateway.conformance._peer import Peer, end_group
 from trade_gateway.conformance._voice import NEVER, SYSTEM, Voice
 
 IDENTITY: Final = "peer"
 NAME: Final = "peer"
-_GOODBYE_S: Final = 5.0
 _START_S: Final = 30.0
 _STILL_S: Final = 0.15
 _LOOK_S: Final = 0.05
@@ -134,6 +134,7 @@ class Stage:
                     stdout=said,
                     stderr=subprocess.STDOUT,
                     env={**_without_ours(os.environ), **self.environment()},
+                    start_new_session=True,  # what is started may be a shell, or start others: all of it is ended
                 )
         except OSError as bad:
             raise ConfigurationError(where="--peer", problem=f"cannot be started: {bad}") from None
@@ -144,18 +145,20 @@ class Stage:
 
         try:
             eventually(seen, f"no sign of life of alive/{IDENTITY}/{NAME}/... is seen", _START_S)
+            rose = set(self.boots()) - known
+            require(len(rose) == 1, f"{len(rose)} signs of life rose: {', '.join(map(str, rose))}")
+            [address] = rose
+            eventually(lambda: self.ask(registry_key("*", address, "*")), "it does not answer what it offers")
         except BaseException:
-            _end(process)
+            end_group(process)
             raise
-        [address] = set(self.boots()) - known
         self._peer = Peer(process, address, self.ask, self.seen)
-        eventually(lambda: self.ask(registry_key("*", address, "*")), "it does not answer what it offers")
         return self._peer
 
     def kill(self) -> Peer:
         """End the one that runs without any warning; returns it."""
         was = self.peer
-        was.process.kill()
+        was.signal(signal.SIGKILL)
         was.process.wait()
         eventually(lambda: not self.seen(was.address), "its sign of life stands after its end")
         self._peer = None
@@ -165,7 +168,7 @@ class Stage:
         """Ask the one that runs to end, and see to it that it does. Idempotent."""
         was, self._peer = self._peer, None
         if was is not None:
-            _end(was.process)
+            end_group(was.process)
 
     def last_words(self) -> str:
         """What it said last, for people."""
@@ -253,12 +256,27 @@ class Stage:
         threading.Event().wait(_LOOK_S)
         return self.angle(who) != before
 
-    def require_rest(self, who: Voice, after: str) -> None:
-        """Raises NotHeld unless it comes to rest in time, and stays there."""
-        begun = time.monotonic()
-        eventually(lambda: not self.moves(who), f"the arm still moves after {after};", STOPPED_S + SLACK_S)
-        took_s = time.monotonic() - begun
-        where = self.angle(who)
+    @contextlib.contextmanager
+    def stopping(self, who: Voice, after: str) -> Generator[None, None, None]:
+        """Raises NotHeld unless the arm rests in time, from when what stops it is begun, and stays there.
+
+        What stops it is not to wait for its answer: an answer may come later than the arm has to rest.
+        """
+        since = time.monotonic()
+        yield
+        self.require_rest(who, after, since)
+
+    def require_rest(self, who: Voice, after: str, since: float) -> None:
+        """Raises NotHeld unless the arm rests in time, from that moment of time.monotonic(), and stays there."""
+        limit_s, before = STOPPED_S + SLACK_S, self.angle(who)
+        while True:
+            took_s = time.monotonic() - since
+            require(took_s < limit_s, f"the arm is not seen at rest after {after} within {limit_s:g} s")
+            threading.Event().wait(_LOOK_S)
+            where = self.angle(who)
+            if where == before:
+                break
+            before = where
         threading.Event().wait(_STILL_S)
         require(self.angle(who) == where, f"the arm moves again after {after}, at rest for {took_s:.1f} s")
 
@@ -284,12 +302,3 @@ def _is_boot(chunks: Sequence[str]) -> bool:
 
 def _without_ours(environment: Mapping[str, str]) -> dict[str, str]:
     return {name: value for name, value in environment.items() if not name.startswith("TRADE_") or "RUNTIME" in name}
-
-
-def _end(process: "subprocess.Popen[bytes]") -> None:
-    process.terminate()
-    try:
-        process.wait(_GOODBYE_S)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()
