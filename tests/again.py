@@ -67,16 +67,23 @@ class Again:
     def __init__(self) -> None:
         self._clock = Clock()
         self._unsteady_left = _UNSTEADY_ONES
+        self._once_more: list[pytest.TestReport] | None = None
 
     @pytest.hookimpl(tryfirst=True)
     def pytest_runtest_protocol(self, item: pytest.Item, nextitem: pytest.Item | None) -> bool:
         """Run one test, and once more if that one was late."""
+        if self._once_more is not None:
+            self._once_more.extend(runtestprotocol(item, nextitem=nextitem, log=False))
+            return True
         item.ihook.pytest_runtest_logstart(nodeid=item.nodeid, location=item.location)
         self._clock.stood_still_s()
         reports = runtestprotocol(item, nextitem=nextitem, log=False)
         if (why := self._late(reports) or self._unsteady(reports)) and _afresh(item):
             item.user_properties.append((_KEY, why))
-            reports = runtestprotocol(item, nextitem=nextitem, log=False)
+            reports = self._once_more = []
+            # By way of the hook, so that this run has a time limit of its own, too.
+            item.ihook.pytest_runtest_protocol(item=item, nextitem=nextitem)
+            self._once_more = None
         for report in reports:
             item.ihook.pytest_runtest_logreport(report=report)
         item.ihook.pytest_runtest_logfinish(nodeid=item.nodeid, location=item.location)

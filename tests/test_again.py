@@ -23,7 +23,7 @@ def test_it(ready):
 """
 
 
-def _run(tmp_path: Path, body: str, times: int = 1) -> tuple[int, str]:
+def _run(tmp_path: Path, body: str, times: int = 1, options: tuple[str, ...] = ()) -> tuple[int, str]:
     for number in range(times):
         (tmp_path / f"test_late{number}.py").write_text(LATE.format(body=body))
     done = subprocess.run(  # noqa: PLW1510 - its exit code is what is asked for
@@ -40,6 +40,7 @@ def _run(tmp_path: Path, body: str, times: int = 1) -> tuple[int, str]:
             "/dev/null",
             "--rootdir",
             ".",
+            *options,
             ".",
         ],
         cwd=tmp_path,
@@ -116,3 +117,11 @@ def test_a_computer_that_stood_still_is_a_reason(tmp_path: Path) -> None:
     code, said = _run(tmp_path, freeze)
     assert code == 0, said
     assert "the computer stood still for 0." in said
+
+
+def test_each_of_the_two_runs_has_the_time_limit_and_only_that_test_fails(tmp_path: Path) -> None:
+    (tmp_path / "test_after.py").write_text("def test_after(): ...\n")
+    code, said = _run(tmp_path, "time.sleep(60)", options=("--timeout", "1", "--timeout-method", "signal"))
+    assert code == 1, said
+    assert "1 failed, 1 passed" in said
+    assert said.count("Failed: Timeout") > 2, said  # the first is told of in the summary
