@@ -66,10 +66,11 @@ class Eye:
 
 @pytest.fixture
 def arm(here: Container, there: Container) -> Arm:
-    """There, and known here."""
+    """There, and known here, as all of its container: what is announced now can be heard before what stood already."""
     provider = Arm()
     there.register(provider, "rosie.arm")
     here.find(where(name="reach"), wait_s=20)
+    here.find(where(name="set_tracing", group="trade", container="there"), wait_s=20)
     return provider
 
 
