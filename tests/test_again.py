@@ -52,11 +52,14 @@ def _run(tmp_path: Path, body: str, times: int = 1, options: tuple[str, ...] = (
     return done.returncode, done.stdout
 
 
-def test_what_was_late_once_runs_again_and_is_told(tmp_path: Path) -> None:
-    code, said = _run(tmp_path, "assert not first, 'its driver was held up for 0.35 s'")
-    assert code == 0, said
-    assert "ran twice: 1" in said
-    assert "test_late0.py::test_it: it said: was held up for 0.35 s" in said
+@pytest.mark.parametrize(
+    "said", ["was held up for 0.35 s", "did not answer on /dev/x within 251 ms", "did not answer within 36 ms"]
+)
+def test_what_was_late_once_runs_again_and_is_told(tmp_path: Path, said: str) -> None:
+    code, told = _run(tmp_path, f"assert not first, 'its driver {said}'")
+    assert code == 0, told
+    assert "ran twice: 1" in told
+    assert f"test_late0.py::test_it: it said: {said}" in told
 
 
 def test_one_that_failed_without_such_a_reason_is_let_off_and_shown(tmp_path: Path) -> None:
