@@ -18,11 +18,15 @@ parts:
   supervisor what ten children cost their gateway; a driver that crashed until it serves again, beside a plain start
   arm        set-points a second that reach the controller of an arm, beside a bare loop of the vendor's library
 
-Progress goes to stderr, tables and targets (met or missed) to stdout. Peers that are not installed are skipped.
+Progress goes to stderr, tables and targets (met or missed) to stdout, all targets once more at the end. Peers that are
+not installed are skipped. A part that fails is told and the others go on; then the exit code is 1.
 """
 
 import argparse
+import sys
+import traceback
 from collections.abc import Callable, Mapping
+from pathlib import Path
 
 from tests.bench import (
     _arm,
@@ -41,6 +45,8 @@ from tests.bench import (
     _supervisor,
     _watching,
 )
+from tests.bench._record import Clock
+from tests.bench._report import begin_part, print_all_targets, print_skipped, this_run
 
 _SERVICES_EACH = 10
 
@@ -69,7 +75,7 @@ _PARTS: Mapping[str, Callable[[argparse.Namespace], None]] = {
     "supervisor": lambda options: _supervisor.run(max(1, options.rounds // 2), options.idle),
     "arm": lambda options: _arm.run(max(1, options.rounds // 2), 2 * options.seconds),
 }
-_QUICK = {"n": 200, "rounds": 8, "seconds": 1.5, "idle": 20.0}
+_QUICK = {"n": 250, "rounds": 8, "seconds": 1.5, "idle": 20.0}
 _FULL = {"n": 500, "rounds": 20, "seconds": 3.0, "idle": 60.0}
 
 
@@ -88,15 +94,35 @@ def main() -> None:
         "--idle", type=float, help=f"seconds for an idle gateway ({_QUICK['idle']}, full {_FULL['idle']})"
     )
     parser.add_argument("--services", type=int, default=10_000, help="of the registry part (default: %(default)s)")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write what was measured, for compare and page")
     options = parser.parse_args()
     if unknown := set(options.parts) - set(_PARTS):
         parser.error(f"there is no part {', '.join(unknown)}; there are {', '.join(_PARTS)}")
     for name, default in (_FULL if options.full else _QUICK).items():
         if getattr(options, name) is None:
             setattr(options, name, default)
-    for part, run in _PARTS.items():
-        if not options.parts or part in options.parts:
-            run(options)
+    sys.exit(_run(options))
+
+
+def _run(options: argparse.Namespace) -> int:
+    """All parts that are asked for; gives how many failed, at most one. What is measured is written after each."""
+    clock, run, failed = Clock(), this_run(), 0
+    run.arguments = [word for word in sys.argv[1:] if not word.endswith(".json") and word != "--json"]
+    for part in _PARTS:
+        if options.parts and part not in options.parts:
+            continue
+        begin_part(part)
+        try:
+            _PARTS[part](options)
+        except Exception as bad:  # noqa: BLE001 - hours of other parts are not lost with it
+            traceback.print_exc()
+            print_skipped(part, f"it failed: {type(bad).__name__}: {bad}")
+            failed = 1
+        clock.stop(run)
+        if options.json:
+            run.write(options.json)
+    print_all_targets()
+    return failed
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ from typing import Final
 
 import psutil
 from tests.bench._children import child, hear
-from tests.bench._report import print_target
+from tests.bench._report import keep_point, print_target
 from tests.bench._site import ADDRESSES, SECURE, SYSTEM, Site
 
 _ROSIE: Final = Path(__file__).parents[2] / "examples" / "rosie.toml"
@@ -48,6 +48,7 @@ def run(site: Site, door: int, seconds: float) -> None:
         core, wakes, mib = _load(process, seconds)
     print(f"\nidle gateway, {known} services known across it, over {seconds:.0f} s:")
     print(f"{process.num_threads()} threads, of which one wakes {wakes:.0f} times a second")
+    keep_point("idle gateway", f"{known} services known", 1, {"MiB": [mib], "% of a core": [core], "wakes/s": [wakes]})
     print_target("idle gateway: RSS, MiB", [mib], f"at most {_MOST_MIB:.0f}", lambda mib: mib <= _MOST_MIB)
     print_target("idle gateway: % of a core", [core], f"at most {_MOST_CORE:.0f}", lambda share: share <= _MOST_CORE)
 

@@ -34,8 +34,11 @@ class Peer(ABC):
     """The network namespaces that its ends run in; by default the bench's own."""
 
     @property
-    def missing(self) -> bool:
-        return bool(self.needs) and find_spec(self.needs) is None
+    def missing(self) -> str:
+        """Why it cannot run here; empty where it can."""
+        if self.needs and find_spec(self.needs) is None:
+            return f"the module {self.needs} is not installed"
+        return ""
 
     @abstractmethod
     def serve(self) -> AbstractContextManager[str]:

@@ -15,6 +15,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Final
 
+from tests.bench._report import print_skipped
 from tests.certificates import Papers
 from tests.system.networks import Networks, why_not
 
@@ -130,7 +131,7 @@ def _end(process: "subprocess.Popen[bytes]") -> None:
 def site() -> Iterator[Site | None]:
     """Lay the networks; all is gone at the end. None, and the reason is said, where that cannot be."""
     if reason := why_not():
-        print(f"gateway: skipped, {reason}")
+        print_skipped("gateway", reason)
         yield None
         return
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:

@@ -7,9 +7,12 @@ import sys
 from pathlib import Path
 
 import pytest
+import tests.bench.__main__ as bench_main
 from tests.bench._calls import up
 from tests.bench._flood import FLOODS
 from tests.bench._others import Rpyc
+from tests.bench._record import Run
+from tests.bench._report import print_target, this_run
 from tests.system.networks import why_not
 
 ROOT = Path(__file__).parents[2]
@@ -26,6 +29,30 @@ def bench(*arguments: str, timeout_s: float = 100) -> str:
     return done.stdout
 
 
+def test_a_part_that_fails_is_told_and_the_others_go_on(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(_: object) -> None:
+        raise RuntimeError("no such bus")
+
+    def succeed(_: object) -> None:
+        print_target("quick", [1.0], "at most 2", lambda x: x <= 2)
+
+    monkeypatch.setattr(sys, "argv", ["bench", "--json", str(tmp_path / "run.json")])
+    monkeypatch.setattr(bench_main, "_PARTS", {"servo": fail, "local": succeed})
+    this_run.cache_clear()
+    with pytest.raises(SystemExit) as ended:
+        bench_main.main()
+    this_run.cache_clear()
+    run = Run.read(tmp_path / "run.json")
+    assert ended.value.code == 1
+    assert [(one.part, one.name, one.reason) for one in run.skipped] == [
+        ("servo", "servo", "it failed: RuntimeError: no such bus")
+    ]
+    assert [(one.part, one.name, one.met) for one in run.targets] == [("local", "quick", True)]
+    assert "all targets: 1 met, 0 missed" in capsys.readouterr().out
+
+
 PEERS = ("raw TCP", "bare zenoh pair", "TRADE ", "rpyc", "Pyro5", "gRPC")
 SIZES = ("64 B", "4 KiB", "64 KiB", "2 MiB")
 
@@ -34,16 +61,18 @@ def test_the_bench_of_calls_prints_every_peer_and_every_target() -> None:
     printed = bench("calls", "-n", "3", "--rounds", "1")
     for peer in (*PEERS, "TRADE, local"):
         assert printed.count(f"\n{peer}") == len(SIZES)
-    assert targets(printed) == [
-        f"{size}: {what}" for size in SIZES for what in ("p50 / bare pair", "CPU / bare pair", "p50 / rpyc")
-    ]
+    each = ("p50 / bare pair", "CPU / bare pair", "p50 / rpyc")
+    small = (*each, "p50 / Pyro5", "p50 / gRPC", "p99 / p50")
+    of_size = {"64 B": small, "4 KiB": each, "64 KiB": each, "2 MiB": ("speed / bare pair", "p50 / rpyc")}
+    assert targets(printed) == [f"{size}: {what}" for size in SIZES for what in of_size[size]]
 
 
 def test_the_bench_of_calls_in_flight_prints_every_peer_and_every_target() -> None:
     printed = bench("in-flight", "-n", "3", "--rounds", "1")
     for peer in (*PEERS, "TRADE, threads"):
         assert len(re.findall(rf"^{peer}[^:]*$", printed, re.MULTILINE)) == len(SIZES)
-    assert targets(printed) == ["TRADE: rate / bare pair", "TRADE, threads: rate / bare pair"] * len(SIZES)
+    shares = [f"{size}, {who}: rate / bare pair" for size in SIZES for who in ("TRADE", "TRADE, threads")]
+    assert targets(printed) == [*shares[:2], "64 B, 32 in flight: /s", *shares[2:]]
 
 
 def test_the_bench_of_the_supervisor_prints_its_targets() -> None:
@@ -60,9 +89,17 @@ def test_a_peer_that_is_not_installed_is_named_and_skipped(
     assert capsys.readouterr().out == "rpyc: skipped, the module no_such_module is not installed\n"
 
 
-def test_the_bench_of_local_calls_prints_its_targets() -> None:
-    printed = bench("local", "-n", "3", "--rounds", "1")
+def test_the_bench_of_local_calls_prints_its_targets_and_writes_them_with_its_points(tmp_path: Path) -> None:
+    printed = bench("local", "-n", "3", "--rounds", "2", "--json", str(tmp_path / "run.json"))
     assert targets(printed) == ["local, strict: us a call", "local, not strict: us a call"]
+    run = Run.read(tmp_path / "run.json")
+    assert [target.name for target in run.targets] == targets(printed)
+    assert [(point.part, point.name) for point in run.points] == [
+        ("local", name) for name in ("plain method", "strict", "strict=False")
+    ]
+    assert all(point.n == 2 * 50 * 3 and point.values["us"].rounds == 2 for point in run.points)
+    assert run.took_s is not None
+    assert run.arguments == ["local", "-n", "3", "--rounds", "2"]
 
 
 def test_the_bench_of_the_registry_prints_its_targets() -> None:
@@ -106,7 +143,7 @@ def test_the_bench_of_the_servo_bus_prints_its_targets() -> None:
     printed = bench("servo", "-n", "3", "--rounds", "1", "--seconds", "0.05")
     assert "156 bytes a cycle" in printed
     assert "190 bytes a cycle" in printed
-    assert printed.count("target") == 3
+    assert targets(printed) == ["fast sync / limit", "CPU at 100 Hz, fast", "CPU at 100 Hz, plain"]
 
 
 def test_the_bench_of_the_Feetech_bus_prints_its_targets() -> None:
@@ -118,7 +155,7 @@ def test_the_bench_of_the_Feetech_bus_prints_its_targets() -> None:
 def test_the_bench_of_arms_prints_its_targets() -> None:
     pytest.importorskip("rtde_control", reason="ur-rtde has no wheel for this platform")
     printed = bench("arm", "--rounds", "1", "--seconds", "0.5")
-    assert targets(printed) == ["set-points/s, driver", "set-points/s, bare library", "CPU of the driver, cores"]
+    assert targets(printed) == ["set-points/s, driver"]
 
 
 @pytest.mark.timeout(300)
