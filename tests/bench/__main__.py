@@ -1,8 +1,9 @@
 """Speed as ratios against peers in the same run. Numbers are printed, never asserted.
 
 parts:
-  calls      one remote call at a time, of 64 B to 2 MiB: raw TCP, the bare transport, ours, rpyc, Pyro5, gRPC
+  calls      one remote call at a time, of 64 B to 2 MiB: raw TCP, the bare transport, ours, rpyc, Pyro5, gRPC, rospy
   in-flight  the same with 32 calls under way: calls/s as a share of the bare transport's
+  checks     what certificates and a policy, 1 and 10 hooks, and a lock that is held add to a call
   local      a call in the same container, of three numbers
   registry   10,000 services as a late joiner sees them: time, memory, finding one (--full: of 10,000 providers, too)
   deadman    how long a joint moves on after its client was killed or frozen
@@ -33,6 +34,7 @@ from tests.bench import (
     _audit,
     _calls,
     _cans,
+    _checks,
     _deadman,
     _feetech,
     _gateway,
@@ -60,6 +62,7 @@ def _run_registry(options: argparse.Namespace) -> None:
 _PARTS: Mapping[str, Callable[[argparse.Namespace], None]] = {
     "calls": lambda options: _calls.run(options.n, options.rounds),
     "in-flight": lambda options: _calls.run_in_flight(options.n, options.rounds),
+    "checks": lambda options: _checks.run(options.n, options.rounds),
     "local": lambda options: _local.run(50 * options.n, options.rounds),
     "registry": _run_registry,
     "deadman": lambda options: _deadman.run(options.rounds),

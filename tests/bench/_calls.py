@@ -14,12 +14,14 @@ from tests.bench._children import Job, Round, Running, running
 from tests.bench._links import Peer
 from tests.bench._others import Grpc, Pyro5, Rpyc
 from tests.bench._ours import LocalTrade, Trade, TradeThreads
-from tests.bench._peers import BarePair, Tcp
+from tests.bench._peers import BarePair, BareQuery, Tcp
 from tests.bench._places import own_folder
 from tests.bench._report import keep_point, print_skipped, print_target
+from tests.bench._ros1 import Rospy
 
-_PEERS: Final[Sequence[Peer]] = (Tcp(), BarePair(), Trade(), Rpyc(), Pyro5(), Grpc(), LocalTrade())
-_IN_FLIGHT_PEERS: Final[Sequence[Peer]] = (Tcp(), BarePair(), Trade(), TradeThreads(), Rpyc(), Pyro5(), Grpc())
+_OTHERS: Final[Sequence[Peer]] = (Rpyc(), Pyro5(), Grpc(), Rospy())
+_PEERS: Final[Sequence[Peer]] = (Tcp(), BarePair(), BareQuery(), Trade(), *_OTHERS, LocalTrade())
+_IN_FLIGHT_PEERS: Final[Sequence[Peer]] = (Tcp(), BarePair(), BareQuery(), Trade(), TradeThreads(), *_OTHERS)
 _IN_FLIGHT: Final = 32
 _SMALL, _LARGE = 64, 2 * 1024 * 1024
 _SIZES: Final = {_SMALL: 1.0, 4096: 1.0, 65_536: 0.5, _LARGE: 0.05}
@@ -98,14 +100,14 @@ def print_latency(title: str, results: Results, job: Job, bare_name: str = BareP
     """Print and keep the p50, p99 and CPU of each, and their ratios to the bare pair of the same round."""
     bare = results[bare_name]
     print(f"\n{title}: medians over {len(bare)} rounds of {job.n} calls; x: times the {bare_name}'s p50 or CPU")
-    print(f"{'':18}{'p50':>10}{'p99':>11}{'CPU':>11}{'p50':>8}{'p99':>8}{'CPU':>8}")
+    print(f"{'':22}{'p50':>10}{'p99':>11}{'CPU':>11}{'p50':>8}{'p99':>8}{'CPU':>8}")
     for name, rounds in results.items():
         values = latency(rounds) | {
             f"{what} / bare": ratios(rounds, bare, *of) for what, of in (("p50", P50), ("p99", _P99), ("CPU", CPU))
         }
         us, x = list(values.values())[:3], list(values.values())[3:]
         shown = "".join(f"{median(each):8.1f} us" for each in us) + "".join(f"{median(each):7.2f}x" for each in x)
-        print(f"{name:17}{shown}")
+        print(f"{name:21}{shown}")
         keep_point(title, name, job.n * len(rounds), values)
 
 
@@ -122,7 +124,7 @@ def print_rate(title: str, results: Results, job: Job, bare_name: str = BarePair
     """Print and keep the calls a second and CPU of each, and their ratios to the bare pair of the same round."""
     bare = results[bare_name]
     print(f"\n{title}: medians over {len(bare)} rounds of {job.n} calls; x: times the {bare_name}'s rate or CPU")
-    print(f"{'':18}{'calls/s':>10}{'CPU a call':>13}{'rate':>8}{'CPU':>8}")
+    print(f"{'':22}{'calls/s':>10}{'CPU a call':>13}{'rate':>8}{'CPU':>8}")
     for name, rounds in results.items():
         values = {
             "calls/s": [one.calls_per_s for one in rounds],
@@ -131,7 +133,7 @@ def print_rate(title: str, results: Results, job: Job, bare_name: str = BarePair
             "CPU / bare": ratios(rounds, bare, *CPU),
         }
         rate, cpu_us, *x = (median(each) for each in values.values())
-        print(f"{name:18}{rate:10.0f}{cpu_us:10.1f} us" + "".join(f"{each:7.2f}x" for each in x))
+        print(f"{name:22}{rate:10.0f}{cpu_us:10.1f} us" + "".join(f"{each:7.2f}x" for each in x))
         keep_point(title, name, job.n * len(rounds), values)
 
 

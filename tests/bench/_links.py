@@ -30,6 +30,8 @@ class Peer(ABC):
     name: str
     needs = ""
     """The module without which it cannot run."""
+    python = ""
+    """Another Python that both ends run under."""
     server_at = caller_at = ""
     """The network namespaces that its ends run in; by default the bench's own."""
 

@@ -6,13 +6,17 @@ import subprocess
 import sys
 from pathlib import Path
 
+import psutil
 import pytest
 import tests.bench.__main__ as bench_main
 from tests.bench._calls import up
+from tests.bench._children import Job
 from tests.bench._flood import FLOODS
 from tests.bench._others import Rpyc
 from tests.bench._record import Run
 from tests.bench._report import print_target, this_run
+from tests.bench._ros1 import Rospy
+from tests.ros1_stand import need_ros1
 from tests.system.networks import why_not
 
 ROOT = Path(__file__).parents[2]
@@ -53,7 +57,7 @@ def test_a_part_that_fails_is_told_and_the_others_go_on(
     assert "all targets: 1 met, 0 missed" in capsys.readouterr().out
 
 
-PEERS = ("raw TCP", "bare zenoh pair", "TRADE ", "rpyc", "Pyro5", "gRPC")
+PEERS = ("raw TCP", "bare zenoh pair", "bare zenoh query", "TRADE ", "rpyc", "Pyro5", "gRPC")
 SIZES = ("64 B", "4 KiB", "64 KiB", "2 MiB")
 
 
@@ -75,6 +79,13 @@ def test_the_bench_of_calls_in_flight_prints_every_peer_and_every_target() -> No
     assert targets(printed) == [*shares[:2], "64 B, 32 in flight: /s", *shares[2:]]
 
 
+def test_the_bench_of_checks_prints_each_thing_that_may_be_added_to_a_call() -> None:
+    printed = bench("checks", "-n", "3", "--rounds", "1")
+    for kind in ("lock held", "hooks: 1 ", "hooks: 10", "TLS and policy"):
+        assert len(re.findall(rf"^TRADE, {kind} .*[1-9].*x$", printed, re.MULTILINE)) == 1
+    assert len(re.findall(r"takes +[0-9.]+ x the p50", printed)) == 5
+
+
 def test_the_bench_of_the_supervisor_prints_its_targets() -> None:
     printed = bench("supervisor", "--rounds", "1", "--idle", "1")
     assert targets(printed) == ["supervisor: % of a core", "crash to serving, s", "crash to serving / plain start"]
@@ -87,6 +98,17 @@ def test_a_peer_that_is_not_installed_is_named_and_skipped(
     with up([Rpyc()]) as peers:
         assert peers == []
     assert capsys.readouterr().out == "rpyc: skipped, the module no_such_module is not installed\n"
+
+
+def test_rospy_answers_under_the_Python_that_it_is_installed_for_and_its_master_ends_with_it() -> None:
+    need_ros1()
+    with up([Rospy()]) as [rospy]:
+        alone, many = rospy.run(Job(64, 5)), rospy.run(Job(4096, 40, in_flight=4))
+        [master] = [one for one in psutil.Process().children(recursive=True) if "/usr/bin/rosmaster" in one.cmdline()]
+    assert not master.is_running()
+    assert alone.p50_us > 0
+    assert many.calls_per_s > 0
+    assert many.cpu_us > 0
 
 
 def test_the_bench_of_local_calls_prints_its_targets_and_writes_them_with_its_points(tmp_path: Path) -> None:
