@@ -26,7 +26,8 @@ not installed are skipped. A part that fails is told and the others go on; then 
 import argparse
 import sys
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 
 from tests.bench import (
@@ -40,6 +41,7 @@ from tests.bench import (
     _gateway,
     _local,
     _locks,
+    _plots,
     _registry,
     _rosie,
     _servo,
@@ -98,6 +100,7 @@ def main() -> None:
     )
     parser.add_argument("--services", type=int, default=10_000, help="of the registry part (default: %(default)s)")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write what was measured, for compare and page")
+    parser.add_argument("--html", type=Path, metavar="FILE", help="write a page with plots of it")
     options = parser.parse_args()
     if unknown := set(options.parts) - set(_PARTS):
         parser.error(f"there is no part {', '.join(unknown)}; there are {', '.join(_PARTS)}")
@@ -110,7 +113,7 @@ def main() -> None:
 def _run(options: argparse.Namespace) -> int:
     """All parts that are asked for; gives how many failed, at most one. What is measured is written after each."""
     clock, run, failed = Clock(), this_run(), 0
-    run.arguments = [word for word in sys.argv[1:] if not word.endswith(".json") and word != "--json"]
+    run.arguments = _without_files(sys.argv[1:])
     for part in _PARTS:
         if options.parts and part not in options.parts:
             continue
@@ -124,8 +127,16 @@ def _run(options: argparse.Namespace) -> int:
         clock.stop(run)
         if options.json:
             run.write(options.json)
+        if options.html:
+            options.html.parent.mkdir(parents=True, exist_ok=True)
+            options.html.write_text(_plots.page(run))
     print_all_targets()
     return failed
+
+
+def _without_files(words: Sequence[str]) -> list[str]:
+    """Where a run is written is no part of what it is."""
+    return [word for before, word in pairwise(["", *words]) if not {before, word} & {"--json", "--html"}]
 
 
 if __name__ == "__main__":

@@ -52,7 +52,7 @@ def run(n: int, rounds: int) -> None:
     """
     with up(_PEERS) as peers:
         for size, share in _SIZES.items():
-            job = Job(size, _worth(n, rounds, share))
+            job = Job(size, worth(n, rounds, share))
             results = measure(f"calls of {NAMES[size]}", peers, job, rounds)
             print_latency(f"remote call of {NAMES[size]}", results, job)
             _print_latency_targets(results, size)
@@ -62,14 +62,14 @@ def run_in_flight(n: int, rounds: int) -> None:
     """Measure and print the rate of calls of which 32 are under way; as above, but of large ones, too, at least 32."""
     with up(_IN_FLIGHT_PEERS) as peers:
         for size, share in _SIZES.items():
-            job = Job(size, max(min(n, _IN_FLIGHT), _worth(n, rounds, share)), _IN_FLIGHT)
+            job = Job(size, max(min(n, _IN_FLIGHT), worth(n, rounds, share)), _IN_FLIGHT)
             results = measure(f"{_IN_FLIGHT} in flight of {NAMES[size]}", peers, job, rounds)
             print_rate(f"{_IN_FLIGHT} calls of {NAMES[size]} in flight", results, job)
             _print_rate_targets(results, size)
 
 
-def _worth(n: int, rounds: int, share: float) -> int:
-    """Calls of a round."""
+def worth(n: int, rounds: int, share: float) -> int:
+    """Calls of a round, of those asked for."""
     return max(1, int(n * share), min(n, ceil(_ENOUGH / rounds)))
 
 

@@ -65,6 +65,7 @@ class Site:
         self.folder = folder
         self._networks = networks
         self._stack = stack
+        self._processes: dict[int, subprocess.Popen[bytes]] = {}
         for network, hosts in ADDRESSES.items():
             networks.lay(network, **hosts)
         papers = Papers(folder / "pki")
@@ -109,11 +110,16 @@ class Site:
         command = ["ip", "netns", "exec", self.host(host), sys.executable, *words]
         places = {"TRADE_RUNTIME_DIR": str(self.folder / runtime), "TRADE_STATE_DIR": str(self.folder / runtime)}
         process = subprocess.Popen(command, stdout=subprocess.PIPE, env={**os.environ, **places, **environment})
+        self._processes[process.pid] = process
         self._stack.callback(_end, process)
         assert process.stdout is not None
         if not json.loads(process.stdout.readline() or b"null"):
             raise RuntimeError(f"{' '.join(words)} did not begin; see above")
         return process.pid  # `ip netns exec` becomes the program
+
+    def end(self, pid: int) -> None:
+        """What was begun and is not to run beside what comes next."""
+        _end(self._processes[pid])
 
 
 def _end(process: "subprocess.Popen[bytes]") -> None:
