@@ -76,5 +76,9 @@ bench-compare: $(UV) ## what differs from an older run by more than noise (BASE=
 bench-page: $(UV) ## docs/performance.md and its pictures, of docs/performance.json (made by make bench ARGS="--full --json docs/performance.json")
 	@$(RUN) python -m tests.bench.page $(ARGS)
 
+build/viam/bin/python: $(UV)
+	@$(UV) venv -q $(@D)/..
+	@$(UV) pip install -q --python $@ 'viam-sdk==0.85.1'
+
 clean: ## remove environments and caches
 	rm -rf .uv .venv .pytest_cache .ruff_cache .hypothesis build dist

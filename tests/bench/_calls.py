@@ -18,8 +18,9 @@ from tests.bench._peers import BarePair, BareQuery, Tcp
 from tests.bench._places import own_folder
 from tests.bench._report import keep_point, print_skipped, print_target
 from tests.bench._ros1 import Rospy
+from tests.bench._viam import Viam
 
-_OTHERS: Final[Sequence[Peer]] = (Rpyc(), Pyro5(), Grpc(), Rospy())
+_OTHERS: Final[Sequence[Peer]] = (Rpyc(), Pyro5(), Grpc(), Rospy(), Viam())
 _PEERS: Final[Sequence[Peer]] = (Tcp(), BarePair(), BareQuery(), Trade(), *_OTHERS, LocalTrade())
 _IN_FLIGHT_PEERS: Final[Sequence[Peer]] = (Tcp(), BarePair(), BareQuery(), Trade(), TradeThreads(), *_OTHERS)
 _IN_FLIGHT: Final = 32
@@ -31,7 +32,7 @@ _ENOUGH: Final = 2000
 """Calls of a point in all rounds together, unless fewer are asked for."""
 
 _MOST_P50, _MOST_P99, _MOST_CPU = 1.3, 3.0, 1.5
-_MOST_OF_OTHERS: Final = {Rpyc.name: 1.0, Pyro5.name: 0.5, Grpc.name: 0.2}
+_MOST_OF_OTHERS: Final = {Rpyc.name: 1.0, Pyro5.name: 0.5, Grpc.name: 0.2, Viam.name: 0.2}
 _LEAST_SPEED, _LEAST_SHARE, _LEAST_RATE = 0.6, 0.6, 9000
 
 P50 = ("p50_us", "p50_us")

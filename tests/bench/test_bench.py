@@ -16,6 +16,7 @@ from tests.bench._others import Rpyc
 from tests.bench._record import Run
 from tests.bench._report import print_target, this_run
 from tests.bench._ros1 import Rospy
+from tests.bench._viam import Viam
 from tests.ros1_stand import need_ros1
 from tests.system.networks import why_not
 
@@ -66,7 +67,8 @@ def test_the_bench_of_calls_prints_every_peer_and_every_target() -> None:
     for peer in (*PEERS, "TRADE, local"):
         assert printed.count(f"\n{peer}") == len(SIZES)
     each = ("p50 / bare pair", "CPU / bare pair", "p50 / rpyc")
-    small = (*each, "p50 / Pyro5", "p50 / gRPC", "p99 / p50")
+    others = ["Pyro5", "gRPC"] if Viam().missing else ["Pyro5", "gRPC", Viam.name]
+    small = (*each, *(f"p50 / {other}" for other in others), "p99 / p50")
     of_size = {"64 B": small, "4 KiB": each, "64 KiB": each, "2 MiB": ("speed / bare pair", "p50 / rpyc")}
     assert targets(printed) == [f"{size}: {what}" for size in SIZES for what in of_size[size]]
 
@@ -109,6 +111,15 @@ def test_rospy_answers_under_the_Python_that_it_is_installed_for_and_its_master_
     assert alone.p50_us > 0
     assert many.calls_per_s > 0
     assert many.cpu_us > 0
+
+
+def test_the_Viam_SDK_answers_in_an_environment_of_its_own() -> None:
+    if why := Viam().missing:
+        pytest.skip(why)
+    with up([Viam()]) as [viam]:
+        alone, many = viam.run(Job(64, 5)), viam.run(Job(4096, 40, in_flight=4))
+    assert alone.p50_us > 0
+    assert many.calls_per_s > 0
 
 
 def test_the_bench_of_local_calls_prints_its_targets_and_writes_them_with_its_points(tmp_path: Path) -> None:
