@@ -34,7 +34,7 @@ took on one machine in one hour; the ratios carry further than the times do. How
 ## The run
 
 {about}
-It took {minutes:.0f} minutes: `python -m tests.bench {arguments}`. Versions: {versions}.
+It took {minutes:.0f} minutes: `{command}`. Versions: {versions}.
 
 - A remote call goes from one process to another on this machine, over loopback; between hosts it is between network
   namespaces with a cable between them.
@@ -88,7 +88,7 @@ def written(run: Run, reasons: Mapping[str, Reason]) -> str:
     head = _HEAD.format(
         about=about(run),
         minutes=(run.took_s or 0) / 60,
-        arguments=" ".join(run.arguments),
+        command=" ".join(["python -m tests.bench", *run.arguments]),
         versions=", ".join(f"{name} {version}" for name, version in run.versions.items()),
     )
     return "\n".join([head.rstrip(), *_targets(run, reasons), *_measured(run), *_skipped(run)]) + "\n"
