@@ -102,6 +102,16 @@ def test_a_peer_that_is_not_installed_is_named_and_skipped(
     assert capsys.readouterr().out == "rpyc: skipped, the module no_such_module is not installed\n"
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="the kernel's figures of threads are Linux's")
+def test_what_each_thread_of_a_call_takes_is_printed_for_both_ends() -> None:
+    command = [sys.executable, "-m", "tests.bench.threads", "-n", "50"]
+    printed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=100, check=True).stdout
+    for peer in ("bare zenoh pair", "TRADE", "TRADE, threads"):
+        [block] = re.findall(rf"^{peer}: 50 calls.*\n((?:  .*\n)+)", printed, re.MULTILINE)
+        assert {"server", "caller"} == {line.split()[0] for line in block.splitlines()}
+        assert "python, main" in block
+
+
 def test_rospy_answers_under_the_Python_that_it_is_installed_for_and_its_master_ends_with_it() -> None:
     need_ros1()
     with up([Rospy()]) as [rospy]:
