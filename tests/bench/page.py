@@ -166,6 +166,8 @@ def main() -> None:
     for target in run.missed:
         if target.name not in reasons:
             print(f"missed without an explanation in {_WHY.name}: {target.name}")
+    for name in reasons.keys() - {target.name for target in run.targets}:
+        print(f"explained in {_WHY.name}, and not in this run: {name}")
 
 
 if __name__ == "__main__":
