@@ -21,6 +21,19 @@ def begin_part(name: str) -> None:
     _part = name
 
 
+def mark() -> tuple[int, int, int]:
+    """How far the run is, for `forget_since`."""
+    run = this_run()
+    return len(run.points), len(run.targets), len(run.skipped)
+
+
+def forget_since(marked: tuple[int, int, int]) -> None:
+    """What was told since then is told once more, or not at all."""
+    run = this_run()
+    for told, count in zip((run.points, run.targets, run.skipped), marked, strict=True):
+        del told[count:]
+
+
 def keep_point(case: str, name: str, n: int, values: Mapping[str, Sequence[float]]) -> None:
     """What was measured, a figure for each round.
 

@@ -4,6 +4,7 @@ import os
 import re
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import psutil
@@ -34,28 +35,49 @@ def bench(*arguments: str, timeout_s: float = 100) -> str:
     return done.stdout
 
 
-def test_a_part_that_fails_is_told_and_the_others_go_on(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def fail(_: object) -> None:
-        raise RuntimeError("no such bus")
-
-    def succeed(_: object) -> None:
-        print_target("quick", [1.0], "at most 2", lambda x: x <= 2)
-
-    monkeypatch.setattr(sys, "argv", ["bench", "--json", str(tmp_path / "run.json")])
-    monkeypatch.setattr(bench_main, "_PARTS", {"servo": fail, "local": succeed})
+def run_of(parts: dict[str, Callable[[object], None]], folder: Path) -> tuple[int, Run]:
+    """The exit code of a bench with these parts alone, and what it wrote."""
     this_run.cache_clear()
-    with pytest.raises(SystemExit) as ended:
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit) as ended:
+        patch.setattr(sys, "argv", ["bench", "--json", str(folder / "run.json")])
+        patch.setattr(bench_main, "_PARTS", parts)
         bench_main.main()
     this_run.cache_clear()
-    run = Run.read(tmp_path / "run.json")
-    assert ended.value.code == 1
+    return int(ended.value.code or 0), Run.read(folder / "run.json")
+
+
+def succeed(_: object) -> None:
+    print_target("quick", [1.0], "at most 2", lambda x: x <= 2)
+
+
+def test_a_part_that_fails_twice_is_told_and_the_others_go_on(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(_: object) -> None:
+        print_target("half done", [1.0], "at most 2", lambda x: x <= 2)
+        raise RuntimeError("no such bus")
+
+    code, run = run_of({"servo": fail, "local": succeed}, tmp_path)
+    assert code == 1
     assert [(one.part, one.name, one.reason) for one in run.skipped] == [
         ("servo", "servo", "it failed: RuntimeError: no such bus")
     ]
     assert [(one.part, one.name, one.met) for one in run.targets] == [("local", "quick", True)]
     assert "all targets: 1 met, 0 missed" in capsys.readouterr().out
+
+
+def test_a_part_that_fails_once_is_measured_anew(tmp_path: Path) -> None:
+    attempts = iter((True, False))
+
+    def fail_first(_: object) -> None:
+        succeed(_)
+        if next(attempts):
+            raise RuntimeError("a servo did not answer")
+
+    code, run = run_of({"servo": fail_first}, tmp_path)
+    assert code == 0
+    assert [one.name for one in run.targets] == ["quick"]
+    assert run.skipped == []
 
 
 PEERS = ("raw TCP", "bare zenoh pair", "bare zenoh query", "TRADE ", "rpyc", "Pyro5", "gRPC")
