@@ -91,7 +91,7 @@ def main() -> None:
         prog="python -m tests.bench", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("parts", nargs="*", metavar="part", help=f"{', '.join(_PARTS)}; all of them by default")
-    parser.add_argument("--full", action="store_true", help="longer rounds and more of them: some fifteen minutes")
+    parser.add_argument("--full", action="store_true", help="longer rounds and more of them: some forty minutes")
     parser.add_argument("-n", type=int, help=f"calls or cycles in a round ({_QUICK['n']}, full {_FULL['n']})")
     parser.add_argument("--rounds", type=int, help=f"turns of each peer ({_QUICK['rounds']}, full {_FULL['rounds']})")
     parser.add_argument(

@@ -46,8 +46,9 @@ class Round:
 class Running:
     """A peer whose processes are up."""
 
-    def __init__(self, name: str, server: Connection, caller: Connection) -> None:
-        self.name = name
+    def __init__(self, peer: Peer, server: Connection, caller: Connection) -> None:
+        self.name = peer.name
+        self.most_bytes = peer.most_bytes
         self._server = server
         self._caller = caller
 
@@ -71,7 +72,7 @@ def running(peer: Peer) -> Iterator[Running]:
         _child_of(peer, peer.caller_at, _call, peer, hear(server)) as caller,
     ):
         hear(caller)
-        yield Running(peer.name, server, caller)
+        yield Running(peer, server, caller)
 
 
 def _child_of(peer: Peer, inside: str, main, *args: object) -> AbstractContextManager[Connection]:

@@ -30,6 +30,8 @@ class Peer(ABC):
     name: str
     needs = ""
     """The module without which it cannot run."""
+    most_bytes = 1 << 30
+    """Larger calls of it are left out, because they would take minutes."""
     python = ""
     """Another Python that both ends run under."""
     server_at = caller_at = ""

@@ -25,6 +25,7 @@ class Viam(Peer):
 
     name = "Viam SDK"
     python = str(_PYTHON)
+    most_bytes = 1 << 20  # 2 MiB take 0.1 to 0.2 s
 
     @property
     def missing(self) -> str:

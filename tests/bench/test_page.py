@@ -108,9 +108,12 @@ def test_the_page_in_docs_is_what_the_run_beside_it_gives() -> None:
         assert (DOCS / name).read_text() == text, f"{name}: make bench-page"
 
 
-def test_targets_have_names_of_their_own_as_reasons_go_by_them() -> None:
-    names = [target.name for target in Run.read(DOCS / "performance.json").targets]
-    assert len(set(names)) == len(names)
+def test_targets_and_points_have_names_of_their_own_as_reasons_and_comparisons_go_by_them() -> None:
+    run = Run.read(DOCS / "performance.json")
+    targets = [target.name for target in run.targets]
+    points = [(point.part, point.case, point.name) for point in run.points]
+    assert len(set(targets)) == len(targets)
+    assert len(set(points)) == len(points)
 
 
 def test_the_command_writes_the_page_and_names_what_is_missed_without_a_reason(
