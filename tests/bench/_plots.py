@@ -17,6 +17,8 @@ _OURS, _BARE, _OTHER, _GRID, _TEXT = "#1261c4", "#333b45", "#8a929c", "#e3e6ea",
 _FONT: Final = "font-family='system-ui, sans-serif'"
 _RINGS: Final = {"p50, us": "p99, us", "call p50, ms": "call p99, ms"}
 """What is shown by a ring beside what is shown by a dot."""
+_STEPS: Final = ((1,), (1, 2, 5), (1, 1.5, 2, 3, 4, 5, 6, 8))
+_FEWEST_TICKS: Final = 3
 PICTURES: Final = {"calls": "calls", "in-flight": "in-flight", "checks": "checks", "gateway": "gateways"}
 """Parts of which the documentation has a picture, and its name."""
 
@@ -73,7 +75,8 @@ def page(run: Run) -> str:
         f"<td{'' if one.met else ' class=missed'}>{'met' if one.met else 'missed'}</tr>"
         for one in run.targets
     )
-    plots = (f"<h2>{escape(part)}</h2>\n{_drawn(part, cases)}" for part, cases in _parts(run))
+    drawn = ((part, _drawn(part, cases)) for part, cases in _parts(run))
+    plots = (f"<h2>{escape(part)}</h2>\n{svg}" for part, svg in drawn if svg)
     return _PAGE.format(
         title="Speed of TRADE",
         text=_TEXT,
@@ -87,7 +90,8 @@ def page(run: Run) -> str:
 
 def pictures(run: Run) -> dict[str, str]:
     """SVG by name, of the parts that the documentation shows."""
-    return {PICTURES[part]: _drawn(part, cases) for part, cases in _parts(run) if part in PICTURES}
+    drawn = {PICTURES[part]: _drawn(part, cases) for part, cases in _parts(run) if part in PICTURES}
+    return {name: svg for name, svg in drawn.items() if svg}
 
 
 def _parts(run: Run) -> Iterator[tuple[str, dict[str, list[Point]]]]:
@@ -99,13 +103,15 @@ def _parts(run: Run) -> Iterator[tuple[str, dict[str, list[Point]]]]:
 
 
 def _drawn(part: str, cases: Mapping[str, Sequence[Point]]) -> str:
-    """One chart below the other."""
+    """One chart below the other; empty where there is nothing to compare."""
     charts: list[str] = []
     y = 0
     for case, points in cases.items():
         for what, those in _by_figure(points):
             charts.append(f"<g transform='translate(0 {y})'>{_chart(case, what, those)}</g>")
             y += _TOP + _ROW * len(those) + _FOOT
+    if not charts:
+        return ""
     return (
         f"<svg xmlns='http://www.w3.org/2000/svg' viewBox='0 0 {_WIDTH} {y}' width='{_WIDTH}' height='{y}' "
         f"role='img' aria-label='{escape(part)}'>\n<rect width='100%' height='100%' fill='white'/>\n"
@@ -115,11 +121,11 @@ def _drawn(part: str, cases: Mapping[str, Sequence[Point]]) -> str:
 
 
 def _by_figure(points: Sequence[Point]) -> Iterator[tuple[str, list[Point]]]:
-    """Points that have the same first figure stand on one scale."""
+    """Points that have the same first figure stand on one scale; one alone needs none."""
     firsts: dict[str, list[Point]] = {}
     for point in points:
         firsts.setdefault(next(iter(point.values)), []).append(point)
-    return iter(firsts.items())
+    return ((what, those) for what, those in firsts.items() if len(those) > 1)
 
 
 def _chart(case: str, what: str, points: Sequence[Point]) -> str:
@@ -175,8 +181,12 @@ class _Scale:
         return _LEFT + share * (_WIDTH - _LEFT - _RIGHT)
 
     def ticks(self) -> list[float]:
-        """Powers of ten, with 2 and 5 where the range is short."""
-        wide = self._high - self._low > 3
-        decades = range(math.floor(self._low), math.ceil(self._high) + 1)
-        steps = (1,) if wide else (1, 2, 5)
-        return [m * 10.0**d for d in decades for m in steps if self._low <= math.log10(m * 10.0**d) <= self._high]
+        """Powers of ten; closer where there would be fewer than three."""
+        ticks: list[float] = []
+        for steps in _STEPS:
+            decades = range(math.floor(self._low), math.ceil(self._high) + 1)
+            all_of_them = (step * 10.0**decade for decade in decades for step in steps)
+            ticks = [tick for tick in all_of_them if self._low <= math.log10(tick) <= self._high]
+            if len(ticks) >= _FEWEST_TICKS:
+                break
+        return ticks

@@ -112,9 +112,10 @@ def _row(target: Target) -> tuple[str, ...]:
 
 
 def _measured(run: Run) -> Iterator[str]:
+    drawn = pictures(run)
     for part, points in groupby(run.points, lambda one: one.part):
         yield f"\n## {_PARTS.get(part, part)}"
-        if part in PICTURES:
+        if PICTURES.get(part) in drawn:
             yield f"\n![{_PARTS[part]}](pictures/performance-{PICTURES[part]}.svg)"
         cases: dict[str, list[Point]] = {}
         for point in points:

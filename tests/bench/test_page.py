@@ -29,6 +29,8 @@ def a_run(**changes: object) -> Run:
             Point("calls", "remote call of 64 B", "raw <TCP>", 2000, {"p50, us": FAST, "p99, us": SLOW}),
             Point("calls", "remote call of 64 B", "TRADE", 2000, {"p50, us": SLOW, "CPU / bare": FAST}),
             Point("can", "500 Hz, 1 TPDO", "empty loop", 8, {"late, %": Spread.of([0.0])}),
+            Point("can", "500 Hz, 1 TPDO", "six drives", 9, {"late, %": Spread.of([0.5])}),
+            Point("rosie", "on their way", "all drivers", 7, {"% of a core": FAST}),
         ],
         targets=[
             Target("calls", "64 B: p50 / bare pair", "at most 1.3", Spread.of([1.1, 1.2]), True),
@@ -97,6 +99,7 @@ def test_pictures_show_every_point_in_order_and_stay_within_their_frame() -> Non
 def test_the_page_of_plots_has_all_parts_and_needs_nothing_from_elsewhere() -> None:
     text = html(a_run())
     assert text.count("<svg") == 2
+    assert "<h2>rosie" not in text  # a figure alone is no plot
     assert "raw &lt;TCP&gt;" in text
     assert "1 met, 3 missed" in text
     assert not re.search(r"<script|src=|href=|url\(", text)
