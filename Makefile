@@ -14,7 +14,7 @@ ARGS ?=
 SEED ?= 1
 MINUTES ?= 3
 
-.PHONY: demo screenshots test test-socketcan soak-registry soak-relocation chaos chaos-robots check bench clean
+.PHONY: demo screenshots test test-socketcan soak-registry soak-relocation chaos chaos-robots check bench bench-compare bench-page clean
 .DEFAULT_GOAL := help
 
 help: ## show the targets
@@ -67,8 +67,18 @@ check: $(UV) ## lint, formatting, types, import rules, isolated install of the c
 screenshots: $(UV) ## the pictures of README and docs, of a simulated robot in a browser (needs chromium)
 	@$(RUN) python docs/pictures/take.py
 
-bench: $(UV) ## speed as ratios against peers in the same run
-	@$(RUN) python -m tests.bench $(ARGS)
+bench: $(UV) ## speed as ratios against peers in the same run, and all targets; leaves build/bench.json and .html
+	@$(RUN) python -m tests.bench --json build/bench.json --html build/bench.html $(ARGS)
+
+bench-compare: $(UV) ## what differs from an older run by more than noise (BASE=old.json; ARGS=new.json)
+	@$(RUN) python -m tests.bench.compare $(or $(BASE),$(error BASE=old.json is missing)) $(or $(ARGS),build/bench.json)
+
+bench-page: $(UV) ## docs/performance.md and its pictures, of docs/performance.json (made by make bench ARGS="--full --json docs/performance.json")
+	@$(RUN) python -m tests.bench.page $(ARGS)
+
+build/viam/bin/python: $(UV)
+	@$(UV) venv -q $(@D)/..
+	@$(UV) pip install -q --python $@ 'viam-sdk==0.85.1'
 
 clean: ## remove environments and caches
 	rm -rf .uv .venv .pytest_cache .ruff_cache .hypothesis build dist

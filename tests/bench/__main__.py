@@ -1,8 +1,9 @@
 """Speed as ratios against peers in the same run. Numbers are printed, never asserted.
 
 parts:
-  calls      one remote call at a time, of 64 B to 2 MiB: raw TCP, the bare transport, ours, rpyc, Pyro5, gRPC
+  calls      one remote call at a time, of 64 B to 2 MiB: raw TCP, the bare transport, ours, rpyc, Pyro5, gRPC, rospy
   in-flight  the same with 32 calls under way: calls/s as a share of the bare transport's
+  checks     what certificates and a policy, 1 and 10 hooks, and a lock that is held add to a call
   local      a call in the same container, of three numbers
   registry   10,000 services as a late joiner sees them: time, memory, finding one (--full: of 10,000 providers, too)
   deadman    how long a joint moves on after its client was killed or frozen
@@ -18,22 +19,30 @@ parts:
   supervisor what ten children cost their gateway; a driver that crashed until it serves again, beside a plain start
   arm        set-points a second that reach the controller of an arm, beside a bare loop of the vendor's library
 
-Progress goes to stderr, tables and targets (met or missed) to stdout. Peers that are not installed are skipped.
+Progress goes to stderr, tables and targets (met or missed) to stdout, all targets once more at the end. Peers that are
+not installed are skipped. A part that fails is tried once more; if it fails again the others go on, and the exit
+code is 1 in the end.
 """
 
 import argparse
-from collections.abc import Callable, Mapping
+import sys
+import traceback
+from collections.abc import Callable, Mapping, Sequence
+from itertools import pairwise
+from pathlib import Path
 
 from tests.bench import (
     _arm,
     _audit,
     _calls,
     _cans,
+    _checks,
     _deadman,
     _feetech,
     _gateway,
     _local,
     _locks,
+    _plots,
     _registry,
     _rosie,
     _servo,
@@ -41,6 +50,8 @@ from tests.bench import (
     _supervisor,
     _watching,
 )
+from tests.bench._record import Clock
+from tests.bench._report import begin_part, forget_since, mark, print_all_targets, print_skipped, this_run
 
 _SERVICES_EACH = 10
 
@@ -54,6 +65,7 @@ def _run_registry(options: argparse.Namespace) -> None:
 _PARTS: Mapping[str, Callable[[argparse.Namespace], None]] = {
     "calls": lambda options: _calls.run(options.n, options.rounds),
     "in-flight": lambda options: _calls.run_in_flight(options.n, options.rounds),
+    "checks": lambda options: _checks.run(options.n, options.rounds),
     "local": lambda options: _local.run(50 * options.n, options.rounds),
     "registry": _run_registry,
     "deadman": lambda options: _deadman.run(options.rounds),
@@ -69,7 +81,8 @@ _PARTS: Mapping[str, Callable[[argparse.Namespace], None]] = {
     "supervisor": lambda options: _supervisor.run(max(1, options.rounds // 2), options.idle),
     "arm": lambda options: _arm.run(max(1, options.rounds // 2), 2 * options.seconds),
 }
-_QUICK = {"n": 200, "rounds": 8, "seconds": 1.5, "idle": 20.0}
+_ATTEMPTS = 2
+_QUICK = {"n": 250, "rounds": 8, "seconds": 1.5, "idle": 20.0}
 _FULL = {"n": 500, "rounds": 20, "seconds": 3.0, "idle": 60.0}
 
 
@@ -78,7 +91,7 @@ def main() -> None:
         prog="python -m tests.bench", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("parts", nargs="*", metavar="part", help=f"{', '.join(_PARTS)}; all of them by default")
-    parser.add_argument("--full", action="store_true", help="longer rounds and more of them: some fifteen minutes")
+    parser.add_argument("--full", action="store_true", help="longer rounds and more of them: some forty minutes")
     parser.add_argument("-n", type=int, help=f"calls or cycles in a round ({_QUICK['n']}, full {_FULL['n']})")
     parser.add_argument("--rounds", type=int, help=f"turns of each peer ({_QUICK['rounds']}, full {_FULL['rounds']})")
     parser.add_argument(
@@ -88,15 +101,55 @@ def main() -> None:
         "--idle", type=float, help=f"seconds for an idle gateway ({_QUICK['idle']}, full {_FULL['idle']})"
     )
     parser.add_argument("--services", type=int, default=10_000, help="of the registry part (default: %(default)s)")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write what was measured, for compare and page")
+    parser.add_argument("--html", type=Path, metavar="FILE", help="write a page with plots of it")
     options = parser.parse_args()
     if unknown := set(options.parts) - set(_PARTS):
         parser.error(f"there is no part {', '.join(unknown)}; there are {', '.join(_PARTS)}")
     for name, default in (_FULL if options.full else _QUICK).items():
         if getattr(options, name) is None:
             setattr(options, name, default)
-    for part, run in _PARTS.items():
-        if not options.parts or part in options.parts:
-            run(options)
+    sys.exit(_run(options))
+
+
+def _run(options: argparse.Namespace) -> int:
+    """All parts that are asked for; gives how many failed, at most one. What is measured is written after each."""
+    clock, run, failed = Clock(), this_run(), 0
+    run.arguments = _without_files(sys.argv[1:])
+    for part in _PARTS:
+        if options.parts and part not in options.parts:
+            continue
+        begin_part(part)
+        failed |= not _succeeds(part, options)
+        clock.stop(run)
+        if options.json:
+            run.write(options.json)
+        if options.html:
+            options.html.parent.mkdir(parents=True, exist_ok=True)
+            options.html.write_text(_plots.page(run))
+    print_all_targets()
+    return failed
+
+
+def _succeeds(part: str, options: argparse.Namespace) -> bool:
+    """Run a part, and once more if it fails: a busy machine loses devices. Of a failure its reason is left."""
+    for attempt in range(_ATTEMPTS):
+        before = mark()
+        try:
+            _PARTS[part](options)
+        except Exception as bad:  # noqa: BLE001 - what the other parts measured is not lost with it
+            traceback.print_exc()
+            forget_since(before)
+            if attempt == _ATTEMPTS - 1:
+                print_skipped(part, f"it failed: {type(bad).__name__}: {bad}")
+        else:
+            return True
+    return False
+
+
+def _without_files(words: Sequence[str]) -> list[str]:
+    """Where a run is written is no part of what it is."""
+    return [word for before, word in pairwise(["", *words]) if not {before, word} & {"--json", "--html"}]
 
 
 if __name__ == "__main__":

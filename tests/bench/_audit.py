@@ -3,6 +3,7 @@
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from statistics import median, quantiles
 from typing import Final
@@ -10,7 +11,7 @@ from typing import Final
 from tests.bench._alone import alone
 from tests.bench._children import child, hear
 from tests.bench._places import own_folder
-from tests.bench._report import print_target
+from tests.bench._report import keep_point, print_target
 
 _SYSTEM: Final = "bench-audit"
 _OFF, _ON = "off", "on"
@@ -33,11 +34,17 @@ def run(n: int, rounds: int, seconds: float) -> None:
     for name, pairs in results.items():
         p50, p99 = (median(values) for values in zip(*pairs, strict=True))
         print(f"audit {name:10}{p50:8.1f} us, p99 {p99:8.1f} us")
+        keep_point("a call to another process", f"audit {name}", n * rounds, _by_name(pairs))
     for i, what in enumerate(("p50", "p99")):
         shares = [on[i] / off[i] for on, off in zip(results[_ON], results[_OFF], strict=True)]
         print_target(f"{what}: audit on / off", shares, f"at most {_MOST:g}", lambda share: share <= _MOST)
     print(f"{_RATE} records/s for {seconds:g} s: {lost} lost, {cpu:.0f} % of a core")
+    keep_point(f"{_RATE} records/s", "written", int(_RATE * seconds), {"records/s": [written], "% of a core": [cpu]})
     print_target("records/s written", [written], f"at least {0.99 * _RATE:g}", lambda rate: rate >= 0.99 * _RATE)
+
+
+def _by_name(pairs: Sequence[tuple[float, float]]) -> dict[str, Sequence[float]]:
+    return {"p50, us": [p50 for p50, _ in pairs], "p99, us": [p99 for _, p99 in pairs]}
 
 
 def _serve(pipe, name: str, folder: str) -> None:

@@ -15,7 +15,7 @@ from itertools import pairwise
 from pathlib import Path
 from statistics import median
 
-from tests.bench._report import print_target
+from tests.bench._report import keep_point, print_target
 
 from trade.errors import DeviceError, TradeError
 from trade_drivers import Motor, Tolerances, Trajectory, TrajectoryPoint
@@ -174,6 +174,14 @@ def _print(
         p50, p99 = ordered[len(ordered) // 2], ordered[len(ordered) * 99 // 100]
         print(f"  cycle, ms: p50 {1e3 * p50:.2f}  p99 {1e3 * p99:.2f}  period {1e3 / rate_hz:.2f}")
         print(f"  processor time of the driver, ms a cycle: {1e3 * median(spent_s):.2f}")
+        values = {
+            "p50, ms": [1e3 * p50],
+            "p99, ms": [1e3 * p99],
+            "CPU, ms": [1e3 * one for one in spent_s],
+            "late, %": late,
+        }
+        keep_point(f"{rate_hz} Hz, {tpdos} TPDO", "cycle of six drives", len(ordered), values)
+    keep_point(f"{rate_hz} Hz, {tpdos} TPDO", "empty loop", len(empty), {"late, %": empty})
     print(f"  late in an empty loop: {median(empty):.2f} % ({min(empty):.2f}-{max(empty):.2f})")
     what = f"late at {rate_hz} Hz, {tpdos} TPDO, %"
     print_target(what, late, f"below {_MOST_LATE:g}", lambda share: share < _MOST_LATE)

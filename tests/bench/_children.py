@@ -5,9 +5,10 @@ import multiprocessing
 import os
 import random
 import statistics
+import subprocess
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -15,7 +16,9 @@ from pathlib import Path
 from tests.bench._links import Link, Peer, check
 
 _SPAWN = multiprocessing.get_context("spawn")
+_ROOT = Path(__file__).parents[2]
 _PATIENCE_S = 60.0
+_END_S = 5.0
 _NETWORK = 0x40000000
 """CLONE_NEWNET of setns(2): os.setns came with Python 3.12."""
 
@@ -43,8 +46,9 @@ class Round:
 class Running:
     """A peer whose processes are up."""
 
-    def __init__(self, name: str, server: Connection, caller: Connection) -> None:
-        self.name = name
+    def __init__(self, peer: Peer, server: Connection, caller: Connection) -> None:
+        self.name = peer.name
+        self.most_bytes = peer.most_bytes
         self._server = server
         self._caller = caller
 
@@ -64,11 +68,43 @@ class Running:
 def running(peer: Peer) -> Iterator[Running]:
     """Start both processes of a peer. Raises RuntimeError if one of them does not come up."""
     with (
-        child(_serve, peer, inside=peer.server_at) as server,
-        child(_call, peer, hear(server), inside=peer.caller_at) as caller,
+        _child_of(peer, peer.server_at, _serve, peer) as server,
+        _child_of(peer, peer.caller_at, _call, peer, hear(server)) as caller,
     ):
         hear(caller)
-        yield Running(peer.name, server, caller)
+        yield Running(peer, server, caller)
+
+
+def _child_of(peer: Peer, inside: str, main, *args: object) -> AbstractContextManager[Connection]:
+    return _elsewhere(peer.python, main, *args) if peer.python else child(main, *args, inside=inside)
+
+
+@contextmanager
+def _elsewhere(python: str, main, *args: object) -> Iterator[Connection]:
+    """The same under another Python, which sees this repository and its own libraries, and none of ours."""
+    ours, theirs = _SPAWN.Pipe()
+    code = f"from tests.bench._children import begin; begin({theirs.fileno()})"
+    others = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
+    environment = {**others, "PYTHONPATH": str(_ROOT), "PYTHONDONTWRITEBYTECODE": "1"}
+    process = subprocess.Popen([python, "-c", code], env=environment, pass_fds=[theirs.fileno()])
+    theirs.close()
+    try:
+        ours.send((main, args))
+        yield ours
+    finally:
+        ours.close()  # which ends it
+        try:
+            process.wait(_END_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+
+
+def begin(pipe: int) -> None:
+    """What such a process does first: hear what it is for, on a pipe of this number."""
+    told = Connection(pipe)
+    main, args = told.recv()
+    main(told, *args)
 
 
 @contextmanager
@@ -82,7 +118,7 @@ def child(main, *args: object, inside: str = "") -> Iterator[Connection]:
         yield ours
     finally:
         ours.close()  # which ends it
-        process.join(5)
+        process.join(_END_S)
         if process.is_alive():
             process.kill()
             process.join()

@@ -15,7 +15,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from statistics import quantiles
 
-from tests.bench._report import print_target
+from tests.bench._report import keep_point, print_target
 
 import trade
 from trade_hil_sim import SimProcess, events
@@ -46,6 +46,7 @@ def run(rounds: int) -> None:
     print(f"deadman: seconds from the client's end to the joint's rest, {rounds} rounds; 95th percentile of each")
     for (end, how), seconds in results.items():
         most = _SIGNALS[end][1]
+        keep_point("end of a client to rest", f"{end} in a {how}", rounds, {"s": seconds})
         p95 = quantiles(seconds, n=20, method="inclusive")[-1] if len(seconds) > 1 else seconds[0]
         print_target(
             f"{end} in a {how}", [min(seconds), p95, max(seconds)], f"at most {most}", lambda x, m=most: x <= m

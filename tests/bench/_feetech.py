@@ -14,7 +14,7 @@ from pathlib import Path
 from statistics import median
 
 import serial
-from tests.bench._report import print_target
+from tests.bench._report import keep_point, print_target
 from tests.bench._servo import Cycle, _cycles_per_s, _load, _measure, _range
 
 from trade_drivers.feetech import open_exchange
@@ -74,9 +74,11 @@ def run(cycles: int, rounds: int, seconds: float) -> None:
     shares = {who: [hz / limit for hz in found] for (who, _), found in speeds.items()}
     for (who, _), found in speeds.items():
         print(f"    {who:10} {median(found):6.0f} cycles/s {_range(shares[who])} of the limit")
+        keep_point(f"{_COUNT} servos", who, cycles * rounds, {"cycles/s": found, "of the wire": shares[who]})
     wanted = f"at least {_LEAST_SHARE}"
     print_target("Feetech sync / limit", shares["driver"], wanted, lambda share: share >= _LEAST_SHARE)
     [load] = loads.values()
+    keep_point(f"{_RATE_HZ} Hz", "driver", len(load), {"% of a core": [100 * one for one in load]})
     print_target(f"CPU at {_RATE_HZ} Hz, Feetech", load, f"at most {_MOST_CPU}", lambda share: share <= _MOST_CPU)
 
 

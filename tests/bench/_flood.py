@@ -14,7 +14,7 @@ from typing import Any, Final
 
 from tests.bench._across import bare_session
 from tests.bench._children import child, hear
-from tests.bench._report import print_target
+from tests.bench._report import keep_point, print_target
 from tests.bench._site import ADDRESSES, SECURE, SYSTEM, Site
 
 RATE_HZ: Final = 50_000
@@ -267,6 +267,7 @@ def _print(results: Mapping[str, Sequence[Felt]], n: int) -> None:
         rates = [statistics.median(getattr(one, what) for one in rounds) for what in ("sent_hz", "ran_hz")]
         widths = (9, 8, 10, 8, 8)
         shown = "".join(f"{statistics.median(x):{w}.1f}" for x, w in zip(times, widths, strict=True))
+        _keep(name, rounds)
         print(f"{name:20}{shown}{lost:6}{rates[0]:9.0f}{rates[1]:8.0f}")
     quiet = results[_QUIET]
     for flood in FLOODS:
@@ -275,6 +276,17 @@ def _print(results: Mapping[str, Sequence[Felt]], n: int) -> None:
         print_target(f"{flood.name}: call p99 / none", x, f"below {_MOST_TIMES_P99:.0f}", lambda x: x < _MOST_TIMES_P99)
         most = [max(one.stop_ms) for one in felt]
         print_target(f"{flood.name}: stop, ms", most, f"below {_MOST_STOP_MS:.0f}", lambda ms: ms < _MOST_STOP_MS)
+
+
+def _keep(name: str, rounds: Sequence[Felt]) -> None:
+    values = {
+        "call p50, ms": [_at(50, one.call_ms) for one in rounds],
+        "call p99, ms": [_at(99, one.call_ms) for one in rounds],
+        "stop p50, ms": [_at(50, one.stop_ms) for one in rounds],
+        "stop most, ms": [max(one.stop_ms) for one in rounds],
+        "put/s": [one.sent_hz for one in rounds],
+    }
+    keep_point("beside a flood", name, sum(len(one.call_ms) for one in rounds), values)
 
 
 def _at(percent: int, values: Sequence[float]) -> float:

@@ -10,12 +10,13 @@ from typing import Final
 
 from tests.bench import _flood, _idle
 from tests.bench._across import BareAcross, TradeAcross
-from tests.bench._calls import CPU, P50, Results, measure, ratios, up
+from tests.bench._calls import CPU, P50, Results, measure, print_latency, print_rate, ratios, up, worth
 from tests.bench._children import Job, Running, child, hear
 from tests.bench._report import print_target
 from tests.bench._site import PLAIN, SECURE, Site, site
 
 _SIZE: Final = 64
+_LARGE_SIZE, _LARGE_SHARE = 2 * 1024 * 1024, 0.05
 _IN_FLIGHT: Final = 32
 _MOST_OF_DIRECT, _MOST_OF_BARE, _MOST_OF_DIRECT_TWO, _LEAST_RATE = 2.0, 1.2, 3.0, 5000
 
@@ -42,10 +43,19 @@ def run(n: int, rounds: int, idle_s: float) -> None:
 
 def _run_pairs(site: Site, n: int, rounds: int) -> None:
     with _up(site) as pairs:
-        _print(measure("calls through gateways", pairs, Job(_SIZE, n), rounds), n)
-        through = [pair for pair in pairs if pair.name in (_BARE_TLS, _DIRECT, _ONE_PLAIN, _ONE)]
+        job = Job(_SIZE, n)
+        results = measure("calls through gateways", pairs, job, rounds)
+        print_latency("remote call of 64 B between hosts", results, job, _BARE_TLS)
+        _print_costs(results)
+        secure = [pair for pair in pairs if pair.name in (_BARE_TLS, _DIRECT, _ONE, _TWO)]
+        job = Job(_LARGE_SIZE, worth(n, rounds, _LARGE_SHARE))
+        large = measure("calls of 2 MiB through gateways", secure, job, rounds)
+        print_latency("remote call of 2 MiB between hosts", large, job, _BARE_TLS)
+        through = [pair for pair in pairs if pair in secure or pair.name == _ONE_PLAIN]
         job = Job(_SIZE, max(n, _IN_FLIGHT), _IN_FLIGHT)
-        _print_rate(measure(f"{_IN_FLIGHT} in flight through a gateway", through, job, rounds))
+        many = measure(f"{_IN_FLIGHT} in flight through a gateway", through, job, rounds)
+        print_rate(f"{_IN_FLIGHT} calls of 64 B in flight between hosts", many, job, _BARE_TLS)
+        _print_rate_target(many)
 
 
 @contextmanager
@@ -74,15 +84,8 @@ def _route(pipe, pair: BareAcross) -> None:
     pair.route(pipe)
 
 
-def _print(results: Results, n: int) -> None:
-    rounds = len(results[_DIRECT])
-    print(f"\nremote call of {_SIZE} B between hosts: medians over {rounds} rounds of {n} calls")
-    print(f"{'':22}{'p50':>10}{'p99':>11}{'CPU of ends':>14}{'p50 / direct':>14}{'p50 / bare':>12}")
-    for name, measured in results.items():
-        us = [median(getattr(one, what) for one in measured) for what in ("p50_us", "p99_us", "cpu_us")]
-        x = [median(ratios(measured, results[other], *P50)) for other in (_DIRECT, _BARE_TLS)]
-        print(f"{name:22}{us[0]:7.1f} us{us[1]:8.1f} us{us[2]:11.1f} us{x[0]:13.2f}x{x[1]:11.2f}x")
-    print("bare: the pair with TLS; both kinds of direct call are between two hosts of one network")
+def _print_costs(results: Results) -> None:
+    print("both kinds of direct call are between two hosts of one network")
     for what, one, other in (
         ("TLS costs a bare pair", _BARE_TLS, _BARE),
         ("rules cost a bare pair", _BARE_RULES, _BARE_TLS),
@@ -101,9 +104,7 @@ def _print(results: Results, n: int) -> None:
         print_target(what, x, f"at most {most:.1f}", lambda x, most=most: x <= most)
 
 
-def _print_rate(results: Results) -> None:
-    rates = {name: [one.calls_per_s for one in measured] for name, measured in results.items()}
-    for name in (_BARE_TLS, _DIRECT, _ONE_PLAIN):
-        print(f"{_IN_FLIGHT} in flight, {name:20} {median(rates[name]):8.0f} calls/s")
+def _print_rate_target(results: Results) -> None:
     what = f"one gateway, {_IN_FLIGHT} in flight: /s"
-    print_target(what, rates[_ONE], f"at least {_LEAST_RATE}", lambda x: x >= _LEAST_RATE)
+    rates = [one.calls_per_s for one in results[_ONE]]
+    print_target(what, rates, f"at least {_LEAST_RATE}", lambda x: x >= _LEAST_RATE)

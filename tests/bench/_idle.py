@@ -8,7 +8,7 @@ from typing import Final
 
 import psutil
 from tests.bench._children import child, hear
-from tests.bench._report import print_target
+from tests.bench._report import keep_point, print_target
 from tests.bench._site import ADDRESSES, SECURE, SYSTEM, Site
 
 _ROSIE: Final = Path(__file__).parents[2] / "examples" / "rosie.toml"
@@ -24,7 +24,7 @@ def run(site: Site, door: int, seconds: float) -> None:
         door: its process id.
         seconds: how long it is looked at.
     """
-    site.begin(
+    robot = site.begin(
         "robot",
         "-m",
         "trade_gateway",
@@ -46,8 +46,10 @@ def run(site: Site, door: int, seconds: float) -> None:
         time.sleep(min(_SETTLE_S, seconds))
         print(f"idle gateway: {seconds:.0f} s", file=sys.stderr, flush=True)
         core, wakes, mib = _load(process, seconds)
+    site.end(robot)
     print(f"\nidle gateway, {known} services known across it, over {seconds:.0f} s:")
     print(f"{process.num_threads()} threads, of which one wakes {wakes:.0f} times a second")
+    keep_point("idle gateway", f"{known} services known", 1, {"MiB": [mib], "% of a core": [core], "wakes/s": [wakes]})
     print_target("idle gateway: RSS, MiB", [mib], f"at most {_MOST_MIB:.0f}", lambda mib: mib <= _MOST_MIB)
     print_target("idle gateway: % of a core", [core], f"at most {_MOST_CORE:.0f}", lambda share: share <= _MOST_CORE)
 
@@ -60,7 +62,7 @@ def _load(process: psutil.Process, seconds: float) -> tuple[float, float, float]
     after, took_s = process.cpu_times(), time.monotonic() - began
     spent_s = after.user + after.system - before.user - before.system
     return (
-        100 * spent_s / took_s,
+        100 * max(0.0, spent_s) / took_s,
         (_switches(process.pid) - switched) / took_s,
         process.memory_info().rss / 1024**2,
     )

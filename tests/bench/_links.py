@@ -30,12 +30,19 @@ class Peer(ABC):
     name: str
     needs = ""
     """The module without which it cannot run."""
+    most_bytes = 1 << 30
+    """Larger calls of it are left out, because they would take minutes."""
+    python = ""
+    """Another Python that both ends run under."""
     server_at = caller_at = ""
     """The network namespaces that its ends run in; by default the bench's own."""
 
     @property
-    def missing(self) -> bool:
-        return bool(self.needs) and find_spec(self.needs) is None
+    def missing(self) -> str:
+        """Why it cannot run here; empty where it can."""
+        if self.needs and find_spec(self.needs) is None:
+            return f"the module {self.needs} is not installed"
+        return ""
 
     @abstractmethod
     def serve(self) -> AbstractContextManager[str]:

@@ -8,7 +8,7 @@ from typing import Final
 
 from tests.bench._alone import alone
 from tests.bench._places import own_folder
-from tests.bench._report import print_target
+from tests.bench._report import keep_point, print_target
 
 _MOST_US: Final = 5.0
 _MOST_LENIENT_US: Final = 1.5
@@ -29,6 +29,7 @@ def run(n: int, rounds: int) -> None:
     print(f"\nlocal call of three numbers: medians over {rounds} rounds of {n} calls")
     for name, us in results.items():
         print(f"{name:16}{median(us):8.2f} us")
+        keep_point("a call of three numbers", name, n * rounds, {"us": us})
     strict, lenient = results[_STRICT], results[_LENIENT]
     print_target("local, strict: us a call", strict, f"at most {_MOST_US:.0f}", lambda us: us <= _MOST_US)
     print_target(

@@ -10,7 +10,7 @@ from typing import Final
 from tests.bench._alone import alone
 from tests.bench._children import child, hear
 from tests.bench._places import own_folder
-from tests.bench._report import print_target
+from tests.bench._report import keep_point, print_target
 
 _SYSTEM, _GROUP = "bench-locks", "bench"
 _HOSTS: Final = ("one", "other")
@@ -35,6 +35,7 @@ def run(n: int, rounds: int) -> None:
     print(f"\nfour services on two containers in processes of their own: medians over {rounds} rounds of {n}")
     for name, us in results.items():
         print(f"{name:16}{median(us):8.1f} us")
+        keep_point("four services of two containers", name, n * rounds, {"p50, us": us})
     pairs = list(zip(results[_LOCK], results[_CALL], results[_UNCHECKED], strict=True))
     costs = [lock / call for lock, call, _ in pairs]
     print_target("lock and unlock / call", costs, f"at most {_MOST_CALLS:g}", lambda share: share <= _MOST_CALLS)

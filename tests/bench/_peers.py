@@ -103,6 +103,52 @@ class _BareLink(Pipeline):
                 return answer[8:]
 
 
+class BareQuery(BarePair):
+    """The other way to call with zenoh alone: a query, and what answers it."""
+
+    name = "bare zenoh query"
+
+    @contextmanager
+    def serve(self) -> Iterator[str]:
+        endpoint = _free_endpoint()
+        with _bare_session(listen=endpoint) as session:
+            queryable = session.declare_queryable(_CALLS, _fifo())
+            threading.Thread(target=_reply_all, args=(queryable,), daemon=True).start()
+            yield endpoint
+
+    @contextmanager
+    def connect(self, address: str) -> Iterator[Link]:
+        import zenoh
+
+        with _bare_session(connect=address) as session:
+            querier = session.declare_querier(_CALLS, target=zenoh.QueryTarget.BEST_MATCHING)
+            _wait_until_heard(querier)
+            yield _QueryLink(querier)
+
+
+class _QueryLink(Pipeline):
+    def __init__(self, querier) -> None:
+        self._querier = querier
+
+    def begin(self, payload: bytes):
+        return self._querier.get(payload=payload)
+
+    def end(self, begun) -> bytes:
+        return begun.recv().ok.payload.to_bytes()
+
+
+def _reply_all(queryable) -> None:
+    import zenoh
+
+    try:
+        while True:
+            query = queryable.handler.recv()
+            query.reply(_CALLS, query.payload.to_bytes(), express=True)
+            query.drop()
+    except zenoh.ZError:  # closed
+        return
+
+
 def serve_bare(session, calls: str, replies: str) -> None:
     """Answer what comes on one key on another one, until the session closes."""
     heard, answers = session.declare_subscriber(calls, _fifo()), _declare(session, replies)
@@ -112,12 +158,16 @@ def serve_bare(session, calls: str, replies: str) -> None:
 def bare_link(session, calls: str, replies: str) -> Link:
     """The caller's end; raises RuntimeError if nobody comes to hear its calls."""
     heard, asked = session.declare_subscriber(replies, _fifo()), _declare(session, calls)
+    _wait_until_heard(asked)
+    return _BareLink(asked.put, heard.recv)
+
+
+def _wait_until_heard(asked) -> None:
     until = time.monotonic() + _PATIENCE_S
     while not asked.matching_status.matching:
         if time.monotonic() > until:
-            raise RuntimeError(f"nobody hears {calls}")
+            raise RuntimeError(f"nobody hears {asked.key_expr}")
         threading.Event().wait(0.01)
-    return _BareLink(asked.put, heard.recv)
 
 
 def _answer_all(calls, replies) -> None:

@@ -16,7 +16,7 @@ from pathlib import Path
 from statistics import median
 
 import serial
-from tests.bench._report import print_target
+from tests.bench._report import keep_point, print_target
 
 from trade_drivers.dynamixel import open_exchange
 from trade_drivers.robotfile import parse
@@ -210,14 +210,16 @@ def _print(
         for who in ("driver", "bare loop"):
             share = [hz / limit for hz in speeds[who, fast]]
             print(f"    {who:10} {median(speeds[who, fast]):6.0f} cycles/s {_range(share)} of the limit")
+            values = {"cycles/s": speeds[who, fast], "of the wire": share}
+            keep_point(f"{_COUNT} servos, {name}", who, rounds * cycles, values)
     for fast in (True, False):
         name = "fast" if fast else "plain"
         share = [hz / _limit_hz(fast) for hz in speeds["driver", fast]]
+        load = loads["driver", fast]
+        keep_point(f"{_RATE_HZ} Hz", f"driver, {name}", len(load), {"% of a core": [100 * one for one in load]})
         if fast:
             print_target("fast sync / limit", share, f"at least {_LEAST_SHARE}", lambda x: x >= _LEAST_SHARE)
-        print_target(
-            f"CPU at {_RATE_HZ} Hz, {name}", loads["driver", fast], f"at most {_MOST_CPU}", lambda x: x <= _MOST_CPU
-        )
+        print_target(f"CPU at {_RATE_HZ} Hz, {name}", load, f"at most {_MOST_CPU}", lambda x: x <= _MOST_CPU)
 
 
 def _range(values: Sequence[float]) -> str:

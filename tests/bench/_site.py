@@ -15,6 +15,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Final
 
+from tests.bench._report import print_skipped
 from tests.certificates import Papers
 from tests.system.networks import Networks, why_not
 
@@ -64,6 +65,7 @@ class Site:
         self.folder = folder
         self._networks = networks
         self._stack = stack
+        self._processes: dict[int, subprocess.Popen[bytes]] = {}
         for network, hosts in ADDRESSES.items():
             networks.lay(network, **hosts)
         papers = Papers(folder / "pki")
@@ -108,11 +110,16 @@ class Site:
         command = ["ip", "netns", "exec", self.host(host), sys.executable, *words]
         places = {"TRADE_RUNTIME_DIR": str(self.folder / runtime), "TRADE_STATE_DIR": str(self.folder / runtime)}
         process = subprocess.Popen(command, stdout=subprocess.PIPE, env={**os.environ, **places, **environment})
+        self._processes[process.pid] = process
         self._stack.callback(_end, process)
         assert process.stdout is not None
         if not json.loads(process.stdout.readline() or b"null"):
             raise RuntimeError(f"{' '.join(words)} did not begin; see above")
         return process.pid  # `ip netns exec` becomes the program
+
+    def end(self, pid: int) -> None:
+        """What was begun and is not to run beside what comes next."""
+        _end(self._processes[pid])
 
 
 def _end(process: "subprocess.Popen[bytes]") -> None:
@@ -130,7 +137,7 @@ def _end(process: "subprocess.Popen[bytes]") -> None:
 def site() -> Iterator[Site | None]:
     """Lay the networks; all is gone at the end. None, and the reason is said, where that cannot be."""
     if reason := why_not():
-        print(f"gateway: skipped, {reason}")
+        print_skipped("gateway", reason)
         yield None
         return
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:

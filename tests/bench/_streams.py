@@ -10,7 +10,7 @@ from typing import Final
 
 from tests.bench._children import child, hear
 from tests.bench._places import own_folder
-from tests.bench._report import print_target
+from tests.bench._report import keep_point, print_target
 
 _SYSTEM, _GROUP = "bench-streams", "bench"
 _JOINTS: Final = 12
@@ -43,6 +43,9 @@ def run(rounds: int, seconds: float) -> None:
     print(f"\na stream of {_JOINTS} joint states at {_HZ:g} Hz: processor of its source, medians over {rounds} rounds")
     for count, spent in cpu.items():
         print(f"{count} listeners     {100 * median(spent):6.2f} % ({100 * min(spent):.2f}-{100 * max(spent):.2f})")
+        keep_point(
+            f"{_JOINTS} joints at {_HZ:g} Hz", f"{count} listeners", rounds, {"% of a core": [100 * x for x in spent]}
+        )
     print(f"heard by each    {median(rates):6.1f} samples/s ({min(rates):.1f}-{max(rates):.1f})")
     ratios = [five / one for five, one in zip(cpu[_LISTENERS], cpu[1], strict=True)]
     print_target("five listeners / one", ratios, f"at most {_MOST:g}", lambda ratio: ratio <= _MOST)

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import psutil
-from tests.bench._report import print_target
+from tests.bench._report import keep_point, print_target
 
 from trade import Container, Settings, where
 
@@ -42,6 +42,9 @@ def run(rounds: int, seconds: float) -> None:
             shares = _overhead(file, system, environment, member, seconds)
             again, plain = _restarts(file, system, environment, member, rounds)
     print(f"\nsupervisor, {_CHILDREN} children over {seconds:.0f} s; {rounds} crashes of a simulated head:")
+    keep_point("a crash", "until it serves again", rounds, {"s": again})
+    keep_point("a crash", "a plain start", rounds, {"s": plain})
+    keep_point("idle", f"{_CHILDREN} children", 1, {"% of a core": shares})
     print_target("supervisor: % of a core", shares, f"at most {_MOST_CORE:g}", lambda share: share <= _MOST_CORE)
     print_target("crash to serving, s", again, f"at most {_MOST_S:g}", lambda took_s: took_s <= _MOST_S)
     ratios = [one / other for one, other in zip(again, plain, strict=True)]

@@ -8,7 +8,7 @@ from typing import Final
 
 from tests.bench._alone import alone
 from tests.bench._places import own_folder
-from tests.bench._report import print_target
+from tests.bench._report import keep_point, print_target
 
 _SYSTEM: Final = "bench-watching"
 _TICKS, _PERIOD_S = 1000, 0.1
@@ -29,10 +29,14 @@ def run(n: int, rounds: int, seconds: float) -> None:
         merged, cpu = alone(_measure_ticks, seconds)
         results = alone(_measure_hooks, n, rounds)
     print(f"\n{_TICKS} notifications, each every {_PERIOD_S:g} s, for {seconds:g} s: {cpu:.0f} % of a core")
+    keep_point(
+        f"{_TICKS} notifications", f"every {_PERIOD_S:g} s", _TICKS, {"% of a core": [cpu], "merged, %": [merged]}
+    )
     print_target("merged ticks, %", [merged], f"below {_MOST_MERGED:g}", lambda share: share < _MOST_MERGED)
     print(f"a call in the same container: medians over {rounds} rounds of {n}")
     for name, us in results.items():
         print(f"{name:20}{median(us):8.1f} us")
+        keep_point("a call in the same container", name, n * rounds, {"p50, us": us})
     shares = [other / none for other, none in zip(results[_ELSEWHERE], results[_NONE], strict=True)]
     target = f"at most {_MOST_ELSEWHERE:g}"
     print_target("another watched / none", shares, target, lambda share: share <= _MOST_ELSEWHERE)

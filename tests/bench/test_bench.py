@@ -4,12 +4,21 @@ import os
 import re
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
+import psutil
 import pytest
+import tests.bench.__main__ as bench_main
 from tests.bench._calls import up
+from tests.bench._children import Job
 from tests.bench._flood import FLOODS
 from tests.bench._others import Rpyc
+from tests.bench._record import Run
+from tests.bench._report import print_target, this_run
+from tests.bench._ros1 import Rospy
+from tests.bench._viam import Viam
+from tests.ros1_stand import need_ros1
 from tests.system.networks import why_not
 
 ROOT = Path(__file__).parents[2]
@@ -26,7 +35,52 @@ def bench(*arguments: str, timeout_s: float = 100) -> str:
     return done.stdout
 
 
-PEERS = ("raw TCP", "bare zenoh pair", "TRADE ", "rpyc", "Pyro5", "gRPC")
+def run_of(parts: dict[str, Callable[[object], None]], folder: Path) -> tuple[int, Run]:
+    """The exit code of a bench with these parts alone, and what it wrote."""
+    this_run.cache_clear()
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit) as ended:
+        patch.setattr(sys, "argv", ["bench", "--json", str(folder / "run.json")])
+        patch.setattr(bench_main, "_PARTS", parts)
+        bench_main.main()
+    this_run.cache_clear()
+    return int(ended.value.code or 0), Run.read(folder / "run.json")
+
+
+def succeed(_: object) -> None:
+    print_target("quick", [1.0], "at most 2", lambda x: x <= 2)
+
+
+def test_a_part_that_fails_twice_is_told_and_the_others_go_on(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(_: object) -> None:
+        print_target("half done", [1.0], "at most 2", lambda x: x <= 2)
+        raise RuntimeError("no such bus")
+
+    code, run = run_of({"servo": fail, "local": succeed}, tmp_path)
+    assert code == 1
+    assert [(one.part, one.name, one.reason) for one in run.skipped] == [
+        ("servo", "servo", "it failed: RuntimeError: no such bus")
+    ]
+    assert [(one.part, one.name, one.met) for one in run.targets] == [("local", "quick", True)]
+    assert "all targets: 1 met, 0 missed" in capsys.readouterr().out
+
+
+def test_a_part_that_fails_once_is_measured_anew(tmp_path: Path) -> None:
+    attempts = iter((True, False))
+
+    def fail_first(_: object) -> None:
+        succeed(_)
+        if next(attempts):
+            raise RuntimeError("a servo did not answer")
+
+    code, run = run_of({"servo": fail_first}, tmp_path)
+    assert code == 0
+    assert [one.name for one in run.targets] == ["quick"]
+    assert run.skipped == []
+
+
+PEERS = ("raw TCP", "bare zenoh pair", "bare zenoh query", "TRADE ", "rpyc", "Pyro5", "gRPC")
 SIZES = ("64 B", "4 KiB", "64 KiB", "2 MiB")
 
 
@@ -34,16 +88,26 @@ def test_the_bench_of_calls_prints_every_peer_and_every_target() -> None:
     printed = bench("calls", "-n", "3", "--rounds", "1")
     for peer in (*PEERS, "TRADE, local"):
         assert printed.count(f"\n{peer}") == len(SIZES)
-    assert targets(printed) == [
-        f"{size}: {what}" for size in SIZES for what in ("p50 / bare pair", "CPU / bare pair", "p50 / rpyc")
-    ]
+    each = ("p50 / bare pair", "CPU / bare pair", "p50 / rpyc")
+    others = ["Pyro5", "gRPC"] if Viam().missing else ["Pyro5", "gRPC", Viam.name]
+    small = (*each, *(f"p50 / {other}" for other in others), "p99 / p50")
+    of_size = {"64 B": small, "4 KiB": each, "64 KiB": each, "2 MiB": ("speed / bare pair", "p50 / rpyc")}
+    assert targets(printed) == [f"{size}: {what}" for size in SIZES for what in of_size[size]]
 
 
 def test_the_bench_of_calls_in_flight_prints_every_peer_and_every_target() -> None:
     printed = bench("in-flight", "-n", "3", "--rounds", "1")
     for peer in (*PEERS, "TRADE, threads"):
         assert len(re.findall(rf"^{peer}[^:]*$", printed, re.MULTILINE)) == len(SIZES)
-    assert targets(printed) == ["TRADE: rate / bare pair", "TRADE, threads: rate / bare pair"] * len(SIZES)
+    shares = [f"{size}, {who}: rate / bare pair" for size in SIZES for who in ("TRADE", "TRADE, threads")]
+    assert targets(printed) == [*shares[:2], "64 B, 32 in flight: /s", *shares[2:]]
+
+
+def test_the_bench_of_checks_prints_each_thing_that_may_be_added_to_a_call() -> None:
+    printed = bench("checks", "-n", "3", "--rounds", "1")
+    for kind in ("lock held", "hooks: 1 ", "hooks: 10", "TLS and policy"):
+        assert len(re.findall(rf"^TRADE, {kind} .*[1-9].*x$", printed, re.MULTILINE)) == 1
+    assert len(re.findall(r"takes +[0-9.]+ x the p50", printed)) == 5
 
 
 def test_the_bench_of_the_supervisor_prints_its_targets() -> None:
@@ -60,9 +124,47 @@ def test_a_peer_that_is_not_installed_is_named_and_skipped(
     assert capsys.readouterr().out == "rpyc: skipped, the module no_such_module is not installed\n"
 
 
-def test_the_bench_of_local_calls_prints_its_targets() -> None:
-    printed = bench("local", "-n", "3", "--rounds", "1")
+@pytest.mark.skipif(sys.platform != "linux", reason="the kernel's figures of threads are Linux's")
+def test_what_each_thread_of_a_call_takes_is_printed_for_both_ends() -> None:
+    command = [sys.executable, "-m", "tests.bench.threads", "-n", "50"]
+    printed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=100, check=True).stdout
+    for peer in ("bare zenoh pair", "TRADE", "TRADE, threads"):
+        [block] = re.findall(rf"^{peer}: 50 calls.*\n((?:  .*\n)+)", printed, re.MULTILINE)
+        assert {"server", "caller"} == {line.split()[0] for line in block.splitlines()}
+        assert "python, main" in block
+
+
+def test_rospy_answers_under_the_Python_that_it_is_installed_for_and_its_master_ends_with_it() -> None:
+    need_ros1()
+    with up([Rospy()]) as [rospy]:
+        alone, many = rospy.run(Job(64, 5)), rospy.run(Job(4096, 40, in_flight=4))
+        [master] = [one for one in psutil.Process().children(recursive=True) if "/usr/bin/rosmaster" in one.cmdline()]
+    assert not master.is_running()
+    assert alone.p50_us > 0
+    assert many.calls_per_s > 0
+    assert many.cpu_us > 0
+
+
+def test_the_Viam_SDK_answers_in_an_environment_of_its_own() -> None:
+    if why := Viam().missing:
+        pytest.skip(why)
+    with up([Viam()]) as [viam]:
+        alone, many = viam.run(Job(64, 5)), viam.run(Job(4096, 40, in_flight=4))
+    assert alone.p50_us > 0
+    assert many.calls_per_s > 0
+
+
+def test_the_bench_of_local_calls_prints_its_targets_and_writes_them_with_its_points(tmp_path: Path) -> None:
+    printed = bench("local", "-n", "3", "--rounds", "2", "--json", str(tmp_path / "run.json"))
     assert targets(printed) == ["local, strict: us a call", "local, not strict: us a call"]
+    run = Run.read(tmp_path / "run.json")
+    assert [target.name for target in run.targets] == targets(printed)
+    assert [(point.part, point.name) for point in run.points] == [
+        ("local", name) for name in ("plain method", "strict", "strict=False")
+    ]
+    assert all(point.n == 2 * 50 * 3 and point.values["us"].rounds == 2 for point in run.points)
+    assert run.took_s is not None
+    assert run.arguments == ["local", "-n", "3", "--rounds", "2"]
 
 
 def test_the_bench_of_the_registry_prints_its_targets() -> None:
@@ -106,7 +208,7 @@ def test_the_bench_of_the_servo_bus_prints_its_targets() -> None:
     printed = bench("servo", "-n", "3", "--rounds", "1", "--seconds", "0.05")
     assert "156 bytes a cycle" in printed
     assert "190 bytes a cycle" in printed
-    assert printed.count("target") == 3
+    assert targets(printed) == ["fast sync / limit", "CPU at 100 Hz, fast", "CPU at 100 Hz, plain"]
 
 
 def test_the_bench_of_the_Feetech_bus_prints_its_targets() -> None:
@@ -118,7 +220,7 @@ def test_the_bench_of_the_Feetech_bus_prints_its_targets() -> None:
 def test_the_bench_of_arms_prints_its_targets() -> None:
     pytest.importorskip("rtde_control", reason="ur-rtde has no wheel for this platform")
     printed = bench("arm", "--rounds", "1", "--seconds", "0.5")
-    assert targets(printed) == ["set-points/s, driver", "set-points/s, bare library", "CPU of the driver, cores"]
+    assert targets(printed) == ["set-points/s, driver"]
 
 
 @pytest.mark.timeout(300)

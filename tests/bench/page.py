@@ -1,0 +1,175 @@
+"""docs/performance.md and its pictures, from the run in docs/performance.json: ``python -m tests.bench.page``.
+
+Nothing on that page is written by hand but the reasons for missed targets, which stand in why.toml beside this module.
+"""
+
+import argparse
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import groupby
+from pathlib import Path
+from typing import Final
+
+from msgspec import Struct, convert
+from tests.bench._plots import PICTURES, about, figure, pictures, with_spread
+from tests.bench._record import Point, Run, Target
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+_ROOT: Final = Path(__file__).parents[2]
+DOCS: Final = _ROOT / "docs"
+_WHY: Final = Path(__file__).with_name("why.toml")
+_HIDDEN: Final = ("p99 / bare",)
+"""Figures that a table has no room for; the JSON has them."""
+
+_HEAD: Final = """# Performance
+
+Made by `make bench-page` of [performance.json](performance.json), which is a run of `make bench`. It says what things
+took on one machine in one hour; the ratios carry further than the times do. How to run it, and how to compare two runs:
+[testing](testing.md#speed).
+
+## The run
+
+{about}
+It took {minutes:.0f} minutes: `{command}`. Versions: {versions}.
+
+- A remote call goes from one process to another on this machine, over loopback; between hosts it is between network
+  namespaces with a cable between them.
+- All that stand in one table had their turns in one run, round by round, in an order that changes. A ratio ("/ bare")
+  divides two turns of the same round.
+- A figure is the median over the rounds; in brackets is the middle half of them. p50 and p99 are of the calls of one
+  round. n is how many there were in all rounds together.
+- CPU is the processor time of both ends together, for each call.
+- "bare" is the bare zenoh pair: a put to the other process and a put back, with nothing of ours around it.
+- In the pictures a dot is the median, the line through it the middle half of the rounds, a ring the p99.
+"""
+_PARTS: Final = {
+    "calls": "Remote calls, one at a time",
+    "in-flight": "Remote calls, 32 under way",
+    "checks": "What certificates, hooks and locks add to a call",
+    "local": "Calls in the same container",
+    "registry": "A late joiner among many services",
+    "deadman": "From the end of a client to the rest of what it moved",
+    "locks": "Locks",
+    "watching": "Notifications and hooks",
+    "audit": "Audit records",
+    "gateway": "Gateways",
+    "streams": "Streams",
+    "servo": "Dynamixel servos, 1 Mbaud",
+    "feetech": "Feetech servos, 1 Mbaud",
+    "can": "CiA 402 drives, 1 Mbit/s",
+    "rosie": "All drivers of a robot",
+    "supervisor": "The supervisor",
+    "arm": "An arm",
+}
+
+
+class Reason(Struct, frozen=True, forbid_unknown_fields=True):
+    """Why targets are missed."""
+
+    targets: tuple[str, ...]
+    """By name."""
+    why: str
+    """As a profile shows."""
+    tried: str
+
+
+def read_reasons(file: Path = _WHY) -> dict[str, Reason]:
+    """By the name of each target that one is for."""
+    read = convert(tomllib.loads(file.read_text()), dict[str, list[Reason]])
+    return {name: reason for reason in read.get("reason", []) for name in reason.targets}
+
+
+def written(run: Run, reasons: Mapping[str, Reason]) -> str:
+    """The page."""
+    head = _HEAD.format(
+        about=about(run),
+        minutes=(run.took_s or 0) / 60,
+        command=" ".join(["python -m tests.bench", *run.arguments]),
+        versions=", ".join(f"{name} {version}" for name, version in run.versions.items()),
+    )
+    return "\n".join([head.rstrip(), *_targets(run, reasons), *_measured(run), *_skipped(run)]) + "\n"
+
+
+def _targets(run: Run, reasons: Mapping[str, Reason]) -> Iterator[str]:
+    yield f"\n## Targets: {len(run.targets) - len(run.missed)} met, {len(run.missed)} missed\n"
+    yield from _table(("part", "target", "asked", "measured", ""), map(_row, run.targets))
+    if not run.missed:
+        return
+    yield "\n### Missed, and why"
+    for reason in dict.fromkeys(reasons.get(target.name) for target in run.missed):
+        names = [target.name for target in run.missed if reasons.get(target.name) == reason]
+        yield f"\n**{'; '.join(names)}**\n"
+        yield f"{reason.why.strip()}\n\nTried: {reason.tried.strip()}" if reason else "There is no explanation yet."
+
+
+def _row(target: Target) -> tuple[str, ...]:
+    word = "met" if target.met else "**missed**"
+    return target.part, target.name, target.asked, with_spread(target.measured), word
+
+
+def _measured(run: Run) -> Iterator[str]:
+    drawn = pictures(run)
+    for part, points in groupby(run.points, lambda one: one.part):
+        yield f"\n## {_PARTS.get(part, part)}"
+        if PICTURES.get(part) in drawn:
+            yield f"\n![{_PARTS[part]}](pictures/performance-{PICTURES[part]}.svg)"
+        cases: dict[str, list[Point]] = {}
+        for point in points:
+            cases.setdefault(point.case, []).append(point)
+        for case, those in cases.items():
+            yield f"\n### {case[:1].upper()}{case[1:]}\n"
+            names = [
+                name for name in dict.fromkeys(name for one in those for name in one.values) if name not in _HIDDEN
+            ]
+            yield from _table(("", "n", *names), (_figures(one, names) for one in those))
+
+
+def _figures(point: Point, names: Sequence[str]) -> tuple[str, ...]:
+    shown = (with_spread(point.values[name]) if name in point.values else "" for name in names)
+    return point.name, figure(point.n), *shown
+
+
+def _skipped(run: Run) -> Iterator[str]:
+    if run.skipped:
+        yield "\n## Not measured\n"
+        yield from _table(("part", "what", "reason"), ((one.part, one.name, one.reason) for one in run.skipped))
+
+
+def _table(head: Sequence[str], rows: Iterator[tuple[str, ...]]) -> Iterator[str]:
+    yield f"| {' | '.join(head)} |"
+    yield "|---" * len(head) + "|"
+    for row in rows:
+        yield f"| {' | '.join(row)} |"
+
+
+def files(run: Run, reasons: Mapping[str, Reason]) -> dict[str, str]:
+    """What belongs into docs/, by path."""
+    drawn = {f"pictures/performance-{name}.svg": picture for name, picture in pictures(run).items()}
+    return {"performance.md": written(run, reasons), **drawn}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.bench.page", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--json", type=Path, default=DOCS / "performance.json", help="the run; default %(default)s")
+    parser.add_argument("--to", type=Path, default=DOCS, help="the folder to write to; default %(default)s")
+    options = parser.parse_args()
+    run, reasons = Run.read(options.json), read_reasons()
+    for name, text in files(run, reasons).items():
+        (options.to / name).parent.mkdir(parents=True, exist_ok=True)
+        (options.to / name).write_text(text)
+        print(f"wrote {options.to / name}")
+    for target in run.missed:
+        if target.name not in reasons:
+            print(f"missed without an explanation in {_WHY.name}: {target.name}")
+    for name in reasons.keys() - {target.name for target in run.targets}:
+        print(f"explained in {_WHY.name}, and not in this run: {name}")
+
+
+if __name__ == "__main__":
+    main()
