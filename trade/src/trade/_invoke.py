@@ -1,7 +1,6 @@
 """From a handle to a result: the same checks whether the service is here or elsewhere."""
 
 import logging
-import threading
 from collections.abc import Callable
 from functools import partial
 from time import monotonic_ns
@@ -17,6 +16,7 @@ from trade._context import CallContext, handed_down, holding, running
 from trade._dispatch import LocalService
 from trade._failures import unpack_error
 from trade._handle import Run
+from trade._hands import Hands
 from trade._ongoing import Ongoing
 from trade._peer import Peer
 from trade._records import type_from_schema
@@ -53,9 +53,17 @@ class LocalTarget:
     """A service of this container: called directly, with the validation and the copies a wire would make."""
 
     def __init__(
-        self, service: LocalService, codec: Codec, own: Address, session: str, new_id: Callable[[], int]
+        self,
+        service: LocalService,
+        codec: Codec,
+        own: Address,
+        session: str,
+        new_id: Callable[[], int],
+        hands: Hands,
     ) -> None:
         self._service = service
+        self._hands = hands
+        self._thread_name = f"trade-run-{service.label}"
         self._codec = codec
         self._label = service.label
         self._is_stop = service.effect == "stop"
@@ -95,12 +103,11 @@ class LocalTarget:
 
         ongoing = Ongoing(service, self._identity, None, report)
         run.on_cancel(ongoing.cancel)
-        name = f"trade-run-{service.label}"
         if service.serial is None:
             outcome = partial(self._run, taken, request, ongoing)
         else:
             outcome = partial(self._take_turn, service.serial, taken, request, ongoing)
-        threading.Thread(target=run.end, args=(outcome,), name=name, daemon=True).start()
+        self._hands.begin(partial(run.end, outcome), self._thread_name)
 
     def _taken(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> bytes:
         """The arguments as they are now, whatever becomes of them."""

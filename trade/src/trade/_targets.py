@@ -7,6 +7,7 @@ from trade._audit import Audit
 from trade._calls import Caller
 from trade._codec import Codec
 from trade._handle import Handle
+from trade._hands import Hands
 from trade._invoke import LocalTarget, RemoteTarget, container_closed
 from trade._providers import Providers
 from trade._registry import Change, Record, Registry, gone_to
@@ -43,6 +44,7 @@ class Targets:
         self._providers = providers
         self._caller = caller
         self._codec = codec
+        self._hands = Hands()
         self._closed = False
         self.known: Final[dict[ServiceKey, Target]] = {}
         """Looked up already, and allowed."""
@@ -88,7 +90,7 @@ class Targets:
         service = self._providers.lookup(f"{record.key.domain}/{record.key.provider}", record.key.name)
         if service is None:  # deregistered since we looked
             return None
-        return LocalTarget(service, self._codec, self._own, self._session, self._caller.new_id)
+        return LocalTarget(service, self._codec, self._own, self._session, self._caller.new_id, self._hands)
 
     def _our_own(self, record: Record) -> ServiceInfo | None:
         """How this container describes a function of the middleware that another one has, too.
@@ -128,4 +130,5 @@ class Targets:
     def close(self) -> None:
         """Keep none from now on."""
         self._closed = True
+        self._hands.close()
         self.known.clear()

@@ -1,0 +1,108 @@
+"""Threads that do one piece of work at a time and wait a while for the next one.
+
+To start a thread takes longer than most calls, and a hook is such a call: it is begun, so that it can be cut off.
+"""
+
+import logging
+import threading
+from collections.abc import Callable
+from contextvars import Context
+from typing import Final
+
+_logger = logging.getLogger("trade")
+
+_MOST_IDLE: Final = 8
+_PATIENCE_S: Final = 10.0
+"""How long one waits for work before it ends."""
+
+Work = Callable[[], object]
+
+
+class Hands:
+    """As many threads as there is work at once; a few wait for more."""
+
+    def __init__(self) -> None:
+        self._idle: list[_Hand] = []
+        self._closed = False
+
+    def begin(self, work: Work, name: str) -> None:
+        """Have this done now, on a thread of its own as far as it can tell; does not wait.
+
+        Args:
+            work: what to do, in a fresh context.
+            name: of the thread meanwhile.
+
+        Raises:
+            RuntimeError: the process may have no more threads.
+        """
+        try:
+            hand = self._idle.pop()
+        except IndexError:
+            hand = _Hand(self)
+        hand.give(work, name)
+
+    def rejoin(self, hand: "_Hand") -> bool:
+        """Whether one that has done its work is to wait for more."""
+        if self._closed or len(self._idle) >= _MOST_IDLE:
+            return False
+        self._idle.append(hand)
+        if self._closed:  # meanwhile
+            return not self.leave(hand)
+        return True
+
+    def leave(self, hand: "_Hand") -> bool:
+        """Whether one that waits may end; if not, work is on its way to it."""
+        try:
+            self._idle.remove(hand)
+        except ValueError:
+            return False
+        return True
+
+    def close(self) -> None:
+        """Those that wait end; work that is under way goes on. Idempotent."""
+        self._closed = True
+        while self._idle:
+            try:
+                hand = self._idle.pop()
+            except IndexError:  # it has ended by itself
+                return
+            hand.dismiss()
+
+
+class _Hand:
+    def __init__(self, hands: Hands) -> None:
+        self._hands = hands
+        self._work: Work | None = None
+        self._given = threading.Lock()
+        self._given.acquire()
+        self._thread: threading.Thread | None = None
+
+    def give(self, work: Work, name: str) -> None:
+        self._work = work
+        if self._thread is None:
+            self._thread = threading.Thread(target=self._main, name=name, daemon=True)
+            self._thread.start()
+        else:
+            self._thread.name = name
+        self._given.release()
+
+    def dismiss(self) -> None:
+        """End; it waits."""
+        self._given.release()
+
+    def _main(self) -> None:
+        while True:
+            if not self._given.acquire(timeout=_PATIENCE_S):
+                if self._hands.leave(self):
+                    return
+                self._given.acquire()
+            work, self._work = self._work, None
+            if work is None:
+                return
+            try:
+                Context().run(work)
+            except Exception:
+                _logger.exception("what was begun failed")
+            del work  # it may hold on to much
+            if not self._hands.rejoin(self):
+                return
