@@ -14,7 +14,7 @@ ARGS ?=
 SEED ?= 1
 MINUTES ?= 3
 
-.PHONY: demo screenshots test test-socketcan soak-registry soak-relocation chaos chaos-robots check bench clean
+.PHONY: demo screenshots docs test test-socketcan soak-registry soak-relocation chaos chaos-robots check bench clean
 .DEFAULT_GOAL := help
 
 help: ## show the targets
@@ -67,8 +67,12 @@ check: $(UV) ## lint, formatting, types, import rules, isolated install of the c
 screenshots: $(UV) ## the pictures of README and docs, of a simulated robot in a browser (needs chromium)
 	@$(RUN) python docs/pictures/take.py
 
+docs: $(UV) ## the site of README.md and docs/ in site/; a warning, a dead link is an error
+	@NO_MKDOCS_2_WARNING=1 $(RUN) mkdocs build --strict --quiet $(ARGS)
+	@echo "site/index.html is the first page; with search, at http://127.0.0.1:8000: python3 -m http.server -b 127.0.0.1 -d site"
+
 bench: $(UV) ## speed as ratios against peers in the same run
 	@$(RUN) python -m tests.bench $(ARGS)
 
 clean: ## remove environments and caches
-	rm -rf .uv .venv .pytest_cache .ruff_cache .hypothesis build dist
+	rm -rf .uv .venv .pytest_cache .ruff_cache .hypothesis build dist site
