@@ -14,7 +14,7 @@ ARGS ?=
 SEED ?= 1
 MINUTES ?= 3
 
-.PHONY: demo screenshots docs test test-socketcan soak-registry soak-relocation chaos chaos-robots check bench clean
+.PHONY: demo screenshots docs release-check test test-socketcan soak-registry soak-relocation chaos chaos-robots check bench clean
 .DEFAULT_GOAL := help
 
 help: ## show the targets
@@ -70,6 +70,9 @@ screenshots: $(UV) ## the pictures of README and docs, of a simulated robot in a
 docs: $(UV) ## the site of README.md and docs/ in site/; a warning, a dead link is an error
 	@NO_MKDOCS_2_WARNING=1 $(RUN) mkdocs build --strict --quiet $(ARGS)
 	@echo "site/index.html is the first page; with search, at http://127.0.0.1:8000: python3 -m http.server -b 127.0.0.1 -d site"
+
+release-check: $(UV) ## wheels built twice and compared, installed and tried on each Python of this machine, licences (ARGS=--whole)
+	@$(RUN) python -m tests.release $(ARGS)
 
 bench: $(UV) ## speed as ratios against peers in the same run
 	@$(RUN) python -m tests.bench $(ARGS)

@@ -12,7 +12,7 @@ from trade import errors
 from trade_hil_sim import SimProcess, events
 
 ROOT = Path(__file__).parents[1]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 
 def test_the_readme_program_does_what_it_says(system: str, tmp_path: Path) -> None:

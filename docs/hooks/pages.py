@@ -17,7 +17,7 @@ from mkdocs.structure.pages import Page
 
 ROOT: Final = Path(__file__).parents[2]
 DOCS: Final = ROOT / "docs"
-FIRST: Final = ("README.md", "CHANGELOG.md")
+FIRST: Final = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")
 """Pages outside of docs/ that are on the site whoever links to them."""
 _LINK: Final = re.compile(r"(\]\()([^)\s#:]+)(#[^)\s]*)?(?=\))")
 _CODE: Final = re.compile(r"^```.*?^```|`[^`\n]*`", re.MULTILINE | re.DOTALL)
