@@ -40,10 +40,13 @@ _EXTRAS: Final = {
 QUICK: Final = (
     "tests/test_docs.py::test_the_readme_program_does_what_it_says",
     "tests/trade/test_wire_vectors.py",
-    "tests/drivers/test_motor_safety.py",
+    "tests/trade/test_calls.py",
+    "tests/hil_sim/test_bus_sdk.py",
+    "tests/drivers/test_robotfile.py",
+    "tests/gateway/test_help.py",
     "tests/system/test_transcript.py",
 )
-"""What shows in a minute that the parts are whole: bytes of messages, servos that are stopped, the command line."""
+"""What shows in a minute that the parts are whole: calls, bytes, simulated servos, robot files, the command line."""
 
 
 class Failed(Exception):
@@ -87,7 +90,7 @@ class Trial:
             copy = shutil.copytree if source.is_dir() else shutil.copy2
             copy(source, target)
         log = self._folder / "pytest.txt"
-        words = [self._python, "-m", "pytest", "-q", "-n", "2", "--dist", "loadfile", "-p", "no:cacheprovider", *which]
+        words = [self._python, "-m", "pytest", "-q", "-n0", "-p", "no:cacheprovider", *which]
         with log.open("w", encoding="utf-8") as said:
             code = subprocess.run(
                 words, cwd=self._stand, stdout=said, stderr=said, env=self._environment(), check=False
@@ -125,7 +128,7 @@ class Trial:
 
     def _environment(self) -> dict[str, str]:
         """As a user's, without what points at the environment this runs in."""
-        left_out = ("VIRTUAL_ENV", "PYTHONPATH", "PYTHONHOME", "UV_PYTHON")
+        left_out = ("VIRTUAL_ENV", "PYTHONDONTWRITEBYTECODE", "PYTHONPATH", "PYTHONHOME", "UV_PYTHON")
         kept = {name: value for name, value in os.environ.items() if name not in left_out}
         path = os.pathsep.join([str(self._python.parent), kept.get("PATH", "")])
         return {**kept, "PATH": path, "TRADE_SYSTEM": f"release-{os.getpid()}-{time.monotonic_ns()}"}
