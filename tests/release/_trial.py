@@ -111,7 +111,7 @@ class Trial:
         return str(wheel)
 
     def _install(self, *what: str | Path) -> None:
-        self._run(self._uv, "pip", "install", "--quiet", "--python", self._python, *what)
+        self._run(self._uv, "pip", "install", "--quiet", "--compile-bytecode", "--python", self._python, *what)
 
     def _run(self, *words: str | Path, at: Path | None = None) -> str:
         ended = subprocess.run(
