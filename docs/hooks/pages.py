@@ -41,6 +41,8 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
     """Have the links of a page lead to where their targets are on the site."""
     if page.file.src_uri == "index.md":
         page.meta["hide"] = ["navigation"]
+    if page.file.src_uri.startswith("decisions/"):
+        page.meta["search"] = {"boost": 0.3}  # found, but below what one does with it
     here = _source(page.file)
     if here is None:
         return markdown
