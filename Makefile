@@ -14,7 +14,8 @@ ARGS ?=
 SEED ?= 1
 MINUTES ?= 3
 
-.PHONY: demo screenshots test test-socketcan soak-registry soak-relocation chaos chaos-robots check bench bench-compare bench-page clean
+.PHONY: demo screenshots docs release-check test test-socketcan soak-registry soak-relocation chaos chaos-robots check
+.PHONY: bench bench-compare bench-page clean
 .DEFAULT_GOAL := help
 
 help: ## show the targets
@@ -79,6 +80,12 @@ bench-page: $(UV) ## docs/performance.md and its pictures, of docs/performance.j
 build/viam/bin/python: $(UV)
 	@$(UV) venv -q $(@D)/..
 	@$(UV) pip install -q --python $@ 'viam-sdk==0.85.1'
+docs: $(UV) ## the site of README.md and docs/ in site/; a warning, a dead link is an error
+	@NO_MKDOCS_2_WARNING=1 $(RUN) mkdocs build --strict --quiet $(ARGS)
+	@echo "site/index.html is the first page; with search, at http://127.0.0.1:8000: python3 -m http.server -b 127.0.0.1 -d site"
+
+release-check: $(UV) ## wheels built twice and compared, installed and tried on each Python of this machine, licences (ARGS=--whole)
+	@$(RUN) python -m tests.release $(ARGS)
 
 clean: ## remove environments and caches
-	rm -rf .uv .venv .pytest_cache .ruff_cache .hypothesis build dist
+	rm -rf .uv .venv .pytest_cache .ruff_cache .hypothesis build dist site

@@ -1,18 +1,29 @@
 """What the pages say is there, is there; what they show, runs."""
 
+import ast
+import json
 import re
 import shlex
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
+import typer
 
 from trade import errors
+from trade_gateway.cli import build
 from trade_hil_sim import SimProcess, events
 
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
 ROOT = Path(__file__).parents[1]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 
 def test_the_readme_program_does_what_it_says(system: str, tmp_path: Path) -> None:
@@ -73,3 +84,66 @@ def test_the_command_for_the_simulator_strikes_it() -> None:
         words = [sys.executable, *shlex.split(command)[1:-1], str(sim.control_path)]
         subprocess.run(words, timeout=60, check=True)
         assert events(sim.entries(), "brown_out", device_id=1)
+
+
+def blocks(page: Path, *languages: str) -> Iterator[str]:
+    """What stands in the blocks of code of these languages, also in lists."""
+    text = page.read_text(encoding="utf-8")
+    for found in re.finditer(r"^( *)```(\w+)[^\n]*\n(.*?)^\1```$", text, re.MULTILINE | re.DOTALL):
+        if found[2] in languages:
+            yield re.sub(rf"^{found[1]}", "", found[3], flags=re.MULTILINE)
+
+
+def commands(page: Path) -> Iterator[list[str]]:
+    """The words of each ``trade`` in the blocks of a page, without what stands before and behind it in its line."""
+    typed = [line for block in blocks(page, "sh") for line in block.splitlines()]
+    typed += [line[2:] for block in blocks(page, "console") for line in block.splitlines() if line.startswith("$ ")]
+    for line in typed:
+        if found := re.match(r"(?:sudo (?:-u \w+ )?)?((?:[A-Z_]+=\S+ )*)trade (?!-)", line):
+            yield list(until_operator(shlex.split(line[found.end() :], comments=True)))
+
+
+def until_operator(words: list[str]) -> Iterator[str]:
+    """The words up to a pipe, another command, or what goes to a file."""
+    for word in words:
+        if word in ("|", "&", "&&", "||", ";", ">", "2>", "<", "--"):
+            return
+        yield word
+
+
+def unknown(command: Any, words: list[str]) -> str:
+    """What of a command line is no command or option; empty if all is."""
+    left = list(words)
+    while hasattr(command, "commands") and left and not left[0].startswith("-"):
+        if left[0] not in command.commands:
+            return f"no command {left[0]}"
+        command = command.commands[left.pop(0)]
+    takes = [command, *getattr(command, "commands", {}).values()]  # a group may have a command that needs no word
+    known = {name for one in takes for each in one.params for name in (*each.opts, *each.secondary_opts)}
+    given = {word.partition("=")[0] for word in left if re.match(r"--?[a-z]", word)}
+    return ", ".join(sorted(given - known - {"--help", "-h"}))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_commands_that_pages_show_exist_with_their_options(page: Path) -> None:
+    trade_ = typer.main.get_command(build())
+    wrong = [(" ".join(words), said) for words in commands(page) if (said := unknown(trade_, words))]
+    assert not wrong
+
+
+def test_a_command_that_does_not_exist_is_noticed() -> None:
+    trade_ = typer.main.get_command(build())
+    assert unknown(trade_, ["up", "rosie.toml", "--simulate"])
+    assert unknown(trade_, ["go", "up"])
+    assert unknown(trade_, ["policy", "chek"])
+    assert not unknown(trade_, ["policy", "check", "ann", "lock", "rosie", "--policy", "policy.toml"])
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_blocks_of_pages_are_of_their_language(page: Path) -> None:
+    for text in blocks(page, "python"):
+        compile(text, str(page), "exec", ast.PyCF_ONLY_AST | ast.PyCF_ALLOW_TOP_LEVEL_AWAIT)
+    for text in blocks(page, "toml"):
+        tomllib.loads(text)
+    for text in blocks(page, "json"):
+        json.loads(text)

@@ -47,6 +47,16 @@ def lacking(lock: str) -> dict[str, list[str]]:
     return found
 
 
+def needed(lock: str) -> set[str]:
+    """Names of all packages that ours need, on one version of Python or another.
+
+    Args:
+        lock: text of a uv.lock.
+    """
+    packages = cast("list[Package]", tomllib.loads(lock)["package"])  # pyright: ignore[reportUnknownMemberType]
+    return {str(one["name"]) for major, minor in PYTHONS for one in _needed(packages, f"{major}.{minor}")}
+
+
 def _needed(packages: Iterable[Package], python: str) -> Iterator[Package]:
     """What our packages need with all their extras, and what that needs."""
     environment = {

@@ -1,10 +1,8 @@
 """What the commands say about a running robot, as the docs show it."""
 
-import getpass
 import os
 import re
 import shlex
-import socket
 import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -14,7 +12,7 @@ import psutil
 import pytest
 
 from system.conftest import ROOT, Program
-from waiting import wait_until
+from system.terminals import end_all_but, in_words, normalised
 
 PAGE: Final = ROOT / "docs" / "transcript.md"
 MARKS: Final = ("<!-- transcript: made by test_the_transcript_is_what_happens -->\n", "<!-- end of transcript -->\n")
@@ -67,7 +65,7 @@ class Terminal:
         """A step as the page has it."""
         command = step.command.format(call=self._call)
         said = normalised(self._said(command), numbers=step.numbers)
-        shown = f"```console\n$ {_words(command)}\n{said}```\n"
+        shown = f"```console\n$ {in_words(command)}\n{said}```\n"
         return f"{step.why}\n\n{shown}\n" if step.why else f"{shown}\n"
 
     def _said(self, command: str) -> str:
@@ -80,34 +78,6 @@ class Terminal:
         return ended.stdout
 
 
-def normalised(text: str, *, numbers: bool = True) -> str:
-    """What differs from run to run, put in words; the columns of a table are drawn anew around them."""
-    head, *rows = lines = text.splitlines()
-    if not re.match(r"[A-Z]+(  |$)", head):
-        return "".join(f"{_words(line)}\n" for line in lines)
-    starts = [found.start() for found in re.finditer(r"\S+(?: \S+)*", head)]
-    spans = list(zip(starts, [*starts[1:], None], strict=True))
-    cells = [[_words(line[a:b].rstrip()) for a, b in spans] for line in (head, *rows)]
-    if not numbers:
-        cells = [[re.sub(r"^\d[\d./]*$", "N", cell) for cell in row] for row in cells]
-    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    return "".join("  ".join(map(str.ljust, row, widths)).rstrip() + "\n" for row in cells)
-
-
-def _words(text: str) -> str:
-    for pattern, word in (
-        (r"(?<![.\d])\d{15,}\b", "CALL"),
-        (r"\b\d\d:\d\d:\d\d\.\d{3}", "TIME"),
-        (r"\b[0-9a-f]{12}\b", "EPOCH"),
-        (r"\bprocess \d+", "process PID"),
-        (r"\b\d+\.\d m?s\b", "TIME"),
-        (rf"\b{re.escape(getpass.getuser())}\b", "USER"),
-        (rf"\b{re.escape(socket.gethostname())}\b", "HOST"),
-    ):
-        text = re.sub(pattern, word, text)
-    return re.sub(r"-?\d+\.\d{4,}", lambda found: f"{float(found[0]):.1f}", text)
-
-
 @pytest.fixture
 def terminal(
     system: str, trade_command: Command, run: Callable[..., Program], monkeypatch: pytest.MonkeyPatch
@@ -116,27 +86,8 @@ def terminal(
     monkeypatch.chdir(ROOT)
     with ExitStack() as left:
         before = set(psutil.pids())
-        left.callback(_end, before)
+        left.callback(end_all_but, before)
         yield Terminal(trade_command, run)
-
-
-def _end(before: set[int]) -> None:
-    """End what the test has left of its system, which is one of its own by its folders."""
-
-    def ours() -> list[psutil.Process]:
-        found = [one for one in psutil.process_iter() if one.pid not in before]
-        return [one for one in found if _folder(one) == os.environ["TRADE_RUNTIME_DIR"]]
-
-    for process in ours():
-        process.terminate()
-    wait_until(lambda: not ours(), "the system has ended")
-
-
-def _folder(process: psutil.Process) -> str | None:
-    try:
-        return None if process.status() == psutil.STATUS_ZOMBIE else process.environ().get("TRADE_RUNTIME_DIR")
-    except psutil.Error:
-        return None
 
 
 def test_the_transcript_is_what_happens(terminal: Terminal) -> None:

@@ -45,9 +45,8 @@ class Moving(Looking):
             ConfigurationError: it drives hardware of its host, or shares something with other providers.
             AccessDenied: the policy does not let this container administer its groups, or those not offer it.
             Busy: the other container has no room at the moment.
-            MigrationUnknown: the other container was lost at the moment it moved; it is withdrawn here.
-
-            With all but the last it is offered as before.
+            MigrationUnknown: the other container was lost at the moment it moved; it is withdrawn here. With all the
+                others it is offered as before.
         """
         moved: tuple[Handle, ...] = tuple(self._of(which, "migrate", to, args))
         self._parts.registry.wait_for(lambda: all(self.has(one.key) for one in moved), _HEARD_S)

@@ -110,7 +110,11 @@ class Notifying(Looking):
 
         Args:
             moment: with a time zone; not in the past.
-            call, if_, when, poll_s, host: as for `once`.
+            call: as for `once`.
+            if_: as for `once`.
+            when: as for `once`.
+            poll_s: as for `once`.
+            host: as for `once`.
         """
         at_s = epoch_s(moment, time.time())
         return self._notify(Terms(occasion="at", at=at_s, poll_s=poll_s), call, if_, when, host)
@@ -136,7 +140,8 @@ class Notifying(Looking):
             if_: skip ticks at which this does not answer True.
             edge: skip those, too, at which it did so already at the tick before.
             when: begin when this answers True.
-            poll_s, host: as for `once`.
+            poll_s: as for `once`.
+            host: as for `once`.
         """
         return self._notify(Terms(occasion="every", s=s, edge=edge, poll_s=poll_s), call, if_, when, host)
 

@@ -92,8 +92,7 @@ class Stream:
             AccessDenied: the policy no longer lets this container read the service.
             SessionEnded: the session that opened it was closed.
             ConfigurationError: the stream was closed.
-
-            And what the service itself raises, for each sample at which it does.
+            Exception: what the service itself raises, for each sample at which it does.
         """
         taken: list[Sample] = []
 
