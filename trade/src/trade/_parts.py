@@ -47,7 +47,7 @@ from trade._targets import Targets
 from trade._terminating import Terminating
 from trade._transport import Transport
 from trade._watch import Watch
-from trade._wire import Address, Estop, ServiceKey, Token, alive_key
+from trade._wire import Address, Estop, ServiceKey, Token
 from trade._withdrawn import Withdrawn
 from trade._zenoh import ZenohTransport
 from trade.errors import AccessDenied
@@ -167,7 +167,7 @@ class Parts:
             undone.callback(self.close)
             self.providers.add(own, (DOMAIN,), name=PROVIDER)
             self.estopping.begin(own)
-            self._leaving.callback(self.transport.appear(alive_key(self._home.address)).close)
+            self._leaving.callback(self.announcer.appear().close)
             self.watch = Watch(
                 self.transport,
                 self.registry,
