@@ -31,6 +31,8 @@ class Passage:
     arrived: bool
 
 
+_MOST_ROUTES: Final = 4096
+
 Tap = Callable[[Passage], None]
 
 
@@ -71,6 +73,8 @@ class Network:
         self._named: dict[str, Node] = {}
         self._links: dict[Node, dict[Node, Link]] = {}
         """Of each node, by its neighbour: what one sends costs nothing for the links of others."""
+        self._routes: dict[str, list[Node]] = {}
+        """Who hears a key, in the order in which they joined; of keys that were put on since anybody listened anew."""
         self._taps: list[Tap] = []
         self._losing: list[Callable[[Passage], bool]] = []
         self._numbers = itertools.count(1)
@@ -153,9 +157,21 @@ class Network:
         with self.lock:
             _check_open(source)
             source.take(message, own=True)
-            for target in self._others(source):
-                if target.hears(message.key):
+            for target in self._hearers(message.key):
+                if target is not source and self.linked(source, target):
                     self.pass_on(kind, source, target, message, _taking(target, message))
+
+    def _hearers(self, key: str) -> list[Node]:
+        found = self._routes.get(key)
+        if found is None:
+            if len(self._routes) >= _MOST_ROUTES:
+                self._routes.clear()
+            found = self._routes[key] = [node for node in self._nodes if node.hears(key)]
+        return found
+
+    def route_anew(self) -> None:
+        """Somebody hears something else now. Used under the network's lock."""
+        self._routes.clear()
 
     def show(self, source: Node, token: int, key: str) -> None:
         """A sign of life for everybody."""

@@ -1,0 +1,1 @@
+def run_crowd(*a): pass
