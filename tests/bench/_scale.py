@@ -9,7 +9,6 @@ import gc
 import sys
 import time
 import tracemalloc
-from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from statistics import median
@@ -17,13 +16,12 @@ from typing import Any, Final
 
 from tests.bench._alone import alone
 from tests.bench._crowd import run_crowd
+from tests.bench._offering import PROVIDERS, SERVICES, fill, kind_of_arm
 from tests.bench._report import print_target
 
 SIZES: Final = (10, 30, 100, 300, 1000)
 _ALL_WHOLE: Final = 30
 """Up to so many all are whole containers; beyond, three."""
-_PROVIDERS, _SERVICES = 10, 10
-"""Of each container, beside the middleware's own: objects, and services of each."""
 _FINDS, _LOCKS = 200, 20
 _PATIENCE_S: Final = 1800.0
 _MOST_PROCESSES: Final = 50
@@ -64,11 +62,12 @@ class Seen:
     lock_us: float
 
 
-def run(containers: int) -> None:
+def run(containers: int, seconds: float) -> None:
     """Measure and print.
 
     Args:
         containers: how many there are at most.
+        seconds: how long those in processes of their own are looked at.
     """
     sizes = [size for size in SIZES if size < containers] + [containers]
     seen: list[Seen] = []
@@ -77,12 +76,13 @@ def run(containers: int) -> None:
         print(f"scale: {size} containers in memory", file=sys.stderr, flush=True)
     _print(seen)
     _print_targets(seen)
-    run_crowd(min(containers, _MOST_PROCESSES), seen[0].own_kib)
+    crowd = min(containers, _MOST_PROCESSES)
+    run_crowd(crowd, alone(measure, crowd, patience_s=_PATIENCE_S).join.bytes, seconds)
 
 
 def _print(seen: Sequence[Seen]) -> None:
-    each = _PROVIDERS * _SERVICES
-    print(f"\ncontainers with {each} services of {_PROVIDERS} providers each, simulated: messages, and KiB of them")
+    each = PROVIDERS * SERVICES
+    print(f"\ncontainers with {each} services of {PROVIDERS} providers each, simulated: messages, and KiB of them")
     print(f"{'containers':26}" + "".join(f"{one.containers:>18}" for one in seen))
     rows: dict[str, Callable[[Seen], str]] = {
         "  of them whole": lambda one: str(one.whole),
@@ -155,10 +155,10 @@ def measure(size: int, whole: int | None = None) -> Seen:
         services = len(late.services())
         own_services = len(late.services(where(container="late")))
         taken_in = services - own_services + (whole - 1) * own_services
-        _fill(late, "late")
+        fill(late, "late")
         system.settle()
         count.since()
-        late.register(_kind()(), "extra.one")
+        late.register(kind_of_arm()(), "extra.one")
         system.settle()
         register = count.since()
         pattern._parts.announcer._quiet = 0
@@ -166,7 +166,7 @@ def measure(size: int, whole: int | None = None) -> Seen:
         beat = count.since()
         estop = _estop(system, late, count) if not stand_ins else None
         find_us = _median_us(
-            lambda turn: late.find(where(name=f"move_{turn % _SERVICES}", group=f"robot.c0.p{turn % _PROVIDERS}")), _FINDS
+            lambda turn: late.find(where(name=f"move_{turn % SERVICES}", group=f"robot.c0.p{turn % PROVIDERS}")), _FINDS
         )
         count.since()
         handle = late.find(where(name="move_0", group="robot.c0.p0"))
@@ -205,7 +205,7 @@ def measure(size: int, whole: int | None = None) -> Seen:
 
 
 class _Counting:
-    """What went from one container to another since it was asked last; of asking only what is asked is counted as read."""
+    """What went from one container to another since it was asked last."""
 
     def __init__(self, system: Any) -> None:
         self._messages = self._bytes = 0
@@ -224,15 +224,9 @@ class _Counting:
 
 def _whole(system: Any, name: str) -> Any:
     container = system.container(name, identity="bench")
-    _fill(container, name)
+    fill(container, name)
     system.settle()
     return container
-
-
-def _fill(container: Any, name: str) -> None:
-    kind = _kind()
-    for number in range(_PROVIDERS):
-        container.register(kind(), f"robot.{name}.p{number}")
 
 
 def _offer_as(offer: Any, name: str) -> Any:
@@ -246,32 +240,6 @@ def _offer_as(offer: Any, name: str) -> Any:
         (renamed(domain), provider): structs.replace(info, groups=tuple(map(renamed, info.groups)))
         for (domain, provider), info in offer.items()
     }
-
-
-def _kind() -> type:
-    """Services as a robot has them: three numbers in, one out, a line of description; and one that stops."""
-    from trade import service
-
-    def halt(self) -> None:
-        """Stop."""
-
-    methods = {f"move_{number}": _method(f"move_{number}") for number in range(_SERVICES - 1)}
-    return type("Arm", (), {**methods, "move_9": service(effect="stop")(_named(halt, "move_9"))})
-
-
-def _method(name: str) -> Any:
-    from trade import service
-
-    def move(self, shoulder_rad: float, elbow_rad: float, speed_rad_s: float) -> float:
-        """Move both joints; gives the time it takes, in seconds."""
-        return 0.0
-
-    return service(_named(move, name))
-
-
-def _named(function: Any, name: str) -> Any:
-    function.__name__ = function.__qualname__ = name
-    return function
 
 
 def _threads() -> int:
