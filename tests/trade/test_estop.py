@@ -11,7 +11,7 @@ import pytest
 
 from trade import Container, Estop, EstopReport, Resource, current_call, service, where
 from trade._crew import MOST_THREADS
-from trade._memory import MemoryTransport
+from trade._memory import MemoryTransport, Passage
 from trade._wire import PROTOCOL, EstopOrder, encode_message
 from trade.errors import Busy, ConfigurationError, MotionStopped, NoSuchEstop, Stopped
 from trade.testing import Kind, MemorySystem, memory_system
@@ -337,6 +337,7 @@ def test_S09_who_was_away_during_clearing_needs_another_one(system: MemorySystem
     assert away.written == [0.1]
 
 
+MOST_BYTES_OF_ESTOPS = 3072
 CONFIRMED = re.compile("estop/[^/]+/[^/]+/[^/]+")
 FORGED = Estop("abc", "mallory/x/e", "", 0.0)
 BAD = {
@@ -392,6 +393,23 @@ def test_S09_confirmations_go_to_who_asks_and_to_nobody_else(system: MemorySyste
     report = caller.estop(limit_s=GENEROUS_S)
     caller.estop_clear([report.id], limit_s=GENEROUS_S)
     assert set(heard) == {"caller"}
+
+
+def test_S09_what_an_estop_has_everybody_tell_everybody_is_small(system: MemorySystem) -> None:
+    """It is as much as the square of how many there are, in a moment that matters."""
+    drivers(system, *(f"d{number}" for number in range(4)))
+    caller, told = system.container("caller"), Counter[str]()
+
+    def hear(passage: Passage) -> None:
+        if passage.kind is Kind.ANNOUNCE and not passage.arrived:
+            told[passage.source] += len(passage.payload or b"")
+
+    system.tap(hear)
+    caller.estop_clear([caller.estop(limit_s=GENEROUS_S).id], limit_s=GENEROUS_S)
+    system.settle()
+    others, changes = 4, 2
+    assert len(told) == 5
+    assert max(told.values()) <= others * changes * MOST_BYTES_OF_ESTOPS
 
 
 def test_S09_orders_reach_who_is_busy_with_calls(system: MemorySystem) -> None:

@@ -136,7 +136,7 @@ def test_joining_takes_as_many_messages_as_there_are_containers_and_providers() 
             container = system.container(f"c{size}")
             system.settle()
             hosts, providers = size, size * 2  # others, and what they offer beyond the middleware's own
-            each = 2 + 3 + 3  # two signs of life; each asks the other for its own services and tally
+            each = 2 + 4 + 4  # two signs of life; each asks the other for its own services, e-stops and tally
             assert system.sent() - before == hosts * each + providers
             for group in ("one", "two"):
                 container.register(Lamp(), group)
