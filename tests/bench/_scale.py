@@ -144,22 +144,22 @@ def measure(size: int, whole: int | None = None) -> Seen:
             StandIn(system.network, f"c{number}", _offer_as(offer, f"c{number}"), asks=not fast)
             for number in range(max(1, whole - 1), size - 1)
         ]
-        system.settle()
+        _settle(system)
         for stand_in in stand_ins:
             stand_in.ask_from_now_on()
         own = [info for (domain, _), info in offer.items() if domain == "trade"]
         count = _Counting(system)
-        kib, _late = _memory_kib(lambda: system.container("late"), system)
-        late = system.container("late")
+        late = system.container("late", identity="bench")
+        _settle(system)
         join = count.since()
         services = len(late.services())
         own_services = len(late.services(where(container="late")))
         taken_in = services - own_services + (whole - 1) * own_services
         fill(late, "late")
-        system.settle()
+        _settle(system)
         count.since()
         late.register(kind_of_arm()(), "extra.one")
-        system.settle()
+        _settle(system)
         register = count.since()
         pattern._parts.announcer._quiet = 0
         pattern._parts.announcer.beat()
@@ -182,8 +182,9 @@ def measure(size: int, whole: int | None = None) -> Seen:
         lock_us = _median_us(use, _LOCKS)
         count.since()
         late.close()
-        system.settle()
+        _settle(system)
         leave = count.since()
+        kib = _memory_kib(lambda: system.container("last", identity="bench"), system)
         for stand_in in stand_ins:
             stand_in.close()
     return Seen(
@@ -225,7 +226,7 @@ class _Counting:
 def _whole(system: Any, name: str) -> Any:
     container = system.container(name, identity="bench")
     fill(container, name)
-    system.settle()
+    _settle(system)
     return container
 
 
@@ -252,23 +253,36 @@ def _threads() -> int:
 def _estop(system: Any, caller: Any, count: _Counting) -> Cost:
     report = caller.estop("scale", limit_s=30)
     caller.estop_clear([report.id], limit_s=30)
-    system.settle()
+    _settle(system)
     if not report.complete:
         raise RuntimeError(f"an e-stop was not confirmed by {report.missing}")
     return count.since()
 
 
-def _memory_kib(make: Callable[[], object], system: Any) -> tuple[float, object]:
-    """What Python keeps of what is made, with what others know of it, in KiB; and that."""
+def _memory_kib(make: Callable[[], object], system: Any) -> float:
+    """What Python keeps of what is made, with what others know of it, in KiB."""
     gc.collect()
     tracemalloc.start()
     before, _ = tracemalloc.get_traced_memory()
     made = make()
-    system.settle()
+    assert made is not None
+    _settle(system)
     gc.collect()
     kept = tracemalloc.get_traced_memory()[0] - before
     tracemalloc.stop()
-    return kept / 1024, made
+    return kept / 1024
+
+
+def _settle(system: Any) -> None:
+    """Wait until everybody has taken note of everything; of a thousand that takes its time."""
+    until = time.monotonic() + _PATIENCE_S
+    while time.monotonic() < until:
+        try:
+            system.settle()
+        except TimeoutError:
+            continue
+        return
+    raise TimeoutError("not everybody has taken note of everything")
 
 
 def _median_us(action: Callable[[int], object], times: int) -> float:
