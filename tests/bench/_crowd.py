@@ -25,7 +25,7 @@ _AT_ONCE: Final = 4
 _SETTLE_S: Final = 20.0
 """Until those that have just begun have nothing new to tell."""
 _PATIENCE_S: Final = 120.0
-_LOOK_AGAIN_S: Final = 0.05
+_LOOK_AGAIN_S: Final = 0.2
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,12 +145,12 @@ def _take_part(pipe: Connection, name: str) -> None:
             fill(container, name)
         pipe.send(os.getpid())
         while (count := _told(pipe)) is not None:
-            _wait(lambda count=count: _complete(container.containers(), count))
+            _wait(lambda count=count: len(container.addresses()) == count and _complete(container.containers()))
             pipe.send("known")
 
 
-def _complete(infos: Sequence[object], count: int) -> bool:
-    return sum(info.services > 0 for info in infos) == count  # type: ignore[attr-defined]
+def _complete(infos: Sequence[object]) -> bool:
+    return all(info.services > 0 for info in infos)  # type: ignore[attr-defined]
 
 
 def _told(pipe: Connection) -> int | None:

@@ -148,8 +148,10 @@ def measure(size: int, whole: int | None = None) -> Seen:
         for stand_in in stand_ins:
             stand_in.ask_from_now_on()
         own = [info for (domain, _), info in offer.items() if domain == "trade"]
+        own_infos = [service for info in own for service in info.services]
         count = _Counting(system)
         late = system.container("late", identity="bench")
+        _wait(lambda: len(late.services()) == (size - 1) * len(pattern.services(_of("c0"))) + len(own_infos))
         _settle(system)
         join = count.since()
         services = len(late.services())
@@ -271,6 +273,21 @@ def _memory_kib(make: Callable[[], object], system: Any) -> float:
     kept = tracemalloc.get_traced_memory()[0] - before
     tracemalloc.stop()
     return kept / 1024
+
+
+def _of(name: str) -> Any:
+    from trade import where
+
+    return where(container=name)
+
+
+def _wait(holds: Callable[[], bool]) -> None:
+    """A thousand that answer may take longer than one waits for them at first; who did not is asked again."""
+    until = time.monotonic() + _PATIENCE_S
+    while not holds():
+        if time.monotonic() > until:
+            raise TimeoutError("the last one that joined does not know all")
+        time.sleep(0.05)
 
 
 def _settle(system: Any) -> None:
