@@ -151,7 +151,8 @@ def measure(size: int, whole: int | None = None) -> Seen:
         own_infos = [service for info in own for service in info.services]
         count = _Counting(system)
         late = system.container("late", identity="bench")
-        _wait(lambda: len(late.services()) == (size - 1) * len(pattern.services(_of("c0"))) + len(own_infos))
+        each = len(pattern.services(_of("c0")))
+        _wait(lambda: sum(info.services for info in late.containers()) == (size - 1) * each + len(own_infos))
         _settle(system)
         join = count.since()
         services = len(late.services())
@@ -287,7 +288,7 @@ def _wait(holds: Callable[[], bool]) -> None:
     while not holds():
         if time.monotonic() > until:
             raise TimeoutError("the last one that joined does not know all")
-        time.sleep(0.05)
+        time.sleep(0.5)
 
 
 def _settle(system: Any) -> None:
