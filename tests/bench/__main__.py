@@ -17,6 +17,8 @@ parts:
   can        cycles of six CiA 402 drives near what 1 Mbit/s can carry: how many are late
   rosie      what all drivers of a robot take of a core, at the rates it is meant for
   supervisor what ten children cost their gateway; a driver that crashed until it serves again, beside a plain start
+  scale      what joining, leaving, telling and finding cost, by how many containers there are: in memory 100, with
+             --full 1,000; and 50 processes (root, iproute2)
   arm        set-points a second that reach the controller of an arm, beside a bare loop of the vendor's library
 
 Progress goes to stderr, tables and targets (met or missed) to stdout, all targets once more at the end. Peers that are
@@ -45,6 +47,7 @@ from tests.bench import (
     _plots,
     _registry,
     _rosie,
+    _scale,
     _servo,
     _streams,
     _supervisor,
@@ -79,11 +82,12 @@ _PARTS: Mapping[str, Callable[[argparse.Namespace], None]] = {
     "can": lambda options: _cans.run(max(1, options.rounds // 2), options.seconds),
     "rosie": lambda options: _rosie.run(max(1, options.rounds // 2), options.seconds),
     "supervisor": lambda options: _supervisor.run(max(1, options.rounds // 2), options.idle),
+    "scale": lambda options: _scale.run(options.containers, options.idle),
     "arm": lambda options: _arm.run(max(1, options.rounds // 2), 2 * options.seconds),
 }
 _ATTEMPTS = 2
-_QUICK = {"n": 250, "rounds": 8, "seconds": 1.5, "idle": 20.0}
-_FULL = {"n": 500, "rounds": 20, "seconds": 3.0, "idle": 60.0}
+_QUICK = {"n": 250, "rounds": 8, "seconds": 1.5, "idle": 20.0, "containers": 100}
+_FULL = {"n": 500, "rounds": 20, "seconds": 3.0, "idle": 60.0, "containers": 1000}
 
 
 def main() -> None:
@@ -99,6 +103,11 @@ def main() -> None:
     )
     parser.add_argument(
         "--idle", type=float, help=f"seconds for an idle gateway ({_QUICK['idle']}, full {_FULL['idle']})"
+    )
+    parser.add_argument(
+        "--containers",
+        type=int,
+        help=f"at most, of the scale part ({_QUICK['containers']}, full {_FULL['containers']})",
     )
     parser.add_argument("--services", type=int, default=10_000, help="of the registry part (default: %(default)s)")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write what was measured, for compare and page")

@@ -19,6 +19,7 @@ from tests.bench._report import print_target, this_run
 from tests.bench._ros1 import Rospy
 from tests.bench._viam import Viam
 from tests.ros1_stand import need_ros1
+from tests.bench._scale import measure
 from tests.system.networks import why_not
 
 ROOT = Path(__file__).parents[2]
@@ -246,3 +247,23 @@ def test_the_bench_of_gateways_prints_every_pair_every_flood_and_every_target() 
 def test_the_bench_of_the_deadman_prints_every_way_to_end() -> None:
     printed = bench("deadman", "--rounds", "1")
     assert targets(printed) == ["killed in a call", "killed in a start", "frozen in a call", "frozen in a jog"]
+
+
+def test_the_bench_of_many_containers_prints_its_targets() -> None:
+    printed = bench("scale", "--containers", "4", "--idle", "0.2")
+    ours = [
+        "join, bytes each: most / least",
+        "remote service: KiB of Python",
+        "find: most / least",
+        "lock: most / least",
+    ]
+    processes = [] if "processes: skipped" in printed else ["join, bytes: real / simulated"]
+    assert targets(printed) == [*ours, *processes]
+
+
+def test_a_stand_in_costs_what_a_container_costs() -> None:
+    """So what is counted of a thousand, most of them stand-ins, is what a thousand containers would cost."""
+    whole, others = measure(6), measure(6, whole=2)
+    assert (whole.whole, others.whole) == (6, 2)
+    assert (whole.join, whole.leave, whole.register) == (others.join, others.leave, others.register)
+    assert (whole.beat, whole.lock, whole.services) == (others.beat, others.lock, others.services)

@@ -10,6 +10,7 @@ import pytest
 from trade import Container, Handle, Resource, Settings, service, where
 from trade._access import FUNCTIONS
 from trade._context import CallContext, running
+from trade._estop_services import EstopServices
 from trade._own_services import OwnServices
 from trade._service import marked_methods
 from trade._wire import Behalf
@@ -210,7 +211,7 @@ def test_the_system_is_changed_by_who_administers_it(member: Member, policy: Pat
 
 
 def test_every_function_of_the_middleware_is_in_the_table_of_what_they_need() -> None:
-    assert set(FUNCTIONS) == set(marked_methods(OwnServices, ()))
+    assert set(FUNCTIONS) == {*marked_methods(OwnServices, ()), *marked_methods(EstopServices, ())}
 
 
 # --- by the provider, whatever the caller did
@@ -311,6 +312,7 @@ def test_readers_ignore_what_somebody_may_not_offer(memory: MemorySystem, member
 def test_only_its_own_functions_are_offered_by_everybody_in_the_group_of_the_middleware(member: Member) -> None:
     access = member("planner").access
     assert access.may_offer("dash", "trade", "system", ("trade",))
+    assert access.may_offer("dash", "trade", "estops", ("trade",))
     assert not access.may_offer("dash", "trade", "system", ("trade", "rosie"))
     assert access.may_offer("dash", "trade", "supervisor", ("trade",))
     assert not access.may_offer("dash", "trade", "another", ("trade",))

@@ -132,7 +132,7 @@ def test_the_containers_of_the_system_are_listed(here: Container, there: Contain
         return (infos["there"].providers, infos["there"].services, infos["there"].epoch)
 
     # what it offers comes one after the other
-    assert here._parts.registry.wait_for(lambda: known() == (2, 2 + own, there.address.epoch), 20), known()
+    assert here._parts.registry.wait_for(lambda: known() == (3, 2 + own, there.address.epoch), 20), known()
 
 
 def test_a_closed_container_is_no_longer_listed(here: Container, there: Container) -> None:

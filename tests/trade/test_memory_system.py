@@ -16,7 +16,7 @@ from trade import Container, Handle, errors, service, where
 from trade._announcing import Announcer
 from trade._memory import MemoryTransport, Passage
 from trade._transport import ChannelClosed
-from trade._wire import Address, ProviderInfo, ServiceInfo, alive_key
+from trade._wire import Address, ProviderInfo, ServiceInfo
 from trade.errors import ContainerLost, NoSuchService, ServiceGone, TradeError
 from trade.testing import Kind, MemorySystem, memory_system
 
@@ -136,7 +136,7 @@ def test_joining_takes_as_many_messages_as_there_are_containers_and_providers() 
             container = system.container(f"c{size}")
             system.settle()
             hosts, providers = size, size * 2  # others, and what they offer beyond the middleware's own
-            each = 2 + 1 + 3 + 3  # two signs of life, one entry; each asks the other for its own services and tally
+            each = 2 + 4 + 4  # two signs of life; each asks the other for its own services, e-stops and tally
             assert system.sent() - before == hosts * each + providers
             for group in ("one", "two"):
                 container.register(Lamp(), group)
@@ -150,6 +150,39 @@ def test_registering_takes_one_message_for_each_other_container() -> None:
         a.register(lamp, "robot")
         a.deregister(lamp)
         assert system.network.sent - before == Counter({Kind.ANNOUNCE: 6})
+
+
+def test_who_joins_is_told_of_by_answers_only(lamp: Lamp) -> None:
+    with memory_system() as system:
+        a = system.container("a")
+        before = system.sent(Kind.ANNOUNCE)
+        b = system.container("b")
+        system.settle()
+        assert len(b.services(where(group="trade"))) == 2 * len(a.services(where(group="trade", container="a")))
+        assert system.sent(Kind.ANNOUNCE) == before
+        b.register(lamp, "robot")
+        assert system.sent(Kind.ANNOUNCE) == before + 1
+
+
+def test_who_has_nothing_new_says_ever_more_seldom_how_far_it_is(lamp: Lamp) -> None:
+    with memory_system() as system:
+        system.container("a")
+        b = system.container("b")
+        announcer = b._parts.announcer
+
+        def beats_that_tell(count: int) -> list[int]:
+            return [beat for beat in range(1, count + 1) if _sends_one(system, announcer.beat)]
+
+        b.register(lamp, "robot")
+        assert beats_that_tell(33) == [1, 2, 4, 8, 16, 24, 32]
+        b.deregister(lamp)
+        assert beats_that_tell(3) == [1, 2]
+
+
+def _sends_one(system: MemorySystem, action: Callable[[], None]) -> bool:
+    before = system.sent()
+    action()
+    return system.sent() > before
 
 
 # --- partitions
@@ -391,7 +424,7 @@ def test_nobody_waits_behind_who_has_failed_to_answer(monkeypatch: pytest.Monkey
         info = ServiceInfo(name="dim", signature="dim()")
         entry = ProviderInfo(revision=1, groups=("hall",), kind="Lamp", host="h", pid=1, services=(info,))
         announcer.announce("hall", "lamp", entry)
-        other.appear(alive_key(address))
+        announcer.appear()
         assert eventually(lambda: labels(a) == ["other/hall.dim"])
         announcer.close()
         question.close()

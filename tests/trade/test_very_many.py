@@ -7,7 +7,7 @@ import pytest
 
 from trade import Container, Handle, service, where
 from trade._announcing import Announcer
-from trade._wire import Address, ProviderInfo, ServiceInfo, alive_key
+from trade._wire import Address, ProviderInfo, ServiceInfo
 
 HOST = Address("somebody", "host", "e1")
 
@@ -22,7 +22,7 @@ def host(here: Container, open_raw: Any) -> Iterator[Announcer]:
     """Announces whatever a test wants; linked with the container, for which it is alive."""
     raw = open_raw(here)
     announcer = Announcer(raw, HOST)
-    sign = raw.appear(alive_key(HOST))
+    sign = announcer.appear()
     assert here._parts.registry.wait_for(lambda: here._parts.registry.is_alive(HOST), 20)
     yield announcer
     sign.close()

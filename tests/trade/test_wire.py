@@ -388,8 +388,9 @@ def test_entries_count_only_while_their_container_shows_itself(
 ) -> None:
     raw, announcing = announcer
     announcing.announce("robot", "P-1", PROVIDER)
+    raw.announce(registry_key("robot", FORGED, "P-1"), encode_message(PROVIDER))
     assert here.services(where(group="forged")) == []
-    sign = raw.appear(alive_key(FORGED))
+    sign = announcing.appear()
     assert here.find(where(group="forged"), wait_s=20).container == "ghost"
     sign.close()
     assert eventually(lambda: here.services(where(group="forged")) == [])
@@ -400,7 +401,7 @@ def test_a_newer_revision_of_an_entry_replaces_it_and_an_older_one_does_not(
     here: Container, announcer: tuple[Any, Announcer], eventually: Any
 ) -> None:
     raw, announcing = announcer
-    _sign = raw.appear(alive_key(FORGED))
+    _sign = announcing.appear()
     announcing.announce("robot", "P-1", PROVIDER)
     handle = here.find(where(group="forged"), wait_s=20)
     announcing.announce("robot", "P-1", msgspec.structs.replace(PROVIDER, revision=3, groups=("newer",)))

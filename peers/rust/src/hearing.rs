@@ -97,14 +97,13 @@ impl Container {
         }
         let (who, payload) = (chunks[2..5].join("/"), sample.payload().to_bytes());
         match chunks[5] {
-            "system" => wire::told_estops(&payload).into_iter().for_each(|told| self.learnt(&told)),
             "tally" => {
                 let Some(revision) = wire::read_tally(&payload) else { return };
                 if self.asking.alive(&who) && known.insert(who.clone(), revision) != Some(revision) {
                     self.ask_later(who); // something of it may have been missed
                 }
             }
-            _ => {}
+            _ => wire::told_estops(&payload).into_iter().for_each(|told| self.learnt(&told)),
         }
     }
 
@@ -121,10 +120,11 @@ impl Container {
         while let Ok(reply) = replies.recv() {
             let Ok(sample) = reply.result() else { continue };
             let key = sample.key_expr().as_str();
-            if key == format!("registry/trade/{who}/system") {
+            if key == format!("registry/trade/{who}/tally") {
+                whole = true; // what it tells last: nothing was cut off
+            } else {
                 wire::told_estops(&sample.payload().to_bytes()).into_iter().for_each(|told| self.learnt(&told));
             }
-            whole |= key == format!("registry/trade/{who}/tally"); // what it tells last: nothing was cut off
         }
         whole || !self.asking.alive(who)
     }

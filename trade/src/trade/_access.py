@@ -10,7 +10,7 @@ from typing import Final
 
 from trade._policies import Decision, Policy
 from trade._policy_file import read_policy
-from trade._system import DOMAIN, PROVIDER
+from trade._system import DOMAIN, ESTOPS, PROVIDER
 from trade._wire import domain_of
 from trade.errors import AccessDenied
 
@@ -74,7 +74,7 @@ SOME_HAVE: Final = {
 }
 """Likewise, of functions that only a container has which looks after others."""
 _ALL_FUNCTIONS: Final = {**FUNCTIONS, **SOME_HAVE}
-_OF_EVERYBODY: Final = (PROVIDER, "supervisor")
+_OF_EVERYBODY: Final = (PROVIDER, ESTOPS, "supervisor")
 """The providers of these functions: who offers them needs no right, as whoever calls them is asked for one."""
 
 _NEEDS: Final = {"read": "read", "note": "call", "actuate": "call", "stop": _ALL}

@@ -28,7 +28,7 @@ class Asker:
     """One thread that asks; several requests for one container are one question.
 
     Those who were waited for in vain are asked by a second one, there from the first such case on: nobody waits behind
-    them. The first also says how far this container itself is, every ``Transport.beat_s``.
+    them. The first also has the container say how far it is itself (`beat`), every ``Transport.beat_s``.
     """
 
     def __init__(self, transport: Transport, registry: Registry, take: Take, beat: Callable[[], None]) -> None:

@@ -11,6 +11,7 @@ from trade import _process
 from trade._access import Access, verb_of
 from trade._bordering import Bordering
 from trade._context import running
+from trade._estop_services import EstopServices
 from trade._guarding import Guarding
 from trade._handle import Handle, Run
 from trade._hosting import Hosting
@@ -75,7 +76,7 @@ class Container(Hosting, Moving, Streaming, Tracing, Guarding, Bordering):
         """How busy it is."""
         self.terminating: Final = self._parts.terminating
         """Its end, if others want it."""
-        self._parts.appear(OwnServices(self._parts, self))
+        self._parts.appear(OwnServices(self._parts, self), EstopServices(self._parts.estopping))
         _process.live.add(self)
 
     def load_policy(self, path: Path | str) -> None:

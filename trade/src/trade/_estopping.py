@@ -71,7 +71,7 @@ class Estopping:
         """Hear orders from now on.
 
         Args:
-            provider: the middleware's own, registered; its entry tells what is open, as its ``open_estops``.
+            provider: that of e-stops, registered; its entry tells what is open, as its ``open_estops``.
         """
         self._provider = provider
         self._registry.listen(self._heard)

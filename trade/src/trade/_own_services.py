@@ -1,11 +1,8 @@
-"""The one provider of the middleware's own functions: what is in group ``trade`` of every container."""
+"""The provider of the middleware's own functions: what is in group ``trade`` of every container, e-stops left out."""
 
 from typing import Final, Protocol
 
 from trade._access import Access
-from trade._context import current_call
-from trade._estop_line import EstopReport
-from trade._estopping import LIMIT_S
 from trade._hook_services import HookServices
 from trade._lock_services import LockServices
 from trade._making_services import MakingServices
@@ -13,11 +10,9 @@ from trade._migration_services import MigrationServices
 from trade._notification_services import Home as Member
 from trade._notification_services import NotificationServices
 from trade._parts import Parts
-from trade._service import service
 from trade._stream_services import StreamServices
 from trade._system import System, SystemServices
 from trade._trace_services import TraceServices
-from trade._wire import Estop
 
 
 class Home(Member, Protocol):
@@ -58,26 +53,3 @@ class OwnServices(
         MakingServices.__init__(self, home.system)
         MigrationServices.__init__(self, parts.departing, parts.arriving)
         StreamServices.__init__(self, parts.streams)
-        self._estopping = parts.estopping
-
-    @property
-    def open_estops(self) -> tuple[Estop, ...]:
-        """What its registry entry tells of e-stops."""
-        return self._estopping.open_here()
-
-    @service(effect="stop")
-    def estop(self, reason: str = "") -> EstopReport:
-        """Stop everything in the whole system, and let nothing move until that is cleared; who did, who is missing."""
-        call = current_call()
-        asked = f"asked by {call.caller}" if call is not None else ""
-        return self._estopping.estop(f"{reason} ({asked})" if reason else asked, LIMIT_S)
-
-    @service(effect="read")
-    def estops(self) -> list[Estop]:
-        """The e-stops that are open anywhere in the system, oldest first."""
-        return self._estopping.open()
-
-    @service
-    def estop_clear(self, ids: list[str]) -> EstopReport:
-        """Clear e-stops by their ids; nothing moves by itself."""
-        return self._estopping.clear(ids, LIMIT_S)

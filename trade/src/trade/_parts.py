@@ -42,12 +42,12 @@ from trade._resources import Holder
 from trade._settings import Settings
 from trade._spans import Spans, new_spans
 from trade._streams import Streams
-from trade._system import DOMAIN, PROVIDER
+from trade._system import DOMAIN, ESTOPS, PROVIDER
 from trade._targets import Targets
 from trade._terminating import Terminating
 from trade._transport import Transport
 from trade._watch import Watch
-from trade._wire import Address, Estop, ServiceKey, Token, alive_key
+from trade._wire import Address, ServiceKey, Token
 from trade._withdrawn import Withdrawn
 from trade._zenoh import ZenohTransport
 from trade.errors import AccessDenied
@@ -57,13 +57,6 @@ class Home(_hooks.Home, _locking.Home, _making.Home, _notifications.Home, _strea
     """The container, as what it is made of sees it."""
 
     def close(self) -> None: ...
-
-
-class Own(Protocol):
-    """The provider of the middleware's own functions."""
-
-    @property
-    def open_estops(self) -> tuple[Estop, ...]: ...
 
 
 class Parts:
@@ -161,13 +154,19 @@ class Parts:
             self.metrics_port = open_metrics(settings, self.audit.calls, self._measures, leaving)
             self._leaving = leaving.pop_all()
 
-    def appear(self, own: Own) -> None:
-        """Be there for others, who find these functions of the middleware's own. Ends everything if it cannot."""
+    def appear(self, own: object, estops: object) -> None:
+        """Be there for others, who find these functions of the middleware's own. Ends everything if it cannot.
+
+        Args:
+            own: the provider of all but e-stops.
+            estops: the one of e-stops.
+        """
         with contextlib.ExitStack() as undone:
             undone.callback(self.close)
             self.providers.add(own, (DOMAIN,), name=PROVIDER)
-            self.estopping.begin(own)
-            self._leaving.callback(self.transport.appear(alive_key(self._home.address)).close)
+            self.providers.add(estops, (DOMAIN,), name=ESTOPS)
+            self.estopping.begin(estops)
+            self._leaving.callback(self.announcer.appear().close)
             self.watch = Watch(
                 self.transport,
                 self.registry,

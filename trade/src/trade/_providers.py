@@ -123,7 +123,7 @@ class Providers:
             host=socket.gethostname(),
             pid=os.getpid(),
             services=_infos(services),
-            kinds=kinds_of(type(provider), implements),
+            kinds=(kind,) if domain == DOMAIN else kinds_of(type(provider), implements),
             meta=checked_meta({**_own_meta(provider), **(meta or {})}),
             members={group: tuple(names) for group, names in getattr(provider, "members", {}).items()},
             estops=getattr(provider, "open_estops", ()) if domain == DOMAIN else (),

@@ -20,6 +20,8 @@ from trade.errors import CannotStart, ConfigurationError, LinkStays, NoSuchServi
 
 DOMAIN: Final = "trade"
 PROVIDER: Final = "system"
+ESTOPS: Final = "estops"
+"""The provider of what has to do with e-stops, in the same domain."""
 CLOCK: Final = "clock"
 
 

@@ -11,7 +11,7 @@ from trade._hands import Hands
 from trade._invoke import LocalTarget, RemoteTarget, container_closed
 from trade._providers import Providers
 from trade._registry import Change, Record, Registry, gone_to
-from trade._system import DOMAIN, PROVIDER
+from trade._system import DOMAIN, ESTOPS, PROVIDER
 from trade._transport import ChannelClosed
 from trade._wire import Address, ServiceInfo, ServiceKey
 from trade.errors import AccessDenied, ServiceGone
@@ -98,9 +98,9 @@ class Targets:
         What it answers is known here, whatever that one says of it: it may be written in another language.
         """
         key = record.key
-        if (key.domain, key.provider) != (DOMAIN, PROVIDER):
+        if key.domain != DOMAIN or key.provider not in (PROVIDER, ESTOPS):
             return None
-        service = self._providers.services_at(f"{DOMAIN}/{PROVIDER}").get(key.name)
+        service = self._providers.services_at(f"{DOMAIN}/{key.provider}").get(key.name)
         return None if service is None else service.info
 
     def gone(self, handle: Handle) -> ServiceGone:

@@ -102,7 +102,7 @@ class Transport(ABC):
     """
 
     beat_s: float = 2.0
-    """How often who announces here says how far it is: so long a lost announcement may go unnoticed."""
+    """How soon after an announcement who made it says how far it is: so long a lost one may go unnoticed."""
 
     @abstractmethod
     def publish(self, key: str, *, urgent: bool = False, droppable: bool = False) -> Publisher:

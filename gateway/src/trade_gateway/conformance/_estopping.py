@@ -59,7 +59,9 @@ def _confirmation(message: Any) -> EstopConfirmed | None:
 
 
 def _told(stage: Stage) -> tuple[str, ...]:
-    return tuple(estop.id for estop in stage.peer.offer().entries[SYSTEM].estops)
+    """Whichever of its own providers tells them."""
+    entries = stage.peer.offer().entries
+    return tuple(estop.id for (domain, _), info in entries.items() if domain == SYSTEM[0] for estop in info.estops)
 
 
 def _require_stopped(stage: Stage, who: Voice, when: str) -> None:

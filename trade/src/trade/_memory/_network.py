@@ -31,6 +31,8 @@ class Passage:
     arrived: bool
 
 
+_MOST_ROUTES: Final = 4096
+
 Tap = Callable[[Passage], None]
 
 
@@ -69,7 +71,10 @@ class Network:
         self._delay = Delay()
         self._nodes: list[Node] = []
         self._named: dict[str, Node] = {}
-        self._links: dict[frozenset[Node], Link] = {}
+        self._links: dict[Node, dict[Node, Link]] = {}
+        """Of each node, by its neighbour: what one sends costs nothing for the links of others."""
+        self._routes: dict[str, list[Node]] = {}
+        """Who hears a key, in the order in which they joined; of keys that were put on since anybody listened anew."""
         self._taps: list[Tap] = []
         self._losing: list[Callable[[Passage], bool]] = []
         self._numbers = itertools.count(1)
@@ -85,8 +90,10 @@ class Network:
         with self.lock:
             node = self._named[name] = Node(name)
             others, self._nodes = self._nodes, [*self._nodes, node]
+            self._links[node] = {}
             for other in others:
-                self._links[frozenset((node, other))] = Link(node, other, self.traffic, self._random, self._delay)
+                link = Link(node, other, self.traffic, self._random, self._delay)
+                self._links[node][other] = self._links[other][node] = link
             for other in others:
                 for token, key in list(other.tokens.items()):
                     self.pass_on(
@@ -120,11 +127,24 @@ class Network:
                 self._forget(link)
 
     def _links_of(self, node: Node) -> list[Link]:
-        return [link for ends, link in self._links.items() if node in ends]
+        return list(self._links.get(node, {}).values())
+
+    def _link(self, one: Node, other: Node) -> Link | None:
+        return self._links.get(one, {}).get(other)
+
+    def _all_links(self) -> list[Link]:
+        return [link for node, links in self._links.items() for link in links.values() if link.ends[0] is node]
 
     def _forget(self, link: Link) -> None:
-        self._links.pop(frozenset(link.ends), None)
+        self._unlink(link)
         self._give_up(link)
+
+    def _unlink(self, link: Link) -> None:
+        for node in link.ends:
+            links = self._links.get(node, {})
+            links.pop(link.far_end(node), None)
+            if node.closed and not links:
+                self._links.pop(node, None)
 
     # --- what passes
 
@@ -137,9 +157,21 @@ class Network:
         with self.lock:
             _check_open(source)
             source.take(message, own=True)
-            for target in self._others(source):
-                if target.hears(message.key):
+            for target in self._hearers(message.key):
+                if target is not source and self.linked(source, target):
                     self.pass_on(kind, source, target, message, _taking(target, message))
+
+    def _hearers(self, key: str) -> list[Node]:
+        found = self._routes.get(key)
+        if found is None:
+            if len(self._routes) >= _MOST_ROUTES:
+                self._routes.clear()
+            found = self._routes[key] = [node for node in self._nodes if node.hears(key)]
+        return found
+
+    def route_anew(self) -> None:
+        """Somebody hears something else now. Used under the network's lock."""
+        self._routes.clear()
 
     def show(self, source: Node, token: int, key: str) -> None:
         """A sign of life for everybody."""
@@ -178,7 +210,7 @@ class Network:
 
     def linked(self, one: Node, other: Node) -> bool:
         """Whether there is a link that is up, between two that are open."""
-        link = self._links.get(frozenset((one, other)))
+        link = self._link(one, other)
         return link is not None and link.up and not (one.closed or other.closed)
 
     def _others(self, node: Node) -> list[Node]:
@@ -195,7 +227,7 @@ class Network:
         self._tell_taps(passage)
         if any(loses(passage) for loses in list(self._losing)):
             return
-        link = self._links.get(frozenset((source, target)))
+        link = self._link(source, target)
         if link is None or not link.up:
             return
 
@@ -241,14 +273,14 @@ class Network:
         with self.lock:
             if between is None:
                 self._delay = delay
-            for link in self._links.values() if between is None else [self._links[frozenset(between)]]:
+            for link in self._all_links() if between is None else [self._links[between[0]][between[1]]]:
                 for way in link.ways.values():
                     way.delay = delay
 
     def partition(self, one: Node, other: Node, *, one_way: bool = False) -> None:
         """Cut a link; ``one_way``: only from the first to the second. A cut that outlasts the lease ends the link."""
         with self.lock:
-            link = self._links.get(frozenset((one, other)))
+            link = self._link(one, other)
             if link is None:
                 return
             for source in (one,) if one_way else (one, other):
@@ -274,18 +306,18 @@ class Network:
             one.lose_all_of(other)
             other.lose_all_of(one)
             if one.closed or other.closed:
-                self._links.pop(frozenset(link.ends), None)
+                self._unlink(link)
             self.changed.notify_all()
 
     def heal(self, one: Node | None = None, other: Node | None = None) -> None:
         """Mend the link of two nodes, or all links of one, or all."""
         with self.lock:
             named = {node for node in (one, other) if node is not None}
-            for link in [link for ends, link in self._links.items() if named <= ends]:
+            for link in [link for link in self._all_links() if named <= {*link.ends}]:
                 for way in link.ways.values():
                     way.cut = False
                     way.resume()
-                if not link.up and self._links.get(frozenset(link.ends)) is link:
+                if not link.up and self._link(*link.ends) is link:
                     self._link_again(link)
 
     def _link_again(self, link: Link) -> None:

@@ -122,6 +122,7 @@ class MemoryTransport(Transport):
             self._check_open()
             channel = MemoryChannel(pattern, self._forget_in(among), of_others=of_others, newest=newest)
             among.append(channel)
+            self.network.route_anew()
             return channel
 
     def _forget_in(self, among: list[Any]) -> Callable[[Inbox[Any]], None]:
@@ -129,5 +130,6 @@ class MemoryTransport(Transport):
             with self.network.lock:
                 if inbox in among:
                     among.remove(inbox)
+                    self.network.route_anew()
 
         return forget

@@ -164,7 +164,8 @@ def memory_system(
     Args:
         seed: of the generator that draws jitter.
         lease_s: how long a partition lasts, on the network's clock, until containers lose each other.
-        beat_s: how often a container says how far it is, in seconds of the real clock: who lost a message asks then.
+        beat_s: how soon after an announcement a container says how far it is, in seconds of the real clock: who lost
+            that asks then.
         state_dir: where containers keep what outlives them, such as open e-stops; none: nowhere.
     """
     system = MemorySystem(seed=seed, lease_s=lease_s, beat_s=beat_s, state_dir=state_dir)

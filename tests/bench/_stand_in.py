@@ -1,0 +1,93 @@
+"""What stands in for a container on a network in memory: it says and asks all that one does, and forgets what it hears.
+
+A thousand whole containers in one process would each keep a registry of all others, which no memory holds. What they
+send to each other does not depend on that.
+"""
+
+import secrets
+import threading
+from collections.abc import Mapping
+
+from msgspec import structs
+
+from trade import Container
+from trade._announcing import Announcer
+from trade._memory import MemoryTransport, Network
+from trade._transport import ChannelClosed, Message
+from trade._wire import (
+    ALIVE,
+    ESTOP_ORDERS,
+    REGISTRY,
+    Address,
+    ProviderInfo,
+    calls_to,
+    decode_provider,
+    registry_key,
+)
+
+Offer = Mapping[tuple[str, str], ProviderInfo]
+"""Providers by domain and name."""
+_ANSWER_S = 20.0
+
+
+def offer_of(container: Container) -> Offer:
+    """What a container tells those who ask it."""
+    standing = dict(container._parts.announcer._standing)
+    return {(key.split("/")[1], key.split("/")[-1]): decode_provider(payload) for key, payload in standing.items()}
+
+
+class StandIn:
+    """One that is no container and costs the others what one would.
+
+    Args:
+        network: where it joins.
+        name: of the container it stands for.
+        offer: what it tells of itself.
+        asks: whether it asks those there and those to come what they offer; else, so that very many begin quickly,
+            nobody before `ask_from_now_on`.
+    """
+
+    def __init__(self, network: Network, name: str, offer: Offer, *, asks: bool = True) -> None:
+        self.address = Address("bench", name, secrets.token_hex(6))
+        self._transport = MemoryTransport(network, name)
+        self._announcer = Announcer(self._transport, self.address)
+        self._asks = asks
+        for pattern in (ESTOP_ORDERS, REGISTRY, *(calls_to(self.address, stop=stop) for stop in (False, True))):
+            self._transport.subscribe(pattern, newest=1)
+        for revision, ((domain, provider), info) in enumerate(offer.items(), 1):
+            self._announcer.announce(domain, provider, structs.replace(info, revision=revision))
+        self._known = set(self._transport.present(ALIVE, _ANSWER_S))
+        self._signs = self._transport.presences(ALIVE)
+        self._thread = threading.Thread(target=self._read, name="stand-in", daemon=True)
+        self._presence = self._announcer.appear()
+        if asks:
+            self._transport.ask(REGISTRY, _ANSWER_S)
+        self._thread.start()
+
+    def ask_from_now_on(self) -> None:
+        """Whoever comes is asked."""
+        self._asks = True
+
+    def beat(self) -> None:
+        """What a container does every two seconds."""
+        self._announcer.beat()
+
+    def _read(self) -> None:
+        while True:
+            try:
+                self._take(self._signs.receive())
+            except ChannelClosed:
+                return
+
+    def _take(self, sign: Message) -> None:
+        _, identity, container, epoch = sign.key.split("/")
+        address = Address(identity, container, epoch)
+        new = sign.payload is not None and sign.key not in self._known and address != self.address
+        self._known.add(sign.key)
+        if new and self._asks:
+            self._transport.ask(registry_key("*", address, "*"), _ANSWER_S)
+
+    def close(self) -> None:
+        """Leave."""
+        self._transport.close()
+        self._announcer.close()
