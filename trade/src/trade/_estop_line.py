@@ -12,10 +12,9 @@ from msgspec import Struct
 
 from trade._access import Access
 from trade._audit import Audit
-from trade._transport import Channel, ChannelClosed, Message, Transport
+from trade._transport import ChannelClosed, Message, Transport
 from trade._wire import (
-    ESTOP_ORDERS,
-    ESTOPS_CONFIRMED,
+    ESTOPS,
     PROTOCOL,
     Address,
     EstopConfirmed,
@@ -55,27 +54,20 @@ class EstopReport(Struct, frozen=True):
 
 
 class EstopLine:
-    """Where one container hears orders and confirms them, and gives its own.
-
-    All hear orders. Confirmations are heard only by who gives an order, while it does: everybody confirms, and if
-    everybody heard that it would be the square of how many there are, ten times a second.
-    """
+    """Where one container hears orders and confirmations, and gives its own."""
 
     def __init__(self, transport: Transport, own: Address, access: Access, audit: Audit) -> None:
         self._access = access
         self._audit = audit
         self._own = own
         self._orders = transport.publish(estop_key(own.identity), urgent=True, droppable=True)
-        self._transport = transport
         self._confirmations = transport.publish(estop_confirmed_key(own), urgent=True, droppable=True)
-        self._channel = transport.subscribe(ESTOP_ORDERS)
+        self._channel = transport.subscribe(ESTOPS)
         self._take: Callable[[EstopOrder, str], None] | None = None
         self._asked: dict[str, dict[Address, str]] = {}
         """By request: who has confirmed it, and what failed there."""
         self._changed = threading.Condition()
-        self._thread = threading.Thread(
-            target=self._read, args=(self._channel, self._ordered), name="trade-estop", daemon=True
-        )
+        self._thread = threading.Thread(target=self._read, name="trade-estop", daemon=True)
         self.malformed = 0
 
     def listen(self, take: Callable[[EstopOrder, str], None]) -> None:
@@ -105,21 +97,16 @@ class EstopLine:
         heard: dict[Address, str] = {}
         with self._changed:
             self._asked[order.request] = heard
-        answered = threading.Event()
-        threading.Thread(target=self._hear, args=(answered,), name="trade-estop-confirmed", daemon=True).start()
-        try:
-            if self._take is not None:
-                self._take(order, self._own.identity)
-            while (left_s := until - time.monotonic()) > 0 and not over():
-                self._orders.put(data)
-                awaited.update(expected())
-                with self._changed:
-                    if self._changed.wait_for(partial(_all_of, awaited, heard), min(_AGAIN_S, left_s)):
-                        break
-        finally:
-            answered.set()
+        if self._take is not None:
+            self._take(order, self._own.identity)
+        while (left_s := until - time.monotonic()) > 0 and not over():
+            self._orders.put(data)
+            awaited.update(expected())
             with self._changed:
-                del self._asked[order.request]
+                if self._changed.wait_for(partial(_all_of, awaited, heard), min(_AGAIN_S, left_s)):
+                    break
+        with self._changed:
+            del self._asked[order.request]
         return EstopReport(
             id=order.opened.id if order.opened is not None else ",".join(order.cleared),
             confirmed=_names(address for address in awaited & heard.keys() if not heard[address]),
@@ -129,31 +116,10 @@ class EstopLine:
 
     # --- hearing
 
-    def _hear(self, until: threading.Event) -> None:
-        """Hear confirmations; to begin and to end that may wait for somebody who stands still, so nobody waits for it.
-
-        What is confirmed before it has begun is confirmed again when the order is repeated.
-        """
-
-        def end() -> None:
-            until.wait()
-            channel.close()
-
-        try:
-            channel = self._transport.subscribe(ESTOPS_CONFIRMED)
-        except ChannelClosed:
-            return
-        threading.Thread(target=end, name="trade-estop-answered", daemon=True).start()
-        self._read(channel, self._confirmed)
-
-    def _read(self, channel: Channel, take: Callable[[Message, list[str]], None]) -> None:
+    def _read(self) -> None:
         while True:
             try:
-                message = channel.receive()
-                _, *chunks = message.key.split("/")
-                if not all(map(is_chunk, chunks)):
-                    raise Malformed(f"{message.key!r} is a pattern")
-                take(message, chunks)
+                self._heard(self._channel.receive())
             except ChannelClosed:
                 return
             except (Malformed, msgspec.DecodeError) as bad:
@@ -163,18 +129,21 @@ class EstopLine:
             except Exception:
                 _logger.exception("an e-stop could not be dealt with")
 
-    def _ordered(self, message: Message, chunks: list[str]) -> None:
-        [who] = chunks
-        order = decode_estop_order(message.payload or b"", who)
-        denied = self._access.denied_order(who, clears=order.opened is None)
-        if denied is not None:
-            self._audit.refused("trade.estop" if order.opened else "trade.estop_clear", denied, who=who)
-            raise Malformed(str(denied))
-        if self._take is not None:
-            self._take(order, who)
+    def _heard(self, message: Message) -> None:
+        _, *chunks = message.key.split("/")
+        if not all(map(is_chunk, chunks)):
+            raise Malformed(f"{message.key!r} is a pattern")
+        if len(chunks) == 1 and self._take is not None:
+            order = decode_estop_order(message.payload or b"", chunks[0])
+            denied = self._access.denied_order(chunks[0], clears=order.opened is None)
+            if denied is not None:
+                self._audit.refused("trade.estop" if order.opened else "trade.estop_clear", denied, who=chunks[0])
+                raise Malformed(str(denied))
+            self._take(order, chunks[0])
+        elif len(chunks) == 3:
+            self._hear_confirmed(Address(*chunks), decode_estop_confirmed(message.payload or b""))
 
-    def _confirmed(self, message: Message, chunks: list[str]) -> None:
-        address, confirmed = Address(*chunks), decode_estop_confirmed(message.payload or b"")
+    def _hear_confirmed(self, address: Address, confirmed: EstopConfirmed) -> None:
         with self._changed:
             heard = self._asked.get(confirmed.request)
             if heard is not None:

@@ -80,8 +80,6 @@ def estop_confirmed_key(address: Address) -> str:
 
 
 ESTOPS: Final = "estop/**"
-ESTOP_ORDERS: Final = "estop/*"
-ESTOPS_CONFIRMED: Final = "estop/*/*/*"
 
 
 TALLY: Final = "tally"
