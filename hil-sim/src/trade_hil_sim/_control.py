@@ -110,7 +110,7 @@ class ControlServer:
                 return Answer(ok=True, buses=[bus.state() for bus in self._buses.values()])
             for bus, meant in self._meant(command):
                 bus.do(meant)
-        except msgspec.DecodeError as problem:
+        except (msgspec.DecodeError, RecursionError) as problem:
             return Answer(error=_explain(problem, line))
         except (SimulationError, OSError) as problem:
             return Answer(error=str(problem))
@@ -202,11 +202,11 @@ def _remove_stale(path: Path) -> None:
                 path.unlink()
 
 
-def _explain(problem: msgspec.DecodeError, line: bytes) -> str:
+def _explain(problem: msgspec.DecodeError | RecursionError, line: bytes) -> str:
     text, kinds = str(problem), {"state": State, **kinds_of(Command)}
     if "$.do" in text or "`do`" in text:
         return f"{text}; do is one of {', '.join(kinds)}"
-    if isinstance(problem, msgspec.ValidationError):
+    with suppress(msgspec.DecodeError, RecursionError, KeyError):
         kind = kinds[msgspec.json.decode(line, type=_Named).do]
         return f"{text}; its keys are do, {', '.join(kind.__struct_fields__)}"
     return f'{text}; a command is one line such as {{"do": "mute", "ids": [1]}}'
