@@ -239,10 +239,11 @@ def test_S09_a_driver_restarted_while_one_is_open_stays_latched(tmp_path: Path) 
         assert call(system.container("one"), "move_to", "one", 0.1) == 0.1
 
 
-def test_S09_what_cannot_be_read_is_open_all_the_same(tmp_path: Path) -> None:
+@pytest.mark.parametrize("text", [b"half of", b'["abc", "\xbb", "", 0.0]'], ids=["broken off", "no text"])
+def test_S09_what_cannot_be_read_is_open_all_the_same(tmp_path: Path, text: bytes) -> None:
     folder = tmp_path / "memory" / "estop"
     folder.mkdir(parents=True)
-    (folder / "abc.json").write_text("half of")
+    (folder / "abc.json").write_bytes(text)
     with memory_system(state_dir=tmp_path) as system:
         drivers(system, "one")
         [estop] = system.container("one").estops()
