@@ -1,6 +1,7 @@
 """What goes over the wire: garbage is dropped, counted, logged once; forgeries are ignored; nothing else stops."""
 
 import logging
+import sys
 import threading
 from collections.abc import Iterator
 from typing import Any, Final
@@ -12,6 +13,8 @@ from hypothesis import strategies as st
 
 from trade import Container, Handle, Secret, _wire, service, where
 from trade._announcing import Announcer
+from trade._handle_codec import handle_codec
+from trade._invoke import result_decoder
 from trade._schemas import schema_message
 from trade._wire import (
     EMPTY,
@@ -623,3 +626,37 @@ def test_an_error_whose_text_is_none_is_still_an_error(callee: FakeCallee, asked
     callee.answer(call, Status.ERROR, msgspec.Raw(b"\x83\xa4type\xa1a\xa7message\xa1\xff\xa6fields\x80"))
     with pytest.raises(RemoteError, match=r"forged.go raised an error that cannot be read"):
         result()
+
+
+NOT_LOADED: Final = "turtledemo.clock"
+PATHS: Final = [
+    "os:system",
+    "subprocess:Popen",
+    "builtins:exec",
+    "builtins:SystemExit",
+    f"{NOT_LOADED}:Turtle",
+    "trade:where",
+]
+
+
+@pytest.mark.parametrize("path", PATHS)
+def test_a_class_path_in_an_error_loads_nothing_and_calls_nothing(callee: FakeCallee, asked: Any, path: str) -> None:
+    call, result = asked
+    fields = {"args": [["touch", "/nowhere"]], "__class__": "x"}
+    callee.answer(call, Status.ERROR, {"type": path, "message": "touch /nowhere", "fields": fields})
+    with pytest.raises(RemoteError) as raised:
+        result()
+    assert raised.value.type_name == path
+    assert NOT_LOADED not in sys.modules
+
+
+@pytest.mark.parametrize("path", PATHS)
+def test_a_class_path_in_a_description_loads_nothing_and_calls_nothing(path: str) -> None:
+    definition = {"type": "object", "properties": {"args": {"type": "array"}}, "required": ["args"]}
+    message = schema_message({"$ref": "#/$defs/Evil"}, {"Evil": definition})
+    info = ServiceInfo(name="go", signature="go()", result_schema=message, types={"Evil": path})
+    codec = handle_codec(lambda handle: handle.key, lambda key: None)  # type: ignore[arg-type,return-value]
+    decoded = result_decoder(codec, info)(msgspec.msgpack.encode({"args": ["touch", "/nowhere"]}))
+    assert decoded.args == ["touch", "/nowhere"]
+    assert type(decoded).__module__ not in {"os", "subprocess", "builtins"}
+    assert NOT_LOADED not in sys.modules
