@@ -132,6 +132,11 @@ def _constraint(data: bytes) -> Constraint:
     return read
 
 
+def _constraint_written(read: Constraint) -> bytes:
+    """In order: sets have none."""
+    return encode_message({"clauses": [sorted(clause) for clause in read.clauses]})
+
+
 def _predicates(data: bytes) -> tuple[Any, ...]:
     """Patterns, and behind a line's end facts."""
     wanted, _, facts = data.decode(errors="replace").partition("\n")
@@ -160,7 +165,7 @@ TARGETS: Final = [
     Target("wire-error", _error, UNREADABLE, encode_message),
     Target("wire-arguments", _arguments, (InvalidArgument, Malformed)),
     Target("wire-key", _text(place_of), (Malformed,)),
-    Target("constraint", _constraint, UNREADABLE, encode_message),
+    Target("constraint", _constraint, UNREADABLE, _constraint_written),
     Target("predicates", _predicates, (ConfigurationError,), lambda found: ", ".join(map(str, found)).encode()),
     Target("endpoint", _text(Endpoint.read), (ConfigurationError,), lambda read: str(read).encode()),
     Target("inherited-lock", _text(_inherited), (ConfigurationError,)),

@@ -10,7 +10,7 @@ from tests.fuzz._target import CORPUS, Target
 from tests.fuzz.targets import TARGETS
 
 EACH: Final = pytest.mark.parametrize("target", TARGETS.values(), ids=list(TARGETS))
-EXAMPLES: Final = 120
+EXAMPLES: Final = 100
 FEW: Final = hypothesis.settings(
     max_examples=EXAMPLES,
     deadline=None,
