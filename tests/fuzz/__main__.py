@@ -41,8 +41,20 @@ def _guide(target: Target, seconds: int) -> None:
     with tempfile.TemporaryDirectory() as grown:
         options = [f"-max_total_time={seconds}", f"-rss_limit_mb={_MOST_MB}", f"-timeout={_LONGEST_S}"]
         options += [f"-artifact_prefix={target.folder}/found-", "-max_len=4096", "-verbosity=0"]
-        atheris.Setup([sys.argv[0], *options, grown, str(target.folder)], target.takes)
+        atheris.Setup([sys.argv[0], *options, grown, str(target.folder)], lambda data: _kept(target, data))
         atheris.Fuzz()
+
+
+def _kept(target: Target, data: bytes) -> None:
+    try:
+        target.takes(data)
+    except Exception:
+        _keep(target.folder, data)
+        raise
+
+
+def _keep(folder: Path, data: bytes) -> None:
+    folder.joinpath(f"found-{hashlib.sha256(data).hexdigest()[:12]}").write_bytes(data)
 
 
 def unguided(names: list[str], seconds: int) -> list[str]:
@@ -76,7 +88,7 @@ def _round(take: object, kind: object, folder: Path) -> None:
     try:
         tried()
     except Exception:
-        folder.joinpath(f"found-{hashlib.sha256(last[0]).hexdigest()[:12]}").write_bytes(last[0])
+        _keep(folder, last[0])
         raise
 
 
