@@ -14,8 +14,8 @@ ARGS ?=
 SEED ?= 1
 MINUTES ?= 3
 
-.PHONY: demo screenshots docs release-check test test-socketcan soak-registry soak-relocation chaos chaos-robots check
-.PHONY: bench bench-compare bench-page clean
+.PHONY: demo screenshots docs release-check test test-socketcan soak-registry soak-relocation chaos chaos-robots siege
+.PHONY: fuzz check audit-deps sbom bench bench-compare bench-page clean
 .DEFAULT_GOAL := help
 
 help: ## show the targets
@@ -50,6 +50,9 @@ chaos: $(UV) ## locks under kill -9, freezes, cuts and delays; 240 clients (SEED
 chaos-robots: $(UV) ## a lock over two robots while a driver is killed and started again, 50 times
 	@CHAOS_ROUNDS=50 $(RUN) pytest tests/system/test_two_robots.py $(ARGS)
 
+fuzz: $(UV) ## every reader of bytes, guided by coverage where Atheris has a wheel (MINUTES=..; exits 1 if something breaks)
+	@$(RUN) --group fuzz python -m tests.fuzz --minutes $(MINUTES) $(ARGS)
+
 soak-registry: $(UV) ## three containers on two hosts register at the same moment, 200 times (root, iproute2)
 	@SOAK_ROUNDS=200 $(RUN) pytest tests/system/test_namespaces.py -k same_moment $(ARGS)
 
@@ -64,6 +67,14 @@ check: $(UV) ## lint, formatting, types, import rules, isolated install of the c
 	@$(UV) run --isolated --no-project --with ./trade python -W error -c 'import trade, sys; \
 	  foreign = {"serial", "cryptography", "dynamixel_sdk", "typer", "trade_drivers", "opentelemetry"} & set(sys.modules); \
 	  sys.exit(f"the core alone imports {foreign}" if foreign else 0)'
+
+audit-deps: $(UV) ## known vulnerabilities of all that is locked, from OSV (needs a network; fails if there is one)
+	@$(UV) audit --locked --preview-features audit $(ARGS)
+
+sbom: $(UV) ## dist/trade.cdx.json: what the packages need to run, in CycloneDX 1.5, from the lock
+	@mkdir -p dist
+	@$(UV) export --quiet --locked --no-dev --preview-features sbom-export --format cyclonedx1.5 --output-file dist/trade.cdx.json
+	@echo dist/trade.cdx.json
 
 screenshots: $(UV) ## the pictures of README and docs, of a simulated robot in a browser (needs chromium)
 	@$(RUN) python docs/pictures/take.py

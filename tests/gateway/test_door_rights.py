@@ -391,3 +391,43 @@ def test_the_file_of_tokens_has_hashes_alone_and_is_read_as_it_is_now(tmp_path: 
         add_token(path, "an na")
     with pytest.raises(ConfigurationError, match="trade door token"):
         Tokens(tmp_path / "missing.toml")
+
+
+# --- what is shown, and what paths lead to
+
+
+def test_no_token_is_in_a_log_or_an_answer(door: Opened, caplog: pytest.LogCaptureFixture) -> None:
+    anna, wrong = door.client("anna"), "not-a-token-that-is-known"
+    with caplog.at_level(logging.DEBUG):
+        refused = Client(door.door.url, wrong).ask("GET", "/me")
+        assert (refused.status, anna.ask("GET", "/me").status) == (401, 200)
+        with anna.socket(subprotocols=["trade.v1", f"bearer.{anna.token}"]) as page:
+            say(page, do="nonsense", id=1)
+            heard(page)
+    told = [(record.name, record.getMessage()) for record in caplog.records if record.name != "websockets.client"]
+    showing = {name for name, text in told if wrong in text or anna.token in text}
+    assert not showing
+    assert wrong not in str(refused)
+    assert anna.token not in door.tokens.read_text()
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/../door-tokens.toml",
+        "/..%2f..%2ftokens.toml",
+        "/%2e%2e/%2e%2e/tokens.toml",
+        "/static/../../_tokens.py",
+        "//etc/passwd",
+        "/dashboard/..%5c..%5ctokens.toml",
+        "/call/..%2f..%2f/x",
+        "/locks/..%2f..%2fsession",
+    ],
+)
+def test_no_path_leads_out_of_the_door(door: Opened, path: str) -> None:
+    anna = door.client("anna")
+    method = "POST" if path.startswith("/call") else "DELETE" if path.startswith("/locks") else "GET"
+    answer = anna.ask(method, path, {} if method == "POST" else None)
+    assert answer.status in {400, 404, 405}
+    assert "root:" not in str(answer.body)
+    assert "[tokens]" not in str(answer.body)

@@ -146,3 +146,9 @@ def test_the_command_line_lists_nobody_without_the_credentials(
     command = [sys.executable, "-m", "trade_gateway", "containers", "--json"]
     ended = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
     assert ("there" in ended.stdout) == seen
+
+
+def test_settings_do_not_show_the_password() -> None:
+    settings = Settings.read(container="desk", system="lab", credentials=("lab", "wide-open-sesame"))
+    assert settings.credentials == ("lab", "wide-open-sesame")
+    assert "sesame" not in f"{settings!r} {settings}"

@@ -11,7 +11,7 @@ import pytest
 from trade import Container, Estop, EstopReport, Resource, current_call, service, where
 from trade._crew import MOST_THREADS
 from trade._memory import MemoryTransport, Passage
-from trade._wire import PROTOCOL, EstopOrder, encode_message
+from trade._wire import PROTOCOL, EstopOrder, decode_estop_order, encode_message
 from trade.errors import Busy, ConfigurationError, MotionStopped, NoSuchEstop, Stopped
 from trade.testing import Kind, MemorySystem, memory_system
 
@@ -240,10 +240,11 @@ def test_S09_a_driver_restarted_while_one_is_open_stays_latched(tmp_path: Path) 
         assert call(system.container("one"), "move_to", "one", 0.1) == 0.1
 
 
-def test_S09_what_cannot_be_read_is_open_all_the_same(tmp_path: Path) -> None:
+@pytest.mark.parametrize("text", [b"half of", b'["abc", "\xbb", "", 0.0]'], ids=["broken off", "no text"])
+def test_S09_what_cannot_be_read_is_open_all_the_same(tmp_path: Path, text: bytes) -> None:
     folder = tmp_path / "memory" / "estop"
     folder.mkdir(parents=True)
-    (folder / "abc.json").write_text("half of")
+    (folder / "abc.json").write_bytes(text)
     with memory_system(state_dir=tmp_path) as system:
         drivers(system, "one")
         [estop] = system.container("one").estops()
@@ -388,3 +389,21 @@ def test_S09_orders_reach_who_is_busy_with_calls(system: MemorySystem) -> None:
     assert caller.estop(limit_s=GENEROUS_S).complete
     for one in runs:
         assert one.exception(GENEROUS_S) is None or isinstance(one.exception(), (Stopped, Busy))
+
+
+def test_a_clearing_that_was_recorded_clears_no_later_e_stop(system: MemorySystem) -> None:
+    drivers(system, "one")
+    one, recorded = system.container("one"), list[tuple[str, bytes]]()
+    system.tap(lambda passage: recorded.append((passage.key, passage.payload or b"")))
+    report = system.container("caller").estop("smoke", limit_s=GENEROUS_S)
+    assert system.container("caller").estop_clear([report.id], limit_s=GENEROUS_S).complete
+    orders = [(key, payload) for key, payload in recorded if key.startswith("estop/") and key.count("/") == 1]
+    clearing = [order for order in orders if decode_estop_order(order[1], order[0][6:]).cleared]
+    raw = MemoryTransport(system.network, "raw")
+    second = system.container("caller").estop("fire", limit_s=GENEROUS_S)
+    for key, payload in clearing:  # it names the one that it was for
+        raw.publish(key).put(payload)
+    system.settle()
+    assert [estop.id for estop in one.estops()] == [second.id]
+    with pytest.raises(Stopped):
+        call(one, "move_to", "one", 0.1)

@@ -1,17 +1,20 @@
 """What goes over the wire: garbage is dropped, counted, logged once; forgeries are ignored; nothing else stops."""
 
 import logging
+import sys
 import threading
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, Final
 
 import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trade import Container, Handle, _wire, service, where
+from trade import Container, Handle, Secret, _wire, service, where
 from trade._announcing import Announcer
+from trade._handle_codec import handle_codec
+from trade._invoke import result_decoder
 from trade._schemas import schema_message
 from trade._wire import (
     EMPTY,
@@ -39,7 +42,7 @@ from trade._wire import (
     tally_key,
 )
 from trade.errors import InvalidResult, RemoteError
-from trade.testing._ear import Teller
+from trade.testing._ear import Ear, Teller
 
 CALL = Call(PROTOCOL, 7, "echo", "raw/0", "tester/raw/0", 2**62, (), EMPTY_ARGUMENTS)
 REPLY = Reply(PROTOCOL, 7, Status.OK, 1, EMPTY)
@@ -302,6 +305,34 @@ def test_arguments_that_are_no_arguments_are_invalid(here: Container, echo: Echo
         publisher.put(encode_message(msgspec.structs.replace(CALL, args=msgspec.Raw(encode_message(args)))))
         reply = decode_reply(replies.receive().payload or b"")
         assert reply.status == Status.ERROR
+        assert msgspec.msgpack.decode(reply.body)["type"] == "trade.errors:InvalidArgument"
+    assert echo.runs == 0
+
+
+class Safe:
+    @service(effect="read")
+    def unlock(self, code: Secret[str]) -> bool:
+        return False
+
+
+DEEPER: Final = [b"\x91" * depth + b"\xc0" for depth in (100, *range(850, 1000))]
+
+
+@pytest.mark.parametrize("name", ["echo", "unlock"])
+def test_arguments_however_deep_are_refused_and_answered_also_where_one_is_secret(
+    here: Container, echo: Echo, open_raw: Any, eventually: Any, name: str
+) -> None:
+    here.register(Safe(), "desk")
+    raw = open_raw(here)
+    key = key_of(here, name)
+    replies = Ear(raw.subscribe(reply_key(here.address.identity, "tester", "raw", "0")))
+    publisher = raw.publish(call_key("tester", key.address, key.domain, key.provider, stop=False))
+    strange = [b"\x91\xa1\xff", *(encode_message(value) for value in (5, "text", None, b"", {1: 2})), *DEEPER]
+    for number, args in enumerate(strange):
+        publisher.put(encode_message(msgspec.structs.replace(CALL, id=number, service=name, args=msgspec.Raw(args))))
+    assert eventually(lambda: replies._heard.qsize() + here.dropped_messages == len(strange))
+    for _ in range(replies._heard.qsize()):
+        reply = decode_reply(replies.next().payload or b"")
         assert msgspec.msgpack.decode(reply.body)["type"] == "trade.errors:InvalidArgument"
     assert echo.runs == 0
 
@@ -589,3 +620,44 @@ def test_an_error_that_cannot_be_read_is_still_an_error(callee: FakeCallee, aske
     callee.answer(call, Status.ERROR, body)
     with pytest.raises(RemoteError, match=r"forged.go raised an error that cannot be read"):
         result()
+
+
+def test_an_error_whose_text_is_none_is_still_an_error(callee: FakeCallee, asked: Any) -> None:
+    call, result = asked
+    callee.answer(call, Status.ERROR, msgspec.Raw(b"\x83\xa4type\xa1a\xa7message\xa1\xff\xa6fields\x80"))
+    with pytest.raises(RemoteError, match=r"forged.go raised an error that cannot be read"):
+        result()
+
+
+NOT_LOADED: Final = "turtledemo.clock"
+PATHS: Final = [
+    "os:system",
+    "subprocess:Popen",
+    "builtins:exec",
+    "builtins:SystemExit",
+    f"{NOT_LOADED}:Turtle",
+    "trade:where",
+]
+
+
+@pytest.mark.parametrize("path", PATHS)
+def test_a_class_path_in_an_error_loads_nothing_and_calls_nothing(callee: FakeCallee, asked: Any, path: str) -> None:
+    call, result = asked
+    fields = {"args": [["touch", "/nowhere"]], "__class__": "x"}
+    callee.answer(call, Status.ERROR, {"type": path, "message": "touch /nowhere", "fields": fields})
+    with pytest.raises(RemoteError) as raised:
+        result()
+    assert raised.value.type_name == path
+    assert NOT_LOADED not in sys.modules
+
+
+@pytest.mark.parametrize("path", PATHS)
+def test_a_class_path_in_a_description_loads_nothing_and_calls_nothing(path: str) -> None:
+    definition = {"type": "object", "properties": {"args": {"type": "array"}}, "required": ["args"]}
+    message = schema_message({"$ref": "#/$defs/Evil"}, {"Evil": definition})
+    info = ServiceInfo(name="go", signature="go()", result_schema=message, types={"Evil": path})
+    codec = handle_codec(lambda handle: handle.key, lambda key: None)  # type: ignore[arg-type,return-value]
+    decoded = result_decoder(codec, info)(msgspec.msgpack.encode({"args": ["touch", "/nowhere"]}))
+    assert decoded.args == ["touch", "/nowhere"]
+    assert type(decoded).__module__ not in {"os", "subprocess", "builtins"}
+    assert NOT_LOADED not in sys.modules

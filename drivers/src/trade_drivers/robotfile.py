@@ -1,21 +1,16 @@
 """The robot file: which devices make up a robot, on which bus, with which limits. Pure records, no I/O."""
 
 import re
-import sys
 from collections.abc import Mapping
 from typing import Annotated, Literal, TypeVar, cast
 
 import msgspec
 from msgspec import Meta, Struct
 
+from trade._toml import read_toml_text
 from trade.errors import ConfigurationError
 from trade_drivers._records import Arm, Camera, Coupled, Drill, Gripper, Group, Positive, Sensor, arm_problem
 from trade_drivers._tables import explain, record_of, wrong
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib  # pyright: ignore[reportMissingImports]
 
 __all__ = [
     "Arm",
@@ -190,8 +185,8 @@ def parse(text: str, where: str) -> Robot:
         ConfigurationError: names file, key, value and what would be right.
     """
     try:
-        raw = cast("dict[str, object]", tomllib.loads(text))  # pyright: ignore[reportUnknownMemberType]
-    except ValueError as bad:  # tomllib.TOMLDecodeError is one
+        raw = read_toml_text(text)
+    except ValueError as bad:
         raise ConfigurationError(where=where, problem=f"not valid TOML: {bad}") from None
     _only_known(raw, where)
     name = _robot_name(raw.get("robot"), where)

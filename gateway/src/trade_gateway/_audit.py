@@ -183,7 +183,7 @@ def _noted(file: Path) -> dict[str, dict[int, bytes]]:
         for line in file.read_bytes().splitlines():
             noted = msgspec.json.decode(line, type=_Noted)
             found.setdefault(noted.container, {})[noted.seq] = bytes.fromhex(noted.hash)
-    except (OSError, ValueError) as bad:
+    except (OSError, ValueError, RecursionError) as bad:
         raise UsageError(where=f"--against {file}", problem=str(bad)) from None
     return found
 

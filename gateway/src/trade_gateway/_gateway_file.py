@@ -3,7 +3,6 @@
 import hashlib
 import os
 import re
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Final, NamedTuple, cast
@@ -12,15 +11,11 @@ import msgspec
 from msgspec import Meta, Struct
 
 from trade import Settings
+from trade._toml import read_toml_text
 from trade.errors import ConfigurationError
 from trade.policies import EVERYTHING, read_policy
 from trade_gateway._parts import Around
 from trade_gateway.supervisor import Child, read_children
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib  # pyright: ignore[reportMissingImports]
 
 __all__ = ["GatewayFile", "Network", "Plan", "Share", "digest", "named_digest", "read_gateway_file"]
 
@@ -213,7 +208,7 @@ def read_gateway_file(path: Path) -> Plan:
         raise ConfigurationError(where=where, problem="there is no such file") from None
     except OSError as bad:
         raise ConfigurationError(where=where, problem=f"cannot be read: {bad.strerror}") from None
-    except ValueError as bad:  # tomllib.TOMLDecodeError is one, and so is text that is no UTF-8
+    except ValueError as bad:  # no TOML, or no UTF-8
         raise ConfigurationError(where=where, problem=f"not valid TOML: {bad}") from None
     try:
         file = msgspec.convert(raw, GatewayFile)
@@ -368,4 +363,4 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def _parsed(text: str) -> dict[str, Any]:
-    return cast("dict[str, Any]", tomllib.loads(text))  # pyright: ignore[reportUnknownMemberType]
+    return read_toml_text(text)

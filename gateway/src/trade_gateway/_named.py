@@ -1,20 +1,15 @@
 """Which files a gateway file or a system file names, with those that they name in turn."""
 
 import os
-import sys
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any, Final, NamedTuple, TypeVar, cast
+from typing import Final, NamedTuple, TypeVar
 
 import msgspec
 from msgspec import Struct
 
+from trade._toml import read_toml_text
 from trade.errors import ConfigurationError
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib  # pyright: ignore[reportMissingImports]
 
 __all__ = ["Named", "named_files"]
 
@@ -120,7 +115,7 @@ def _once(paths: Iterable[Path]) -> tuple[Path, ...]:
 
 def _read(path: Path, kind: type[_Table]) -> _Table:
     try:
-        raw = cast("dict[str, Any]", tomllib.loads(path.read_text(encoding="utf-8")))  # pyright: ignore[reportUnknownMemberType]
+        raw = read_toml_text(path.read_text(encoding="utf-8"))
         return msgspec.convert(raw, kind)
     except FileNotFoundError:
         raise ConfigurationError(where=str(path), problem="there is no such file") from None

@@ -3,7 +3,6 @@
 import importlib.util
 import os
 import re
-import sys
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
 from graphlib import CycleError, TopologicalSorter
@@ -14,15 +13,11 @@ import msgspec
 from msgspec import Meta, Struct
 
 from trade import Settings
+from trade._toml import read_toml_text
 from trade.errors import ConfigurationError
 from trade.policies import read_policy
 from trade.rules import read_rules
 from trade_drivers import load, without
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib  # pyright: ignore[reportMissingImports]
 
 __all__ = ["LOCAL", "Around", "Entry", "Made", "Part", "Tables", "at", "converted", "line_of", "read_toml"]
 
@@ -298,12 +293,12 @@ def read_toml(path: Path) -> tuple[str, dict[str, Any]]:
     """The text of a file, and what it says. Raises ConfigurationError."""
     try:
         text = path.read_text(encoding="utf-8")
-        return text, cast("dict[str, Any]", tomllib.loads(text))  # pyright: ignore[reportUnknownMemberType]
+        return text, read_toml_text(text)
     except FileNotFoundError:
         raise ConfigurationError(where=str(path), problem="there is no such file") from None
     except OSError as bad:
         raise ConfigurationError(where=str(path), problem=f"cannot be read: {bad.strerror}") from None
-    except ValueError as bad:  # tomllib.TOMLDecodeError is one, and so is text that is no UTF-8
+    except ValueError as bad:  # no TOML, or no UTF-8
         raise ConfigurationError(where=str(path), problem=f"not valid TOML: {bad}") from None
 
 

@@ -14,7 +14,6 @@ import ipaddress
 import os
 import secrets
 import stat
-import sys
 from collections.abc import Iterable, Sequence
 from datetime import datetime, timedelta, timezone
 from pathlib import Path
@@ -26,14 +25,10 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from msgspec import Struct
 
+from trade._toml import read_toml_text
 from trade._wire import is_chunk
 from trade.errors import ConfigurationError
 from trade_gateway._files import claim, replace
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib  # pyright: ignore[reportMissingImports]
 
 __all__ = ["Authority", "Issued", "NameRevoked", "NameTaken", "NoAuthority", "Purpose"]
 
@@ -196,7 +191,7 @@ class Authority:
     def _listed(self) -> frozenset[str] | None:
         """Those in the list for policies; None: there is no list."""
         try:
-            listed = tomllib.loads(self._revoked_file.read_text(encoding="utf-8"))["revoked"]  # pyright: ignore[reportUnknownMemberType, reportUnknownVariableType]
+            listed = read_toml_text(self._revoked_file.read_text(encoding="utf-8"))["revoked"]
         except FileNotFoundError:
             return None
         except (ValueError, KeyError):

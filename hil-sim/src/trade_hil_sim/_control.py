@@ -25,6 +25,7 @@ __all__ = ["Answer", "ControlServer", "State", "Steered"]
 LONGEST_LINE: Final = 65_536
 LONGEST_PATH: Final = 100
 """Unix socket paths end at 108 bytes on Linux and sooner elsewhere."""
+_UNREADABLE: Final = (msgspec.DecodeError, UnicodeDecodeError, RecursionError)
 
 
 class Steered(Protocol):
@@ -110,7 +111,7 @@ class ControlServer:
                 return Answer(ok=True, buses=[bus.state() for bus in self._buses.values()])
             for bus, meant in self._meant(command):
                 bus.do(meant)
-        except msgspec.DecodeError as problem:
+        except _UNREADABLE as problem:
             return Answer(error=_explain(problem, line))
         except (SimulationError, OSError) as problem:
             return Answer(error=str(problem))
@@ -202,11 +203,11 @@ def _remove_stale(path: Path) -> None:
                 path.unlink()
 
 
-def _explain(problem: msgspec.DecodeError, line: bytes) -> str:
+def _explain(problem: Exception, line: bytes) -> str:
     text, kinds = str(problem), {"state": State, **kinds_of(Command)}
     if "$.do" in text or "`do`" in text:
         return f"{text}; do is one of {', '.join(kinds)}"
-    if isinstance(problem, msgspec.ValidationError):
+    with suppress(*_UNREADABLE, KeyError):
         kind = kinds[msgspec.json.decode(line, type=_Named).do]
         return f"{text}; its keys are do, {', '.join(kind.__struct_fields__)}"
     return f'{text}; a command is one line such as {{"do": "mute", "ids": [1]}}'

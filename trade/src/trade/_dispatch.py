@@ -34,6 +34,7 @@ from trade._wire import (
     CANCEL,
     EMPTY,
     PROTOCOL,
+    UNREADABLE,
     Address,
     Call,
     CancelArguments,
@@ -350,7 +351,7 @@ class Dispatcher:
     def _cancel(self, caller: str, call: Call) -> Answer:
         try:
             asked = _decode_cancel(call.args)
-        except msgspec.DecodeError as bad:
+        except UNREADABLE as bad:
             return Status.ERROR, Raw(encode_message(pack_error(bad)))
         self._once.cancel(caller, asked.id, asked.service, asked.keep_s)
         return Status.OK, EMPTY

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import msgspec
 
-from trade._wire import Estop, is_chunk
+from trade._wire import UNREADABLE, Estop, is_chunk
 
 
 class EstopStore:
@@ -42,6 +42,6 @@ class EstopStore:
 def _read(path: Path) -> Estop:
     try:
         found = msgspec.json.decode(path.read_bytes(), type=Estop)
-    except (OSError, msgspec.DecodeError) as bad:
+    except (OSError, *UNREADABLE) as bad:
         return Estop(path.stem, "unknown", f"its file {path} cannot be read: {bad}", 0.0)
     return found if found.id == path.stem else Estop(path.stem, found.by, found.reason, found.at)

@@ -33,7 +33,7 @@ class InheritedLock:
             self._holder = Address(*map(str, holder))
             self._resources = tuple(map(str, resources))
             self._tokens = [Token(str(epoch), int(number)) for epoch, number in tokens]
-        except (ValueError, TypeError):
+        except (ValueError, TypeError, RecursionError):
             problem = "is what `trade lock` passes to the command it runs; unset it"
             raise ConfigurationError(where=VARIABLE, problem=problem) from None
         self._lost = False

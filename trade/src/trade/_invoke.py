@@ -27,7 +27,7 @@ from trade._serial import Serial, Turn
 from trade._session import speaking
 from trade._spans import traceable
 from trade._system import CLOCK, DOMAIN, PROVIDER
-from trade._wire import EMPTY_ARGUMENTS, Address, Call, ErrorInfo, Reply, ServiceInfo, Status
+from trade._wire import EMPTY_ARGUMENTS, UNREADABLE, Address, Call, ErrorInfo, Reply, ServiceInfo, Status
 from trade.errors import (
     Busy,
     Cancelled,
@@ -279,7 +279,7 @@ class RemoteTarget:
             raise error
         try:
             return self._decode(reply.body)
-        except msgspec.DecodeError as bad:
+        except UNREADABLE as bad:
             raise InvalidResult(service=self._label, problem=str(bad)) from None
 
     def _not_begun(self, reply: Reply, request: Request) -> BaseException:
@@ -319,7 +319,7 @@ class RemoteTarget:
     def _error(self, reply: Reply) -> BaseException:
         try:
             return unpack_error(_decode_error(reply.body), self._label)
-        except msgspec.DecodeError as bad:
+        except UNREADABLE as bad:
             return RemoteError(service=self._label, type_name="an error that cannot be read", message=str(bad))
 
 

@@ -2,20 +2,15 @@
 
 import difflib
 import re
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final, cast
 
 from trade._constraints import GROUP
 from trade._policies import EVERYTHING, VERBS, Policy, Role
+from trade._toml import read_toml_text
 from trade._wire import NO_GROUP, is_chunk
 from trade.errors import ConfigurationError
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib  # pyright: ignore[reportMissingImports]
 
 __all__ = ["read_policy"]
 
@@ -65,8 +60,8 @@ def _load(path: Path) -> _Table:
         reason = bad.strerror if isinstance(bad, OSError) and bad.strerror else str(bad)
         raise _wrong(str(path), f"the policy cannot be read: {reason}; write the file, or name another one") from None
     try:
-        return cast("_Table", tomllib.loads(text))  # pyright: ignore[reportUnknownMemberType]
-    except ValueError as bad:  # tomllib.TOMLDecodeError is one
+        return read_toml_text(text)
+    except ValueError as bad:
         raise _wrong(str(path), f"not valid TOML: {bad}") from None
 
 

@@ -12,6 +12,8 @@ from trade.errors import ConfigurationError
 _TOKEN: Final = re.compile(r"\s*([?]?[\w.+-]+|[(),])\s*")
 _LONGEST: Final = 1000
 _DEEPEST: Final = 20
+_MOST_STEPS: Final = 10_000
+"""In which a match is found, or there is none: both sides may have been written to keep others busy for ever."""
 _Bindings = Mapping[str, "Predicate"]
 
 
@@ -120,35 +122,53 @@ def _renamed(predicate: Predicate) -> Predicate:
 
 
 def achieves_all(achieved: Sequence[str], patterns: Sequence[Predicate]) -> bool:
-    """Whether every pattern fits one of the post-conditions, a variable meaning the same throughout."""
+    """Whether every pattern fits one of the post-conditions, a variable meaning the same throughout.
+
+    What takes too long to find out counts as no.
+    """
     facts = [fact for fact in map(read_achieved, achieved) if fact is not None]
-    return any(True for _ in _solutions(facts, patterns, {}))
+    try:
+        return any(True for _ in _solutions(facts, patterns, {}, iter(range(_MOST_STEPS))))
+    except _TooLong:
+        return False
 
 
-def _solutions(facts: Sequence[Predicate], patterns: Sequence[Predicate], bindings: _Bindings) -> Iterator[_Bindings]:
+class _TooLong(Exception):
+    """A search has had all its steps."""
+
+
+def _step(steps: Iterator[int]) -> None:
+    if next(steps, None) is None:
+        raise _TooLong
+
+
+def _solutions(
+    facts: Sequence[Predicate], patterns: Sequence[Predicate], bindings: _Bindings, steps: Iterator[int]
+) -> Iterator[_Bindings]:
     if not patterns:
         yield bindings
         return
     for fact in facts:
-        agreed = _unified(patterns[0], fact, bindings)
+        agreed = _unified(patterns[0], fact, bindings, steps)
         if agreed is not None:
-            yield from _solutions(facts, patterns[1:], agreed)
+            yield from _solutions(facts, patterns[1:], agreed, steps)
 
 
-def _unified(left: Predicate, right: Predicate, bindings: _Bindings) -> _Bindings | None:
+def _unified(left: Predicate, right: Predicate, bindings: _Bindings, steps: Iterator[int]) -> _Bindings | None:
+    _step(steps)
     left, right = _walked(left, bindings), _walked(right, bindings)
     if left == right:
         return bindings
     if left.is_variable:
-        return None if _occurs(left, right, bindings) else {**bindings, left.functor: right}
+        return None if _occurs(left, right, bindings, steps) else {**bindings, left.functor: right}
     if right.is_variable:
-        return _unified(right, left, bindings)
+        return _unified(right, left, bindings, steps)
     if left.functor != right.functor or len(left.arguments) != len(right.arguments):
         return None
     agreed: _Bindings | None = bindings
     for one, other in zip(left.arguments, right.arguments, strict=True):
         if agreed is not None:
-            agreed = _unified(one, other, agreed)
+            agreed = _unified(one, other, agreed, steps)
     return agreed
 
 
@@ -158,6 +178,7 @@ def _walked(term: Predicate, bindings: _Bindings) -> Predicate:
     return term
 
 
-def _occurs(variable: Predicate, term: Predicate, bindings: _Bindings) -> bool:
+def _occurs(variable: Predicate, term: Predicate, bindings: _Bindings, steps: Iterator[int]) -> bool:
+    _step(steps)
     term = _walked(term, bindings)
-    return term == variable or any(_occurs(variable, inner, bindings) for inner in term.arguments)
+    return term == variable or any(_occurs(variable, inner, bindings, steps) for inner in term.arguments)

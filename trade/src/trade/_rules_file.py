@@ -2,7 +2,6 @@
 
 import math
 import re
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final, cast
@@ -13,13 +12,9 @@ from msgspec import UNSET, Struct, UnsetType
 from trade._constraints import Constraint, where
 from trade._handle import LONGEST_DEADLINE_S, Handle
 from trade._occasions import LONGEST_S, SHORTEST_S
+from trade._toml import read_toml_text
 from trade._wire import Scalar, is_chunk
 from trade.errors import ConfigurationError
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib  # pyright: ignore[reportMissingImports]
 
 SERVICE: Final = "$service"
 """Stands for the service that joined, left or changed."""
@@ -190,10 +185,10 @@ def read_rules(path: Path) -> dict[str, Rule]:
     file = str(path)
     try:
         text = path.read_text(encoding="utf-8")
-        raw = cast("dict[str, Any]", tomllib.loads(text))  # pyright: ignore[reportUnknownMemberType]
+        raw = read_toml_text(text)
     except OSError as bad:
         raise ConfigurationError(where=file, problem=f"cannot be read: {bad.strerror or bad}") from None
-    except ValueError as bad:  # tomllib.TOMLDecodeError is one, and so is text that is no UTF-8
+    except ValueError as bad:  # no TOML, or no UTF-8
         raise ConfigurationError(where=file, problem=f"not valid TOML: {bad}") from None
     tables = _converted(raw, RulesFile, file, "").rule
     rules: dict[str, Rule] = {}

@@ -1,12 +1,12 @@
 """Arguments that reach the provider and nobody else: masked wherever a text might show them."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Annotated, Any, Final, TypeVar, get_args
+from typing import Annotated, Any, Final, TypeVar, cast, get_args
 
 import msgspec
 from msgspec import Meta, Raw, structs
 
-from trade._wire import ErrorInfo
+from trade._wire import UNREADABLE, ErrorInfo
 
 # What is masked has no types: it came over the wire.
 # pyright: reportUnknownVariableType=false, reportUnknownArgumentType=false
@@ -37,16 +37,33 @@ def mask(info: ErrorInfo, raw: Raw | bytes, names: Sequence[str], secrets: froze
         names: the service's parameters that may be given by place, in their order.
         secrets: the ones to mask.
     """
-    given: Any = msgspec.msgpack.decode(raw)
-    named = given if isinstance(given, Mapping) else dict(zip(names, given, strict=False))
-    texts = {form for name in secrets if name in named for value in _leaves(named[name]) for form in _forms(value)}
-    ordered = sorted(texts, key=len, reverse=True)
-    return structs.replace(
-        info,
-        message=_masked(info.message, ordered),
-        fields=_masked(info.fields, ordered),
-        traceback=_masked(info.traceback, ordered),
-    )
+    named = _named(raw, names)
+    try:
+        texts = {form for name in secrets if name in named for value in _leaves(named[name]) for form in _forms(value)}
+        ordered = sorted(texts, key=len, reverse=True)
+        return structs.replace(
+            info,
+            message=_masked(info.message, ordered),
+            fields=_masked(info.fields, ordered),
+            traceback=_masked(info.traceback, ordered),
+        )
+    except RecursionError:  # nested too deeply to be looked through
+        return structs.replace(info, message=MASK, fields={}, traceback="")
+
+
+def _named(raw: Raw | bytes, names: Sequence[str]) -> Mapping[str, Any]:
+    """The arguments by name; none where the message has no arguments: no provider has seen a value then."""
+    try:
+        given: Any = msgspec.msgpack.decode(raw)
+    except UNREADABLE:
+        return {}
+    match given:
+        case dict():
+            return cast("dict[str, Any]", given)
+        case list():
+            return dict(zip(names, cast("list[Any]", given), strict=False))
+        case _:
+            return {}
 
 
 def _leaves(value: Any) -> Iterator[Any]:

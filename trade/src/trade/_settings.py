@@ -70,7 +70,7 @@ class Settings:
     """Endpoints such as ``tcp/127.0.0.1:7450``; none: any free port of the loopback interface."""
     connect: tuple[str, ...] = ()
     """Endpoints of others; none: the containers of this system on this host."""
-    credentials: tuple[str, str] | None = None
+    credentials: tuple[str, str] | None = field(default=None, repr=False)
     """User and password of the whole system; none: a secret that this user's containers on this host share."""
     tls: Path | None = None
     """A folder with ``ca.pem``, ``cert.pem`` and ``key.pem``, as ``trade pki issue`` makes it: the links are encrypted,

@@ -20,7 +20,7 @@ from trade._description import describe, described, field_of
 from trade._limits import NOT_FINITE, problem_text, value_at
 from trade._secret import MASK, is_secret, mask
 from trade._service import ServiceMark
-from trade._wire import MOST_BYTES, ErrorInfo, ServiceInfo
+from trade._wire import MOST_BYTES, UNREADABLE, ErrorInfo, ServiceInfo
 from trade.errors import ConfigurationError, InvalidArgument, InvalidResult, NotSerialisable, TooLarge
 
 _AT: Final = re.compile(r" - at `\$(?:\[(\d+)\]|\.(\w+))(.*)`$")
@@ -85,10 +85,10 @@ class Signature:
         try:
             head = raw[0] if type(raw) is bytes else memoryview(raw)[0]
             args, kwargs = self._by_name(raw) if head in _MAP_HEADS else (self._by_place(raw), {})
-        except (msgspec.ValidationError, msgspec.DecodeError) as bad:
-            raise self._explain(service, str(bad), raw) from None
-        if self._must_be_finite and not (all(map(self._is_finite, args)) and (not kwargs or _finite(kwargs))):
-            raise self._not_finite(service, args, kwargs)
+            if self._must_be_finite and not (all(map(self._is_finite, args)) and (not kwargs or _finite(kwargs))):
+                raise self._not_finite(service, args, kwargs)
+        except UNREADABLE as bad:
+            raise self._explain(service, bad, raw) from None
         return args, kwargs
 
     def _by_place(self, raw: Raw | bytes) -> Sequence[Any]:
@@ -163,7 +163,14 @@ class Signature:
         """An error of a call with these arguments, fit for everybody's eyes."""
         return mask(error, raw, self._positional, self._secrets)
 
-    def _explain(self, service: str, text: str, raw: Raw | bytes) -> InvalidArgument:
+    def _explain(self, service: str, bad: Exception, raw: Raw | bytes) -> InvalidArgument:
+        try:
+            return self._explained(service, str(bad), raw)
+        except UNREADABLE as worse:
+            problem = "nested too deeply" if isinstance(worse, RecursionError) else str(worse)
+            return InvalidArgument(service=service, argument="", problem=problem, signature=self.info.signature)
+
+    def _explained(self, service: str, text: str, raw: Raw | bytes) -> InvalidArgument:
         at = _AT.search(text)
         if at is not None:
             index, name, rest = at.groups()

@@ -14,7 +14,7 @@ from trade._failures import unpack_error
 from trade._handle import Handle
 from trade._sample import Sample, StreamSample
 from trade._session import Session
-from trade._wire import ErrorInfo
+from trade._wire import UNREADABLE, ErrorInfo
 from trade.errors import ConfigurationError, InvalidResult, SessionEnded
 
 __all__ = ["Stream"]
@@ -236,7 +236,7 @@ class Stream:
             if message.failed:
                 return unpack_error(_decode_error(message.body), label)
             value = self._decode(message.body)
-        except msgspec.DecodeError as bad:
+        except UNREADABLE as bad:
             return InvalidResult(service=label, problem=str(bad))
         if self._if is not None and not self._if(value):
             return None

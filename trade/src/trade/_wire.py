@@ -314,6 +314,10 @@ EMPTY_ARGUMENTS: Final = Raw(msgspec.msgpack.encode(()))
 _Message = TypeVar("_Message", Call, Reply, _ProviderMessage, Tally, EstopOrder, EstopConfirmed)
 
 
+UNREADABLE: Final = (msgspec.DecodeError, UnicodeDecodeError, RecursionError)
+"""What decoding of values from elsewhere raises: another type, text that is none, nested too deeply."""
+
+
 class Malformed(Exception):
     """Bytes that are no message of this protocol version; dropped, never answered."""
 

@@ -9,8 +9,8 @@ __all__ = ["TIMED_OUT", "Aborted", "Request", "Transfer", "abort", "download", "
 _SIZE: Final = 8
 _EXPEDITED: Final = 4
 """As many bytes fit into the first frame; nothing longer is written."""
-_LONGEST: Final = 256
-"""Of a text, more is not asked for."""
+_MOST_SEGMENTS: Final = 37
+"""Of a text, more is not asked for: 259 bytes, or fewer from a drive whose segments are not full."""
 _DOWNLOAD, _UPLOAD, _SEGMENT, _ABORT = 0x20, 0x40, 0x60, 0x80
 _COMMAND: Final = 0xE0
 _TOGGLE: Final = 0x10
@@ -62,7 +62,7 @@ def upload(index: int, sub: int) -> Transfer:
         unused = first[0] >> 2 & 3 if first[0] & 1 else 0
         return first[4 : _SIZE - unused]
     data, toggle = b"", 0
-    while len(data) < _LONGEST:
+    for _ in range(_MOST_SEGMENTS):
         segment = yield from _ask(Request(bytes((_SEGMENT | toggle,)) + bytes(7), address))
         data += segment[1 : _SIZE - (segment[0] >> 1 & 7)]
         if segment[0] & 1:

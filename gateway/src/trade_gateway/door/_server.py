@@ -93,6 +93,7 @@ class Door:
             ws_per_message_deflate=False,
             lifespan="on",
             log_config=None,
+            log_level="info",  # more would tell of headers, and of the tokens in them
             access_log=False,
             proxy_headers=False,
             server_header=False,

@@ -5,7 +5,7 @@ import logging
 import os
 import secrets
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, cast
 
 import tomlkit
 from tomlkit.exceptions import TOMLKitError
@@ -91,8 +91,11 @@ def _read(path: Path) -> dict[str, str]:
         raise ConfigurationError(where=str(path), problem=problem) from None
     except (TOMLKitError, UnicodeDecodeError) as bad:
         raise ConfigurationError(where=str(path), problem=f"is no TOML: {bad}") from None
-    for digest, identity in known.items():
+    if not isinstance(known, dict):
+        problem = f"{_TABLE} must be a table: [{_TABLE}]"
+        raise ConfigurationError(where=str(path), problem=problem)
+    for digest, identity in cast("dict[str, object]", known).items():
         if len(digest) != hashlib.sha256().digest_size * 2 or not isinstance(identity, str) or not is_chunk(identity):
             problem = "each line of [tokens] is the SHA-256 of a token = the identity that it is for"
             raise ConfigurationError(where=f"{path}, {digest}", problem=problem)
-    return known
+    return cast("dict[str, str]", known)

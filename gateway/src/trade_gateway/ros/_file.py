@@ -1,20 +1,15 @@
 """The file of a ROS bridge: which ROS system it joins, and what of each side the other one has. Checked as a whole."""
 
 import re
-import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal, cast
+from typing import Annotated, Any, Final, Literal
 
 import msgspec
 from msgspec import Meta, Struct
 
+from trade._toml import read_toml_text
 from trade.errors import ConfigurationError
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib  # pyright: ignore[reportMissingImports]
 
 __all__ = [
     "Command",
@@ -265,7 +260,7 @@ def read_ros_file(path: Path) -> RosFile:
         ConfigurationError: it cannot be read, or something in it is wrong: says where, and what would be right.
     """
     try:
-        raw = cast("dict[str, Any]", tomllib.loads(path.read_text(encoding="utf-8")))  # pyright: ignore[reportUnknownMemberType]
+        raw = read_toml_text(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as bad:
         raise ConfigurationError(where=str(path), problem=f"cannot be read: {bad}") from None
     try:

@@ -2,23 +2,18 @@
 
 import re
 import string
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Any, Final, NamedTuple, cast
+from typing import Annotated, Any, Final, NamedTuple
 
 import msgspec
 from msgspec import Meta, Struct
 
+from trade._toml import read_toml_text
 from trade.errors import ConfigurationError
 from trade_gateway._output import UsageError
 from trade_gateway.talk._questions import QUESTIONS
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib  # pyright: ignore[reportMissingImports]
 
 __all__ = ["Heard", "Lexicon", "NotUnderstood", "Phrase", "read_lexicon"]
 
@@ -104,7 +99,7 @@ def read_lexicon(path: Path | None = None) -> Lexicon:
 
 def _phrases(text: str, where: str) -> Iterator[Phrase]:
     try:
-        raw = cast("dict[str, Any]", tomllib.loads(text))  # pyright: ignore[reportUnknownMemberType]
+        raw = read_toml_text(text)
         file = msgspec.convert(raw, _File)
     except ValueError as bad:  # no TOML, or of another shape
         raise ConfigurationError(where=where, problem=str(bad)) from None

@@ -7,6 +7,7 @@ from typing import Final
 
 import msgspec
 
+from trade._wire import UNREADABLE
 from trade_gateway._files import replace
 
 __all__ = ["Memory"]
@@ -46,5 +47,5 @@ def _read(path: Path) -> dict[str, str] | None:
     try:
         with path.open("rb") as file:
             return msgspec.json.decode(file.read(_MOST_BYTES), type=dict[str, str])
-    except (OSError, msgspec.MsgspecError):  # spoiled is as good as none
+    except (OSError, *UNREADABLE):  # spoiled is as good as none
         return None

@@ -97,7 +97,7 @@ class Axis:
         if command in ANSWERS:
             if frame.remote or not frame.data:
                 self._tell(command, t)
-        elif not frame.remote:
+        elif not frame.remote and command in ORDERS:
             layout = ORDERS[command]
             if len(frame.data) >= layout.size:
                 self._obey(command, layout.unpack(frame.data[: layout.size]), frame.data, t)
