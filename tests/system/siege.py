@@ -23,6 +23,7 @@ from system.sites import DOOR, SYSTEM, Site
 from trade_hil_sim import SimProcess
 
 _SCRIPT: Final = Path(__file__).with_name("planner.py")
+_BROKEN: Final = Path(__file__).with_name("broken_driver.py")
 _PLANNERS: Final = 4
 _POLICY: Final = f"""
 gateways = ["door"]
@@ -62,8 +63,9 @@ def _robot_file(robot: str) -> str:
 class Driver:
     """A robot's simulated servos, and beside them its driver, which may be killed and started again."""
 
-    def __init__(self, site: Site, robot: str) -> None:
+    def __init__(self, site: Site, robot: str, mutant: str) -> None:
         self.robot = robot
+        self._program = [str(_BROKEN), mutant] if mutant else ["-m", "trade_gateway"]
         self._site = site
         file = site.folder / f"{robot}.toml"
         file.write_text(_robot_file(robot))
@@ -103,7 +105,7 @@ class Driver:
         self._process = subprocess.Popen(
             [
                 *("ip", "netns", "exec", self._site.networks.host("left")),
-                *(sys.executable, "-m", "trade_gateway", "up", str(self._file), "--json"),
+                *(sys.executable, *self._program, "up", str(self._file), "--json"),
             ],
             stdout=subprocess.DEVNULL,
             stderr=self._complaints,
@@ -130,14 +132,14 @@ class Driver:
 class Stand:
     """All of it. Troubles come from one seed; each is noted with how long it lasted."""
 
-    def __init__(self, networks: Networks, folder: Path, seed: int) -> None:
+    def __init__(self, networks: Networks, folder: Path, seed: int, mutant: str) -> None:
         self.records = folder / "records"
         self.records.mkdir()
         self._log = Log(self.records, "faults")
         self._dice = random.Random(seed)
         self._turns = Counter[int]()
         self.site = Site(networks, folder, _POLICY, private='["rosie", "dora"]')
-        self.drivers = {robot: Driver(self.site, robot) for robot in _ROBOTS}
+        self.drivers = {robot: Driver(self.site, robot, mutant) for robot in _ROBOTS}
         self.planners = {slot: self._planner(slot) for slot in range(_PLANNERS)}
 
     def _planner(self, slot: int) -> tuple[str, Member]:
@@ -328,9 +330,10 @@ def _nothing() -> None: ...
 
 
 @contextmanager
-def stand(networks: Networks, folder: Path, seed: int) -> Generator[Stand]:
+def stand(networks: Networks, folder: Path, seed: int, mutant: str = "") -> Generator[Stand]:
+    """All of it, ended after use; ``mutant``: how its drivers are broken, see `broken_driver`."""
     with mock.patch.dict(os.environ, PYTHONPATH=str(_SCRIPT.parents[1])):
-        made = Stand(networks, folder, seed)
+        made = Stand(networks, folder, seed, mutant)
         try:
             yield made
         finally:

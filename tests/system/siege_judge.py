@@ -5,7 +5,7 @@ from bisect import bisect_right
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 from system.siege_records import Answer, AnyRecord, Ask, Done, Fault, Held, Order, Seen
 from trade_hil_sim import Entry
@@ -149,7 +149,7 @@ def _motions(
     resource: str, motions: Sequence[Motion], orders: Sequence[Order], owned: Sequence[Owned], faults: Sequence[Fault]
 ) -> list[str]:
     found: list[str] = []
-    done = Counter[str]()
+    done, last = Counter[str](), cast("tuple[Motion, Order] | None", None)
     times = [order.t for order in orders]
     since = [span.since for span in owned]
     for motion in motions:
@@ -162,6 +162,9 @@ def _motions(
             continue
         if motion.far <= _FAR_COUNTS:  # it may be a stop that happens to end there
             continue
+        if last is not None and last[0].rests == motion.t and last[1].hold != order.hold:
+            found.append(f"{at} for {order.hold}, while it moves for {last[1].hold}")
+        last = (motion, order)
         done[order.number] += 1
         if done[order.number] > 1:
             found.append(f"{at}: {order.number} is done again")
