@@ -50,7 +50,7 @@ class Planner:
 
     def works(self) -> list[str]:
         """What is wrong once it locks everything and moves every joint; waits for them."""
-        until, wrong = time.monotonic() + 60, ["nothing was tried"]
+        until, wrong = time.monotonic() + 25, ["nothing was tried"]
         while wrong and time.monotonic() < until:
             wrong = self._move_all()
             time.sleep(0.2)

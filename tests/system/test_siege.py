@@ -37,10 +37,11 @@ def test_nothing_moves_that_must_not_whatever_befalls_them(besieged: Stand) -> N
         besieged.restart(slot)
     besieged.siege(SECONDS, FEWEST)
     besieged.quiet()
-    wrong = besieged.wrong()
-    verdict = judge(read(besieged.records), {name: driver.sim.entries() for name, driver in besieged.drivers.items()})
+    logs = {name: driver.sim.entries() for name, driver in besieged.drivers.items()}
+    verdict = judge(read(besieged.records), logs)
     print(f"seed {SEED}:", *(f"  {name:28} {count:6}" for name, count in sorted(verdict.counts.items())), sep="\n")
     assert not verdict.violations, "\n".join(verdict.violations)
+    wrong = besieged.wrong()
     assert not any(wrong.values()), f"{wrong}\n{besieged.site.complaints()}"
     for name, (files, threads) in besieged.held().items():
         assert files <= before[name][0] + 30, f"{name} has {files} files open, {before[name][0]} before"
