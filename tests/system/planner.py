@@ -1,5 +1,7 @@
 """A client of the siege: locks joints of two robots, moves them, gives them back; notes all it did and was told.
 
+It is careless: it goes on to move what it has lost, and now and then moves what it never asked for.
+
 ``planner.py NAMESPACE NAME ADDRESS``; its first line of input says the rest as JSON. ``quiet`` ends the locking,
 ``works`` moves every joint once more and answers, the end of its input ends it.
 """
@@ -21,6 +23,7 @@ ROBOTS = ("rosie", "dora")
 CENTRE_COUNTS, FAR_COUNTS = 2048, 800
 STEP = 8
 """Planners order positions that are theirs alone: of so many next to each other one."""
+_FREELY = 0.2
 _WAITS_S = (0.0, 0.3, 2.0)
 _SPEEDS_RAD_S = (0.05, 0.05, 0.5, 2.0)
 _DEADLINES_S = (0.5, 5.0, 30.0)
@@ -64,7 +67,7 @@ class Planner:
             with self._container.lock(moves, wait_s=5, lease_s=2):
                 for move in moves:
                     self._enable(move)
-                    self._order(move, "", CENTRE_COUNTS, 20.0, 2.0)
+                    self._order(move, "in the end", CENTRE_COUNTS, 20.0, 2.0)
         except TradeError as error:
             return [f"{type(error).__name__}: {error}"]
         return []
@@ -79,7 +82,10 @@ class Planner:
             if not moves:
                 continue
             try:
-                self._lock_and_move(moves)
+                if self._random.random() < _FREELY:
+                    self._move(f"{self._name}:free", self._random.choice(moves))
+                else:
+                    self._lock_and_move(moves)
             except TradeError as error:
                 self._log.note(Answer(t=time.monotonic(), number="", how=f"not expected: {type(error).__name__}"))
 
@@ -98,15 +104,14 @@ class Planner:
         try:
             with lock.use():
                 for _ in range(self._random.randint(1, 3)):
-                    self._move(lock, hold, self._random.choice(moves))
+                    self._still(lock, hold)
+                    self._move(hold, self._random.choice(moves))
         finally:
             how = "given back" if self._still(lock, hold) else "lost"
             lock.release()
             self._log.note(Done(t=time.monotonic(), hold=hold, how=how))
 
-    def _move(self, lock: Lock, hold: str, move: Handle) -> None:
-        if not self._still(lock, hold):
-            return
+    def _move(self, hold: str, move: Handle) -> None:
         counts = CENTRE_COUNTS + self._random.randrange(-FAR_COUNTS // STEP, FAR_COUNTS // STEP) * STEP + self._slot
         deadline_s, speed_rad_s = self._random.choice(_DEADLINES_S), self._random.choice(_SPEEDS_RAD_S)
         try:

@@ -18,6 +18,8 @@ _ANSWERED_S = 3.0
 """So long after its deadline a call may end, beside the time that its process did not have."""
 _FAR_COUNTS = 100
 """What a stop may take to come to rest, and more; what goes farther was ordered."""
+_FREE = ":free"
+"""What holds are named that no lock was asked for: among these the last one wins."""
 _GOAL = re.compile(r"goal position (-?\d+)")
 
 
@@ -162,7 +164,8 @@ def _motions(
             continue
         if motion.far <= _FAR_COUNTS:  # it may be a stop that happens to end there
             continue
-        if last is not None and last[0].rests == motion.t and last[1].hold != order.hold:
+        free = last is not None and last[1].hold.endswith(_FREE) and order.hold.endswith(_FREE)
+        if last is not None and last[0].rests == motion.t and last[1].hold != order.hold and not free:
             found.append(f"{at} for {order.hold}, while it moves for {last[1].hold}")
         last = (motion, order)
         done[order.number] += 1
@@ -171,7 +174,7 @@ def _motions(
         if motion.t > order.t + order.deadline_s:
             found.append(f"{at}: {order.number} is done after its deadline of {order.deadline_s:g} s")
         span = owned[bisect_right(since, motion.t) - 1] if since and since[0] <= motion.t else None
-        if span is not None and span.hold != order.hold and order.hold and motion.t < span.until:
+        if span is not None and span.hold != order.hold and motion.t < span.until:
             found.append(f"{at} for {order.hold} while {span.hold} had it")
         found += _goes_on(at, motion, order, resource, faults)
     return found

@@ -30,6 +30,7 @@ def besieged(networks: Networks, tmp_path: Path) -> Iterator[Stand]:
 
 
 def test_nothing_moves_that_must_not_whatever_befalls_them(besieged: Stand) -> None:
+    besieged.quiet()
     wrong = besieged.wrong()
     assert not any(wrong.values()), wrong
     before = besieged.held()
