@@ -13,6 +13,7 @@ RUN := $(UV) run --locked
 ARGS ?=
 SEED ?= 1
 MINUTES ?= 3
+MUTANT ?=
 
 .PHONY: demo screenshots docs release-check test test-socketcan soak-registry soak-relocation chaos chaos-robots siege
 .PHONY: fuzz check audit-deps sbom bench bench-compare bench-page clean
@@ -46,6 +47,9 @@ test-socketcan: $(UV) ## the CAN suites on kernel interfaces; where the kernel h
 
 chaos: $(UV) ## locks under kill -9, freezes, cuts and delays; 240 clients (SEED=.. MINUTES=..; exits 1 on a violation)
 	@$(RUN) python -m tests.chaos --seed $(SEED) --minutes $(MINUTES) --clients 8 --threads 30 --drivers 3 $(ARGS)
+
+siege: $(UV) ## two robots, a gateway and planners under every trouble (SEED=.. MINUTES=.. MUTANT=..; root, iproute2)
+	@SIEGE_MINUTES=$(MINUTES) SIEGE_MUTANT=$(MUTANT) SEED=$(SEED) $(RUN) pytest -s tests/system/test_siege.py -p no:again $(ARGS)
 
 chaos-robots: $(UV) ## a lock over two robots while a driver is killed and started again, 50 times
 	@CHAOS_ROUNDS=50 $(RUN) pytest tests/system/test_two_robots.py $(ARGS)
