@@ -17,9 +17,9 @@ from tests.bench._others import Rpyc
 from tests.bench._record import Run
 from tests.bench._report import print_target, this_run
 from tests.bench._ros1 import Rospy
+from tests.bench._scale import measure
 from tests.bench._viam import Viam
 from tests.ros1_stand import need_ros1
-from tests.bench._scale import measure
 from tests.system.networks import why_not
 
 ROOT = Path(__file__).parents[2]

@@ -41,4 +41,4 @@ def a_check_has_rules_of_its_own(patch: pytest.MonkeyPatch) -> None:
     def decision(policy: Policy, who: str, verb: str, what: str) -> Decision:
         return Policy(policy.roles.values(), policy.identities).decide(who, verb, what)  # revoked or not
 
-    patch.setattr("trade_gateway._policy._decision", decision)
+    patch.setattr("trade_gateway.commands._policy._decision", decision)

@@ -14,13 +14,13 @@ from trade._policy_file import read_policy
 from trade._rules_file import read_rules
 from trade.errors import ConfigurationError
 from trade_drivers.robotfile import parse as parse_robot
-from trade_gateway._archive import read_archive
-from trade_gateway._audit import _noted as read_notes
-from trade_gateway._audit import _verified as verified
 from trade_gateway._gateway_file import read_gateway_file
-from trade_gateway._named import named_files
 from trade_gateway._pki import Authority
 from trade_gateway._system_file import read_system_file
+from trade_gateway.commands._archive import read_archive
+from trade_gateway.commands._audit import _noted as read_notes
+from trade_gateway.commands._audit import _verified as verified
+from trade_gateway.commands._named import named_files
 from trade_gateway.door._tokens import Tokens
 from trade_gateway.ros._file import read_ros_file
 from trade_gateway.talk import read_lexicon

@@ -31,9 +31,9 @@ from trade._wire import EMPTY, PROTOCOL, Estop, encode_message
 from trade.errors import LimitExceeded, LockedByOther
 from trade_drivers.dynamixel._frames import crc16 as dynamixel_crc
 from trade_drivers.feetech._frames import packet as feetech_packet
-from trade_gateway._archive import _MANIFEST as MANIFEST
-from trade_gateway._archive import Entry, Manifest
 from trade_gateway.agents._tools import TOOLS
+from trade_gateway.commands._archive import _MANIFEST as MANIFEST
+from trade_gateway.commands._archive import Entry, Manifest
 from trade_gateway.ros.ros2._attachment import Attachment
 from trade_hil_sim.dynamixel import encode as dynamixel_packet
 from trade_hil_sim.robotiq._protocol import frame as modbus_frame

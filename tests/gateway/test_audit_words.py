@@ -13,8 +13,8 @@ from typer.testing import CliRunner
 from trade._audit_chain import AuditRow
 from trade._audit_store import AuditStore, Keep
 from trade.errors import ConfigurationError
-from trade_gateway._output import UsageError
 from trade_gateway.cli import app
+from trade_gateway.commands._output import UsageError
 
 
 def trade(*words: str | Path) -> Any:

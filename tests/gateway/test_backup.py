@@ -17,8 +17,8 @@ from typer.testing import CliRunner, Result
 
 from certificates import Papers
 from trade.errors import ConfigurationError
-from trade_gateway._archive import Manifest, read_archive, unpack
 from trade_gateway.cli import app
+from trade_gateway.commands._archive import Manifest, read_archive, unpack
 
 ROOT = Path(__file__).parents[2]
 FILE = """

@@ -12,9 +12,9 @@ from typer.testing import CliRunner, Result
 from robots import HEAD
 from trade.errors import ConfigurationError, WrongDevice
 from trade_drivers import Joint, parse
-from trade_gateway._calibrate import Ends, Sweep, homed, measured, with_values
-from trade_gateway._output import UsageError
 from trade_gateway.cli import app
+from trade_gateway.commands._calibrate import Ends, Sweep, homed, measured, with_values
+from trade_gateway.commands._output import UsageError
 from trade_hil_sim import DynamixelBus, writes
 
 

@@ -2,8 +2,8 @@
 
 import pytest
 
-from trade_gateway._call import parse_arguments
-from trade_gateway._output import UsageError
+from trade_gateway.commands._call import parse_arguments
+from trade_gateway.commands._output import UsageError
 
 
 def test_words_are_json_by_place_or_by_name() -> None:

@@ -12,11 +12,11 @@ from typer.testing import CliRunner
 from robots import HAND, HEAD
 from trade_drivers import CanBus, parse
 from trade_drivers.can import ErrorState, Link
-from trade_gateway import _doctor_host as host
-from trade_gateway import _doctor_robot as robots
-from trade_gateway._doctor_host import Finding
 from trade_gateway._pki import Authority
 from trade_gateway.cli import app
+from trade_gateway.commands import _doctor_host as host
+from trade_gateway.commands import _doctor_robot as robots
+from trade_gateway.commands._doctor_host import Finding
 from trade_hil_sim import DynamixelBus, Mute
 
 

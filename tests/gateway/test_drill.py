@@ -10,8 +10,8 @@ import pytest
 
 from trade_drivers import load
 from trade_drivers.robotfile import Drill
-from trade_gateway._drill import _chosen
-from trade_gateway._output import UsageError
+from trade_gateway.commands._drill import _chosen
+from trade_gateway.commands._output import UsageError
 from trade_gateway.drill import SCENES, Played, Report, Scene, Stop, Target, _play, as_data, page, play, targets_of
 from trade_gateway.drill._actors import DrillFailed
 from trade_gateway.drill._judge import Judge

@@ -8,8 +8,8 @@ import pytest
 
 from trade_drivers import FaultLog, Motor
 from trade_drivers.faults._lookout import Found
-from trade_gateway._faults import FaultWatch
-from trade_gateway._output import Output
+from trade_gateway.commands._faults import FaultWatch
+from trade_gateway.commands._output import Output
 
 OVERLOAD = Found("overload", "rosie.pan: overload", "remove the cause")
 BLOCKED = Found("is it blocked?", "rosie.pan: is it blocked?", "remove the cause")

@@ -12,9 +12,9 @@ from typer.testing import CliRunner, Result
 
 from trade.errors import ConfigurationError
 from trade_drivers import load
-from trade_gateway import _install
-from trade_gateway._unit import UDEV_RULES, Needs, needs_of, unit_text
 from trade_gateway.cli import app
+from trade_gateway.commands import _install
+from trade_gateway.commands._unit import UDEV_RULES, Needs, needs_of, unit_text
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 FILE = """

@@ -5,9 +5,9 @@ import re
 import pytest
 from typer.testing import CliRunner
 
-from trade_gateway._lock import _wanted
-from trade_gateway._output import UsageError
 from trade_gateway.cli import app
+from trade_gateway.commands._lock import _wanted
+from trade_gateway.commands._output import UsageError
 
 
 @pytest.mark.parametrize("command", ["lock", "locks", "unlock", "resume", "estop"])

@@ -17,7 +17,7 @@ from trade.errors import ConfigurationError, TradeError
 from trade.policies import read_policy
 from trade_gateway import _files, _pki
 from trade_gateway._pki import Authority, Issued, NameRevoked, NameTaken, NoAuthority
-from trade_gateway._pki_commands import app
+from trade_gateway.commands._pki_commands import app
 
 
 @pytest.fixture

@@ -17,8 +17,8 @@ from typer.testing import CliRunner
 
 from disks import FullDisk
 from trade import Container, Resource, Secret, service, where
-from trade_gateway._output import UsageError
 from trade_gateway.cli import app
+from trade_gateway.commands._output import UsageError
 from trade_gateway.recording import _under_way
 from trade_gateway.recording._channels import Message
 from trade_gateway.recording._file import RecordingFile

@@ -2,7 +2,7 @@
 
 import pytest
 
-from trade_gateway._output import table_lines
+from trade_gateway.commands._output import table_lines
 
 COLUMNS = ("SERVICE", "CALLED AS", "EFFECT", "HOST")
 ROWS = [

@@ -2,8 +2,8 @@
 
 import pytest
 
-from trade_gateway._output import UsageError
-from trade_gateway._up import ports_told
+from trade_gateway.commands._output import UsageError
+from trade_gateway.commands._up import ports_told
 
 
 def test_a_port_of_the_command_line_may_have_any_sign_in_it() -> None:

@@ -14,9 +14,9 @@ from msgspec import Struct
 
 from trade import Container, Handle, current_call, service, where
 from trade.errors import AccessDenied, ConfigurationError
-from trade_gateway._approvals import GROUP
 from trade_gateway.agents._problems import NeedsApproval
 from trade_gateway.clients import places
+from trade_gateway.commands._approvals import GROUP
 
 __all__ = ["Approvals", "Request"]
 

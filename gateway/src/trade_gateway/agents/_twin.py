@@ -16,8 +16,8 @@ from msgspec import Struct
 
 from trade import Container, Handle, Settings
 from trade.errors import NoSuchService, TradeError
-from trade_gateway._call import find
 from trade_gateway.agents._problems import NoTwin
+from trade_gateway.commands._call import find
 from trade_gateway.drill._actors import Actor, DrillFailed, bare_environment
 
 __all__ = ["Tried", "Twin"]

@@ -5,10 +5,10 @@ from typing import Annotated, Final
 
 import typer
 
-from trade_gateway._list import Json
-from trade_gateway._output import Output, UsageError
-from trade_gateway._system_choice import visitor
-from trade_gateway._up import leaving
+from trade_gateway.commands._list import Json
+from trade_gateway.commands._output import Output, UsageError
+from trade_gateway.commands._system_choice import visitor
+from trade_gateway.commands._up import leaving
 from trade_gateway.recording import require
 from trade_gateway.recording._sources import Wanted
 

@@ -7,9 +7,9 @@ import typer
 from rich.markup import escape
 
 from trade import where
-from trade_gateway._list import Json
-from trade_gateway._output import Output
-from trade_gateway._system_choice import visitor
+from trade_gateway.commands._list import Json
+from trade_gateway.commands._output import Output
+from trade_gateway.commands._system_choice import visitor
 from trade_gateway.recording import require
 
 _WAIT_S: Final = 10.0

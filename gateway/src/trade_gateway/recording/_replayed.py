@@ -11,8 +11,8 @@ from msgspec import Struct
 from trade import Container, Handle, Stream, where
 from trade.errors import ConfigurationError, DeviceError
 from trade_drivers import JointLimits, Tolerances
-from trade_gateway._call import run_to_end
-from trade_gateway._output import UsageError
+from trade_gateway.commands._call import run_to_end
+from trade_gateway.commands._output import UsageError
 from trade_gateway.recording._channels import JointStates
 from trade_gateway.recording._motion import Motion, deviation, fitted, motion_of, motions, moving
 from trade_gateway.recording._sources import joint_states

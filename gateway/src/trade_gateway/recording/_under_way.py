@@ -9,7 +9,7 @@ from typing import Final
 from rich.markup import escape
 
 from trade.errors import ConfigurationError
-from trade_gateway._output import Output, complain
+from trade_gateway.commands._output import Output, complain
 from trade_gateway.recording._at_fault import SavedAtFault
 from trade_gateway.recording._file import Attachment, RecordingFile
 from trade_gateway.recording._recorder import Recorder, about

@@ -7,7 +7,7 @@ import msgspec
 from msgspec import Struct
 
 from trade import Container
-from trade_gateway._call import find
+from trade_gateway.commands._call import find
 from trade_gateway.talk._lexicon import Lexicon, NotUnderstood, Phrase
 from trade_gateway.talk._memory import Memory
 from trade_gateway.talk._questions import QUESTIONS, Unknown

@@ -1,0 +1,1 @@
+"""The commands of ``trade``, a module each, and how all of them print."""

@@ -1,0 +1,93 @@
+"""``trade doctor [ROBOT.toml]``: what is wrong with this host and this robot, each finding with its fix."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+
+from trade.errors import TradeError
+from trade_drivers import drivers, load
+from trade_gateway.commands import _doctor_host as host
+from trade_gateway.commands import _doctor_robot as robots
+from trade_gateway.commands._doctor_host import Finding
+from trade_gateway.commands._list import Json
+from trade_gateway.commands._output import Output
+from trade_gateway.commands._scan import serial_ports
+from trade_gateway.commands._system_choice import choice_of, visitor
+
+_COLOURS = {"ok": "green", "warning": "yellow", "error": "red"}
+
+
+def doctor(
+    context: typer.Context,
+    robot_file: Annotated[
+        Path | None,
+        typer.Argument(metavar="[ROBOT.toml]", help="A robot file, to look at its lines and devices, too."),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Look for what keeps a robot from working, and say what helps. Nothing is changed; the exit code is 1 on errors.
+
+    Of the host: rights and latency of serial ports, libraries, clock, certificates, who is in sight. With a robot file:
+    its ports and CAN interfaces, whether its devices answer and are those it names, and which have no watchdog. Lines
+    that a driver holds are left alone.
+
+    For example: trade doctor rosie.toml
+    """
+    out = Output(as_json=as_json)
+    found: list[Finding] = []
+    for one in (*_of_host(context, robot_file), *(() if robot_file is None else _of_robot(robot_file))):
+        found.append(one)
+        if not as_json:
+            _tell(out, one)
+    if as_json:
+        out.data(found)
+    errors = sum(one.level == "error" for one in found)
+    warnings = sum(one.level == "warning" for one in found)
+    out.say(f"{errors} errors, {warnings} warnings")
+    if errors:
+        raise typer.Exit(1)
+
+
+def _of_host(context: typer.Context, robot_file: Path | None) -> Iterator[Finding]:
+    yield from host.ports(serial_ports())
+    yield from host.latencies()
+    if robot_file is None:
+        yield from host.libraries(sorted(drivers()), needed=False)
+    yield from host.clock()
+    try:
+        settings = choice_of(context).settings()
+    except TradeError as bad:
+        yield Finding(level="error", about="settings", text=str(bad), fix="correct that variable, or leave it out")
+        return
+    if settings.tls is not None:
+        yield from host.certificate(settings.tls)
+    yield from host.multicast()
+    try:
+        with visitor(context) as member:
+            yield from host.in_sight(member, settings.system)
+    except TradeError as bad:
+        yield Finding(
+            level="error", about=f"system {settings.system}", text=str(bad), fix="the message says what helps"
+        )
+
+
+def _of_robot(path: Path) -> Iterator[Finding]:
+    try:
+        robot = load(path)
+    except TradeError as bad:
+        yield Finding(level="error", about=str(path), text=str(bad), fix="correct the file; the message says where")
+        return
+    yield from host.libraries(sorted({bus.driver for bus in robot.buses}), needed=True)
+    yield from robots.unwatched(robot)
+    yield from robots.interfaces(robot)
+    yield from robots.devices(robot)
+    yield from robots.controllers(robot)
+
+
+def _tell(out: Output, one: Finding) -> None:
+    out.say(f"[{_COLOURS[one.level]}]{one.level:7}[/]  {escape(one.about)}: {escape(one.text)}")
+    if one.fix:
+        out.say(f"         fix: {escape(one.fix)}")

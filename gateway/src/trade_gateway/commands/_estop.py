@@ -1,0 +1,65 @@
+"""``trade estop``: stop the whole system, and clear that again."""
+
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+
+from trade import Container, EstopReport
+from trade_gateway.commands._list import Json
+from trade_gateway.commands._output import Output, UsageError
+from trade_gateway.commands._system_choice import visitor
+
+
+def estop(
+    context: typer.Context,
+    ids: Annotated[list[str] | None, typer.Argument(metavar="[ID]...", help="With --clear: which; else all.")] = None,
+    reason: Annotated[str, typer.Option(help="Why, for people.")] = "",
+    clear: Annotated[bool, typer.Option("--clear", help="Clear open e-stops. Nothing moves by itself.")] = False,
+    limit: Annotated[float, typer.Option(min=0.1, max=60.0, help="Seconds to try.")] = 3.0,
+    as_json: Json = False,
+) -> None:
+    """Stop everything in the system at once, and let nothing move before it is cleared.
+
+    The exit code is not 0 if a container did not confirm, could not stop something, or if none was found.
+    This is software: it is not safety-rated and replaces no switch that cuts the power.
+
+    For example: trade estop --reason "smoke", and later trade estop --clear
+    """
+    if ids and not clear:
+        raise UsageError(where="trade estop", problem="ids are for clearing: trade estop --clear ID")
+    if reason and clear:
+        raise UsageError(where="trade estop", problem="--reason is for stopping, and --clear clears")
+    out = Output(as_json=as_json)
+    with visitor(context) as container:
+        report = _clear(container, ids, limit) if clear else container.estop(reason, limit_s=limit)
+        system = container.settings.system
+    if report is None:
+        if as_json:
+            out.data(None)
+        out.say(f"no e-stop is open in system {escape(system)}")
+        return
+    if as_json:
+        out.data(report)
+    else:
+        _say(out, report, system, "cleared" if clear else "stopped")
+    if not report.complete:
+        raise typer.Exit(1)
+
+
+def _clear(container: Container, ids: list[str] | None, limit_s: float) -> EstopReport | None:
+    wanted = ids or [known.id for known in container.estops()]
+    return container.estop_clear(wanted, limit_s=limit_s) if wanted else None
+
+
+def _say(out: Output, report: EstopReport, system: str, done: str) -> None:
+    for name in report.confirmed:
+        out.say(f"{done}: {escape(name)}")
+    for name, problem in report.failed.items():
+        out.say(f"[bold red]FAILED: {escape(name)}: {escape(problem)}[/]")
+    for name in report.missing:
+        out.say(f"[bold red]MISSING: {escape(name)} did not answer[/]")
+    if not (report.confirmed or report.failed or report.missing):
+        out.say(f"[bold red]nobody was found[/] in system {escape(system)} that has something to stop")
+    if done == "stopped":
+        out.say(f"e-stop {report.id} is open; when it is safe: [bold]trade estop --clear {report.id}[/]")

@@ -1,0 +1,128 @@
+"""``trade install GATEWAY.toml``: have the system start a gateway, and know its serial adapters."""
+
+import hashlib
+import os
+import pwd
+import re
+import shlex
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Annotated, Final
+
+import typer
+from rich.markup import escape
+
+from trade.errors import ConfigurationError
+from trade_drivers import load
+from trade_gateway._files import replace
+from trade_gateway._gateway_file import read_gateway_file
+from trade_gateway.commands._named import Named, named_files
+from trade_gateway.commands._output import Output, UsageError
+from trade_gateway.commands._unit import UDEV_RULES, needs_of, program_folders, unit_text
+
+_MARK: Final = re.compile(r"# Written by `trade install`; [^\n]* sha256 ([0-9a-f]{64})\n")
+_HEAD: Final = "# Written by `trade install`; what you change here it will not overwrite. sha256 {digest}\n{text}"
+_UNITS: Final = "etc/systemd/system"
+_RULES: Final = "etc/udev/rules.d/60-trade.rules"
+_NAME: Final = re.compile(r"[A-Za-z0-9_][\w.-]*")
+_USER: Final = re.compile(r"[a-z_][a-z0-9_-]{0,30}")
+
+
+def install(
+    file: Annotated[Path, typer.Argument(metavar="GATEWAY.toml", help="The gateway file.")],
+    user: Annotated[str, typer.Option(help="The user it will run as.")] = "trade",
+    name: Annotated[str, typer.Option(help="The name of the service.")] = "trade-gateway",
+    root: Annotated[Path, typer.Option(help="The folder that is / on the computer that this is for.")] = Path("/"),
+    show: Annotated[bool, typer.Option("--print", help="Only say what would be written.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Overwrite also what somebody changed, or wrote.")] = False,
+) -> None:
+    """Write a unit for systemd that keeps a gateway up, and udev rules for serial adapters; start nothing.
+
+    The unit lets the gateway do what its file and robot files need, and no more. Changes of your own belong into
+    NAME.service.d/*.conf. Again after a change of these files: `trade install` writes what has become different.
+
+    For example: sudo trade install /etc/trade/gateway.toml
+    """
+    for given, form, option in ((name, _NAME, "--name"), (user, _USER, "--user")):
+        if not form.fullmatch(given):
+            raise UsageError(where=f"{option} {given}", problem="is no such name; use letters, digits, _ and -")
+    read_gateway_file(file)
+    named = named_files(file)
+    bodies = {root / _UNITS / f"{name}.service": _unit(named, user, root), root / _RULES: UDEV_RULES}
+    texts = {path: _marked(body) for path, body in bodies.items()}
+    if show:
+        for path, text in texts.items():
+            print(f"# {path}\n{text}")  # noqa: T201 - as it stands, for other programs
+        return
+    out = Output(as_json=False)
+    fresh = [path for path, text in texts.items() if _is_to_be_written(path, text, force=force)]
+    for path, text in texts.items():
+        if path in fresh:
+            _write(path, text)
+        out.say(escape(f"{'wrote' if path in fresh else 'as it should be:'} {path}"))
+    _say_next(out, user, name, named.records)
+
+
+def _unit(named: Named, user: str, root: Path) -> str:
+    above = Path(os.path.normpath(root.absolute()))
+
+    def seen(path: Path) -> Path:
+        """A path as that computer sees it."""
+        return Path("/") / path.relative_to(above) if path.is_relative_to(above) else path
+
+    return unit_text(
+        seen(named.files[0]),
+        user=user,
+        needs=needs_of(map(load, named.robots)),
+        containers=named.containers,
+        program=[str(seen(Path(sys.executable))), "-m", "trade_gateway"],
+        folders=map(seen, (*program_folders(), *(one.parent for one in named.files))),
+        records=map(seen, named.records),
+    )
+
+
+def _marked(text: str) -> str:
+    return _HEAD.format(digest=hashlib.sha256(text.encode()).hexdigest(), text=text)
+
+
+def _is_to_be_written(path: Path, text: str, *, force: bool) -> bool:
+    """Raises ConfigurationError: there is one that is not ours to overwrite."""
+    try:
+        found = path.read_bytes().decode(errors="replace")
+    except FileNotFoundError:
+        return True
+    except OSError as bad:
+        raise ConfigurationError(where=str(path), problem=f"cannot be read: {bad.strerror}") from None
+    mark = _MARK.match(found)
+    ours = mark is not None and _marked(found[mark.end() :]) == found
+    if found != text and not ours and not force:
+        problem = "was changed by somebody" if mark else "was written by somebody else"
+        remedy = "move it away, or put your changes into a .d folder beside it and say --force. Nothing was written"
+        raise ConfigurationError(where=str(path), problem=f"{problem}; {remedy}")
+    return found != text
+
+
+def _write(path: Path, text: str) -> None:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        replace(path, text.encode(), 0o644)
+    except PermissionError:
+        again = shlex.join([sys.executable, "-m", "trade_gateway", *sys.argv[1:]])
+        raise ConfigurationError(where=str(path), problem=f"takes the rights of root: sudo {again}") from None
+    except OSError as bad:
+        raise ConfigurationError(where=str(path), problem=f"cannot be written: {bad.strerror}") from None
+
+
+def _say_next(out: Output, user: str, name: str, records: Iterable[Path]) -> None:
+    out.say("Next, on that computer:")
+    try:
+        pwd.getpwnam(user)
+    except KeyError:
+        out.say(f"  sudo useradd --system --user-group --home-dir /var/lib/trade --shell /usr/sbin/nologin {user}")
+    for folder in records:
+        out.say(escape(f"  sudo install --directory --owner {user} --mode 0700 {shlex.quote(str(folder))}"))
+    out.say("  sudo udevadm control --reload")
+    out.say("  sudo udevadm trigger --action=add --subsystem-match=tty --subsystem-match=usb-serial")
+    out.say("  sudo systemctl daemon-reload")
+    out.say(f"  sudo systemctl enable {name} && sudo systemctl restart {name}")

@@ -1,0 +1,89 @@
+"""``trade locks``, ``unlock`` and ``resume``: who has what for himself, taking it away, letting it move again."""
+
+import time
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+
+from trade import LockInfo
+from trade_gateway.commands._list import Json, asked_for
+from trade_gateway.commands._output import Output
+from trade_gateway.commands._system_choice import visitor
+
+Group = Annotated[str, typer.Argument(help="A group and what is beneath it: rosie.head.")]
+
+
+def locks(context: typer.Context, as_json: Json = False) -> None:
+    """List what is locked: by whom, what for, since when, how much of the lease is left, who waits.
+
+    For example: trade locks --json
+    """
+    out = Output(as_json=as_json)
+    with visitor(context) as container:
+        found = container.locks()
+    if as_json:
+        out.data([_plain(info) for info in found])
+    elif not found:
+        out.say("nothing is locked")
+    else:
+        columns = ("RESOURCES", "OWNER", "PURPOSE", "SINCE", "LEASE LEFT", "CONTAINER", "WAITING")
+        out.table(columns, [_row(info) for info in found])
+
+
+def _owner(info: LockInfo) -> str:
+    return info.holder.owner
+
+
+def _plain(info: LockInfo) -> dict[str, object]:
+    return {
+        "resources": info.resources,
+        "owner": _owner(info),
+        "purpose": info.holder.purpose,
+        "since": info.holder.since,
+        "lease_left_s": info.left_s,
+        "container": info.container,
+        "uses": info.uses,
+        "waiting": info.waiting,
+    }
+
+
+def _row(info: LockInfo) -> tuple[str, ...]:
+    return (
+        ", ".join(info.resources),
+        _owner(info),
+        info.holder.purpose,
+        time.strftime("%H:%M:%S", time.localtime(info.holder.since)),
+        f"{info.left_s:.1f} s",
+        info.container,
+        ", ".join(info.waiting),
+    )
+
+
+def unlock(
+    context: typer.Context,
+    group: Group,
+    reason: Annotated[str, typer.Option("--break", metavar="REASON", help="Why; the owner is told.")],
+) -> None:
+    """Take locks away from their owners; what moves under them is stopped.
+
+    For example: trade unlock rosie.head --break "its program hangs"
+    """
+    out = Output(as_json=False)
+    with visitor(context) as container:
+        broken = container.break_lock(asked_for(f"group {group!r}", group=group, name=None), reason)
+    for info in broken:
+        out.say(f"taken from {escape(_owner(info))}: {escape(', '.join(info.resources))}")
+    if not broken:
+        out.say(f"nothing of {escape(group)} was locked")
+
+
+def resume(context: typer.Context, group: Group) -> None:
+    """Let a group move again after a stop by somebody else. It moves nothing itself.
+
+    For example: trade resume rosie.head
+    """
+    out = Output(as_json=False)
+    with visitor(context) as container:
+        resumed = container.resume(asked_for(f"group {group!r}", group=group, name=None))
+    out.say(f"may move again: {escape(', '.join(resumed))}" if resumed else f"nothing of {escape(group)} was held")
