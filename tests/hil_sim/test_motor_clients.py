@@ -1,6 +1,7 @@
 """Other people's clients on the simulated motors: odrive-can and damiao-motor, unmodified, over socketcand."""
 
 import asyncio
+import struct
 import sys
 import time
 from collections.abc import Iterator
@@ -97,6 +98,16 @@ def test_a_question_without_data_is_answered_as_a_remote_frame_is(odrive: Odrive
         wait_until(lambda: len(frames(list(odrive.log.entries), "get_version", direction="out")) >= 1, "it answers")
     [asked, *_] = frames(list(odrive.log.entries), "ask_get_version")
     assert asked.device_id == NODE
+
+
+@pytest.mark.parametrize("turns", [float("inf"), float("-inf"), float("nan")])
+def test_an_order_that_is_infinite_or_no_number_is_refused(odrive: OdriveBus, turns: float) -> None:
+    with client(odrive) as asker:
+        data = struct.pack("<fhh", turns, 0, 0)
+        asker.send(can.Message(arbitration_id=NODE << 5 | 0x0C, is_extended_id=False, data=data))
+        wait_until(lambda: bool(events(list(odrive.log.entries), "refused")), "it is refused")
+    [truth] = odrive.state().devices
+    assert truth.goal_counts == truth.position_counts
 
 
 # --- Damiao

@@ -3,7 +3,7 @@
 import socket
 import struct
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import closing, suppress
 from itertools import pairwise
 
 import pytest
@@ -119,6 +119,27 @@ def test_what_is_no_packet_ends_the_connection(controller: UrBus) -> None:
         with pytest.raises(ConnectionResetError):
             rtde.receive()
     assert events(controller.log.entries, "misunderstood")
+
+
+@pytest.mark.parametrize(
+    ("port", "sent"),
+    [
+        (29999, b"x" * 2_000_000),
+        (30003, b"x" * 2_000_000),
+        (30004, struct.pack(">HB", 65_010, ord("O")) + struct.pack(">d", 125.0) + b",".join([b"a"] * 32_500)),
+    ],
+    ids=["a line", "a program", "an answer longer than a packet"],
+)
+def test_what_has_no_end_ends_the_connection_and_nothing_else(controller: UrBus, port: int, sent: bytes) -> None:
+    with closing(socket.create_connection((controller.port, port), PATIENCE_S)) as one:
+        with suppress(ConnectionError):
+            one.sendall(sent)
+        with suppress(ConnectionError):
+            while one.recv(4096):
+                pass
+    assert [entry.detail for entry in events(controller.log.entries, "misunderstood")] != []
+    with client(controller) as rtde:
+        assert rtde.stream("timestamp") == b"\x01DOUBLE"
 
 
 def test_packets_are_understood_byte_by_byte_and_answers_may_come_so(controller: UrBus) -> None:

@@ -2,7 +2,7 @@
 
 import struct
 from collections.abc import Callable
-from math import inf, tau
+from math import inf, isfinite, tau
 from typing import Final
 
 from trade_hil_sim import _faults as faults
@@ -100,7 +100,11 @@ class Axis:
         elif not frame.remote and command in ORDERS:
             layout = ORDERS[command]
             if len(frame.data) >= layout.size:
-                self._obey(command, layout.unpack(frame.data[: layout.size]), frame.data, t)
+                values = layout.unpack(frame.data[: layout.size])
+                if all(map(isfinite, values)):
+                    self._obey(command, values, frame.data, t)
+                else:
+                    self._log("refused", t, f"{command.name.lower()}: infinite, or no number")
         self._plan(t)
 
     def advance(self, t: float) -> None:

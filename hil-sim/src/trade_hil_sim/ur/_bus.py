@@ -19,7 +19,7 @@ from trade_hil_sim._ready import ready
 from trade_hil_sim._state import ArmTruth, BusState
 
 from ._arm import HOME, Arm
-from ._client import Client
+from ._client import MOST_HELD, Client
 from ._dashboard import GREETING, Dashboard, lines_in
 from ._packets import Packet
 from ._ports import listeners
@@ -255,6 +255,8 @@ class UrBus:
                     del client.held[: whole + 5]
                     if self._dashboard.remote and not self._script.names("script"):
                         self._program.upload(text)
+        if len(client.held) > MOST_HELD:
+            raise ValueError(f"{len(client.held)} bytes without an end")
 
     def _say_packet(self, client: Client, packet: Packet, name: str) -> None:
         self._say(client, packet.encode(), name)

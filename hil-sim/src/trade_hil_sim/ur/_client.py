@@ -9,13 +9,15 @@ from typing import Final
 
 from trade_hil_sim._faults import Piece
 
-__all__ = ["Client"]
+__all__ = ["MOST_HELD", "Client"]
 
 MOST_UNSENT: Final = 65_536
 """Bytes kept for a client that does not read; then it is hung up on."""
 SEND_BUFFER: Final = 32_768
 """Bytes the system may keep for a client: one that lay frozen wakes to little that is old."""
 MOST_READ: Final = 65_536
+MOST_HELD: Final = 1 << 20
+"""Bytes of a line, a packet or a program that is not whole yet; more has no end."""
 
 
 class Client:

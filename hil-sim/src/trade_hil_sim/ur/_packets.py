@@ -7,11 +7,12 @@ from typing import Final, NamedTuple
 
 from ._table import TYPES
 
-__all__ = ["LONGEST", "Packet", "PacketType", "Recipe", "frames", "names_in"]
+__all__ = ["LONGEST", "MOST_PAYLOAD", "Packet", "PacketType", "Recipe", "frames", "names_in"]
 
 _HEAD: Final = struct.Struct(">HB")
 LONGEST: Final = 65_535
 """Bytes a packet can have."""
+MOST_PAYLOAD: Final = LONGEST - _HEAD.size
 
 Value = float | int | bool | Sequence[float] | Sequence[int]
 

@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Final
 
 from ._arm import Arm
-from ._packets import Packet, PacketType, Recipe, Value, frames, names_in
+from ._packets import MOST_PAYLOAD, Packet, PacketType, Recipe, Value, frames, names_in
 from ._program import PLAYING, Program
 from ._table import INPUTS, OUTPUTS, RobotMode
 
@@ -107,6 +107,8 @@ class Rtde:
                 return
             case _:
                 return
+        if len(answer) > MOST_PAYLOAD:
+            raise ValueError(f"an answer of {len(answer)} bytes to one of {len(packet.payload)}")
         session.say(Packet(packet.kind, answer), "rtde")
 
     def _want(self, session: RtdeSession, payload: bytes) -> bytes:
