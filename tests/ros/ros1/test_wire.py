@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from ros1_stand import PYTHON, need_ros1
+from trade.errors import ConfigurationError
 from trade_gateway.ros import ros1
 from trade_gateway.ros._types import Types
 from trade_gateway.ros.ros1._wire import action_types, message_head, service_head
@@ -79,3 +80,18 @@ def test_parts_of_services_are_named_as_ros_does(types: Types) -> None:
 def test_the_node_is_written_for_the_python_of_older_distributions() -> None:
     for path in sorted((Path(ros1.__file__).parent / "_node").glob("*.py")):
         ast.parse(path.read_text(), filename=str(path), feature_version=(3, 8))
+
+
+@pytest.mark.timeout(30)
+def test_an_array_of_what_has_no_bytes_is_refused_before_one_comes(tmp_path: Path) -> None:
+    """Its length is only claimed: four bytes would keep the bridge at it for hours."""
+    folder = tmp_path / "custom" / "msg"
+    folder.mkdir(parents=True)
+    (folder / "Nothing.msg").write_text("std_msgs/Empty[2] inner\n")
+    (folder / "Row.msg").write_text("string name\nNothing[] many\n")
+    (folder / "Table.msg").write_text("Row[] rows\n")
+    types = Types(1, [tmp_path])
+    assert types.from_bytes("custom/msg/Nothing", b"") == {"inner": [{}, {}]}
+    for name in ("Row", "Table"):
+        with pytest.raises(ConfigurationError, match="many is an array of custom/msg/Nothing, which has no bytes"):
+            types.from_bytes(f"custom/msg/{name}", b"\x01\x00\x00\x00" + bytes(4) + b"\xff\xff\xff\x0f")

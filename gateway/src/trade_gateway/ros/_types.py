@@ -185,7 +185,23 @@ class Types:
             found = self._store.fielddefs[type_name][1]
         except KeyError:
             raise ConfigurationError(where="ROS type", problem=_unknown(type_name, self._store.fielddefs)) from None
-        return tuple(_field(name, kind) for name, kind in found if name != _FILLER)
+        fields = tuple(_field(name, kind) for name, kind in found if name != _FILLER)
+        for field in fields:
+            if field.many and not field.length and self._is_nothing(field.type):
+                problem = (
+                    f"{field.name} is an array of {field.type}, which has no bytes: no message tells how many come"
+                )
+                raise ConfigurationError(where=type_name, problem=problem)
+            if field.type in self._store.fielddefs:
+                self.fields(field.type)
+        return fields
+
+    def _is_nothing(self, type_name: str) -> bool:
+        """Whether it is a message that takes no bytes, so that any number may be claimed of it; in ROS 2 none is."""
+        if self.ros == 2 or type_name not in self._store.fielddefs:
+            return False
+        fields = [_field(name, kind) for name, kind in self._store.fielddefs[type_name][1] if name != _FILLER]
+        return all((field.length or not field.many) and self._is_nothing(field.type) for field in fields)
 
     def _read(self, folder: Path) -> None:
         if not folder.is_dir():
