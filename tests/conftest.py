@@ -5,6 +5,7 @@ import gc
 import os
 import resource
 import secrets
+import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -15,6 +16,9 @@ import pytest
 
 import trade
 from trade import Container, Settings, where
+
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # a run in the background; what tests start would ignore it, too
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 _FILES = 8192
 _SETTLE_S = 5.0

@@ -250,12 +250,15 @@ class TransportConformance(StandingConformance):
         with self.pair() as (one, _):
             channel, interrupted = one.subscribe("room/a"), False
             timer = threading.Timer(0.02, os.kill, (os.getpid(), signal.SIGINT))
-            timer.start()
+            before = signal.signal(signal.SIGINT, signal.default_int_handler)  # in the background it is ignored
             try:
+                timer.start()
                 channel.receive()
             except KeyboardInterrupt:
                 interrupted = True
-            timer.join()
+            finally:
+                timer.join()
+                signal.signal(signal.SIGINT, before)
             assert interrupted
 
 
