@@ -16,7 +16,7 @@ from trade._memory import MemoryTransport, Network
 from trade._transport import ChannelClosed, Message
 from trade._wire import (
     ALIVE,
-    ESTOP_ORDERS,
+    ESTOPS,
     REGISTRY,
     Address,
     ProviderInfo,
@@ -52,7 +52,7 @@ class StandIn:
         self._transport = MemoryTransport(network, name)
         self._announcer = Announcer(self._transport, self.address)
         self._asks = asks
-        for pattern in (ESTOP_ORDERS, REGISTRY, *(calls_to(self.address, stop=stop) for stop in (False, True))):
+        for pattern in (ESTOPS, REGISTRY, *(calls_to(self.address, stop=stop) for stop in (False, True))):
             self._transport.subscribe(pattern, newest=1)
         for revision, ((domain, provider), info) in enumerate(offer.items(), 1):
             self._announcer.announce(domain, provider, structs.replace(info, revision=revision))

@@ -97,7 +97,7 @@ class Driver:
         settings = {
             "TRADE_SYSTEM": SYSTEM,
             "TRADE_TLS": str(self._papers),
-            "TRADE_POLICY": str(self._site.policy),
+            "TRADE_POLICY": str(self._site.folder / "kept.toml"),
             "TRADE_CONNECT": DOOR["private"],
             "TRADE_RUNTIME_DIR": str(self._site.folder / "runtime" / "left"),
             "TRADE_STATE_DIR": str(self._site.folder / "state" / "left"),
@@ -139,6 +139,8 @@ class Stand:
         self._dice = random.Random(seed)
         self._turns = Counter[int]()
         self.site = Site(networks, folder, _POLICY, private='["rosie", "dora"]')
+        self._policy = folder / "kept.toml"
+        self._policy.write_text(_POLICY)
         self.drivers = {robot: Driver(self.site, robot, mutant) for robot in _ROBOTS}
         self.planners = {slot: self._planner(slot) for slot in range(_PLANNERS)}
 
@@ -146,7 +148,7 @@ class Stand:
         self._turns[slot] += 1
         host = "right" if slot % 2 else "right2"
         name = f"planner{slot}-{self._turns[slot]}"
-        member = self.site.launched(host, name, identity=f"planner{slot}", script=_SCRIPT)
+        member = self.site.launched(host, name, identity=f"planner{slot}", script=_SCRIPT, policy=self._policy)
         told = {
             "slot": slot,
             "seed": self._dice.randrange(2**32),
@@ -285,14 +287,13 @@ class Stand:
         return self._noted("one way", host, heal)
 
     def change_policy(self) -> Callable[[], None]:
-        """Nobody may lock dora, for a while; everybody reads it again."""
+        """The gateway lets nobody lock dora, for a while. Others read their policy once, and keep it."""
 
-        def say(text: str) -> None:
-            for path in (self.site.policy, *(self.site.folder / f"{name}.toml" for name, _ in self.planners.values())):
-                path.write_text(text)
+        def back() -> None:
+            self.site.policy.write_text(_POLICY)
 
-        say(_POLICY.replace('lock = ["rosie", "dora"]', 'lock = ["rosie"]'))
-        return self._noted("policy", "everybody", lambda: say(_POLICY))
+        self.site.policy.write_text(_POLICY.replace('lock = ["rosie", "dora"]', 'lock = ["rosie"]'))
+        return self._noted("policy", "door", back)
 
     # --- after it
 

@@ -33,7 +33,7 @@ def estop(
     out = Output(as_json=as_json)
     with visitor(context) as container:
         report = _clear(container, ids, limit) if clear else container.estop(reason, limit_s=limit)
-        system = container.settings.system
+        system, own = container.settings.system, f"{container.address.identity}/{container.address.container}"
     if report is None:
         if as_json:
             out.data(None)
@@ -42,7 +42,7 @@ def estop(
     if as_json:
         out.data(report)
     else:
-        _say(out, report, system, "cleared" if clear else "stopped")
+        _say(out, report, system, "cleared" if clear else "stopped", own)
     if not report.complete:
         raise typer.Exit(1)
 
@@ -52,8 +52,11 @@ def _clear(container: Container, ids: list[str] | None, limit_s: float) -> Estop
     return container.estop_clear(wanted, limit_s=limit_s) if wanted else None
 
 
-def _say(out: Output, report: EstopReport, system: str, done: str) -> None:
-    for name in report.confirmed:
+def _say(out: Output, report: EstopReport, system: str, done: str, own: str) -> None:
+    others = [
+        name for name in report.confirmed if name != own
+    ]  # this command hears of an e-stop like everybody, or not yet
+    for name in others or report.confirmed:
         out.say(f"{done}: {escape(name)}")
     for name, problem in report.failed.items():
         out.say(f"[bold red]FAILED: {escape(name)}: {escape(problem)}[/]")
