@@ -25,8 +25,8 @@ STEP = 8
 """Planners order positions that are theirs alone: of so many next to each other one."""
 _FREELY = 0.2
 _WAITS_S = (0.0, 0.3, 2.0)
-_SPEEDS_RAD_S = (0.05, 0.05, 0.5, 2.0)
-_DEADLINES_S = (0.5, 5.0, 30.0)
+_SPEEDS_RAD_S = (0.05, 0.05, 0.05, 0.5, 2.0)
+_DEADLINES_S = (0.5, 5.0, 30.0, 30.0)
 
 
 def rad(counts: int) -> float:
