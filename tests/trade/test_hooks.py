@@ -12,6 +12,7 @@ import pytest
 from trade import Called, Container, Handle, Secret, current_call, errors, service, where
 from trade._context import CallContext
 from trade._dispatch import LocalService
+from trade._hooking import Hook
 from trade.errors import AccessDenied, ConfigurationError, NoSuchHook
 from waiting import wait_until
 
@@ -194,6 +195,35 @@ def test_what_is_detached_is_not_called_any_more(
     hook.detach()
     plan("twice")
     assert observer.times == 1
+    assert here.hooks() == []
+
+
+def test_what_is_detached_stays_so_while_it_is_being_attached_to_who_comes(
+    here: Container, start_container: Any, watch: Callable[[str], Handle], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun, go, over, attach = threading.Event(), threading.Event(), threading.Event(), Hook._attach
+
+    def late(self: Hook, handle: Handle) -> Any:
+        if handle.container == "late":
+            begun.set()
+            go.wait(20)
+        return attach(self, handle)
+
+    join = Hook._join
+
+    def joined(self: Hook, handle: Handle) -> None:
+        join(self, handle)
+        if handle.container == "late":
+            over.set()
+
+    monkeypatch.setattr(Hook, "_attach", late)
+    monkeypatch.setattr(Hook, "_join", joined)
+    hook = here.after_service(where(name="plan"), watch("see"))
+    start_container("late")
+    assert begun.wait(20)
+    hook.detach()
+    go.set()
+    assert over.wait(20)
     assert here.hooks() == []
 
 

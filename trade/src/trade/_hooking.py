@@ -56,6 +56,8 @@ class Hook:
             return
         try:
             self._attach(handle).result()
+            if not self._attached:  # meanwhile, and perhaps before this got there
+                self._home.handle(ServiceKey(handle.key.address, DOMAIN, PROVIDER, "detach_hook"))(self.id)
         except (ContainerLost, ServiceGone):  # it has left already
             _logger.debug("hook %s is not attached in %s, which has ended", self.call.label, handle.container)
         except TradeError as error:
