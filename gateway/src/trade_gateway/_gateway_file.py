@@ -203,7 +203,7 @@ def read_gateway_file(path: Path) -> Plan:
     where = str(path)
     try:
         text = path.read_text(encoding="utf-8")
-        raw = _parsed(text)
+        raw = read_toml_text(text)
     except FileNotFoundError:
         raise ConfigurationError(where=where, problem="there is no such file") from None
     except OSError as bad:
@@ -359,8 +359,4 @@ def _named_by(part: Mapping[str, Any], path: Path) -> list[Path]:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    return _parsed(path.read_text(encoding="utf-8"))
-
-
-def _parsed(text: str) -> dict[str, Any]:
-    return read_toml_text(text)
+    return read_toml_text(path.read_text(encoding="utf-8"))

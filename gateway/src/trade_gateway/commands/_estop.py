@@ -53,9 +53,7 @@ def _clear(container: Container, ids: list[str] | None, limit_s: float) -> Estop
 
 
 def _say(out: Output, report: EstopReport, system: str, done: str, own: str) -> None:
-    others = [
-        name for name in report.confirmed if name != own
-    ]  # this command hears of an e-stop like everybody, or not yet
+    others = [name for name in report.confirmed if name != own]  # that this command has heard of it itself says nothing
     for name in others or report.confirmed:
         out.say(f"{done}: {escape(name)}")
     for name, problem in report.failed.items():
