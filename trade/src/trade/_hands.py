@@ -1,6 +1,8 @@
 """Threads that do one piece of work at a time and wait a while for the next one.
 
-To start a thread takes longer than most calls, and a hook is such a call: it is begun, so that it can be cut off.
+To start a thread takes longer than most calls, and a hook is such a call: it is begun, so that it can be cut off. What is
+due (`Clockwork`) has threads of its own, so many and no more: what is begun here may last for minutes, as a motion does,
+and must hold up nobody.
 """
 
 import logging
@@ -61,12 +63,9 @@ class Hands:
     def close(self) -> None:
         """Those that wait end; work that is under way goes on. Idempotent."""
         self._closed = True
-        while self._idle:
-            try:
-                hand = self._idle.pop()
-            except IndexError:  # it has ended by itself
-                return
-            hand.dismiss()
+        for hand in list(self._idle):
+            if self.leave(hand):
+                hand.dismiss()
 
 
 class _Hand:
