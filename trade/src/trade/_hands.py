@@ -1,8 +1,8 @@
 """Threads that do one piece of work at a time and wait a while for the next one.
 
-To start a thread takes longer than most calls, and a hook is such a call: it is begun, so that it can be cut off. What is
-due (`Clockwork`) has threads of its own, so many and no more: what is begun here may last for minutes, as a motion does,
-and must hold up nobody.
+To start a thread takes longer than most calls, and a hook is such a call: it is begun, so that it can be cut off. What
+is due (`Clockwork`) has threads of its own, so many and no more: what is begun here may last for minutes, as a motion
+does, and must hold up nobody.
 """
 
 import logging
