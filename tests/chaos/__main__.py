@@ -20,8 +20,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from tests.chaos import _client, _driver
-from tests.chaos._records import Fault, Log, now, read
-from tests.chaos._verify import Verdict, verify
+from tests.chaos._records import AnyRecord, Fault
+from tests.chaos._verify import verify
+from tests.holds import Log, Verdict, now, read
 
 _FORKS = multiprocessing.get_context("forkserver")
 _FAULTS: Final = ("kill", "freeze", "delay", "cut")
@@ -194,7 +195,7 @@ def run(plan: Plan, folder: Path) -> Verdict:
         running.rage()
     finally:
         running.end()
-    return verify(read(logs))
+    return verify(read(logs, AnyRecord))
 
 
 def _print(plan: Plan, verdict: Verdict) -> None:

@@ -12,7 +12,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-from tests.chaos._records import Ask, Done, Held, Log, Seen, now
+from tests.holds import Ask, Done, Held, Log, Seen, now
 
 from trade import Container, Handle, Settings, where
 from trade._context import holding

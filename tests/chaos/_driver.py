@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from tests.chaos import _mutants
-from tests.chaos._records import Beat, Byte, Command, End, Grant, Log, Renewed, now
+from tests.chaos._records import Beat, Byte, Command, End, Grant, Renewed
+from tests.holds import Log, now
 
 from trade import Container, Resource, Settings, current_call, permit, service
 from trade._locks import LockTable

@@ -1,48 +1,6 @@
-"""What every process notes down as it happens: a JSON line each, on one clock for all processes of a machine."""
+"""What every process of the chaos notes down as it happens, beyond what clients of locks do."""
 
-import os
-import time
-from collections.abc import Iterator
-from pathlib import Path
-
-import msgspec
-from msgspec import Struct
-
-
-class Record(Struct, tag_field="kind", tag=str.lower, frozen=True, kw_only=True):
-    """One line."""
-
-    t: float
-
-
-# --- what a client believes
-
-
-class Ask(Record):
-    """It is about to ask for a lock."""
-
-    hold: str
-    resources: tuple[str, ...]
-
-
-class Held(Record):
-    """It has it."""
-
-    hold: str
-
-
-class Seen(Record):
-    """It still had it."""
-
-    hold: str
-
-
-class Done(Record):
-    """It was refused, gave it back or lost it."""
-
-    hold: str
-    how: str
-
+from tests.holds import Ask, Done, Held, Record, Seen
 
 # --- what happens at a driver
 
@@ -107,26 +65,3 @@ class Fault(Record):
 
 
 AnyRecord = Ask | Held | Seen | Done | Command | Byte | Grant | Renewed | End | Beat | Fault
-_encode = msgspec.json.Encoder().encode
-
-
-class Log:
-    """A file of one process. A line is whole or not there, also after kill -9."""
-
-    def __init__(self, folder: Path, process: str) -> None:
-        path = folder / f"{process}-{os.getpid()}.jsonl"
-        self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
-
-    def note(self, record: Record) -> None:
-        os.write(self._fd, _encode(record) + b"\n")
-
-
-def now() -> float:
-    return time.monotonic()
-
-
-def read(folder: Path) -> Iterator[AnyRecord]:
-    """Every record of a run; the order is that of the files."""
-    decode = msgspec.json.Decoder(AnyRecord).decode
-    for path in sorted(folder.glob("*.jsonl")):
-        yield from map(decode, path.read_bytes().splitlines())

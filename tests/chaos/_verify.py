@@ -2,11 +2,11 @@
 
 import itertools
 from bisect import bisect_right
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Iterable
-from dataclasses import dataclass, field
 
-from tests.chaos._records import AnyRecord, Ask, Beat, Byte, Command, Done, End, Fault, Grant, Held, Renewed, Seen
+from tests.chaos._records import AnyRecord, Beat, Byte, Command, End, Fault, Grant, Renewed
+from tests.holds import Done, Owned, Verdict, asks_without_end, by_kind, owned, two_owners
 
 _BEAT_S = 0.05
 """How far apart a driver's signs of life are meant to be."""
@@ -16,72 +16,27 @@ Place = tuple[str, str]
 """An epoch and a resource, or an epoch and the number of a grant."""
 
 
-@dataclass
-class Verdict:
-    """What a run was, and what was wrong."""
-
-    counts: Counter[str] = field(default_factory=Counter)
-    violations: list[str] = field(default_factory=list)
-
-
-@dataclass
-class _Owned:
-    hold: str
-    resources: tuple[str, ...]
-    since: float
-    until: float
-
-
 def verify(records: Iterable[AnyRecord]) -> Verdict:
     """Look for two owners, bytes of who must not write, grants that outlive their lease, asks without end."""
-    known: dict[type, list] = defaultdict(list)
-    for record in records:
-        known[type(record)].append(record)
+    known = by_kind(records)
     verdict = Verdict()
     for kind, those in known.items():
         if kind is not Beat:
             verdict.counts[kind.__name__.lower()] = len(those)
     verdict.counts.update(f"fault {fault.what}" for fault in known[Fault])
     verdict.counts.update(f"done {done.how}" for done in known[Done])
-    owned = _owned(known)
-    verdict.violations += _two_owners(owned)
-    verdict.violations += _foreign_bytes(owned, known[Byte])
+    surely = owned(known)
+    verdict.violations += two_owners(surely)
+    verdict.violations += _foreign_bytes(surely, known[Byte])
     verdict.violations += _bytes_after_a_newer_grant(known[Grant], known[Byte])
     verdict.violations += _commands_without_a_grant(known[Grant], known[End], known[Command])
     verdict.violations += _grants_that_outlive_their_lease(known)
-    verdict.violations += _asks_without_end(known)
+    killed = {fault.process for fault in known[Fault] if fault.what == "kill"}
+    verdict.violations += asks_without_end(known, killed)
     return verdict
 
 
-def _owned(known: dict[type, list]) -> dict[str, list[_Owned]]:
-    """By resource: from when to when somebody surely had it, as far as he himself knew."""
-    resources = {ask.hold: ask.resources for ask in known[Ask]}
-    last: dict[str, float] = {}
-    for seen in known[Seen]:
-        last[seen.hold] = max(seen.t, last.get(seen.hold, seen.t))
-    owned: dict[str, list[_Owned]] = defaultdict(list)
-    for held in known[Held]:
-        span = _Owned(held.hold, resources[held.hold], held.t, max(held.t, last.get(held.hold, held.t)))
-        for resource in span.resources:
-            owned[resource].append(span)
-    for spans in owned.values():
-        spans.sort(key=lambda span: span.since)
-    return owned
-
-
-def _two_owners(owned: dict[str, list[_Owned]]) -> list[str]:
-    found: list[str] = []
-    for resource, spans in owned.items():
-        latest: _Owned | None = None
-        for span in spans:
-            if latest is not None and span.since < latest.until:
-                found.append(f"{resource} has two owners at {span.since:.6f}: {latest.hold} and {span.hold}")
-            if latest is None or span.until > latest.until:
-                latest = span
-    return found
-
-
-def _foreign_bytes(owned: dict[str, list[_Owned]], sent: list[Byte]) -> list[str]:
+def _foreign_bytes(owned: dict[str, list[Owned]], sent: list[Byte]) -> list[str]:
     starts = {resource: [span.since for span in spans] for resource, spans in owned.items()}
     found: list[str] = []
     for byte in sent:
@@ -161,10 +116,3 @@ def _not_had(signs: list[float], since: float, until: float) -> float:
     around = signs[max(0, bisect_right(signs, since) - 1) : bisect_right(signs, until) + 1]
     gaps = itertools.pairwise([*around, until])  # who is told to end as he is thawed gives no more signs
     return sum(max(0.0, min(later, until) - max(earlier, since) - _BEAT_S) for earlier, later in gaps)
-
-
-def _asks_without_end(known: dict[type, list]) -> list[str]:
-    answered = {record.hold for kind in (Held, Done) for record in known[kind]}
-    killed = {fault.process for fault in known[Fault] if fault.what == "kill"}
-    waiting = [ask for ask in known[Ask] if ask.hold not in answered and ask.hold.split(":")[0] not in killed]
-    return [f"{ask.hold} asked at {ask.t:.6f} and never heard anything" for ask in waiting]

@@ -1,7 +1,8 @@
 """The judge on histories made by hand: what is right passes, and each kind of wrong is named."""
 
-from tests.chaos._records import AnyRecord, Ask, Beat, Byte, Command, Done, End, Fault, Grant, Held, Renewed, Seen
+from tests.chaos._records import AnyRecord, Beat, Byte, Command, End, Fault, Grant, Renewed
 from tests.chaos._verify import verify
+from tests.holds import Ask, Done, Held, Seen
 
 
 def lock(hold: str, *times: float, resource: str = "a") -> list[AnyRecord]:

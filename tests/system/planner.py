@@ -15,7 +15,9 @@ import threading
 import time
 from typing import Any
 
-from system.siege_records import Answer, Ask, Done, Held, Log, Order, Seen
+from tests.holds import Ask, Done, Held, Log, Seen, now
+
+from system.siege_records import Answer, Order
 from trade import Container, Handle, Lock, Settings, where
 from trade.errors import DeviceError, Stopped, TradeError
 
@@ -53,8 +55,8 @@ class Planner:
 
     def works(self) -> list[str]:
         """What is wrong once it locks everything and moves every joint; waits for them."""
-        until, wrong = time.monotonic() + 25, ["nothing was tried"]
-        while wrong and time.monotonic() < until:
+        until, wrong = now() + 25, ["nothing was tried"]
+        while wrong and now() < until:
             wrong = self._move_all()
             time.sleep(0.2)
         return wrong
@@ -87,20 +89,20 @@ class Planner:
                 else:
                     self._lock_and_move(moves)
             except TradeError as error:
-                self._log.note(Answer(t=time.monotonic(), number="", how=f"not expected: {type(error).__name__}"))
+                self._log.note(Answer(t=now(), number="", how=f"not expected: {type(error).__name__}"))
 
     def _lock_and_move(self, moves: list[Handle]) -> None:
         self._count += 1
         hold = f"{self._name}:{self._count}"
         names = tuple(sorted({name for handle in moves for name in handle.resources}))
-        self._log.note(Ask(t=time.monotonic(), hold=hold, resources=names))
+        self._log.note(Ask(t=now(), hold=hold, resources=names))
         lock = self._container.lock(moves, wait_s=self._random.choice(_WAITS_S), lease_s=2)
         try:
             lock.acquire()
         except TradeError as refused:
-            self._log.note(Done(t=time.monotonic(), hold=hold, how=type(refused).__name__))
+            self._log.note(Done(t=now(), hold=hold, how=type(refused).__name__))
             return
-        self._log.note(Held(t=time.monotonic(), hold=hold))
+        self._log.note(Held(t=now(), hold=hold))
         try:
             with lock.use():
                 for _ in range(self._random.randint(1, 3)):
@@ -109,7 +111,7 @@ class Planner:
         finally:
             how = "given back" if self._still(lock, hold) else "lost"
             lock.release()
-            self._log.note(Done(t=time.monotonic(), hold=hold, how=how))
+            self._log.note(Done(t=now(), hold=hold, how=how))
 
     def _move(self, hold: str, move: Handle) -> None:
         counts = CENTRE_COUNTS + self._random.randrange(-FAR_COUNTS // STEP, FAR_COUNTS // STEP) * STEP + self._slot
@@ -123,7 +125,7 @@ class Planner:
 
     def _order(self, move: Handle, hold: str, counts: int, deadline_s: float, speed_rad_s: float) -> None:
         self._count += 1
-        number, asked = f"{self._name}:{self._count}", time.monotonic()
+        number, asked = f"{self._name}:{self._count}", now()
         [resource] = move.resources
         self._log.note(
             Order(t=asked, number=number, hold=hold, resource=resource, counts=counts, deadline_s=deadline_s)
@@ -135,16 +137,16 @@ class Planner:
             how = type(error).__name__
             raise
         finally:
-            self._log.note(Answer(t=time.monotonic(), number=number, how=how))
+            self._log.note(Answer(t=now(), number=number, how=how))
 
     def _enable(self, move: Handle) -> None:
         try:
             self._container.call(where(name="enable", kind="Motor", group=move.groups[0]))
         except TradeError as error:  # the next one tries again
-            self._log.note(Answer(t=time.monotonic(), number="", how=f"enable: {type(error).__name__}"))
+            self._log.note(Answer(t=now(), number="", how=f"enable: {type(error).__name__}"))
 
     def _still(self, lock: Lock, hold: str) -> bool:
-        before_t = time.monotonic()
+        before_t = now()
         if not lock.held:
             return False
         self._log.note(Seen(t=before_t, hold=hold))

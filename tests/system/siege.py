@@ -16,9 +16,10 @@ from typing import Final
 from unittest import mock
 
 import psutil
+from tests.holds import Log
 
 from system.networks import Member, Networks, ip
-from system.siege_records import Fault, Log
+from system.siege_records import Fault
 from system.sites import DOOR, SYSTEM, Site
 from trade_hil_sim import SimProcess
 
@@ -112,13 +113,6 @@ class Driver:
             env={**os.environ, **settings},
         )
 
-    def signal(self, number: int) -> None:
-        with suppress(ProcessLookupError):
-            os.kill(self.pid, number)
-
-    def kill(self) -> None:
-        self.signal(signal.SIGKILL)
-
     def close(self) -> None:
         self._closed.set()
         self._keeper.join()
@@ -210,14 +204,7 @@ class Stand:
 
     def freeze_planner(self) -> Callable[[], None]:
         name, member = self.planners[self._dice.randrange(_PLANNERS)]
-        pid = member.pid
-        os.kill(pid, signal.SIGSTOP)
-
-        def thaw() -> None:
-            with suppress(ProcessLookupError):
-                os.kill(pid, signal.SIGCONT)
-
-        return self._noted("freeze planner", name, thaw)
+        return self._noted("freeze planner", name, _frozen(member.pid))
 
     def _driver(self) -> Driver:
         return self._dice.choice([*self.drivers.values()])
@@ -225,19 +212,12 @@ class Stand:
     def kill_driver(self) -> Callable[[], None]:
         driver = self._driver()
         self._noted("kill driver", driver.robot, None)
-        driver.kill()
+        _signal(driver.pid, signal.SIGKILL)
         return _nothing
 
     def freeze_driver(self) -> Callable[[], None]:
         driver = self._driver()
-        pid = driver.pid
-        driver.signal(signal.SIGSTOP)
-
-        def thaw() -> None:
-            with suppress(ProcessLookupError):
-                os.kill(pid, signal.SIGCONT)
-
-        return self._noted("freeze driver", driver.robot, thaw)
+        return self._noted("freeze driver", driver.robot, _frozen(driver.pid))
 
     def unplug(self) -> Callable[[], None]:
         driver = self._driver()
@@ -250,15 +230,7 @@ class Stand:
         return self.site.begin
 
     def freeze_gateway(self) -> Callable[[], None]:
-        pid = self.site.gateway.pid
-        with suppress(ProcessLookupError):
-            os.kill(pid, signal.SIGSTOP)
-
-        def thaw() -> None:
-            with suppress(ProcessLookupError):
-                os.kill(pid, signal.SIGCONT)
-
-        return self._noted("freeze gateway", "door", thaw)
+        return self._noted("freeze gateway", "door", _frozen(self.site.gateway.pid))
 
     def cut(self) -> Callable[[], None]:
         """Both planners' hosts, or the robots'."""
@@ -311,20 +283,27 @@ class Stand:
     def held(self) -> dict[str, tuple[int, int]]:
         """By process of ours that serves: its open files and its threads."""
         pids = {"door": self.site.gateway.pid, **{name: driver.pid for name, driver in self.drivers.items()}}
-        return {name: (_process(pid).num_fds(), _process(pid).num_threads()) for name, pid in pids.items()}
+        processes = {name: psutil.Process(pid) for name, pid in pids.items()}
+        return {name: (process.num_fds(), process.num_threads()) for name, process in processes.items()}
 
     def close(self) -> None:
         for driver in self.drivers.values():
-            driver.signal(signal.SIGCONT)
+            _signal(driver.pid, signal.SIGCONT)
             driver.close()
-        with suppress(ProcessLookupError):
-            os.kill(self.site.gateway.pid, signal.SIGCONT)
+        _signal(self.site.gateway.pid, signal.SIGCONT)
         self.site.close()
         self._log.close()
 
 
-def _process(pid: int) -> psutil.Process:
-    return psutil.Process(pid)
+def _frozen(pid: int) -> Callable[[], None]:
+    """Stop a process for now; returns what has it go on."""
+    _signal(pid, signal.SIGSTOP)
+    return lambda: _signal(pid, signal.SIGCONT)
+
+
+def _signal(pid: int, number: int) -> None:
+    with suppress(ProcessLookupError):  # it may have been killed meanwhile
+        os.kill(pid, number)
 
 
 def _nothing() -> None: ...
@@ -333,7 +312,7 @@ def _nothing() -> None: ...
 @contextmanager
 def stand(networks: Networks, folder: Path, seed: int, mutant: str = "") -> Generator[Stand]:
     """All of it, ended after use; ``mutant``: how its drivers are broken, see `broken_driver`."""
-    with mock.patch.dict(os.environ, PYTHONPATH=str(_SCRIPT.parents[1])):
+    with mock.patch.dict(os.environ, PYTHONPATH=os.pathsep.join(map(str, _SCRIPT.parents[1:3]))):
         made = Stand(networks, folder, seed, mutant)
         try:
             yield made

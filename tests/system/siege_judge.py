@@ -4,10 +4,11 @@ import re
 from bisect import bisect_right
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
-from system.siege_records import Answer, AnyRecord, Ask, Done, Fault, Held, Order, Seen
+from tests.holds import Owned, Verdict, asks_without_end, by_kind, owned, two_owners
+
+from system.siege_records import Answer, AnyRecord, Fault, Order
 from trade_hil_sim import Entry
 
 STOPS_S = 6.0
@@ -35,22 +36,6 @@ class Motion(NamedTuple):
     """When it came to rest; never: infinity."""
 
 
-class Owned(NamedTuple):
-    """From when to when somebody surely had a resource, as far as he himself knew."""
-
-    hold: str
-    since: float
-    until: float
-
-
-@dataclass
-class Verdict:
-    """What a run was, and what was wrong."""
-
-    counts: Counter[str] = field(default_factory=Counter)
-    violations: list[str] = field(default_factory=list)
-
-
 def judge(records: Iterable[AnyRecord], logs: Mapping[str, Iterable[Entry]]) -> Verdict:
     """Look for two owners, and for motions that nobody ordered or that came twice, late, without a lock or had no end.
 
@@ -58,21 +43,19 @@ def judge(records: Iterable[AnyRecord], logs: Mapping[str, Iterable[Entry]]) -> 
         records: of planners, and the faults.
         logs: by robot, of its simulator.
     """
-    known: dict[type, list] = defaultdict(list)
-    for record in records:
-        known[type(record)].append(record)
+    known = by_kind(records)
     motions = {f"{robot}.{joint}": of for robot, entries in logs.items() for joint, of in motions_of(entries).items()}
     verdict = Verdict()
     verdict.counts.update({kind.__name__.lower(): len(those) for kind, those in known.items()})
     verdict.counts.update(f"fault {fault.what}" for fault in known[Fault])
     verdict.counts.update(f"answer {answer.how}" for answer in known[Answer])
     verdict.counts["motion"] = sum(len(of) for of in motions.values())
-    owned = _owned(known)
-    verdict.violations += _two_owners(owned)
-    verdict.violations += _unanswered(known)
+    surely = owned(known)
+    killed = {fault.whom for fault in known[Fault] if fault.what == "kill planner"}
+    verdict.violations += two_owners(surely) + asks_without_end(known, killed) + _unanswered(known, killed)
     for resource, of in sorted(motions.items()):
         orders = sorted((order for order in known[Order] if order.resource == resource), key=lambda order: order.t)
-        verdict.violations += _motions(resource, of, orders, owned[resource], known[Fault])
+        verdict.violations += _motions(resource, of, orders, surely[resource], known[Fault])
     return verdict
 
 
@@ -93,40 +76,9 @@ def motions_of(entries: Iterable[Entry]) -> dict[str, list[Motion]]:
     return found
 
 
-def _owned(known: dict[type, list]) -> dict[str, list[Owned]]:
-    resources = {ask.hold: ask.resources for ask in known[Ask]}
-    last: dict[str, float] = {}
-    for seen in known[Seen]:
-        last[seen.hold] = max(seen.t, last.get(seen.hold, seen.t))
-    owned: dict[str, list[Owned]] = defaultdict(list)
-    for held in known[Held]:
-        for resource in resources[held.hold]:
-            owned[resource].append(Owned(held.hold, held.t, max(held.t, last.get(held.hold, held.t))))
-    for spans in owned.values():
-        spans.sort(key=lambda span: span.since)
-    return owned
-
-
-def _two_owners(owned: Mapping[str, Sequence[Owned]]) -> list[str]:
-    found: list[str] = []
-    for resource, spans in owned.items():
-        latest: Owned | None = None
-        for span in spans:
-            if latest is not None and span.since < latest.until:
-                found.append(f"{resource} has two owners at {span.since:.3f}: {latest.hold} and {span.hold}")
-            latest = span if latest is None or span.until > latest.until else latest
-    return found
-
-
-def _unanswered(known: dict[type, list]) -> list[str]:
+def _unanswered(known: dict[type, list[Any]], killed: set[str]) -> list[str]:
     answered = {answer.number: answer.t for answer in known[Answer]}
-    heard = {record.hold for kind in (Held, Done) for record in known[kind]}
-    killed = {fault.whom for fault in known[Fault] if fault.what == "kill planner"}
-    found = [
-        f"{ask.hold} asked for a lock at {ask.t:.3f} and never heard anything"
-        for ask in known[Ask]
-        if ask.hold not in heard and _who(ask.hold) not in killed
-    ]
+    found: list[str] = []
     for order in known[Order]:
         late_s = answered.get(order.number, float("inf")) - order.t - order.deadline_s
         late_s -= _frozen_s(known[Fault], _who(order.number), order.t)
