@@ -223,9 +223,9 @@ class Source:
             answer = service.signature.encode_result(service.label, _in_turn(service, context))
         except BaseException as error:  # noqa: BLE001 - whatever a provider raises belongs to who listens
             info = structs.replace(service.failure(error, EMPTY_ARGUMENTS), traceback="")
-            if info.message != self._problem:  # the same again says nothing new
+            if info.type != self._problem:  # the same again says nothing new, however long it has lasted by now
                 _logger.warning("%s fails while it is listened to: %s: %s", service.label, info.type, info.message)
-            self._problem = info.message
+            self._problem = info.type
             return True, encode_message(info)
         self._problem = ""
         return False, answer

@@ -1,0 +1,34 @@
+"""What the log is told of a service that fails while it is listened to."""
+
+import itertools
+import logging
+
+import pytest
+
+from trade import errors, service, where
+from trade.testing import memory_system
+from waiting import PATIENCE_S
+
+
+class Sick:
+    def __init__(self) -> None:
+        self._silent_ms = itertools.count(100)
+
+    @service(effect="read")
+    def state(self) -> float:
+        raise errors.DeviceSilent(device="neck.pan", bus="/dev/ttyUSB0", waited_s=next(self._silent_ms) / 1e3)
+
+
+def test_a_failure_that_only_lasts_longer_is_told_once(caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.WARNING), memory_system() as system:
+        robot, viewer = system.container("robot"), system.container("viewer")
+        robot.register(Sick(), "rosie.neck")
+        with viewer.stream(where(name="state"), hz=50) as samples:
+            texts = set()
+            for _ in range(3):
+                with pytest.raises(errors.DeviceSilent) as silent:
+                    samples.next(PATIENCE_S)
+                texts.add(str(silent.value))
+    assert len(texts) == 3
+    told = [record for record in caplog.records if "while it is listened to" in record.getMessage()]
+    assert len(told) == 1
