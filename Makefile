@@ -13,9 +13,10 @@ RUN := $(UV) run --locked
 ARGS ?=
 SEED ?= 1
 MINUTES ?= 3
+HOURS ?= 1
 MUTANT ?=
 
-.PHONY: demo screenshots docs release-check test test-socketcan soak-registry soak-relocation chaos chaos-robots siege
+.PHONY: demo screenshots docs release-check test test-socketcan soak soak-registry soak-relocation chaos chaos-robots siege
 .PHONY: fuzz check audit-deps sbom bench bench-compare bench-page clean
 .DEFAULT_GOAL := help
 
@@ -36,8 +37,8 @@ demo: $(UV) ## a simulated robot looks, walks and grips for behaviours beyond a 
 test: $(UV) ## the whole test suite; in parts; the others run also when one fails
 	@failed=; part() { code=0; $(RUN) pytest "$$@" $(ARGS) || code=$$?; \
 	  case $$code in 0|5) ;; 1) failed=1 ;; *) exit $$code ;; esac; }; \
-	part -n 2 --dist loadfile --ignore tests/drivers --ignore tests/complaints --ignore tests/system --ignore tests/bench --ignore tests/chaos --ignore tests/browser --ignore tests/peers; \
-	part -n 2 --dist loadfile tests/system tests/bench tests/chaos --ignore tests/system/test_demo.py; \
+	part -n 2 --dist loadfile --ignore tests/drivers --ignore tests/complaints --ignore tests/system --ignore tests/bench --ignore tests/chaos --ignore tests/soak --ignore tests/browser --ignore tests/peers; \
+	part -n 2 --dist loadfile tests/system tests/bench tests/chaos tests/soak --ignore tests/system/test_demo.py; \
 	part -n 2 --dist loadfile tests/drivers tests/complaints; \
 	part tests/browser tests/peers tests/system/test_demo.py; \
 	test -z "$$failed"
@@ -56,6 +57,9 @@ chaos-robots: $(UV) ## a lock over two robots while a driver is killed and start
 
 fuzz: $(UV) ## every reader of bytes, guided by coverage where Atheris has a wheel (MINUTES=..; exits 1 if something breaks)
 	@$(RUN) --group fuzz python -m tests.fuzz --minutes $(MINUTES) $(ARGS)
+
+soak: $(UV) ## a robot, a gateway, a page and planners for hours; nothing may grow or fail (HOURS=..; leaves build/soak.svg)
+	@$(RUN) python -m tests.soak --hours $(HOURS) $(ARGS)
 
 soak-registry: $(UV) ## three containers on two hosts register at the same moment, 200 times (root, iproute2)
 	@SOAK_ROUNDS=200 $(RUN) pytest tests/system/test_namespaces.py -k same_moment $(ARGS)

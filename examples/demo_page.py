@@ -14,12 +14,19 @@ _CHUNK = 65536
 
 
 @contextlib.contextmanager
-def dashboard(scene: Stage) -> Generator[tuple[str, str]]:
-    """An address for the browser, and a token for anna."""
+def door(scene: Stage) -> Generator[tuple[str, str]]:
+    """An address on the laboratory's network, and a token for anna."""
     tokens = scene.folder / "door-tokens.toml"
     token = add_token(tokens, "anna")
-    with scene.trade("anna", "door", "--name", "page", "--listen", "127.0.0.1:0", "--tokens", tokens, "--json") as door:
-        url: str = door.ready()["url"]
+    words = ("door", "--name", "page", "--listen", "127.0.0.1:0", "--tokens", tokens, "--json")
+    with scene.trade("anna", *words) as opened:
+        yield opened.ready()["url"], token
+
+
+@contextlib.contextmanager
+def dashboard(scene: Stage) -> Generator[tuple[str, str]]:
+    """An address for the browser of this host, and a token for anna."""
+    with door(scene) as (url, token):
         if (window := scene.places.window) is None:
             yield url, token
             return

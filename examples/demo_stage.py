@@ -257,13 +257,13 @@ _TRADE = (sys.executable, "-m", "trade_gateway")
 
 
 @contextlib.contextmanager
-def stage(folder: Path, *, loopback: bool) -> Generator[Stage]:
+def stage(folder: Path, *, loopback: bool, policy: str = POLICY) -> Generator[Stage]:
     """Lay the networks, make certificates and a policy, open the gateway, and step onto the laboratory's network."""
     why = "as you said --loopback" if loopback else why_no_namespaces()
     with contextlib.ExitStack() as undo:
         places = Loopback(why) if why else Namespaces(undo)
         made = Stage(folder, places)
-        (folder / "policy.toml").write_text(POLICY)
+        (folder / "policy.toml").write_text(policy)
         authority = Authority.create(folder / "pki")  # what `trade pki init` and `trade pki issue` do
         for name in ("rosie", "planner", "visitor", "keeper", "anna", "archive"):
             authority.issue(name)
