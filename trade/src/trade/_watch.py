@@ -122,10 +122,15 @@ class Watch:
             self._registry.vanish(address)
 
     def _answer(self, answer: Answer, meant: dict[Address, ContainerState]) -> None:
-        """Take what a container says that it offers. Who speaks for anybody else is not listened to at all."""
+        """Take what a container says that it offers. Who speaks for anybody else is not listened to at all.
+
+        The answer is empty then: of ten thousand entries each is kept as it came, or as it was read, and never both.
+        """
         offered: dict[str, tuple[str, ProviderInfo]] = {}
-        speakers, revision = set[Address](), None
-        for message in answer.messages:
+        speakers, revision, message = set[Address](), None, None
+        answer.messages.reverse()
+        while answer.messages:
+            message = answer.messages.pop()
             try:
                 address, domain, provider = _place(message.key)
                 speakers.add(address)
@@ -135,8 +140,8 @@ class Watch:
                     offered[provider] = (domain, decode_provider(message.payload or b""))
             except Malformed as bad:
                 self._drop(message.key, bad)
-        if len(speakers) > 1:
-            self._drop(answer.messages[0].key, Malformed("one container answered for several"))
+        if message is not None and len(speakers) > 1:
+            self._drop(message.key, Malformed("one container answered for several"))
         elif revision is not None and (state := meant.get(speakers.pop())) is not None:
             self._registry.settle(state, revision, offered)  # without the tally, which comes last, it is not all
 
