@@ -99,6 +99,7 @@ bench-page: $(UV) ## docs/performance.md and its pictures, of docs/performance.j
 build/viam/bin/python: $(UV)
 	@$(UV) venv -q $(@D)/..
 	@$(UV) pip install -q --python $@ 'viam-sdk==0.85.1'
+
 docs: $(UV) ## the site of README.md and docs/ in site/; a warning, a dead link is an error
 	@NO_MKDOCS_2_WARNING=1 $(RUN) mkdocs build --strict --quiet $(ARGS)
 	@echo "site/index.html is the first page; with search, at http://127.0.0.1:8000: python3 -m http.server -b 127.0.0.1 -d site"

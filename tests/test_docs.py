@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 import typer
 
+from pages.blocks import blocks
 from trade import errors
 from trade_gateway.cli import build
 from trade_hil_sim import SimProcess, events
@@ -35,17 +36,6 @@ def test_the_readme_program_does_what_it_says(system: str, tmp_path: Path) -> No
     assert ended.stdout.strip() == "True"
     said = last.split("# ", 1)[1]
     assert said in ended.stderr.splitlines()[-1].removeprefix("trade.errors.")
-
-
-def test_the_guide_on_locks_and_stops_does_what_it_says(system: str, tmp_path: Path) -> None:
-    page = (ROOT / "docs" / "guide.md").read_text(encoding="utf-8")
-    section = page.split("## Locks, stops, e-stop")[1].split("\n## ")[0]
-    program = "\n".join(re.findall(r"```python\n(.*?)```", section, re.DOTALL))
-    path = tmp_path / "program.py"
-    path.write_text(program, encoding="utf-8")
-    ended = subprocess.run([sys.executable, path], capture_output=True, text=True, timeout=60, check=False)
-    assert ended.returncode == 0, ended.stderr
-    assert ended.stdout.splitlines() == re.findall(r"print\(.*\) +# (.*)", program)
 
 
 def test_no_merge_was_left_half_done() -> None:
@@ -86,18 +76,10 @@ def test_the_command_for_the_simulator_strikes_it() -> None:
         assert events(sim.entries(), "brown_out", device_id=1)
 
 
-def blocks(page: Path, *languages: str) -> Iterator[str]:
-    """What stands in the blocks of code of these languages, also in lists."""
-    text = page.read_text(encoding="utf-8")
-    for found in re.finditer(r"^( *)```(\w+)[^\n]*\n(.*?)^\1```$", text, re.MULTILINE | re.DOTALL):
-        if found[2] in languages:
-            yield re.sub(rf"^{found[1]}", "", found[3], flags=re.MULTILINE)
-
-
 def commands(page: Path) -> Iterator[list[str]]:
     """The words of each ``trade`` in the blocks of a page, without what stands before and behind it in its line."""
-    typed = [line for block in blocks(page, "sh") for line in block.splitlines()]
-    typed += [line[2:] for block in blocks(page, "console") for line in block.splitlines() if line.startswith("$ ")]
+    typed = [line for block in blocks(page, "sh") for line in block.text.splitlines()]
+    typed += [line[2:] for block in blocks(page, "console") for line in block.text.splitlines() if line[:2] == "$ "]
     for line in typed:
         if found := re.match(r"(?:sudo (?:-u \w+ )?)?((?:[A-Z_]+=\S+ )*)trade (?!-)", line):
             yield list(until_operator(shlex.split(line[found.end() :], comments=True)))
@@ -141,9 +123,9 @@ def test_a_command_that_does_not_exist_is_noticed() -> None:
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_blocks_of_pages_are_of_their_language(page: Path) -> None:
-    for text in blocks(page, "python"):
-        compile(text, str(page), "exec", ast.PyCF_ONLY_AST | ast.PyCF_ALLOW_TOP_LEVEL_AWAIT)
-    for text in blocks(page, "toml"):
-        tomllib.loads(text)
-    for text in blocks(page, "json"):
-        json.loads(text)
+    for block in blocks(page, "python"):
+        compile(block.text, str(page), "exec", ast.PyCF_ONLY_AST | ast.PyCF_ALLOW_TOP_LEVEL_AWAIT)
+    for block in blocks(page, "toml"):
+        tomllib.loads(block.text)
+    for block in blocks(page, "json"):
+        json.loads(block.text)

@@ -1,13 +1,76 @@
-"""What commands say, as pages show it, and the end of what they leave behind."""
+"""Commands typed in a shell, what they say as pages show it, and the end of what they leave behind."""
 
 import getpass
 import os
 import re
+import signal
 import socket
+import subprocess
+import sys
+from contextlib import ExitStack
+from pathlib import Path
 
 import psutil
 
-from waiting import wait_until
+from waiting import PATIENCE_S, wait_until
+
+
+class Shell:
+    """A shell in a folder of its own that finds ``trade``; what goes on in the background ends with the test."""
+
+    def __init__(self, folder: Path, undo: ExitStack, **environment: str) -> None:
+        self.folder = folder
+        path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
+        self.environment = {**os.environ, "PATH": path, "PYTHONUNBUFFERED": "1", **environment}
+        self._undo = undo
+
+    def run(self, command: str) -> tuple[int, str]:
+        """The exit code of a command, and all that it says, errors too."""
+        ended = subprocess.run(
+            ["bash", "-c", command],
+            cwd=self.folder,
+            env=self.environment,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            timeout=PATIENCE_S,
+            check=False,
+        )
+        return ended.returncode, ended.stdout
+
+    def start(self, command: str) -> "subprocess.Popen[str]":
+        """A command that goes on beside the others; it can be answered, and Ctrl-C ends it with the test."""
+        process = subprocess.Popen(
+            ["bash", "-c", f"exec env {command}"],  # variables may stand before it
+            cwd=self.folder,
+            env=self.environment,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            bufsize=1,
+        )
+        self._undo.callback(self.end, process)
+        return process
+
+    @staticmethod
+    def heard(process: "subprocess.Popen[str]", last: str) -> str:
+        """What it says, up to the line in which this pattern is."""
+        assert process.stdout is not None
+        said = ""
+        while not re.search(last, said, re.MULTILINE):
+            line = process.stdout.readline()
+            assert line, f"{process.args} has ended: {said}"
+            said += line
+        return said
+
+    @staticmethod
+    def end(process: "subprocess.Popen[str]") -> None:
+        """Ctrl-C, unless it has ended."""
+        if process.poll() is None:
+            process.send_signal(signal.SIGINT)
+        process.communicate(timeout=PATIENCE_S)
 
 
 def normalised(text: str, *, numbers: bool = True) -> str:

@@ -159,7 +159,8 @@ def test_a_hook_gets_copies_and_changes_nothing(here: Container) -> None:
 def test_a_constraint_covers_services_that_join_later(
     here: Container, there: Container, watch: Callable[[str], Handle], observer: Observer
 ) -> None:
-    here.after_service(where(group="mind"), watch("see"))
+    hook = here.after_service(where(group="mind"), watch("see"))
+    wait_until(lambda: any(info.container == there.name for info in hook.infos()))
     there.register(Planner(), "mind")
     here.call(where(name="plan", group="mind"), "late")
     assert observer.next().args == {"goal": "late"}
