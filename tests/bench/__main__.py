@@ -15,6 +15,8 @@ parts:
   servo      the Dynamixel driver against what a bus of 1 Mbaud can carry
   feetech    the same of the Feetech driver
   can        cycles of six CiA 402 drives near what 1 Mbit/s can carry: how many are late
+  jitter     by how much the cycles of each kind of bus are off their period: quiet and under load, with and without
+             SCHED_FIFO where the system allows it
   rosie      what all drivers of a robot take of a core, at the rates it is meant for
   supervisor what ten children cost their gateway; a driver that crashed until it serves again, beside a plain start
   scale      what joining, leaving, telling and finding cost, by how many containers there are: in memory 100, with
@@ -42,6 +44,7 @@ from tests.bench import (
     _deadman,
     _feetech,
     _gateway,
+    _jitter,
     _local,
     _locks,
     _plots,
@@ -57,6 +60,8 @@ from tests.bench._record import Clock
 from tests.bench._report import begin_part, forget_since, mark, print_all_targets, print_skipped, this_run
 
 _SERVICES_EACH = 10
+_JITTER_ROUNDS = 8
+"""One in a thousand cycles is told of, so there have to be some thousands."""
 
 
 def _run_registry(options: argparse.Namespace) -> None:
@@ -80,6 +85,7 @@ _PARTS: Mapping[str, Callable[[argparse.Namespace], None]] = {
     "servo": lambda options: _servo.run(options.n, options.rounds, options.seconds),
     "feetech": lambda options: _feetech.run(options.n, options.rounds, options.seconds),
     "can": lambda options: _cans.run(max(1, options.rounds // 2), options.seconds),
+    "jitter": lambda options: _jitter.run(_JITTER_ROUNDS * options.n),
     "rosie": lambda options: _rosie.run(max(1, options.rounds // 2), options.seconds),
     "supervisor": lambda options: _supervisor.run(max(1, options.rounds // 2), options.idle),
     "scale": lambda options: _scale.run(options.containers, options.idle),
@@ -95,7 +101,7 @@ def main() -> None:
         prog="python -m tests.bench", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("parts", nargs="*", metavar="part", help=f"{', '.join(_PARTS)}; all of them by default")
-    parser.add_argument("--full", action="store_true", help="longer rounds and more of them: some forty minutes")
+    parser.add_argument("--full", action="store_true", help="longer rounds and more of them: about an hour")
     parser.add_argument("-n", type=int, help=f"calls or cycles in a round ({_QUICK['n']}, full {_FULL['n']})")
     parser.add_argument("--rounds", type=int, help=f"turns of each peer ({_QUICK['rounds']}, full {_FULL['rounds']})")
     parser.add_argument(

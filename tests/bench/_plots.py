@@ -1,6 +1,7 @@
 """The plots of a run: dots on a logarithmic scale, drawn as SVG by hand, so that a page needs nothing from elsewhere.
 
 A dot is the median over the rounds, the line through it the middle half of them, a ring the p99 where there is one.
+Points that have histograms are drawn as those instead.
 """
 
 import math
@@ -9,17 +10,21 @@ from html import escape
 from itertools import groupby
 from typing import Final
 
+from tests.bench._histograms import histograms
+from tests.bench._ink import BARE, FONT, FOOT, GRID, LEFT, OTHER, OURS, RIGHT, ROW, TEXT, TOP, WIDTH
 from tests.bench._record import Point, Run, Spread
 
-_WIDTH, _LEFT, _RIGHT = 760, 190, 120
-_TOP, _ROW, _FOOT = 44, 22, 34
-_OURS, _BARE, _OTHER, _GRID, _TEXT = "#1261c4", "#333b45", "#8a929c", "#e3e6ea", "#1c2127"
-_FONT: Final = "font-family='system-ui, sans-serif'"
 _RINGS: Final = {"p50, us": "p99, us", "call p50, ms": "call p99, ms"}
 """What is shown by a ring beside what is shown by a dot."""
 _STEPS: Final = ((1,), (1, 2, 5), (1, 1.5, 2, 3, 4, 5, 6, 8))
 _FEWEST_TICKS: Final = 3
-PICTURES: Final = {"calls": "calls", "in-flight": "in-flight", "checks": "checks", "gateway": "gateways"}
+PICTURES: Final = {
+    "calls": "calls",
+    "in-flight": "in-flight",
+    "checks": "checks",
+    "gateway": "gateways",
+    "jitter": "jitter",
+}
 """Parts of which the documentation has a picture, and its name."""
 
 _PAGE: Final = """<!doctype html>
@@ -79,7 +84,7 @@ def page(run: Run) -> str:
     plots = (f"<h2>{escape(part)}</h2>\n{svg}" for part, svg in drawn if svg)
     return _PAGE.format(
         title="Speed of TRADE",
-        text=_TEXT,
+        text=TEXT,
         about=escape(about(run)).replace("**", ""),
         met=len(run.targets) - len(run.missed),
         missed=len(run.missed),
@@ -107,17 +112,25 @@ def _drawn(part: str, cases: Mapping[str, Sequence[Point]]) -> str:
     charts: list[str] = []
     y = 0
     for case, points in cases.items():
-        for what, those in _by_figure(points):
-            charts.append(f"<g transform='translate(0 {y})'>{_chart(case, what, those)}</g>")
-            y += _TOP + _ROW * len(those) + _FOOT
+        for chart, high in _charts(case, points):
+            charts.append(f"<g transform='translate(0 {y})'>{chart}</g>")
+            y += high
     if not charts:
         return ""
     return (
-        f"<svg xmlns='http://www.w3.org/2000/svg' viewBox='0 0 {_WIDTH} {y}' width='{_WIDTH}' height='{y}' "
+        f"<svg xmlns='http://www.w3.org/2000/svg' viewBox='0 0 {WIDTH} {y}' width='{WIDTH}' height='{y}' "
         f"role='img' aria-label='{escape(part)}'>\n<rect width='100%' height='100%' fill='white'/>\n"
         + "\n".join(charts)
         + "\n</svg>\n"
     )
+
+
+def _charts(case: str, points: Sequence[Point]) -> Iterator[tuple[str, int]]:
+    """Each with its height."""
+    if distributed := [point for point in points if point.histogram is not None]:
+        yield histograms(case, distributed)
+    for what, those in _by_figure([point for point in points if point.histogram is None]):
+        yield _chart(case, what, those), TOP + ROW * len(those) + FOOT
 
 
 def _by_figure(points: Sequence[Point]) -> Iterator[tuple[str, list[Point]]]:
@@ -131,30 +144,28 @@ def _by_figure(points: Sequence[Point]) -> Iterator[tuple[str, list[Point]]]:
 def _chart(case: str, what: str, points: Sequence[Point]) -> str:
     ring = _RINGS.get(what, "")
     scale = _Scale([spread for point in points for name, spread in point.values.items() if name in (what, ring)])
-    bottom = _TOP + _ROW * len(points)
-    drawn = [
-        f"<text x='12' y='20' {_FONT} font-size='14' font-weight='600' fill='{_TEXT}'>{escape(case)}: {what}</text>"
-    ]
+    bottom = TOP + ROW * len(points)
+    drawn = [f"<text x='12' y='20' {FONT} font-size='14' font-weight='600' fill='{TEXT}'>{escape(case)}: {what}</text>"]
     for tick in scale.ticks():
         x = scale.x(tick)
-        drawn.append(f"<path d='M{x:.1f} {_TOP - 10}V{bottom}' stroke='{_GRID}'/>")
-        label = f"<text x='{x:.1f}' y='{bottom + 14}' {_FONT} font-size='11' text-anchor='middle' fill='{_OTHER}'>"
+        drawn.append(f"<path d='M{x:.1f} {TOP - 10}V{bottom}' stroke='{GRID}'/>")
+        label = f"<text x='{x:.1f}' y='{bottom + 14}' {FONT} font-size='11' text-anchor='middle' fill='{OTHER}'>"
         drawn.append(f"{label}{figure(tick)}</text>")
     for row, point in enumerate(points):
-        drawn.append(_row(point, what, ring, scale, _TOP + _ROW * row + 4))
+        drawn.append(_row(point, what, ring, scale, TOP + ROW * row + 4))
     return "\n".join(drawn)
 
 
 def _row(point: Point, what: str, ring: str, scale: "_Scale", y: float) -> str:
     spread, colour = point.values[what], _colour(point.name)
-    weight = 600 if colour == _OURS else 400
+    weight = 600 if colour == OURS else 400
     x, low, high = (scale.x(value) for value in (spread.median, spread.low, spread.high))
-    text = f"{_FONT} font-size='12' fill='{_TEXT}' font-weight='{weight}'"
+    text = f"{FONT} font-size='12' fill='{TEXT}' font-weight='{weight}'"
     drawn = [
-        f"<text x='{_LEFT - 12}' y='{y + 4}' {text} text-anchor='end'>{escape(point.name)}</text>",
+        f"<text x='{LEFT - 12}' y='{y + 4}' {text} text-anchor='end'>{escape(point.name)}</text>",
         f"<path d='M{low:.1f} {y}H{high:.1f}' stroke='{colour}' stroke-width='4' stroke-opacity='.35'/>",
         f"<circle cx='{x:.1f}' cy='{y}' r='4.5' fill='{colour}'/>",
-        f"<text x='{_WIDTH - 12}' y='{y + 4}' {text} text-anchor='end'>{figure(spread.median)}</text>",
+        f"<text x='{WIDTH - 12}' y='{y + 4}' {text} text-anchor='end'>{figure(spread.median)}</text>",
     ]
     if ring in point.values:
         far = scale.x(point.values[ring].median)
@@ -164,8 +175,8 @@ def _row(point: Point, what: str, ring: str, scale: "_Scale", y: float) -> str:
 
 def _colour(name: str) -> str:
     if name.startswith(("TRADE", "driver", "strict")):
-        return _OURS
-    return _BARE if "bare" in name else _OTHER
+        return OURS
+    return BARE if "bare" in name else OTHER
 
 
 class _Scale:
@@ -178,7 +189,7 @@ class _Scale:
     def x(self, value: float) -> float:
         place = math.log10(max(value, 1e-12)) - self._low
         share = min(1.0, max(0.0, place / (self._high - self._low)))
-        return _LEFT + share * (_WIDTH - _LEFT - _RIGHT)
+        return LEFT + share * (WIDTH - LEFT - RIGHT)
 
     def ticks(self) -> list[float]:
         """Powers of ten; closer where there would be fewer than three."""

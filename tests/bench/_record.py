@@ -4,6 +4,7 @@ import os
 import platform
 import subprocess
 import time
+from bisect import bisect_right
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from importlib import metadata
@@ -46,7 +47,23 @@ class Spread(Struct, frozen=True, array_like=True):
         return self.high - self.low
 
 
-class Point(Struct, frozen=True):
+class Histogram(Struct, frozen=True):
+    """How many of one thing's figures lie where."""
+
+    edges: tuple[float, ...]
+    """Ascending; a figure that is one of them lies above it."""
+    counts: tuple[int, ...]
+    """Below the first edge, between each and the next, above the last."""
+
+    @classmethod
+    def of(cls, values: Sequence[float], edges: Sequence[float]) -> "Histogram":
+        counts = [0] * (len(edges) + 1)
+        for value in values:
+            counts[bisect_right(edges, value)] += 1
+        return cls(tuple(edges), tuple(counts))
+
+
+class Point(Struct, frozen=True, omit_defaults=True):
     """What was measured of one thing."""
 
     part: str
@@ -57,6 +74,8 @@ class Point(Struct, frozen=True):
     """Calls, cycles or samples, of all rounds; 0 where there is nothing to count."""
     values: dict[str, Spread]
     """By what was measured, with its unit; ``p50 / bare`` and the like are ratios to another point's same round."""
+    histogram: Histogram | None = None
+    """Of what was measured one by one, where its distribution is the point."""
 
 
 class Target(Struct, frozen=True):

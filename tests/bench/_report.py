@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from statistics import median
 
-from tests.bench._record import Point, Run, Skipped, Spread, Target
+from tests.bench._record import Histogram, Point, Run, Skipped, Spread, Target
 
 _part = ""
 
@@ -34,7 +34,9 @@ def forget_since(marked: tuple[int, int, int]) -> None:
         del told[count:]
 
 
-def keep_point(case: str, name: str, n: int, values: Mapping[str, Sequence[float]]) -> None:
+def keep_point(
+    case: str, name: str, n: int, values: Mapping[str, Sequence[float]], histogram: Histogram | None = None
+) -> None:
     """What was measured, a figure for each round.
 
     Args:
@@ -42,10 +44,10 @@ def keep_point(case: str, name: str, n: int, values: Mapping[str, Sequence[float
         name: of what.
         n: calls, cycles or samples of all rounds; 0 where there is nothing to count.
         values: by what it is, with its unit.
+        histogram: of all that was measured, if it is to be shown.
     """
-    this_run().points.append(
-        Point(_part, case, name, n, {what: Spread.of(figures) for what, figures in values.items()})
-    )
+    spreads = {what: Spread.of(figures) for what, figures in values.items()}
+    this_run().points.append(Point(_part, case, name, n, spreads, histogram))
 
 
 def print_target(what: str, values: Sequence[float], target: str, met: Callable[[float], bool]) -> None:

@@ -64,7 +64,17 @@ _PARTS: Final = {
     "rosie": "All drivers of a robot",
     "supervisor": "The supervisor",
     "arm": "An arm",
+    "jitter": "Jitter of bus loops",
 }
+_NOTES: Final = {
+    "jitter": """By how much the time between the first questions of two cycles was longer than the period, in us: less
+than zero follows a cycle that was late. They are taken from the wire, where a simulator in a process of its own reads
+them. In the pictures the edges of the bins are 1, 2 and 5 times powers of ten on either side of zero, and bars grow
+with the logarithm of their count. "load" is one busy process for each processor. Where the system allows SCHED_FIFO,
+the simulator has it in all cases; where a case is named so, the driver has it, too. "nothing" is a loop that only
+sleeps until its next turn. A mean that is not zero is a period that was not kept.""",
+}
+"""What has to be said of a part."""
 
 
 class Reason(Struct, frozen=True, forbid_unknown_fields=True):
@@ -117,6 +127,8 @@ def _measured(run: Run) -> Iterator[str]:
         yield f"\n## {_PARTS.get(part, part)}"
         if PICTURES.get(part) in drawn:
             yield f"\n![{_PARTS[part]}](pictures/performance-{PICTURES[part]}.svg)"
+        if part in _NOTES:
+            yield f"\n{_NOTES[part]}"
         cases: dict[str, list[Point]] = {}
         for point in points:
             cases.setdefault(point.case, []).append(point)

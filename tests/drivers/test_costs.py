@@ -23,6 +23,7 @@ from drivers.legs import Leg
 from drivers.motor_rig import DamiaoRig, OdriveRig
 from drivers.tail_rig import TailRig
 from trade_drivers import AttachedRobot
+from trade_drivers._driver import Driver, drivers
 from trade_hil_sim import Entry
 from waiting import wait_until
 
@@ -44,24 +45,25 @@ class Loop:
 
 _ASKED_IN_TURN = ("temperature", "bus_voltage_current", "error", "iq")
 LOOPS = {
-    "Dynamixel": Loop(Rig, {("", 16): 1, ("", 14): 1}, {("sync_read", 21): 2, ("read", 94): 1}),
-    "Feetech": Loop(TailRig, {("", 10): 1, ("", 8): 1}, {("sync_read", 12): 2, ("sync_read", 14): 2, ("read", 33): 1}),
-    "CiA 402": Loop(
+    "dynamixel": Loop(Rig, {("", 16): 1, ("", 14): 1}, {("sync_read", 21): 2, ("read", 94): 1}),
+    "feetech": Loop(TailRig, {("", 10): 1, ("", 8): 1}, {("sync_read", 12): 2, ("sync_read", 14): 2, ("read", 33): 1}),
+    "cia402": Loop(
         lambda _, undo: Leg(undo), {("sync", 0): 1, ("heartbeat", 1): 1}, {("tpdo1", 8): 2, ("tpdo2", 7): 2}
     ),
-    "ODrive": Loop(
+    "odrive": Loop(
         lambda _, undo: OdriveRig(undo),
         {("ask_get_encoder_estimates", 0): 2} | {(f"ask_get_{name}", 0): 2 for name in _ASKED_IN_TURN},
         {(f"get_{name}", 8): 2 for name in _ASKED_IN_TURN},
     ),
-    "Damiao": Loop(lambda _, undo: DamiaoRig(undo), {("refresh", 8): 2}, {("feedback", 8): 2}),
-    "Robotiq": Loop(
+    "damiao": Loop(lambda _, undo: DamiaoRig(undo), {("refresh", 8): 2}, {("feedback", 8): 2}),
+    "robotiq": Loop(
         HandRig,
         {("", 8): 1},
         {("read_input", 11): 1, ("read", 11): 1, ("read_input", 7): 1, ("read", 9): 1},
     ),
-    "UR": Loop(lambda _, undo: ArmRig(undo), {}, {}),
+    "ur": Loop(lambda _, undo: ArmRig(undo), {}, {}),
 }
+"""By driver."""
 _BY_THEMSELVES = {("heartbeat", 1), ("heartbeat", 8), ("get_encoder_estimates", 8)}
 """What devices say unasked."""
 
@@ -99,6 +101,11 @@ def running(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Running]
         made = Running(loop, rig, robot)
         made.turn(TURNS)
         yield made
+
+
+def test_every_driver_of_a_bus_has_its_loop_here() -> None:
+    ours = [point for points in drivers().values() for point in points if point.value.startswith("trade_drivers.")]
+    assert {point.name for point in ours if issubclass(point.load(), Driver)} == set(LOOPS)
 
 
 def test_a_turn_sends_so_much_and_no_more(running: Running) -> None:
