@@ -56,7 +56,7 @@ from tests.bench import (
     _supervisor,
     _watching,
 )
-from tests.bench._record import Clock
+from tests.bench._record import Clock, Run
 from tests.bench._report import begin_part, forget_since, mark, print_all_targets, print_skipped, this_run
 
 _SERVICES_EACH = 10
@@ -117,6 +117,7 @@ def main() -> None:
     )
     parser.add_argument("--services", type=int, default=10_000, help="of the registry part (default: %(default)s)")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write what was measured, for compare and page")
+    parser.add_argument("--into", type=Path, metavar="RUN", help="an earlier run, whose other parts are kept")
     parser.add_argument("--html", type=Path, metavar="FILE", help="write a page with plots of it")
     options = parser.parse_args()
     if unknown := set(options.parts) - set(_PARTS):
@@ -130,6 +131,7 @@ def main() -> None:
 def _run(options: argparse.Namespace) -> int:
     """All parts that are asked for; gives how many failed, at most one. What is measured is written after each."""
     clock, run, failed = Clock(), this_run(), 0
+    earlier = Run.read(options.into) if options.into else None
     run.arguments = _without_files(sys.argv[1:])
     for part in _PARTS:
         if options.parts and part not in options.parts:
@@ -138,7 +140,7 @@ def _run(options: argparse.Namespace) -> int:
         failed |= not _succeeds(part, options)
         clock.stop(run)
         if options.json:
-            run.write(options.json)
+            (earlier.amended(run) if earlier else run).write(options.json)
         if options.html:
             options.html.parent.mkdir(parents=True, exist_ok=True)
             options.html.write_text(_plots.page(run))
@@ -164,7 +166,7 @@ def _succeeds(part: str, options: argparse.Namespace) -> bool:
 
 def _without_files(words: Sequence[str]) -> list[str]:
     """Where a run is written is no part of what it is."""
-    return [word for before, word in pairwise(["", *words]) if not {before, word} & {"--json", "--html"}]
+    return [word for before, word in pairwise(["", *words]) if not {before, word} & {"--json", "--html", "--into"}]
 
 
 if __name__ == "__main__":

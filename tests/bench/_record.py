@@ -10,10 +10,10 @@ from contextlib import suppress
 from importlib import metadata
 from pathlib import Path
 from statistics import median, quantiles
-from typing import Final
+from typing import Any, Final
 
 import psutil
-from msgspec import Struct, field, json
+from msgspec import Struct, field, json, structs
 
 _ROOT: Final = Path(__file__).parents[2]
 _LIBRARIES: Final = ("eclipse-zenoh", "msgspec", "rpyc", "Pyro5", "grpcio", "ur-rtde")
@@ -116,6 +116,16 @@ class Machine(Struct, frozen=True):
         )
 
 
+class Again(Struct, frozen=True):
+    """When some parts of a run were measured anew."""
+
+    parts: tuple[str, ...]
+    commit: str
+    began: str
+    arguments: tuple[str, ...]
+    others_cores: float | None
+
+
 class Run(Struct):
     """A run. ``others_cores`` is how many cores other programs took meanwhile, on average; None until it has ended."""
 
@@ -132,6 +142,7 @@ class Run(Struct):
     points: list[Point] = field(default_factory=list)
     targets: list[Target] = field(default_factory=list)
     skipped: list[Skipped] = field(default_factory=list)
+    again: list[Again] = field(default_factory=list)
 
     @classmethod
     def begin(cls, arguments: Sequence[str] = ()) -> "Run":
@@ -153,6 +164,20 @@ class Run(Struct):
         """A line for each point and target, so that a difference can be read."""
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_bytes(json.encode(self).replace(b"},{", b"},\n{") + b"\n")
+
+    def amended(self, newer: "Run") -> "Run":
+        """This run with all that the newer one measured, or could not, in the place of what is here of its parts."""
+        anew = tuple(dict.fromkeys((*newer.parts(), *(one.part for one in newer.skipped))))
+        order = {part: at for at, part in enumerate(dict.fromkeys((*self.parts(), *anew)))}
+
+        def of(kind: str) -> list[Any]:
+            old = [one for one in getattr(self, kind) if one.part not in anew]
+            return sorted([*old, *getattr(newer, kind)], key=lambda one: order.get(one.part, len(order)))
+
+        told = Again(anew, newer.commit, newer.began, tuple(newer.arguments), newer.others_cores)
+        kept = [one for one in self.again if not set(one.parts) <= set(anew)]
+        lists = {kind: of(kind) for kind in ("points", "targets", "skipped")}
+        return structs.replace(self, again=[*kept, told], **lists)
 
     @property
     def quiet(self) -> bool:

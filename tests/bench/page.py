@@ -101,7 +101,15 @@ def written(run: Run, reasons: Mapping[str, Reason]) -> str:
         command=" ".join(["python -m tests.bench", *run.arguments]),
         versions=", ".join(f"{name} {version}" for name, version in run.versions.items()),
     )
-    return "\n".join([head.rstrip(), *_targets(run, reasons), *_measured(run), *_skipped(run)]) + "\n"
+    return "\n".join([head.rstrip(), *_again(run), *_targets(run, reasons), *_measured(run), *_skipped(run)]) + "\n"
+
+
+def _again(run: Run) -> Iterator[str]:
+    for one in run.again:
+        others = "an unknown part" if one.others_cores is None else f"{one.others_cores:g} cores"
+        command = " ".join(["python -m tests.bench", *one.arguments])
+        yield f"- **Measured anew**: {', '.join(one.parts)}; {one.began}, commit {one.commit or 'unknown'}, while other"
+        yield f"  programs took {others} of the machine: `{command}`."
 
 
 def _targets(run: Run, reasons: Mapping[str, Reason]) -> Iterator[str]:

@@ -132,3 +132,28 @@ def test_the_command_writes_the_page_and_names_what_is_missed_without_a_reason(
         "missed without an explanation in why.toml: late at 500 Hz, 1 TPDO, %",
         "explained in why.toml, and not in this run: 64 B: p50 / Viam SDK",
     ]
+
+
+def test_parts_that_are_measured_anew_take_the_place_of_those_before_and_the_page_says_so() -> None:
+    anew = a_run(
+        commit="fedcba",
+        arguments=["can", "servo"],
+        others_cores=0.5,
+        points=[Point("can", "500 Hz, 1 TPDO", "empty loop", 5, {"late, %": Spread.of([0.25])})],
+        targets=[Target("can", "late at 500 Hz, 1 TPDO, %", "below 1", Spread.of([0.25]), True)],
+        skipped=[Skipped("servo", "servo", "it failed")],
+    )
+    both = a_run().amended(anew)
+    assert list(both.parts()) == list(a_run().parts())
+    assert [one for one in both.points if one.part != "can"] == [one for one in a_run().points if one.part != "can"]
+    assert [one for one in both.points if one.part == "can"] == anew.points
+    assert [one.met for one in both.targets] == [True, False, False, True]
+    assert Skipped("servo", "servo", "it failed") in both.skipped
+    text = files(both, {})["performance.md"]
+    assert "**Measured anew**: can, servo; 2026-11-22 10:00 UTC, commit fedcba, while other" in text
+    once_more = both.amended(
+        a_run(arguments=["servo"], points=[], targets=[], skipped=[Skipped("servo", "servo", "x")])
+    )
+    assert [one.parts for one in once_more.again] == [("can", "servo"), ("servo",)]
+    assert [one.reason for one in once_more.skipped if one.part == "servo"] == ["x"]
+    assert [one.parts for one in both.amended(anew).again] == [("can", "servo")]

@@ -4,6 +4,7 @@
 and how long the calls since took; SIGTERM ends it. ``passer`` is somebody who comes, asks around, and goes.
 """
 
+import contextlib
 import json
 import math
 import signal
@@ -17,7 +18,7 @@ from typing import Any, Final
 
 import trade
 from trade import Called, Constraint, Handle, Settings, service, where
-from trade.errors import TradeError
+from trade.errors import DeviceSilent, TradeError
 
 SAYS_EVERY_S: Final = 10.0
 _ASKS: Final = 25
@@ -181,9 +182,10 @@ class Planner:
 
 def pass_by() -> None:
     """Come, look around, ask what there is to ask, go."""
-    trade.find(where(group="rosie.head", name="state"), wait_s=30)()
+    trade.find(where(group="rosie.head", name="state"), wait_s=30)
     for handle in trade.services(where(name="state", group="rosie")):
-        handle()
+        with contextlib.suppress(DeviceSilent):  # of which the planners tell
+            handle()
     print(json.dumps({"knew": len(trade.services(where()))}), flush=True)
 
 
