@@ -165,14 +165,17 @@ class Model(RuleBasedStateMachine):
     def _of(self, places: set[int]) -> list[Joint]:
         return [self.joints[place] for place in sorted(places)]
 
-    @rule(places=some, exchanges=st.integers(1, 5), fails=st.booleans())
-    def submit(self, places: set[int], exchanges: int, fails: bool) -> None:
-        job = Job(self, next(self.numbers), self._of(places), exchanges, fails)
-        self.exchange.submit(job)
-        if self.exchange.refusing is not None:
-            assert became_of(job) is BusGone
-        else:
-            self.jobs.append(job)
+    job = st.tuples(some, st.integers(1, 5), st.booleans())
+
+    @rule(jobs=st.lists(job, min_size=1, max_size=4))
+    def submit(self, jobs: list[tuple[set[int], int, bool]]) -> None:
+        for places, exchanges, fails in jobs:
+            job = Job(self, next(self.numbers), self._of(places), exchanges, fails)
+            self.exchange.submit(job)
+            if self.exchange.refusing is not None:
+                assert became_of(job) is BusGone
+            else:
+                self.jobs.append(job)
 
     @rule(places=some)
     def stop(self, places: set[int]) -> None:
@@ -230,22 +233,15 @@ class Model(RuleBasedStateMachine):
         self.exchange.idle(0.0)
         assert not self.unwritten
 
-    @rule(place=st.integers(0, 2))
-    def comes_to_rest(self, place: int) -> None:
-        self.joints[place].halting_since_ns = 0
-
-    @rule(place=st.integers(0, 2))
-    def is_heard_no_more(self, place: int) -> None:
-        self.joints[place].deafened = True
-
-    @rule(place=st.integers(0, 2))
-    def is_left_out(self, place: int) -> None:
-        self.joints[place].silent = True
-
-    @rule(place=st.integers(0, 2))
-    def is_heard_again(self, place: int) -> None:
+    @rule(place=st.integers(0, 2), what=st.sampled_from(["rests", "rests", "deaf", "left out", "heard again"]))
+    def joint(self, place: int, what: str) -> None:
         joint = self.joints[place]
-        joint.deafened = joint.silent = False
+        if what == "rests":
+            joint.halting_since_ns = 0
+        elif what == "heard again":
+            joint.deafened = joint.silent = False
+        else:
+            joint.deafened, joint.silent = True, what == "left out"
 
     @rule(duration_ns=st.sampled_from([PERIOD_NS, 2 * STALE_NS, HALT_NS + PERIOD_NS]))
     def advance(self, duration_ns: int) -> None:

@@ -278,8 +278,11 @@ class Model(RuleBasedStateMachine):
     def _alive(self) -> list[str]:
         return [name for name, child in self.kept.items() if child.alive]
 
+    def _up(self) -> list[str]:
+        return [name for name, child in self.kept.items() if child.state in ("up", "silent")]
+
     def _asking(self) -> list[str]:
-        return [name for name, child in self.kept.items() if child.asking and child.state in ("up", "silent")]
+        return [name for name in self._up() if self.kept[name].asking]
 
     @rule(last=st.sampled_from(["", "a", "b", "c"]), with_d=st.booleans(), version=st.sampled_from([1, 1, 1, 2]))
     def go_by(self, last: str, with_d: bool, version: int) -> None:
@@ -299,7 +302,9 @@ class Model(RuleBasedStateMachine):
     @precondition(lambda self: self._mute())
     @rule(data=st.data(), what=st.sampled_from(["up", "up", "up", "rubbish", "its objects cannot be made"]))
     def says(self, data: st.DataObject, what: str) -> None:
-        name = self._named(data, self._mute())
+        self._says(self._named(data, self._mute()), what)
+
+    def _says(self, name: str, what: str) -> None:
         child, body = self.kept[name], self._body(name)
         (self.refused.discard if what == "up" else self.refused.add)(name)
         if child.state == "starting":
@@ -327,7 +332,9 @@ class Model(RuleBasedStateMachine):
     @precondition(lambda self: self._asking())
     @rule(data=st.data(), answers=st.sampled_from([True, False, False]))
     def is_asked(self, data: st.DataObject, answers: bool) -> None:
-        name = self._named(data, self._asking())
+        self._is_asked(self._named(data, self._asking()), answers)
+
+    def _is_asked(self, name: str, answers: bool) -> None:
         child = self.kept[name]
         child.asking = False
         if answers:
@@ -341,11 +348,50 @@ class Model(RuleBasedStateMachine):
         [question] = [one for one in self.questions if one.body is self._body(name) and not one.over]
         question.end(None if answers else TimeoutError("no answer"))
 
-    @precondition(lambda self: self._late())
-    @rule()
-    def answers_late(self) -> None:
-        """What a process that is gone by now was asked ends in whatever way: it counts for nothing."""
-        self._late()[0].end(TimeoutError("no answer"))
+    @precondition(lambda self: self._up())
+    @rule(data=st.data(), times=st.sampled_from([MISSES - 1, MISSES]))
+    def hangs(self, data: st.DataObject, times: int) -> None:
+        """It leaves so many questions unanswered."""
+        name = self._named(data, self._up())
+        for _ in range(times):
+            if not self.kept[name].asking:
+                self._advance(max(self.now, self.kept[name].until))
+                self.it_agrees()
+            if name in self._asking():
+                self._is_asked(name, answers=False)
+                self.it_agrees()
+
+    @precondition(lambda self: self._alive())
+    @rule(data=st.data(), times=st.integers(2, RESTARTS + 1))
+    def dies_again_and_again(self, data: st.DataObject, times: int) -> None:
+        """As often as it is started, each time as soon as that is over which it has to wait."""
+        name = self._named(data, self._alive())
+        for _ in range(times):
+            if name in self._alive():
+                self._dies(name)
+                self.it_agrees()
+            if name in self.kept and self.kept[name].state == "waiting":
+                self._advance(self.kept[name].until)
+                self.it_agrees()
+
+    @precondition(lambda self: self._up())
+    @rule(data=st.data())
+    def answers_late(self, data: st.DataObject) -> None:
+        """What a process was asked that is gone by now ends when the next one is up: it counts for nothing."""
+        name = self._named(data, self._up())
+        if not self.kept[name].asking:
+            self._advance(max(self.now, self.kept[name].until))
+            self.it_agrees()
+        self._dies(name)
+        self.it_agrees()
+        if name in self.kept and self.kept[name].state == "waiting":
+            self._advance(self.kept[name].until)
+            self.it_agrees()
+        if name in self._mute() and self.kept[name].state == "starting":
+            self._says(name, "up")
+            self.it_agrees()
+        for question in self._late():
+            question.end(TimeoutError("no answer"))
 
     def _late(self) -> list[Question]:
         return [question for question in self.questions if question.body.dead and not question.over]
@@ -360,14 +406,14 @@ class Model(RuleBasedStateMachine):
             self._start(child)
         self._settle()
         assert self.real.restart(name, "anna")
-
-    @rule()
-    def restart_what_is_not_there(self) -> None:
         assert not self.real.restart("nobody", "anna")
 
     @rule(duration_s=st.sampled_from([0.125, 0.25, 1.0, 1.0, 5.0, GRACE_S, START_S, WINDOW_S]))
     def advance(self, duration_s: float) -> None:
-        self.now += duration_s
+        self._advance(self.now + duration_s)
+
+    def _advance(self, until: float) -> None:
+        self.now = until
         self._settle()
         self.real._post(lambda: None)
 
