@@ -460,3 +460,23 @@ def _child(name: str, version: int) -> Child:
 
 TestModel = Model.TestCase
 TestModel.settings = hypothesis.settings(max_examples=30, stateful_step_count=40, deadline=None)
+
+
+def test_what_the_process_before_was_asked_counts_for_nothing() -> None:
+    model = Model()
+    model.kept["a"] = Kept(1)
+    model._settle()
+    model.real.go_by([_child("a", 1)])
+    model.it_agrees()
+    for _ in range(2):
+        model._says("a", "up")
+        model.it_agrees()
+        model._advance(model.kept["a"].until)  # it is asked
+        model.it_agrees()
+        for late in model._late():
+            late.end(TimeoutError("no answer"))
+        model.it_agrees()
+        model._dies("a")
+        model._advance(model.kept["a"].until)  # the wait is over
+        model.it_agrees()
+    model.teardown()

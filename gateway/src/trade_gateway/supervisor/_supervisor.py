@@ -317,7 +317,8 @@ class Supervisor:
         except TradeError:
             self._do(unit, unit.life.missed(now))
             return
-        run.when_done(lambda run: self._post(partial(self._answered, unit, unit.boot, run)))
+        boot = unit.boot
+        run.when_done(lambda run: self._post(partial(self._answered, unit, boot, run)))
 
     def _answered(self, unit: Unit, boot: int, run: Run) -> None:
         if boot != unit.boot:
