@@ -477,6 +477,7 @@ def test_what_the_process_before_was_asked_counts_for_nothing() -> None:
             late.end(TimeoutError("no answer"))
         model.it_agrees()
         model._dies("a")
+        model.it_agrees()
         model._advance(model.kept["a"].until)  # the wait is over
         model.it_agrees()
     model.teardown()
