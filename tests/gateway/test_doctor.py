@@ -69,6 +69,16 @@ def test_a_host_without_the_tool_does_not_know() -> None:
     assert only(host.clock(["/no/such/tool"])).text.startswith("nobody")
 
 
+@pytest.mark.parametrize(("symbol", "level"), [(b"sem_clockwait", "ok"), (b"sem_timedwait", "warning")])
+def test_a_python_whose_waits_go_by_the_clock_on_the_wall_is_told_of(tmp_path: Path, symbol: bytes, level: str) -> None:
+    python, other, maps = tmp_path / "libpython3.11.so.1.0", tmp_path / "libc.so.6", tmp_path / "maps"
+    python.write_bytes(b"\0sem_post\0" + symbol + b"\0")
+    other.write_bytes(b"\0sem_clockwait\0")
+    there = [f"7f00-7f{at}0 r-xp 0000 08:01 123    {path}" for at, path in enumerate((python, other, "[heap]"))]
+    maps.write_text("\n".join([*there, "7f00-7f01 rw-p 0000 00:00 0"]))
+    assert only(host.waits(maps)).level == level
+
+
 @pytest.mark.parametrize(
     ("later", "level", "text"),
     [

@@ -1,6 +1,7 @@
 """``where``: what a service must be."""
 
 import inspect
+import json
 import threading
 from dataclasses import dataclass, field
 from typing import Any
@@ -183,10 +184,45 @@ def _built(expression: Any) -> Constraint:
             return _built(left) | _built(right)
 
 
+def _like(text: str, pattern: str) -> bool:
+    if not pattern:
+        return not text
+    if pattern[0] == "*":
+        return any(_like(text[at:], pattern[1:]) for at in range(len(text) + 1))
+    return text != "" and pattern[0] in ("?", text[0]) and _like(text[1:], pattern[1:])
+
+
+def _under(name: str, above: str) -> bool:
+    words = above.split(".")
+    return name.split(".")[: len(words)] == words
+
+
+def _holds(term: Term, candidate: Candidate) -> bool:
+    """One field at a time, as one would say it; types and post-conditions have tables of their own."""
+    match term.field:
+        case "name" | "host" | "container":
+            return _like(getattr(candidate, term.field), term.pattern)
+        case "kind":
+            return any(_like(kind, term.pattern) for kind in candidate.kinds)
+        case "group":
+            return any(_under(group, term.pattern) for group in candidate.groups)
+        case "uses":
+            return any(_under(resource, term.pattern) for resource in candidate.info.uses)
+        case "local":
+            return candidate.local
+        case "healthy":
+            return candidate.healthy
+        case "meta":
+            key, value = json.loads(term.pattern)
+            return any((key, repr(value)) == (name, repr(given)) for name, given in candidate.meta.items())
+        case _:
+            return term.matches(candidate)
+
+
 def _evaluated(expression: Any, candidate: Candidate) -> bool:
     match expression:
         case Term():
-            return expression.matches(candidate)
+            return _holds(expression, candidate) is not expression.negated
         case ("not", inner):
             return not _evaluated(inner, candidate)
         case ("and", left, right):

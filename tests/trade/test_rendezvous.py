@@ -20,6 +20,9 @@ def folder(system: str, tmp_path: Path) -> Path:
 
 
 def old(path: Path) -> None:
+    """Have it be written long ago."""
+    endpoint, *writer = path.read_bytes().split(b"\n")[:2]
+    path.write_bytes(b"\n".join([endpoint, *writer, b"-1000.0"]))
     os.utime(path, (1, 1))
 
 
@@ -52,6 +55,22 @@ def test_endpoints_of_those_that_are_just_starting_are_kept(system: str, folder:
     starting = free_endpoint()
     Rendezvous(system).enter(starting)
     assert Rendezvous(system).enter("tcp/127.0.0.1:1") == [starting]
+
+
+@pytest.mark.parametrize("at_s", [1, 4e9], ids=["forward", "back"])
+def test_a_clock_that_is_set_while_they_start_hides_nobody(system: str, folder: Path, at_s: float) -> None:
+    """As on a computer that has none of its own and asks the network when it starts."""
+    starting = free_endpoint()
+    Rendezvous(system).enter(starting)
+    os.utime(next(folder.iterdir()), (at_s, at_s))
+    assert Rendezvous(system).enter("tcp/127.0.0.1:1") == [starting]
+
+
+def test_a_file_of_before_this_host_was_started_is_old(system: str, folder: Path) -> None:
+    endpoint = free_endpoint()
+    for entered in ("1e9", "nan", "inf", "-1"):
+        (folder / "tcp_early").write_text(f"{endpoint}\n{os.getpid()}\n{entered}\n")
+        assert Rendezvous(system).enter("tcp/127.0.0.1:1") == []
 
 
 def test_endpoints_of_processes_that_were_killed_are_pruned_at_once(

@@ -170,9 +170,10 @@ class BusExchange(ABC, Generic[_Device]):
         while self._working and not self._stops:
             taken: set[_Device] = set()
             for job in tuple(self._working):
-                if not job.ended and not taken.isdisjoint(job.devices):
+                free = taken.isdisjoint(job.devices)
+                taken.update(job.devices)  # also of one that waits: nobody overtakes it, and then works beside it
+                if not job.ended and not free:
                     continue  # one at a time touches a device
-                taken.update(job.devices)
                 if job.ended or not job.step():
                     self._working.remove(job)
                     job.done_stepping()
@@ -235,6 +236,7 @@ _Job = TypeVar("_Job")
 
 
 def _drained(queue: "deque[_Job]") -> list[_Job]:
-    jobs = list(queue)
-    queue.clear()
+    jobs: list[_Job] = []
+    while queue:  # others may be adding to it
+        jobs.append(queue.popleft())
     return jobs

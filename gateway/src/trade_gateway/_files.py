@@ -9,9 +9,15 @@ __all__ = ["claim", "fresh_beside", "replace"]
 
 def claim(path: Path, text: bytes) -> None:
     """Write a file for this user only. Raises FileExistsError: it is there already."""
-    with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
-        file.write(text)
-        os.fsync(file.fileno())
+    made = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    try:
+        with os.fdopen(made, "wb") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+    except BaseException:
+        path.unlink(missing_ok=True)
+        raise
 
 
 def replace(path: Path, text: bytes, mode: int) -> None:

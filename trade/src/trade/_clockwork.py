@@ -48,10 +48,16 @@ class Due:
 
 
 class Clockwork:
-    """The queue and its threads, of which there are none until something is due."""
+    """The queue and its threads, of which there are none until something is due.
 
-    def __init__(self, name: str) -> None:
+    Args:
+        name: of its threads.
+        clock: ``time.monotonic_ns``; a test has its own.
+    """
+
+    def __init__(self, name: str, clock: Callable[[], int] = time.monotonic_ns) -> None:
         self._name = name
+        self._clock = clock
         self._numbers = itertools.count(1)
         self._queue: list[tuple[int, int, Due]] = []
         self._lock = threading.Lock()
@@ -100,10 +106,14 @@ class Clockwork:
             self._called = True
             self._followers.notify()
         elif len(self._threads) < MOST_THREADS:
-            self._called = True
             thread = threading.Thread(target=self._main, name=f"{self._name}-{len(self._threads)}", daemon=True)
-            self._threads.add(thread)
-            thread.start()
+            try:
+                thread.start()
+            except RuntimeError:  # the process may have no more threads; whoever comes back or enters next tries again
+                _logger.exception("%s cannot have another thread", self._name)
+            else:
+                self._called = True
+                self._threads.add(thread)
 
     def _main(self) -> None:
         with self._lock:
@@ -115,7 +125,7 @@ class Clockwork:
     def _next(self) -> Due | None:
         """What is due, once it is; None if this thread is not needed. Under the lock, which waiting lets go of."""
         while not self._closed:
-            left_ns = self._queue[0][0] - time.monotonic_ns() if self._queue else None
+            left_ns = self._queue[0][0] - self._clock() if self._queue else None
             if left_ns is not None and left_ns <= 0:
                 _, turn, due = heapq.heappop(self._queue)
                 if due._turn == turn and not due.cancelled:  # pyright: ignore[reportPrivateUsage]

@@ -21,6 +21,7 @@ __all__ = ["dictionary_file", "user_secret"]
 _FILE: Final = "@secret"
 """No system can have this name: those have folders beside it."""
 _USER: Final = "host"
+_OPEN_FILES: Final = Path("/proc/self/fd")
 
 
 def user_secret() -> tuple[str, str]:
@@ -39,9 +40,19 @@ def user_secret() -> tuple[str, str]:
 
 @contextlib.contextmanager
 def dictionary_file(credentials: tuple[str, str]) -> Generator[Path]:
-    """Whom a session lets in, in the one form the transport takes it: a file, there while the session opens."""
-    with _private_file(":".join(credentials) + "\n") as path:
-        yield path
+    """Whom a session lets in, in the one form the transport takes it: a file, there while the session opens.
+
+    It is in memory where there are such files, so that nobody is kept out by a full disk.
+    """
+    text = ":".join(credentials) + "\n"
+    if not (hasattr(os, "memfd_create") and _OPEN_FILES.is_dir()):
+        with _private_file(text) as path:
+            yield path
+        return
+    with os.fdopen(os.memfd_create("trade-credentials"), "w", encoding="utf-8") as file:
+        file.write(text)
+        file.flush()
+        yield _OPEN_FILES / str(file.fileno())
 
 
 @contextlib.contextmanager

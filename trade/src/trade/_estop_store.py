@@ -27,11 +27,14 @@ class EstopStore:
             return
         self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         fresh = self._folder / f".{estop.id}.{secrets.token_hex(4)}"  # other containers write it, too
-        with fresh.open("wb") as file:
-            file.write(msgspec.json.encode(estop))
-            file.flush()
-            os.fsync(file.fileno())
-        fresh.replace(self._folder / f"{estop.id}.json")
+        try:
+            with fresh.open("wb") as file:
+                file.write(msgspec.json.encode(estop))
+                file.flush()
+                os.fsync(file.fileno())
+            fresh.replace(self._folder / f"{estop.id}.json")
+        finally:
+            fresh.unlink(missing_ok=True)
 
     def remove(self, estop_id: str) -> None:
         """Keep it no more. Raises OSError, but not if it is not there."""

@@ -5,6 +5,7 @@ two that start together at least one sees the other; the newcomer dials everybod
 """
 
 import contextlib
+import logging
 import os
 import stat
 import tempfile
@@ -16,6 +17,8 @@ from trade._endpoints import accepts, free_endpoint
 from trade.errors import ConfigurationError
 
 __all__ = ["Rendezvous", "free_endpoint", "runtime_folder"]
+
+_logger = logging.getLogger("trade")
 
 _YOUNG_S: Final = 10.0
 """A file this young may belong to a container that does not listen yet, if its process lives."""
@@ -30,12 +33,19 @@ class Rendezvous:
         self._own: Path | None = None
 
     def enter(self, endpoint: str) -> list[str]:
-        """Say where we listen; returns where the others do."""
+        """Say where we listen; returns where the others do.
+
+        Who cannot say it, as on a full disk, dials the others all the same: it may be there to stop them.
+        """
         name = endpoint.replace("/", "_").replace(":", "_")
-        self._own = self._folder / name
-        fresh = self._folder / f".{name}.{os.getpid()}"
-        fresh.write_text(f"{endpoint}\n{os.getpid()}\n", encoding="ascii")
-        fresh.replace(self._own)
+        own, fresh = self._folder / name, self._folder / f".{name}.{os.getpid()}"
+        try:
+            fresh.write_text(f"{endpoint}\n{os.getpid()}\n{time.monotonic()}\n", encoding="ascii")
+            self._own = fresh.replace(own)
+        except OSError as bad:
+            with contextlib.suppress(OSError):
+                fresh.unlink()
+            _logger.warning("%s cannot be written: %s; who starts later on this host may not find this one", own, bad)
         return self._others()
 
     def _others(self) -> list[str]:
@@ -44,9 +54,8 @@ class Rendezvous:
             with contextlib.suppress(OSError, ValueError):
                 if path == self._own:
                     continue
-                endpoint, _, writer = path.read_text(encoding="ascii").strip().partition("\n")
-                young = time.time() - path.stat().st_mtime < _YOUNG_S
-                if accepts(endpoint) or (young and _may_live(writer)):
+                endpoint, writer, entered, *_ = [*path.read_text(encoding="ascii").strip().split("\n"), "", ""]
+                if accepts(endpoint) or (_is_young(path, entered) and _may_live(writer)):
                     found.append(endpoint)
                 else:
                     path.unlink()
@@ -57,6 +66,14 @@ class Rendezvous:
         if self._own is not None:
             self._own.unlink(missing_ok=True)
             self._own = None
+
+
+def _is_young(path: Path, entered: str) -> bool:
+    """Whether it was written a moment ago, by a clock that nobody sets; on some systems that is set as they start."""
+    try:
+        return abs(time.monotonic() - float(entered)) < _YOUNG_S  # of before the last start of the host: any number
+    except ValueError:  # it was written by something else
+        return time.time() - path.stat().st_mtime < _YOUNG_S
 
 
 def _may_live(writer: str) -> bool:

@@ -3,7 +3,7 @@
 import difflib
 import os
 import select
-import shutil
+import stat
 import sys
 import time
 from collections.abc import Callable, Generator, Mapping
@@ -18,6 +18,7 @@ from rich.markup import escape
 
 from trade.errors import ConfigurationError, WrongDevice
 from trade_drivers import Bench, Driver, Joint, Robot, SerialBus, WireError, load, load_driver, parse
+from trade_gateway._files import replace
 from trade_gateway.commands._output import Output, UsageError
 
 if TYPE_CHECKING:
@@ -275,8 +276,8 @@ def _write(out: Output, path: Path, before: str, after: str, *, yes: bool) -> No
     target = path.resolve()
     if target.read_text(encoding="utf-8") != before:
         raise ConfigurationError(where=name, problem="was changed by somebody else meanwhile; nothing was written")
-    made = target.with_name(f".{target.name}.new")
-    made.write_text(after, encoding="utf-8")
-    shutil.copymode(target, made)
-    made.replace(target)
+    try:
+        replace(target, after.encode(), stat.S_IMODE(target.stat().st_mode))
+    except OSError as bad:
+        raise ConfigurationError(where=name, problem=f"cannot be written: {bad}; it is as it was") from None
     out.say(f"[bold]{escape(name)}[/] is written")

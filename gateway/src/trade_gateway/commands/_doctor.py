@@ -57,6 +57,7 @@ def _of_host(context: typer.Context, robot_file: Path | None) -> Iterator[Findin
     if robot_file is None:
         yield from host.libraries(sorted(drivers()), needed=False)
     yield from host.clock()
+    yield from host.waits()
     try:
         settings = choice_of(context).settings()
     except TradeError as bad:

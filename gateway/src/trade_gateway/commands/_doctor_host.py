@@ -14,11 +14,12 @@ from msgspec import Struct
 from trade import Container
 from trade_drivers import AnyDriver, load_driver
 
-__all__ = ["Finding", "certificate", "clock", "in_sight", "latencies", "libraries", "multicast", "ports"]
+__all__ = ["Finding", "certificate", "clock", "in_sight", "latencies", "libraries", "multicast", "ports", "waits"]
 
 _LATENCIES: Final = Path("/sys/bus/usb-serial/devices")
 _LATEST_MS: Final = 2
 _CLOCK: Final = ("timedatectl", "show", "--property=NTPSynchronized", "--value")
+_MAPS: Final = Path("/proc/self/maps")
 _SOON: Final = timedelta(days=2)
 _PATIENCE_S: Final = 5.0
 _MULTICAST: Final = "239.255.71.68"
@@ -94,6 +95,22 @@ def clock(command: Sequence[str] = _CLOCK) -> Iterator[Finding]:
     else:
         text = "nobody here can tell whether it is synchronised"
         yield Finding(level="warning", about="clock", text=text, fix="compare `date -u` on all hosts")
+
+
+def waits(maps: Path = _MAPS) -> Iterator[Finding]:
+    """Whether waits of this Python end in time although the clock is set meanwhile.
+
+    CPython waits for its locks by `sem_clockwait` where it was built with a C library that has it (glibc 2.30), else by
+    the clock on the wall.
+    """
+    loaded = {Path(line.split(maxsplit=5)[-1]) for line in maps.read_text().splitlines() if "/" in line}
+    pythons = [path for path in loaded if "python" in path.name and path.is_file()]
+    if any(b"sem_clockwait" in path.read_bytes() for path in pythons):
+        yield Finding(level="ok", about="waits", text="end in time also if the clock is set")
+        return
+    text = "end late by as much as the clock is set back meanwhile, those of locks and drivers, too"
+    fix = "use the Python of the distribution, or a newer build; else set the clock before the robot is started"
+    yield Finding(level="warning", about="waits", text=text, fix=fix)
 
 
 def certificate(folder: Path, now: datetime | None = None) -> Iterator[Finding]:

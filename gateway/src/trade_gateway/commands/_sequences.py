@@ -10,6 +10,7 @@ from msgspec import Struct
 
 from trade import Span
 from trade.errors import ConfigurationError
+from trade_gateway._files import replace
 
 _ENOUGH: Final = 20
 """So often something must have happened before its being rare means anything."""
@@ -114,7 +115,7 @@ def _much_rarer(usual: Model, now: Model, pair: Pair) -> bool:
 def write(path: Path, model: Model) -> None:
     """Raises ConfigurationError: it cannot be written."""
     try:
-        path.write_bytes(msgspec.json.format(msgspec.json.encode(model), indent=2) + b"\n")
+        replace(path.resolve(), msgspec.json.format(msgspec.json.encode(model), indent=2) + b"\n", 0o644)
     except OSError as problem:
         raise ConfigurationError(where=str(path), problem=str(problem)) from None
 

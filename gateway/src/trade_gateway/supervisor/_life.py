@@ -79,6 +79,7 @@ class Life:
         self.deadline = math.inf
         """When `due` is to be called."""
         self._grace_s = grace_s
+        self._launched = False
         self._failures: deque[float] = deque()
         self._after = _After.FAILED
         self._next: deque[Do] = deque()
@@ -100,8 +101,8 @@ class Life:
 
     def start(self, now: float) -> Do | None:
         """It is wanted: at once if it waits or was given up, again if it runs."""
+        self._failures.clear()
         if not self.alive:
-            self._failures.clear()
             return self._launch(now)
         return self._end(now, "it is to start again", _After.START, save=self._was_up)
 
@@ -159,7 +160,6 @@ class Life:
             case _After.STOPPED:
                 self._rest(State.STOPPED)
             case _After.START:
-                self.restarts += 1
                 return self._launch(now)
             case _After.FAILED:
                 self._failed(now)
@@ -176,7 +176,6 @@ class Life:
             case State.STOPPING:
                 return self._step(now)
             case State.WAITING:
-                self.restarts += 1
                 return self._launch(now)
             case State.STOPPED | State.GIVEN_UP:
                 self.deadline = math.inf
@@ -189,6 +188,7 @@ class Life:
     # --- going on
 
     def _launch(self, now: float) -> Do:
+        self.restarts, self._launched = self.restarts + self._launched, True
         self.state, self.deadline = State.STARTING, now + START_S
         return Do.LAUNCH
 

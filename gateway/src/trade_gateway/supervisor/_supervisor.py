@@ -17,6 +17,7 @@ from msgspec import structs
 from trade import Container, Handle, Run
 from trade.errors import Busy, ConfigurationError, ServiceGone, TradeError
 from trade.starting import Started
+from trade_gateway._fence import Term
 from trade_gateway.supervisor._furnish import Furnished, furnish, save
 from trade_gateway.supervisor._leasing import Asking, Leased, StandIn
 from trade_gateway.supervisor._life import GRACE_S, SAVE_S, Do, State
@@ -39,11 +40,25 @@ class Supervisor:
         tell: is told of what becomes of them, on the supervisor's thread.
         folder: for logs, in ``logs``, and for what providers remember.
         grace_s: how long one may take to leave before it is killed.
+        clock: ``time.monotonic``; a test has its own, and processes that are none.
+        launch: starts the process of a child.
+        furnish: waits until that is seen, and makes its objects.
     """
 
     def __init__(
-        self, member: Callable[[], Container], tell: Callable[[News], None], folder: Path, *, grace_s: float = GRACE_S
+        self,
+        member: Callable[[], Container],
+        tell: Callable[[News], None],
+        folder: Path,
+        *,
+        grace_s: float = GRACE_S,
+        clock: Callable[[], float] = time.monotonic,
+        launch: Callable[[Child, Path, Path | None, Term | None], Process] = Process,
+        furnish: Callable[[Callable[[], Container], Child, Started, Mapping[str, Any]], Furnished] = furnish,
     ) -> None:
+        self._clock = clock
+        self._new_process = launch
+        self._furnishes = furnish
         self._member = member
         self._tell = tell
         self._folder = folder
@@ -128,7 +143,7 @@ class Supervisor:
             while self._inbox:
                 self._inbox.popleft()()
             for unit in list(self._units.values()):
-                self._look(unit, time.monotonic())
+                self._look(unit, self._clock())
             self._shown = tuple(unit.info() for unit in self._units.values())
 
     def _rung(self) -> None:
@@ -140,7 +155,7 @@ class Supervisor:
         if unit.may_be_up():
             unit.stay()
             return True
-        lease, now = unit.lease, time.monotonic()
+        lease, now = unit.lease, self._clock()
         if lease is not None and unit.begun and not unit.given_up:
             unit.begun = False
             self._do(unit, unit.life.stop(now, lease.why, save=lease.term is None))
@@ -180,7 +195,7 @@ class Supervisor:
         for name, child in children.items():
             unit = self._units.get(name)
             if unit is None:
-                unit = self._units[name] = Unit(child, self._grace_s)
+                unit = self._units[name] = Unit(child, self._grace_s, self._clock)
                 unit.lease = self._leased(child)
                 continue
             same, was_leaving = unit.child.starts_like(child), bool(unit.leaving)
@@ -190,7 +205,7 @@ class Supervisor:
                 unit.lease.go_by(child)
             unit.child, unit.life.terms, unit.leaving = child, child.terms, ""
             if unit.begun and (was_leaving or not same):
-                self._do(unit, unit.life.start(time.monotonic()))
+                self._do(unit, unit.life.start(self._clock()))
 
     def _leased(self, child: Child) -> Leased | None:
         lock = self._folder / "locks" / f"{self._member().name}.{child.name}.lock"
@@ -205,13 +220,11 @@ class Supervisor:
         if unit is None or unit.leaving:
             return
         if unit.lease is not None and not unit.may_be_up():
-            self._do(
-                unit, unit.life.stop(time.monotonic(), unit.lease.why)
-            )  # if it was given up, it is asked for again
+            self._do(unit, unit.life.stop(self._clock(), unit.lease.why))  # if it was given up, it is asked for again
         else:
             self._told(unit, f"{name} is started again, as {who} asks for it")
             unit.begun = True
-            self._do(unit, unit.life.start(time.monotonic()))
+            self._do(unit, unit.life.start(self._clock()))
 
     def _close(self) -> None:
         self._closing = True
@@ -242,7 +255,7 @@ class Supervisor:
         unit.boot, unit.furnished, unit.save_at = unit.boot + 1, None, math.inf
         try:
             lock, unit.told = (None, None) if unit.lease is None else (unit.lease.lock, unit.lease.term)
-            unit.process = Process(unit.child, self._folder / "logs", lock, unit.told)
+            unit.process = self._new_process(unit.child, self._folder / "logs", lock, unit.told)
         except OSError as none:
             self._ended(unit, f"there can be no process: {none}")
             return
@@ -256,7 +269,7 @@ class Supervisor:
         try:
             started, more = process.read()
         except ValueError:
-            self._do(unit, unit.life.fail(time.monotonic(), "it said something else than that it is up"))
+            self._do(unit, unit.life.fail(self._clock(), "it said something else than that it is up"))
             return
         if not more:
             self._selector.unregister(process.output)
@@ -276,7 +289,7 @@ class Supervisor:
     def _ended(self, unit: Unit, how: str) -> None:
         life, name = unit.life, unit.child.name
         unit.boot, unit.furnished, unit.save_at = unit.boot + 1, None, math.inf
-        do = life.ended(time.monotonic(), how)
+        do = life.ended(self._clock(), how)
         match life.state:
             case State.WAITING:
                 self._told(unit, f"{name} {how}; back in {life.wait_s:g} s", bad=True)
@@ -293,7 +306,7 @@ class Supervisor:
     # --- asking them
 
     def _ask(self, unit: Unit) -> None:
-        terms, furnished, now = unit.child.terms, unit.furnished, time.monotonic()
+        terms, furnished, now = unit.child.terms, unit.furnished, self._clock()
         if unit.process is None or furnished is None:
             return
         if terms.max_rss_mb is not None and (took := rss_mb(unit.process.pid)) > terms.max_rss_mb:
@@ -304,12 +317,13 @@ class Supervisor:
         except TradeError:
             self._do(unit, unit.life.missed(now))
             return
-        run.when_done(lambda run: self._post(partial(self._answered, unit, unit.boot, run)))
+        boot = unit.boot
+        run.when_done(lambda run: self._post(partial(self._answered, unit, boot, run)))
 
     def _answered(self, unit: Unit, boot: int, run: Run) -> None:
         if boot != unit.boot:
             return
-        error, now = run.exception(0), time.monotonic()
+        error, now = run.exception(0), self._clock()
         if isinstance(error, (TimeoutError, ConnectionError, ServiceGone)) and not isinstance(error, Busy):
             self._do(unit, unit.life.missed(now))
         else:
@@ -332,18 +346,18 @@ class Supervisor:
 
     def _furnish(self, unit: Unit, child: Child, started: Started, load: Callable[[], Any]) -> Callable[[], None]:
         try:
-            furnished = furnish(self._member, child, started, load())
+            furnished = self._furnishes(self._member, child, started, load())
         except Exception as wrong:  # noqa: BLE001 - what an object raises may come as its own type
             why = f"it came up, but: {wrong}"
-            return lambda: self._do(unit, unit.life.fail(time.monotonic(), why))
+            return lambda: self._do(unit, unit.life.fail(self._clock(), why))
         return lambda: self._up(unit, furnished)
 
     def _up(self, unit: Unit, furnished: Furnished) -> None:
-        unit.life.up(time.monotonic())
+        unit.life.up(self._clock())
         if unit.life.state is not State.UP:
             return
         unit.furnished, unit.was_up = furnished, True
-        unit.save_at = time.monotonic() + unit.child.terms.save_every_s if furnished.made else math.inf
+        unit.save_at = self._clock() + unit.child.terms.save_every_s if furnished.made else math.inf
         pid = unit.process.pid if unit.process else 0
         self._told(unit, f"{unit.child.name} is {'back' if unit.life.restarts else 'up'}, process {pid}")
         for problem in furnished.problems:
@@ -367,7 +381,7 @@ class Supervisor:
         self._job(unit, "save", work)
 
     def _saved(self, unit: Unit, saved_at: float = 0.0) -> None:
-        now, unit.saved_at = time.monotonic(), saved_at or unit.saved_at
+        now, unit.saved_at = self._clock(), saved_at or unit.saved_at
         if unit.life.state is State.STOPPING:
             self._do(unit, unit.life.saved(now))
         elif unit.furnished is not None and unit.furnished.made:

@@ -1,7 +1,7 @@
 """A child with all that belongs to it, and what is told of it."""
 
 import math
-import time
+from collections.abc import Callable
 
 from msgspec import Struct
 
@@ -43,8 +43,9 @@ class News(Struct, frozen=True):
 class Unit:
     """A child with all that belongs to it; only the supervisor's thread touches it."""
 
-    def __init__(self, child: Child, grace_s: float) -> None:
+    def __init__(self, child: Child, grace_s: float, clock: Callable[[], float]) -> None:
         self.child = child
+        self._clock = clock
         self.life = Life(child.terms, grace_s=grace_s)
         self.process: Process | None = None
         self.boot = 0
@@ -63,7 +64,7 @@ class Unit:
     @property
     def due_s(self) -> float:
         """How long until something is to be done for it."""
-        now = time.monotonic()
+        now = self._clock()
         leased_s = math.inf if self.lease is None else self.lease.due - uptime_s()
         return min(self.life.deadline - now, self.save_at - now, leased_s)
 
