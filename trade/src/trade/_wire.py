@@ -348,6 +348,8 @@ def decode_provider(payload: bytes) -> ProviderInfo:
         services = tuple(_service(bytes(raw)) for raw in message.services)
     except (msgspec.DecodeError, ValueError, RecursionError, MemoryError) as bad:
         raise Malformed(why_malformed(payload, bad)) from None
+    if not all(is_chunk(estop.id) for estop in message.estops):  # they name files, too
+        raise Malformed("an e-stop's id is one chunk")
     told: dict[str, Any] = {
         **structs.asdict(message),
         "services": services,
