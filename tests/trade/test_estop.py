@@ -11,6 +11,7 @@ import pytest
 
 from trade import Container, Estop, EstopReport, Resource, current_call, service, where
 from trade._crew import MOST_THREADS
+from trade._estop_messages import decode_estop_order
 from trade._memory import MemoryTransport, Passage
 from trade._wire import (
     PROTOCOL,
@@ -19,7 +20,6 @@ from trade._wire import (
     ProviderInfo,
     ServiceInfo,
     alive_key,
-    decode_estop_order,
     encode_message,
     registry_key,
 )
@@ -353,7 +353,8 @@ FORGED = Estop("abc", "mallory/x/e", "", 0.0)
 BAD = {
     "garbage": ("estop/tester", b"\xc1"),
     "another's name": ("estop/tester", encode_message(EstopOrder(PROTOCOL, "abc", FORGED))),
-    "another version": ("estop/mallory", encode_message(EstopOrder(PROTOCOL + 1, "abc", FORGED))),
+    "another version's clearing": ("estop/mallory", encode_message(EstopOrder(PROTOCOL + 1, "abc", None, ("abc",)))),
+    "another's name in another version": ("estop/tester", encode_message(EstopOrder(PROTOCOL + 1, "abc", FORGED))),
     "another request": ("estop/mallory", encode_message(EstopOrder(PROTOCOL, "abcd", FORGED))),
     "a path": ("estop/mallory", encode_message(EstopOrder(PROTOCOL, "../a", Estop("../a", "mallory/x/e", "", 0.0)))),
     "a path to clear": ("estop/mallory", encode_message(EstopOrder(PROTOCOL, "abc", None, ("../a",)))),
