@@ -228,7 +228,8 @@ impl EstopOrder {
         let fields = any_fields(payload, 2)?;
         let request = fields[1].as_str().filter(|request| is_chunk(request))?.to_owned();
         if let Some(estop) = fields.get(2).filter(|estop| !estop.is_nil()) {
-            let opened = Estop::read(estop).filter(|one| one.id == request && one.by.starts_with(&format!("{identity}/")))?;
+            let opened =
+                Estop::read(estop).filter(|one| one.id == request && one.by.starts_with(&format!("{identity}/")))?;
             return Some(EstopOrder { request, opened: Some(opened), cleared: vec![] });
         }
         let cleared = fields.get(3).map_or(Some(vec![]), texts)?;
