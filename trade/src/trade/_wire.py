@@ -411,6 +411,6 @@ def unread(payload: bytes, bad: Exception) -> Malformed:
         version: Any = raw[0] if isinstance(raw, list) else raw.get("v")
     except Exception:  # noqa: BLE001 - the bytes are anything
         version = None
-    if type(version) is int and version != PROTOCOL:
+    if isinstance(version, int) and not isinstance(version, bool) and version != PROTOCOL:
         return OtherVersion(version)
     return Malformed(f"not a message of this protocol: {bad}")
