@@ -107,7 +107,9 @@ MESSAGES: Final[dict[str, Any]] = {
     "an e-stop": _ESTOP,
     "an order to stop": EstopOrder(PROTOCOL, _ESTOP.id, _ESTOP),
     "an order to clear": EstopOrder(PROTOCOL, "c1ea12ed", None, (_ESTOP.id,)),
+    "an order to stop of another version": EstopOrder(PROTOCOL + 1, _ESTOP.id, _ESTOP),
     "an order confirmed": EstopConfirmed(PROTOCOL, _ESTOP.id),
+    "an order confirmed by another version": EstopConfirmed(PROTOCOL + 1, _ESTOP.id),
     "an order that failed": EstopConfirmed(PROTOCOL, _ESTOP.id, "rosie.pan still moves"),
     "a sample": StreamSample(PROTOCOL, 12, AT, 80_000_000_123, False, _raw(0.25)),
 }
@@ -138,7 +140,14 @@ DROPPED: Final[dict[str, tuple[str, bytes]]] = {
     "a reply of an unknown status": ("Reply", msgpack.encode(_field(MESSAGES["an answer"], 2, 99))),
     "a tally of version 2": ("Tally", msgpack.encode([2, 3])),
     "a tally without a revision": ("Tally", msgpack.encode([1])),
-    "an order of version 2": ("EstopOrder", msgpack.encode(_field(_ORDER, 0, 2))),
+    "an order of version 0": ("EstopOrder", msgpack.encode(_field(_ORDER, 0, 0))),
+    "an order to clear of version 2": ("EstopOrder", msgpack.encode([2, "c1ea12ed", None, [_ESTOP.id]])),
+    "an order of version 2 that is no e-stop": ("EstopOrder", msgpack.encode([2, _ESTOP.id, ["smoke"]])),
+    "an order of version 2 of somebody else": (
+        "EstopOrder",
+        msgpack.encode([2, "5c0ffee5", ["5c0ffee5", "bob/page/77aa00bb11cc"]]),
+    ),
+    "a confirmation without a request": ("EstopConfirmed", msgpack.encode([2])),
     "an order under another name than its e-stop's": ("EstopOrder", msgpack.encode(_field(_ORDER, 1, "another"))),
     "an order that is no chunk": ("EstopOrder", msgpack.encode([1, "a/b", None, ["x"]])),
     "an order of somebody else": (

@@ -1,13 +1,16 @@
 """What the log of faults keeps, forgets and writes down, on days when nothing goes right."""
 
+import contextlib
 import random
 import resource
 import signal
+import sqlite3
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 
 from trade.errors import DeviceFault, InvalidArgument
@@ -274,6 +277,23 @@ def test_samples_and_evidence_are_there_for_the_next_process(bench: Bench) -> No
     bench.end()
     before = log.fault(only(log).id)
     assert bench.open().fault(before.id) == before
+
+
+def test_faults_with_more_to_them_than_this_version_knows_are_read(bench: Bench) -> None:
+    bench.open()
+    bench.begin()
+    bench.close()
+    with contextlib.closing(sqlite3.connect(bench.path)) as file, file:
+        [(blob,)] = file.execute("select blob from fault").fetchall()
+        later = msgspec.msgpack.encode({**msgspec.msgpack.decode(blob), "zone": {"room": 2}})
+        file.execute("alter table fault add column room text")
+        file.execute("update fault set blob = ?", (later,))
+    log = bench.open()
+    assert only(log).device == PAN
+    bench.begin(HOT, TILT)
+    bench.written()
+    assert bench.told == []
+    assert {info.device for info in bench.open().faults()} == {PAN, TILT}
 
 
 # --- bad disks

@@ -9,6 +9,7 @@ from tests.fuzz._target import Target
 
 from trade import Constraint, Handle, Secret, service
 from trade._endpoints import Endpoint
+from trade._estop_messages import decode_estop_confirmed, decode_estop_order, decode_open_estops
 from trade._failures import pack_error, unpack_error
 from trade._handle_codec import handle_codec
 from trade._inherited import InheritedLock
@@ -26,8 +27,6 @@ from trade._wire import (
     ServiceInfo,
     ServiceKey,
     decode_call,
-    decode_estop_confirmed,
-    decode_estop_order,
     decode_provider,
     decode_reply,
     decode_tally,
@@ -162,6 +161,7 @@ TARGETS: Final = [
     Target("wire-sample", decode_sample, (Malformed,), encode_message),
     Target("wire-estop-order", lambda data: decode_estop_order(data, "anna"), (Malformed,), encode_message),
     Target("wire-estop-confirmed", decode_estop_confirmed, (Malformed,), encode_message),
+    Target("wire-open-estops", decode_open_estops, (Malformed,), lambda told: encode_message({"estops": told})),
     Target("wire-error", _error, UNREADABLE, encode_message),
     Target("wire-arguments", _arguments, (InvalidArgument, Malformed)),
     Target("wire-key", _text(place_of), (Malformed,)),

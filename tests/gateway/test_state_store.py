@@ -1,5 +1,6 @@
 """What is saved survives whatever ends the process, the disk or the file; and nobody is held up by it."""
 
+import contextlib
 import random
 import resource
 import signal
@@ -85,6 +86,18 @@ def test_what_was_saved_last_is_there_for_the_next_process(opened: Callable[[], 
     assert store.save("a", {"lamp": {"on": False}})
     assert store.save("b", {"lamp": 3})
     assert opened().load("a") == {"lamp": {"on": False}, "clock": [1, 2.5, "x", b"y", None]}
+    assert told == []
+
+
+def test_a_table_that_a_later_version_gave_a_column_more_is_gone_on_with(
+    opened: Callable[[], StateStore], path: Path, told: list[str]
+) -> None:
+    assert opened().save("a", {"lamp": 1})
+    with contextlib.closing(sqlite3.connect(path)) as file:
+        file.execute("alter table state add column room text")
+    store = opened()
+    assert store.save("a", {"lamp": 2, "clock": 3})
+    assert store.load("a") == {"lamp": 2, "clock": 3}
     assert told == []
 
 

@@ -8,7 +8,18 @@ from typing import Any
 
 import msgspec
 
-from trade import _container, _dispatch, _estop, _estop_line, _estop_store, _locks, _ongoing, _resources, _wire
+from trade import (
+    _container,
+    _dispatch,
+    _estop,
+    _estop_line,
+    _estop_messages,
+    _estop_store,
+    _locks,
+    _ongoing,
+    _resources,
+    _wire,
+)
 from trade._announcing import Announcer
 from trade._deadman import Deadman
 
@@ -90,6 +101,12 @@ def _from_anybody(payload: bytes, identity: str) -> _wire.EstopOrder:
     return msgspec.msgpack.decode(payload, type=_wire.EstopOrder)
 
 
+def _of_our_version(payload: bytes, identity: str) -> _wire.EstopOrder:
+    if msgspec.msgpack.decode(payload)[0] != _wire.PROTOCOL:
+        raise _wire.Malformed("another version")
+    return _estop_messages.decode_estop_order(payload, identity)
+
+
 _encode: Any = _dispatch.Signature.encode_result
 
 
@@ -110,11 +127,12 @@ BREAK: dict[str, Callable[[], None]] = {
     "ignores-epochs": _put(_resources.Resource, "check_lock", _check_numbers),
     "outlives-its-caller": _put(_container, "new_request", _as_long_as_usual),
     "believes-any-estop": _put(_estop_line, "decode_estop_order", _from_anybody),
+    "hears-its-own-version-only": _put(_estop_line, "decode_estop_order", _of_our_version),
     "never-latches": _put(_resources.Resource, "_is_of", lambda self, asking: True),
     "ignores-estops": _put(_estop.Estops, "take", _confirm_only),
     "forgets-estops": _put(_estop_store.EstopStore, "read", lambda self: []),
     "learns-no-estops": _put(_estop.Estops, "learn", lambda self, estops: None),
-    "any-version": _put(_wire, "_decoded", _any_version),
+    "any-version": _put(_wire, "decoded", _any_version),
     "ignores-cancels": _put(_ongoing.Ongoing, "cancel", lambda self: None),
     "endless-leases": _put(_locks.LockTable, "expire", lambda self: None),
     "grants-what-moves": _put(_locks.LockTable, "_running", lambda self, waiter: None),

@@ -28,6 +28,7 @@ NOTICED_BY = {
     "ignores-epochs": "locks",
     "outlives-its-caller": "calls-no-longer",
     "believes-any-estop": "estop-forged",
+    "hears-its-own-version-only": "estop-of-any-version",
     "never-latches": "stop-latches",
     "ignores-estops": "estop",
     "forgets-estops": "estop-kept",

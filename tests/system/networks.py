@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 import threading
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +39,8 @@ def why_not() -> str:
 class Member:
     """``member.py``, or another script that is told by lines, in one of the namespaces.
 
-    With certificates if ``tls`` is its folder, else with a password; ``system`` if it is not the test's own.
+    With certificates if ``tls`` is its folder, else with a password; ``system`` if it is not the test's own;
+    ``through`` another script, with its words, that runs this one.
     """
 
     def __init__(
@@ -52,9 +54,10 @@ class Member:
         policy: Path | None = None,
         script: Path = MEMBER,
         system: str = "",
+        through: Sequence[str] = (),
     ) -> None:
         # With a host name of its own: the namespace's.
-        command = ["ip", "netns", "exec", namespace, "unshare", "--uts", sys.executable, str(script)]
+        command = ["ip", "netns", "exec", namespace, "unshare", "--uts", sys.executable, *through, str(script)]
         # Each namespace is a host of its own: no folder in common.
         lax = {} if policy is not None else {"TRADE_INSECURE_LAN": "1"}
         entry = {"TRADE_CREDENTIALS": "lab:secret"} if tls is None else {"TRADE_TLS": str(tls)}

@@ -64,9 +64,10 @@ def _robot_file(robot: str) -> str:
 class Driver:
     """A robot's simulated servos, and beside them its driver, which may be killed and started again."""
 
-    def __init__(self, site: Site, robot: str, mutant: str) -> None:
+    def __init__(self, site: Site, robot: str, mutant: str = "") -> None:
         self.robot = robot
-        self._program = [str(_BROKEN), mutant] if mutant else ["-m", "trade_gateway"]
+        self.program = [str(_BROKEN), mutant] if mutant else ["-m", "trade_gateway"]
+        """What is run when it is started the next time."""
         self._site = site
         file = site.folder / f"{robot}.toml"
         file.write_text(_robot_file(robot))
@@ -88,6 +89,10 @@ class Driver:
         assert self._process is not None
         return self._process.pid
 
+    @property
+    def running(self) -> bool:
+        return self._process is not None and self._process.poll() is None
+
     def _keep(self) -> None:
         """Start it whenever it does not run: it is killed, and ends by itself while its bus is unplugged."""
         while not self._closed.wait(0.5):
@@ -106,7 +111,7 @@ class Driver:
         self._process = subprocess.Popen(
             [
                 *("ip", "netns", "exec", self._site.networks.host("left")),
-                *(sys.executable, *self._program, "up", str(self._file), "--json"),
+                *(sys.executable, *self.program, "up", str(self._file), "--json"),
             ],
             stdout=subprocess.DEVNULL,
             stderr=self._complaints,

@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 from certificates import Papers
@@ -39,6 +40,8 @@ class Site:
         self.policy.write_text(policy)
         self.file.write_text(_gateway_file(public, private))
         self.members: list[Member] = []
+        self.through: Sequence[str] = ()
+        """A script, with its words, that runs the gateway when it is started the next time."""
         at = {host: address for host, (_, address) in _HOSTS.items()}
         networks.lay("net1", between="10.231.1.1", left=at["left"])
         networks.lay("net2", between="10.231.2.1", right=at["right"], right2=at["right2"])
@@ -48,7 +51,7 @@ class Site:
     def begin(self) -> None:
         """Start the gateway; it is up then."""
         command = ["ip", "netns", "exec", self.networks.host("between")]
-        command += [sys.executable, "-m", "trade_gateway", "gateway", str(self.file), "--json"]
+        command += [sys.executable, *self.through, "-m", "trade_gateway", "gateway", str(self.file), "--json"]
         complaints = (self.folder / "complaints").open("ab")
         with complaints:
             self.gateway = subprocess.Popen(
@@ -87,6 +90,7 @@ class Site:
         policy: Path | None = None,
         script: Path = MEMBER,
         reachable: bool = False,
+        through: Sequence[str] = (),
     ) -> Member:
         """A member process, not told anything yet.
 
@@ -97,6 +101,7 @@ class Site:
             policy: that it goes by; the site's unless said.
             script: in place of ``member.py``.
             reachable: whether others of its network can dial it.
+            through: another script, with its words, that runs this one.
         """
         own = self.folder / f"{name}.toml"
         own.write_text(self.policy.read_text())
@@ -110,6 +115,7 @@ class Site:
             policy=policy or own,
             script=script,
             system=SYSTEM.removesuffix("-0"),
+            through=through,
         )
         self.members.append(made)
         return made

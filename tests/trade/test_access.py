@@ -7,13 +7,14 @@ from typing import Any
 
 import pytest
 
-from trade import Container, Handle, Resource, Settings, service, where
+from trade import Container, Estop, Handle, Resource, Settings, service, where
 from trade._access import FUNCTIONS
 from trade._context import CallContext, running
 from trade._estop_services import EstopServices
+from trade._memory import MemoryTransport
 from trade._own_services import OwnServices
 from trade._service import marked_methods
-from trade._wire import Behalf
+from trade._wire import PROTOCOL, Behalf, EstopOrder, encode_message, estop_key
 from trade.errors import AccessDenied, ConfigurationError, LockedByOther, LockLost, Stopped
 from trade.testing import MemorySystem, memory_system
 
@@ -297,6 +298,18 @@ def test_a_revoked_identity_stops_nobody(memory: MemorySystem, member: Member, n
     with pytest.raises(AccessDenied, match="thief is revoked"):
         find(thief, "stop")()
     assert (neck.stops, member("drv").estops()) == (0, [])
+
+
+def test_a_revoked_identity_stops_nobody_in_another_version_of_the_protocol_either(
+    memory: MemorySystem, member: Member, neck: Neck
+) -> None:
+    drv, raw = member("drv"), MemoryTransport(memory.network, "raw")
+    for who in ("thief", "dash"):
+        order = encode_message(EstopOrder(PROTOCOL + 1, f"of-{who}", Estop(f"of-{who}", f"{who}/raw/e1", "", 0.0)))
+        raw.publish(estop_key(who)).put(order)
+    memory.settle()
+    memory.drive(lambda: neck.stops > 0)
+    assert [known.id for known in drv.estops()] == ["of-dash"]
 
 
 def test_readers_ignore_what_somebody_may_not_offer(memory: MemorySystem, member: Member, neck: Neck) -> None:

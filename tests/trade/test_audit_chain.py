@@ -48,6 +48,12 @@ def links(path: Path) -> list[Link]:
         return list(found)
 
 
+def test_a_record_that_a_later_version_gave_a_column_more_is_gone_on_with(store: AuditStore, path: Path) -> None:
+    tamper(path, "ALTER TABLE record ADD COLUMN room TEXT")
+    store.add([row("rosie.step21")])
+    assert (verdict(path).problem, verdict(path).rows) == ("", 21)
+
+
 def test_rows_follow_each_other_from_the_first(path: Path) -> None:
     found = verdict(path)
     assert (found.problem, found.rows, found.first, found.head.seq) == ("", 20, 1, 20)

@@ -1,6 +1,7 @@
 """S09: one e-stop for the whole system, with messages lost, drivers restarted, and ids cleared."""
 
 import random
+import tempfile
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -10,8 +11,18 @@ import pytest
 
 from trade import Container, Estop, EstopReport, Resource, current_call, service, where
 from trade._crew import MOST_THREADS
+from trade._estop_messages import decode_estop_order
 from trade._memory import MemoryTransport, Passage
-from trade._wire import PROTOCOL, EstopOrder, decode_estop_order, encode_message
+from trade._wire import (
+    PROTOCOL,
+    Address,
+    EstopOrder,
+    ProviderInfo,
+    ServiceInfo,
+    alive_key,
+    encode_message,
+    registry_key,
+)
 from trade.errors import Busy, ConfigurationError, MotionStopped, NoSuchEstop, Stopped
 from trade.testing import Kind, MemorySystem, memory_system
 
@@ -342,7 +353,8 @@ FORGED = Estop("abc", "mallory/x/e", "", 0.0)
 BAD = {
     "garbage": ("estop/tester", b"\xc1"),
     "another's name": ("estop/tester", encode_message(EstopOrder(PROTOCOL, "abc", FORGED))),
-    "another version": ("estop/mallory", encode_message(EstopOrder(PROTOCOL + 1, "abc", FORGED))),
+    "another version's clearing": ("estop/mallory", encode_message(EstopOrder(PROTOCOL + 1, "abc", None, ("abc",)))),
+    "another's name in another version": ("estop/tester", encode_message(EstopOrder(PROTOCOL + 1, "abc", FORGED))),
     "another request": ("estop/mallory", encode_message(EstopOrder(PROTOCOL, "abcd", FORGED))),
     "a path": ("estop/mallory", encode_message(EstopOrder(PROTOCOL, "../a", Estop("../a", "mallory/x/e", "", 0.0)))),
     "a path to clear": ("estop/mallory", encode_message(EstopOrder(PROTOCOL, "abc", None, ("../a",)))),
@@ -361,6 +373,34 @@ def test_a_malformed_message_is_dropped_counted_and_latches_nothing(
     assert eventually(lambda: one.dropped_messages == 1)
     assert one.estops() == []
     assert call(one, "move_to", "one", 0.1) == 0.1
+
+
+def test_an_e_stop_that_is_told_under_a_path_is_dropped_and_written_nowhere(eventually: Eventually) -> None:
+    """Its id names a file."""
+    with tempfile.TemporaryDirectory() as folder, memory_system(state_dir=Path(folder)) as system:  # ids are short
+        drivers(system, "one")
+        one, raw, mallory = (
+            system.container("one"),
+            MemoryTransport(system.network, "raw"),
+            Address("mallory", "x", "e"),
+        )
+        up = "/.." * len((Path(folder) / "memory" / "estop").parts[1:])
+        told = ProviderInfo(
+            revision=1,
+            groups=("trade",),
+            kind="Estops",
+            host="h",
+            pid=1,
+            services=(ServiceInfo(name="estops", signature="estops()"),),
+            estops=(Estop(f"{up}{folder}/found", str(mallory), "", 0.0),),
+        )
+        before, _sign = one.dropped_messages, raw.appear(alive_key(mallory))
+        system.settle()
+        raw.announce(registry_key("trade", mallory, "estops"), encode_message(told))
+        assert eventually(lambda: one.dropped_messages > before or bool(one.estops()))
+        one.close()  # what it writes is written
+        assert not list(Path(folder).glob("found*"))
+        assert one.dropped_messages > before
 
 
 def test_S09_what_an_estop_has_everybody_tell_everybody_is_small(system: MemorySystem) -> None:

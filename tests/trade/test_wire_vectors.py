@@ -6,7 +6,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from trade import _wire
+from trade import _estop_messages, _wire
 from trade._sample import decode_sample
 from vectors import DROPPED, FILE, MESSAGES, kind_of, text
 
@@ -15,8 +15,8 @@ READERS: dict[str, Callable[[bytes], Any]] = {
     "Reply": _wire.decode_reply,
     "Tally": _wire.decode_tally,
     "ProviderInfo": _wire.decode_provider,
-    "EstopOrder": lambda data: _wire.decode_estop_order(data, "anna"),
-    "EstopConfirmed": _wire.decode_estop_confirmed,
+    "EstopOrder": lambda data: _estop_messages.decode_estop_order(data, "anna"),
+    "EstopConfirmed": _estop_messages.decode_estop_confirmed,
     "StreamSample": decode_sample,
 }
 

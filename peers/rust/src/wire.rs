@@ -55,8 +55,13 @@ pub fn texts(value: &Value) -> Option<Vec<String>> {
 
 /// A message of this version as the array that it is; later versions append to it, so it may be longer.
 fn fields(payload: &[u8], least: usize) -> Option<Vec<Value>> {
+    any_fields(payload, least).filter(|fields| fields[0].as_u64() == Some(VERSION))
+}
+
+/// Of whatever version.
+fn any_fields(payload: &[u8], least: usize) -> Option<Vec<Value>> {
     match decode(payload)? {
-        Value::Array(fields) if fields.len() >= least && fields[0].as_u64() == Some(VERSION) => Some(fields),
+        Value::Array(fields) if fields.len() >= least && fields[0].as_u64() >= Some(1) => Some(fields),
         _ => None,
     }
 }
@@ -194,11 +199,14 @@ pub struct Estop {
 }
 
 impl Estop {
+    /// What stands in every version, id and session, and what is understood of the rest.
     pub fn read(value: &Value) -> Option<Estop> {
-        let parts = value.as_array().filter(|parts| parts.len() >= 4)?;
+        let parts = value.as_array().filter(|parts| parts.len() >= 2)?;
         let id = parts[0].as_str().filter(|id| is_chunk(id))?.to_owned();
-        let by = parts[1].as_str().filter(|by| by.len() <= 300)?.to_owned();
-        Some(Estop { id, by, reason: parts[2].as_str()?.to_owned(), at: parts[3].as_f64()? })
+        let by = parts[1].as_str().filter(|by| by.chars().count() <= 300)?.to_owned();
+        let reason = parts.get(2).and_then(Value::as_str).unwrap_or("").chars().take(500).collect();
+        let at = parts.get(3).and_then(Value::as_f64).filter(|at| at.is_finite()).unwrap_or(0.0);
+        Some(Estop { id, by, reason, at })
     }
 
     pub fn value(&self) -> Value {
@@ -214,20 +222,19 @@ pub struct EstopOrder {
 }
 
 impl EstopOrder {
-    /// An order of that identity; None if it is none, or in the name of another.
+    /// An order of that identity: to stop, of any version; to clear, of this one. None if it is none, or in the name
+    /// of another.
     pub fn read(payload: &[u8], identity: &str) -> Option<EstopOrder> {
-        let fields = fields(payload, 2)?;
+        let fields = any_fields(payload, 2)?;
         let request = fields[1].as_str().filter(|request| is_chunk(request))?.to_owned();
-        let opened = match fields.get(2) {
-            None | Some(Value::Nil) => None,
-            Some(estop) => Some(Estop::read(estop)?),
-        };
-        if opened.as_ref().is_some_and(|one| one.id != request || !one.by.starts_with(&format!("{identity}/"))) {
-            return None;
+        if let Some(estop) = fields.get(2).filter(|estop| !estop.is_nil()) {
+            let opened =
+                Estop::read(estop).filter(|one| one.id == request && one.by.starts_with(&format!("{identity}/")))?;
+            return Some(EstopOrder { request, opened: Some(opened), cleared: vec![] });
         }
         let cleared = fields.get(3).map_or(Some(vec![]), texts)?;
         let plain = cleared.len() <= 64 && cleared.iter().all(|id| is_chunk(id));
-        plain.then_some(EstopOrder { request, opened, cleared })
+        (plain && fields[0].as_u64() == Some(VERSION)).then_some(EstopOrder { request, opened: None, cleared })
     }
 }
 
@@ -235,12 +242,9 @@ pub fn estop_confirmed(request: &str, problem: &str) -> Vec<u8> {
     encode(&Value::Array(vec![VERSION.into(), request.into(), problem.into()]))
 }
 
-/// The open e-stops that a container's own entry tells of.
+/// The open e-stops that a container's own entry tells of, in whatever version.
 pub fn told_estops(payload: &[u8]) -> Option<Vec<Estop>> {
     let entry = decode(payload)?;
-    if field(&entry, "v")?.as_u64() != Some(VERSION) {
-        return None;
-    }
     field(&entry, "estops").map_or(Some(vec![]), |told| told.as_array()?.iter().map(Estop::read).collect())
 }
 

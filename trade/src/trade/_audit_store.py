@@ -25,7 +25,9 @@ _SCHEMA: Final = (
     f"CREATE TABLE IF NOT EXISTS record (seq INTEGER PRIMARY KEY, {', '.join(_COLUMNS[1:])}, before BLOB, hash BLOB)",
     "CREATE TABLE IF NOT EXISTS head (only_one INTEGER PRIMARY KEY CHECK (only_one = 1), seq INTEGER, hash BLOB)",
 )
-_ADD: Final = f"INSERT INTO record VALUES ({', '.join('?' * (len(_COLUMNS) + 2))})"  # noqa: S608 - no words of others
+_ADD: Final = (  # by name: a later version may have added columns
+    f"INSERT INTO record ({', '.join(_COLUMNS)}, before, hash) VALUES ({', '.join('?' * (len(_COLUMNS) + 2))})"  # noqa: S608 - no words of others
+)
 _READ: Final = f"SELECT {', '.join(_COLUMNS)}, before, hash FROM record WHERE seq > ? ORDER BY seq"  # noqa: S608
 
 Make = Callable[[Head], Sequence[AuditRow]]

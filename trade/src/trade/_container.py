@@ -157,6 +157,7 @@ class Container(Hosting, Moving, Streaming, Tracing, Guarding, Bordering):
                     pid=first.pid if first else 0,
                     providers=len(state.providers),
                     services=len(records),
+                    protocol=state.protocol,
                 )
             )
         return infos

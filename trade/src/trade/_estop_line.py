@@ -12,6 +12,7 @@ from msgspec import Struct
 
 from trade._access import Access
 from trade._audit import Audit
+from trade._estop_messages import decode_estop_confirmed, decode_estop_order
 from trade._transport import ChannelClosed, Message, Transport
 from trade._wire import (
     ESTOPS,
@@ -20,8 +21,6 @@ from trade._wire import (
     EstopConfirmed,
     EstopOrder,
     Malformed,
-    decode_estop_confirmed,
-    decode_estop_order,
     encode_message,
     estop_confirmed_key,
     estop_key,
@@ -46,6 +45,9 @@ class EstopReport(Struct, frozen=True):
     """Containers with something to stop that did not answer in time."""
     failed: dict[str, str] = {}
     """Containers that answered that something of it failed, and what."""
+    versions: dict[str, int] = {}
+    """Those of the above that speak another version of the protocol, and which. What they offer cannot be read here, so
+    each of them counts as one with something to stop. A clearing they do not heed: one of their version is needed."""
 
     @property
     def complete(self) -> bool:

@@ -3,7 +3,7 @@
 import logging
 import secrets
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -90,7 +90,8 @@ class Estopping:
         estop = Estop(secrets.token_hex(4), str(self._own), reason[:_LONGEST_REASON], time.time())
         order = EstopOrder(PROTOCOL, estop.id, estop)
 
-        return self._line.ask(order, self._with_stops, limit_s, lambda: self._is_cleared(estop.id))
+        report = self._line.ask(order, self._awaited, limit_s, lambda: self._is_cleared(estop.id))
+        return self._with_versions(report)
 
     def hear(self, tell: Callable[[Estop], None]) -> None:
         """Have this called, on a thread of its own, with every e-stop: those that are open, and those to come."""
@@ -109,7 +110,7 @@ class Estopping:
         reason = f"{estop.reason} (in system {system}, by {estop.by})"[:_LONGEST_REASON]
         mine = Estop(estop.id, str(self._own), reason, estop.at)
         order = EstopOrder(PROTOCOL, estop.id, mine)
-        report = self._line.ask(order, self._with_stops, LIMIT_S, lambda: self._is_cleared(estop.id))
+        report = self._line.ask(order, self._awaited, LIMIT_S, lambda: self._is_cleared(estop.id))
         if report.missing or report.failed:
             _logger.error("e-stop %s of system %s: missing %s, %s", estop.id, system, report.missing, report.failed)
 
@@ -119,6 +120,7 @@ class Estopping:
     def open(self) -> list[Estop]:
         """See `Container.estops`."""
         told = {estop.id: estop for record in self._own_records() for estop in record.estops}
+        told.update((estop.id, estop) for state in self._others() for estop in state.open_estops())
         told.update((estop.id, estop) for estop in self._estops.open())
         return sorted(told.values(), key=lambda estop: (estop.at, estop.id))
 
@@ -140,7 +142,15 @@ class Estopping:
 
         report = self._line.ask(order, expected, limit_s, lambda: False)
         self._registry.wait_for(lambda: not self._still_told(ids, report.confirmed), _TOLD_S)
-        return report
+        unheeding = (state for state in self._others() if any(estop.id in ids for estop in state.open_estops()))
+        names = {f"{state.address.identity}/{state.address.container}" for state in unheeding}
+        report = structs.replace(report, missing=tuple(sorted({*report.missing, *names})))
+        return self._with_versions(report)
+
+    def _with_versions(self, report: EstopReport) -> EstopReport:
+        there = {f"{state.address.identity}/{state.address.container}": state.protocol for state in self._others()}
+        named = {*report.confirmed, *report.missing, *report.failed}
+        return structs.replace(report, versions={name: there[name] for name in sorted(there) if name in named})
 
     def _still_told(self, ids: Sequence[str], by: Sequence[str]) -> bool:
         """Whether the entries of those who confirmed still have them: what they say now may not have arrived."""
@@ -154,6 +164,14 @@ class Estopping:
     def _with_stops(self) -> set[Address]:
         return {state.address for state in self._registry.containers() if _has_stop(state)}
 
+    def _awaited(self) -> set[Address]:
+        """Who has something to stop, as far as that can be known."""
+        return {*self._with_stops(), *(state.address for state in self._others())}
+
+    def _others(self) -> list[ContainerState]:
+        """Those that speak another version."""
+        return [state for state in self._registry.containers() if state.protocol != PROTOCOL]
+
     def _own_records(self) -> list[Record]:
         """One record of each container, of the provider that tells what is open there."""
         containers = self._registry.containers()
@@ -161,6 +179,10 @@ class Estopping:
         return [entry.records[0] for entry in entries if _tells(entry.records)]
 
     # --- telling and hearing of what is open
+
+    def learn(self, estops: Iterable[Estop]) -> None:
+        """Told by the watch: a container of another version has these open."""
+        self._estops.learn(estops)
 
     def _tell(self) -> None:
         """Let our registry entry say what is open, for those who join."""

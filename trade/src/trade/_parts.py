@@ -174,6 +174,7 @@ class Parts:
                 self._lost,
                 self.session_ended,
                 self.announcer.beat,
+                self.estopping.learn,
             )
             self._leaving.callback(self.watch.close)
             undone.pop_all()

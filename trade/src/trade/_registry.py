@@ -9,7 +9,7 @@ from trade._bell import Bell
 from trade._constraints import Constraint
 from trade._heard import Heard
 from trade._index import Index
-from trade._wire import HEALTHY, Address, Estop, ProviderInfo, Scalar, ServiceInfo, ServiceKey
+from trade._wire import HEALTHY, PROTOCOL, Address, Estop, ProviderInfo, Scalar, ServiceInfo, ServiceKey
 from trade.errors import ServiceGone
 
 __all__ = ["ContainerState", "Record", "Registry"]
@@ -77,6 +77,14 @@ class ContainerState:
     removed: dict[str, str] = field(default_factory=dict)
     """Deregistered, in this order, and where they moved, if they did: a name is never used twice in one boot."""
     heard: Heard = field(default_factory=Heard)
+    protocol: int = PROTOCOL
+    """The version that it speaks. If it is not ours, it has no providers here."""
+    estops: dict[str, tuple[Estop, ...]] = field(default_factory=dict)
+    """Of one that speaks another version: what is open there, by the provider that tells of it."""
+
+    def open_estops(self) -> list[Estop]:
+        """See ``estops``."""
+        return [estop for told in list(self.estops.values()) for estop in told]
 
 
 class Change(NamedTuple):
@@ -150,6 +158,28 @@ class Registry:
                 return True
             state.heard.counted(revision)
             return state.heard.complete
+
+    def speaks(self, address: Address, version: int) -> bool:
+        """A container speaks another version. Returns whether that is news."""
+        with self._lock:
+            state = self._containers.get(address)
+            if state is None or state.protocol == version:
+                return False
+            state.protocol = version
+            self._bell.ring()
+            return True
+
+    def tells_open(self, address: Address, domain: str, provider: str, estops: tuple[Estop, ...]) -> bool:
+        """One that speaks another version tells what is open there. Returns whether it is there and may tell that."""
+        if not self._may_offer(address.identity, domain, provider, (domain,)):
+            return False
+        with self._lock:
+            state = self._containers.get(address)
+            if state is None or (provider not in state.estops and len(state.estops) >= _MOST_PROVIDERS):
+                return False
+            state.estops[provider] = estops
+            self._bell.ring()
+            return True
 
     def settle(self, state: ContainerState, revision: int, offered: Mapping[str, tuple[str, ProviderInfo]]) -> None:
         """A container has answered with all it offered at a revision: provider to domain and entry.

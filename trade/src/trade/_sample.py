@@ -5,7 +5,7 @@ from typing import Annotated, Any, Final
 import msgspec
 from msgspec import Meta, Raw, Struct
 
-from trade._wire import MOST_BYTES, PROTOCOL, Malformed, ServiceKey, why_malformed
+from trade._wire import MOST_BYTES, PROTOCOL, Malformed, OtherVersion, ServiceKey, unread
 
 __all__ = [
     "STEPS_HZ",
@@ -86,7 +86,7 @@ def decode_sample(payload: bytes) -> StreamSample:
     try:
         sample = _decoder.decode(payload)
     except (msgspec.DecodeError, ValueError, RecursionError, MemoryError) as bad:
-        raise Malformed(why_malformed(payload, bad)) from None
+        raise unread(payload, bad) from None
     if sample.v != PROTOCOL:
-        raise Malformed(why_malformed(payload, None))
+        raise OtherVersion(sample.v)
     return sample

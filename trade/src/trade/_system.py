@@ -15,7 +15,7 @@ from trade._reach import Reach
 from trade._service import service
 from trade._settings import Settings
 from trade._starting import start
-from trade._wire import Address, ServiceKey
+from trade._wire import PROTOCOL, Address, ServiceKey
 from trade.errors import CannotStart, ConfigurationError, LinkStays, NoSuchService, TooManyServices
 
 DOMAIN: Final = "trade"
@@ -35,6 +35,8 @@ class ContainerInfo(Struct, frozen=True):
     pid: int
     providers: int
     services: int
+    protocol: int = PROTOCOL
+    """The version that it speaks. If it is another one than ours, nothing of what it offers is known here."""
 
 
 class WithdrawnInfo(Struct, frozen=True):

@@ -2,24 +2,29 @@
 
 import logging
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Final
 
 from trade._absence import Absences
 from trade._asking import Asker
+from trade._estop_messages import decode_open_estops
 from trade._registry import ContainerState, Registry
 from trade._system import DOMAIN
 from trade._transport import Answer, Channel, ChannelClosed, Message, Transport
 from trade._wire import (
     ALIVE,
+    PROTOCOL,
     REGISTRY,
     TALLY,
     Address,
+    Estop,
     Malformed,
+    OtherVersion,
     ProviderInfo,
     decode_provider,
     decode_tally,
     is_chunk,
+    tally_key,
 )
 
 _logger = logging.getLogger("trade")
@@ -38,8 +43,10 @@ class Watch:
         lost: Callable[..., None],
         ended: Callable[[str], None],
         beat: Callable[[], None],
+        learn: Callable[[Iterable[Estop]], None],
     ) -> None:
         self._registry = registry
+        self._learn = learn
         self._own = own
         self._lost = lost
         self._ended = ended
@@ -85,8 +92,30 @@ class Watch:
                 complete = self._registry.put(address, domain, provider, decode_provider(payload))
             if not complete:
                 self._asker.request(address)
+        except OtherVersion as other:
+            self._of_another_version(message, other)
         except Malformed as bad:
             self._drop(message.key, bad)
+
+    def _of_another_version(self, message: Message, other: OtherVersion) -> None:
+        """Of what it says only this is heeded: that it does, and which e-stops are open there."""
+        self.malformed += 1
+        address, domain, provider = _place(message.key)
+        if self._registry.speaks(address, other.version):
+            _logger.warning(
+                "container %s/%s speaks protocol version %d, this one speaks %d: neither sees what the other offers, "
+                "and only e-stops cross; update the older one",
+                *(address.identity, address.container, other.version, PROTOCOL),
+            )
+        if domain != DOMAIN or provider == TALLY:
+            return
+        try:
+            estops = decode_open_estops(message.payload or b"")
+        except Malformed as bad:
+            self._drop(message.key, bad)
+            return
+        if self._registry.tells_open(address, domain, provider, estops):
+            self._learn(estops)
 
     def _sign(self, message: Message) -> None:
         try:
@@ -128,6 +157,7 @@ class Watch:
         """
         offered: dict[str, tuple[str, ProviderInfo]] = {}
         speakers, revision, message = set[Address](), None, None
+        others: list[tuple[Message, OtherVersion]] = []
         answer.messages.reverse()
         while answer.messages:
             message = answer.messages.pop()
@@ -138,12 +168,20 @@ class Watch:
                     revision = decode_tally(message.payload or b"").revision
                 else:
                     offered[provider] = (domain, decode_provider(message.payload or b""))
+            except OtherVersion as other:
+                others.append((message, other))
             except Malformed as bad:
                 self._drop(message.key, bad)
         if message is not None and len(speakers) > 1:
             self._drop(message.key, Malformed("one container answered for several"))
-        elif revision is not None and (state := meant.get(speakers.pop())) is not None:
+            return
+        for other_message, other in others:
+            self._of_another_version(other_message, other)
+        state = meant.get(speakers.pop()) if speakers else None
+        if state is not None and revision is not None:
             self._registry.settle(state, revision, offered)  # without the tally, which comes last, it is not all
+        elif state is not None and others and others[-1][0].key == tally_key(state.address):
+            state.heard.all_told(0)  # of what it tells nothing is counted: to be asked once is enough
 
     def _drop(self, key: str, bad: Exception) -> None:
         self.malformed += 1

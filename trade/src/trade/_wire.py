@@ -11,7 +11,7 @@ import msgspec
 from msgspec import Meta, Raw, Struct, structs
 
 PROTOCOL: Final = 1
-"""Version of every message. A reader drops, counts and logs once what carries another."""
+"""Version of every message. A reader drops and counts what carries another, except what says that all is to stop."""
 
 _CHUNK = re.compile(r"[A-Za-z0-9_.@:-]{1,80}")
 
@@ -234,7 +234,10 @@ class Estop(Struct, frozen=True, array_like=True, gc=False):
 
 
 class EstopOrder(Struct, array_like=True, gc=False):
-    """Put on ``estop/<identity>`` until all have confirmed: one e-stop is opened, or some are cleared."""
+    """Put on ``estop/<identity>`` until all have confirmed: one e-stop is opened, or some are cleared.
+
+    One that opens is obeyed whatever its version; one that clears is of the reader's own.
+    """
 
     v: int
     request: Annotated[str, Meta(min_length=1, max_length=80)]
@@ -244,9 +247,9 @@ class EstopOrder(Struct, array_like=True, gc=False):
 
 
 class EstopConfirmed(Struct, array_like=True, gc=False):
-    """Put on ``estop/<identity>/<container>/<epoch>`` by who did what an order says."""
+    """Put on ``estop/<identity>/<container>/<epoch>`` by who did what an order says; the same in every version."""
 
-    v: int
+    v: Annotated[int, Meta(ge=1)]
     request: str
     problem: str = ""
     """What of it failed."""
@@ -311,7 +314,8 @@ _MOST_MESSAGE_BYTES: Final = MOST_BYTES + (1 << 20)  # what is larger is not eve
 EMPTY: Final = Raw(msgspec.msgpack.encode(None))
 EMPTY_ARGUMENTS: Final = Raw(msgspec.msgpack.encode(()))
 
-_Message = TypeVar("_Message", Call, Reply, _ProviderMessage, Tally, EstopOrder, EstopConfirmed)
+_Message = TypeVar("_Message", Call, Reply, _ProviderMessage, Tally, EstopOrder)
+_Value = TypeVar("_Value")
 
 
 UNREADABLE: Final = (msgspec.DecodeError, UnicodeDecodeError, RecursionError)
@@ -322,6 +326,17 @@ class Malformed(Exception):
     """Bytes that are no message of this protocol version; dropped, never answered."""
 
 
+class OtherVersion(Malformed):
+    """A message of another protocol version."""
+
+    def __init__(self, version: int) -> None:
+        super().__init__(f"protocol version {version}, this is {PROTOCOL}; update the older side")
+        self.version = version
+
+
+NO_CHUNK: Final = "an e-stop's id is one chunk"
+"""It names a file, too."""
+
 call_decoder: Final = msgspec.msgpack.Decoder(Call)
 reply_decoder: Final = msgspec.msgpack.Decoder(Reply)
 _provider_decoder: Final = msgspec.msgpack.Decoder(_ProviderMessage)
@@ -329,25 +344,25 @@ _service_decoder: Final = msgspec.msgpack.Decoder(ServiceInfo)
 _services: Final[WeakValueDictionary[bytes, ServiceInfo]] = WeakValueDictionary()
 """The services known now by their bytes: a thousand objects of one class tell the same."""
 _tally_decoder: Final = msgspec.msgpack.Decoder(Tally)
-_estop_order_decoder: Final = msgspec.msgpack.Decoder(EstopOrder)
-_estop_confirmed_decoder: Final = msgspec.msgpack.Decoder(EstopConfirmed)
 encode_message: Final = msgspec.msgpack.Encoder().encode
 
 
 def decode_call(payload: bytes) -> Call:
-    return _decoded(call_decoder, payload)
+    return decoded(call_decoder, payload)
 
 
 def decode_reply(payload: bytes) -> Reply:
-    return _decoded(reply_decoder, payload)
+    return decoded(reply_decoder, payload)
 
 
 def decode_provider(payload: bytes) -> ProviderInfo:
-    message = _decoded(_provider_decoder, payload)
+    message = decoded(_provider_decoder, payload)
     try:
         services = tuple(_service(bytes(raw)) for raw in message.services)
     except (msgspec.DecodeError, ValueError, RecursionError, MemoryError) as bad:
-        raise Malformed(why_malformed(payload, bad)) from None
+        raise unread(payload, bad) from None
+    if not all(is_chunk(estop.id) for estop in message.estops):
+        raise Malformed(NO_CHUNK)
     told: dict[str, Any] = {
         **structs.asdict(message),
         "services": services,
@@ -368,43 +383,34 @@ def _understood(info: ServiceInfo) -> ServiceInfo:
 
 
 def decode_tally(payload: bytes) -> Tally:
-    return _decoded(_tally_decoder, payload)
+    return decoded(_tally_decoder, payload)
 
 
-def decode_estop_order(payload: bytes, identity: str) -> EstopOrder:
-    """An order, given by that identity."""
-    order = _decoded(_estop_order_decoder, payload)
-    estop = order.opened
-    if estop is not None and (estop.id != order.request or not estop.by.startswith(f"{identity}/")):
-        raise Malformed(f"e-stop {estop.id!r} of {estop.by!r} is not one of {identity}")
-    if not all(map(is_chunk, (order.request, *order.cleared))):  # they name files, too
-        raise Malformed("an e-stop's id is one chunk")
-    return order
-
-
-def decode_estop_confirmed(payload: bytes) -> EstopConfirmed:
-    return _decoded(_estop_confirmed_decoder, payload)
-
-
-def _decoded(decoder: msgspec.msgpack.Decoder[_Message], payload: bytes) -> _Message:
-    if len(payload) > _MOST_MESSAGE_BYTES:
-        raise Malformed(f"{len(payload)} bytes are more than any message may have ({_MOST_MESSAGE_BYTES})")
-    try:
-        message = decoder.decode(payload)
-    except (msgspec.DecodeError, ValueError, RecursionError, MemoryError) as bad:
-        raise Malformed(why_malformed(payload, bad)) from None
+def decoded(decoder: msgspec.msgpack.Decoder[_Message], payload: bytes) -> _Message:
+    """A message of this version. Raises Malformed."""
+    message = read_any(decoder, payload)
     if message.v != PROTOCOL:
-        raise Malformed(why_malformed(payload, None))
+        raise OtherVersion(message.v)
     return message
 
 
-def why_malformed(payload: bytes, bad: Exception | None) -> str:
-    """A reason for the log: a future version is worth telling from garbage."""
+def read_any(decoder: msgspec.msgpack.Decoder[_Value], payload: bytes) -> _Value:
+    """A message of whatever version. Raises Malformed."""
+    if len(payload) > _MOST_MESSAGE_BYTES:
+        raise Malformed(f"{len(payload)} bytes are more than any message may have ({_MOST_MESSAGE_BYTES})")
+    try:
+        return decoder.decode(payload)
+    except (msgspec.DecodeError, ValueError, RecursionError, MemoryError) as bad:
+        raise unread(payload, bad) from None
+
+
+def unread(payload: bytes, bad: Exception) -> Malformed:
+    """Why bytes are dropped that are no message of this version: another one is worth telling from garbage."""
     try:
         raw: Any = msgspec.msgpack.decode(payload)
         version: Any = raw[0] if isinstance(raw, list) else raw.get("v")
     except Exception:  # noqa: BLE001 - the bytes are anything
         version = None
-    if isinstance(version, int) and version != PROTOCOL:
-        return f"protocol version {version}, this is {PROTOCOL}; update the older side"
-    return f"not a message of this protocol: {bad}"
+    if isinstance(version, int) and not isinstance(version, bool) and version != PROTOCOL:
+        return OtherVersion(version)
+    return Malformed(f"not a message of this protocol: {bad}")

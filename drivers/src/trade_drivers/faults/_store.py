@@ -23,7 +23,7 @@ create table if not exists fault (
   device text not null, kind text not null, number integer not null, blob blob not null, primary key (device, kind)
 )
 """
-_SAVE: Final = "insert or replace into fault values (?, ?, ?, ?)"
+_SAVE: Final = "insert or replace into fault (device, kind, number, blob) values (?, ?, ?, ?)"
 _DROP: Final = "delete from fault where device = ? and kind = ?"
 _LOAD: Final = "select number, blob from fault order by number"
 

@@ -55,12 +55,19 @@ def _clear(container: Container, ids: list[str] | None, limit_s: float) -> Estop
 def _say(out: Output, report: EstopReport, system: str, done: str, own: str) -> None:
     others = [name for name in report.confirmed if name != own]  # that this command has heard of it itself says nothing
     for name in others or report.confirmed:
-        out.say(f"{done}: {escape(name)}")
+        out.say(f"{done}: {escape(name)}{_version(report, name)}")
     for name, problem in report.failed.items():
-        out.say(f"[bold red]FAILED: {escape(name)}: {escape(problem)}[/]")
+        out.say(f"[bold red]FAILED: {escape(name)}{_version(report, name)}: {escape(problem)}[/]")
     for name in report.missing:
-        out.say(f"[bold red]MISSING: {escape(name)} did not answer[/]")
+        hears = done == "stopped" or name not in report.versions
+        missed = "did not answer" if hears else "is cleared by a `trade` of its version only"
+        out.say(f"[bold red]MISSING: {escape(name)}{_version(report, name)} {missed}[/]")
     if not (report.confirmed or report.failed or report.missing):
         out.say(f"[bold red]nobody was found[/] in system {escape(system)} that has something to stop")
     if done == "stopped":
         out.say(f"e-stop {report.id} is open; when it is safe: [bold]trade estop --clear {report.id}[/]")
+
+
+def _version(report: EstopReport, name: str) -> str:
+    """Of the protocol, if it is another one than that of this command."""
+    return f" (protocol version {report.versions[name]})" if name in report.versions else ""

@@ -7,7 +7,8 @@ from typing import Annotated, Any, Final
 import typer
 from rich.markup import escape
 
-from trade import Constraint, Container, Handle, LoadInfo, where
+from trade import Constraint, Container, ContainerInfo, Handle, LoadInfo, where
+from trade._wire import PROTOCOL
 from trade.errors import ConfigurationError
 from trade_gateway._loads import loads, loads_table
 from trade_gateway.commands._output import Output, UsageError
@@ -122,10 +123,24 @@ def containers(
         elif not found:
             out.say(_ALONE)
         else:
-            rows = [
-                (info.name, info.identity, info.host, str(info.pid), str(info.services), info.epoch) for info in found
-            ]
-            out.table(("CONTAINER", "IDENTITY", "HOST", "PID", "SERVICES", "EPOCH"), rows)
+            out.table(*_containers_table(found))
+
+
+def _containers_table(found: Sequence[ContainerInfo]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    """Where one speaks another version of the protocol, there is a column for it."""
+    columns: dict[str, list[str]] = {
+        "CONTAINER": [info.name for info in found],
+        "IDENTITY": [info.identity for info in found],
+    }
+    if any(info.protocol != PROTOCOL for info in found):
+        columns["PROTOCOL"] = [
+            str(info.protocol) if info.protocol == PROTOCOL else f"{info.protocol} (here {PROTOCOL})" for info in found
+        ]
+    columns["HOST"] = [info.host or "?" for info in found]
+    columns["PID"] = [str(info.pid or "?") for info in found]
+    columns["SERVICES"] = [str(info.services) if info.protocol == PROTOCOL else "?" for info in found]
+    columns["EPOCH"] = [info.epoch for info in found]
+    return tuple(columns), list(zip(*columns.values(), strict=True))
 
 
 def _say_loads(out: Output, found: Sequence[LoadInfo]) -> None:

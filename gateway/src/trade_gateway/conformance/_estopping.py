@@ -6,13 +6,13 @@ from collections.abc import Callable
 from typing import Any
 
 from trade import errors, where
+from trade._estop_messages import decode_estop_confirmed
 from trade._wire import (
     PROTOCOL,
     Estop,
     EstopConfirmed,
     EstopOrder,
     Malformed,
-    decode_estop_confirmed,
     encode_message,
     estop_confirmed_key,
     estop_key,
@@ -38,13 +38,17 @@ def _cleared(*orders: EstopOrder) -> EstopOrder:
 
 def _order(stage: Stage, who: Voice, order: EstopOrder) -> EstopConfirmed:
     """Put an order until it is confirmed; raises NotHeld if it is not."""
+    return _confirmed(stage, who, order.request, encode_message(order))
+
+
+def _confirmed(stage: Stage, who: Voice, request: str, payload: bytes) -> EstopConfirmed:
     address = stage.peer.address
     with stage.listening(estop_confirmed_key(address)) as heard:
         found: list[EstopConfirmed] = []
 
         def confirmed() -> bool:
-            who.put(estop_key(who.identity), encode_message(order), urgent=True)
-            found[:] = [one for one in map(_confirmation, list(heard)) if one and one.request == order.request]
+            who.put(estop_key(who.identity), payload, urgent=True)
+            found[:] = [one for one in map(_confirmation, list(heard)) if one and one.request == request]
             return bool(found)
 
         eventually(confirmed, "an e-stop's order is not confirmed", PATIENCE_S)
@@ -115,12 +119,10 @@ def estop_reported(stage: Stage) -> None:
 
 @check("estop-forged", "E-stops")
 def estop_forged(stage: Stage) -> None:
-    """An order in the name of another identity, or of another version, is dropped: the arm goes on."""
+    """An order in the name of another identity is dropped: the arm goes on."""
     with stage.voice("anna") as anna, stage.voice("bob") as bob:
-        running, forged, later = stage.begin_turn(anna), _open(anna), _open(bob)
-        later.v = PROTOCOL + 1
-        for order in (forged, later):
-            bob.put(estop_key("bob"), encode_message(order), urgent=True)
+        running, forged = stage.begin_turn(anna), _open(anna)
+        bob.put(estop_key("bob"), encode_message(forged), urgent=True)
         until = time.monotonic() + _WATCHED_S
         while True:  # it may take a moment until something comes of it
             last = time.monotonic() >= until
@@ -130,6 +132,27 @@ def estop_forged(stage: Stage) -> None:
                 break
         anna.cancel(running, "peer.turn")
         anna.answer(running)
+
+
+@check("estop-of-any-version", "S09")
+def estop_of_any_version(stage: Stage) -> None:
+    """An order to stop of another version is obeyed and confirmed, whatever else is in it; one to clear is not."""
+    with stage.voice("anna") as anna, stage.voice("bob") as bob:
+        running, order = stage.begin_turn(anna), _open(bob)
+        try:
+            later = [PROTOCOL + 1, order.request, [order.request, bob.session, {"text": "smoke"}, None, 7], "more"]
+            confirmed = _confirmed(stage, bob, order.request, encode_message(later))
+            require(confirmed.problem == "", f"it says that something of an e-stop failed: {confirmed.problem}")
+            require(not stage.moves(anna), "the arm moves after an e-stop of another version was confirmed")
+            error_of(anna.answer(running))
+            cleared = [PROTOCOL + 1, secrets.token_hex(4), None, [order.request]]
+            for _ in range(3):
+                bob.put(estop_key("bob"), encode_message(cleared), urgent=True)
+            _require_stopped(stage, anna, "after a clearing of another version")
+        finally:
+            _order(stage, bob, _cleared(order))
+        anna.result(SYSTEM, "resume", ["peer.arm"])
+        anna.result(stage.peer.arm, "turn", stage.angle(anna))
 
 
 @check("estop-kept", "S09")

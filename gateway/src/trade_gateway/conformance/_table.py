@@ -55,6 +55,7 @@ CHECKS: Final[tuple[Check, ...]] = (
     _estopping.estop,
     _estopping.estop_reported,
     _estopping.estop_forged,
+    _estopping.estop_of_any_version,
     _estopping.estop_kept,
     _estopping.estop_learnt,
 )

@@ -18,7 +18,7 @@ create table if not exists state (
   primary key (container, object)
 )
 """
-_SAVE: Final = "insert or replace into state values (?, ?, ?, ?)"
+_SAVE: Final = "insert or replace into state (container, object, saved_at, blob) values (?, ?, ?, ?)"
 _LOAD: Final = "select object, blob from state where container = ?"
 
 
