@@ -20,10 +20,11 @@ from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
 
+from demo_actor import PATIENCE_S, DemoFailed
 from demo_judge import PAN, Judge
 from demo_kept import kill_and_see
 from demo_page import dashboard
-from demo_stage import PATIENCE_S, DemoFailed, Stage, stage
+from demo_stage import Stage, stage
 
 import trade
 from trade import Settings, errors, where

@@ -9,7 +9,8 @@ from typing import TypeVar
 import greet
 import msgspec
 import walk
-from demo_stage import PATIENCE_S, ROBOT, DemoFailed
+from demo_actor import PATIENCE_S, DemoFailed
+from demo_stage import ROBOT
 
 import trade_drivers
 from trade_hil_sim import Entry, SimControl, events, frames, motion_writes, read_log

@@ -8,8 +8,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from demo_actor import PATIENCE_S, DemoFailed
 from demo_judge import AGREE_RAD, PAN, Judge, say
-from demo_stage import HERE, PATIENCE_S, DemoFailed, Stage
+from demo_stage import HERE, Stage
 
 import trade
 from trade import Constraint, Handle, where

@@ -10,12 +10,38 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
-from tests.trade.test_locking import Joint, Robot
 from websockets.sync.client import ClientConnection, connect
 
+from jointed import Joint, Robot
 from trade import Container, service
+from trade.testing import memory_system
 from trade_gateway.door import Door, Tokens, add_token
 from waiting import PATIENCE_S
+
+POLICY = """
+[roles.all]
+call = ["*"]
+read = ["*"]
+register = ["*"]
+lock = ["*"]
+administer = ["*"]
+instrument = ["*"]
+
+[roles.operator]
+call = ["robot.a"]
+read = ["robot.a"]
+lock = ["robot.a"]
+
+[roles.viewer]
+read = ["robot"]
+
+[identities]
+tester = ["all"]
+chief = ["all"]
+anna = ["operator"]
+bert = ["viewer"]
+"""
+"""Who may do what at a door that is `governed`."""
 
 
 class Axis(Joint):
@@ -136,3 +162,20 @@ def ask(socket: ClientConnection, **message: Any) -> Any:
         told = heard(socket)
         if told.get("id") == message["id"] and ("result" in told or "problem" in told):
             return told
+
+
+def govern(robot: Robot, folder: Path, text: str) -> None:
+    """Give the door's container a policy."""
+    path = folder / "policy.toml"
+    path.write_text(text)
+    robot.me.load_policy(path)
+
+
+@contextmanager
+def governed(folder: Path) -> Iterator[Opened]:
+    """A door that may do everything, in a system with a policy."""
+    with memory_system() as system:
+        robot = Robot(system)
+        govern(robot, folder, POLICY)
+        with opened(robot.me, folder) as (made, tokens):
+            yield Opened(robot, made, tokens)

@@ -8,6 +8,9 @@ from trade_hil_sim.cia402 import Drive, Mode, State
 NODE = 5
 MODEL = "Simulated CiA 402 servo drive"
 STATUS = 0x6F
+SHUTDOWN, SWITCH_ON, ENABLE, DISABLE_VOLTAGE, QUICK_STOP, RESET, HALT = 0x06, 0x07, 0x0F, 0x00, 0x02, 0x80, 0x100
+NEW, AT_ONCE, RELATIVE = 0x10, 0x20, 0x40
+REACHED, LIMITED, ACK = 0x400, 0x800, 0x1000
 
 
 class Bench:
@@ -107,3 +110,19 @@ class Bench:
             assert self.t - begun < within_s, "it did not happen"
             self.run(step_s)
         return self.t - begun
+
+
+def enabled(mode: Mode, position: float = 0.0) -> Bench:
+    """One that is on, in a mode."""
+    bench = Bench(position)
+    if mode is Mode.CYCLIC_POSITION:
+        bench.put(0x607A, round(position), 4)
+    bench.enable(mode)
+    return bench
+
+
+def move(bench: Bench, target: int, extra: int = 0) -> None:
+    """The whole handshake of a set-point."""
+    bench.put(0x607A, target, 4)
+    assert bench.control(ENABLE | NEW | extra) & ACK
+    assert not bench.control(ENABLE) & ACK

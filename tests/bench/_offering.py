@@ -15,15 +15,18 @@ def fill(container: Any, name: str) -> None:
         container.register(kind(), f"robot.{name}.p{number}")
 
 
-def kind_of_arm() -> type:
-    """Services as a robot has them: three numbers in, one out, a line of description; and one that stops."""
+def kind_of_arm(services: int = SERVICES, *, stops: bool = True) -> type:
+    """Services as a robot has them: three numbers in, one out, a line of description; the last one may stop."""
     from trade import service
 
     def halt(self) -> None:
         """Stop."""
 
-    methods = {f"move_{number}": _method(f"move_{number}") for number in range(SERVICES - 1)}
-    return type("Arm", (), {**methods, "move_9": service(effect="stop")(_named(halt, "move_9"))})
+    methods = {f"move_{number}": _method(f"move_{number}") for number in range(services)}
+    if stops:
+        last = f"move_{services - 1}"
+        methods[last] = service(effect="stop")(_named(halt, last))
+    return type("Arm", (), methods)
 
 
 def _method(name: str) -> Any:

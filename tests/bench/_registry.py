@@ -16,6 +16,7 @@ from typing import Final
 import psutil
 from tests.bench._alone import alone
 from tests.bench._children import child, hear
+from tests.bench._offering import kind_of_arm
 from tests.bench._places import own_folder
 from tests.bench._report import keep_point, print_target
 
@@ -101,7 +102,7 @@ def _print_targets(joiners: Sequence[Seen], kib: Sequence[float], of: str) -> No
 def _serve(pipe: Connection, providers: int, services: int) -> None:
     from trade import Container, Settings
 
-    kind = _kind(services)
+    kind = kind_of_arm(services, stops=False)
     with Container(Settings.read(container=_SERVER, system=_SYSTEM)) as container:
         began = time.perf_counter()
         for i in range(providers):
@@ -111,22 +112,6 @@ def _serve(pipe: Connection, providers: int, services: int) -> None:
             pipe.recv()
         except EOFError:  # the run is over
             return
-
-
-def _kind(services: int) -> type:
-    """A class with so many services as a robot has them: three numbers in, one out, a line of description."""
-    return type("Arm", (), {f"move_{i}": _method(f"move_{i}") for i in range(services)})
-
-
-def _method(name: str):
-    from trade import service
-
-    def move(self, shoulder_rad: float, elbow_rad: float, speed_rad_s: float) -> float:
-        """Move both joints; gives the time it takes, in seconds."""
-        return 0.0
-
-    move.__name__ = move.__qualname__ = name
-    return service(move)
 
 
 # --- the late joiner

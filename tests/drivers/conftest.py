@@ -12,6 +12,7 @@ import pytest
 from drivers.gate import Gate
 from robots import HEAD
 from trade._context import CallContext, running
+from trade.errors import DeviceSilent
 from trade_drivers import AttachedRobot, Robot, attach, parse
 from trade_hil_sim import DynamixelBus, Entry, Servo, events, motion_writes, writes
 from waiting import PATIENCE_S, wait_until
@@ -159,3 +160,11 @@ def goal_counts(entry: Entry) -> int:
 def written_now() -> float:
     """A mark in the log's time."""
     return time.monotonic()
+
+
+def is_silent(robot: AttachedRobot, joint: str) -> bool:
+    try:
+        robot.motor(joint).state()
+    except DeviceSilent:
+        return True
+    return False

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from robots import HAND
+from trade.errors import DeviceError
 from trade_drivers import AttachedRobot, Gripper, Robot, attach, parse
 from trade_hil_sim import Entry, GripperTruth, RobotiqBus, events, motion_writes, writes
 from waiting import wait_until
@@ -71,6 +72,10 @@ class HandRig:
     def truth(self) -> GripperTruth:
         return self.sim.state().grippers[0]
 
+    def under_way(self) -> None:
+        """Wait until the fingers have left their open end."""
+        wait_until(lambda: self.truth.moving and self.truth.width_m < 0.083, "it is under way")
+
 
 @contextmanager
 def made_rig(tmp_path: Path) -> Iterator[HandRig]:
@@ -83,3 +88,12 @@ def _close(robot: AttachedRobot) -> None:
         robot.close()
     except Exception as error:  # noqa: BLE001 - what closing says is tested where it matters
         print(f"closing: {error}")
+
+
+def silent(gripper: Gripper) -> bool:
+    """Whether it does not say how it is."""
+    try:
+        gripper.state()
+    except DeviceError:
+        return True
+    return False

@@ -38,7 +38,7 @@ def state(gripper: Gripper) -> GripperState | None:
 def closing(hand: HandRig, gripper: Gripper) -> Outcome:
     """A slow move that has begun."""
     moving = Outcome(lambda: gripper.close(SLOW_M_S))
-    wait_until(lambda: hand.truth.moving and hand.truth.width_m < 0.083, "it is under way")
+    hand.under_way()
     return moving
 
 

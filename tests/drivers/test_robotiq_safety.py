@@ -5,7 +5,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -13,13 +12,12 @@ import pytest
 
 from drivers.conftest import Outcome, call, sleep_past, written_now
 from drivers.gate import Gate
-from drivers.gripper_rig import HandRig, made_rig
+from drivers.gripper_rig import HandRig, made_rig, silent
 from robots import HAND
 from trade import Container, Handle, where
 from trade.errors import (
     DeadlineExceeded,
     DeviceError,
-    DeviceFault,
     DeviceSilent,
     InvalidArgument,
     LimitExceeded,
@@ -30,7 +28,7 @@ from trade.errors import (
     Stopped,
 )
 from trade_drivers import Gripper
-from trade_hil_sim import BrownOut, Heal, Mute, Put, Replug, RobotiqBus, Unplug, events, instructions, received
+from trade_hil_sim import Heal, Mute, Put, instructions, received
 from waiting import wait_until
 
 SLOW_M_S = 0.02
@@ -46,10 +44,6 @@ def rig(tmp_path: Path) -> Iterator[HandRig]:
 def hand(rig: HandRig) -> HandRig:
     rig.plug()
     return rig
-
-
-def under_way(hand: HandRig) -> None:
-    wait_until(lambda: hand.truth.moving and hand.truth.width_m < 0.083, "it is under way")
 
 
 # --- S01
@@ -129,14 +123,14 @@ def test_S06_that_a_2F85_has_no_watchdog_is_in_the_documentation() -> None:
 def test_S06_an_unhealthy_process_stops_the_fingers_once_and_falls_silent(hand: HandRig, gate: Gate) -> None:
     gripper = hand.active(healthy=gate)
     moving = Outcome(lambda: gripper.close(SLOW_M_S))
-    under_way(hand)
+    hand.under_way()
     mark = written_now()
     gate.says = False
     assert moving.wait().error is not None
     wait_until(lambda: not hand.truth.moving, "it stands")
     [stop] = [entry for entry in hand.writes(mark) if not entry.moves]
     assert hand.truth.width_m > 0.03
-    wait_until(lambda: _silent(gripper), "what was measured is too old")
+    wait_until(lambda: silent(gripper), "what was measured is too old")
     assert not received(hand.log, since=stop.t + 0.1)
     for act in (gripper.close, gripper.activate, gripper.state):
         with pytest.raises(DeviceError, match="not healthy"):
@@ -148,7 +142,7 @@ def test_S06_a_defect_in_the_bus_thread_is_silence_and_an_error_for_everybody(
 ) -> None:
     gripper = hand.active()
     moving = Outcome(lambda: gripper.close(SLOW_M_S))
-    under_way(hand)
+    hand.under_way()
 
     def defect(_: object) -> None:
         raise RuntimeError("a defect")
@@ -166,7 +160,7 @@ def test_S06_a_defect_in_the_bus_thread_is_silence_and_an_error_for_everybody(
 def test_S07_a_stop_is_the_first_thing_on_a_bus_that_was_held_up(hand: HandRig, gate: Gate) -> None:
     gripper = hand.active(healthy=gate)
     moving = Outcome(lambda: gripper.close(SLOW_M_S))
-    under_way(hand)
+    hand.under_way()
     gate.hold_up()
     mark = written_now()
     stop = Outcome(gripper.stop)
@@ -211,7 +205,7 @@ def test_S08_a_stop_ends_activation_and_leaves_it_not_activated(hand: HandRig) -
 def test_S08_a_stop_that_is_not_answered_is_written_again_until_it_is_heard(hand: HandRig) -> None:
     gripper = hand.active()
     moving = Outcome(lambda: gripper.close(SLOW_M_S))
-    under_way(hand)
+    hand.under_way()
     hand.sim.do(Mute(instruction="read_write", count=1))
     gripper.stop()
     assert isinstance(moving.wait().error, MotionStopped)
@@ -222,7 +216,7 @@ def test_S08_a_stop_that_is_not_answered_is_written_again_until_it_is_heard(hand
 def test_S08_a_stop_of_a_silent_gripper_is_sent_blind_and_cannot_activate_it(hand: HandRig) -> None:
     gripper = hand.active()
     moving = Outcome(lambda: gripper.close(SLOW_M_S))
-    under_way(hand)
+    hand.under_way()
     hand.sim.do(Mute())
     assert isinstance(moving.wait().error, DeviceSilent)
     wait_until(lambda: not hand.truth.moving, "it stands")
@@ -304,7 +298,7 @@ def test_S08_a_foreign_stop_holds_until_somebody_resumes(
     hand: HandRig, gripper: Gripper, planner: Container, operator: Container
 ) -> None:
     run = service(planner, "close").start(SLOW_M_S)
-    under_way(hand)
+    hand.under_way()
     service(operator, "stop")()
     with pytest.raises(MotionStopped):
         run.result()
@@ -321,7 +315,7 @@ def test_S05_a_move_ends_with_its_session_and_what_is_held_stays_held(
     hand: HandRig, gripper: Gripper, planner: Container, operator: Container
 ) -> None:
     service(planner, "close").start(SLOW_M_S)
-    under_way(hand)
+    hand.under_way()
     planner.close()
     wait_until(lambda: not hand.truth.moving, "it stands")
     assert hand.truth.width_m > 0.03
@@ -333,102 +327,6 @@ def test_S05_a_move_ends_with_its_session_and_what_is_held_stays_held(
     wait_until(lambda: gripper.state().measured_at > first.measured_at + 0.3, "it had time")
     assert not hand.writes(mark)
     assert hand.truth.holding
-
-
-# --- S18, S19
-
-
-def tell(bus: RobotiqBus, *values: int) -> None:
-    """What somebody else wrote before."""
-    bus.devices[0].write(0x03E8, values, time.monotonic())
-    bus._line.nudge()
-
-
-def test_S18_attaching_to_a_gripper_at_rest_writes_nothing(hand: HandRig) -> None:
-    gripper = hand.gripper()
-    assert not gripper.state().activated
-    assert not hand.writes()
-
-
-def test_S18_attaching_to_a_gripper_that_holds_something_leaves_it_so(hand: HandRig) -> None:
-    hand.sim.do(Put(width_m=0.04))
-    tell(hand.sim, 0x0100, 0, 0)
-    hand.wait_for("activated")
-    tell(hand.sim, 0x0900, 255, 0xFFFF)
-    wait_until(lambda: hand.truth.holding, "it holds")
-    assert hand.gripper().state().holding == "outside"
-    assert not hand.writes()
-
-
-def test_S18_a_gripper_found_moving_is_stopped(hand: HandRig) -> None:
-    tell(hand.sim, 0x0100, 0, 0)
-    hand.wait_for("activated")
-    tell(hand.sim, 0x0900, 255, 0x00FF)
-    under_way(hand)
-    hand.gripper()
-    wait_until(lambda: not hand.truth.moving, "it stands")
-    assert not hand.moves()
-    assert hand.truth.activated
-    assert hand.truth.width_m > 0.02
-
-
-def test_S18_a_gripper_found_activating_is_stopped(hand: HandRig) -> None:
-    tell(hand.sim, 0x0100, 0, 0)
-    wait_until(lambda: hand.truth.moving, "its fingers move")
-    hand.gripper()
-    wait_until(lambda: not hand.truth.moving, "it stands")
-    assert not hand.moves()
-    assert not hand.truth.activated
-
-
-@pytest.mark.parametrize("what", ["attach", "brown-out", "replug", "silence"])
-def test_S19_nothing_but_activate_ever_activates(hand: HandRig, what: str) -> None:
-    gripper = hand.gripper() if what == "attach" else hand.active()
-    mark = written_now()
-    match what:
-        case "brown-out":
-            hand.sim.do(BrownOut())
-        case "replug":
-            hand.sim.do(Unplug())
-            hand.sim.do(BrownOut())
-            hand.sim.do(Replug())
-        case "silence":
-            hand.sim.do(Mute())
-            hand.sim.do(BrownOut())
-            wait_until(lambda: _silent(gripper), "it is silent")
-            hand.sim.do(Heal())
-        case _:
-            pass
-    wait_until(lambda: not _silent(gripper) and not gripper.state().activated, "it is back")
-    gripper.stop()
-    for act in (gripper.close, gripper.open, lambda: gripper.move_to(0.04)):
-        with pytest.raises(DeviceFault, match=r"call activate\(\): it moves the fingers"):
-            act()
-    assert not hand.moves(mark)
-    assert gripper.activate().activated
-    assert events(hand.log, "activating", since=mark)
-
-
-def _silent(gripper: Gripper) -> bool:
-    try:
-        gripper.state()
-    except DeviceError:
-        return True
-    return False
-
-
-def test_S19_a_brown_out_in_the_middle_of_a_move_ends_it_and_its_stop_does_not_activate(hand: HandRig) -> None:
-    gripper = hand.active()
-    moving = Outcome(lambda: gripper.close(SLOW_M_S))
-    under_way(hand)
-    mark = written_now()
-    hand.sim.do(BrownOut())
-    assert isinstance(moving.wait().error, DeviceFault)
-    assert "lost its activation" in str(moving.error)
-    first = gripper.state()
-    wait_until(lambda: gripper.state().measured_at > first.measured_at + 0.2, "it had time")
-    assert not hand.moves(mark)
-    assert not events(hand.log, "activating", since=mark)
 
 
 # --- S22

@@ -10,9 +10,9 @@ from http.client import HTTPConnection
 from pathlib import Path
 
 import pytest
-from tests.trade.test_locking import Robot
 
 from doors import Axis, Opened, opened
+from jointed import Robot
 from trade import Handle, service, where
 from trade.testing import memory_system
 from waiting import wait_until

@@ -10,9 +10,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis.errors import Unsatisfiable
 from msgspec import Meta, Struct
-from tests.trade.test_locking import Robot
 
 from doors import Opened, opened
+from jointed import Robot
 from trade import service
 from trade.testing import memory_system
 

@@ -12,11 +12,11 @@ from urllib.parse import urlsplit
 
 import msgspec
 import pytest
-from tests.trade.test_locking import Robot
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
 from doors import Axis, Client, Opened, ask, heard, opened, say
+from jointed import Robot
 from trade import progress, service
 from trade._memory._network import Passage
 from trade._wire import decode_call

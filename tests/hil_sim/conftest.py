@@ -9,6 +9,7 @@ from typing import Any
 import dynamixel_sdk
 import pytest
 
+from drive_bench import Bench
 from robots import HEAD_AND_ARM
 from trade_hil_sim import DynamixelBus, Servo
 
@@ -85,3 +86,9 @@ def robot_file(tmp_path: Path) -> Path:
     path = tmp_path / "rosie.toml"
     path.write_text(HEAD_AND_ARM)
     return path
+
+
+@pytest.fixture
+def bench() -> Bench:
+    """A drive at rest, without power."""
+    return Bench()

@@ -12,11 +12,6 @@ START, STOP, PRE_OP, RESET, RESET_COMM = "01", "02", "80", "81", "82"
 
 
 @pytest.fixture
-def bench() -> Bench:
-    return Bench()
-
-
-@pytest.fixture
 def running(bench: Bench) -> Bench:
     """In OPERATIONAL; what it said so far is forgotten."""
     bench.hear(0, "0105")

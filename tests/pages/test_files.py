@@ -85,6 +85,7 @@ def test_a_lexicon(tmp_path: Path, text: str) -> None:
 def test_a_policy(tmp_path: Path, text: str) -> None:
     policy = read_policy(save(tmp_path, "policy.toml", text))
     assert policy.decide("planner", "call", "rosie.neck").allowed
+    assert policy.decide("rosie", "register", "rosie").allowed  # who brings her up has that identity
     assert not policy.decide("dash-1", "call", "rosie.neck").allowed
 
 

@@ -8,9 +8,7 @@ are compared. `kill %1` ends the first of those.
 import os
 import re
 import shutil
-import signal
 import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -20,90 +18,42 @@ import psutil
 import pytest
 
 from system.conftest import ROOT
-from system.terminals import end_all_but, normalised
-from waiting import PATIENCE_S
+from system.terminals import Shell, end_all_but, normalised
 
 PAGES: Final = sorted((ROOT / "docs" / "tutorials").glob("*.md"))
 _TYPED: Final = r"console\n(?P<typed>.*?)"
 _SAVED: Final = r'\w+ title="(?P<name>[\w.]+)"\n(?P<text>.*?)'
 _BLOCK: Final = re.compile(rf"^```(?:{_TYPED}|{_SAVED})^```$", re.MULTILINE | re.DOTALL)
 _COMMAND: Final = re.compile(r"^\$ (.*)\n((?:(?!\$ ).*\n)*)", re.MULTILINE)
-_LAST: Final = re.compile(r"Ctrl-C leaves|\"ready\":true|: up$|holding|listening")
+_LAST: Final = r"Ctrl-C leaves|\"ready\":true|: up$|holding|listening"
 """What background programs of the tutorials say last before they wait."""
 
 
 class Terminal:
-    """A shell in a folder of its own."""
+    """A shell, and what is typed into it as the page has it."""
 
-    def __init__(self, folder: Path, undo: ExitStack) -> None:
-        self._folder, self._undo = folder, undo
-        path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
-        self._environment = {
-            **os.environ,
-            "PATH": path,
-            "COLUMNS": "180",
-            "TRADE_SYSTEM": "home",
-            "PYTHONUNBUFFERED": "1",
-        }
+    def __init__(self, shell: Shell) -> None:
+        self._shell = shell
         self._jobs: list[subprocess.Popen[str]] = []
 
     def save(self, name: str, text: str) -> None:
-        (self._folder / name).write_text(text, encoding="utf-8")
+        (self._shell.folder / name).write_text(text, encoding="utf-8")
 
     def type(self, command: str) -> str:
         """What a command says, errors too; what differs from run to run in words."""
         if job := re.fullmatch(r"kill %(\d)", command):
-            self._end(self._jobs[int(job[1]) - 1])
+            self._shell.end(self._jobs[int(job[1]) - 1])
             said = ""
         elif command.endswith(" &"):
-            said = self._begin(command[:-2])
+            self._jobs.append(self._shell.start(command[:-2]))
+            said = self._shell.heard(self._jobs[-1], _LAST)
         else:
-            said = self._run(command)
-        said = said.replace(str(self._folder), "/home/you")
+            _, said = self._shell.run(command)
+        said = said.replace(str(self._shell.folder), "/home/you")
         said = re.sub(r"^\d\d:\d\d:\d\d ", "", said, flags=re.MULTILINE)
         said = re.sub(r"since \d\d:\d\d:\d\d", "since TIME", said)
         said = re.sub(r"e-stop [0-9a-f]{8}|--clear [0-9a-f]{8}", lambda found: f"{found[0].rsplit(' ', 1)[0]} ID", said)
         return normalised(said, numbers="status" not in command) if said else ""
-
-    def _run(self, command: str) -> str:
-        return subprocess.run(
-            ["bash", "-c", command],
-            cwd=self._folder,
-            env=self._environment,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            timeout=PATIENCE_S,
-            check=False,
-        ).stdout
-
-    def _begin(self, command: str) -> str:
-        process = subprocess.Popen(
-            ["bash", "-c", f"exec {command}"],
-            cwd=self._folder,
-            env=self._environment,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            bufsize=1,
-        )
-        self._jobs.append(process)
-        self._undo.callback(self._end, process)
-        said = ""
-        assert process.stdout is not None
-        while not _LAST.search(said):
-            line = process.stdout.readline()
-            assert line, f"{command} has ended: {said}"
-            said += line
-        return said
-
-    @staticmethod
-    def _end(process: "subprocess.Popen[str]") -> None:
-        if process.poll() is None:
-            process.send_signal(signal.SIGINT)
-            process.communicate(timeout=PATIENCE_S)
 
 
 @pytest.fixture
@@ -111,7 +61,7 @@ def terminal(system: str, tmp_path: Path) -> Iterator[Terminal]:
     shutil.copytree(ROOT / "examples", tmp_path / "examples", ignore=shutil.ignore_patterns("__pycache__"))
     with ExitStack() as undo:
         undo.callback(end_all_but, set(psutil.pids()))
-        yield Terminal(tmp_path, undo)
+        yield Terminal(Shell(tmp_path, undo, COLUMNS="180", TRADE_SYSTEM="home"))
 
 
 @pytest.mark.timeout(300)

@@ -15,13 +15,18 @@ from typing import Any
 import hypothesis
 import pytest
 
+from jointed import Robot
+from lamps import Lamp, Pair, found
+from listening import Battery, Two
 from migrants import Scene, migration_scene
+from ruled import Desk, Engine
 from trade import Container, Handle, service, where
 from trade._credentials import user_secret
 from trade._endpoints import free_endpoint
 from trade._rendezvous import Rendezvous
 from trade._wire import ALIVE, alive_key
 from trade._zenoh import ZenohTransport, configuration
+from trade.testing import MemorySystem, memory_system
 
 hypothesis.settings.register_profile("deterministic", deadline=None, derandomize=True, max_examples=60)
 hypothesis.settings.load_profile("deterministic")
@@ -203,3 +208,75 @@ def open_raw(system: str) -> Iterator[OpenRaw]:
             return transport
 
         yield start
+
+
+@pytest.fixture(params=["zenoh", "memory", "one container"])
+def two(request: pytest.FixtureRequest, start_container: Callable[..., Container]) -> Iterator[Two]:
+    battery = Battery()
+    if request.param == "memory":
+        with memory_system() as system:
+            two = Two(system.container("here"), system.container("there"), battery)
+            two.there.register(battery, "rosie")
+            yield two
+        return
+    here = start_container("here")
+    there = here if request.param == "one container" else start_container("there")
+    there.register(battery, "rosie")
+    yield Two(here, there, battery)
+
+
+@pytest.fixture
+def memory() -> Iterator[MemorySystem]:
+    with memory_system() as system:
+        yield system
+
+
+@pytest.fixture
+def apart(memory: MemorySystem) -> Two:
+    """Two containers in memory."""
+    battery = Battery()
+    memory.container("there").register(battery, "rosie")
+    return Two(memory.container("here"), memory.container("there"), battery)
+
+
+@pytest.fixture
+def robot() -> Iterator[Robot]:
+    with memory_system() as system:
+        made = Robot(system)
+        yield made
+        for joint in made.joints.values():
+            joint.hold.set()
+
+
+@pytest.fixture
+def lamp() -> Lamp:
+    return Lamp()
+
+
+@pytest.fixture
+def pair(lamp: Lamp) -> Pair:
+    """A caller, a callee, and the caller's handle of the callee's lamp, called once."""
+
+    def start(system: MemorySystem) -> tuple[Container, Container, Handle]:
+        caller, callee = system.container("caller"), system.container("callee")
+        callee.register(lamp, "robot")
+        handle = found(caller)
+        handle(0.0)
+        return caller, callee, handle
+
+    return start
+
+
+@pytest.fixture
+def desk(here: Container) -> Desk:
+    desk = Desk()
+    here.register(desk, "desk")
+    return desk
+
+
+@pytest.fixture
+def engine(here: Container, tmp_path: Path) -> Iterator[Engine]:
+    made = Engine(here, tmp_path)
+    yield made
+    if made.running is not None:
+        made.running.close()

@@ -4,8 +4,8 @@ import threading
 from collections.abc import Callable, Iterator
 
 import pytest
-from tests.trade.test_locking import Joint, Robot
 
+from jointed import Joint, Robot
 from trade import Container, Handle, where
 from trade.errors import ConfigurationError, LockedByOther, LockLost, SessionEnded, Stopped
 from trade.testing import MemorySystem, memory_system

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import pytest
 from msgspec import Struct
-from tests.trade.test_locking import Joint
 
+from jointed import Joint
 from trade import Container, Handle, Settings, progress, service, where
 from trade._memory import MemoryTransport
 from trade._session import foreign

@@ -5,8 +5,9 @@ from typing import Any
 
 import hypothesis
 import pytest
+import zenoh
 
-from ros2_peers import DEFINITIONS, Process, Router, closing_all, free_port
+from ros2_peers import DEFINITIONS, Process, Router, closing_all, free_port, raw_session
 from trade_gateway.ros.ros2 import Ros2
 from waiting import wait_until
 
@@ -74,3 +75,15 @@ def graph(router: Router, open_graph: Callable[..., Ros2]) -> Ros2:
     ours = open_graph(router)
     wait_until(lambda: not ours.healthy, "our graph has found the router")
     return ours
+
+
+@pytest.fixture
+def raw(router: Router) -> Iterator[zenoh.Session]:
+    with raw_session(router) as session:
+        yield session
+
+
+@pytest.fixture
+def other(router: Router, open_graph: Callable[..., Ros2]) -> Ros2:
+    """Ours, once more."""
+    return open_graph(router, node="/client")
