@@ -3,6 +3,7 @@
 import os
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from multiprocessing.connection import Connection
 
 from tests.bench._children import _requests
@@ -64,9 +65,17 @@ def busy_with(robot: Robot, attached: AttachedRobot) -> Callable[[float], object
         names = [joint.name for joint in arm.limits().joints]
         return lambda seconds: _follow(arm, names, arm.state().positions_rad, seconds)
     group = attached.group(GROUP)
+    motors = [attached.motor(joint) for one in robot.groups for joint in one.joints]
+
+    def enable() -> None:
+        for motor in motors:  # each with a deadline of its own: some wait for their watchdog the first time
+            motor.enable()
+
+    with suppress(TradeError):
+        enable()
 
     def follow(seconds: float) -> None:
-        group.enable()
+        enable()
         _follow(group, group.joints(), [state.position_rad for state in group.state()], seconds)
 
     return follow
