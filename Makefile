@@ -40,8 +40,8 @@ test: $(UV) ## the whole test suite; in parts; the others run also when one fail
 	part -n 2 --dist loadfile --ignore tests/drivers --ignore tests/complaints --ignore tests/system --ignore tests/bench --ignore tests/chaos --ignore tests/soak --ignore tests/browser --ignore tests/peers; \
 	part -n 2 --dist loadfile tests/system tests/bench tests/chaos tests/soak --ignore tests/system/test_demo.py; \
 	part -n 2 --dist loadfile tests/drivers tests/complaints; \
-	part -n 2 --dist loadfile tests/browser tests/peers; \
-	part tests/system/test_demo.py; \
+	part -n 2 --dist loadfile tests/browser tests/peers/test_conformance.py; \
+	part tests/peers/test_rust.py tests/system/test_demo.py; \
 	test -z "$$failed"
 
 test-socketcan: $(UV) ## the CAN suites on kernel interfaces; where the kernel has none, inside User-Mode Linux

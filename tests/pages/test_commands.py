@@ -38,7 +38,7 @@ TYPED_ELSEWHERE: Final = {
 NOT_TYPED: Final = {
     Section("guide.md", "Several networks"): "settings, not commands, for a host in two networks",
     Section("deployment.md", "Updating"): "takes root, systemd and a newer version",
-    Section("deployment.md", "Real time"): "takes the right to real time, and would take the processor from the other tests",
+    Section("deployment.md", "Real time"): "takes a right, and the processor from all other tests",
     Section("deployment.md", "In a container"): "takes podman or docker: tests/test_container.py, where there is one",
 }
 
