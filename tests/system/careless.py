@@ -28,7 +28,7 @@ STEP = 8
 _FREELY = 0.2
 _WAITS_S = (0.0, 0.3, 2.0)
 _SPEEDS_RAD_S = (0.05, 0.05, 0.05, 0.5, 2.0)
-_DEADLINES_S = (0.5, 5.0, 30.0, 30.0)
+_DEADLINES_S = (0.4, 0.5, 5.0, 30.0, 30.0)
 _IN_THE_END_S = 25.0
 _FAULTS = {
     name

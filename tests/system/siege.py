@@ -342,7 +342,7 @@ class Stand:
 
     def delay(self) -> Callable[[], None]:
         """What clients say is held back, what they are told, or both."""
-        most_s = self._dice.choice((0.3, 0.8, 1.5))
+        most_s = self._dice.choice((0.5, 1.0, 1.5))
         up, down = self._dice.choice([(most_s, 0.0), (0.0, most_s), (most_s, most_s)])
         self._slow(up, down)
         return self._noted("delay", "net2", lambda: self._slow(0.0, 0.0))
