@@ -15,8 +15,10 @@ SEED ?= 1
 MINUTES ?= 3
 HOURS ?= 1
 MUTANT ?=
+MINIMISE ?=
 
-.PHONY: demo screenshots docs release-check test test-socketcan soak soak-registry soak-relocation chaos chaos-robots siege
+.PHONY: demo screenshots docs release-check test test-socketcan soak soak-registry soak-relocation
+.PHONY: chaos chaos-locks chaos-robots siege
 .PHONY: fuzz check audit-deps sbom bench bench-compare bench-page clean
 .DEFAULT_GOAL := help
 
@@ -47,11 +49,17 @@ test: $(UV) ## the whole test suite; in parts; the others run also when one fail
 test-socketcan: $(UV) ## the CAN suites on kernel interfaces; where the kernel has none, inside User-Mode Linux
 	@$(RUN) tests/socketcan/run pytest tests/socketcan $(ARGS)
 
-chaos: $(UV) ## locks under kill -9, freezes, cuts and delays; 240 clients (SEED=.. MINUTES=..; exits 1 on a violation)
+chaos: chaos-locks siege ## the whole proof: the next two, one after the other (SEED=.. MINUTES=.. of each)
+
+chaos-locks: $(UV) ## locks under kill -9, freezes, cuts and delays; 240 clients (SEED=.. MINUTES=..; exits 1 on a violation)
 	@$(RUN) python -m tests.chaos --seed $(SEED) --minutes $(MINUTES) --clients 8 --threads 30 --drivers 3 $(ARGS)
 
-siege: $(UV) ## two robots, a gateway and planners under every trouble (SEED=.. MINUTES=.. MUTANT=..; root, iproute2)
-	@SIEGE_MINUTES=$(MINUTES) SIEGE_MUTANT=$(MUTANT) SEED=$(SEED) $(RUN) pytest -s tests/system/test_siege.py -p no:again $(ARGS)
+siege: export SIEGE_MINUTES := $(MINUTES)
+siege: export SIEGE_MUTANT := $(MUTANT)
+siege: export SEED := $(SEED)
+siege: $(UV) ## robots, gateway, door, clients under every trouble (SEED=.. MINUTES=.. MUTANT=.. MINIMISE=1; root, iproute2)
+	@$(RUN) pytest -s -n 0 tests/system/test_siege.py -p no:again $(ARGS) || { \
+	  test -z "$(MINIMISE)" || PYTHONPATH=tests:. $(RUN) python -m system.siege_minimised; exit 1; }
 
 chaos-robots: $(UV) ## a lock over two robots while a driver is killed and started again, 50 times
 	@CHAOS_ROUNDS=50 $(RUN) pytest tests/system/test_two_robots.py $(ARGS)

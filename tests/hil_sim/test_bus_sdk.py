@@ -58,6 +58,16 @@ def test_a_move_is_seen_by_client_and_log(sdk: SimpleNamespace, bus: DynamixelBu
     assert (end.device_id, end.position_counts) == (1, 2200)
 
 
+def test_the_log_says_where_a_servo_is_as_it_is_told_to_move(sdk: SimpleNamespace, bus: DynamixelBus) -> None:
+    assert sdk.ph.write1ByteTxRx(sdk.port, 1, TORQUE, 1) == OK
+    for goal in (2200, 2100):
+        assert sdk.ph.write4ByteTxRx(sdk.port, 1, GOAL, goal) == OK
+        wait_until(lambda: sdk.ph.read1ByteTxRx(sdk.port, 1, 122)[0] == 0, "the end of the motion")
+    told = motion_writes(bus.log.entries, device_id=1)
+    assert [entry.position_counts for entry in told] == [2048, 2048, 2200]
+    assert len({entry.joint for entry in told}) == 1
+
+
 def test_reg_write_and_action(sdk: SimpleNamespace, bus: DynamixelBus) -> None:
     assert sdk.ph.regWriteTxRx(sdk.port, 2, GOAL, 4, [0, 9, 0, 0]) == OK
     assert sdk.ph.read4ByteTxRx(sdk.port, 2, GOAL) == (2048, *OK)

@@ -1,4 +1,7 @@
-"""The siege: two simulated robots on one host, a gateway on another, planners on two more, and all their troubles."""
+"""The siege: two simulated robots on one host, a gateway on another, clients on two more, and all their troubles.
+
+Clients are containers, a dashboard's page and an agent; they reach the gateway through `slow_wire`.
+"""
 
 import json
 import os
@@ -9,7 +12,7 @@ import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Final
@@ -18,14 +21,33 @@ from unittest import mock
 import psutil
 from tests.holds import Log
 
+from system import wall_clock
 from system.networks import Member, Networks, ip
 from system.siege_records import Fault
 from system.sites import DOOR, SYSTEM, Site
+from trade_gateway.door import add_token
 from trade_hil_sim import SimProcess
 
-_SCRIPT: Final = Path(__file__).with_name("planner.py")
-_BROKEN: Final = Path(__file__).with_name("broken_driver.py")
-_PLANNERS: Final = 4
+_HERE: Final = Path(__file__).parent
+_KINDS: Final = ("planner", "planner", "planner", "planner", "page", "agent")
+"""Of clients, by slot."""
+_SCRIPTS: Final = {
+    "planner": _HERE / "planner.py",
+    "page": _HERE / "outsiders.py",
+    "agent": _HERE / "outsiders.py",
+}
+_WIRE: Final = "10.231.2.1:7451"
+_HALL: Final = "127.0.0.1:7480"
+"""Where pages come in, on their own host."""
+_DISK_BYTES: Final = 4 << 20
+_JUMPS_S: Final = (-36_000.0, -5.0, 5.0, 36_000.0)
+_LONG_S: Final = 60.0
+"""Of a siege: one in which there is time to come to rest between troubles."""
+_WHO: Final = [
+    *(f"{kind}{slot}" for slot, kind in enumerate(_KINDS)),
+    "hall",
+    "anna",
+]
 _POLICY: Final = f"""
 gateways = ["door"]
 
@@ -40,7 +62,7 @@ lock = ["rosie", "dora"]
 [identities]
 rosie = ["driver"]
 dora = ["driver"]
-{"".join(f'planner{slot} = ["operator"]' + chr(10) for slot in range(_PLANNERS))}"""
+{"".join(f'{who} = ["operator"]' + chr(10) for who in _WHO)}"""
 _JOINT: Final = """
 [joint."{name}"]
 bus = "{bus}"
@@ -61,24 +83,28 @@ def _robot_file(robot: str) -> str:
     )
 
 
-class Driver:
-    """A robot's simulated servos, and beside them its driver, which may be killed and started again."""
+class Kept:
+    """A process on a host that is started again whenever it does not run: it is killed, or ends by itself.
 
-    def __init__(self, site: Site, robot: str, mutant: str = "") -> None:
-        self.robot = robot
-        self.program = [str(_BROKEN), mutant] if mutant else ["-m", "trade_gateway"]
-        """What is run when it is started the next time."""
-        self._site = site
-        file = site.folder / f"{robot}.toml"
-        file.write_text(_robot_file(robot))
-        self.sim = SimProcess(file)
-        text = file.read_text()
-        for port in self.sim.ports.values():
-            text = text.replace("/dev/ttyNOWHERE", port)
-        file.write_text(text)
-        self._file = file
-        self._complaints = (site.folder / f"{robot}.complaints").open("ab")
-        self._papers = site.papers.of(robot)
+    Args:
+        site: of which host.
+        host: its name there.
+        identity: whose certificate it has.
+        connect: where it finds the others.
+        command: what is run, for Python.
+    """
+
+    def __init__(self, site: Site, host: str, identity: str, connect: str, command: Sequence[str]) -> None:
+        self._command = ["ip", "netns", "exec", site.networks.host(host), sys.executable, *command]
+        self._settings = {
+            "TRADE_SYSTEM": SYSTEM,
+            "TRADE_TLS": str(site.papers.of(identity)),
+            "TRADE_POLICY": str(site.folder / "kept.toml"),
+            "TRADE_CONNECT": connect,
+            "TRADE_RUNTIME_DIR": str(site.folder / "runtime" / identity),
+            "TRADE_STATE_DIR": str(site.folder / "disk" / identity),
+        }
+        self._complaints = (site.folder / f"{identity}.complaints").open("ab")
         self._process: subprocess.Popen[bytes] | None = None
         self._closed = threading.Event()
         self._keeper = threading.Thread(target=self._keep)
@@ -94,29 +120,14 @@ class Driver:
         return self._process is not None and self._process.poll() is None
 
     def _keep(self) -> None:
-        """Start it whenever it does not run: it is killed, and ends by itself while its bus is unplugged."""
         while not self._closed.wait(0.5):
             if self._process is None or self._process.poll() is not None:
-                self._begin()
-
-    def _begin(self) -> None:
-        settings = {
-            "TRADE_SYSTEM": SYSTEM,
-            "TRADE_TLS": str(self._papers),
-            "TRADE_POLICY": str(self._site.folder / "kept.toml"),
-            "TRADE_CONNECT": DOOR["private"],
-            "TRADE_RUNTIME_DIR": str(self._site.folder / "runtime" / "left"),
-            "TRADE_STATE_DIR": str(self._site.folder / "state" / "left"),
-        }
-        self._process = subprocess.Popen(
-            [
-                *("ip", "netns", "exec", self._site.networks.host("left")),
-                *(sys.executable, *self.program, "up", str(self._file), "--json"),
-            ],
-            stdout=subprocess.DEVNULL,
-            stderr=self._complaints,
-            env={**os.environ, **settings},
-        )
+                self._process = subprocess.Popen(
+                    self._command,
+                    stdout=subprocess.DEVNULL,
+                    stderr=self._complaints,
+                    env={**os.environ, **self._settings},
+                )
 
     def close(self) -> None:
         self._closed.set()
@@ -124,69 +135,138 @@ class Driver:
         if self._process is not None:
             self._process.kill()
             self._process.wait(20)
-        self.sim.close()
         self._complaints.close()
+
+
+class Driver(Kept):
+    """A robot's simulated servos, and beside them its driver, whose wall clock can be shifted."""
+
+    def __init__(self, site: Site, robot: str, mutant: str = "") -> None:
+        self.robot = robot
+        self.clock = site.folder / f"{robot}.clock"
+        wall_clock.shift(self.clock, 0.0)
+        file = site.folder / f"{robot}.toml"
+        file.write_text(_robot_file(robot))
+        self.sim = SimProcess(file)
+        text = file.read_text()
+        for port in self.sim.ports.values():
+            text = text.replace("/dev/ttyNOWHERE", port)
+        file.write_text(text)
+        program = [str(_HERE / "broken_driver.py"), mutant] if mutant else ["-m", "trade_gateway"]
+        self._file = file
+        super().__init__(site, "left", robot, DOOR["private"], self._words(program))
+
+    def _words(self, program: Sequence[str]) -> list[str]:
+        return [str(_HERE / "wall_clock.py"), str(self.clock), *program, "up", str(self._file), "--json"]
+
+    def run_from_now_on(self, program: Sequence[str]) -> None:
+        """What is run when it is started the next time, for Python."""
+        self._command = [*self._command[: self._command.index(sys.executable) + 1], *self._words(program)]
+
+    def close(self) -> None:
+        super().close()
+        self.sim.close()
+
+
+class Disk:
+    """A small one in memory, at a folder."""
+
+    def __init__(self, folder: Path) -> None:
+        folder.mkdir()
+        self._folder = folder
+        size = f"size={_DISK_BYTES}"
+        subprocess.run(["mount", "-t", "tmpfs", "-o", size, "siege", str(folder)], check=True, timeout=20)
+
+    def fill(self) -> None:
+        with suppress(OSError), (self._folder / "full").open("wb", buffering=0) as file:  # it is, at some time
+            while file.write(bytes(1 << 12)):
+                pass
+
+    def free(self) -> None:
+        (self._folder / "full").unlink()
+
+    def close(self) -> None:
+        subprocess.run(["umount", "--lazy", str(self._folder)], check=True, timeout=20)
 
 
 class Stand:
     """All of it. Troubles come from one seed; each is noted with how long it lasted."""
 
-    def __init__(self, networks: Networks, folder: Path, seed: int, mutant: str) -> None:
+    def __init__(self, networks: Networks, folder: Path, disk: Disk, seed: int, mutant: str) -> None:
         self.records = folder / "records"
         self.records.mkdir()
         self._log = Log(self.records, "faults")
         self._dice = random.Random(seed)
         self._turns = Counter[int]()
+        self._disk = disk
         self.site = Site(networks, folder, _POLICY, private='["rosie", "dora"]')
         self._policy = folder / "kept.toml"
         self._policy.write_text(_POLICY)
+        self._wire = Member(networks.host("between"), "wire", _WIRE, folder / "runtime", script=_HERE / "slow_wire.py")
+        self._wire.ask(json.dumps({"connect": DOOR["public"].removeprefix("tls/")}))
         self.drivers = {robot: Driver(self.site, robot, mutant) for robot in _ROBOTS}
-        self.planners = {slot: self._planner(slot) for slot in range(_PLANNERS)}
+        tokens = folder / "tokens.toml"
+        self._token = add_token(tokens, "anna")
+        door = ["-m", "trade_gateway", "door", "--name", "hall", "--listen", _HALL, "--tokens", str(tokens), "--json"]
+        self._hall = Kept(self.site, "right", "hall", f"tls/{_WIRE}", door)
+        self.clients = {slot: self._client(slot) for slot in range(len(_KINDS))}
 
-    def _planner(self, slot: int) -> tuple[str, Member]:
+    def _client(self, slot: int) -> tuple[str, Member]:
         self._turns[slot] += 1
-        host = "right" if slot % 2 else "right2"
-        name = f"planner{slot}-{self._turns[slot]}"
-        member = self.site.launched(host, name, identity=f"planner{slot}", script=_SCRIPT, policy=self._policy)
+        kind = _KINDS[slot]
+        host = "right2" if kind == "planner" and slot % 2 == 0 else "right"
+        name = f"{kind}{slot}-{self._turns[slot]}"
+        member = self.site.launched(host, name, identity=f"{kind}{slot}", script=_SCRIPTS[kind], policy=self._policy)
         told = {
             "slot": slot,
             "seed": self._dice.randrange(2**32),
             "folder": str(self.records),
-            "connect": DOOR["public"],
+            "connect": f"tls/{_WIRE}",
+            "by": kind,
+            "url": f"http://{_HALL}",
+            "token": self._token,
         }
         member.tell(json.dumps(told))
         return name, member
 
     def restart(self, slot: int) -> None:
-        """Another planner in its place, which locks and moves."""
-        self.planners[slot][1].kill()
-        self.planners[slot] = self._planner(slot)
+        """Another client in its place, which locks and moves."""
+        self.clients[slot][1].kill()
+        self.clients[slot] = self._client(slot)
 
     # --- troubles
 
-    def siege(self, seconds: float, fewest: int) -> None:
-        """One trouble or two at a time, until that time is over and every kind was had so often; all is undone then."""
-        kinds = [self.kill_planner, self.freeze_planner, self.kill_driver, self.freeze_driver, self.unplug]
-        kinds += [self.kill_gateway, self.freeze_gateway, self.cut, self.one_way, self.change_policy]
-        done, until, bag = Counter[str](), time.monotonic() + seconds, list[Callable[[], Callable[[], None]]]()
-        while time.monotonic() < until or min(done[kind.__name__] for kind in kinds) < fewest:
+    def siege(self, seconds: float, fewest: int, kinds: Sequence[str]) -> None:
+        """A few troubles at a time, until that time is over and every kind was had so often; all is undone then.
+
+        A short one has more of them at once, and shorter rests.
+
+        Args:
+            seconds: that time.
+            fewest: so often.
+            kinds: of `TROUBLES`.
+        """
+        long = seconds >= _LONG_S
+        at_once, rest_s = ((1, 1, 2), 6.0) if long else ((1, 2, 2), 4.0)
+        done, until, bag = Counter[str](), time.monotonic() + seconds, list[str]()
+        while time.monotonic() < until or min(done[kind] for kind in kinds) < fewest:
             undo: list[Callable[[], None]] = []
-            for _ in range(self._dice.choice((1, 1, 2))):
+            for _ in range(self._dice.choice(at_once)):
                 if not bag:
                     bag = self._dice.sample(kinds, len(kinds))
                 kind = bag.pop()
-                done[kind.__name__] += 1
-                undo.append(kind())
+                done[kind] += 1
+                undo.append(TROUBLES[kind](self))
                 self._rest(0.3)
             self._rest(self._dice.choice((0.5, 3.0, 8.0)))
             for back in reversed(undo):
                 back()
-            self._rest(6.0)
+            self._rest(rest_s)
 
     def _rest(self, most_s: float) -> None:
         threading.Event().wait(self._dice.random() * most_s)
 
-    def _noted(self, what: str, whom: str, undo: Callable[[], None] | None) -> Callable[[], None]:
+    def _noted(self, what: str, whom: str, undo: Callable[[], object] | None) -> Callable[[], None]:
         """Note it as it begins and, if it ends, with that time instead."""
         began = time.monotonic()
         if undo is None:
@@ -199,17 +279,17 @@ class Stand:
 
         return back
 
-    def kill_planner(self) -> Callable[[], None]:
-        slot = self._dice.randrange(_PLANNERS)
-        name, member = self.planners[slot]
-        self._noted("kill planner", name, None)
+    def kill_client(self) -> Callable[[], None]:
+        slot = self._dice.randrange(len(_KINDS))
+        name, member = self.clients[slot]
+        self._noted("kill client", name, None)
         member.kill()
-        self.planners[slot] = self._planner(slot)
+        self.clients[slot] = self._client(slot)
         return _nothing
 
-    def freeze_planner(self) -> Callable[[], None]:
-        name, member = self.planners[self._dice.randrange(_PLANNERS)]
-        return self._noted("freeze planner", name, _frozen(member.pid))
+    def freeze_client(self) -> Callable[[], None]:
+        name, member = self.clients[self._dice.randrange(len(_KINDS))]
+        return self._noted("freeze client", name, _frozen(member.pid))
 
     def _driver(self) -> Driver:
         return self._dice.choice([*self.drivers.values()])
@@ -237,8 +317,16 @@ class Stand:
     def freeze_gateway(self) -> Callable[[], None]:
         return self._noted("freeze gateway", "door", _frozen(self.site.gateway.pid))
 
+    def kill_door(self) -> Callable[[], None]:
+        self._noted("kill door", "hall", None)
+        _signal(self._hall.pid, signal.SIGKILL)
+        return _nothing
+
+    def freeze_door(self) -> Callable[[], None]:
+        return self._noted("freeze door", "hall", _frozen(self._hall.pid))
+
     def cut(self) -> Callable[[], None]:
-        """Both planners' hosts, or the robots'."""
+        """Both clients' hosts, or the robots'."""
         network, hosts = self._dice.choice([("net1", ("left",)), ("net2", ("right", "right2"))])
         switch = self.site.networks.host(f"{network}-switch")
         for host in hosts:
@@ -263,41 +351,85 @@ class Stand:
 
         return self._noted("one way", host, heal)
 
-    def change_policy(self) -> Callable[[], None]:
+    def delay(self) -> Callable[[], None]:
+        """What clients say is held back, what they are told, or both."""
+        most_s = self._dice.choice((0.5, 1.0, 1.5))
+        up, down = self._dice.choice([(most_s, 0.0), (0.0, most_s), (most_s, most_s)])
+        self._slow(up, down)
+        return self._noted("delay", "net2", lambda: self._slow(0.0, 0.0))
+
+    def _slow(self, up: float, down: float) -> int:
+        return self._wire.ask(json.dumps({"up": up, "down": down}))
+
+    def policy(self) -> Callable[[], None]:
         """The gateway lets nobody lock dora, for a while. Others read their policy once, and keep it."""
-
-        def back() -> None:
-            self.site.policy.write_text(_POLICY)
-
         self.site.policy.write_text(_POLICY.replace('lock = ["rosie", "dora"]', 'lock = ["rosie"]'))
-        return self._noted("policy", "door", back)
+        return self._noted("policy", "door", lambda: self.site.policy.write_text(_POLICY))
+
+    def clock(self) -> Callable[[], None]:
+        """The wall clock of a robot's driver jumps, and back."""
+        driver = self._driver()
+        wall_clock.shift(driver.clock, self._dice.choice(_JUMPS_S))
+        return self._noted("clock", driver.robot, lambda: wall_clock.shift(driver.clock, 0.0))
+
+    def disk(self) -> Callable[[], None]:
+        """There is no room any more for what drivers, door and gateway keep."""
+        self._disk.fill()
+        return self._noted("disk", "all", self._disk.free)
 
     # --- after it
 
     def quiet(self) -> None:
         """Everybody locks nothing any more."""
-        for _, member in self.planners.values():
+        for _, member in self.clients.values():
             member.tell("quiet")
-        for _, member in self.planners.values():
+        for _, member in self.clients.values():
             member.heard()
 
     def wrong(self) -> dict[str, list[str]]:
-        """By planner, what does not work although there is no trouble any more."""
-        return {name: member.ask("works") for name, member in self.planners.values()}
+        """By client, what does not work although there is no trouble any more."""
+        return {name: member.ask("works") for name, member in self.clients.values()}
+
+    def held_back(self) -> int:
+        """How often the connection of the clients has held something back."""
+        return self._slow(0.0, 0.0)
 
     def held(self) -> dict[str, tuple[int, int]]:
         """By process of ours that serves: its open files and its threads."""
-        pids = {"door": self.site.gateway.pid, **{name: driver.pid for name, driver in self.drivers.items()}}
+        pids = {"gateway": self.site.gateway.pid, "door": self._hall.pid}
+        pids |= {name: driver.pid for name, driver in self.drivers.items()}
         processes = {name: psutil.Process(pid) for name, pid in pids.items()}
         return {name: (process.num_fds(), process.num_threads()) for name, process in processes.items()}
 
     def close(self) -> None:
-        for driver in self.drivers.values():
-            _signal(driver.pid, signal.SIGCONT)
-            driver.close()
+        for kept in (*self.drivers.values(), self._hall):
+            with suppress(AssertionError):  # it has not begun yet
+                _signal(kept.pid, signal.SIGCONT)
+            kept.close()
         _signal(self.site.gateway.pid, signal.SIGCONT)
+        self._wire.close()
         self.site.close()
         self._log.close()
+
+
+TROUBLES: Final[Mapping[str, Callable[[Stand], Callable[[], None]]]] = {
+    "kill client": Stand.kill_client,
+    "freeze client": Stand.freeze_client,
+    "kill driver": Stand.kill_driver,
+    "freeze driver": Stand.freeze_driver,
+    "unplug": Stand.unplug,
+    "kill gateway": Stand.kill_gateway,
+    "freeze gateway": Stand.freeze_gateway,
+    "kill door": Stand.kill_door,
+    "freeze door": Stand.freeze_door,
+    "cut": Stand.cut,
+    "one way": Stand.one_way,
+    "delay": Stand.delay,
+    "policy": Stand.policy,
+    "clock": Stand.clock,
+    "disk": Stand.disk,
+}
+"""Each begins, and returns what ends it."""
 
 
 def _frozen(pid: int) -> Callable[[], None]:
@@ -317,9 +449,17 @@ def _nothing() -> None: ...
 @contextmanager
 def stand(networks: Networks, folder: Path, seed: int, mutant: str = "") -> Generator[Stand]:
     """All of it, ended after use; ``mutant``: how its drivers are broken, see `broken_driver`."""
-    with mock.patch.dict(os.environ, PYTHONPATH=os.pathsep.join(map(str, _SCRIPT.parents[1:3]))):
-        made = Stand(networks, folder, seed, mutant)
-        try:
-            yield made
-        finally:
-            made.close()
+    disk = Disk(folder / "disk")
+    settings = {
+        "PYTHONPATH": os.pathsep.join(map(str, _HERE.parents[:2])),
+        "TRADE_STATE_DIR": str(folder / "disk" / "gateway"),
+    }
+    try:
+        with mock.patch.dict(os.environ, settings):
+            made = Stand(networks, folder, disk, seed, mutant)
+            try:
+                yield made
+            finally:
+                made.close()
+    finally:
+        disk.close()

@@ -1,10 +1,10 @@
-"""The judge of the siege: a pure function from what planners noted and what simulators logged to what was wrong."""
+"""The judge of the siege: a pure function from what clients noted and what simulators logged to what was wrong."""
 
-import re
 from bisect import bisect_right
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, NamedTuple, cast
+from math import inf
+from typing import Any, NamedTuple
 
 from tests.holds import Owned, Verdict, asks_without_end, by_kind, owned, two_owners
 
@@ -12,35 +12,47 @@ from system.siege_records import Answer, AnyRecord, Fault, Order
 from trade_hil_sim import Entry
 
 STOPS_S = 6.0
-"""A joint whose planner, driver or network is gone for longer than that rests: three of the transport's leases."""
+"""A joint whose client, driver or network is gone for longer than that rests: three of the transport's leases."""
 WATCHED_S = 2.0
 """A joint whose driver is gone for longer than that rests: its servo's watchdog waits for 0.5 s."""
+FULL_SPEED = 100
+"""What is written with so much and more (of 0.229 rpm) is a stop: nobody orders more than 84."""
 _ANSWERED_S = 3.0
 """So long after its deadline a call may end, beside the time that its process did not have."""
 _FAR_COUNTS = 100
 """What a stop may take to come to rest, and more; what goes farther was ordered."""
 _FREE = ":free"
 """What holds are named that no lock was asked for: among these the last one wins."""
-_GOAL = re.compile(r"goal position (-?\d+)")
+_SPEED, _GOAL = 112, 116
+"""Addresses of profile velocity and goal position, four bytes each: XL430 e-Manual, control table."""
 
 
 class Motion(NamedTuple):
-    """One of a joint."""
+    """One of a joint, from a goal that it was given to the next one or to rest."""
 
     t: float
     counts: int
     """Where to."""
-    far: int
-    """From where it began."""
-    rests: float
-    """When it came to rest; never: infinity."""
+    at: int
+    """Where it was then."""
+    rests: float = inf
+    """When it came to rest or was given another goal; never: infinity."""
+    stopped: bool = False
+    """Whether it was told to stop on its way."""
+    turned: bool = False
+    """Whether it was given its goal on the way to another one."""
+
+    @property
+    def far(self) -> int:
+        """How far it has to go."""
+        return abs(self.counts - self.at)
 
 
 def judge(records: Iterable[AnyRecord], logs: Mapping[str, Iterable[Entry]]) -> Verdict:
     """Look for two owners, and for motions that nobody ordered or that came twice, late, without a lock or had no end.
 
     Args:
-        records: of planners, and the faults.
+        records: of clients, and the faults.
         logs: by robot, of its simulator.
     """
     known = by_kind(records)
@@ -49,92 +61,129 @@ def judge(records: Iterable[AnyRecord], logs: Mapping[str, Iterable[Entry]]) -> 
     verdict.counts.update({kind.__name__.lower(): len(those) for kind, those in known.items()})
     verdict.counts.update(f"fault {fault.what}" for fault in known[Fault])
     verdict.counts.update(f"answer {answer.how}" for answer in known[Answer])
+    verdict.counts.update(f"order of a {_kind(order.number)}" for order in known[Order])
     verdict.counts["motion"] = sum(len(of) for of in motions.values())
+    verdict.counts["motion turned"] = sum(motion.turned for of in motions.values() for motion in of)
     surely = owned(known)
-    killed = {fault.whom for fault in known[Fault] if fault.what == "kill planner"}
+    killed = {fault.whom for fault in known[Fault] if fault.what == "kill client"}
     verdict.violations += two_owners(surely) + asks_without_end(known, killed) + _unanswered(known, killed)
     for resource, of in sorted(motions.items()):
         orders = sorted((order for order in known[Order] if order.resource == resource), key=lambda order: order.t)
-        verdict.violations += _motions(resource, of, orders, surely[resource], known[Fault])
+        found, done = _motions(resource, of, orders, surely[resource], known[Fault])
+        verdict.violations += found
+        verdict.counts["order carried out"] += done
     return verdict
 
 
 def motions_of(entries: Iterable[Entry]) -> dict[str, list[Motion]]:
-    """By joint, what it did."""
+    """By joint, what it did: it tells of setting off and of rest; on its way, what it was told counts."""
     found: dict[str, list[Motion]] = defaultdict(list)
     for entry in entries:
-        if entry.kind != "event" or not entry.joint:
-            continue
-        of, goal = found[entry.joint], _GOAL.search(entry.detail)
-        if entry.name == "motion_started" and goal is not None:
-            began = entry.position_counts or 0
-            if of and of[-1].rests == float("inf"):  # another goal on the way
+        of = found[entry.joint]
+        going = bool(of) and of[-1].rests == inf
+        match entry.kind, entry.name:
+            case "event", "motion_started":
+                of.append(Motion(entry.t, int(entry.detail.rpartition(" ")[2]), entry.position_counts or 0))
+            case "event", "at_rest" | "torque_off" | "rebooted" if going:
                 of[-1] = of[-1]._replace(rests=entry.t)
-            of.append(Motion(entry.t, int(goal[1]), abs(int(goal[1]) - began), float("inf")))
-        elif entry.name in ("at_rest", "torque_off", "rebooted") and of and of[-1].rests == float("inf"):
-            of[-1] = of[-1]._replace(rests=entry.t)
+            case "instruction", _ if going and "goal_position" in entry.registers:
+                speed, goal = _written(entry, _SPEED), _written(entry, _GOAL)
+                if speed is None or goal is None or speed >= FULL_SPEED:
+                    of[-1] = of[-1]._replace(stopped=True)
+                else:
+                    of[-1] = of[-1]._replace(rests=entry.t)
+                    of.append(Motion(entry.t, goal, entry.position_counts or 0, turned=True))
+    found.pop("", None)
     return found
+
+
+def _written(entry: Entry, address: int) -> int | None:
+    at = address - (entry.address or 0)
+    return int.from_bytes(entry.data[at : at + 4], "little", signed=True) if 0 <= at <= len(entry.data) - 4 else None
 
 
 def _unanswered(known: dict[type, list[Any]], killed: set[str]) -> list[str]:
     answered = {answer.number: answer.t for answer in known[Answer]}
     found: list[str] = []
     for order in known[Order]:
-        late_s = answered.get(order.number, float("inf")) - order.t - order.deadline_s
-        late_s -= _frozen_s(known[Fault], _who(order.number), order.t)
+        late_s = answered.get(order.number, inf) - order.t - order.deadline_s
+        late_s -= _frozen_s(known[Fault], order)
         if late_s > _ANSWERED_S and _who(order.number) not in killed:
             found.append(f"{order.number} ordered at {order.t:.3f}, answered {late_s:.1f} s after its deadline")
     return found
 
 
-def _frozen_s(faults: Sequence[Fault], who: str, since: float) -> float:
+def _frozen_s(faults: Sequence[Fault], order: Order) -> float:
+    """For how long, since then, whoever ordered it did not run."""
     return sum(
-        fault.until - fault.t
+        fault.until - max(fault.t, order.t)
         for fault in faults
-        if fault.what == "freeze planner" and fault.whom == who and fault.until > since
+        if fault.until > order.t and (fault.what, fault.whom) == ("freeze client", _who(order.number))
     )
+
+
+def _held_up_s(faults: Sequence[Fault], order: Order) -> float:
+    """For how long, since then, the door did not run that a page comes by: it counts from when it has heard."""
+    if _kind(order.number) != "page":
+        return 0.0
+    frozen = (fault for fault in faults if fault.what == "freeze door" and fault.until > order.t)
+    return sum(fault.until - max(fault.t, order.t) for fault in frozen)
 
 
 def _who(number: str) -> str:
     return number.partition(":")[0]
 
 
+def _kind(number: str) -> str:
+    """Planner, page or agent: names are of that and its number."""
+    return _who(number).partition("-")[0].rstrip("0123456789")
+
+
 def _motions(
     resource: str, motions: Sequence[Motion], orders: Sequence[Order], owned: Sequence[Owned], faults: Sequence[Fault]
-) -> list[str]:
+) -> tuple[list[str], int]:
+    """What was wrong, and how many orders were carried out."""
     found: list[str] = []
-    done, last = Counter[str](), cast("tuple[Motion, Order] | None", None)
+    done = Counter[str]()
+    before: tuple[Motion, Order | None] | None = None
     times = [order.t for order in orders]
     since = [span.since for span in owned]
     for motion in motions:
         at = f"{resource} goes to {motion.counts} at {motion.t:.3f}"
-        before = orders[: bisect_right(times, motion.t)]
-        order = next((order for order in reversed(before) if order.counts == motion.counts), None)
-        if order is None:
-            if motion.far > _FAR_COUNTS:
-                found.append(f"{at}, {motion.far} counts away: nobody ordered that")
-            continue
+        earlier = orders[: bisect_right(times, motion.t)]
+        order = next((order for order in reversed(earlier) if order.counts == motion.counts), None)
+        last, before = before, (motion, order)
         if motion.far <= _FAR_COUNTS:  # it may be a stop that happens to end there
             continue
-        free = last is not None and last[1].hold.endswith(_FREE) and order.hold.endswith(_FREE)
-        if last is not None and last[0].rests == motion.t and last[1].hold != order.hold and not free:
+        if order is None:
+            found.append(f"{at}, {motion.far} counts away: nobody ordered that")
+            continue
+        if last is not None and last[1] is not None and motion.turned and _broken_into(motion, order, *last):
             found.append(f"{at} for {order.hold}, while it moves for {last[1].hold}")
-        last = (motion, order)
         done[order.number] += 1
         if done[order.number] > 1:
             found.append(f"{at}: {order.number} is done again")
-        if motion.t > order.t + order.deadline_s:
+        if motion.t > order.t + order.deadline_s + _held_up_s(faults, order):
             found.append(f"{at}: {order.number} is done after its deadline of {order.deadline_s:g} s")
         span = owned[bisect_right(since, motion.t) - 1] if since and since[0] <= motion.t else None
         if span is not None and span.hold != order.hold and motion.t < span.until:
             found.append(f"{at} for {order.hold} while {span.hold} had it")
         found += _goes_on(at, motion, order, resource, faults)
-    return found
+    return found, len(done)
+
+
+def _broken_into(motion: Motion, order: Order, last: Motion, its: Order) -> bool:
+    """Whether it took the joint from somebody else, under a lock of either, whose motion nobody had stopped."""
+    free = its.hold.endswith(_FREE) and order.hold.endswith(_FREE)
+    under_way = abs(motion.at - last.counts) > _FAR_COUNTS and not last.stopped
+    return under_way and not free and _who(its.number) != _who(order.number)
 
 
 def _goes_on(at: str, motion: Motion, order: Order, resource: str, faults: Sequence[Fault]) -> list[str]:
     """Whether it went on although who ordered it, or who carried it out, was gone for long enough."""
     found: list[str] = []
+    if order.valid_s and motion.rests - motion.t > order.valid_s + WATCHED_S:
+        found.append(f"{at} and on for {motion.rests - motion.t:.1f} s, which was to hold for {order.valid_s:g} s")
     for fault in faults:
         most_s = _must_rest_s(fault, order, resource)
         if most_s is None or not motion.t < fault.t < motion.rests:
@@ -147,8 +196,13 @@ def _goes_on(at: str, motion: Motion, order: Order, resource: str, faults: Seque
 def _must_rest_s(fault: Fault, order: Order, resource: str) -> float | None:
     robot = resource.partition(".")[0]
     match fault.what:
-        case "kill planner" | "freeze planner":
+        case "kill client":
             return STOPS_S if fault.whom == _who(order.number) else None
+        case "freeze client":  # an agent says nothing while it waits: its host cannot tell that it is frozen
+            mine = fault.whom == _who(order.number) and _kind(order.number) != "agent"
+            return STOPS_S if mine else None
+        case "kill door" | "freeze door":
+            return STOPS_S if _kind(order.number) == "page" else None
         case "kill gateway" | "freeze gateway" | "cut" | "one way":
             return STOPS_S
         case "kill driver" | "freeze driver" | "unplug":

@@ -1,16 +1,18 @@
-"""What planners of the siege note beyond what clients of locks do, and what is done to whom."""
+"""What clients of the siege note beyond what clients of locks do, and what is done to whom."""
 
 from tests.holds import Ask, Done, Held, Record, Seen
 
 
 class Order(Record):
-    """A planner is about to have a joint moved to there."""
+    """A client is about to have a joint moved to there."""
 
     number: str
     hold: str
     resource: str
     counts: int
     deadline_s: float
+    valid_s: float = 0.0
+    """How long it holds unless it is given again; 0: until it is there."""
 
 
 class Answer(Record):

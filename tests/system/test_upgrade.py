@@ -12,11 +12,12 @@ from typing import Any, Final
 from unittest import mock
 
 import pytest
+from tests.holds import Done, Log, read
 
 from system.networks import Member, Networks
 from system.siege import Driver
 from system.siege_judge import judge
-from system.siege_records import Answer, Done, Fault, Log, read
+from system.siege_records import Answer, AnyRecord, Fault
 from system.sites import DOOR, SYSTEM, Site
 from trade._wire import PROTOCOL
 from waiting import wait_until
@@ -94,9 +95,9 @@ class Stand:
         driver = self.drivers[robot]
         wait_until(lambda: driver.running, f"the driver of {robot} runs")
         self._log.note(Fault(t=time.monotonic(), what="kill driver", whom=robot, until=1e12))
-        driver.program = [*self._through(version), "-m", "trade_gateway"]
+        driver.run_from_now_on([*self._through(version), "-m", "trade_gateway"])
         before = driver.pid
-        driver.signal(signal.SIGTERM)
+        os.kill(driver.pid, signal.SIGTERM)
         wait_until(lambda: driver.pid != before, f"the driver of {robot} is started again")
 
     # --- looking
@@ -163,7 +164,7 @@ class Stand:
 
 @pytest.fixture
 def stand(networks: Networks, tmp_path: Path) -> Iterator[Stand]:
-    with mock.patch.dict(os.environ, PYTHONPATH=str(_BEHAVIOUR.parents[1])):
+    with mock.patch.dict(os.environ, PYTHONPATH=os.pathsep.join(map(str, _BEHAVIOUR.parents[1:3]))):
         made = Stand(networks, tmp_path)
         try:
             yield made
@@ -178,7 +179,7 @@ def unwell(stand: Stand, name: str, since: float, until: float) -> list[str]:
     """
     return [
         record.how
-        for record in read(stand.records)
+        for record in read(stand.records, AnyRecord)
         if isinstance(record, (Answer, Done)) and since < record.t < until
         if record.how not in {"arrived", "given back"} and not record.how.startswith("DeviceSilent")
         for number in [record.number if isinstance(record, Answer) else record.hold]
@@ -223,7 +224,9 @@ def test_a_system_goes_to_another_version_and_back_while_what_is_not_concerned_g
     assert not any(wrong.values()), wrong
     said = stand.complaints("dora")
     assert said.count(f"rosie speaks protocol version {NEXT}, this one speaks {NOW}") == 1, said
-    verdict = judge(read(stand.records), {name: driver.sim.entries() for name, driver in stand.drivers.items()})
+    verdict = judge(
+        read(stand.records, AnyRecord), {name: driver.sim.entries() for name, driver in stand.drivers.items()}
+    )
     assert not verdict.violations, "\n".join(verdict.violations)
     assert verdict.counts["motion"] > _FEW
 

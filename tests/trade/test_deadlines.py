@@ -2,6 +2,8 @@
 
 import asyncio
 import contextlib
+import gc
+import itertools
 import threading
 from pathlib import Path
 from typing import Any
@@ -9,7 +11,19 @@ from typing import Any
 import pytest
 
 from trade import Container, Handle, current_call, service, where
-from trade._wire import EMPTY_ARGUMENTS, PROTOCOL, Call, Status, call_key, decode_reply, encode_message, reply_key
+from trade._calls import _Pending
+from trade._peer import Peer
+from trade._wire import (
+    EMPTY_ARGUMENTS,
+    PROTOCOL,
+    Call,
+    Reply,
+    Status,
+    call_key,
+    decode_reply,
+    encode_message,
+    reply_key,
+)
 from trade.errors import DeadlineExceeded, OutcomeUnknown
 
 COUNTING = """
@@ -232,3 +246,37 @@ def test_what_arrives_runs_only_if_it_is_known_to_be_in_time(
     reply = decode_reply(replies.receive().payload or b"")
     assert (reply.id, reply.status) == (7, status)
     assert (motor.moves, motor.stops) == ran
+
+
+def test_calls_end_at_their_deadlines_although_others_begin_while_they_are_looked_through(
+    here: Container, there: Container
+) -> None:
+    """Making things may collect garbage, and whatever that lets go of may let another thread run."""
+    caller = here._parts.caller
+    peer = Peer(there.address)
+    ended: list[int] = []
+
+    def note(reply: Reply) -> None:
+        ended.append(reply.id)
+
+    def begin(number: int) -> None:
+        caller._pending[number] = _Pending(peer, 0, note, None, (None, b""))  # type: ignore[arg-type]
+
+    others = itertools.count(10_000)
+
+    def interrupt(phase: str, _: object) -> None:
+        if phase == "start":
+            begin(next(others))
+
+    for number in range(5000):
+        begin(number)
+    before = gc.get_threshold()
+    gc.callbacks.append(interrupt)
+    gc.set_threshold(1)
+    try:
+        caller._end_overdue(1)
+    finally:
+        gc.set_threshold(*before)
+        gc.callbacks.remove(interrupt)
+        caller._end_overdue(1)
+    assert {*range(5000)} <= {*ended}

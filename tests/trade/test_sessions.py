@@ -78,6 +78,26 @@ def test_S03_a_call_that_comes_after_the_end_of_its_session_is_refused(robot: Ro
     assert robot.joints["a"].written == [1.0]
 
 
+def test_S03_a_client_that_could_not_be_reached_moves_again_when_it_can_and_one_that_left_meanwhile_does_not(
+    robot: Robot,
+) -> None:
+    go, one, two = robot.find("a", "go_on"), robot.me.open_session("one"), robot.me.open_session("two")
+    with one.use():
+        go(1.0)
+    robot.system.partition("me", "a")
+    robot.system.advance(2)
+    assert robot.joints["a"].stopped.wait(20)
+    two.close()
+    robot.system.heal()
+    robot.system.settle()
+    go = robot.find("a", "go_on")
+    with one.use():
+        go(2.0)
+    home = robot.system.container("a")._parts.locks
+    assert home.gone([one.name]) is None
+    assert home.gone([two.name]) is not None
+
+
 def test_S03_of_two_clients_of_one_program_one_stops_the_other_only_for_a_reason(robot: Robot) -> None:
     go, stop = robot.find("a", "go_on"), robot.find("a", "stop")
     one, two = robot.me.open_session("one"), robot.me.open_session("two")

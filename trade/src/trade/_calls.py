@@ -391,7 +391,7 @@ class Caller:
             if call_id != box.ended_id and meant(peer, deadline_ns):
                 box.ended_id = call_id
                 self._transport.wake(box.wake_key, encode_message(_ended(call_id, status)))
-        for call_id, pending in list(self._pending.items()):
+        for call_id, pending in self._pending.copy().items():  # a list of pairs is not made at one go
             if meant(pending.peer, pending.deadline_ns):
                 self._finish(_ended(call_id, status))
 

@@ -173,6 +173,7 @@ class Parts:
                 self._home.address,
                 self._lost,
                 self.session_ended,
+                self.locks.session_back,
                 self.announcer.beat,
                 self.estopping.learn,
             )
@@ -185,7 +186,6 @@ class Parts:
         """Told by the watch: a container is out of sight, or there again."""
         self.caller.lost(address, back=back)
         if back:
-            self.locks.session_back(str(address))
             return
         self.locking.keeper.lost(address)
         if self.inherited is not None:

@@ -42,6 +42,7 @@ class Watch:
         own: Address,
         lost: Callable[..., None],
         ended: Callable[[str], None],
+        returned: Callable[[str], None],
         beat: Callable[[], None],
         learn: Callable[[Iterable[Estop]], None],
     ) -> None:
@@ -50,6 +51,7 @@ class Watch:
         self._own = own
         self._lost = lost
         self._ended = ended
+        self._returned = returned
         self.malformed = 0
         self._asker = Asker(transport, registry, self._answer, beat)
         self._transport = transport
@@ -135,6 +137,7 @@ class Watch:
                 self._gone(session)
             return
         was_away = self._absences.end(session)
+        self._returned(session)
         if not client:
             self._lost(address, back=True)
             if self._registry.appear(address) or was_away:

@@ -70,19 +70,24 @@ class Journal:
         self._log.add(Entry(t, self._bus, "instruction", packet.name, packet.device_id, ids, hex=data, address=address))
 
     def _writing(self, name: str, wish: Writing, t: float) -> None:
-        servos = self._addressed(wish.device_id) or self._servos
+        addressed = self._addressed(wish.device_id)
+        servos = addressed or self._servos
         touched = (name for servo in servos for name in servo.table.touched(wish.address, len(wish.data)))
         registers = tuple(dict.fromkeys(touched))
+        moves = bool(MOTION & set(registers))
+        told = addressed[0] if moves and len(addressed) == 1 else None
         entry = Entry(
             t,
             self._bus,
             "instruction",
             name,
             wish.device_id,
+            joint="" if told is None else told.joint,
             hex=wish.data.hex(),
             address=wish.address,
             registers=registers,
-            moves=bool(MOTION & set(registers)),
+            moves=moves,
+            position_counts=None if told is None else told.counts(t),
         )
         self._log.add(entry)
 

@@ -1,0 +1,92 @@
+"""Drivers that are broken on purpose, each in one way; as a plugin of pytest (``-p mutants``) tests are run on one.
+
+``MUTANT`` in the environment says which. Broken locks have a place of their own: `chaos._mutants`.
+"""
+
+import os
+import sys
+from collections.abc import Callable
+from typing import Any, Final
+
+import waiting
+
+Patch = Callable[[Any, str, Any], object]
+"""As `setattr`."""
+_IMPATIENCE_S: Final = 6.0
+"""How long a test waits for what a mutant never does."""
+
+
+def _nothing_stops(patch: Patch) -> None:
+    """Who is gone, and what he has lost, is of no concern."""
+    from trade._deadman import Deadman
+    from trade._resources import Permit
+
+    patch(Deadman, "stop", lambda self, resources, reason, done: [done(resource, "") for resource in resources])
+    patch(Permit, "gate", lambda self: None)
+
+
+def _anybody_may(patch: Patch) -> None:
+    """No lock is looked at."""
+    from trade._resources import Permit, Resource
+
+    patch(Resource, "check", lambda self, *_: None)
+    patch(Permit, "gate", lambda self: None)
+
+
+def _never_late(patch: Patch) -> None:
+    """Calls and commands run however late they come."""
+    from trade._dispatch import LocalService
+    from trade_drivers import _work
+    from trade_drivers.joints import _jobs
+
+    patch(LocalService, "too_late", lambda self, _: False)
+    check = _work.check_admitted
+
+    def lenient(*args: Any, expires_ns: int, **more: int) -> None:
+        check(*args, expires_ns=sys.maxsize, **more)
+
+    patch(_jobs, "check_admitted", lenient)
+
+
+def _no_dedupe(patch: Patch) -> None:
+    """A call that comes again runs again."""
+    from trade._ongoing import Once
+
+    patch(Once, "begin", lambda self, call, ongoing: ongoing)
+    patch(Once, "find", lambda self, caller, call: None)
+
+
+def _stop_loses(patch: Patch) -> None:
+    """What was asked for before a stop is done after it."""
+    from trade._resources import Resource
+
+    patch(Resource, "stop", lambda self, *_, **__: None)
+
+
+def _watchdog_off(patch: Patch) -> None:
+    """Servos are not told to look after themselves."""
+    from trade_drivers.dynamixel._exchange import DynamixelExchange
+
+    begin = DynamixelExchange.__init__
+
+    def unwatched(self: Any, *args: Any, **options: Any) -> None:
+        begin(self, *args, **options)
+        self.watchdog_counts = 0
+
+    patch(DynamixelExchange, "__init__", unwatched)
+
+
+HOW: Final[dict[str, Callable[[Patch], None]]] = {
+    "nothing-stops": _nothing_stops,
+    "anybody-may": _anybody_may,
+    "never-late": _never_late,
+    "no-dedupe": _no_dedupe,
+    "stop-loses": _stop_loses,
+    "watchdog-off": _watchdog_off,
+}
+
+
+def pytest_configure() -> None:
+    """Called for a module that is named as a plugin."""
+    HOW[os.environ["MUTANT"]](setattr)
+    waiting.PATIENCE_S = _IMPATIENCE_S

@@ -1,0 +1,53 @@
+"""The fewest kinds of trouble under which a siege still fails, by leaving some out: ``make siege MINIMISE=1``.
+
+Each try is a siege of its own with the same seed, of ``SIEGE_MINUTES`` but at most 1.5. A siege is not the same twice,
+so a kind that was left out may have had its part, and one that is named may have none.
+"""
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+_TEST = Path(__file__).with_name("test_siege.py")
+_MOST_MINUTES = 1.5
+_STARTS_AND_ENDS_S = 400.0
+
+
+def fewest(kinds: Sequence[str], fails: Callable[[Sequence[str]], bool]) -> list[str]:
+    """Leave out halves, quarters and so on, down to each alone, whatever it fails without."""
+    left, size = [*kinds], len(kinds) // 2
+    while size:
+        for some in [left[at : at + size] for at in range(0, len(left), size)]:
+            rest = [kind for kind in left if kind not in some]
+            if rest and fails(rest):
+                left = rest
+        size //= 2
+    return left
+
+
+def _fails(kinds: Sequence[str]) -> bool:
+    minutes = min(_MOST_MINUTES, float(os.environ.get("SIEGE_MINUTES", "1")))
+    settings = {"SIEGE_KINDS": ",".join(kinds), "SIEGE_MINUTES": str(minutes)}
+    command = [sys.executable, "-m", "pytest", "-q", "-n", "0", "-p", "no:again", str(_TEST), "-k", "befalls"]
+    print(f"with {', '.join(kinds)}: ", end="", flush=True)
+    done = subprocess.run(
+        command,
+        env={**os.environ, **settings},
+        stdout=subprocess.DEVNULL,
+        timeout=120 * minutes + _STARTS_AND_ENDS_S,
+        check=False,
+    )
+    print("fails" if done.returncode else "passes", flush=True)
+    return done.returncode != 0
+
+
+def main() -> None:
+    from system.siege import TROUBLES
+
+    print(f"fails at least with: {', '.join(fewest([*TROUBLES], _fails))}")
+
+
+if __name__ == "__main__":
+    main()
