@@ -1,6 +1,7 @@
 """``trade lock``, ``locks``, ``unlock``, ``resume`` and ``estop`` on a simulated robot, as a user types them."""
 
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -11,6 +12,7 @@ import pytest
 
 import trade
 from trade import Container, where
+from trade._endpoints import free_endpoint
 from trade.errors import LockedByOther, Stopped
 from waiting import PATIENCE_S, wait_until
 
@@ -92,6 +94,12 @@ def locked(rosie_up):
     yield start
     for lock in started:
         lock.close()
+
+
+@pytest.fixture
+def nobody_there() -> str:
+    """An endpoint where nobody listens."""
+    return free_endpoint()
 
 
 def move(joint: str = "pan") -> float:
@@ -181,7 +189,8 @@ def test_a_lock_that_cannot_be_had_runs_nothing(locked, trade_command: Command, 
         (["lock", "nowhere", "--", "true"], 1, "ConfigurationError: lock of group='nowhere'"),
         (["lock", "a b", "--", "true"], 2, "UsageError: lock a b:"),
         (["estop", "abc"], 2, "UsageError: trade estop: ids are for clearing"),
-        (["estop", "--clear", "abc"], 1, "NoSuchEstop: there is no open e-stop abc; none is open"),
+        (["estop", "--clear", "--limit", "0.2"], 1, "NobodyFound: nobody was found in system test-"),
+        (["estop", "--clear", "abc", "--limit", "0.2"], 1, "NobodyFound: nobody was found in system test-"),
     ],
 )
 def test_wrong_words_are_answered_in_one_line(
@@ -214,6 +223,48 @@ def test_S09_an_estop_holds_the_robot_until_it_is_cleared(rosie_up, trade_comman
     assert (cleared.returncode, "cleared:" in cleared.stdout) == (0, True)
     assert move() == pytest.approx(0.05, abs=0.02)
     assert "no e-stop is open" in trade_command("estop", "--clear").stdout
+    unknown = trade_command("estop", "--clear", "abc")
+    assert (unknown.returncode, "NoSuchEstop: there is no open e-stop abc" in unknown.stderr) == (1, True)
+
+
+def test_S09_who_finds_nobody_cannot_tell_whether_an_estop_is_open(trade_command: Command) -> None:
+    said = trade_command("estop", "--clear", "--limit", "0.2", "--json")
+    assert (said.returncode, said.stdout) == (1, "")
+    assert "nobody can tell whether an e-stop is open; none was cleared" in said.stderr
+
+
+def test_S09_who_finds_nobody_where_it_is_to_connect_says_where(trade_command: Command, nobody_there: str) -> None:
+    said = trade_command("--connect", nobody_there, "estop", "--clear", "--limit", "0.2")
+    assert (said.returncode, said.stdout) == (1, "")
+    assert f"nobody answers at {nobody_there} (TRADE_CONNECT): nothing accepts connections there" in said.stderr
+
+
+def test_S09_who_does_not_answer_may_have_one_open(rosie_up, trade_command: Command) -> None:
+    rosie = rosie_up()
+    rosie.program.signal(signal.SIGSTOP)
+    try:
+        said = trade_command("estop", "--clear", "--limit", "0.5")
+    finally:
+        rosie.program.signal(signal.SIGCONT)
+    assert (said.returncode, said.stdout) == (1, "")
+    assert re.search(
+        "rosie did not answer; .*nobody can tell|nobody was found", said.stderr
+    )  # it may seem gone by then
+
+
+def test_S09_what_was_found_is_cleared_and_what_is_missing_is_told(
+    rosie_up, trade_command: Command, start_container: Callable[..., Container], nobody_there: str
+) -> None:
+    door = start_container("door", listen=[free_endpoint()])
+    rosie_up()
+    assert trade_command("estop").returncode == 0
+    both = ["--connect", door.settings.listen[0], "--connect", nobody_there]
+    said = trade_command(*both, "estop", "--clear", "--limit", "2")
+    assert said.returncode == 1
+    assert "cleared: " in said.stdout
+    assert f"nobody answers at {nobody_there}" in said.stderr
+    assert "stays open until it is cleared once more" in said.stderr
+    assert move() == pytest.approx(0.05, abs=0.02)
 
 
 def test_S09_an_estop_that_misses_somebody_or_finds_nobody_is_no_success(rosie_up, trade_command: Command) -> None:

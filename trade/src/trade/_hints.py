@@ -1,7 +1,8 @@
 """What a look-up that found nothing, or too much, tells its caller: what there is instead, and what tells it apart."""
 
 import difflib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from types import MappingProxyType
 from typing import Final
 
 from trade._constraints import Constraint
@@ -17,12 +18,19 @@ _MOST: Final = 2
 _MOST_GROUPS: Final = 20
 
 
-def no_such_service(constraint: Constraint, records: Iterable[Record], waited_s: float) -> NoSuchService:
-    """The error of a look-up without a match, given all services there are."""
+_NONE: Final[Mapping[str, str]] = MappingProxyType({})
+
+
+def no_such_service(
+    constraint: Constraint, records: Iterable[Record], waited_s: float, apart: Mapping[str, str] = _NONE
+) -> NoSuchService:
+    """The error of a look-up without a match, given all services there are, and where there is no link (`Sight`)."""
     known = list(records)
     groups = sorted({group for record in known for group in record.groups} - {DOMAIN})
     near = _near(_asked(constraint, "group"), _asked(constraint, "name"), groups, known)
-    return NoSuchService(constraint=str(constraint), waited_s=waited_s, near=near, groups=groups[:_MOST_GROUPS])
+    return NoSuchService(
+        constraint=str(constraint), waited_s=waited_s, near=near, groups=groups[:_MOST_GROUPS], apart=dict(apart)
+    )
 
 
 def _asked(constraint: Constraint, field: str) -> str:

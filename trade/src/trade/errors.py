@@ -7,8 +7,8 @@ One module on purpose, however long: whoever catches reads the tree as a whole.
 """
 
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
 
 __all__ = [
     "AccessDenied",
@@ -43,6 +43,7 @@ __all__ = [
     "NoSuchHook",
     "NoSuchNotification",
     "NoSuchService",
+    "NobodyFound",
     "NotInstantiable",
     "NotSerialisable",
     "OutcomeUnknown",
@@ -84,6 +85,11 @@ def _some(texts: Sequence[str]) -> str:
     return ", ".join(list(texts)[:5]) + (", ..." if len(texts) > 5 else "")
 
 
+def _nobody_at(apart: Mapping[str, str]) -> str:
+    """At which endpoints nobody was found, and why."""
+    return "; ".join(f"nobody answers at {endpoint} (TRADE_CONNECT): {why}" for endpoint, why in apart.items())
+
+
 # --- the caller must act
 
 
@@ -101,6 +107,8 @@ class NoSuchService(CallerError, LookupError):
     near: Sequence[str] = ()
     groups: Sequence[str] = ()
     """Some of those there are in the system."""
+    apart: Mapping[str, str] = field(default_factory=dict[str, str])
+    """Where nobody was found of those it is to connect to, and why, if nobody else was found at all."""
 
     def describe(self) -> str:
         return f"no service matches {self.constraint} after {self.waited_s:.3g} s; {self._hint()}"
@@ -110,6 +118,8 @@ class NoSuchService(CallerError, LookupError):
             return f"did you mean {' or '.join(self.near)}?"
         if self.groups:
             return f"there is {_some(self.groups)}; `trade services` lists what they offer"
+        if self.apart:
+            return _nobody_at(self.apart)
         return "nothing is offered in this system: is its provider up, with the same TRADE_SYSTEM?"
 
 
@@ -657,6 +667,27 @@ class CannotConnect(SetupError, ConnectionError):
 
     def describe(self) -> str:
         return f"no link to {self.endpoint}: {self.reason}"
+
+
+@dataclass(kw_only=True, eq=False)
+class NobodyFound(SetupError, ConnectionError):
+    """Nobody else was found in the system, or not all of it: what was asked cannot be told."""
+
+    system: str
+    so: str = ""
+    """What cannot be told therefore, and what to do."""
+    others: bool = False
+    """Whether somebody was found."""
+    silent: Sequence[str] = ()
+    """Containers that are there, and have not answered."""
+    apart: Mapping[str, str] = field(default_factory=dict[str, str])
+    """Endpoints where nobody was found, and why."""
+
+    def describe(self) -> str:
+        said = [] if self.others else [f"nobody was found in system {self.system}"]
+        said += [_nobody_at(self.apart)] if self.apart else []
+        said += [f"{_some(self.silent)} did not answer"] if self.silent else []
+        return "; ".join([*said, self.so] if self.so else said)
 
 
 @dataclass(kw_only=True, eq=False)
