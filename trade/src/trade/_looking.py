@@ -7,7 +7,7 @@ from typing import Any
 from trade import _many
 from trade._constraints import Constraint, where
 from trade._handle import Bound, Handle
-from trade._hints import no_such_service, too_many_services
+from trade._hints import asked_for, no_such_service, too_many_services
 from trade._member import Member
 from trade._registry import Record
 from trade._sight import Sight, look_around
@@ -41,8 +41,9 @@ class Looking(Member):
             return bool(matches)
 
         if not self._parts.registry.wait_for(found, wait_s):
-            apart = self.sight(limit_s=0).apart if len(self.addresses()) == 1 else {}
-            raise no_such_service(constraint, self._parts.registry.select(where()), wait_s, apart)
+            apart = self.sight(limit_s=0).unanswered if len(self.addresses()) == 1 else ()
+            hidden = self.access.hidden(self.address.identity, asked_for(constraint, "group"))
+            raise no_such_service(constraint, self._parts.registry.select(where()), wait_s, apart, hidden)
         if len(matches) > 1:
             raise too_many_services(constraint, matches)
         return Handle(self, matches[0].key, matches[0])

@@ -29,6 +29,11 @@ class Sight(Struct, frozen=True):
     """The endpoints of ``Settings.connect`` where nobody was found, and why, as far as is known."""
 
     @property
+    def unanswered(self) -> tuple[str, ...]:
+        """The same in words, as errors tell it."""
+        return tuple(f"{endpoint} (TRADE_CONNECT): {why}" for endpoint, why in self.apart.items())
+
+    @property
     def complete(self) -> bool:
         """Whether somebody was found, at each endpoint, and all have said what is theirs."""
         return bool(self.others) and not self.silent and not self.apart

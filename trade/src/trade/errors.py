@@ -7,8 +7,8 @@ One module on purpose, however long: whoever catches reads the tree as a whole.
 """
 
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 
 __all__ = [
     "AccessDenied",
@@ -85,9 +85,9 @@ def _some(texts: Sequence[str]) -> str:
     return ", ".join(list(texts)[:5]) + (", ..." if len(texts) > 5 else "")
 
 
-def _nobody_at(apart: Mapping[str, str]) -> str:
+def _nobody_at(apart: Sequence[str]) -> str:
     """At which endpoints nobody was found, and why."""
-    return "; ".join(f"nobody answers at {endpoint} (TRADE_CONNECT): {why}" for endpoint, why in apart.items())
+    return "; ".join(f"nobody answers at {endpoint}" for endpoint in apart)
 
 
 # --- the caller must act
@@ -107,13 +107,17 @@ class NoSuchService(CallerError, LookupError):
     near: Sequence[str] = ()
     groups: Sequence[str] = ()
     """Some of those there are in the system."""
-    apart: Mapping[str, str] = field(default_factory=dict[str, str])
-    """Where nobody was found of those it is to connect to, and why, if nobody else was found at all."""
+    apart: Sequence[str] = ()
+    """Endpoints where nobody was found, each with the reason, if nobody else was found at all."""
+    hidden: str = ""
+    """Why it would not be seen here if it was there, in words of the policy; empty: it would."""
 
     def describe(self) -> str:
         return f"no service matches {self.constraint} after {self.waited_s:.3g} s; {self._hint()}"
 
     def _hint(self) -> str:
+        if self.hidden:
+            return f"{self.hidden}; so nothing of it is seen here, and whoever keeps the policy can change that"
         if self.near:
             return f"did you mean {' or '.join(self.near)}?"
         if self.groups:
@@ -260,10 +264,15 @@ class Stopped(CallerError, RuntimeError):
     by: str
     reason: str
     estop: bool = False
+    """Whether an e-stop is open."""
+    cleared: bool = False
+    """Whether an e-stop did it that is cleared by now: what it stopped waits for who resumes it."""
 
     def describe(self) -> str:
         remedy = "`trade estop --clear`" if self.estop else "trade.resume(...) or `trade resume`"
-        return f"{self.resource} was stopped by {self.by}: {self.reason}. When it is safe to move, call {remedy}"
+        cleared = " That e-stop is cleared, and nobody has resumed what it stopped." if self.cleared else ""
+        said = f"{self.resource} was stopped by {self.by}: {self.reason}.{cleared}"
+        return f"{said} When it is safe to move, call {remedy}"
 
 
 @dataclass(kw_only=True, eq=False)
@@ -680,8 +689,8 @@ class NobodyFound(SetupError, ConnectionError):
     """Whether somebody was found."""
     silent: Sequence[str] = ()
     """Containers that are there, and have not answered."""
-    apart: Mapping[str, str] = field(default_factory=dict[str, str])
-    """Endpoints where nobody was found, and why."""
+    apart: Sequence[str] = ()
+    """Endpoints where nobody was found, each with the reason."""
 
     def describe(self) -> str:
         said = [] if self.others else [f"nobody was found in system {self.system}"]

@@ -72,7 +72,7 @@ def _clear(container: Container, sight: Sight, ids: list[str] | None, limit_s: f
 
 
 def _unheard(system: str, sight: Sight, so: str) -> NobodyFound:
-    return NobodyFound(system=system, so=so, others=bool(sight.others), silent=sight.silent, apart=sight.apart)
+    return NobodyFound(system=system, so=so, others=bool(sight.others), silent=sight.silent, apart=sight.unanswered)
 
 
 def _say(out: Output, report: EstopReport, system: str, done: str, own: str) -> None:
@@ -85,5 +85,7 @@ def _say(out: Output, report: EstopReport, system: str, done: str, own: str) -> 
         out.say(f"[bold red]MISSING: {escape(name)} did not answer[/]")
     if not (report.confirmed or report.failed or report.missing):
         out.say(f"[bold red]nobody was found[/] in system {escape(system)} that has something to stop")
+    if done == "cleared" and others:
+        out.say("nothing moves by itself: what others had in use waits for [bold]trade resume GROUP[/]")
     if done == "stopped":
         out.say(f"e-stop {report.id} is open; when it is safe: [bold]trade estop --clear {report.id}[/]")
