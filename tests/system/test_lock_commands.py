@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 import trade
+from system.conftest import ROSIES_HEAD, Program
 from trade import Container, where
 from trade._endpoints import free_endpoint
 from trade.errors import LockedByOther, Stopped
@@ -202,6 +203,30 @@ def test_wrong_words_are_answered_in_one_line(
     assert len(said.stderr.splitlines()) == 1
 
 
+@pytest.mark.parametrize("words", [["services"], ["containers"], ["locks"], ["resume", "rosie"], ["faults"]], ids=str)
+def test_who_finds_nobody_where_it_is_to_connect_lists_nothing(
+    trade_command: Command, nobody_there: str, words: list[str]
+) -> None:
+    said = trade_command("--connect", nobody_there, *words)
+    assert (said.returncode, said.stdout) == (1, "")
+    assert said.stderr.startswith("NobodyFound: nobody was found in system test-")
+    assert f"nobody answers at {nobody_there} (TRADE_CONNECT): nothing accepts connections there" in said.stderr
+
+
+def test_a_call_of_nobody_says_where_nobody_answers(trade_command: Command, nobody_there: str) -> None:
+    said = trade_command("--connect", nobody_there, "call", "rosie.head.move_to", "0.1", "--wait", "0.1")
+    assert said.returncode == 1
+    assert said.stderr.startswith("NoSuchService: no service matches")
+    assert f"nobody answers at {nobody_there} (TRADE_CONNECT)" in said.stderr
+    assert "TRADE_SYSTEM" not in said.stderr
+
+
+def test_resume_of_nothing_speaks_of_resuming(trade_command: Command) -> None:
+    said = trade_command("resume", "rosie")
+    assert said.returncode == 1
+    assert "resume of group='rosie': nothing that matches actuates, so there is nothing to resume" in said.stderr
+
+
 # --- stops
 
 
@@ -216,15 +241,31 @@ def test_S09_an_estop_holds_the_robot_until_it_is_cleared(rosie_up, trade_comman
     assert "smoke" in refused.stderr
     rosie.program.signal(signal.SIGTERM)
     rosie.program.wait()
-    rosie_up()  # a restart changes nothing
+    assert rosie_up().ready["estops"] == [report["id"]]  # a restart changes nothing
     with pytest.raises(Stopped, match="smoke"):
         move()
+    still = trade_command("resume", "rosie.neck")
+    assert (still.returncode, "may move" in still.stdout) == (1, False)
+    assert f"e-stop {report['id']} is open: smoke" in still.stdout
     cleared = trade_command("estop", "--clear")
     assert (cleared.returncode, "cleared:" in cleared.stdout) == (0, True)
+    assert "nothing moves by itself" in cleared.stdout
+    assert "trade resume GROUP" in cleared.stdout
     assert move() == pytest.approx(0.05, abs=0.02)
     assert "no e-stop is open" in trade_command("estop", "--clear").stdout
     unknown = trade_command("estop", "--clear", "abc")
     assert (unknown.returncode, "NoSuchEstop: there is no open e-stop abc" in unknown.stderr) == (1, True)
+
+
+def test_S09_a_robot_that_comes_up_with_one_open_says_so_and_how_it_is_cleared(
+    run: Callable[..., Program], start_container: Callable[..., Container]
+) -> None:
+    opened = start_container("other").estop("smoke", limit_s=0.2)
+    up = run("-m", "trade_gateway", "up", ROSIES_HEAD, "--sim")
+    while "Ctrl-C leaves" not in up.line():
+        pass
+    assert up.line() == f"e-stop {opened.id} is open: smoke; nothing moves before it is cleared\n"
+    assert up.line() == f"when it is safe: trade estop --clear {opened.id}\n"
 
 
 def test_S09_who_finds_nobody_cannot_tell_whether_an_estop_is_open(trade_command: Command) -> None:
