@@ -11,10 +11,11 @@ from pathlib import Path
 
 import pytest
 
-from doors import Axis, Opened, opened
+from doors import Axis, Client, Opened, opened
 from jointed import Robot
 from trade import Handle, service, where
 from trade.testing import memory_system
+from trade_gateway.door import add_token
 from waiting import wait_until
 
 
@@ -212,6 +213,12 @@ def test_S09_an_e_stop_holds_until_it_is_cleared(door: Opened) -> None:
     assert anna.ask("POST", "/estop/clear", {"ids": ["nonsense"]}).title == "NoSuchEstop"
     assert anna.ask("POST", "/estop/clear").body["complete"]
     assert anna.call("robot.a.move", 1.0).status == 200
+
+
+def test_S09_a_door_that_finds_nobody_does_not_say_that_none_is_open(tmp_path: Path) -> None:
+    with memory_system() as system, opened(system.container("alone"), tmp_path) as (made, tokens):
+        refused = Client(made.url, add_token(tokens, "anna")).ask("POST", "/estop/clear")
+        assert (refused.status, refused.title) == (503, "NobodyFound")
 
 
 def test_S07_of_too_much_at_once_some_is_refused_and_a_stop_is_not(door: Opened) -> None:

@@ -14,7 +14,7 @@ from typing import Any
 
 from tests.holds import Ask, Done, Held, Log, Seen
 
-from system.planner import CENTRE_COUNTS, STEP, rad
+from system.careless import CENTRE_COUNTS, STEP, rad
 from system.siege_records import Answer, Order
 from trade import Container, Handle, Settings, where
 from trade.errors import TradeError

@@ -1,6 +1,7 @@
 """``trade lock``, ``locks``, ``unlock``, ``resume`` and ``estop`` on a simulated robot, as a user types them."""
 
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -10,7 +11,9 @@ from pathlib import Path
 import pytest
 
 import trade
+from system.conftest import ROSIES_HEAD, Program
 from trade import Container, where
+from trade._endpoints import free_endpoint
 from trade.errors import LockedByOther, Stopped
 from waiting import PATIENCE_S, wait_until
 
@@ -92,6 +95,12 @@ def locked(rosie_up):
     yield start
     for lock in started:
         lock.close()
+
+
+@pytest.fixture
+def nobody_there() -> str:
+    """An endpoint where nobody listens."""
+    return free_endpoint()
 
 
 def move(joint: str = "pan") -> float:
@@ -181,7 +190,8 @@ def test_a_lock_that_cannot_be_had_runs_nothing(locked, trade_command: Command, 
         (["lock", "nowhere", "--", "true"], 1, "ConfigurationError: lock of group='nowhere'"),
         (["lock", "a b", "--", "true"], 2, "UsageError: lock a b:"),
         (["estop", "abc"], 2, "UsageError: trade estop: ids are for clearing"),
-        (["estop", "--clear", "abc"], 1, "NoSuchEstop: there is no open e-stop abc; none is open"),
+        (["estop", "--clear", "--limit", "0.2"], 1, "NobodyFound: nobody was found in system test-"),
+        (["estop", "--clear", "abc", "--limit", "0.2"], 1, "NobodyFound: nobody was found in system test-"),
     ],
 )
 def test_wrong_words_are_answered_in_one_line(
@@ -191,6 +201,30 @@ def test_wrong_words_are_answered_in_one_line(
     assert said.returncode == code
     assert said.stderr.startswith(complaint)
     assert len(said.stderr.splitlines()) == 1
+
+
+@pytest.mark.parametrize("words", [["services"], ["containers"], ["locks"], ["resume", "rosie"], ["faults"]], ids=str)
+def test_who_finds_nobody_where_it_is_to_connect_lists_nothing(
+    trade_command: Command, nobody_there: str, words: list[str]
+) -> None:
+    said = trade_command("--connect", nobody_there, *words)
+    assert (said.returncode, said.stdout) == (1, "")
+    assert said.stderr.startswith("NobodyFound: nobody was found in system test-")
+    assert f"nobody answers at {nobody_there} (TRADE_CONNECT): nothing accepts connections there" in said.stderr
+
+
+def test_a_call_of_nobody_says_where_nobody_answers(trade_command: Command, nobody_there: str) -> None:
+    said = trade_command("--connect", nobody_there, "call", "rosie.head.move_to", "0.1", "--wait", "0.1")
+    assert said.returncode == 1
+    assert said.stderr.startswith("NoSuchService: no service matches")
+    assert f"nobody answers at {nobody_there} (TRADE_CONNECT)" in said.stderr
+    assert "TRADE_SYSTEM" not in said.stderr
+
+
+def test_resume_of_nothing_speaks_of_resuming(trade_command: Command) -> None:
+    said = trade_command("resume", "rosie")
+    assert said.returncode == 1
+    assert "resume of group='rosie': nothing that matches actuates, so there is nothing to resume" in said.stderr
 
 
 # --- stops
@@ -207,13 +241,71 @@ def test_S09_an_estop_holds_the_robot_until_it_is_cleared(rosie_up, trade_comman
     assert "smoke" in refused.stderr
     rosie.program.signal(signal.SIGTERM)
     rosie.program.wait()
-    rosie_up()  # a restart changes nothing
+    assert rosie_up().ready["estops"] == [report["id"]]  # a restart changes nothing
     with pytest.raises(Stopped, match="smoke"):
         move()
+    still = trade_command("resume", "rosie.neck")
+    assert (still.returncode, "may move" in still.stdout) == (1, False)
+    assert f"e-stop {report['id']} is open: smoke" in still.stdout
     cleared = trade_command("estop", "--clear")
     assert (cleared.returncode, "cleared:" in cleared.stdout) == (0, True)
+    assert "nothing moves by itself" in cleared.stdout
+    assert "trade resume GROUP" in cleared.stdout
     assert move() == pytest.approx(0.05, abs=0.02)
     assert "no e-stop is open" in trade_command("estop", "--clear").stdout
+    unknown = trade_command("estop", "--clear", "abc")
+    assert (unknown.returncode, "NoSuchEstop: there is no open e-stop abc" in unknown.stderr) == (1, True)
+
+
+def test_S09_a_robot_that_comes_up_with_one_open_says_so_and_how_it_is_cleared(
+    run: Callable[..., Program], start_container: Callable[..., Container]
+) -> None:
+    opened = start_container("other").estop("smoke", limit_s=0.2)
+    up = run("-m", "trade_gateway", "up", ROSIES_HEAD, "--sim")
+    while "Ctrl-C leaves" not in up.line():
+        pass
+    assert up.line() == f"e-stop {opened.id} is open: smoke; nothing moves before it is cleared\n"
+    assert up.line() == f"when it is safe: trade estop --clear {opened.id}\n"
+
+
+def test_S09_who_finds_nobody_cannot_tell_whether_an_estop_is_open(trade_command: Command) -> None:
+    said = trade_command("estop", "--clear", "--limit", "0.2", "--json")
+    assert (said.returncode, said.stdout) == (1, "")
+    assert "nobody can tell whether an e-stop is open; none was cleared" in said.stderr
+
+
+def test_S09_who_finds_nobody_where_it_is_to_connect_says_where(trade_command: Command, nobody_there: str) -> None:
+    said = trade_command("--connect", nobody_there, "estop", "--clear", "--limit", "0.2")
+    assert (said.returncode, said.stdout) == (1, "")
+    assert f"nobody answers at {nobody_there} (TRADE_CONNECT): nothing accepts connections there" in said.stderr
+
+
+def test_S09_who_does_not_answer_may_have_one_open(rosie_up, trade_command: Command) -> None:
+    rosie = rosie_up()
+    rosie.program.signal(signal.SIGSTOP)
+    try:
+        said = trade_command("estop", "--clear", "--limit", "0.5")
+    finally:
+        rosie.program.signal(signal.SIGCONT)
+    assert (said.returncode, said.stdout) == (1, "")
+    assert re.search(
+        "rosie did not answer; .*nobody can tell|nobody was found", said.stderr
+    )  # it may seem gone by then
+
+
+def test_S09_what_was_found_is_cleared_and_what_is_missing_is_told(
+    rosie_up, trade_command: Command, start_container: Callable[..., Container], nobody_there: str
+) -> None:
+    door = start_container("door", listen=[free_endpoint()])
+    rosie_up()
+    assert trade_command("estop").returncode == 0
+    both = ["--connect", door.settings.listen[0], "--connect", nobody_there]
+    said = trade_command(*both, "estop", "--clear", "--limit", "2")
+    assert said.returncode == 1
+    assert "cleared: " in said.stdout
+    assert f"nobody answers at {nobody_there}" in said.stderr
+    assert "stays open until it is cleared once more" in said.stderr
+    assert move() == pytest.approx(0.05, abs=0.02)
 
 
 def test_S09_an_estop_that_misses_somebody_or_finds_nobody_is_no_success(rosie_up, trade_command: Command) -> None:

@@ -8,14 +8,15 @@ from typing import Any
 import pytest
 
 from trade import Container, Estop, Handle, Resource, Settings, service, where
-from trade._access import FUNCTIONS
+from trade._access import FUNCTIONS, Access
 from trade._context import CallContext, running
 from trade._estop_services import EstopServices
+from trade._hints import no_such_service
 from trade._memory import MemoryTransport
 from trade._own_services import OwnServices
 from trade._service import marked_methods
 from trade._wire import PROTOCOL, Behalf, EstopOrder, encode_message, estop_key
-from trade.errors import AccessDenied, ConfigurationError, LockedByOther, LockLost, Stopped
+from trade.errors import AccessDenied, ConfigurationError, LockedByOther, LockLost, NoSuchService, Stopped
 from trade.testing import MemorySystem, memory_system
 
 POLICY = """
@@ -178,8 +179,24 @@ def test_locking_needs_the_right_over_the_group(member: Member, neck: Neck) -> N
     planner, dash = member("planner"), member("dash")
     with planner.lock(where(group="rosie.neck")):
         assert find(planner, "move")(0.1) == 0.1
-    with pytest.raises(AccessDenied, match=r"dash may not lock rosie.neck.move"):
+    with pytest.raises(AccessDenied, match=r"dash may not lock rosie.neck \(of it rosie.neck.move\)"):
         dash.lock(where(group="rosie.neck")).acquire()
+
+
+def test_who_may_not_read_what_he_looks_for_is_told_that(policy: Path) -> None:
+    access = Access(policy, certified=True)
+    hidden = access.hidden("nobody", "rosie.neck")
+    assert hidden.startswith("nobody may not read rosie.neck: ")
+    assert access.hidden("planner", "rosie.neck") == ""
+    assert Access(policy).hidden("nobody", "rosie.neck") == ""  # without certificates it is told all the same
+    assert hidden in str(no_such_service(where(group="rosie.neck"), [], 0.1, hidden=hidden))
+
+
+def test_a_look_up_says_that_the_policy_hides_it(member: Member, neck: Neck, monkeypatch: pytest.MonkeyPatch) -> None:
+    dash = member("dash")
+    monkeypatch.setattr(dash.access, "_certified", True)
+    with pytest.raises(NoSuchService, match=r"dash may not read cellar: .*nothing of it is seen here"):
+        dash.find(where(group="cellar", name="light"), wait_s=0)
 
 
 def test_breaking_a_lock_resuming_and_clearing_are_for_who_administers(
@@ -187,7 +204,7 @@ def test_breaking_a_lock_resuming_and_clearing_are_for_who_administers(
 ) -> None:
     planner, dash, chief = member("planner"), member("dash"), member("chief")
     with planner.lock(where(group="rosie.neck")):
-        with pytest.raises(AccessDenied, match=r"dash may not administer rosie.neck.move"):
+        with pytest.raises(AccessDenied, match=r"dash may not administer rosie.neck \(of it rosie.neck.move\)"):
             dash.break_lock(where(group="rosie.neck"), "mine")
         find(dash, "stop")()
         planner.resume(where(group="rosie.neck"))

@@ -323,8 +323,9 @@ def test_S09_after_clearing_nothing_moves_by_itself(system: MemorySystem) -> Non
     other.estop_clear([other.estop("look", limit_s=GENEROUS_S).id], limit_s=GENEROUS_S)
     run.result(GENEROUS_S)
     assert not axis.joint.moving
-    with pytest.raises(Stopped, match=r"trade\.resume"):
+    with pytest.raises(Stopped, match=r"That e-stop is cleared, and nobody has resumed .* trade\.resume") as refused:
         call(mover, "move_to", "one", 0.1)
+    assert (refused.value.estop, refused.value.cleared) == (False, True)
     mover.resume(where(group="one"))
     assert call(mover, "move_to", "one", 0.1) == 0.1
 

@@ -35,6 +35,7 @@ from trade._secret import Secret
 from trade._service import service
 from trade._session import Session
 from trade._settings import Settings
+from trade._sight import Sight
 from trade._spans import Span
 from trade._stream import If, Stream
 from trade._system import ContainerInfo, System
@@ -71,6 +72,7 @@ __all__ = [
     "Secret",
     "Session",
     "Settings",
+    "Sight",
     "Span",
     "Stream",
     "System",

@@ -109,6 +109,13 @@ class Access:
         policy = self.policy if self._certified else None
         return [] if policy is None else [*policy.names(), *policy.gateways]
 
+    def hidden(self, who: str, group: str) -> str:
+        """Why it is not told what there is in a group, in words of the policy; empty: it is, as far as is known."""
+        if self.policy is None or not self._certified or group in ("", DOMAIN):
+            return ""
+        decision = self.policy.decide(who, "read", group)
+        return "" if decision.allowed else f"{who} may not read {group}: {decision.rule}"
+
     # --- calls
 
     def denied_call(

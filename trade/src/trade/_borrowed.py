@@ -41,9 +41,16 @@ class SharedResource(Resource):
         self.home_name: Final = home_name
         self.lender: Final = lender
 
-    def stop(self, by: str, sessions: Iterable[str] = (), reason: str = "stop was called") -> None:  # noqa: ARG002
+    def stop(
+        self,
+        by: str,
+        sessions: Iterable[str] = (),  # noqa: ARG002
+        reason: str = "stop was called",
+        *,
+        estop: bool = False,
+    ) -> None:
         """Void what was admitted; whether it latches is judged at home."""
-        super().stop(by, (), reason)
+        super().stop(by, (), reason, estop=estop)
 
 
 class Loan:

@@ -117,7 +117,7 @@ class Estops:
         with self._guard:
             self._latch()
         for resource in self._table.resources():
-            resource.stop(estop.by, (estop.by,), reason)
+            resource.stop(estop.by, (estop.by,), reason, estop=True)
         ended = threading.Event()
         problems: list[str] = []
 

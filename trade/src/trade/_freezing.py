@@ -10,7 +10,7 @@ from trade._locks import LockTable
 from trade._resources import Holder, Resource, locked
 from trade._terms import Terms
 from trade._wire import Address
-from trade.errors import ConfigurationError, LockedByOther, Stopped
+from trade.errors import ConfigurationError, LockedByOther
 
 CALLS_S: Final = 2.0
 """How long calls that run may take to end."""
@@ -109,7 +109,7 @@ def require_rest(resources: tuple[Resource, ...]) -> None:
     """Raises LockedByOther: one moves. Stopped: one was stopped, and nobody has resumed it."""
     for resource in resources:
         if (latch := resource.estop or resource.latch) is not None:
-            raise Stopped(resource=resource.name, by=latch.by, reason=latch.reason, estop=resource.estop is not None)
+            raise latch.stopped(resource.name, estop=resource.estop is not None)
         if resource.moving:
             owner, purpose = ", ".join(resource.movers) or "somebody", "a motion that has not ended"
             raise LockedByOther(resources=(resource.name,), owner=owner, purpose=purpose)

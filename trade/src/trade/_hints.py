@@ -9,7 +9,7 @@ from trade._registry import Record
 from trade._system import DOMAIN
 from trade.errors import NoSuchService, TooManyServices
 
-__all__ = ["no_such_service", "too_many_services"]
+__all__ = ["asked_for", "no_such_service", "too_many_services"]
 
 _LIKE: Final = 0.7
 _NAME_LIKE: Final = 0.6
@@ -17,15 +17,37 @@ _MOST: Final = 2
 _MOST_GROUPS: Final = 20
 
 
-def no_such_service(constraint: Constraint, records: Iterable[Record], waited_s: float) -> NoSuchService:
-    """The error of a look-up without a match, given all services there are."""
+def no_such_service(
+    constraint: Constraint,
+    records: Iterable[Record],
+    waited_s: float,
+    apart: Sequence[str] = (),
+    hidden: str = "",
+) -> NoSuchService:
+    """The error of a look-up without a match.
+
+    Args:
+        constraint: what was looked for.
+        records: all services there are.
+        waited_s: how long, in seconds.
+        apart: where there is no link, and why (`Sight`).
+        hidden: why the policy does not let it be seen.
+    """
     known = list(records)
     groups = sorted({group for record in known for group in record.groups} - {DOMAIN})
-    near = _near(_asked(constraint, "group"), _asked(constraint, "name"), groups, known)
-    return NoSuchService(constraint=str(constraint), waited_s=waited_s, near=near, groups=groups[:_MOST_GROUPS])
+    near = _near(asked_for(constraint, "group"), asked_for(constraint, "name"), groups, known)
+    return NoSuchService(
+        constraint=str(constraint),
+        waited_s=waited_s,
+        near=near,
+        groups=groups[:_MOST_GROUPS],
+        apart=apart,
+        hidden=hidden,
+    )
 
 
-def _asked(constraint: Constraint, field: str) -> str:
+def asked_for(constraint: Constraint, field: str) -> str:
+    """The first pattern that a constraint has for a field; empty if it has none."""
     terms = [term for clause in constraint.clauses for term in clause if not term.negated]
     return next((term.pattern for term in terms if term.field == field), "")
 

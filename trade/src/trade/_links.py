@@ -130,7 +130,10 @@ class Links:
     def linked_at(self, endpoint: str) -> bool:
         """Whether one of the main session's links leads there."""
         wanted = set(Endpoint.read(endpoint).resolved())
-        return any(_plain(str(link.dst)) in wanted for link in self._session.info.links())
+        try:
+            return any(_plain(str(link.dst)) in wanted for link in self._session.info.links())
+        except zenoh.ZError:  # closed
+            return False
 
     def beacon(self) -> Beacon:
         """A session linked to the main one that answers scouts and dials nobody, until it is closed."""

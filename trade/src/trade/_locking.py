@@ -62,7 +62,7 @@ class Locking:
             handles = selected(which, self._home.services)
             if not partial:
                 require_whole(which, handles)
-            self._require("lock", handles)
+            self._require("lock", handles, which)
             return resources_of(handles)
 
         return Lock(self.keeper, terms, wanted, on_lost, on_request)
@@ -90,7 +90,7 @@ class Locking:
     def break_lock(self, which: Constraint | Iterable[Handle], reason: str) -> list[LockInfo]:
         """See `Container.break_lock`."""
         handles = selected(which, self._home.services)
-        self._require("administer", handles)
+        self._require("administer", handles, which)
         wanted = resources_of(handles)
         broken: list[LockInfo] = []
         for address, names in wanted.items():
@@ -98,12 +98,16 @@ class Locking:
             broken += [info for info in hit if self._service(address, "break_lock")(info.token.number, reason)]
         return broken
 
-    def _require(self, verb: str, handles: Sequence[Handle]) -> None:
+    def _require(self, verb: str, handles: Sequence[Handle], which: Constraint | Iterable[Handle]) -> None:
+        """Raises AccessDenied, which names what was asked for, and then the service that it fails at."""
+        groups = _groups_of(which) if isinstance(which, Constraint) else []
         for handle in handles:
-            self._home.access.require(self._home.address.identity, verb, handle.key.domain, handle.label)
+            what = f"{groups[0]} (of it {handle.label})" if len(groups) == 1 else handle.label
+            self._home.access.require(self._home.address.identity, verb, handle.key.domain, what)
 
     def _everywhere(self, name: str, which: Constraint | Iterable[Handle], *rest: str) -> list[str]:
-        wanted = resources_of(selected(which, self._home.services))
+        verb = "resume" if name == "resume" else "lock"
+        wanted = resources_of(selected(which, self._home.services, verb))
         runs = [self._service(address, name).start(names, *rest) for address, names in wanted.items()]
         return [text for run in runs for text in run.result()]
 
@@ -126,31 +130,39 @@ def own_resource(key: ServiceKey) -> str:
     return f"{key.domain}/{key.provider}/{key.name}"
 
 
-def selected(which: Constraint | Iterable[Handle], select: Callable[[Constraint], Sequence[Handle]]) -> list[Handle]:
-    """The services a lock is for: those given, or the actuating ones that match.
+def selected(
+    which: Constraint | Iterable[Handle], select: Callable[[Constraint], Sequence[Handle]], verb: str = "lock"
+) -> list[Handle]:
+    """The services a lock, or a resume, is for: those given, or the actuating ones that match.
 
     Raises:
         ConfigurationError: there are none, a stop is among them, or it is one handle and no list.
     """
     if isinstance(which, Handle):
-        problem = "is one service; give a list, lock([handle]), or a constraint, lock(where(...))"
+        problem = f"is one service; give a list, {verb}([handle]), or a constraint, {verb}(where(...))"
         raise ConfigurationError(where=which.label, problem=problem)
     if isinstance(which, Constraint):
         found = [handle for handle in select(which) if handle.effect == "actuate"]
         if not found:
-            problem = "nothing that matches actuates, so there is nothing to lock; what reads is locked by its handle"
-            raise ConfigurationError(where=f"lock of {which}", problem=problem)
+            problem = f"nothing that matches actuates, so there is nothing to {verb}"
+            problem += "; what reads is locked by its handle" if verb == "lock" else ""
+            raise ConfigurationError(where=f"{verb} of {which}", problem=problem)
         return found
     found = list(which)
     if noted := next((handle for handle in found if handle.effect == "note"), None):
         problem = "it only writes something down; no lock takes it"
         raise ConfigurationError(where=noted.label, problem=problem)
     if not found:
-        raise ConfigurationError(where="lock", problem="an empty selection locks nothing; name some services")
+        raise ConfigurationError(where=verb, problem=f"an empty selection {verb}s nothing; name some services")
     for handle in found:
         if handle.effect == "stop":
             raise ConfigurationError(where=handle.label, problem="a stop is everybody's; it cannot be locked")
     return found
+
+
+def _groups_of(which: Constraint) -> list[str]:
+    """The groups that a constraint names."""
+    return [term.pattern for clause in which.clauses for term in clause if term.field == "group" and not term.negated]
 
 
 def require_whole(which: Constraint | Iterable[Handle], handles: Sequence[Handle]) -> None:
@@ -161,7 +173,7 @@ def require_whole(which: Constraint | Iterable[Handle], handles: Sequence[Handle
     """
     if not isinstance(which, Constraint):
         return
-    groups = [term.pattern for clause in which.clauses for term in clause if term.field == "group" and not term.negated]
+    groups = _groups_of(which)
     there = {name for handle in handles for name in handle.record.info.uses}
     for group in groups:
         expected = {

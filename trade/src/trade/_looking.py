@@ -7,9 +7,10 @@ from typing import Any
 from trade import _many
 from trade._constraints import Constraint, where
 from trade._handle import Bound, Handle
-from trade._hints import no_such_service, too_many_services
+from trade._hints import asked_for, no_such_service, too_many_services
 from trade._member import Member
 from trade._registry import Record
+from trade._sight import Sight, look_around
 from trade._system import DOMAIN
 from trade.errors import AccessDenied
 
@@ -40,10 +41,24 @@ class Looking(Member):
             return bool(matches)
 
         if not self._parts.registry.wait_for(found, wait_s):
-            raise no_such_service(constraint, self._parts.registry.select(where()), wait_s)
+            apart = self.sight(limit_s=0).unanswered if len(self.addresses()) == 1 else ()
+            hidden = self.access.hidden(self.address.identity, asked_for(constraint, "group"))
+            raise no_such_service(constraint, self._parts.registry.select(where()), wait_s, apart, hidden)
         if len(matches) > 1:
             raise too_many_services(constraint, matches)
         return Handle(self, matches[0].key, matches[0])
+
+    def sight(self, *, limit_s: float = 3.0) -> Sight:
+        """Whom it has found: what nobody tells is only told by nobody if somebody was there to tell.
+
+        Returns at once when it is `Sight.complete`.
+
+        Args:
+            limit_s: how long to wait for that, in seconds; also if nobody is found. Finding out why there is no link to
+                an endpoint takes up to 3 s more for each.
+        """
+        self._check_open()
+        return look_around(self._parts.registry, self._parts.reach, self.address, limit_s)
 
     # --- calling
 

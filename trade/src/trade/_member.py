@@ -23,6 +23,10 @@ class Member(ABC):
         """Raises ConfigurationError if it is closed, or if this is a forked child."""
 
     @abstractmethod
+    def addresses(self) -> list[Address]:
+        """Where the containers of the system are, this one included."""
+
+    @abstractmethod
     def handle(self, key: ServiceKey) -> Handle:
         """A handle of a service whose key is known."""
 

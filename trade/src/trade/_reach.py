@@ -36,6 +36,8 @@ class Reach:
         self._discovering = False
         self._kept: dict[str, str] = {}
         """Endpoint -> id of the session found there."""
+        self.configured: Final = tuple(configured)
+        """The endpoints it was told to dial when it was started."""
         self._unsure = list(configured)
         self._unsure_until = time.monotonic() + _REFUSED_S
         self._refused: dict[str, float] = {}
@@ -98,6 +100,26 @@ class Reach:
         asked = Endpoint.read(endpoint)
         found = asked.resolved() if asked.protocol in ("tcp", "udp") and not asked.rest else [endpoint]
         return self._links.join(found, "", _JOIN_S, self._ended) if found else ""
+
+    def unlinked(self) -> list[str]:
+        """Those of the configured endpoints that none of the links leads to."""
+        return [endpoint for endpoint in self.configured if not self._links.linked_at(endpoint)]
+
+    def why_apart(self, endpoint: str, *, certain: bool) -> str:
+        """Why there is no link to an endpoint that none leads to.
+
+        Args:
+            endpoint: a configured one.
+            certain: whether it is known that there is none; else somebody there may have dialled us, which is looked at
+                for two seconds at most.
+
+        Returns:
+            The reason; empty if there is a link.
+        """
+        why = _why(endpoint, self._links)
+        if certain or not accepts(endpoint):
+            return why
+        return "" if self._dial(endpoint) else why
 
     # --- the thread
 

@@ -46,6 +46,17 @@ class Latch(NamedTuple):
 
     by: str
     reason: str
+    estop: bool = False
+    """Whether an e-stop did it; clearing that does not resume."""
+
+    def stopped(self, resource: str, *, estop: bool) -> Stopped:
+        """The error of who comes to that resource.
+
+        Args:
+            resource: its name.
+            estop: whether an e-stop is open.
+        """
+        return Stopped(resource=resource, by=self.by, reason=self.reason, estop=estop, cleared=self.estop and not estop)
 
 
 class Resource:
@@ -110,18 +121,21 @@ class Resource:
         if self._rested is not None:
             self._rested()
 
-    def stop(self, by: str, sessions: Iterable[str] = (), reason: str = "stop was called") -> None:
+    def stop(
+        self, by: str, sessions: Iterable[str] = (), reason: str = "stop was called", *, estop: bool = False
+    ) -> None:
         """Void everything admitted so far; by a session other than the motion's own or the lock owner's, latch (S08).
 
         Args:
             by: who stops, for messages.
             sessions: of who stops; none: whoever drives the resource, which never latches.
             reason: why.
+            estop: whether it is an e-stop.
         """
         asking = set(sessions)
         used = self.holder is not None or self.busy or self.movers
         if asking and used and not self._is_of(asking):
-            self.latch = Latch(by, reason)  # first: who is let in under the new number has seen it
+            self.latch = Latch(by, reason, estop)  # first: who is let in under the new number has seen it
         self.stops = _stop_numbers()  # not += 1: of two at once one would be lost
 
     def _is_of(self, asking: set[str]) -> bool:
@@ -161,7 +175,7 @@ class Resource:
         """
         latch = self.estop or self.latch
         if latch is not None:
-            raise Stopped(resource=self.name, by=latch.by, reason=latch.reason, estop=self.estop is not None)
+            raise latch.stopped(self.name, estop=self.estop is not None)
         self.check_lock(tokens, caller, session)
 
     def check_lock(self, tokens: Iterable[Token], caller: str, session: str = "") -> None:

@@ -43,6 +43,7 @@ __all__ = [
     "NoSuchHook",
     "NoSuchNotification",
     "NoSuchService",
+    "NobodyFound",
     "NotInstantiable",
     "NotSerialisable",
     "OutcomeUnknown",
@@ -84,6 +85,11 @@ def _some(texts: Sequence[str]) -> str:
     return ", ".join(list(texts)[:5]) + (", ..." if len(texts) > 5 else "")
 
 
+def _nobody_at(apart: Sequence[str]) -> str:
+    """At which endpoints nobody was found, and why."""
+    return "; ".join(f"nobody answers at {endpoint}" for endpoint in apart)
+
+
 # --- the caller must act
 
 
@@ -101,15 +107,23 @@ class NoSuchService(CallerError, LookupError):
     near: Sequence[str] = ()
     groups: Sequence[str] = ()
     """Some of those there are in the system."""
+    apart: Sequence[str] = ()
+    """Endpoints where nobody was found, each with the reason, if nobody else was found at all."""
+    hidden: str = ""
+    """Why it would not be seen here if it was there, in words of the policy; empty: it would."""
 
     def describe(self) -> str:
         return f"no service matches {self.constraint} after {self.waited_s:.3g} s; {self._hint()}"
 
     def _hint(self) -> str:
+        if self.hidden:
+            return f"{self.hidden}; so nothing of it is seen here, and whoever keeps the policy can change that"
         if self.near:
             return f"did you mean {' or '.join(self.near)}?"
         if self.groups:
             return f"there is {_some(self.groups)}; `trade services` lists what they offer"
+        if self.apart:
+            return _nobody_at(self.apart)
         return "nothing is offered in this system: is its provider up, with the same TRADE_SYSTEM?"
 
 
@@ -250,10 +264,15 @@ class Stopped(CallerError, RuntimeError):
     by: str
     reason: str
     estop: bool = False
+    """Whether an e-stop is open."""
+    cleared: bool = False
+    """Whether an e-stop did it that is cleared by now: what it stopped waits for who resumes it."""
 
     def describe(self) -> str:
         remedy = "`trade estop --clear`" if self.estop else "trade.resume(...) or `trade resume`"
-        return f"{self.resource} was stopped by {self.by}: {self.reason}. When it is safe to move, call {remedy}"
+        cleared = " That e-stop is cleared, and nobody has resumed what it stopped." if self.cleared else ""
+        said = f"{self.resource} was stopped by {self.by}: {self.reason}.{cleared}"
+        return f"{said} When it is safe to move, call {remedy}"
 
 
 @dataclass(kw_only=True, eq=False)
@@ -657,6 +676,27 @@ class CannotConnect(SetupError, ConnectionError):
 
     def describe(self) -> str:
         return f"no link to {self.endpoint}: {self.reason}"
+
+
+@dataclass(kw_only=True, eq=False)
+class NobodyFound(SetupError, ConnectionError):
+    """Nobody else was found in the system, or not all of it: what was asked cannot be told."""
+
+    system: str
+    so: str = ""
+    """What cannot be told therefore, and what to do."""
+    others: bool = False
+    """Whether somebody was found."""
+    silent: Sequence[str] = ()
+    """Containers that are there, and have not answered."""
+    apart: Sequence[str] = ()
+    """Endpoints where nobody was found, each with the reason."""
+
+    def describe(self) -> str:
+        said = [] if self.others else [f"nobody was found in system {self.system}"]
+        said += [_nobody_at(self.apart)] if self.apart else []
+        said += [f"{_some(self.silent)} did not answer"] if self.silent else []
+        return "; ".join([*said, self.so] if self.so else said)
 
 
 @dataclass(kw_only=True, eq=False)

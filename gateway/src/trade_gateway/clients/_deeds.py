@@ -24,6 +24,7 @@ from trade.errors import (
     Cancelled,
     ConfigurationError,
     LockLost,
+    NobodyFound,
     NoSuchService,
     TooManyServices,
     TradeError,
@@ -40,6 +41,8 @@ T = TypeVar("T")
 
 _THREADS: Final = MOST + 16
 """As many as there may be calls, locks and questions under way, and some for sessions that come and go."""
+_HEARD_S: Final = 1.0
+"""How long to wait for everybody to be heard."""
 _NO_GROUP: Final = "_"
 
 Gone = Callable[[], Awaitable[object]]
@@ -265,12 +268,20 @@ class Deeds:
         return _stopped(await self.apart(self._container.estop, reason, stops=True))
 
     async def clear(self, who: str, body: messages.ClearBody) -> messages.Stopped:
-        """Clear e-stops. Raises AccessDenied, NoSuchEstop."""
+        """Clear e-stops. Raises AccessDenied, NoSuchEstop; NobodyFound: none is known, and not everybody was heard."""
         ids = body.ids or [one.id for one in self._container.estops()]
         self.judge.require_system(who, "administer", f"e-stop {', '.join(ids)}")
         if not ids:
+            await self.counted(who, self._require_all_heard)
             return messages.Stopped("", True, (), (), {})
         return _stopped(await self.counted(who, self._container.estop_clear, ids))
+
+    def _require_all_heard(self) -> None:
+        sight = self._container.sight(limit_s=_HEARD_S)
+        if not sight.complete:
+            so, system = "so nobody can tell whether an e-stop is open", self._container.settings.system
+            others = bool(sight.others)
+            raise NobodyFound(system=system, so=so, others=others, silent=sight.silent, apart=sight.unanswered)
 
     def estops(self) -> list[messages.EstopView]:
         """Those that are open."""

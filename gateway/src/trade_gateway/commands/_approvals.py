@@ -11,7 +11,7 @@ from trade import Container, Handle, where
 from trade.errors import ConfigurationError, TradeError
 from trade_gateway.commands._list import Json
 from trade_gateway.commands._output import Output, complain
-from trade_gateway.commands._system_choice import visitor
+from trade_gateway.commands._system_choice import visitor_among_others
 
 GROUP: Final = "approvals"
 """Where what waits is a service."""
@@ -31,7 +31,7 @@ def approvals(context: typer.Context, as_json: Json = False) -> None:
     if context.invoked_subcommand is not None:
         return
     out = Output(as_json=as_json)
-    with visitor(context) as container:
+    with visitor_among_others(context) as container:
         found = [one for _, one in _pending(container)]
     if as_json:
         out.data(found)
@@ -67,7 +67,7 @@ def no(
 
 
 def _decide(context: typer.Context, name: str, word: str, *args: str) -> None:
-    with visitor(context) as container:
+    with visitor_among_others(context) as container:
         for handle, one in _pending(container):
             if one["id"] == name:
                 beside = where(name=word, container=handle.container)

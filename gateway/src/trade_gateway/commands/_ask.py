@@ -10,7 +10,7 @@ from rich.markup import escape
 from trade.errors import TradeError
 from trade_gateway.commands._list import Json
 from trade_gateway.commands._output import Output, say_error
-from trade_gateway.commands._system_choice import visitor
+from trade_gateway.commands._system_choice import visitor_among_others
 from trade_gateway.talk import Lexicon, Memory, Reply, Talk, read_lexicon
 
 _FILE: Final = "asked.json"
@@ -33,7 +33,7 @@ def ask(
     if phrases:
         _show(out, known)
         return
-    with visitor(context) as container:
+    with visitor_among_others(context) as container:
         folder = container.settings.state_dir
         memory = Memory(None if folder is None else folder / container.settings.system / _FILE)
         talk = Talk(container, known, memory)

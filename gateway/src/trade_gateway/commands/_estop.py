@@ -5,7 +5,8 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
-from trade import Container, EstopReport
+from trade import Container, EstopReport, Sight
+from trade.errors import NobodyFound, NoSuchEstop
 from trade_gateway.commands._list import Json
 from trade_gateway.commands._output import Output, UsageError
 from trade_gateway.commands._system_choice import visitor
@@ -21,7 +22,8 @@ def estop(
 ) -> None:
     """Stop everything in the system at once, and let nothing move before it is cleared.
 
-    The exit code is not 0 if a container did not confirm, could not stop something, or if none was found.
+    The exit code is not 0 if a container did not confirm, could not stop something, or if none was found; with --clear
+    also if nobody answers at one of the endpoints of TRADE_CONNECT: who is not heard cannot tell what is open there.
     This is software: it is not safety-rated and replaces no switch that cuts the power.
 
     For example: trade estop --reason "smoke", and later trade estop --clear
@@ -32,7 +34,8 @@ def estop(
         raise UsageError(where="trade estop", problem="--reason is for stopping, and --clear clears")
     out = Output(as_json=as_json)
     with visitor(context) as container:
-        report = _clear(container, ids, limit) if clear else container.estop(reason, limit_s=limit)
+        sight = container.sight(limit_s=limit) if clear else None
+        report = container.estop(reason, limit_s=limit) if sight is None else _clear(container, sight, ids, limit)
         system, own = container.settings.system, f"{container.address.identity}/{container.address.container}"
     if report is None:
         if as_json:
@@ -43,13 +46,33 @@ def estop(
         out.data(report)
     else:
         _say(out, report, system, "cleared" if clear else "stopped", own)
+    if sight is not None and not sight.complete:
+        raise _unheard(system, sight, "what is open there stays open until it is cleared once more")
     if not report.complete:
         raise typer.Exit(1)
 
 
-def _clear(container: Container, ids: list[str] | None, limit_s: float) -> EstopReport | None:
+def _clear(container: Container, sight: Sight, ids: list[str] | None, limit_s: float) -> EstopReport | None:
+    """Clear those, or all that are open; None: none is, say all that there are.
+
+    Raises:
+        NobodyFound: nobody was found, or not everybody, and none of those knows it.
+        NoSuchEstop: everybody was asked, and nobody knows it.
+    """
+    system, cannot_tell = container.settings.system, "so nobody can tell whether an e-stop is open; none was cleared"
     wanted = ids or [known.id for known in container.estops()]
-    return container.estop_clear(wanted, limit_s=limit_s) if wanted else None
+    if not sight.others or not (wanted or sight.complete):
+        raise _unheard(system, sight, cannot_tell)
+    try:
+        return container.estop_clear(wanted, limit_s=limit_s) if wanted else None
+    except NoSuchEstop:
+        if sight.complete:
+            raise
+        raise _unheard(system, sight, cannot_tell) from None
+
+
+def _unheard(system: str, sight: Sight, so: str) -> NobodyFound:
+    return NobodyFound(system=system, so=so, others=bool(sight.others), silent=sight.silent, apart=sight.unanswered)
 
 
 def _say(out: Output, report: EstopReport, system: str, done: str, own: str) -> None:
@@ -64,6 +87,8 @@ def _say(out: Output, report: EstopReport, system: str, done: str, own: str) -> 
         out.say(f"[bold red]MISSING: {escape(name)}{_version(report, name)} {missed}[/]")
     if not (report.confirmed or report.failed or report.missing):
         out.say(f"[bold red]nobody was found[/] in system {escape(system)} that has something to stop")
+    if done == "cleared" and others:
+        out.say("nothing moves by itself: what others had in use waits for [bold]trade resume GROUP[/]")
     if done == "stopped":
         out.say(f"e-stop {report.id} is open; when it is safe: [bold]trade estop --clear {report.id}[/]")
 

@@ -12,7 +12,7 @@ from trade.errors import TradeError
 from trade_gateway.commands._by_default import FirstByDefault
 from trade_gateway.commands._list import Json, asked_for
 from trade_gateway.commands._output import Output, UsageError, complain
-from trade_gateway.commands._system_choice import visitor
+from trade_gateway.commands._system_choice import visitor_among_others
 
 if TYPE_CHECKING:
     from trade import Handle
@@ -43,7 +43,7 @@ def list_faults(
     """
     out, silent = Output(as_json=as_json), False
     found: list[FaultInfo] = []
-    with visitor(context) as container:
+    with visitor_among_others(context) as container:
         for handle in _logs(container, robot):
             try:
                 found += handle(open_only=open_only)
@@ -74,7 +74,7 @@ def show(
     For example: trade faults show rosie-3f2a
     """
     out = Output(as_json=as_json)
-    with visitor(context) as container:
+    with visitor_among_others(context) as container:
         fault: Fault = _service(container, fault_id, "fault")(fault_id)
     if as_json:
         out.data(fault)
@@ -99,7 +99,7 @@ def ack(context: typer.Context, fault_id: Id, as_json: Json = False) -> None:
     For example: trade faults ack rosie-3f2a
     """
     out = Output(as_json=as_json)
-    with visitor(context) as container:
+    with visitor_among_others(context) as container:
         seen: FaultInfo = _service(container, fault_id, "acknowledge")(fault_id)
     if as_json:
         out.data(seen)

@@ -12,10 +12,10 @@ from trade._wire import PROTOCOL
 from trade.errors import ConfigurationError
 from trade_gateway._loads import loads, loads_table
 from trade_gateway.commands._output import Output, UsageError
-from trade_gateway.commands._system_choice import visitor
+from trade_gateway.commands._system_choice import visitor_among_others
 
 HEALTHY: Final = "healthy"
-_ALONE: Final = "no other container is up in this system; [bold]trade up examples/rosie.toml --sim[/] starts one"
+_STARTS: Final = "; [bold]trade up examples/rosie.toml --sim[/] starts one"
 Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
 
@@ -35,7 +35,7 @@ def services(
     if not everything and group is None:
         constraint = constraint & ~where(group="trade")
     out = Output(as_json=as_json)
-    with visitor(context) as container:
+    with visitor_among_others(context) as container:
         found = container.services(constraint)
         if as_json:
             out.data([describe(handle) for handle in found])
@@ -67,9 +67,17 @@ def _nothing(container: Container, constraint: Constraint) -> str:
     groups = sorted({group for handle in others for group in handle.groups})
     if groups:
         return f"no services match {escape(str(constraint))}; there is {', '.join(groups)}"
-    return (
-        f"nothing is up in system {container.settings.system}; [bold]trade up examples/rosie.toml --sim[/] starts one"
-    )
+    return f"nothing is up in system {escape(container.settings.system)}{_starts(container)}"
+
+
+def _alone(container: Container) -> str:
+    return f"no other container is up in this system{_starts(container)}"
+
+
+def _starts(container: Container) -> str:
+    """Who tries it out is told how to begin; who has set up a system of his own is not."""
+    settings = container.settings
+    return "" if settings.connect or settings.tls is not None else _STARTS
 
 
 def describe(handle: Handle) -> dict[str, Any]:
@@ -113,15 +121,15 @@ def containers(
     For example: trade containers --load
     """
     out = Output(as_json=as_json)
-    with visitor(context) as container:
+    with visitor_among_others(context) as container:
         if load:
-            _say_loads(out, loads(container))
+            _say_loads(out, container, loads(container))
             return
         found = [info for info in container.containers() if info.epoch != container.address.epoch]
         if as_json:
             out.data(found)
         elif not found:
-            out.say(_ALONE)
+            out.say(_alone(container))
         else:
             out.table(*_containers_table(found))
 
@@ -143,10 +151,10 @@ def _containers_table(found: Sequence[ContainerInfo]) -> tuple[tuple[str, ...], 
     return tuple(columns), list(zip(*columns.values(), strict=True))
 
 
-def _say_loads(out: Output, found: Sequence[LoadInfo]) -> None:
+def _say_loads(out: Output, container: Container, found: Sequence[LoadInfo]) -> None:
     if out.as_json:
         out.data(found)
     elif not found:
-        out.say(_ALONE)
+        out.say(_alone(container))
     else:
         out.table(*loads_table(found))

@@ -17,7 +17,7 @@ from trade import Constraint
 from trade.errors import LockLost
 from trade_gateway.commands._list import asked_for
 from trade_gateway.commands._output import UsageError
-from trade_gateway.commands._system_choice import SystemChoice, choice_of, visitor
+from trade_gateway.commands._system_choice import SystemChoice, choice_of, visitor_among_others
 
 _COMMAND: Final = "trade_gateway.command"
 _KILLED_BY: Final = 128
@@ -69,7 +69,7 @@ def lock(
         raise UsageError(where="trade lock", problem="say what to run: trade lock rosie.head -- python look.py")
     wanted = _wanted(group, name or [])
     running = _Running(command)
-    with visitor(context) as container:
+    with visitor_among_others(context) as container:
         held = container.lock(
             wanted,
             purpose=shlex.join(command) if purpose is None else purpose,

@@ -9,7 +9,7 @@ from rich.markup import escape
 from trade import LockInfo
 from trade_gateway.commands._list import Json, asked_for
 from trade_gateway.commands._output import Output
-from trade_gateway.commands._system_choice import visitor
+from trade_gateway.commands._system_choice import visitor_among_others
 
 Group = Annotated[str, typer.Argument(help="A group and what is beneath it: rosie.head.")]
 
@@ -20,7 +20,7 @@ def locks(context: typer.Context, as_json: Json = False) -> None:
     For example: trade locks --json
     """
     out = Output(as_json=as_json)
-    with visitor(context) as container:
+    with visitor_among_others(context) as container:
         found = container.locks()
     if as_json:
         out.data([_plain(info) for info in found])
@@ -70,7 +70,7 @@ def unlock(
     For example: trade unlock rosie.head --break "its program hangs"
     """
     out = Output(as_json=False)
-    with visitor(context) as container:
+    with visitor_among_others(context) as container:
         broken = container.break_lock(asked_for(f"group {group!r}", group=group, name=None), reason)
     for info in broken:
         out.say(f"taken from {escape(_owner(info))}: {escape(', '.join(info.resources))}")
@@ -81,9 +81,20 @@ def unlock(
 def resume(context: typer.Context, group: Group) -> None:
     """Let a group move again after a stop by somebody else. It moves nothing itself.
 
+    The exit code is 1 while an e-stop is open: nothing moves before that is cleared.
+
     For example: trade resume rosie.head
     """
     out = Output(as_json=False)
-    with visitor(context) as container:
+    with visitor_among_others(context) as container:
         resumed = container.resume(asked_for(f"group {group!r}", group=group, name=None))
+        still = container.estops()
+    for estop in still:
+        why = f": {escape(estop.reason)}" if estop.reason else ""
+        out.say(f"[bold red]e-stop {estop.id} is open{why}; nothing moves before it is cleared[/]")
+    if still:
+        if resumed:
+            out.say(f"resumed, for when it is: {escape(', '.join(resumed))}")
+        out.say(f"when it is safe: [bold]trade estop --clear {' '.join(estop.id for estop in still)}[/]")
+        raise typer.Exit(1)
     out.say(f"may move again: {escape(', '.join(resumed))}" if resumed else f"nothing of {escape(group)} was held")

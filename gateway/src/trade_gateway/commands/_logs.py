@@ -10,7 +10,7 @@ from rich.markup import escape
 from trade import LogLine, LogReader
 from trade_gateway.commands._list import Json
 from trade_gateway.commands._output import Output
-from trade_gateway.commands._system_choice import visitor
+from trade_gateway.commands._system_choice import visitor_among_others
 from trade_gateway.commands._trace import Name, clock
 
 _EVERY_S: Final = 0.5
@@ -37,7 +37,7 @@ def logs(
     """
     least: int = getattr(logging, level.upper())
     out, pause = Output(as_json=as_json), threading.Event()
-    with visitor(context) as member:
+    with visitor_among_others(context) as member:
         reader = LogReader(member, container)
         while True:
             for line in reader.read():

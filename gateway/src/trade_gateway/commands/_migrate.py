@@ -7,7 +7,7 @@ from rich.markup import escape
 
 from trade_gateway.commands._list import Json, asked_for, describe
 from trade_gateway.commands._output import Output
-from trade_gateway.commands._system_choice import visitor
+from trade_gateway.commands._system_choice import visitor_among_others
 
 
 def migrate(
@@ -28,7 +28,7 @@ def migrate(
     """
     out = Output(as_json=as_json)
     wanted = asked_for(f"group {group!r}", group=group, name=name, container=container)
-    with visitor(context) as member:
+    with visitor_among_others(context) as member:
         moved = member.migrate(wanted, to=to)
         if as_json:
             out.data([describe(handle) for handle in moved])

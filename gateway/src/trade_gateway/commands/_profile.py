@@ -13,7 +13,7 @@ from trade import Span
 from trade_gateway.commands._list import Json
 from trade_gateway.commands._output import Output, UsageError
 from trade_gateway.commands._sequences import Deviation, deviations, learn, read, write
-from trade_gateway.commands._system_choice import visitor
+from trade_gateway.commands._system_choice import visitor_among_others
 from trade_gateway.commands._trace import Name
 
 
@@ -46,7 +46,7 @@ def profile(
         raise UsageError(where="trade profile", problem="either --learn or --against")
     usual = None if against is None else read(against)
     out = Output(as_json=as_json)
-    with visitor(context) as member:
+    with visitor_among_others(context) as member:
         spans = member.spans(container=container)
     if usual is not None:
         _compare(out, deviations(spans, usual))

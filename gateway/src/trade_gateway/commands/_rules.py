@@ -15,7 +15,7 @@ from trade_gateway.commands._detached import Detach, detach_now, ready
 from trade_gateway.commands._gateway import hangups
 from trade_gateway.commands._list import Json
 from trade_gateway.commands._output import Output, complain
-from trade_gateway.commands._system_choice import choice_of, visitor
+from trade_gateway.commands._system_choice import choice_of, visitor_among_others
 from trade_gateway.commands._up import leaving, refuse_twice
 
 _LOOK_EVERY_S: Final = 0.5
@@ -126,7 +126,7 @@ def test(context: typer.Context, file: File, as_json: Json = False) -> None:
     For example: trade rules test examples/rules.toml
     """
     out, rules = Output(as_json=as_json), read_rules(file)
-    with visitor(context) as container:
+    with visitor_among_others(context) as container:
         told = rehearse(container, rules)
     if as_json:
         out.data(told)
@@ -150,7 +150,7 @@ def list_(context: typer.Context, as_json: Json = False) -> None:
     For example: trade rules list --json
     """
     out = Output(as_json=as_json)
-    with visitor(context) as container:
+    with visitor_among_others(context) as container:
         outcomes = container.call_all(where(name="rules", group=GROUP, kind="Rules"))
     found: list[RuleInfo] = []
     for outcome in outcomes:

@@ -1,10 +1,15 @@
 """Which system a command speaks to."""
 
 from dataclasses import dataclass, replace
+from typing import Final
 
 import typer
 
 from trade import Container, Settings
+from trade.errors import NobodyFound
+
+_PATIENCE_S: Final = 3.0
+"""How long nobody may be found where the settings say that it is to connect to."""
 
 
 @dataclass(frozen=True)
@@ -29,3 +34,21 @@ def choice_of(context: typer.Context) -> SystemChoice:
 def visitor(context: typer.Context) -> Container:
     """A short-lived container of this command's own; what it asks for is in the records of who is asked."""
     return Container(replace(choice_of(context).settings(), audit=None, metrics=""))
+
+
+def visitor_among_others(context: typer.Context) -> Container:
+    """The same for who asks what there is: where the settings say whom to connect to, somebody has to be there.
+
+    Raises:
+        NobodyFound: nobody is, at any of these endpoints; says why, as far as is known.
+    """
+    container = visitor(context)
+    try:
+        if container.settings.connect and len(container.addresses()) == 1:
+            sight = container.sight(limit_s=_PATIENCE_S)
+            if not sight.others:
+                raise NobodyFound(system=container.settings.system, apart=sight.unanswered)
+    except BaseException:
+        container.close()
+        raise
+    return container

@@ -9,7 +9,7 @@ import typer
 from trade import Span, Trace
 from trade_gateway.commands._list import Json
 from trade_gateway.commands._output import Output, UsageError
-from trade_gateway.commands._system_choice import visitor
+from trade_gateway.commands._system_choice import visitor_among_others
 
 _LATEST: Final = 20
 
@@ -28,7 +28,7 @@ def tracing(
     For example: trade tracing on
     """
     out = Output(as_json=as_json)
-    with visitor(context) as member:
+    with visitor_among_others(context) as member:
         own = member.name
         names = [name for name in member.set_tracing(switch == "on", container=container) if name != own]
     if not names:
@@ -51,7 +51,7 @@ def trace(
     For example: trade trace 2873421361915625477
     """
     out = Output(as_json=as_json)
-    with visitor(context) as member:
+    with visitor_among_others(context) as member:
         if call_id is None:
             _list(out, member.spans())
             return

@@ -10,6 +10,7 @@ from types import FrameType
 from typing import Annotated, Any
 
 import typer
+from rich.markup import escape
 
 from trade import Container
 from trade.errors import ConfigurationError
@@ -178,7 +179,9 @@ def _say_ready(out: Output, robot: Robot, container: Container, simulation: Any)
     mine = [handle for handle in container.services() if handle.local and "trade" not in handle.groups]
     if out.as_json:
         extra = {"control": str(simulation.control_path)} if simulation else {}
-        out.data({**ready(container), "robot": robot.name, **extra, "services": [handle.label for handle in mine]})
+        open_ones = [estop.id for estop in container.estops()]
+        told = {**ready(container), "robot": robot.name, "estops": open_ones, **extra}
+        out.data({**told, "services": [handle.label for handle in mine]})
         return
     out.say(f"[bold green]{robot.name} is up[/]: {len(mine)} services in container {container.name}")
     example = next((handle.label for handle in mine if handle.name in {"state", "read"}), None)
@@ -187,3 +190,7 @@ def _say_ready(out: Output, robot: Robot, container: Container, simulation: Any)
     if simulation:
         out.say(f"to strike the simulator with faults (docs/simulators.md): {simulation.control_path}")
     out.say("Ctrl-C leaves")
+    for estop in container.estops():
+        why = f": {escape(estop.reason)}" if estop.reason else ""
+        out.say(f"[bold red]e-stop {estop.id} is open{why}; nothing moves before it is cleared[/]")
+        out.say(f"when it is safe: [bold]trade estop --clear {estop.id}[/]")

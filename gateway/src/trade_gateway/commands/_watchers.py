@@ -8,7 +8,7 @@ from rich.markup import escape
 from trade import HookInfo, NotificationInfo
 from trade_gateway.commands._list import Json
 from trade_gateway.commands._output import Output
-from trade_gateway.commands._system_choice import visitor
+from trade_gateway.commands._system_choice import visitor_among_others
 
 
 def notifications(
@@ -21,7 +21,7 @@ def notifications(
     For example: trade notifications --cancel 5c1f09ae37b2.1
     """
     out = Output(as_json=as_json)
-    with visitor(context) as container:
+    with visitor_among_others(context) as container:
         if cancel is not None:
             container.cancel_notification(cancel)
             out.say(f"cancelled: {escape(cancel)}")
@@ -72,7 +72,7 @@ def hooks(
     For example: trade hooks --detach 5c1f09ae37b2.h1
     """
     out = Output(as_json=as_json)
-    with visitor(context) as container:
+    with visitor_among_others(context) as container:
         if detach is not None:
             container.detach_hook(detach)
             out.say(f"detached: {escape(detach)}")
