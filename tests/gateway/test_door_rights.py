@@ -1,10 +1,13 @@
 """Who is let in, as whom, and what the policy lets that one do: the client is judged, not the door (S21)."""
 
 import logging
+import socket
 import ssl
 import stat
+import struct
 from collections.abc import Iterator
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import pytest
 from tests.trade.test_locking import Robot
@@ -17,7 +20,7 @@ from trade.errors import ConfigurationError
 from trade.testing import memory_system
 from trade_gateway.clients._records import newest
 from trade_gateway.door import Door, Tokens, add_token
-from waiting import wait_until
+from waiting import PATIENCE_S, wait_until
 
 POLICY = """
 [roles.all]
@@ -369,6 +372,34 @@ def test_a_certificate_of_the_systems_authority_is_an_identity_and_of_no_other(t
             trust.load_cert_chain(foreign / "cert.pem", foreign / "key.pem")
             with pytest.raises(OSError):
                 Client(made.url, trust=trust).ask("GET", "/services")
+
+
+@pytest.mark.parametrize("reset", [False, True])
+@pytest.mark.parametrize("asks", ["", "GET /me HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n", "nonsense\r\n\r\n"])
+def test_a_client_that_breaks_off_leaves_no_traceback(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, asks: str, *, reset: bool
+) -> None:
+    monkeypatch.setattr("trade_gateway.door._protocols._ASKED_WITHIN_S", 0.5)
+    papers = Papers(tmp_path / "pki").of("door", addresses=["127.0.0.1"])
+    trust = ssl.create_default_context(cafile=str(papers / "ca.pem"))
+    with memory_system() as system, opened(system.container("me"), tmp_path, tls=papers) as (made, tokens):
+        place = urlsplit(made.url)
+
+        def joined() -> ssl.SSLSocket:
+            plain = socket.create_connection((place.hostname, place.port), timeout=PATIENCE_S)  # type: ignore[arg-type]
+            return trust.wrap_socket(plain, server_hostname=place.hostname)
+
+        with joined() as gone:
+            gone.sendall(asks.encode())
+            if asks:
+                gone.recv(1)
+            if reset:
+                gone.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        with Client(made.url, add_token(tokens, "anna")).socket(ssl=trust):
+            pass
+        with joined() as later:
+            assert later.recv(1) == b""  # closed for asking nothing, and so the wait for the first one is over, too
+    assert not [record.getMessage() for record in caplog.records if record.exc_info]
 
 
 def test_the_file_of_tokens_has_hashes_alone_and_is_read_as_it_is_now(tmp_path: Path) -> None:
