@@ -50,6 +50,24 @@ def test_the_example_is_right_and_says_what_crosses(file: Path, monkeypatch: pyt
     assert settings.connect == ()
 
 
+def test_the_commands_in_the_example_make_all_that_it_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("gateway.toml", "policy.toml"):
+        (tmp_path / name).write_text(EXAMPLE.with_name(name).read_text())
+    monkeypatch.chdir(tmp_path)
+    commands = [
+        line.removeprefix("#     trade ").split() for line in EXAMPLE.read_text().splitlines() if "#     trade " in line
+    ]
+    said = [CliRunner().invoke(app, words, catch_exceptions=False).stdout for words in commands]
+    assert len(said) == 3 and "gateway.toml is right" in said[-1]
+
+
+def test_a_gateway_that_its_policy_does_not_name_is_told_of(file: Path) -> None:
+    change(file.parent / "policy.toml", 'gateways = ["door"]', 'gateways = ["other"]')
+    assert read_gateway_file(file).settings  # it goes on, as it did before
+    with pytest.raises(ConfigurationError, match=r'door.*gateways = \["other", "door"\]'):
+        CliRunner().invoke(app, ["gateway", str(file), "--check"], catch_exceptions=False)
+
+
 def test_without_any_list_everything_crosses_and_with_one_the_rest_does(file: Path) -> None:
     change(file, 'export = ["rosie"]', "")
     assert read_gateway_file(file).settings.exports == {"eth0": ("*",), "eth1": ()}

@@ -193,6 +193,25 @@ class Plan(NamedTuple):
     children: Sequence[Child]
     """The containers that it looks after, in the order in which they are started."""
 
+    @property
+    def unnamed(self) -> str:
+        """What is wrong with a policy that does not name the gateway; empty: nothing.
+
+        Raises:
+            ConfigurationError: the policy is wrong by now.
+        """
+        carries = self.settings.bridge and self.settings.tls is not None
+        if not carries or self.settings.policy is None:
+            return ""
+        name = self.settings.identity
+        named = read_policy(self.settings.policy).gateways
+        if name in named:
+            return ""
+        said = ", ".join(f'"{one}"' for one in (*named, name))
+        return (
+            f"does not name the gateway {name!r}, so nobody believes it whom it speaks for; write gateways = [{said}]"
+        )
+
 
 def read_gateway_file(path: Path) -> Plan:
     """Read and check a gateway file, the policy and the certificate that it names.

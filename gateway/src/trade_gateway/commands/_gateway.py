@@ -14,7 +14,7 @@ import typer
 from rich.markup import escape
 
 from trade import Container, Settings
-from trade.errors import TradeError
+from trade.errors import ConfigurationError, TradeError
 from trade.policies import EVERYTHING
 from trade_gateway._gateway_file import Plan, digest, named_digest, read_gateway_file
 from trade_gateway._guests import Guests, opened
@@ -47,6 +47,8 @@ def gateway(
     out, notifier = Output(as_json=as_json), Notifier()
     plan = read_gateway_file(file)
     if check:
+        if unnamed := plan.unnamed:
+            raise ConfigurationError(where=str(plan.settings.policy), problem=unnamed)
         out.say(f"{file} is right")
         _say_what_crosses(out, plan)
         _say_children(out, plan)
@@ -60,6 +62,8 @@ def gateway(
         try:
             settle()
             _say_ready(out, running, plan)
+            if unnamed := plan.unnamed:
+                complain(f"{plan.settings.policy}: {unnamed}")
             notifier.ready(_status(running))
             while not asked_to_leave.wait(_LOOK_EVERY_S):
                 if running.healthy:
