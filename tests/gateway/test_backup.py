@@ -64,7 +64,7 @@ def config(tmp_path: Path) -> Path:
     folder = tmp_path / "etc"
     (folder / "robots").mkdir(parents=True)
     (folder / "gateway.toml").write_text(FILE)
-    (folder / "policy.toml").write_text('revoked_file = "revoked.toml"\n[roles]\n[identities]\n')
+    (folder / "policy.toml").write_text('revoked_file = "revoked.toml"\ngateways = ["door"]\n[roles]\n[identities]\n')
     (folder / "revoked.toml").write_text("revoked = []")
     Papers(folder / "pki").of("door", purpose="gateway")
     return folder

@@ -1,13 +1,16 @@
 """Gateway files: what is right is taken as it stands, what is wrong is named with its remedy before anything starts."""
 
+from datetime import timedelta
 from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
 
 from certificates import Papers
+from trade._tls import Certificate
 from trade.errors import ConfigurationError
-from trade_gateway._gateway_file import digest, read_gateway_file
+from trade_gateway._gateway_file import Named, digest, named_by, read_gateway_file
+from trade_gateway._pki import Authority
 from trade_gateway.cli import app
 from trade_gateway.supervisor import Child
 
@@ -253,6 +256,23 @@ def test_a_change_is_seen_in_the_file_the_policy_the_revoked_names_and_the_certi
         assert digest(file) == seen[-1]
     file.write_text("not TOML [")
     assert digest(file) not in seen  # and no error
+
+
+def test_what_has_changed_is_told_by_name(file: Path) -> None:
+    def named() -> Named:
+        return named_by(file, read_gateway_file(file))
+
+    before = named()
+    assert named().since(before) == ""
+    (file.parent / "revoked.toml").write_text('revoked = ["planner"]')
+    assert named().since(before) == "revoked.toml is another one, planner is revoked now"
+    before = named()
+    Authority(file.parent / "pki").issue("door", lasts=timedelta(days=3))
+    until = Certificate.read(file.parent / "pki" / "issued" / "door").until
+    assert named().since(before) == f"new certificate of door until {until:%Y-%m-%d %H:%M} UTC"
+    before = named()
+    change(file.parent / "policy.toml", 'planner = ["viewer"]', "planner = []")
+    assert named().since(before) == "policy.toml is another one, other identities"
 
 
 def test_check_starts_nothing(file: Path) -> None:

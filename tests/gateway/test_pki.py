@@ -355,7 +355,8 @@ def test_the_commands_say_what_is_wrong(folder: Path) -> None:
     said("issue", "door", "--for", "gateway", "--ca", folder)
     assert isinstance(refused("issue", "door", "--for", "container", "--ca", folder), NameTaken)
     assert "there is container and gateway" in str(refused("issue", "x", "--for", "robot", "--ca", folder))
-    said("revoke", "door", "--ca", folder)
+    revoked = said("revoke", "door", "--ca", folder).stdout
+    assert str(folder / "revoked.toml") in revoked and "every host" in revoked
     assert isinstance(refused("issue", "door", "--ca", folder), NameRevoked)
     assert said("issue", "x", "--hours", "0", "--ca", folder).exit_code == 2
 

@@ -11,7 +11,7 @@ from trade._policies import Policy
 from trade._policy_file import Seen
 from trade.errors import ConfigurationError
 
-__all__ = ["begin_watching", "difference"]
+__all__ = ["begin_watching", "different"]
 
 _logger = logging.getLogger("trade")
 _EVERY_NS: Final = 1_000_000_000
@@ -60,7 +60,7 @@ class _Watching:
             return
         after = self._access.policy
         assert after is not None  # noqa: S101 - it has just been read
-        said = f"{path}: {difference(before, after)}"
+        said = f"{path}: {', '.join(different(before, after)) or 'nothing is different'}"
         _logger.warning("read again: %s", said)
         self._audit.changed("policy read again", said, None)
         try:
@@ -69,11 +69,11 @@ class _Watching:
             _logger.exception("not all could be judged anew by %s", path)
 
 
-def difference(before: Policy, after: Policy) -> str:
+def different(before: Policy, after: Policy) -> list[str]:
     """What has become different, in words."""
     changed = [f"{name} is revoked now" for name in sorted(after.revoked - before.revoked)]
     changed += [f"{name} is revoked no more" for name in sorted(before.revoked - after.revoked)]
     parts = ("roles", "identities", "gateways", "approval")
     others = [part for part in parts if getattr(before, part) != getattr(after, part)]
     changed += [f"other {' and '.join(others)}"] if others else []
-    return ", ".join(changed) or "nothing is different"
+    return changed

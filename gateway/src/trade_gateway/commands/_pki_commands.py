@@ -144,7 +144,9 @@ def revoke(name: Name, folder: Folder = _DEFAULT) -> None:
     Output(as_json=False).say(
         f"{name} is revoked and not issued again. Links know no revocation: its certificate links until "
         f"{_moment(taken.until)}. Refused before that it is by the policies that have the list:\n"
-        f"  {escape(str(taken.folder.parents[1] / 'revoked.toml'))}"
+        f"  {escape(str(taken.folder.parents[1] / 'revoked.toml'))}\n"
+        "Copy it to every host, to where its policy says (revoked_file): what runs there reads it within seconds, and "
+        "says so in its log."
     )
 
 
