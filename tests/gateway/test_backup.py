@@ -17,8 +17,10 @@ from typer.testing import CliRunner, Result
 
 from certificates import Papers
 from trade.errors import ConfigurationError
+from trade.policies import read_policy
 from trade_gateway.cli import app
 from trade_gateway.commands._archive import Manifest, read_archive, unpack
+from trade_gateway.supervisor._alone import alone, lock_of
 
 ROOT = Path(__file__).parents[2]
 FILE = """
@@ -64,7 +66,7 @@ def config(tmp_path: Path) -> Path:
     folder = tmp_path / "etc"
     (folder / "robots").mkdir(parents=True)
     (folder / "gateway.toml").write_text(FILE)
-    (folder / "policy.toml").write_text('revoked_file = "revoked.toml"\n[roles]\n[identities]\n')
+    (folder / "policy.toml").write_text('revoked_file = "revoked.toml"\ngateways = ["door"]\n[roles]\n[identities]\n')
     (folder / "revoked.toml").write_text("revoked = []")
     Papers(folder / "pki").of("door", purpose="gateway")
     return folder
@@ -266,6 +268,24 @@ def test_nothing_is_overwritten_unless_by_force(config: Path, state: Path, out: 
     assert content(to) == {"policy.toml": b"mine"}
     run("restore", out, "--to", to, "--force")
     assert (to / "policy.toml").read_bytes() == (config / "policy.toml").read_bytes()
+
+
+def test_who_was_revoked_since_stays_revoked(config: Path, state: Path, out: Path, tmp_path: Path) -> None:
+    (config / "revoked.toml").write_text('revoked = ["old"]')
+    back_up(config, out, state)
+    (config / "revoked.toml").write_text('revoked = ["new"]')
+    told = run("restore", out, "--to", config, "--state", tmp_path / "var-again", "--force")
+    assert read_policy(config / "policy.toml").revoked == {"old", "new"}
+    assert "new stays revoked" in told.stderr
+
+
+def test_nothing_is_put_back_beneath_a_container_that_runs(config: Path, state: Path, out: Path) -> None:
+    back_up(config, out, state)
+    before = content(state)
+    with alone(lock_of(state / "lab", "door", "rosie")), pytest.raises(ConfigurationError, match="stop its gateway"):
+        run("restore", out, "--to", config, "--state", state, "--force")
+    assert before.items() <= content(state).items()
+    run("restore", out, "--to", config, "--state", state, "--force")  # it has ended
 
 
 def test_a_link_does_not_lead_it_out_of_its_folder(config: Path, state: Path, out: Path, tmp_path: Path) -> None:

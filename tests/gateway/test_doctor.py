@@ -194,3 +194,16 @@ def test_the_exit_code_tells_of_errors(system: str, robot_file: Path) -> None:
         well = CliRunner().invoke(app, ["doctor", str(robot_file)])
     assert well.exit_code == 0, well.output
     assert "0 errors" in well.output
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [('system = "lab"', "trade gateway {} --check"), ('[system]\nname = "home"', "trade system up {} --check")],
+)
+def test_a_file_of_another_kind_is_told_by_its_name(system: str, tmp_path: Path, text: str, said: str) -> None:
+    path = tmp_path / "some.toml"
+    path.write_text(text)
+    found = json.loads(CliRunner().invoke(app, ["doctor", str(path), "--json"]).stdout)
+    [error] = [one for one in found if one["about"] == str(path)]
+    assert error["fix"] == said.format(path)
+    assert "robot file" in error["text"] and "unknown table" not in error["text"]

@@ -1,10 +1,13 @@
 """How one gets to the door: under which name, by which page, by what proof; and what is shown of it."""
 
 import logging
+import socket
 import ssl
 import stat
+import struct
 from collections.abc import Iterator
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import pytest
 
@@ -14,6 +17,7 @@ from jointed import Robot
 from trade.errors import ConfigurationError
 from trade.testing import memory_system
 from trade_gateway.door import Door, Tokens, add_token
+from waiting import PATIENCE_S
 
 
 @pytest.fixture
@@ -177,3 +181,31 @@ def test_no_path_leads_out_of_the_door(door: Opened, path: str) -> None:
     assert answer.status in {400, 404, 405}
     assert "root:" not in str(answer.body)
     assert "[tokens]" not in str(answer.body)
+
+
+@pytest.mark.parametrize("reset", [False, True])
+@pytest.mark.parametrize("asks", ["", "GET /me HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n", "nonsense\r\n\r\n"])
+def test_a_client_that_breaks_off_leaves_no_traceback(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, asks: str, *, reset: bool
+) -> None:
+    monkeypatch.setattr("trade_gateway.door._protocols._ASKED_WITHIN_S", 0.5)
+    papers = Papers(tmp_path / "pki").of("door", addresses=["127.0.0.1"])
+    trust = ssl.create_default_context(cafile=str(papers / "ca.pem"))
+    with memory_system() as system, opened(system.container("me"), tmp_path, tls=papers) as (made, tokens):
+        place = urlsplit(made.url)
+
+        def joined() -> ssl.SSLSocket:
+            plain = socket.create_connection((place.hostname, place.port), timeout=PATIENCE_S)  # type: ignore[arg-type]
+            return trust.wrap_socket(plain, server_hostname=place.hostname)
+
+        with joined() as gone:
+            gone.sendall(asks.encode())
+            if asks:
+                gone.recv(1)
+            if reset:
+                gone.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        with Client(made.url, add_token(tokens, "anna")).socket(ssl=trust):
+            pass
+        with joined() as later:
+            assert later.recv(1) == b""  # closed for asking nothing, and so the wait for the first one is over, too
+    assert not [record.getMessage() for record in caplog.records if record.exc_info]

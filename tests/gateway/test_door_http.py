@@ -10,11 +10,14 @@ from http.client import HTTPConnection
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
+from certificates import Papers
 from doors import Axis, Client, Opened, opened
 from jointed import Robot
 from trade import Handle, service, where
 from trade.testing import memory_system
+from trade_gateway.cli import app
 from trade_gateway.door import add_token
 from waiting import wait_until
 
@@ -72,6 +75,32 @@ def test_the_page_about_it_does_what_it_says(door: Opened) -> None:
         [sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False, env=environment
     )
     assert ended.stdout.splitlines() == re.findall(r"print\(.*\) +# (.*)", program), ended.stderr
+
+
+def test_its_program_comes_in_over_an_encrypted_door(tmp_path: Path) -> None:
+    text = (Path(__file__).parents[2] / "docs" / "http.md").read_text(encoding="utf-8")
+    [program] = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    papers = Papers(tmp_path / "pki").of("page", addresses=["127.0.0.1"])
+    with memory_system() as system:
+        system.container("lamps").register(Lamp(), "lab.desk")
+        system.settle()
+        with opened(system.container("me"), tmp_path, tls=papers) as (made, tokens):
+            environment = {**os.environ, "DOOR": made.url, "TOKEN": add_token(tokens, "anna")}
+            ended = subprocess.run(
+                [sys.executable, "-c", program],
+                capture_output=True,
+                text=True,
+                timeout=60,
+                check=False,
+                env=environment,
+                cwd=papers,
+            )
+    assert ended.stdout.splitlines() == re.findall(r"print\(.*\) +# (.*)", program), ended.stderr
+
+
+def test_a_new_token_claims_no_address_that_it_cannot_know(tmp_path: Path) -> None:
+    said = CliRunner().invoke(app, ["door", "token", "anna", "--tokens", str(tmp_path / "tokens.toml")]).stdout
+    assert "Authorization: Bearer" in said and "127.0.0.1" not in said
 
 
 def test_services_of_no_group_and_of_one_container_among_several_are_called(door: Opened) -> None:

@@ -1,13 +1,16 @@
 """Gateway files: what is right is taken as it stands, what is wrong is named with its remedy before anything starts."""
 
+from datetime import timedelta
 from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
 
 from certificates import Papers
+from trade._tls import Certificate
 from trade.errors import ConfigurationError
-from trade_gateway._gateway_file import digest, read_gateway_file
+from trade_gateway._gateway_file import Named, digest, named_by, read_gateway_file
+from trade_gateway._pki import Authority
 from trade_gateway.cli import app
 from trade_gateway.supervisor import Child
 
@@ -48,6 +51,24 @@ def test_the_example_is_right_and_says_what_crosses(file: Path, monkeypatch: pyt
     assert settings.bridge == ("eth0", "eth1")
     assert settings.exports == {"eth0": ("rosie",), "eth1": ()}
     assert settings.connect == ()
+
+
+def test_the_commands_in_the_example_make_all_that_it_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("gateway.toml", "policy.toml"):
+        (tmp_path / name).write_text(EXAMPLE.with_name(name).read_text())
+    monkeypatch.chdir(tmp_path)
+    commands = [
+        line.removeprefix("#     trade ").split() for line in EXAMPLE.read_text().splitlines() if "#     trade " in line
+    ]
+    said = [CliRunner().invoke(app, words, catch_exceptions=False).stdout for words in commands]
+    assert len(said) == 3 and "gateway.toml is right" in said[-1]
+
+
+def test_a_gateway_that_its_policy_does_not_name_is_told_of(file: Path) -> None:
+    change(file.parent / "policy.toml", 'gateways = ["door"]', 'gateways = ["other"]')
+    assert read_gateway_file(file).settings  # it goes on, as it did before
+    with pytest.raises(ConfigurationError, match=r'door.*gateways = \["other", "door"\]'):
+        CliRunner().invoke(app, ["gateway", str(file), "--check"], catch_exceptions=False)
 
 
 def test_without_any_list_everything_crosses_and_with_one_the_rest_does(file: Path) -> None:
@@ -235,6 +256,23 @@ def test_a_change_is_seen_in_the_file_the_policy_the_revoked_names_and_the_certi
         assert digest(file) == seen[-1]
     file.write_text("not TOML [")
     assert digest(file) not in seen  # and no error
+
+
+def test_what_has_changed_is_told_by_name(file: Path) -> None:
+    def named() -> Named:
+        return named_by(file, read_gateway_file(file))
+
+    before = named()
+    assert named().since(before) == ""
+    (file.parent / "revoked.toml").write_text('revoked = ["planner"]')
+    assert named().since(before) == "revoked.toml is another one, planner is revoked now"
+    before = named()
+    Authority(file.parent / "pki").issue("door", lasts=timedelta(days=3))
+    until = Certificate.read(file.parent / "pki" / "issued" / "door").until
+    assert named().since(before) == f"new certificate of door until {until:%Y-%m-%d %H:%M} UTC"
+    before = named()
+    change(file.parent / "policy.toml", 'planner = ["viewer"]', "planner = []")
+    assert named().since(before) == "policy.toml is another one, other identities"
 
 
 def test_check_starts_nothing(file: Path) -> None:

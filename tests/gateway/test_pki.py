@@ -301,7 +301,34 @@ def test_the_commands_make_an_identity_and_say_how_to_start_with_it(folder: Path
     variables = dict(re.findall(r"(TRADE_\w+)=(\S+)", issued))
     assert variables["TRADE_LISTEN"] == "tls/10.0.0.5:7450"
     assert (Path(variables["TRADE_TLS"]) / "key.pem").is_file()
-    assert "TRADE_LISTEN=tls/10.0.0.5:7450" in said("issue", "arm", "--ca", folder).stdout  # renewed: still
+    assert {"TRADE_SYSTEM", "TRADE_POLICY", "TRADE_CONNECT"} <= variables.keys()
+
+
+def test_who_has_no_address_is_told_to_dial_and_not_to_listen(folder: Path) -> None:
+    said("init", folder)
+    issued = said("issue", "planner", "--ca", folder).stdout
+    assert "TRADE_LISTEN" not in issued
+    assert "export TRADE_CONNECT=tls/" in issued
+
+
+def test_a_gateway_is_told_of_its_file_with_all_its_addresses(folder: Path) -> None:
+    said("init", folder)
+    addresses = ["--address", "192.168.7.1", "--address", "10.0.0.7", "--host", "gate.example"]
+    issued = said("issue", "gate", "--for", "gateway", *addresses, "--ca", folder).stdout
+    assert "trade gateway GATEWAY.toml" in issued and "trade up" not in issued
+    assert f'tls = "{folder / "issued" / "gate"}"' in issued
+    listens = ("192.168.7.1", "10.0.0.7", "gate.example")
+    assert [f'listen = ["tls/{host}:7450"]' in issued for host in listens] == [True] * 3
+    assert 'gateways = ["gate"]' in issued
+
+
+def test_of_the_next_certificate_only_what_to_copy_is_told(folder: Path) -> None:
+    said("init", folder)
+    said("issue", "arm", "--address", "10.0.0.5", "--ca", folder)
+    renewed = said("issue", "arm", "--ca", folder).stdout
+    assert str(folder / "issued" / "arm" / "cert.pem") in renewed and "10.0.0.5" in renewed
+    assert "TRADE_" not in renewed and "key.pem" not in renewed
+    assert "key.pem" in said("issue", "arm", "--force", "--ca", folder).stdout  # another key has to be taken along
 
 
 def test_the_commands_list_who_there_is(folder: Path) -> None:
@@ -328,7 +355,8 @@ def test_the_commands_say_what_is_wrong(folder: Path) -> None:
     said("issue", "door", "--for", "gateway", "--ca", folder)
     assert isinstance(refused("issue", "door", "--for", "container", "--ca", folder), NameTaken)
     assert "there is container and gateway" in str(refused("issue", "x", "--for", "robot", "--ca", folder))
-    said("revoke", "door", "--ca", folder)
+    revoked = said("revoke", "door", "--ca", folder).stdout
+    assert str(folder / "revoked.toml") in revoked and "every host" in revoked
     assert isinstance(refused("issue", "door", "--ca", folder), NameRevoked)
     assert said("issue", "x", "--hours", "0", "--ca", folder).exit_code == 2
 

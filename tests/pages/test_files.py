@@ -179,6 +179,12 @@ def test_limits_of_a_drill(text: str) -> None:
     assert robot(HEAD + text).drill
 
 
+@of("http.md", "Beyond this host")
+def test_rights_of_a_door(tmp_path: Path, text: str) -> None:
+    policy = read_policy(save(tmp_path, "policy.toml", f'[roles.operator]\ncall = ["rosie"]\n{text}'))
+    assert policy.decide("page", "call", "rosie.head") == policy.decide("anna", "call", "rosie.head")
+
+
 @of("http.md", "HTTP and WebSocket")
 def test_a_door(tmp_path: Path, text: str) -> None:
     save(tmp_path, "door-tokens.toml", "")

@@ -18,6 +18,7 @@ from trade._service import marked_methods
 from trade._wire import PROTOCOL, Behalf, EstopOrder, encode_message, estop_key
 from trade.errors import AccessDenied, ConfigurationError, LockedByOther, LockLost, NoSuchService, Stopped
 from trade.testing import MemorySystem, memory_system
+from waiting import wait_until
 
 POLICY = """
 revoked = ["thief"]
@@ -518,6 +519,53 @@ def test_a_caller_asks_its_policy_once_a_service(
     for _ in range(20):
         move(0.1)
     assert asked.count("move") == 1
+
+
+# --- files that change
+
+
+@pytest.fixture
+def watching(memory: MemorySystem, policy: Path) -> Iterator[Container]:
+    """A container that was started with the policy, and offers something."""
+    settings = Settings(system="memory", identity="drv", container="of-drv", policy=policy)
+    with Container(settings, transport=MemoryTransport(memory.network, "of-drv")) as made:
+        made.register(Neck(), "rosie.neck")
+        memory.settle()
+        yield made
+
+
+def test_who_is_revoked_in_the_file_is_refused_without_anybody_loading_it(
+    watching: Container, memory: MemorySystem, policy: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "revoked.toml").write_text('revoked = ["thief"]')
+    rewritten(policy, 'revoked = ["thief"]', 'revoked_file = "revoked.toml"')
+    wait_until(lambda: "nothing is different" in caplog.text, "the list is named now")
+    move = find(memory.container("asking", identity="planner"), "move")  # it has no policy, and asks nobody
+    assert move(0.1) == 0.1
+    (tmp_path / "revoked.toml").write_text('revoked = ["thief", "planner"]')
+    wait_until(lambda: "planner is revoked now" in caplog.text, "it is read")
+    with pytest.raises(AccessDenied, match="planner is revoked"):
+        move(0.1)
+    (tmp_path / "revoked.toml").write_text("revoked = 1")
+    wait_until(lambda: "going on by the old one" in caplog.text, "it is refused")
+    assert watching.access.policy is not None
+    assert "planner" in watching.access.policy.revoked
+    assert caplog.text.count("going on by the old one") == 1
+    (tmp_path / "revoked.toml").write_text("revoked = []")
+    wait_until(lambda: "planner is revoked no more" in caplog.text, "and it is right again")
+    assert move(0.1) == 0.1
+
+
+def test_a_policy_that_was_loaded_on_purpose_is_the_one_that_is_looked_at(
+    watching: Container, policy: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    other = tmp_path / "other.toml"
+    other.write_text(POLICY)
+    watching.load_policy(other)
+    rewritten(policy, 'dash = ["viewer"]', 'dash = ["chief"]')
+    rewritten(other, 'dash = ["viewer"]', 'dash = ["operator"]')
+    wait_until(lambda: f"{other}: other identities" in caplog.text, "it is read")
+    assert str(policy) not in caplog.text
 
 
 # --- settings

@@ -11,14 +11,18 @@ import msgspec
 from msgspec import Meta, Struct
 
 from trade import Settings
+from trade._policies import Policy
+from trade._policy_watch import different
+from trade._tls import Certificate
 from trade._toml import read_toml_text
 from trade.errors import ConfigurationError
 from trade.policies import EVERYTHING, read_policy
 from trade_gateway._parts import Around
 from trade_gateway.supervisor import Child, read_children
 
-__all__ = ["GatewayFile", "Network", "Plan", "Share", "digest", "named_digest", "read_gateway_file"]
+__all__ = ["GatewayFile", "Named", "Network", "Plan", "Share", "digest", "named_by", "read_gateway_file"]
 
+_CERTIFICATE: Final = "cert.pem"
 _GROUP: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_-]*(\.[A-Za-z0-9_-]+)*")
 _UNKNOWN_LOOPBACK: Final = re.compile(r"/127\.(?!0\.0\.1:)")
 """The transport knows the interface of a link by the interface's own addresses; it would apply no rule."""
@@ -193,6 +197,25 @@ class Plan(NamedTuple):
     children: Sequence[Child]
     """The containers that it looks after, in the order in which they are started."""
 
+    @property
+    def unnamed(self) -> str:
+        """What is wrong with a policy that does not name the gateway; empty: nothing.
+
+        Raises:
+            ConfigurationError: the policy is wrong by now.
+        """
+        carries = self.settings.bridge and self.settings.tls is not None
+        if not carries or self.settings.policy is None:
+            return ""
+        name = self.settings.identity
+        named = read_policy(self.settings.policy).gateways
+        if name in named:
+            return ""
+        said = ", ".join(f'"{one}"' for one in (*named, name))
+        return (
+            f"does not name the gateway {name!r}, so nobody believes it whom it speaks for; write gateways = [{said}]"
+        )
+
 
 def read_gateway_file(path: Path) -> Plan:
     """Read and check a gateway file, the policy and the certificate that it names.
@@ -314,12 +337,39 @@ def _named(path: str, raw: Mapping[str, Any]) -> str:
 
 def digest(path: Path) -> str:
     """Changes when the file does, or anything that it names."""
-    return f"{_digest([path])}{named_digest(path)}"
+    return _digest([path, *_beside(path)])
 
 
-def named_digest(path: Path) -> str:
-    """Changes when a policy does, its list of revoked names, or a certificate that the file names."""
-    return _digest(_beside(path))
+class Named(NamedTuple):
+    """What a gateway file names, as it is at one moment."""
+
+    digests: Mapping[Path, str]
+    """Of policies, lists of revoked names and certificates: what changes with each."""
+    policy: Policy | None
+    """Its own."""
+
+    def since(self, before: "Named") -> str:
+        """What has become different, in words; empty: nothing."""
+        changed = [path for path, seen in self.digests.items() if before.digests.get(path) != seen]
+        told = [_certified(path) for path in changed if path.name == _CERTIFICATE]
+        told += [f"{path.name} is another one" for path in changed if path.name != _CERTIFICATE]
+        if changed and self.policy is not None and before.policy is not None:
+            told += different(before.policy, self.policy)
+        return ", ".join(told)
+
+
+def named_by(path: Path, plan: Plan) -> Named:
+    """What a gateway file names, now. Raises ConfigurationError: its policy is wrong by now."""
+    policy = plan.settings.policy
+    return Named({file: _digest([file]) for file in _beside(path)}, None if policy is None else read_policy(policy))
+
+
+def _certified(path: Path) -> str:
+    try:
+        made = Certificate.read(path.parent)
+    except ConfigurationError as wrong:
+        return str(wrong)
+    return f"new certificate of {made.identity} until {made.until:%Y-%m-%d %H:%M} UTC"
 
 
 def _digest(files: Sequence[Path]) -> str:
@@ -346,7 +396,7 @@ def _beside(path: Path) -> list[Path]:
 def _named_by(part: Mapping[str, Any], path: Path) -> list[Path]:
     found: list[Path] = []
     if part.get("tls"):
-        found.append(path.parent / str(part["tls"]) / "cert.pem")
+        found.append(path.parent / str(part["tls"]) / _CERTIFICATE)
     if part.get("policy"):
         policy = path.parent / str(part["policy"])
         found.append(policy)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Final
 
 from trade._policies import Decision, Policy
-from trade._policy_file import read_policy
+from trade._policy_file import Seen, look_at, policy_files, read_policy
 from trade._system import DOMAIN, ESTOPS, PROVIDER
 from trade._wire import domain_of
 from trade.errors import AccessDenied
@@ -98,11 +98,25 @@ class Access:
     def __init__(self, path: Path | None = None, *, certified: bool = False) -> None:
         """Read the policy; ``certified``: links tell who is who. Raises ConfigurationError: it is wrong."""
         self._certified = certified
-        self.policy: Policy | None = None if path is None else read_policy(path)
+        self.policy: Policy | None = None
+        self.path: Path | None = None
+        """Where it was read from."""
+        self._files: tuple[Path, ...] = ()
+        self.seen: Seen = ()
+        """What its files were like before they were read."""
+        if path is not None:
+            self.load(path)
 
     def load(self, path: Path) -> None:
         """Go by another one from now on. Raises ConfigurationError: it is wrong, and the old one stays."""
+        files = policy_files(path.absolute())
+        seen = look_at(files)
         self.policy = read_policy(path)
+        self.path, self._files, self.seen = path.absolute(), files, seen
+
+    def look(self) -> Seen:
+        """What its files are like now."""
+        return look_at(self._files)
 
     def callers(self) -> list[str]:
         """Who can call, one by one; nobody where that cannot be told."""

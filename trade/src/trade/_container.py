@@ -82,6 +82,9 @@ class Container(Hosting, Moving, Streaming, Tracing, Guarding, Bordering):
     def load_policy(self, path: Path | str) -> None:
         """Go by another access policy, or by the same file as it is now; calls under way go on.
 
+        A container that was started with one (`Settings.policy`) reads it again by itself when its files change, and
+        so it does with what is loaded here.
+
         What may no longer be offered leaves the registry, and locks that may no longer be held are lost.
 
         Raises:

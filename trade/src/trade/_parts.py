@@ -35,6 +35,7 @@ from trade._measures import Measure
 from trade._metrics import open_metrics
 from trade._notifications import Notifier
 from trade._otlp import open_export
+from trade._policy_watch import begin_watching
 from trade._providers import Providers
 from trade._reach import Reach
 from trade._registry import Record, Registry
@@ -64,6 +65,7 @@ class Parts:
 
     def __init__(self, home: Home, settings: Settings, transport: Transport | None) -> None:
         self._home = home
+        self._watches_policy = settings.policy is not None
         address, access = home.address, home.access
         epoch, session = address.epoch, str(address)
         self.told_of_ends: Final[list[Callable[[str], None]]] = []
@@ -178,6 +180,8 @@ class Parts:
                 self.estopping.learn,
             )
             self._leaving.callback(self.watch.close)
+            if self._watches_policy:
+                begin_watching(self._home.access, self.clockwork, self.audit, self.judge_anew)
             undone.pop_all()
 
     # --- being told

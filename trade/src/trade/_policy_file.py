@@ -2,7 +2,7 @@
 
 import difflib
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Final, cast
 
@@ -12,7 +12,10 @@ from trade._toml import read_toml_text
 from trade._wire import NO_GROUP, is_chunk
 from trade.errors import ConfigurationError
 
-__all__ = ["read_policy"]
+__all__ = ["Seen", "look_at", "policy_files", "read_policy"]
+
+Seen = tuple[tuple[int, int, int] | None, ...]
+"""What files are like: inode, time of change and size of each; None: it is not there."""
 
 _PATTERN: Final = re.compile(r"[A-Za-z0-9_.@:*?-]{1,80}")
 _KEYS: Final = ("roles", "identities", "gateways", "revoked", "revoked_file", "approval")
@@ -51,6 +54,28 @@ def read_policy(path: Path) -> Policy:
         for name, groups in marked.items()
     }
     return Policy(roles.values(), identities, revoked, where, _names(raw, "gateways", where), approval)
+
+
+def policy_files(path: Path) -> tuple[Path, ...]:
+    """A policy's file, and that of revoked identities which it names; of one that cannot be read, it alone."""
+    try:
+        beside = read_toml_text(path.read_text(encoding="utf-8")).get("revoked_file")
+    except (OSError, ValueError):
+        return (path,)
+    return (path, path.parent / beside) if isinstance(beside, str) else (path,)
+
+
+def look_at(files: Iterable[Path]) -> Seen:
+    """What files are like: other ones, once somebody has written one of them."""
+    return tuple(_stamp(file) for file in files)
+
+
+def _stamp(file: Path) -> tuple[int, int, int] | None:
+    try:
+        found = file.stat()
+    except OSError:
+        return None
+    return found.st_ino, found.st_mtime_ns, found.st_size
 
 
 def _load(path: Path) -> _Table:

@@ -131,13 +131,19 @@ def read_archive(path: Path) -> Manifest:
     return manifest
 
 
-def unpack(path: Path, manifest: Manifest, folders: Mapping[str, Path]) -> list[str]:
+def unpack(
+    path: Path,
+    manifest: Manifest,
+    folders: Mapping[str, Path],
+    before: Callable[[Path, Path], None] = lambda _there, _fresh: None,
+) -> list[str]:
     """Put the files of a backup in place, each in one step; returns owners that this host does not know.
 
     Args:
         path: of the backup.
         manifest: its own, as `read_archive` found it.
         folders: where to, by part.
+        before: told of each file that is there, and of the one that is about to take its place.
 
     Raises:
         ConfigurationError: it has been changed since it was read.
@@ -156,6 +162,8 @@ def unpack(path: Path, manifest: Manifest, folders: Mapping[str, Path]) -> list[
                     _copy(path, archive, member, entry, file.write)
                     file.flush()
                     os.fsync(file.fileno())
+                if target.is_file():
+                    before(target, fresh)
                 _give(fresh, entry, unknown)
                 fresh.chmod(entry.mode)
                 for end in SQLITE_BESIDE if entry.database else ():

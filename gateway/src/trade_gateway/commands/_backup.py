@@ -10,12 +10,13 @@ from contextlib import closing, contextmanager
 from datetime import datetime, timezone
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated, Final, cast
 
 import typer
 from rich.markup import escape
 
 from trade import Settings
+from trade._toml import read_toml_text
 from trade.errors import ConfigurationError
 from trade_gateway.commands._archive import (
     CONFIG,
@@ -29,6 +30,7 @@ from trade_gateway.commands._archive import (
 )
 from trade_gateway.commands._named import Named, named_files
 from trade_gateway.commands._output import Output, UsageError, complain
+from trade_gateway.supervisor._alone import held_in
 
 _SQLITE: Final = b"SQLite format 3\0"
 _PATIENCE_S: Final = 10.0
@@ -85,7 +87,8 @@ def restore(
 ) -> None:
     """Put a backup back: first it is found whole, then each file takes its place in one step.
 
-    Stop the gateway before. As root, files are given back to their owners.
+    Stop the gateway before: where one of its containers is known to run (one that another host stands in for), nothing
+    is written. As root, files are given back to their owners. Who is revoked in a list that is there stays revoked.
 
     For example: trade restore trade.tar.gz --to /etc/trade --state /var/lib/trade
     """
@@ -93,8 +96,9 @@ def restore(
     folders = {CONFIG: to, STATE: state or to / STATE}
     with _said(to):
         manifest = read_archive(archive)
+        _check_nobody_runs(manifest, folders[STATE])
         _check_places(manifest, folders, force=force)
-        unknown = unpack(archive, manifest, folders)
+        unknown = unpack(archive, manifest, folders, _keep_revoked)
     for names in unknown:
         complain(f"there is no {names} on this host; what was theirs is yours now: sudo chown")
     _say(out, archive, manifest)
@@ -117,6 +121,36 @@ def _check_places(manifest: Manifest, folders: dict[str, Path], *, force: bool) 
     if there and not force:
         problem = "would be overwritten; say --force, or another folder with --to. Nothing was written"
         raise ConfigurationError(where=", ".join(there), problem=problem)
+
+
+def _check_nobody_runs(manifest: Manifest, folder: Path) -> None:
+    """Raises ConfigurationError: a container that a gateway has a lease on runs on that state now."""
+    systems = {entry.below(Path()).parts[0] for entry in manifest.files if entry.part == STATE}
+    for lock in (lock for system in systems for lock in held_in(folder / system)):
+        problem = "is held by a container that runs; stop its gateway first. Nothing was written"
+        raise ConfigurationError(where=str(lock), problem=problem)
+
+
+def _keep_revoked(there: Path, fresh: Path) -> None:
+    """Who was revoked since the backup was made stays so."""
+    now, then = _revoked(there), _revoked(fresh)
+    if now is None or then is None or not now - then:
+        return
+    names = ", ".join(f'"{name}"' for name in sorted(now | then))
+    fresh.write_text(f"# Of a backup and of what was there before it.\nrevoked = [{names}]\n", encoding="utf-8")
+    complain(f"{there}: {', '.join(sorted(now - then))} stays revoked, although the backup does not say so")
+
+
+def _revoked(path: Path) -> set[str] | None:
+    """The names in a list of revoked ones; None: it is another file."""
+    try:
+        read = read_toml_text(path.read_text(encoding="utf-8"))
+    except ValueError:
+        return None
+    names = read.get("revoked")
+    if set(read) != {"revoked"} or not isinstance(names, list):
+        return None
+    return {name for name in cast("list[object]", names) if isinstance(name, str)}
 
 
 def _about(file: Path) -> Manifest:

@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
+from trade._toml import read_toml_text
 from trade.errors import TradeError
 from trade_drivers import drivers, load
 from trade_gateway.commands import _doctor_host as host
@@ -79,13 +80,30 @@ def _of_robot(path: Path) -> Iterator[Finding]:
     try:
         robot = load(path)
     except TradeError as bad:
-        yield Finding(level="error", about=str(path), text=str(bad), fix="correct the file; the message says where")
+        yield _no_robot(path) or Finding(
+            level="error", about=str(path), text=str(bad), fix="correct the file; the message says where"
+        )
         return
     yield from host.libraries(sorted({bus.driver for bus in robot.buses}), needed=True)
     yield from robots.unwatched(robot)
     yield from robots.interfaces(robot)
     yield from robots.devices(robot)
     yield from robots.controllers(robot)
+
+
+def _no_robot(path: Path) -> Finding | None:
+    """That it is a file of another kind; None: it is none that is known."""
+    try:
+        system = read_toml_text(path.read_text(encoding="utf-8")).get("system")
+    except (OSError, ValueError):
+        return None
+    if system is None:
+        return None
+    kind, check = (
+        ("gateway", "trade gateway {} --check") if isinstance(system, str) else ("system", "trade system up {} --check")
+    )
+    text = f"is a {kind} file; trade doctor looks at robot files, such as those that it names"
+    return Finding(level="error", about=str(path), text=text, fix=check.format(path))
 
 
 def _tell(out: Output, one: Finding) -> None:

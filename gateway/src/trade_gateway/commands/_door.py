@@ -91,7 +91,8 @@ def token(
         out.data({"identity": identity, "token": made})
         return
     out.say(f"{escape(identity)} is whoever shows this token; it is not shown again:\n  [bold]{made}[/]")
-    out.say(f"for example: [bold]curl -H 'Authorization: Bearer {made}' http://127.0.0.1:7080/services[/]")
+    out.say("for example, where DOOR is the address that trade door says:")
+    out.say(f"  [bold]curl -H 'Authorization: Bearer {made}' DOOR/services[/]")
 
 
 def _doors() -> Any:

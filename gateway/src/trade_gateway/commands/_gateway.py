@@ -14,9 +14,9 @@ import typer
 from rich.markup import escape
 
 from trade import Container, Settings
-from trade.errors import TradeError
+from trade.errors import ConfigurationError, TradeError
 from trade.policies import EVERYTHING
-from trade_gateway._gateway_file import Plan, digest, named_digest, read_gateway_file
+from trade_gateway._gateway_file import Named, Plan, digest, named_by, read_gateway_file
 from trade_gateway._guests import Guests, opened
 from trade_gateway.commands._detached import Detach, detach_now, ready
 from trade_gateway.commands._list import Json
@@ -47,6 +47,8 @@ def gateway(
     out, notifier = Output(as_json=as_json), Notifier()
     plan = read_gateway_file(file)
     if check:
+        if unnamed := plan.unnamed:
+            raise ConfigurationError(where=str(plan.settings.policy), problem=unnamed)
         out.say(f"{file} is right")
         _say_what_crosses(out, plan)
         _say_children(out, plan)
@@ -56,10 +58,12 @@ def gateway(
         return
     with leaving() as asked_to_leave, hangups() as hangup, notifier:
         seen = digest(file)
-        running = Gateway(plan, named_digest(file), asked_to_leave.set)
+        running = Gateway(plan, named_by(file, plan), asked_to_leave.set)
         try:
             settle()
             _say_ready(out, running, plan)
+            if unnamed := plan.unnamed:
+                complain(f"{plan.settings.policy}: {unnamed}")
             notifier.ready(_status(running))
             while not asked_to_leave.wait(_LOOK_EVERY_S):
                 if running.healthy:
@@ -82,7 +86,7 @@ def gateway(
 class Gateway:
     """The container that joins the networks, its guests in other systems, its children, as the file says now."""
 
-    def __init__(self, plan: Plan, named: str, leave: Callable[[], None]) -> None:
+    def __init__(self, plan: Plan, named: Named, leave: Callable[[], None]) -> None:
         self._plan = plan
         self._leave = leave
         """What ends the gateway when its container is terminated."""
@@ -122,11 +126,13 @@ class Gateway:
             anew: open everything anew, even where the file says nothing else.
         """
         try:
-            plan, named = read_gateway_file(file), named_digest(file)
+            plan = read_gateway_file(file)
+            named = named_by(file, plan)
         except TradeError as wrong:
             complain(f"{file} was changed and is wrong; going on as before: {wrong}")
             return False
-        anew = anew or named != self._named
+        changed = named.since(self._named)
+        anew = anew or named.digests != self._named.digests
         try:
             self._go_by(plan, anew=anew)
         except TradeError as refused:
@@ -134,11 +140,11 @@ class Gateway:
             complain(f"{file} was changed and cannot be used; going on as before: {refused}")
             return False
         self._plan, self._named = plan, named
-        self._container.note_change("gateway file read", str(file))
+        self._container.note_change("gateway file read", f"{file}: {changed}" if changed else str(file))
         self._look_after(plan)
-        out.say(f"read {file} again")
+        out.say(escape(f"read {file} again{': ' if changed else ''}{changed}"))
         if out.as_json:
-            out.data({"reloaded": str(file)})
+            out.data({"reloaded": str(file), "changed": changed})
         return True
 
     def _go_by(self, plan: Plan, *, anew: bool) -> None:

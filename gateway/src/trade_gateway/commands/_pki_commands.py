@@ -74,7 +74,9 @@ def issue(
     """
     if purpose not in (None, *_PURPOSES):
         raise UsageError(where=f"--for {purpose}", problem=f"there is {' and '.join(_PURPOSES)}")
-    given = _authority(folder).issue(
+    authority = _authority(folder)
+    renewed = not force and any(one.name == name and one.until for one in authority.issued())
+    given = authority.issue(
         name,
         purpose="gateway" if purpose == "gateway" else "container" if purpose else None,
         hosts=host or (),
@@ -86,14 +88,50 @@ def issue(
     if as_json:
         out.data(_plain(given))
         return
-    dialled = next((host for host in given.hosts if ":" not in host), "127.0.0.1")  # IPv6 does not go with certificates
-    listen = f"tls/{dialled}:7450"
-    out.say(
-        f"{given.name}, a {given.purpose}, until {_moment(given.until)}: ca.pem, cert.pem and key.pem (secret) are in\n"
-        f"  {escape(str(given.folder))}\nStart it with them, wherever you take them:\n"
-        f"  export TRADE_SYSTEM=SYSTEM TRADE_TLS={escape(_quoted(given.folder))}\n"
-        f"  TRADE_LISTEN={escape(listen)} trade up ROBOT.toml"
-    )
+    advice = _to_renew if renewed else _for_gateway if given.purpose == "gateway" else _for_container
+    out.say(escape("\n".join((f"{given.name}, a {given.purpose}, until {_moment(given.until)}", *advice(given)))))
+
+
+def _to_renew(given: "Issued") -> list[str]:
+    return [
+        "Its key and ca.pem are the same, so copy only this one, over the old one on its host:",
+        f"  {given.folder / 'cert.pem'}",
+        f"It may be dialled by {', '.join(given.hosts)}" if given.hosts else "Nobody beyond its host can dial it.",
+    ]
+
+
+def _for_gateway(given: "Issued") -> list[str]:
+    endpoints = _endpoints(given)
+    return [
+        *_where(given),
+        "Name the folder in its gateway file, and each address in the table of its network:",
+        f'  tls = "{given.folder}"',
+        *(f'  listen = ["{endpoint}"]' for endpoint in endpoints),
+        *([] if endpoints else [f"  (it has no address yet: trade pki issue {given.name} --address ADDRESS)"]),
+        f'  trade gateway GATEWAY.toml          # the policy it names needs gateways = ["{given.name}"]',
+    ]
+
+
+def _for_container(given: "Issued") -> list[str]:
+    endpoints = ",".join(_endpoints(given))
+    return [
+        *_where(given),
+        "Start it with them, wherever you take them, and with the policy of the system:",
+        f"  export TRADE_SYSTEM=SYSTEM TRADE_TLS={_quoted(given.folder)} TRADE_POLICY=POLICY.toml",
+        *([f"  export TRADE_LISTEN={endpoints}          # where others dial it"] if endpoints else []),
+        "  export TRADE_CONNECT=tls/ADDRESS:7450          # whom it dials: a gateway, or a robot"
+        + (", if any" if endpoints else "; nobody beyond its host can dial it"),
+        "  trade list          # or trade up ROBOT.toml, or a program of yours",
+    ]
+
+
+def _where(given: "Issued") -> list[str]:
+    return ["ca.pem, cert.pem and key.pem (secret) are in", f"  {given.folder}"]
+
+
+def _endpoints(given: "Issued") -> list[str]:
+    """Where it may listen; IPv6 does not go with certificates."""
+    return [f"tls/{host}:7450" for host in given.hosts if ":" not in host]
 
 
 @app.command()
@@ -106,7 +144,9 @@ def revoke(name: Name, folder: Folder = _DEFAULT) -> None:
     Output(as_json=False).say(
         f"{name} is revoked and not issued again. Links know no revocation: its certificate links until "
         f"{_moment(taken.until)}. Refused before that it is by the policies that have the list:\n"
-        f"  {escape(str(taken.folder.parents[1] / 'revoked.toml'))}"
+        f"  {escape(str(taken.folder.parents[1] / 'revoked.toml'))}\n"
+        "Copy it to every host, to where its policy says (revoked_file): what runs there reads it within seconds, and "
+        "says so in its log."
     )
 
 

@@ -17,6 +17,8 @@ class HttpProtocol(H11Protocol):
     """One connection over HTTP."""
 
     _waiting: TimerHandle | None = None
+    _over = False
+    """Whether it is gone, or a WebSocket's by now: its transport is then nothing to be asked of."""
 
     def connection_made(self, transport: Any) -> None:
         """Let the application know whose certificate was shown."""
@@ -29,13 +31,29 @@ class HttpProtocol(H11Protocol):
         super().data_received(data)
         self._wait()
 
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Who is gone is waited for no more."""
+        self._wait_no_more()
+        super().connection_lost(exc)
+
+    def handle_websocket_upgrade(self, event: Any) -> None:
+        """A WebSocket has asked what it came for."""
+        self._wait_no_more()
+        super().handle_websocket_upgrade(event)
+
     def _wait(self) -> None:
-        if self._waiting is None and self._asks_nothing:
+        if self._waiting is None and self._asks_nothing and not self._over:
             self._waiting = self.loop.call_later(_ASKED_WITHIN_S, self._waited)
+
+    def _wait_no_more(self) -> None:
+        self._over = True
+        if self._waiting is not None:
+            self._waiting.cancel()
+            self._waiting = None
 
     def _waited(self) -> None:
         self._waiting = None
-        if self._asks_nothing and self.transport.get_protocol() is self:
+        if self._asks_nothing:
             self.transport.close()
 
     @property

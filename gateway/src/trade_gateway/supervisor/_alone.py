@@ -5,8 +5,21 @@ import fcntl
 import os
 from collections.abc import Generator
 from pathlib import Path
+from typing import Final
 
-__all__ = ["alone", "is_free"]
+__all__ = ["alone", "held_in", "is_free", "lock_of"]
+
+_FOLDER: Final = "locks"
+
+
+def lock_of(folder: Path, gateway: str, child: str) -> Path:
+    """The file of a child that a gateway has a lease on, in the folder of a system's state."""
+    return folder / _FOLDER / f"{gateway}.{child}.lock"
+
+
+def held_in(folder: Path) -> list[Path]:
+    """Those in the folder of a system's state that a process has now."""
+    return [path for path in sorted((folder / _FOLDER).glob("*.lock")) if not is_free(path)]
 
 
 @contextlib.contextmanager

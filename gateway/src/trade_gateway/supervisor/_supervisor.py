@@ -18,6 +18,7 @@ from trade import Container, Handle, Run
 from trade.errors import Busy, ConfigurationError, ServiceGone, TradeError
 from trade.starting import Started
 from trade_gateway._fence import Term
+from trade_gateway.supervisor._alone import lock_of
 from trade_gateway.supervisor._furnish import Furnished, furnish, save
 from trade_gateway.supervisor._leasing import Asking, Leased, StandIn
 from trade_gateway.supervisor._life import GRACE_S, SAVE_S, Do, State
@@ -208,7 +209,7 @@ class Supervisor:
                 self._do(unit, unit.life.start(self._clock()))
 
     def _leased(self, child: Child) -> Leased | None:
-        lock = self._folder / "locks" / f"{self._member().name}.{child.name}.lock"
+        lock = lock_of(self._folder, self._member().name, child.name)
         if child.terms.lease_from:
             return Asking(child, self._member, self._post, self._complain, lock)
         if child.terms.stands_in_for:
