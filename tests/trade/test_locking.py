@@ -13,6 +13,7 @@ from trade import Container, Handle, Resource, permit, service, where
 from trade._wire import Address
 from trade.errors import (
     ConfigurationError,
+    DeviceFault,
     DeviceSilent,
     IncompleteGroup,
     LockedByOther,
@@ -347,7 +348,7 @@ def test_S12_on_waking_what_could_not_be_renewed_is_lost_before_anything_is_done
     lock, handle = robot.me.lock([robot.find("a")], lease_s=60).acquire(), robot.find("a")
     before = robot.system.sent()
     lock._confirmed = {address: at - 60 for address, at in lock._confirmed.items()}
-    with lock.use(), pytest.raises(LockLost, match="could not be renewed within its lease"):
+    with lock.use(), pytest.raises(LockLost, match=r"could not be renewed within its lease"):
         handle(0.1)
     assert robot["a"].written == []
     assert robot.system.sent() - before <= 2  # its release and the answer, no call
@@ -425,8 +426,9 @@ def test_S14_what_could_not_be_stopped_is_given_to_nobody_until_it_is_resumed(ro
     with lock.use():
         robot.find("a", "go_on")(0.1)
     assert len(robot.other.break_lock(WHOLE, "maintenance")) == 2
-    with pytest.raises(DeviceSilent):
+    with pytest.raises(DeviceFault, match=r"could not be stopped at .* so nobody gets a lock on it"):
         robot.other.lock(WHOLE, wait_s=20).acquire()
+    assert [(info.resources, info.holder.owner) for info in robot.other.locks()] == [(("a",), "nobody")]
     robot["a"].resource.moving = False
     assert robot.other.resume(WHOLE) == ["a"]
     with robot.other.lock(WHOLE, wait_s=20):

@@ -572,7 +572,7 @@ class DeviceSilent(DeviceError, TimeoutError):
 
 @dataclass(kw_only=True, eq=False)
 class DeviceFault(DeviceError, RuntimeError):
-    """A device reports a fault, or refused a command."""
+    """A device reports a fault, refused a command, or could not be stopped when it had to be."""
 
     fault: str
     remedy: str = "remove the cause, then enable it again"
