@@ -13,8 +13,8 @@ from robots import HEAD
 from trade.errors import ConfigurationError, WrongDevice
 from trade_drivers import Joint, parse
 from trade_gateway.cli import app
-from trade_gateway.commands._calibrate import Ends, Sweep, homed, measured, with_values
-from trade_gateway.commands._output import UsageError
+from trade_gateway.commands._calibrate import Ends, Sweep, _measure, homed, measured, with_values
+from trade_gateway.commands._output import Output, UsageError
 from trade_hil_sim import DynamixelBus, writes
 
 
@@ -74,6 +74,16 @@ def test_a_joint_that_turns_past_the_end_of_its_encoder_is_refused(beyond: list[
 def test_nobody_is_waited_for_without_an_end() -> None:
     with pytest.raises(ConfigurationError, match="nobody went on"):
         Sweep(Hand([0.0, 0.0, 0.0]), 1).until(lambda: False, 0.0)  # type: ignore[arg-type]
+
+
+def test_the_zero_of_a_joint_that_moves_is_refused() -> None:
+    def zero(*angles: float) -> dict[str, float]:
+        hand: Any = Hand(angles)
+        return _measure(Output(as_json=False), joint(), Sweep(hand, 1), zero_here=True, seconds=None)
+
+    with pytest.raises(ConfigurationError, match=r"it moves \(by 0\.030 rad in .* s\); hold it still"):
+        zero(0.5, 0.53)
+    assert zero(0.5, 0.502) == {"offset_rad": -0.502}  # a hand is never quite still
 
 
 COMMENTED = HEAD.replace("min_rad = -1.4", "min_rad = -1.4   # the left shoulder").replace(
