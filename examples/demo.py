@@ -20,6 +20,7 @@ from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
 
+from demo_busy import busy_here
 from demo_judge import PAN, Judge
 from demo_kept import kill_and_see
 from demo_page import dashboard
@@ -223,6 +224,8 @@ def main() -> int:
                 trade.close()
     except (DemoFailed, errors.TradeError, subprocess.SubprocessError) as failed:
         print(f"\nthe demo failed: {failed}", file=sys.stderr)
+        if reason := busy_here():
+            print(reason, file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         return 130
