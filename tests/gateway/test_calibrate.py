@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner, Result
 
-from robots import HEAD
+from robots import HAND, HEAD
 from trade.errors import ConfigurationError, WrongDevice
 from trade_drivers import Joint, parse
 from trade_gateway.cli import app
@@ -155,6 +155,14 @@ def test_a_joint_that_is_not_there_is_told_from_those_that_are(rosie: Rosie) -> 
     error = rosie.calibrate("neck.roll", "--zero-here").exception
     assert isinstance(error, UsageError)
     assert "there is neck.pan, neck.tilt" in str(error)
+
+
+def test_a_gripper_is_activated_and_not_calibrated(rosie: Rosie) -> None:
+    hand = HAND.partition("[bus.hand]")
+    rosie.file.write_text(f"{rosie.text}\n{hand[1]}{hand[2]}", encoding="utf-8")
+    error = rosie.calibrate("left.hand", "--zero-here").exception
+    assert isinstance(error, UsageError)
+    assert "a gripper is not calibrated; activate it: `trade call rosie.left.hand.activate`" in str(error)
 
 
 def test_a_homing_offset_that_the_file_does_not_know_is_written_with_the_new_zero(rosie: Rosie) -> None:

@@ -210,6 +210,9 @@ def _table(document: "tomlkit.TOMLDocument", joint: str) -> dict[str, object]:
 def _joint(robot: Robot, name: str) -> tuple[Joint, SerialBus]:
     """A joint whose servo can be turned by hand, and its bus."""
     joint = next((one for one in robot.joints if one.name == name), None)
+    if any(one.name == name for one in robot.grippers):
+        activate = f"`trade call {robot.name}.{name}.activate`, once it is up"
+        raise UsageError(where=robot.where, problem=f"a gripper is not calibrated; activate it: {activate}")
     if joint is None:
         there = ", ".join(one.name for one in robot.joints) or "none"
         raise UsageError(where=robot.where, problem=f"there is no joint {name!r}; there is {there}")
