@@ -21,6 +21,7 @@ from pathlib import Path
 from types import FrameType
 
 from demo_actor import PATIENCE_S, DemoFailed
+from demo_busy import busy_here
 from demo_judge import PAN, Judge
 from demo_kept import kill_and_see
 from demo_page import dashboard
@@ -224,6 +225,8 @@ def main() -> int:
                 trade.close()
     except (DemoFailed, errors.TradeError, subprocess.SubprocessError) as failed:
         print(f"\nthe demo failed: {failed}", file=sys.stderr)
+        if reason := busy_here():
+            print(reason, file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         return 130

@@ -22,7 +22,9 @@ from _pytest.runner import runtestprotocol
 _MOST: Final = 12
 _STILL_S: Final = 0.04
 """For so long a device of these tests may go unattended."""
-_LATE: Final = re.compile(r"was held up for [\d.]+ s|did not answer (on \S+ )?within \d+ ms|nobody answers;")
+_LATE: Final = re.compile(
+    r"was held up for [\d.]+ s|did not answer on [^\s;]+( for [\d.]+ s)?|did not answer within \d+ ms|nobody answers;"
+)
 _CLOCK: Final = f"""
 import os, time
 last = time.monotonic()

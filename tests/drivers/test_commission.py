@@ -187,6 +187,20 @@ def test_an_answer_that_gets_lost_does_not_hide_that_the_id_was_changed(line: Li
     assert line.set_id(1, 2).id == 2
 
 
+def test_an_answer_that_gets_lost_while_it_is_read_is_asked_for_again(line: Line) -> None:
+    line.plug(1)
+    line.sim.do(Mute(instruction="read", skip=1, count=1))
+    [found] = line.scan(1)
+    assert (found.model, found.problem) == (line.make.model, "")
+
+
+def test_one_that_answers_a_ping_and_never_a_read_is_told_from_that(line: Line) -> None:
+    line.plug(1)
+    line.sim.do(Mute(instruction="read"))
+    problems = ["register 68" in found.problem for found in line.scan(1)]
+    assert problems == ([] if line.make is MAKES["feetech"] else [True])  # a Feetech servo tells no model then
+
+
 def test_a_new_rate_outlives_the_power(line: Line) -> None:
     line.plug(1)
     make = line.make

@@ -9,12 +9,12 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner, Result
 
-from robots import HEAD
+from robots import HAND, HEAD
 from trade.errors import ConfigurationError, WrongDevice
 from trade_drivers import Joint, parse
 from trade_gateway.cli import app
-from trade_gateway.commands._calibrate import Ends, Sweep, homed, measured, with_values
-from trade_gateway.commands._output import UsageError
+from trade_gateway.commands._calibrate import Ends, Sweep, _measure, homed, measured, with_values
+from trade_gateway.commands._output import Output, UsageError
 from trade_hil_sim import DynamixelBus, writes
 
 
@@ -74,6 +74,16 @@ def test_a_joint_that_turns_past_the_end_of_its_encoder_is_refused(beyond: list[
 def test_nobody_is_waited_for_without_an_end() -> None:
     with pytest.raises(ConfigurationError, match="nobody went on"):
         Sweep(Hand([0.0, 0.0, 0.0]), 1).until(lambda: False, 0.0)  # type: ignore[arg-type]
+
+
+def test_the_zero_of_a_joint_that_moves_is_refused() -> None:
+    def zero(*angles: float) -> dict[str, float]:
+        hand: Any = Hand(angles)
+        return _measure(Output(as_json=False), joint(), Sweep(hand, 1), zero_here=True, seconds=None)
+
+    with pytest.raises(ConfigurationError, match=r"it moves \(by 0\.030 rad in .* s\); hold it still"):
+        zero(0.5, 0.53)
+    assert zero(0.5, 0.502) == {"offset_rad": -0.502}  # a hand is never quite still
 
 
 COMMENTED = HEAD.replace("min_rad = -1.4", "min_rad = -1.4   # the left shoulder").replace(
@@ -145,6 +155,14 @@ def test_a_joint_that_is_not_there_is_told_from_those_that_are(rosie: Rosie) -> 
     error = rosie.calibrate("neck.roll", "--zero-here").exception
     assert isinstance(error, UsageError)
     assert "there is neck.pan, neck.tilt" in str(error)
+
+
+def test_a_gripper_is_activated_and_not_calibrated(rosie: Rosie) -> None:
+    hand = HAND.partition("[bus.hand]")
+    rosie.file.write_text(f"{rosie.text}\n{hand[1]}{hand[2]}", encoding="utf-8")
+    error = rosie.calibrate("left.hand", "--zero-here").exception
+    assert isinstance(error, UsageError)
+    assert "a gripper is not calibrated; activate it: `trade call rosie.left.hand.activate`" in str(error)
 
 
 def test_a_homing_offset_that_the_file_does_not_know_is_written_with_the_new_zero(rosie: Rosie) -> None:

@@ -10,13 +10,14 @@ import pytest
 from typer.testing import CliRunner
 
 from robots import HAND, HEAD
-from trade_drivers import CanBus, parse
+from trade_drivers import CanBus, Found, parse
 from trade_drivers.can import ErrorState, Link
 from trade_gateway._pki import Authority
 from trade_gateway.cli import app
 from trade_gateway.commands import _doctor_host as host
 from trade_gateway.commands import _doctor_robot as robots
 from trade_gateway.commands._doctor_host import Finding
+from trade_gateway.commands._first_file import first_file
 from trade_hil_sim import DynamixelBus, Mute
 
 
@@ -34,6 +35,20 @@ def test_a_port_that_may_not_be_opened_names_the_group_to_join(tmp_path: Path, m
     found = only(host.ports([str(port)]))
     assert (found.level, found.about) == ("error", str(port))
     assert "usermod -aG" in found.fix
+
+
+def test_ports_that_the_system_does_not_list_are_not_said_to_be_missing() -> None:
+    assert only(host.ports([])).text == "no adapter is plugged in"
+    assert only(host.ports([], ["/x/neck", "/x/hand"])).text.endswith("the robot file names /x/neck, /x/hand")
+
+
+def test_a_joint_that_nobody_has_measured_is_told_with_what_measures_it() -> None:
+    text = first_file(
+        [("/dev/ttyUSB0", Found(driver="dynamixel", baud=57600, id=1, model="XL430-W250"))], Path("new.toml")
+    )
+    found = only(robots.unmeasured(parse(text, "new.toml"), Path("new.toml")))
+    assert (found.level, found.about, found.fix) == ("warning", "joint1_1", "trade calibrate new.toml joint1_1")
+    assert not list(robots.unmeasured(parse(HEAD, "head.toml"), Path("head.toml")))
 
 
 @pytest.mark.parametrize(("ms", "level"), [(16, "warning"), (1, "ok")])

@@ -10,10 +10,12 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner, Result
 
+from robots import HEAD
 from trade.errors import ConfigurationError
 from trade_drivers import load
 from trade_gateway.cli import app
 from trade_gateway.commands import _install
+from trade_gateway.commands._output import UsageError
 from trade_gateway.commands._unit import UDEV_RULES, Needs, needs_of, unit_text
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -107,6 +109,29 @@ def test_what_somebody_else_wrote_or_changed_is_overwritten_only_by_force(file: 
     assert (rules(root).read_text(), unit(root).exists()) == (theirs, False)
     install(file, root, "--force")
     assert UDEV_RULES in rules(root).read_text()
+
+
+def test_what_the_service_may_not_find_is_warned_of(file: Path, root: Path, tmp_path: Path) -> None:
+    (file.parent / "rosie.toml").write_text(HEAD.replace("/dev/ttyNOWHERE", "/tmp/lines/neck"))
+    file.write_text('system = "lab"\n[container.rosie]\nrobot = "rosie.toml"\n')
+    told = " ".join(install(file, tmp_path / "root").stdout.split())
+    assert "warning port /tmp/lines/neck lies in /tmp, which the service does not see" in told
+    assert f"warning file {file} lies in /" in told
+
+
+def test_what_lies_where_it_lasts_is_not_warned_of(root: Path, tmp_path: Path) -> None:
+    there = root / "etc" / "trade" / "gateway.toml"
+    there.parent.mkdir(parents=True)
+    there.write_text(FILE)
+    assert "warning file" not in install(there, root).stdout
+
+
+def test_a_file_named_as_the_other_computer_sees_it_is_looked_for_in_its_folder(root: Path) -> None:
+    there = root / "etc" / "trade" / "no-such-gateway.toml"
+    there.parent.mkdir(parents=True)
+    there.write_text(FILE)
+    with pytest.raises(UsageError, match=f"did you mean {there}"):
+        install(Path("/etc/trade/no-such-gateway.toml"), root)
 
 
 def test_a_wrong_gateway_file_writes_nothing(file: Path, root: Path) -> None:

@@ -5,9 +5,10 @@ import re
 import pytest
 from typer.testing import CliRunner
 
+from trade.errors import LockedByOther, LockLost, ServiceGone
 from trade_gateway.cli import app
 from trade_gateway.commands._lock import _wanted
-from trade_gateway.commands._output import UsageError
+from trade_gateway.commands._output import REMEDIES, UsageError, say_error
 
 
 @pytest.mark.parametrize("command", ["lock", "locks", "unlock", "resume", "estop"])
@@ -33,3 +34,23 @@ def test_names_are_alternatives_within_the_group() -> None:
     assert str(_wanted("rosie", ["move_to", "enable"])).count("rosie") == 2
     with pytest.raises(UsageError, match="say what to lock"):
         _wanted(None, [])
+
+
+def test_what_helps_is_said_in_words_of_the_command_line(capsys: pytest.CaptureFixture[str]) -> None:
+    say_error(LockedByOther(resources=("rosie.pan",), owner="anna/desk"))
+    say_error(LockLost(resources=("rosie.pan",), reason="its lease ended"))
+    say_error(ServiceGone(service="rosie.pan.move_to"))
+    told = capsys.readouterr().err
+    assert "`trade lock --wait SECONDS`" in told
+    assert "`trade unlock GROUP --break REASON`" in told
+    assert "trade.lock(" not in told
+    assert "trade.find(" not in told
+
+
+def test_every_remedy_that_is_put_in_other_words_is_one_of_an_error() -> None:
+    errors = (
+        LockedByOther(resources=("a",), owner="b"),
+        LockLost(resources=("a",), reason="b"),
+        ServiceGone(service="a"),
+    )
+    assert all(any(remedy in str(error) for error in errors) for remedy in REMEDIES)

@@ -174,6 +174,16 @@ def test_a_joint_that_says_which_device_it_means(text: str) -> None:
     assert robot(f'{rest}{text}bus = "neck"\nid = 1\n{JOINT}').joints[0].firmware == "45"
 
 
+@of("commissioning.md", 'From "works" to "starts at boot"')
+def test_a_gateway_file_that_keeps_a_robot_up(tmp_path: Path, text: str) -> None:
+    assert [child.name for child in gateway(tmp_path, text).children] == ["rosie"]
+
+
+@of("deployment.md", "On a robot's computer")
+def test_the_same_where_deployment_begins(tmp_path: Path, text: str) -> None:
+    assert [child.name for child in gateway(tmp_path, text).children] == ["rosie"]
+
+
 @of("drill.md", "A drill: does it stop when what it hangs on is gone?")
 def test_limits_of_a_drill(text: str) -> None:
     assert robot(HEAD + text).drill

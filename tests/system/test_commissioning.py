@@ -61,12 +61,14 @@ STEPS: Final = (
         "trade scan --port lines/neck --port lines/hand --ids 1-9 --write rosie.toml",
     ),
     Step(
-        "Devices get names, by an editor or by this line.",
+        "Devices get names, by an editor or by this line: `joint1_2` is the joint with id 2 on the first line.",
         """sed -i 's/joint1_1/"neck.pan"/; s/joint1_2/"neck.tilt"/; s/gripper2_9/"left.hand"/; s/"robot"/"rosie"/' """
         "rosie.toml",
     ),
     Step(
-        "Where are zero and ends of each joint? It is moved by hand; its torque stays off.",
+        "Where are zero and ends of each joint? It is moved by hand; its torque stays off. In another terminal, this "
+        "line is the hand that moves a simulated one, to a position in counts: `python -c 'import sys; from "
+        """trade_hil_sim import SimControl; SimControl(sys.argv[1]).place(2100, [1], bus="neck")' lines/_control`.""",
         "trade calibrate rosie.toml neck.pan",
         "calibrate",
         (2100, 1500, 2700),

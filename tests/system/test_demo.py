@@ -3,6 +3,7 @@
 import json
 import math
 import re
+import runpy
 import signal
 import subprocess
 import tempfile
@@ -47,6 +48,12 @@ def told(demo: Program, until: str) -> str:
     while until not in story:
         story += demo.line()
     return story
+
+
+def test_who_fails_on_a_busy_computer_says_so() -> None:
+    busy = runpy.run_path(str(DEMO.with_name("demo_busy.py")))["busy"]
+    assert busy(40.0, 2).startswith("this computer is busy (load 40 on 2 cores); try again when it is not")
+    assert not busy(1.0, 2)
 
 
 def left_of(story: str) -> list[str]:

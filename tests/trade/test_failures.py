@@ -258,3 +258,18 @@ def test_what_a_provider_raises_unmeant_is_logged_once_where_it_runs(
     assert "hunter2" not in first
     assert "robot.lie failed" in second
     assert "robot.leave failed" in third
+
+
+@pytest.mark.parametrize(
+    ("silent_s", "said"),
+    [(0.005, "on /dev/x;"), (0.0, "on /dev/x;"), (0.34, "on /dev/x for 0.3 s;"), (20.487, "on /dev/x for 20 s;")],
+)
+def test_a_silence_is_told_as_what_it_is_and_not_as_a_wait(silent_s: float, said: str) -> None:
+    told = str(errors.DeviceSilent(device="rosie.pan", bus="/dev/x", waited_s=silent_s))
+    assert told.startswith(f"rosie.pan did not answer {said} is it powered")
+
+
+def test_a_simulated_device_that_is_silent_is_not_looked_for_on_a_cable() -> None:
+    told = str(errors.DeviceSilent(device="rosie.pan", bus="/tmp/trade-sim-x1/neck", waited_s=0.3))
+    assert "powered" not in told
+    assert "this computer is too busy" in told

@@ -8,7 +8,7 @@ from jointed import WHOLE, Robot
 from trade import Handle
 from trade._wire import Address
 from trade.errors import (
-    DeviceSilent,
+    DeviceFault,
     LockedByOther,
     LockLost,
     ServiceGone,
@@ -155,8 +155,9 @@ def test_S14_what_could_not_be_stopped_is_given_to_nobody_until_it_is_resumed(ro
     with lock.use():
         robot.find("a", "go_on")(0.1)
     assert len(robot.other.break_lock(WHOLE, "maintenance")) == 2
-    with pytest.raises(DeviceSilent):
+    with pytest.raises(DeviceFault, match=r"could not be stopped at .* so nobody gets a lock on it"):
         robot.other.lock(WHOLE, wait_s=20).acquire()
+    assert [(info.resources, info.holder.owner) for info in robot.other.locks()] == [(("a",), "nobody")]
     robot["a"].resource.moving = False
     assert robot.other.resume(WHOLE) == ["a"]
     with robot.other.lock(WHOLE, wait_s=20):

@@ -11,7 +11,7 @@ from trade._locks import LockTable
 from trade._resources import Holder, Permit
 from trade._terms import Granted, Terms
 from trade._wire import Token
-from trade.errors import DeviceSilent, LockedByOther, LockLost, MotionStopped, ServiceGone, Stopped
+from trade.errors import DeviceFault, LockedByOther, LockLost, MotionStopped, ServiceGone, Stopped
 from waiting import wait_until
 
 
@@ -137,7 +137,7 @@ def test_leases_go_on_ending_after_a_stop_that_raised(table: Table) -> None:
         table.resources[name].moving = True
     table.advance(2.0)
     assert table.table.infos() == []
-    with pytest.raises(DeviceSilent):
+    with pytest.raises(DeviceFault):
         table.acquire("a")
 
 
@@ -174,13 +174,35 @@ def test_S14_who_waits_for_what_could_not_be_stopped_is_told_at_once_until_it_is
     [(resource, done)] = table.stopping
     done(resource, "no answer")
     for asking in waiting:
-        with pytest.raises(DeviceSilent):
+        with pytest.raises(DeviceFault):
             asking.result(60)
     resource.moving = False
-    with pytest.raises(DeviceSilent):
+    with pytest.raises(DeviceFault):
         table.acquire("ab")
     resource.resume()
     table.acquire("ab")
+
+
+def test_S14_a_refusal_says_what_could_not_be_stopped_when_why_and_what_to_do_and_it_is_listed(table: Table) -> None:
+    token = table.take("ab")
+    resource = table.resources["a"]
+    resource.moving = True
+    table.table.lose(token.number, "gone")
+    [(_, done)] = table.stopping
+    done(resource, "no answer")
+    resource.moving = False
+    with pytest.raises(
+        DeviceFault, match=r"a on .*: could not be stopped at \d\d:\d\d:\d\d \(no answer\), so nobody gets a"
+    ):
+        table.acquire("a")
+    with pytest.raises(DeviceFault, match="look at it, then `trade resume a`"):
+        table.acquire("a")
+    [info] = table.table.withheld()
+    assert (info.resources, info.holder.owner) == (("a",), "nobody")
+    assert "no answer" in info.holder.purpose
+    table.call("a").close()  # calls without a lock are not refused
+    resource.resume()
+    assert table.table.withheld() == []
 
 
 def test_a_lock_of_what_is_no_longer_offered_is_lost_and_who_waits_for_it_is_refused(table: Table) -> None:

@@ -12,7 +12,7 @@ from lock_table import COUPLED, NAMES, Table
 from trade._resources import Permit
 from trade._terms import Granted
 from trade._wire import Token
-from trade.errors import DeviceSilent, LockedByOther, LockLost, MotionStopped
+from trade.errors import DeviceFault, LockedByOther, LockLost, MotionStopped
 from waiting import wait_until
 
 
@@ -107,7 +107,7 @@ class Model(RuleBasedStateMachine):
             token = self.real.take(sorted(names), "try")
             assert free and not whole & self.unsafe
             self.real.table.release(token.number, "tester")
-        except DeviceSilent:
+        except DeviceFault:
             assert whole & self.unsafe
         except LockedByOther:
             assert not free

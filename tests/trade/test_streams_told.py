@@ -12,11 +12,11 @@ from waiting import PATIENCE_S
 
 class Sick:
     def __init__(self) -> None:
-        self._silent_ms = itertools.count(100)
+        self._silent_s = itertools.count(20)
 
     @service(effect="read")
     def state(self) -> float:
-        raise errors.DeviceSilent(device="neck.pan", bus="/dev/ttyUSB0", waited_s=next(self._silent_ms) / 1e3)
+        raise errors.DeviceSilent(device="neck.pan", bus="/dev/ttyUSB0", waited_s=next(self._silent_s))
 
 
 def test_a_failure_that_only_lasts_longer_is_told_once(caplog: pytest.LogCaptureFixture) -> None:

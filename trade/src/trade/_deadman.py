@@ -146,7 +146,7 @@ class _Together:
                 self._problems.append(problem)
             last = not self._left
         for resource in self._stops[service] if problem else ():
-            resource.unsafe = problem
+            resource.stop_ended(problem)
         if last:
             self._done(self._problems)
 
@@ -176,6 +176,6 @@ def _end_calls(cancels: Sequence[Callable[[], None]]) -> None:
 
 def _unsafe(resource: Resource, problem: str) -> None:
     """What could not be stopped is locked by nobody before somebody resumes it (S14)."""
-    resource.unsafe = problem
+    resource.stop_ended(problem)
     if problem:
         _logger.error("%s could not be stopped: %s", resource.name, problem)

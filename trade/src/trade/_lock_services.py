@@ -108,8 +108,8 @@ class LockServices:
 
     @service(effect="read")
     def locks(self) -> list[LockInfo]:
-        """What is locked here, by whom, and who waits for it."""
-        return self._table.infos()
+        """What is locked here, by whom, and who waits for it; and what nobody gets, as it could not be stopped."""
+        return self._table.infos() + self._table.withheld()
 
     @service(effect="stop")
     def break_lock(self, grant: int, reason: str) -> bool:

@@ -13,11 +13,11 @@ from typing import Final
 from msgspec import Struct, structs
 
 from trade._audit import Audit
-from trade._resources import Holder, Latch, Resource, locked
+from trade._resources import Holder, Latch, Resource, locked, not_stopped
 from trade._session import foreign
 from trade._terms import Granted, LockInfo, Terms
 from trade._wire import Token
-from trade.errors import DeviceSilent, LockedByOther, ServiceGone, SessionEnded, TradeError
+from trade.errors import DeviceFault, LockedByOther, ServiceGone, SessionEnded, TradeError
 
 _STOPPING: Final = Holder("trade", "", "", "stopping what moved under a lock that was lost", 0.0)
 
@@ -179,7 +179,7 @@ class LockTable:
 
         Raises:
             LockedByOther: not within the times given; nothing is held then.
-            DeviceSilent: one could not be stopped when it had to be, and is given to nobody.
+            DeviceFault: one could not be stopped when it had to be, and is given to nobody.
             ServiceGone: one is not here.
             SessionEnded: who asks is not there any more.
         """
@@ -225,7 +225,7 @@ class LockTable:
     def _obstacle(self, waiter: _Waiter) -> TradeError | None:
         for resource in waiter.resources:
             if resource.unsafe:
-                return DeviceSilent(device=resource.name, bus=self._container, waited_s=0.0)
+                return not_stopped(resource, self._container)
         for resource in waiter.resources:
             if resource.live:
                 return locked(resource, resource.holder, waiter.holder.session)
@@ -247,7 +247,7 @@ class LockTable:
 
     def _wait(self, waiter: _Waiter, until: float, obstacle: TradeError) -> None:
         left = until - self._clock()
-        if left <= 0 or waiter.gone or self._closed or isinstance(obstacle, DeviceSilent):
+        if left <= 0 or waiter.gone or self._closed or isinstance(obstacle, DeviceFault):
             raise obstacle
         self._changed.wait(left)
 
@@ -384,6 +384,23 @@ class LockTable:
             now = self._clock()
             return [self._info(grant, now) for grant in self._grants.values()]
 
+    def withheld(self) -> list[LockInfo]:
+        """What nobody gets before it is resumed, as it could not be stopped (S14): of "nobody", with number 0."""
+        return [self._withheld(resource) for resource in self.resources() if resource.unsafe]
+
+    def _withheld(self, resource: Resource) -> LockInfo:
+        purpose = f"could not be stopped ({resource.unsafe}); look at it, then `trade resume {resource.name}`"
+        return LockInfo(
+            token=Token(self._epoch, 0),
+            container=self._container,
+            resources=(resource.name,),
+            holder=Holder("nobody", "", "", purpose, resource.unsafe_at),
+            left_s=0.0,
+            uses=0,
+            last_use=0.0,
+            waiting=(),
+        )
+
     def _info(self, grant: _Grant, now: float) -> LockInfo:
         waiting = [one.holder for one in self._waiting if not set(one.resources).isdisjoint(grant.resources)]
         return LockInfo(
@@ -416,7 +433,7 @@ class LockTable:
 
     def _stopped(self, resource: Resource, problem: str) -> None:
         with self._changed:
-            resource.unsafe = problem
+            resource.stop_ended(problem)
             if resource.pending is _STOPPING:
                 resource.pending = None
             self._changed.notify_all()

@@ -15,7 +15,7 @@ from msgspec import Struct, structs
 from trade._context import CallContext, running
 from trade._session import foreign
 from trade._wire import Token
-from trade.errors import LockedByOther, LockLost, MotionStopped, SessionEnded, Stopped
+from trade.errors import DeviceFault, LockedByOther, LockLost, MotionStopped, SessionEnded, Stopped
 
 __all__ = ["Permit", "Resource", "permit"]
 
@@ -38,7 +38,7 @@ class Holder(Struct, frozen=True):
     @property
     def owner(self) -> str:
         """``identity/container``, or ``clinic/anna via door`` for a client of another system."""
-        return foreign(self.session) or f"{self.identity}/{self.container}"
+        return foreign(self.session) or (f"{self.identity}/{self.container}" if self.container else self.identity)
 
 
 class Latch(NamedTuple):
@@ -68,7 +68,7 @@ class Resource:
 
     __slots__ = (
         *("_moving", "_rested", "calls", "coupled", "epoch", "estop", "gone", "holder"),
-        *("latch", "live", "movers", "name", "over", "pending", "stops", "unsafe", "used_at", "uses"),
+        *("latch", "live", "movers", "name", "over", "pending", "stops", "unsafe", "unsafe_at", "used_at", "uses"),
     )
 
     def __init__(self, name: str, *, coupled: Sequence[str] = ()) -> None:
@@ -91,6 +91,8 @@ class Resource:
         self.estop: Latch | None = None
         self.unsafe = ""
         """Why it is not granted on: it could not be stopped when it had to be."""
+        self.unsafe_at = 0.0
+        """``time.time()`` when that was."""
         self.movers: tuple[str, ...] = ()
         """The sessions for which it was moved last."""
         self.calls: dict[int, Permit] = {}
@@ -160,6 +162,14 @@ class Resource:
         """Whether somebody has it or is about to; asked in this order, as a grant holds before it ceases to pend."""
         return self.pending is not None or self.live != 0
 
+    def stop_ended(self, problem: str) -> None:
+        """Note how a stop that had to be ended: with a problem nobody gets it before somebody resumes it (S14).
+
+        Args:
+            problem: why it could not be stopped; empty if it was.
+        """
+        self.unsafe_at, self.unsafe = time.time(), problem  # the time first: who sees the problem tells it
+
     def resume(self) -> None:
         """Let it move again after a stop that latched, and be granted again after one that failed."""
         self.latch = None
@@ -224,6 +234,17 @@ def locked(resource: Resource, holder: Holder | None, session: str = "") -> Lock
         purpose=holder.purpose,
         since=holder.since,
         own=holder.session == session,
+    )
+
+
+def not_stopped(resource: Resource, container: str) -> DeviceFault:
+    """The error of who wants what could not be stopped."""
+    when = time.strftime("%H:%M:%S", time.localtime(resource.unsafe_at))
+    return DeviceFault(
+        device=resource.name,
+        bus=container,
+        fault=f"could not be stopped at {when} ({resource.unsafe}), so nobody gets a lock on it",
+        remedy=f"look at it, then `trade resume {resource.name}`",
     )
 
 

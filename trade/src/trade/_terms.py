@@ -30,7 +30,7 @@ class Granted(Struct, frozen=True):
 
 
 class LockInfo(Struct, frozen=True):
-    """One grant, as `trade.locks` tells it."""
+    """One grant, as `trade.locks` tells it; or, with number 0 and of "nobody", what could not be stopped (S14)."""
 
     token: Token
     container: str

@@ -9,6 +9,7 @@ One module on purpose, however long: whoever catches reads the tree as a whole.
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from typing import Final
 
 __all__ = [
     "AccessDenied",
@@ -61,6 +62,13 @@ __all__ = [
 ]
 
 
+_WORTH_TELLING_S: Final = 0.1
+"""A shorter silence than this is one exchange of a bus: its length says nothing."""
+_NO_MORE_TENTHS_S: Final = 10.0
+_SIMULATED: Final = "/trade-sim-"
+"""In the ports of ``trade up --sim``: they lie in a temporary folder of that name."""
+
+
 @dataclass(kw_only=True, eq=False)
 class TradeError(Exception):
     """Root of everything this project raises on purpose."""
@@ -88,6 +96,13 @@ def _some(texts: Sequence[str]) -> str:
 def _nobody_at(apart: Sequence[str]) -> str:
     """At which endpoints nobody was found, and why."""
     return "; ".join(f"nobody answers at {endpoint}" for endpoint in apart)
+
+
+def _for(seconds: float) -> str:
+    """How long something has lasted, if that is worth telling."""
+    if seconds < _WORTH_TELLING_S:
+        return ""
+    return f" for {seconds:.1f} s" if seconds < _NO_MORE_TENTHS_S else f" for {seconds:.0f} s"
 
 
 # --- the caller must act
@@ -581,17 +596,20 @@ class DeviceSilent(DeviceError, TimeoutError):
     """A device has not answered within its time; the last values are too old to be trusted."""
 
     waited_s: float
+    """How long it has not: since it was asked, or since it was last measured."""
 
     def describe(self) -> str:
-        return (
-            f"{self.device} did not answer on {self.bus} within {self.waited_s * 1e3:.0f} ms; is it powered, plugged "
-            "in, and set to the id and baud rate of the robot file?"
-        )
+        return f"{self.device} did not answer on {self.bus}{_for(self.waited_s)}; {self._hint()}"
+
+    def _hint(self) -> str:
+        if _SIMULATED in self.bus:
+            return "it is simulated: this computer is too busy, or its simulator was told to keep it silent"
+        return "is it powered, plugged in, and set to the id and baud rate of the robot file?"
 
 
 @dataclass(kw_only=True, eq=False)
 class DeviceFault(DeviceError, RuntimeError):
-    """A device reports a fault, or refused a command."""
+    """A device reports a fault, refused a command, or could not be stopped when it had to be."""
 
     fault: str
     remedy: str = "remove the cause, then enable it again"

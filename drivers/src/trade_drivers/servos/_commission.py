@@ -50,6 +50,13 @@ class ServoBench(Bench):
         return True
 
     def look(self, device_id: int) -> Found | None:
+        found = self._look(device_id)
+        for _ in range(_LOOKS - 1):
+            if found is not None and found.problem == self.mute:  # one answer that got lost says nothing of it
+                found = self._look(device_id)
+        return found
+
+    def _look(self, device_id: int) -> Found | None:
         try:
             number = self.wire.ping(device_id)
         except BadAnswer:
@@ -69,6 +76,7 @@ class ServoBench(Bench):
         except BadAnswer:
             return self._found(device_id, problem=_SHARED)
         except NoAnswer:
+            self.wire.settled_at = 0.0
             return self._found(device_id, model, problem=self.mute)
         except Refused as refused:
             return self._found(device_id, model, problem=f"it refuses to be read: {refused}")

@@ -29,6 +29,9 @@ __all__ = ["Sweep", "calibrate", "homed", "measured", "with_values"]
 _MARGIN_RAD: Final = 0.02
 """How far inside of what was reached the range ends: the last bit is the stop giving way."""
 _LEAST_RAD: Final = 0.1
+_APART_S: Final = 0.3
+_STILL_RAD: Final = 0.01
+"""What is held still has moved by no more since it was looked at before: a hand trembles."""
 _LONGEST_S: Final = 600.0
 """How long somebody may take between two prompts."""
 _DIGITS: Final = 4
@@ -40,7 +43,7 @@ _Number = TypeVar("_Number", int, float)
 def calibrate(
     robot_file: Annotated[Path, typer.Argument(metavar="ROBOT.toml", help="The robot file.")],
     joint: Annotated[str, typer.Argument(help="The joint, as the file names it: neck.pan.")],
-    zero_here: Annotated[bool, typer.Option("--zero-here", help="Its zero is where it stands now.")] = False,
+    zero_here: Annotated[bool, typer.Option("--zero-here", help="Its zero is where it stands still now.")] = False,
     range_from_motion: Annotated[
         float | None,
         typer.Option(metavar="SECONDS", min=1.0, max=_LONGEST_S, help="Its range is where it is moved meanwhile."),
@@ -98,6 +101,20 @@ class Sweep:
                 raise ConfigurationError(where=f"id {self._id}", problem=problem)
             low, high, last = min(low, now), max(high, now), now
         return Ends(low, high, last)
+
+    def still(self) -> float:
+        """Where it stands, seen twice.
+
+        Raises:
+            ConfigurationError: it moves.
+        """
+        before = self.read()
+        time.sleep(_APART_S)
+        now = self.read()
+        if abs(now - before) > _STILL_RAD:
+            problem = f"it moves (by {abs(now - before):.3f} rad in {_APART_S:g} s); hold it still, then try again"
+            raise ConfigurationError(where=f"id {self._id}", problem=problem)
+        return now
 
     def read(self) -> float:
         """Where it stands, from its own centre, in rad."""
@@ -194,6 +211,9 @@ def _table(document: "tomlkit.TOMLDocument", joint: str) -> dict[str, object]:
 def _joint(robot: Robot, name: str) -> tuple[Joint, SerialBus]:
     """A joint whose servo can be turned by hand, and its bus."""
     joint = next((one for one in robot.joints if one.name == name), None)
+    if any(one.name == name for one in robot.grippers):
+        activate = f"`trade call {robot.name}.{name}.activate`, once it is up"
+        raise UsageError(where=robot.where, problem=f"a gripper is not calibrated; activate it: {activate}")
     if joint is None:
         there = ", ".join(one.name for one in robot.joints) or "none"
         raise UsageError(where=robot.where, problem=f"there is no joint {name!r}; there is {there}")
@@ -228,7 +248,7 @@ def _measure(
 ) -> dict[str, float]:
     """What changes, by the ways that were asked for; by prompts if none was."""
     name, asked = escape(joint.name), enter or _enter_pressed
-    zero, ends = sweep.read() if zero_here else None, None
+    zero, ends = sweep.still() if zero_here else None, None
     if seconds is not None:
         out.say(f"Move [bold]{name}[/] slowly from one end to the other and back, for {seconds:g} s")
         until = time.monotonic() + seconds

@@ -9,7 +9,7 @@ from rich.markup import escape
 
 from trade._toml import read_toml_text
 from trade.errors import TradeError
-from trade_drivers import drivers, load
+from trade_drivers import SerialBus, drivers, load
 from trade_gateway.commands import _doctor_host as host
 from trade_gateway.commands import _doctor_robot as robots
 from trade_gateway.commands._doctor_host import Finding
@@ -53,7 +53,7 @@ def doctor(
 
 
 def _of_host(context: typer.Context, robot_file: Path | None) -> Iterator[Finding]:
-    yield from host.ports(serial_ports())
+    yield from host.ports(serial_ports(), _lines_of(robot_file))
     yield from host.latencies()
     if robot_file is None:
         yield from host.libraries(sorted(drivers()), needed=False)
@@ -76,6 +76,14 @@ def _of_host(context: typer.Context, robot_file: Path | None) -> Iterator[Findin
         )
 
 
+def _lines_of(path: Path | None) -> list[str]:
+    """The serial ports that a robot file names; none if it cannot be read, which is told later."""
+    try:
+        return [bus.port for bus in load(path).buses if isinstance(bus, SerialBus)] if path is not None else []
+    except TradeError:
+        return []
+
+
 def _of_robot(path: Path) -> Iterator[Finding]:
     try:
         robot = load(path)
@@ -86,6 +94,7 @@ def _of_robot(path: Path) -> Iterator[Finding]:
         return
     yield from host.libraries(sorted({bus.driver for bus in robot.buses}), needed=True)
     yield from robots.unwatched(robot)
+    yield from robots.unmeasured(robot, path)
     yield from robots.interfaces(robot)
     yield from robots.devices(robot)
     yield from robots.controllers(robot)

@@ -36,10 +36,16 @@ class Finding(Struct, frozen=True, kw_only=True):
     """What to do, where something is wrong."""
 
 
-def ports(paths: Sequence[str]) -> Iterator[Finding]:
-    """Whether this user may open the serial devices there are."""
+def ports(paths: Sequence[str], named: Sequence[str] = ()) -> Iterator[Finding]:
+    """Whether this user may open the serial devices there are.
+
+    Args:
+        paths: of those that the system lists.
+        named: those of the robot file, which are looked at with their devices.
+    """
     if not paths:
-        yield Finding(level="ok", about="serial ports", text="there is none")
+        others = f"; the robot file names {', '.join(named)}" if named else ""
+        yield Finding(level="ok", about="serial ports", text=f"no adapter is plugged in{others}")
     for path in paths:
         if os.access(path, os.R_OK | os.W_OK):
             yield Finding(level="ok", about=path, text="may be opened")

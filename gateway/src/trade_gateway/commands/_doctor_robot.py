@@ -10,11 +10,12 @@ from trade.errors import ConfigurationError
 from trade_drivers import Bench, CanBus, Commissioner, Driver, Found, Joint, Robot, SerialBus, UrBus, load_driver
 from trade_drivers.robotfile import Gripper
 from trade_gateway.commands._doctor_host import Finding
+from trade_gateway.commands._first_file import UNMEASURED_RAD
 
 if TYPE_CHECKING:
     from trade_drivers.can import Link
 
-__all__ = ["controllers", "devices", "interfaces", "judged", "unwatched"]
+__all__ = ["controllers", "devices", "interfaces", "judged", "unmeasured", "unwatched"]
 
 _LOOKS: Final = 10
 """How often a device is asked: a bad line shows in some of them."""
@@ -34,6 +35,20 @@ def unwatched(robot: Robot) -> Iterator[Finding]:
         if without and named:
             fix = "give the robot an emergency stop that cuts their power; docs/safety.md, S06"
             yield Finding(level="warning", about=", ".join(named), text=without, fix=fix)
+
+
+def unmeasured(robot: Robot, path: Path) -> Iterator[Finding]:
+    """Joints whose zero and range nobody has measured: they are as a scan writes them."""
+    lines = {bus.name for bus in robot.buses if isinstance(bus, SerialBus)}
+    for joint in robot.joints:
+        if (joint.offset_rad, joint.min_rad, joint.max_rad) == (0.0, -UNMEASURED_RAD, UNMEASURED_RAD):
+            fix = (
+                f"trade calibrate {path} {joint.name}"
+                if joint.bus in lines
+                else "measure it, and write it into the file"
+            )
+            text = "its zero and range are those that `trade scan` wrote, and nobody's"
+            yield Finding(level="warning", about=joint.name, text=text, fix=fix)
 
 
 def interfaces(robot: Robot) -> Iterator[Finding]:

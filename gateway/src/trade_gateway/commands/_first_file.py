@@ -9,7 +9,10 @@ import msgspec
 from trade.errors import ConfigurationError
 from trade_drivers import Found, parse
 
-__all__ = ["first_file"]
+__all__ = ["UNMEASURED_RAD", "first_file"]
+
+UNMEASURED_RAD: Final = 0.1
+"""The range of a joint that nobody has measured, to both sides of a zero that nobody has measured."""
 
 _HEAD: Final = """\
 # Written by `trade scan`. Give the robot, its buses and its devices names of your own, as in [joint."neck.pan"].
@@ -85,8 +88,8 @@ def _joint(one: Found) -> list[str]:
     return [
         *keys,
         "offset_rad = 0.0",
-        f"min_rad = -0.1          # {measures}",
-        "max_rad = 0.1",
+        f"min_rad = {-UNMEASURED_RAD}          # {measures}",
+        f"max_rad = {UNMEASURED_RAD}",
         "max_speed_rad_s = 1.0",
         "max_accel_rad_s2 = 10.0",
     ]

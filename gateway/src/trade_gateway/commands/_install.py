@@ -19,7 +19,7 @@ from trade_gateway._files import replace
 from trade_gateway._gateway_file import read_gateway_file
 from trade_gateway.commands._named import Named, named_files
 from trade_gateway.commands._output import Output, UsageError
-from trade_gateway.commands._unit import UDEV_RULES, needs_of, program_folders, unit_text
+from trade_gateway.commands._unit import UDEV_RULES, hidden_in, needs_of, program_folders, unit_text
 
 _MARK: Final = re.compile(r"# Written by `trade install`; [^\n]* sha256 ([0-9a-f]{64})\n")
 _HEAD: Final = "# Written by `trade install`; what you change here it will not overwrite. sha256 {digest}\n{text}"
@@ -43,10 +43,12 @@ def install(
     NAME.service.d/*.conf. Again after a change of these files: `trade install` writes what has become different.
 
     For example: sudo trade install /etc/trade/gateway.toml
+    For another computer: trade install image/etc/trade/gateway.toml --root image
     """
     for given, form, option in ((name, _NAME, "--name"), (user, _USER, "--user")):
         if not form.fullmatch(given):
             raise UsageError(where=f"{option} {given}", problem="is no such name; use letters, digits, _ and -")
+    _require_there(file, root)
     read_gateway_file(file)
     named = named_files(file)
     bodies = {root / _UNITS / f"{name}.service": _unit(named, user, root), root / _RULES: UDEV_RULES}
@@ -61,15 +63,41 @@ def install(
         if path in fresh:
             _write(path, text)
         out.say(escape(f"{'wrote' if path in fresh else 'as it should be:'} {path}"))
+    for doubt in _doubts(named, user, root):
+        out.say(f"[yellow]warning[/]  {escape(doubt)}")
     _say_next(out, user, name, named.records)
 
 
-def _unit(named: Named, user: str, root: Path) -> str:
-    above = Path(os.path.normpath(root.absolute()))
+def _require_there(file: Path, root: Path) -> None:
+    """Raises UsageError: the file is named as the other computer will see it, and lies in its folder."""
+    there = root / str(file).lstrip("/")
+    if not file.exists() and there.exists():
+        raise UsageError(where=str(file), problem=f"there is none on this computer; did you mean {there}?")
 
+
+def _doubts(named: Named, user: str, root: Path) -> Iterable[str]:
+    """What the service may not find, or not for long."""
+    for what, path in (("the Python", Path(sys.executable)), *(("file", one) for one in named.files)):
+        seen = _seen(path, root)
+        if (hidden := hidden_in(seen)) is not None:
+            why = f"user {user} may not be let in there, and what is temporary goes; /opt and /etc are places that last"
+            yield f"{what} {seen} lies in {hidden}: {why}"
+        elif checkout := next((one for one in path.parents if (one / ".git").exists()), None):
+            yield f"{what} {seen} lies in the checkout {checkout}: a change of it changes the service"
+    for port in needs_of(map(load, named.robots)).devices:
+        if (hidden := hidden_in(Path(port))) is not None:
+            yield f"port {port} lies in {hidden}, which the service does not see: is it a simulated one?"
+
+
+def _seen(path: Path, root: Path) -> Path:
+    """A path as the computer sees it whose / is that folder."""
+    above = Path(os.path.normpath(root.absolute()))
+    return Path("/") / path.relative_to(above) if path.is_relative_to(above) else path
+
+
+def _unit(named: Named, user: str, root: Path) -> str:
     def seen(path: Path) -> Path:
-        """A path as that computer sees it."""
-        return Path("/") / path.relative_to(above) if path.is_relative_to(above) else path
+        return _seen(path, root)
 
     return unit_text(
         seen(named.files[0]),

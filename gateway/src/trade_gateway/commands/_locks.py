@@ -17,6 +17,8 @@ Group = Annotated[str, typer.Argument(help="A group and what is beneath it: rosi
 def locks(context: typer.Context, as_json: Json = False) -> None:
     """List what is locked: by whom, what for, since when, how much of the lease is left, who waits.
 
+    What could not be stopped is of nobody, and nobody gets it before somebody resumes it.
+
     For example: trade locks --json
     """
     out = Output(as_json=as_json)
@@ -54,7 +56,7 @@ def _row(info: LockInfo) -> tuple[str, ...]:
         _owner(info),
         info.holder.purpose,
         time.strftime("%H:%M:%S", time.localtime(info.holder.since)),
-        f"{info.left_s:.1f} s",
+        f"{info.left_s:.1f} s" if info.token.number else "",  # what nobody gets has no lease
         info.container,
         ", ".join(info.waiting),
     )

@@ -89,8 +89,21 @@ def complain(text: str) -> None:
     sys.stderr.flush()
 
 
+REMEDIES: Final = {
+    "wait with trade.lock(..., wait_s=...) or ask with trade.request_release(...)": (
+        "wait with `trade lock --wait SECONDS`, or take it away with `trade unlock GROUP --break REASON`"
+    ),
+    "take it anew with trade.lock(...)": "take it anew with `trade lock`",
+    "look it up again with trade.find(...)": "`trade services` lists what there is",
+}
+"""What errors tell a program to do, and what somebody at a terminal does instead."""
+
+
 def say_error(error: BaseException) -> None:
-    """The error's name and message on standard error."""
+    """The error's name and message on standard error; what helps in words of the command line."""
     console = Console(stderr=True, highlight=False, soft_wrap=True)
-    console.print(f"[bold red]{type(error).__name__}[/]: {escape(str(error))}")
+    message = str(error)
+    for remedy, ours in REMEDIES.items():
+        message = message.replace(remedy, ours)
+    console.print(f"[bold red]{type(error).__name__}[/]: {escape(message)}")
     sys.stderr.flush()

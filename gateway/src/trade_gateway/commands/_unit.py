@@ -10,7 +10,7 @@ from msgspec import Struct
 
 from trade_drivers import CanBus, Robot, SerialBus
 
-__all__ = ["UDEV_RULES", "Needs", "needs_of", "program_folders", "unit_text"]
+__all__ = ["UDEV_RULES", "Needs", "hidden_in", "needs_of", "program_folders", "unit_text"]
 
 _COMES_AND_GOES: Final = re.compile(r"/dev/(serial/|tty(USB|ACM)\d)")
 _HIDDEN: Final = tuple(map(Path, ("/home", "/root", "/run/user", "/tmp", "/var/tmp")))  # noqa: S108 - what the unit hides
@@ -107,8 +107,13 @@ def _devices(needs: Needs) -> str:
     return "\n".join([*group, "DevicePolicy=closed", *(f"DeviceAllow={one} rw" for one in needs.devices)])
 
 
+def hidden_in(path: Path) -> Path | None:
+    """Which folder that the unit hides from the service a path lies in."""
+    return next((hidden for hidden in _HIDDEN if path.is_relative_to(hidden)), None)
+
+
 def _is_hidden(folder: Path) -> bool:
-    return any(folder.is_relative_to(hidden) for hidden in _HIDDEN)
+    return hidden_in(folder) is not None
 
 
 def _outermost(folders: Iterable[Path]) -> list[Path]:
