@@ -39,7 +39,7 @@ def test_a_port_that_may_not_be_opened_names_the_group_to_join(tmp_path: Path, m
 
 def test_ports_that_the_system_does_not_list_are_not_said_to_be_missing() -> None:
     assert only(host.ports([])).text == "no adapter is plugged in"
-    assert only(host.ports([], ["/x/neck", "/x/hand"])).text.endswith("the robot file names /x/neck, /x/hand")
+    assert only(host.ports([], ["/x/neck", "/x/hand"])).text.endswith("the robot file names 2, looked at below")
 
 
 def test_a_joint_that_nobody_has_measured_is_told_with_what_measures_it() -> None:
