@@ -9,6 +9,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
+from multiprocessing import resource_tracker
 from pathlib import Path
 
 import psutil
@@ -29,8 +30,10 @@ _SETTLE_S = 5.0
 def _warm_up(tmp_path_factory: pytest.TempPathFactory) -> None:
     """The transport's runtime and the event loop's selector open files once a process; that is no leak.
 
-    Of every session the transport keeps two or three files of shared memory open until the process ends.
+    Of every session the transport keeps two or three files of shared memory open until the process ends. The first
+    child of `multiprocessing` brings up a process that looks after what children share, and stays.
     """
+    resource_tracker.ensure_running()
     allowed, most = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (max(allowed, min(most, _FILES)), most))
     os.environ["TRADE_RUNTIME_DIR"] = str(tmp_path_factory.mktemp("runtime"))

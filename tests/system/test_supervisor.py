@@ -415,8 +415,10 @@ def test_with_certificates_a_gateway_shows_keeps_and_saves_its_children(
     anna.find(where(name="restart_child"), wait_s=30)("a")
     there.until("up")
     assert anna.find(where(name="shown"), wait_s=30)() == 1
-    [info] = anna.find(where(name="children"))()
-    assert (info.name, info.state, info.restarts) == ("a", "up", 1)
+    children = anna.find(where(name="children"))
+    wait_until(
+        lambda: [(one.name, one.state, one.restarts) for one in children()] == [("a", "up", 1)], "it is up again"
+    )
 
 
 def test_nonsense_in_the_file_changes_nothing_and_what_is_right_again_is_gone_by(door: Callable[[str], Door]) -> None:

@@ -448,3 +448,23 @@ def test_a_clearing_that_was_recorded_clears_no_later_e_stop(system: MemorySyste
     assert [estop.id for estop in one.estops()] == [second.id]
     with pytest.raises(Stopped):
         call(one, "move_to", "one", 0.1)
+
+
+def test_S09_who_is_there_and_was_not_read_yet_is_waited_for() -> None:
+    """It may have something to stop: without its word an e-stop is not complete."""
+    with memory_system() as system:
+        near, far, me = (system.container(name) for name in ("near", "far", "me"))
+        near.register(Axis("near"), "rosie.near")
+        far.register(Axis("far"), "rosie.far")
+        system.settle()
+        registry = me._parts.registry
+        [state] = [one for one in registry.containers() if one.address == far.address]
+        state.heard.answered = -1  # as it is before its answer has come
+        state.heard._first = 2
+        state.providers.clear()
+        system.lose(
+            lambda passage: passage.key.startswith("estop/") and passage.key.count("/") == 3 and "far" in passage.key
+        )
+        report = me.estop("smoke", limit_s=0.5)
+        assert not report.complete
+        assert [name.rpartition("/")[2] for name in report.missing] == ["far"]

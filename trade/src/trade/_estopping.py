@@ -138,7 +138,7 @@ class Estopping:
 
         def expected() -> set[Address]:
             knowing = (r.key.address for r in self._own_records() if any(estop.id in ids for estop in r.estops))
-            return {*self._with_stops(), *knowing}
+            return {*self._with_stops(), *self._unread(), *knowing}
 
         report = self._line.ask(order, expected, limit_s, lambda: False)
         self._registry.wait_for(lambda: not self._still_told(ids, report.confirmed), _TOLD_S)
@@ -165,8 +165,13 @@ class Estopping:
         return {state.address for state in self._registry.containers() if _has_stop(state)}
 
     def _awaited(self) -> set[Address]:
-        """Who has something to stop, as far as that can be known."""
-        return {*self._with_stops(), *(state.address for state in self._others())}
+        """Who has something to stop, or may have, as far as that can be known."""
+        return {*self._with_stops(), *self._unread(), *(state.address for state in self._others())}
+
+    def _unread(self) -> set[Address]:
+        """Who is there and has not said yet what is its own: nobody can tell that it has nothing to stop."""
+        containers = self._registry.containers()
+        return {state.address for state in containers if not state.heard.complete and state.address != self._own}
 
     def _others(self) -> list[ContainerState]:
         """Those that speak another version."""
