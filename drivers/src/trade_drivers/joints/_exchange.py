@@ -167,7 +167,7 @@ class Exchange(BusExchange[Axis]):
         self.answer_stops(now_ns)
 
     def _watch_halt(self, axis: Axis, now_ns: int, again: list[Axis]) -> None:
-        if axis.still >= 2 or not axis.may_hold_torque:
+        if axis.still >= 2 or not axis.may_hold_torque or axis.fault:
             axis.halting_since_ns = 0
         elif now_ns - axis.halting_since_ns <= HALT_NS and axis.moved_since_held:
             again.append(axis)  # it was still on its way: so it need not come back as far
