@@ -101,6 +101,14 @@ def _from_anybody(payload: bytes, identity: str) -> _wire.EstopOrder:
     return msgspec.msgpack.decode(payload, type=_wire.EstopOrder)
 
 
+def _all_of(*breaks: Callable[[], None]) -> Callable[[], None]:
+    def break_all() -> None:
+        for one in breaks:
+            one()
+
+    return break_all
+
+
 def _of_our_version(payload: bytes, identity: str) -> _wire.EstopOrder:
     if msgspec.msgpack.decode(payload)[0] != _wire.PROTOCOL:
         raise _wire.Malformed("another version")
@@ -127,7 +135,10 @@ BREAK: dict[str, Callable[[], None]] = {
     "ignores-epochs": _put(_resources.Resource, "check_lock", _check_numbers),
     "outlives-its-caller": _put(_container, "new_request", _as_long_as_usual),
     "believes-any-estop": _put(_estop_line, "decode_estop_order", _from_anybody),
-    "hears-its-own-version-only": _put(_estop_line, "decode_estop_order", _of_our_version),
+    "hears-its-own-version-only": _all_of(  # and does not learn of it from the suite's own container either
+        _put(_estop_line, "decode_estop_order", _of_our_version),
+        _put(_estop.Estops, "learn", lambda self, estops: None),
+    ),
     "never-latches": _put(_resources.Resource, "_is_of", lambda self, asking: True),
     "ignores-estops": _put(_estop.Estops, "take", _confirm_only),
     "forgets-estops": _put(_estop_store.EstopStore, "read", lambda self: []),
