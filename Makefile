@@ -37,14 +37,15 @@ demo: $(UV) ## a simulated robot looks, walks and grips for behaviours beyond a 
 	@$(RUN) python examples/demo.py $(ARGS)
 
 test: $(UV) ## the whole test suite; in parts; the others run also when one fails
-	@failed=; part() { code=0; $(RUN) pytest "$$@" $(ARGS) || code=$$?; \
+	@mkdir -p build; rm -f build/failures; export TEST_FAILURES=build/failures; \
+	failed=; part() { code=0; $(RUN) pytest "$$@" $(ARGS) || code=$$?; \
 	  case $$code in 0|5) ;; 1) failed=1 ;; *) exit $$code ;; esac; }; \
 	part -n 2 --dist loadfile --ignore tests/drivers --ignore tests/complaints --ignore tests/system --ignore tests/bench --ignore tests/chaos --ignore tests/soak --ignore tests/browser --ignore tests/peers; \
 	part -n 2 --dist loadfile tests/system tests/bench tests/chaos tests/soak --ignore tests/system/test_demo.py; \
 	part -n 2 --dist loadfile tests/drivers tests/complaints; \
 	part -n 2 --dist loadfile tests/browser tests/peers/test_conformance.py; \
 	part tests/peers/test_rust.py tests/system/test_demo.py; \
-	test -z "$$failed"
+	test -z "$$failed" || { echo "failed, of all parts:"; cat build/failures; exit 1; }
 
 test-socketcan: $(UV) ## the CAN suites on kernel interfaces; where the kernel has none, inside User-Mode Linux
 	@$(RUN) tests/socketcan/run pytest tests/socketcan $(ARGS)

@@ -14,6 +14,7 @@ import re
 import subprocess
 import sys
 import time
+from pathlib import Path
 from typing import Final
 
 import pytest
@@ -38,6 +39,8 @@ while os.getppid() == {{parent}}:
 _KEY: Final = "ran again"
 _UNSTEADY: Final = "for no reason that is known, mend it: "
 _UNSTEADY_ONES: Final = 2
+_FAILURES: Final = "TEST_FAILURES"
+"""The variable that names a file for a line of each failure: `make test` shows those of all its parts at its end."""
 
 
 class Clock:
@@ -130,9 +133,14 @@ class Told:
 
     def __init__(self) -> None:
         self._again: dict[str, str] = {}
+        self._failed: list[str] = []
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        """Remember who ran again."""
+        """Remember who ran again, and who failed."""
+        if report.failed:
+            crash = getattr(report.longrepr, "reprcrash", None)
+            why = str(getattr(crash, "message", report.longreprtext)).strip().partition("\n")[0]
+            self._failed.append(f"{report.nodeid} ({report.when}): {why}")
         for key, why in report.user_properties:
             if key == _KEY:
                 self._again[report.nodeid] = str(why)
@@ -141,6 +149,10 @@ class Told:
         """Too many of them is a failure."""
         if len(self._again) > _MOST and session.exitstatus == pytest.ExitCode.OK:
             session.exitstatus = pytest.ExitCode.TESTS_FAILED
+            self._failed.extend(f"{name} ran twice, one of more than {_MOST}" for name in self._again)
+        if path := os.environ.get(_FAILURES):
+            with Path(path).open("a", encoding="utf-8") as file:
+                file.writelines(f"{line}\n" for line in self._failed)
 
     def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
         """Say who ran again."""

@@ -9,7 +9,8 @@ from typer.testing import CliRunner
 from certificates import Papers
 from trade._tls import Certificate
 from trade.errors import ConfigurationError
-from trade_gateway._gateway_file import Named, digest, named_by, read_gateway_file
+from trade_gateway._gateway_changes import Named, digest, named_by
+from trade_gateway._gateway_file import read_gateway_file
 from trade_gateway._pki import Authority
 from trade_gateway.cli import app
 from trade_gateway.supervisor import Child

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import typer
 from cryptography import x509
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from typer.testing import CliRunner, Result
@@ -17,6 +18,7 @@ from trade.errors import ConfigurationError, TradeError
 from trade.policies import read_policy
 from trade_gateway import _files, _pki
 from trade_gateway._pki import Authority, Issued, NameRevoked, NameTaken, NoAuthority
+from trade_gateway.cli import build
 from trade_gateway.commands._pki_commands import app
 
 
@@ -309,6 +311,14 @@ def test_who_has_no_address_is_told_to_dial_and_not_to_listen(folder: Path) -> N
     issued = said("issue", "planner", "--ca", folder).stdout
     assert "TRADE_LISTEN" not in issued
     assert "export TRADE_CONNECT=tls/" in issued
+
+
+@pytest.mark.parametrize("purpose", ["container", "gateway"])
+def test_the_commands_that_it_advises_are_there(folder: Path, purpose: str) -> None:
+    said("init", folder)
+    issued = said("issue", "ada", "--for", purpose, "--address", "10.0.0.5", "--ca", folder).stdout
+    advised = re.findall(r"(?:^ *|or )trade ([a-z]+)", issued, re.MULTILINE)
+    assert advised and set(advised) <= vars(typer.main.get_command(build()))["commands"].keys()
 
 
 def test_a_gateway_is_told_of_its_file_with_all_its_addresses(folder: Path) -> None:

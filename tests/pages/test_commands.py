@@ -37,7 +37,7 @@ TYPED_ELSEWHERE: Final = {
 """Modules of tests that do what the section says, often with other names."""
 NOT_TYPED: Final = {
     Section("guide.md", "Several networks"): "settings, not commands, for a host in two networks",
-    Section("deployment.md", "Taking one back"): "takes two hosts: trade/test_access.py has what is done there",
+    Section("deployment.md", "Taking one back"): "takes two hosts: trade/test_policy_watch.py has what is done there",
     Section("deployment.md", "Updating"): "takes root, systemd and a newer version",
     Section("deployment.md", "Real time"): "takes a right, and the processor from all other tests",
     Section("deployment.md", "In a container"): "takes podman or docker: tests/test_container.py, where there is one",

@@ -1,13 +1,14 @@
 """The access policy at work: refused by who calls before anything is sent, and once more by who is called."""
 
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from trade import Container, Estop, Handle, Resource, Settings, service, where
+from guarded_neck import Neck, find, memory, policy, rewritten
+from trade import Container, Estop, Handle, Settings, service, where
 from trade._access import FUNCTIONS, Access
 from trade._context import CallContext, running
 from trade._estop_services import EstopServices
@@ -17,67 +18,9 @@ from trade._own_services import OwnServices
 from trade._service import marked_methods
 from trade._wire import PROTOCOL, Behalf, EstopOrder, encode_message, estop_key
 from trade.errors import AccessDenied, ConfigurationError, LockedByOther, LockLost, NoSuchService, Stopped
-from trade.testing import MemorySystem, memory_system
-from waiting import wait_until
+from trade.testing import MemorySystem
 
-POLICY = """
-revoked = ["thief"]
-
-[roles.operator]
-includes = ["viewer"]
-call = ["rosie.neck"]
-lock = ["rosie.neck"]
-
-[roles.viewer]
-read = ["rosie"]
-
-[roles.driver]
-register = ["rosie", "lab"]
-
-[roles.chief]
-administer = ["*"]
-register = ["rosie"]
-
-[identities]
-planner = ["operator"]
-dash = ["viewer"]
-drv = ["driver"]
-chief = ["chief"]
-"""
-
-
-class Neck:
-    def __init__(self, name: str = "rosie.neck.pan") -> None:
-        self.resources = (Resource(name),)
-        self.moved: list[float] = []
-        self.stops = 0
-
-    @service
-    def move(self, angle_rad: float) -> float:
-        self.moved.append(angle_rad)
-        return angle_rad
-
-    @service(effect="read")
-    def angle(self) -> float:
-        return 0.5
-
-    @service(effect="stop")
-    def stop(self) -> None:
-        self.stops += 1
-
-
-@pytest.fixture
-def policy(tmp_path: Path) -> Path:
-    path = tmp_path / "policy.toml"
-    path.write_text(POLICY)
-    return path
-
-
-@pytest.fixture
-def memory() -> Iterator[MemorySystem]:
-    with memory_system() as system:
-        yield system
-
+__all__ = ["memory", "policy"]
 
 Member = Callable[[str], Container]
 
@@ -103,10 +46,6 @@ def neck(member: Member, memory: MemorySystem) -> Neck:
     member("drv").register(neck, "rosie.neck")
     memory.settle()
     return neck
-
-
-def find(container: Container, name: str, group: str = "rosie.neck") -> Handle:
-    return container.find(where(name=name, group=group, container="of-drv"))
 
 
 # --- by the caller
@@ -353,11 +292,6 @@ def test_only_its_own_functions_are_offered_by_everybody_in_the_group_of_the_mid
 # --- reload
 
 
-def rewritten(policy: Path, old: str, new: str) -> Path:
-    policy.write_text(policy.read_text().replace(old, new))
-    return policy
-
-
 def test_a_reloaded_policy_counts_for_the_next_call_on_both_sides(
     member: Member, careless: Container, policy: Path
 ) -> None:
@@ -519,97 +453,6 @@ def test_a_caller_asks_its_policy_once_a_service(
     for _ in range(20):
         move(0.1)
     assert asked.count("move") == 1
-
-
-# --- files that change
-
-
-@pytest.fixture
-def watching(memory: MemorySystem, policy: Path) -> Iterator[Container]:
-    """A container that was started with the policy, and offers something."""
-    settings = Settings(system="memory", identity="drv", container="of-drv", policy=policy)
-    with Container(settings, transport=MemoryTransport(memory.network, "of-drv")) as made:
-        made.register(Neck(), "rosie.neck")
-        memory.settle()
-        yield made
-
-
-def test_who_is_revoked_in_the_file_is_refused_without_anybody_loading_it(
-    watching: Container, memory: MemorySystem, policy: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    (tmp_path / "revoked.toml").write_text('revoked = ["thief"]')
-    rewritten(policy, 'revoked = ["thief"]', 'revoked_file = "revoked.toml"')
-    wait_until(lambda: "nothing is different" in caplog.text, "the list is named now")
-    move = find(memory.container("asking", identity="planner"), "move")  # it has no policy, and asks nobody
-    assert move(0.1) == 0.1
-    (tmp_path / "revoked.toml").write_text('revoked = ["thief", "planner"]')
-    wait_until(lambda: "planner is revoked now" in caplog.text, "it is read")
-    with pytest.raises(AccessDenied, match="planner is revoked"):
-        move(0.1)
-    (tmp_path / "revoked.toml").write_text("revoked = 1")
-    wait_until(lambda: "going on by the old one" in caplog.text, "it is refused")
-    assert watching.access.policy is not None
-    assert "planner" in watching.access.policy.revoked
-    assert caplog.text.count("going on by the old one") == 1
-    (tmp_path / "revoked.toml").write_text("revoked = []")
-    wait_until(lambda: "planner is revoked no more" in caplog.text, "and it is right again")
-    assert move(0.1) == 0.1
-
-
-def test_a_list_that_could_not_be_read_is_read_once_it_can_be(
-    watching: Container, policy: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Whoever copies it as another user and gives the right to read it afterwards changes nothing else of it."""
-    monkeypatch.setattr("trade._policy_watch._AGAIN_NS", 10**15)
-    listed, may = tmp_path / "revoked.toml", Path.read_text
-    listed.write_text("revoked = []")
-    rewritten(policy, 'revoked = ["thief"]', 'revoked_file = "revoked.toml"')
-    wait_until(lambda: "thief is revoked no more" in caplog.text, "the list is named now")
-
-    def refused(path: Path, **options: str) -> str:
-        if path == listed:
-            raise PermissionError(13, "Permission denied")
-        return may(path, **options)
-
-    monkeypatch.setattr(Path, "read_text", refused)
-    listed.write_text('revoked = ["planner"]')
-    wait_until(lambda: "Permission denied" in caplog.text, "it cannot be read")
-    monkeypatch.setattr(Path, "read_text", may)
-    listed.chmod(0o640)
-    wait_until(lambda: "planner is revoked now" in caplog.text, "it is read")
-    assert watching.access.policy is not None
-
-
-def test_files_that_were_refused_are_tried_again_as_they_are(
-    watching: Container, policy: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("trade._policy_watch._AGAIN_NS", 10**9)
-    may, down = Path.read_text, [False]
-
-    def passing(path: Path, **options: str) -> str:
-        if path == policy and down[0]:
-            raise OSError(5, "Input/output error")
-        return may(path, **options)
-
-    monkeypatch.setattr(Path, "read_text", passing)
-    rewritten(policy, 'revoked = ["thief"]', 'revoked = ["thief", "planner"]')
-    down[0] = True
-    wait_until(lambda: "Input/output error" in caplog.text, "it cannot be read")
-    down[0] = False
-    wait_until(lambda: "planner is revoked now" in caplog.text, "it is read")
-    assert caplog.text.count("going on by the old one") == 1
-
-
-def test_a_policy_that_was_loaded_on_purpose_is_the_one_that_is_looked_at(
-    watching: Container, policy: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    other = tmp_path / "other.toml"
-    other.write_text(POLICY)
-    watching.load_policy(other)
-    rewritten(policy, 'dash = ["viewer"]', 'dash = ["chief"]')
-    rewritten(other, 'dash = ["viewer"]', 'dash = ["operator"]')
-    wait_until(lambda: f"{other}: other identities" in caplog.text, "it is read")
-    assert str(policy) not in caplog.text
 
 
 # --- settings

@@ -269,7 +269,8 @@ def test_a_silence_is_told_as_what_it_is_and_not_as_a_wait(silent_s: float, said
     assert told.startswith(f"rosie.pan did not answer {said} is it powered")
 
 
-def test_a_simulated_device_that_is_silent_is_not_looked_for_on_a_cable() -> None:
-    told = str(errors.DeviceSilent(device="rosie.pan", bus="/tmp/trade-sim-x1/neck", waited_s=0.3))
-    assert "powered" not in told
-    assert "this computer is too busy" in told
+@pytest.mark.parametrize("bus", ["/tmp/trade-sim-x1/neck", "socketcand:127.0.0.1:4242/can0"])
+def test_a_silence_says_what_it_is_of_a_device_and_of_a_simulated_one(bus: str) -> None:
+    told = str(errors.DeviceSilent(device="rosie.pan", bus=bus, waited_s=0.3))
+    assert "is it powered, plugged in" in told
+    assert told.endswith("If it is simulated, this computer may be too busy")

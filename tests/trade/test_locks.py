@@ -8,7 +8,7 @@ import pytest
 
 from lock_table import EPOCH, Table
 from trade._locks import LockTable
-from trade._resources import Holder, Permit
+from trade._resources import Holder, Permit, Resource
 from trade._terms import Granted, Terms
 from trade._wire import Token
 from trade.errors import LockedByOther, LockLost, MotionStopped, NotStopped, ServiceGone, Stopped
@@ -195,14 +195,19 @@ def test_S14_who_waits_for_rest_does_not_get_what_could_not_be_stopped_meanwhile
     assert table.table.infos() == []
 
 
-def test_S14_a_later_stop_that_goes_well_gives_nothing_free(table: Table) -> None:
-    token = table.take("a")
-    resource = table.resources["a"]
+def _could_not_be_stopped(table: Table, names: str) -> Resource:
+    """The first of these: their lock was lost while it moved, and its driver did not hear the stop; it rests by now."""
+    token, resource = table.take(names), table.resources[names[0]]
     resource.moving = True
     table.table.lose(token.number, "gone")
     [(_, done)] = table.stopping
     done(resource, "no answer")
     resource.moving = False
+    return resource
+
+
+def test_S14_a_later_stop_that_goes_well_gives_nothing_free(table: Table) -> None:
+    resource = _could_not_be_stopped(table, "a")
     resource.stop_ended("")
     with pytest.raises(NotStopped):
         table.acquire("a")
@@ -211,13 +216,7 @@ def test_S14_a_later_stop_that_goes_well_gives_nothing_free(table: Table) -> Non
 
 
 def test_S14_a_refusal_says_what_could_not_be_stopped_when_why_and_what_to_do_and_it_is_listed(table: Table) -> None:
-    token = table.take("ab")
-    resource = table.resources["a"]
-    resource.moving = True
-    table.table.lose(token.number, "gone")
-    [(_, done)] = table.stopping
-    done(resource, "no answer")
-    resource.moving = False
+    resource = _could_not_be_stopped(table, "ab")
     with pytest.raises(
         NotStopped, match=r"a on .*: could not be stopped at \d\d:\d\d:\d\d \(no answer\), so nobody gets a"
     ):

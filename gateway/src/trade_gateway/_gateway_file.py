@@ -1,6 +1,5 @@
 """The gateway file: which networks are joined, what crosses, who may do what, what is kept up. Checked as a whole."""
 
-import hashlib
 import os
 import re
 from collections.abc import Mapping, Sequence
@@ -11,18 +10,14 @@ import msgspec
 from msgspec import Meta, Struct
 
 from trade import Settings
-from trade._policies import Policy
-from trade._policy_watch import different
-from trade._tls import Certificate
 from trade._toml import read_toml_text
 from trade.errors import ConfigurationError
 from trade.policies import EVERYTHING, read_policy
 from trade_gateway._parts import Around
 from trade_gateway.supervisor import Child, read_children
 
-__all__ = ["GatewayFile", "Named", "Network", "Plan", "Share", "digest", "named_by", "read_gateway_file"]
+__all__ = ["GatewayFile", "Network", "Plan", "Share", "read_gateway_file"]
 
-_CERTIFICATE: Final = "cert.pem"
 _GROUP: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_-]*(\.[A-Za-z0-9_-]+)*")
 _UNKNOWN_LOOPBACK: Final = re.compile(r"/127\.(?!0\.0\.1:)")
 """The transport knows the interface of a link by the interface's own addresses; it would apply no rule."""
@@ -333,80 +328,3 @@ def _named(path: str, raw: Mapping[str, Any]) -> str:
         named = cast("Mapping[str, object]", raw.get(path.partition("[")[0], {}))
         path = path.replace("[...]", f".{next(iter(named))}" if len(named) == 1 else "", 1)
     return f"{path}." if path else ""
-
-
-def digest(path: Path) -> str:
-    """Changes when the file does, or anything that it names."""
-    return _digest([path, *_beside(path)])
-
-
-class Named(NamedTuple):
-    """What a gateway file names, as it is at one moment."""
-
-    digests: Mapping[Path, str]
-    """Of policies, lists of revoked names and certificates: what changes with each."""
-    policy: Policy | None
-    """Its own."""
-
-    def since(self, before: "Named") -> str:
-        """What has become different, in words; empty: nothing."""
-        changed = [path for path, seen in self.digests.items() if before.digests.get(path) != seen]
-        told = [_certified(path) for path in changed if path.name == _CERTIFICATE]
-        told += [f"{path.name} is another one" for path in changed if path.name != _CERTIFICATE]
-        if changed and self.policy is not None and before.policy is not None:
-            told += different(before.policy, self.policy)
-        return ", ".join(told)
-
-
-def named_by(path: Path, plan: Plan) -> Named:
-    """What a gateway file names, now. Raises ConfigurationError: its policy is wrong by now."""
-    policy = plan.settings.policy
-    return Named({file: _digest([file]) for file in _beside(path)}, None if policy is None else read_policy(policy))
-
-
-def _certified(path: Path) -> str:
-    try:
-        made = Certificate.read(path.parent)
-    except ConfigurationError as wrong:
-        return str(wrong)
-    return f"new certificate of {made.identity} until {made.until:%Y-%m-%d %H:%M} UTC"
-
-
-def _digest(files: Sequence[Path]) -> str:
-    seen = hashlib.sha256()
-    for file in files:
-        try:
-            seen.update(file.read_bytes())
-        except OSError as gone:
-            seen.update(str(gone.errno).encode())
-    return seen.hexdigest()
-
-
-def _beside(path: Path) -> list[Path]:
-    try:
-        raw = _read(path)
-    except (OSError, ValueError):  # what is wrong with it is said by who reads it
-        return []
-    shares = raw.get("share")
-    parts = [raw, *(cast("Mapping[str, Any]", shares).values() if isinstance(shares, dict) else ())]
-    tables = [cast("Mapping[str, Any]", part) for part in parts if isinstance(part, dict)]
-    return [file for table in tables for file in _named_by(table, path)]
-
-
-def _named_by(part: Mapping[str, Any], path: Path) -> list[Path]:
-    found: list[Path] = []
-    if part.get("tls"):
-        found.append(path.parent / str(part["tls"]) / _CERTIFICATE)
-    if part.get("policy"):
-        policy = path.parent / str(part["policy"])
-        found.append(policy)
-        try:
-            named = _read(policy).get("revoked_file")
-        except (OSError, ValueError):
-            return found
-        found += [policy.parent / named] if isinstance(named, str) else []
-    return found
-
-
-def _read(path: Path) -> dict[str, Any]:
-    return read_toml_text(path.read_text(encoding="utf-8"))

@@ -126,7 +126,7 @@ class Departing:
         with self._lock:
             if place in self._away:
                 own = self._home.address
-                owner = f"{own.identity}/{own.container}"
+                owner = own.who
                 raise LockedByOther(resources=(place,), owner=owner, purpose="moving it, or its state, already")
             self._away.add(place)
         try:

@@ -113,7 +113,7 @@ class EstopLine:
             id=order.opened.id if order.opened is not None else ",".join(order.cleared),
             confirmed=_names(address for address in awaited & heard.keys() if not heard[address]),
             missing=_names(awaited - heard.keys()),
-            failed={_name(address): problem for address, problem in heard.items() if problem},
+            failed={address.who: problem for address, problem in heard.items() if problem},
         )
 
     # --- hearing
@@ -164,8 +164,4 @@ def _all_of(awaited: set[Address], heard: dict[Address, str]) -> bool:
 
 
 def _names(addresses: Iterable[Address]) -> tuple[str, ...]:
-    return tuple(sorted(map(_name, addresses)))
-
-
-def _name(address: Address) -> str:
-    return f"{address.identity}/{address.container}"
+    return tuple(sorted(address.who for address in addresses))

@@ -143,22 +143,19 @@ class Estopping:
         report = self._line.ask(order, expected, limit_s, lambda: False)
         self._registry.wait_for(lambda: not self._still_told(ids, report.confirmed), _TOLD_S)
         unheeding = (state for state in self._others() if any(estop.id in ids for estop in state.open_estops()))
-        names = {f"{state.address.identity}/{state.address.container}" for state in unheeding}
+        names = {state.address.who for state in unheeding}
         report = structs.replace(report, missing=tuple(sorted({*report.missing, *names})))
         return self._with_versions(report)
 
     def _with_versions(self, report: EstopReport) -> EstopReport:
-        there = {f"{state.address.identity}/{state.address.container}": state.protocol for state in self._others()}
+        there = {state.address.who: state.protocol for state in self._others()}
         named = {*report.confirmed, *report.missing, *report.failed}
         return structs.replace(report, versions={name: there[name] for name in sorted(there) if name in named})
 
     def _still_told(self, ids: Sequence[str], by: Sequence[str]) -> bool:
         """Whether the entries of those who confirmed still have them: what they say now may not have arrived."""
         return any(
-            estop.id in ids
-            for record in self._own_records()
-            if f"{record.key.address.identity}/{record.key.address.container}" in by
-            for estop in record.estops
+            estop.id in ids for record in self._own_records() if record.key.address.who in by for estop in record.estops
         )
 
     def _with_stops(self) -> set[Address]:

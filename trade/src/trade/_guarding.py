@@ -53,7 +53,7 @@ class Guarding(Member):
             IncompleteGroup: the robot file says that more belongs to the group.
             ConfigurationError: nothing to lock.
             AccessDenied: the policy does not let this container lock one of them.
-            DeviceFault: one of them could not be stopped when it had to be.
+            NotStopped: one of them could not be stopped when it had to be.
         """
         self._check_open()
         return self.locking.lock(

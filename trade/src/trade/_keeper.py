@@ -54,7 +54,7 @@ class Keeper:
         """Take all or nothing: all containers at once first, then one after the other in the order all keep (S13).
 
         Raises:
-            LockedByOther, DeviceFault, ServiceGone, ContainerLost: not within ``terms.wait_s``; nothing is held.
+            LockedByOther, NotStopped, ServiceGone, ContainerLost: not within ``terms.wait_s``; nothing is held.
             LockLost: one part was lost while it waited for the others; nothing is held.
         """
         until = time.monotonic() + terms.wait_s

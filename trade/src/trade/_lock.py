@@ -61,7 +61,7 @@ class Lock:
         """Take it: what entering the context does. Once; whoever wants it again makes another one.
 
         Raises:
-            LockedByOther, DeviceFault, IncompleteGroup, ServiceGone, ContainerLost, ConfigurationError: see
+            LockedByOther, NotStopped, IncompleteGroup, ServiceGone, ContainerLost, ConfigurationError: see
                 `Container.lock`; nothing is held then.
             LockLost: what it had already was lost while it waited for the rest.
         """

@@ -1,7 +1,7 @@
 """The part of a container that looks services up, is told of them, and calls them by what they are."""
 
 import asyncio
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 from trade import _many
@@ -41,12 +41,19 @@ class Looking(Member):
             return bool(matches)
 
         if not self._parts.registry.wait_for(found, wait_s):
-            apart = self.sight(limit_s=0).unanswered if len(self.addresses()) == 1 else ()
+            apart = self._unanswered(wait_s) if len(self.addresses()) == 1 else ()
             hidden = self.access.hidden(self.address.identity, asked_for(constraint, "group"))
             raise no_such_service(constraint, self._parts.registry.select(where()), wait_s, apart, hidden)
         if len(matches) > 1:
             raise too_many_services(constraint, matches)
         return Handle(self, matches[0].key, matches[0])
+
+    def _unanswered(self, wait_s: float) -> Sequence[str]:
+        """Where nobody was found; why is only looked at for who has waited, as it takes half a second for each."""
+        reach = self._parts.reach
+        if wait_s > 0 or reach is None:
+            return self.sight(limit_s=0).unanswered
+        return tuple(f"{endpoint} (TRADE_CONNECT)" for endpoint in reach.configured)
 
     def sight(self, *, limit_s: float = 3.0) -> Sight:
         """Whom it has found: what nobody tells is only told by nobody if somebody was there to tell.

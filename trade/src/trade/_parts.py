@@ -65,7 +65,6 @@ class Parts:
 
     def __init__(self, home: Home, settings: Settings, transport: Transport | None) -> None:
         self._home = home
-        self._watches_policy = settings.policy is not None
         address, access = home.address, home.access
         epoch, session = address.epoch, str(address)
         self.told_of_ends: Final[list[Callable[[str], None]]] = []
@@ -180,7 +179,7 @@ class Parts:
                 self.estopping.learn,
             )
             self._leaving.callback(self.watch.close)
-            if self._watches_policy:
+            if self._home.access.path is not None:
                 begin_watching(self._home.access, self.clockwork, self.audit, self.judge_anew)
             undone.pop_all()
 

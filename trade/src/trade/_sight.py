@@ -8,6 +8,7 @@ from msgspec import Struct
 from trade._reach import Reach
 from trade._registry import Registry
 from trade._wire import Address
+from trade.errors import NobodyFound
 
 __all__ = ["Sight", "look_around"]
 
@@ -38,6 +39,15 @@ class Sight(Struct, frozen=True):
         """Whether somebody was found, at each endpoint, and all have said what is theirs."""
         return bool(self.others) and not self.silent and not self.apart
 
+    def nobody(self, system: str, so: str = "") -> NobodyFound:
+        """The error of who could not be told something.
+
+        Args:
+            system: where it was asked.
+            so: what cannot be told therefore.
+        """
+        return NobodyFound(system=system, so=so, others=bool(self.others), silent=self.silent, apart=self.unanswered)
+
 
 def look_around(registry: Registry, reach: Reach | None, own: Address, limit_s: float) -> Sight:
     """Wait until the sight is complete, for ``limit_s`` seconds at most; what it is then."""
@@ -51,8 +61,8 @@ def _sight(registry: Registry, reach: Reach | None, own: Address) -> Sight:
     states = [state for state in registry.containers() if state.address != own]
     unlinked = () if reach is None else reach.unlinked()
     return Sight(
-        others=tuple(_name(state.address) for state in states),
-        silent=tuple(_name(state.address) for state in states if not state.heard.complete),
+        others=tuple(state.address.who for state in states),
+        silent=tuple(state.address.who for state in states if not state.heard.complete),
         apart=dict.fromkeys(unlinked, ""),
     )
 
@@ -65,7 +75,3 @@ def _apart(reach: Reach, own: Address, sight: Sight) -> dict[str, str]:
         hidden = _HIDDEN.format(identity=own.identity)
         apart |= {endpoint: hidden for endpoint in reach.configured if endpoint not in apart}
     return apart
-
-
-def _name(address: Address) -> str:
-    return f"{address.identity}/{address.container}"

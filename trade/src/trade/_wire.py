@@ -34,7 +34,12 @@ class Address(Struct, frozen=True, array_like=True, gc=False, cache_hash=True):
     epoch: str
 
     def __str__(self) -> str:
-        return f"{self.identity}/{self.container}/{self.epoch}"
+        return f"{self.who}/{self.epoch}"
+
+    @property
+    def who(self) -> str:
+        """The container, whichever boot of it: as reports and messages tell it."""
+        return f"{self.identity}/{self.container}"
 
 
 class ServiceKey(Struct, frozen=True, array_like=True, gc=False, cache_hash=True):

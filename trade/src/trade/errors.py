@@ -66,8 +66,6 @@ __all__ = [
 _WORTH_TELLING_S: Final = 0.1
 """A shorter silence than this is one exchange of a bus: its length says nothing."""
 _NO_MORE_TENTHS_S: Final = 10.0
-_SIMULATED: Final = "/trade-sim-"
-"""In the ports of ``trade up --sim``: they lie in a temporary folder of that name."""
 
 
 @dataclass(kw_only=True, eq=False)
@@ -600,12 +598,10 @@ class DeviceSilent(DeviceError, TimeoutError):
     """How long it has not: since it was asked, or since it was last measured."""
 
     def describe(self) -> str:
-        return f"{self.device} did not answer on {self.bus}{_for(self.waited_s)}; {self._hint()}"
-
-    def _hint(self) -> str:
-        if _SIMULATED in self.bus:
-            return "it is simulated: this computer is too busy, or its simulator was told to keep it silent"
-        return "is it powered, plugged in, and set to the id and baud rate of the robot file?"
+        return (
+            f"{self.device} did not answer on {self.bus}{_for(self.waited_s)}; is it powered, plugged in, and set to "
+            "the id and baud rate of the robot file? If it is simulated, this computer may be too busy"
+        )
 
 
 @dataclass(kw_only=True, eq=False)

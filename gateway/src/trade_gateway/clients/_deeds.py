@@ -24,7 +24,6 @@ from trade.errors import (
     Cancelled,
     ConfigurationError,
     LockLost,
-    NobodyFound,
     NoSuchService,
     TooManyServices,
     TradeError,
@@ -279,9 +278,7 @@ class Deeds:
     def _require_all_heard(self) -> None:
         sight = self._container.sight(limit_s=_HEARD_S)
         if not sight.complete:
-            so, system = "so nobody can tell whether an e-stop is open", self._container.settings.system
-            others = bool(sight.others)
-            raise NobodyFound(system=system, so=so, others=others, silent=sight.silent, apart=sight.unanswered)
+            raise sight.nobody(self._container.settings.system, "so nobody can tell whether an e-stop is open")
 
     def estops(self) -> list[messages.EstopView]:
         """Those that are open."""

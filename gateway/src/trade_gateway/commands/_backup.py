@@ -137,7 +137,10 @@ def _keep_revoked(there: Path, fresh: Path) -> None:
     if now is None or then is None or not now - then:
         return
     names = ", ".join(f'"{name}"' for name in sorted(now | then))
-    fresh.write_text(f"# Of a backup and of what was there before it.\nrevoked = [{names}]\n", encoding="utf-8")
+    with fresh.open("w", encoding="utf-8") as file:
+        file.write(f"# Of a backup and of what was there before it.\nrevoked = [{names}]\n")
+        file.flush()
+        os.fsync(file.fileno())
     complain(f"{there}: {', '.join(sorted(now - then))} stays revoked, although the backup does not say so")
 
 

@@ -6,7 +6,7 @@ import typer
 from rich.markup import escape
 
 from trade import Container, EstopReport, Sight
-from trade.errors import NobodyFound, NoSuchEstop
+from trade.errors import NoSuchEstop
 from trade_gateway.commands._list import Json
 from trade_gateway.commands._output import Output, UsageError
 from trade_gateway.commands._system_choice import visitor
@@ -36,7 +36,7 @@ def estop(
     with visitor(context) as container:
         sight = container.sight(limit_s=limit) if clear else None
         report = container.estop(reason, limit_s=limit) if sight is None else _clear(container, sight, ids, limit)
-        system, own = container.settings.system, f"{container.address.identity}/{container.address.container}"
+        system, own = container.settings.system, container.address.who
     if report is None:
         if as_json:
             out.data(None)
@@ -47,7 +47,7 @@ def estop(
     else:
         _say(out, report, system, "cleared" if clear else "stopped", own)
     if sight is not None and not sight.complete:
-        raise _unheard(system, sight, "what is open there stays open until it is cleared once more")
+        raise sight.nobody(system, "what is open there stays open until it is cleared once more")
     if not report.complete:
         raise typer.Exit(1)
 
@@ -62,17 +62,13 @@ def _clear(container: Container, sight: Sight, ids: list[str] | None, limit_s: f
     system, cannot_tell = container.settings.system, "so nobody can tell whether an e-stop is open; none was cleared"
     wanted = ids or [known.id for known in container.estops()]
     if not sight.others or not (wanted or sight.complete):
-        raise _unheard(system, sight, cannot_tell)
+        raise sight.nobody(system, cannot_tell)
     try:
         return container.estop_clear(wanted, limit_s=limit_s) if wanted else None
     except NoSuchEstop:
         if sight.complete:
             raise
-        raise _unheard(system, sight, cannot_tell) from None
-
-
-def _unheard(system: str, sight: Sight, so: str) -> NobodyFound:
-    return NobodyFound(system=system, so=so, others=bool(sight.others), silent=sight.silent, apart=sight.unanswered)
+        raise sight.nobody(system, cannot_tell) from None
 
 
 def _say(out: Output, report: EstopReport, system: str, done: str, own: str) -> None:

@@ -16,7 +16,8 @@ from trade import Container, Settings
 from trade.errors import ConfigurationError, TradeError
 from trade.policies import EVERYTHING
 from trade_gateway._asked import Asked
-from trade_gateway._gateway_file import Named, Plan, digest, named_by, read_gateway_file
+from trade_gateway._gateway_changes import Named, digest, named_by
+from trade_gateway._gateway_file import Plan, read_gateway_file
 from trade_gateway._guests import Guests, opened
 from trade_gateway.commands._detached import Detach, detach_now, ready
 from trade_gateway.commands._list import Json

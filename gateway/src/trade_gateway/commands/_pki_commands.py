@@ -121,7 +121,7 @@ def _for_container(given: "Issued") -> list[str]:
         *([f"  export TRADE_LISTEN={endpoints}          # where others dial it"] if endpoints else []),
         "  export TRADE_CONNECT=tls/ADDRESS:7450          # whom it dials: a gateway, or a robot"
         + (", if any" if endpoints else "; nobody beyond its host can dial it"),
-        "  trade list          # or trade up ROBOT.toml, or a program of yours",
+        "  trade services          # or trade up ROBOT.toml, or a program of yours",
     ]
 
 

@@ -6,7 +6,6 @@ from typing import Final
 import typer
 
 from trade import Container, Settings
-from trade.errors import NobodyFound
 
 _PATIENCE_S: Final = 3.0
 """How long nobody may be found where the settings say that it is to connect to."""
@@ -47,7 +46,7 @@ def visitor_among_others(context: typer.Context) -> Container:
         if container.settings.connect and len(container.addresses()) == 1:
             sight = container.sight(limit_s=_PATIENCE_S)
             if not sight.others:
-                raise NobodyFound(system=container.settings.system, apart=sight.unanswered)
+                raise sight.nobody(container.settings.system)
     except BaseException:
         container.close()
         raise
