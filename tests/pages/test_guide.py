@@ -81,23 +81,27 @@ class Head:
 
 @of(PAGE, "Find and call")
 def test_find_and_call(play: Play, printed: Said) -> None:
-    oven, head = Oven(), Head()
+    oven = Oven()
     play.offer("kitchen", oven, "kitchen.oven")
     play.run_next()
     assert oven.heated == [(180, 10), (180, 5), (180, 10), (180, 10)]
     assert "kitchen.oven.heat heat(celsius: float, minutes: float = 10) -> float" in printed.text
 
-    def restart() -> None:
-        assert head.called.wait(60)
-        play.container("driver").close()
-        play.container("driver-2").register(Head("overload"), "rosie.head")
+    for loop in ("find", "lock"):
+        head = Head()
 
-    play.offer("driver", head, "rosie.head")
-    restarting = threading.Thread(target=restart)
-    restarting.start()
-    with pytest.raises(DeviceFault, match="overload"):
-        play.run_next()
-    restarting.join()
+        def restart(loop: str = loop, head: Head = head) -> None:
+            play.container(f"{loop}-1").register(head, "rosie.head")
+            assert head.called.wait(60)
+            play.container(f"{loop}-1").close()
+            play.container(f"{loop}-2").register(Head("overload"), "rosie.head")
+
+        restarting = threading.Thread(target=restart)
+        restarting.start()
+        with pytest.raises(DeviceFault, match="overload"):
+            play.run_next()
+        restarting.join()
+        play.container(f"{loop}-2").close()
     assert "overload" in printed.text
 
 

@@ -10,6 +10,8 @@ from contextvars import Token as Reset
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Final
 
+from msgspec import structs
+
 from trade._context import Held, holding
 from trade._inherited import VARIABLE, passed_on
 from trade._terms import Granted, Terms
@@ -22,7 +24,7 @@ if TYPE_CHECKING:
 _logger = logging.getLogger("trade")
 
 Wanted = Callable[[], dict[Address, list[str]]]
-"""Finds what to lock, by the container that judges it, at the moment it is taken."""
+"""Finds what to lock, by the container that judges it, at the moment it is taken; waits until it is there."""
 OnLost = Callable[[LockLost], object]
 OnRequest = Callable[[str, str], object]
 """Told who would like to have the lock, and why."""
@@ -61,8 +63,8 @@ class Lock:
         """Take it: what entering the context does. Once; whoever wants it again makes another one.
 
         Raises:
-            LockedByOther, DeviceFault, IncompleteGroup, ServiceGone, ContainerLost, ConfigurationError: see
-                `Container.lock`; nothing is held then.
+            NoSuchService, LockedByOther, DeviceFault, IncompleteGroup, ServiceGone, ContainerLost, ConfigurationError:
+                see `Container.lock`; nothing is held then.
             LockLost: what it had already was lost while it waited for the rest.
         """
         with self._guard:
@@ -70,7 +72,10 @@ class Lock:
                 problem = "a lock is taken once; make another one with trade.lock(...), or share this one with use()"
                 raise ConfigurationError(where=f"lock for {self.purpose!r}", problem=problem)
             self._taken = True
-        self._keeper.acquire(self, self._wanted(), self._terms)
+        begun = time.monotonic()
+        wanted = self._wanted()
+        left_s = max(0.0, self._terms.wait_s - (time.monotonic() - begun))
+        self._keeper.acquire(self, wanted, structs.replace(self._terms, wait_s=left_s))
         self._whole = True
         return self
 
