@@ -16,7 +16,7 @@ from trade._context import Held, holding
 from trade._inherited import VARIABLE, passed_on
 from trade._terms import Granted, Terms
 from trade._wire import Address, Token
-from trade.errors import ConfigurationError, LockLost
+from trade.errors import ConfigurationError, LockLost, TradeError
 
 if TYPE_CHECKING:
     from trade._keeper import Keeper
@@ -144,7 +144,7 @@ class Lock:
         try:
             await asyncio.shield(taking)
         except asyncio.CancelledError:
-            taking.add_done_callback(lambda _: apart(self.release))
+            taking.add_done_callback(lambda _: apart(self._keeper.over, self.release))
             raise
         return self._enter()
 
@@ -216,18 +216,27 @@ class Lock:
                 return
             self._lost = LockLost(resources=self.resources, reason=reason)
         _logger.warning("%s", self._lost)
-        apart(self._keeper.let_go, self, reason)
+        apart(self._keeper.over, self._keeper.let_go, self, reason)
         if self._on_lost is not None:
-            apart(self._on_lost, self._lost)
+            apart(self._keeper.over, self._on_lost, self._lost)
 
 
-def apart(call: Callable[..., object], *arguments: Any) -> None:
-    """Call it on a thread of its own: nobody who tells of locks waits for whoever is told."""
+def apart(over: Callable[[], bool], call: Callable[..., object], *arguments: Any) -> None:
+    """Call it on a thread of its own: nobody who tells of locks waits for whoever is told.
+
+    Args:
+        over: whether the container closes; what that cuts off is no failure.
+        call: what to call.
+        arguments: with these.
+    """
 
     def guarded() -> None:
         try:
             call(*arguments)
-        except Exception:
-            _logger.exception("told of a lock, %r failed", call)
+        except Exception as error:
+            if over() and isinstance(error, TradeError):
+                _logger.debug("told of a lock, %r was cut off as its own container closed: %s", call, error)
+            else:
+                _logger.exception("told of a lock, %r failed", call)
 
     threading.Thread(target=guarded, name="trade-lock-told", daemon=True).start()
