@@ -63,7 +63,7 @@ class Streaming(Hooking):
         if if_ is not None and (isinstance(if_, Handle) or not callable(if_)):
             problem = f"if_ must be a function of the value, not {if_!r}"
             raise ConfigurationError(where="trade.stream", problem=problem)
-        pushed = None if call is None else target_of(call, "trade.stream", "call")
+        pushed = None if call is None else target_of(call, "trade.stream", "call", 1)
         source = target if isinstance(target, Handle) else self.find(target)
         check_sampled(source)
         client = speaking.get()
@@ -114,10 +114,10 @@ class _Push:
             handle(value, *target.args, **target.kwargs)
 
     def _failed(self, error: BaseException) -> None:
-        text = f"{type(error).__name__}: {error}"
-        if text != self._problem:  # the same again says nothing new
-            _logger.warning("a sample of %r was not passed on: %s", self._stream, text)
-        self._problem = text
+        kind = type(error).__name__
+        if kind != self._problem:  # the same again says nothing new, whatever numbers are in its text
+            _logger.warning("a sample of %r was not passed on: %s: %s", self._stream, kind, error)
+        self._problem = kind
 
 
 def _check(name: str, value: float, least: float, most: float) -> None:
