@@ -224,6 +224,23 @@ def test_listen(play: Play, printed: Said) -> None:
     wait_until(lambda: listener.told == [15])
 
 
+class MovingHead(Head, Joints):
+    """Moves, and tells of its joints."""
+
+    def __init__(self) -> None:
+        Head.__init__(self)
+        Joints.__init__(self)
+
+
+@of(PAGE, "From asyncio")
+def test_from_asyncio(play: Play, printed: Said) -> None:
+    head = MovingHead()
+    play.offer("robot", head, "rosie.head")
+    play.run()
+    assert printed.lines == ["[0.3, -0.2]"]
+    assert head.looks >= 3
+
+
 @of(PAGE, "Locks, stops, e-stop")
 def test_locks_and_stops(play: Play, printed: Said) -> None:
     expected = [line.rpartition("# ")[2] for block in play.left for line in block.text.splitlines() if "print(" in line]
