@@ -221,7 +221,9 @@ def test_listen(play: Play, printed: Said) -> None:
     play.offer("mind", listener, "mind")
     play.run(battery=trade.find(where(name="battery")), dock=trade.find(where(name="dock")))
     assert "moving=False" in printed.lines[-1]
-    wait_until(lambda: listener.told == [15])
+    wait_until(lambda: listener.told == [15, 15])  # of the stream, and of the one that is there already
+    play.offer("mind-2", Listener(), "mind")
+    wait_until(lambda: listener.told == [15, 15, 15])
 
 
 class MovingHead(Head, Joints):

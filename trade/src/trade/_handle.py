@@ -312,7 +312,7 @@ class Handle:
 
     @property
     def effect(self) -> str:
-        """``read``, ``actuate`` or ``stop``."""
+        """``read``, ``note``, ``actuate`` or ``stop``."""
         return self.record.info.effect
 
     @property

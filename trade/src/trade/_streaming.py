@@ -4,6 +4,7 @@ import contextlib
 import logging
 import math
 import time
+from typing import Final
 
 from trade._clockwork import Clockwork
 from trade._constraints import Constraint
@@ -13,11 +14,12 @@ from trade._occasions import Deed, Target, What, target_of
 from trade._session import speaking
 from trade._stream import If, Stream
 from trade._streams import LEAST_HZ, MOST_HZ, check_sampled
-from trade.errors import ConfigurationError
+from trade.errors import ConfigurationError, ServiceGone, SourceLost
 
 _logger = logging.getLogger("trade")
 
 _MOST_KEPT = 100_000
+_AGAIN: Final = "; trade.joined(where(...), call=listen, existing=True) has another one opened whenever it comes again"
 
 
 class Streaming(Hooking):
@@ -116,7 +118,8 @@ class _Push:
     def _failed(self, error: BaseException) -> None:
         kind = type(error).__name__
         if kind != self._problem:  # the same again says nothing new, whatever numbers are in its text
-            _logger.warning("a sample of %r was not passed on: %s: %s", self._stream, kind, error)
+            hint = _AGAIN if isinstance(error, SourceLost | ServiceGone) else ""
+            _logger.warning("a sample of %r was not passed on: %s: %s%s", self._stream, kind, error, hint)
         self._problem = kind
 
 
