@@ -12,7 +12,7 @@ from trade._bell import Bell
 from trade._registry import Record
 from trade._schemas import read_schema
 from trade._wire import Address, Scalar, ServiceKey
-from trade.errors import ConfigurationError, TradeError
+from trade.errors import ConfigurationError
 
 __all__ = ["Bound", "Handle", "Run"]
 
@@ -229,7 +229,7 @@ class Handle:
             run.ask_to_end()
             if self.record.info.cancel is not None:
                 self.cancel_service().start().when_done(look)
-        except TradeError as error:  # a container that is gone, say: the call is, too
+        except Exception as error:  # noqa: BLE001 - a container that is gone, say: the call is, too
             self._say_not_cancelled(error)
 
     def _say_not_cancelled(self, error: BaseException) -> None:
