@@ -37,6 +37,7 @@ TYPED_ELSEWHERE: Final = {
 """Modules of tests that do what the section says, often with other names."""
 NOT_TYPED: Final = {
     Section("guide.md", "Several networks"): "settings, not commands, for a host in two networks",
+    Section("deployment.md", "Taking one back"): "takes two hosts: trade/test_access.py has what is done there",
     Section("deployment.md", "Updating"): "takes root, systemd and a newer version",
     Section("deployment.md", "Real time"): "takes a right, and the processor from all other tests",
     Section("deployment.md", "In a container"): "takes podman or docker: tests/test_container.py, where there is one",
@@ -119,8 +120,8 @@ def test_a_policy(typist: Typist, tmp_path: Path) -> None:
 @of("guide.md", "A gateway")
 def test_a_gateway(typist: Typist, tmp_path: Path) -> None:
     (tmp_path / "gateway.toml").write_text(shown("A gateway"))
-    (tmp_path / "policy.toml").write_text(shown("Who may do what"))
-    typist.also("trade pki init pki")
+    shutil.copy(ROOT / "examples" / "policy.toml", tmp_path)
+    typist.next()
     typist.next()
     assert "is right" in typist.next()
     typist.leave("takes two interfaces and their addresses: tests/system/test_gateway.py has them")
@@ -146,5 +147,7 @@ def test_backups(typist: Typist, tmp_path: Path) -> None:
     mine = ("sudo /opt/trade/bin/", "")
     typist.next(mine, ("/etc/trade", "etc"), ("/var/lib/trade", "state"))
     typist.next(mine)
+    typist.leave("takes systemd")
     typist.next(mine, ("/etc/trade", "etc-again"), ("/var/lib/trade", "state-again"))
     assert (tmp_path / "etc-again" / "head.toml").exists()
+    typist.leave("takes systemd")

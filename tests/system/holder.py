@@ -8,7 +8,7 @@ from datetime import datetime, timezone
 
 from trade import Container, Settings, where
 
-LEASE_S = 1.0
+LEASE_S = 10.0
 PAN = "rosie.neck.pan"
 
 with Container(Settings.read(container="holder")) as holder:

@@ -264,7 +264,7 @@ def test_S09_an_e_stop_stays_open_in_a_driver_that_goes_to_another_version(stand
         stand.change_driver("rosie", version)
         wait_until(lambda version=version: stand.versions("left", NEXT).get("rosie") == version, "rosie is up")
         stand.behave("near", version, ["rosie"])
-        wait_until(lambda: stand.sees("near") == ["rosie"], "rosie is seen")
+        wait_until(lambda: "rosie" in stand.sees("near"), "rosie is seen")  # and dora, where both are of one version
         assert stand.behaviours["near"].ask("estops") == [report["id"]]
     began = [entry for entry in stand.drivers["rosie"].sim.entries() if entry.name == "motion_started"]
     assert stand.behaviours["near"].ask("moved") == 0

@@ -556,6 +556,50 @@ def test_who_is_revoked_in_the_file_is_refused_without_anybody_loading_it(
     assert move(0.1) == 0.1
 
 
+def test_a_list_that_could_not_be_read_is_read_once_it_can_be(
+    watching: Container, policy: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whoever copies it as another user and gives the right to read it afterwards changes nothing else of it."""
+    monkeypatch.setattr("trade._policy_watch._AGAIN_NS", 10**15)
+    listed, may = tmp_path / "revoked.toml", Path.read_text
+    listed.write_text("revoked = []")
+    rewritten(policy, 'revoked = ["thief"]', 'revoked_file = "revoked.toml"')
+    wait_until(lambda: "thief is revoked no more" in caplog.text, "the list is named now")
+
+    def refused(path: Path, **options: str) -> str:
+        if path == listed:
+            raise PermissionError(13, "Permission denied")
+        return may(path, **options)
+
+    monkeypatch.setattr(Path, "read_text", refused)
+    listed.write_text('revoked = ["planner"]')
+    wait_until(lambda: "Permission denied" in caplog.text, "it cannot be read")
+    monkeypatch.setattr(Path, "read_text", may)
+    listed.chmod(0o640)
+    wait_until(lambda: "planner is revoked now" in caplog.text, "it is read")
+    assert watching.access.policy is not None
+
+
+def test_files_that_were_refused_are_tried_again_as_they_are(
+    watching: Container, policy: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("trade._policy_watch._AGAIN_NS", 10**9)
+    may, down = Path.read_text, [False]
+
+    def passing(path: Path, **options: str) -> str:
+        if path == policy and down[0]:
+            raise OSError(5, "Input/output error")
+        return may(path, **options)
+
+    monkeypatch.setattr(Path, "read_text", passing)
+    rewritten(policy, 'revoked = ["thief"]', 'revoked = ["thief", "planner"]')
+    down[0] = True
+    wait_until(lambda: "Input/output error" in caplog.text, "it cannot be read")
+    down[0] = False
+    wait_until(lambda: "planner is revoked now" in caplog.text, "it is read")
+    assert caplog.text.count("going on by the old one") == 1
+
+
 def test_a_policy_that_was_loaded_on_purpose_is_the_one_that_is_looked_at(
     watching: Container, policy: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -8,9 +8,9 @@ from jointed import WHOLE, Robot
 from trade import Handle
 from trade._wire import Address
 from trade.errors import (
-    DeviceFault,
     LockedByOther,
     LockLost,
+    NotStopped,
     ServiceGone,
     Stopped,
 )
@@ -155,7 +155,7 @@ def test_S14_what_could_not_be_stopped_is_given_to_nobody_until_it_is_resumed(ro
     with lock.use():
         robot.find("a", "go_on")(0.1)
     assert len(robot.other.break_lock(WHOLE, "maintenance")) == 2
-    with pytest.raises(DeviceFault, match=r"could not be stopped at .* so nobody gets a lock on it"):
+    with pytest.raises(NotStopped, match=r"could not be stopped at .* so nobody gets a lock on it"):
         robot.other.lock(WHOLE, wait_s=20).acquire()
     assert [(info.resources, info.holder.owner) for info in robot.other.locks()] == [(("a",), "nobody")]
     robot["a"].resource.moving = False

@@ -11,7 +11,7 @@ from trade._locks import LockTable
 from trade._resources import Holder, Permit
 from trade._terms import Granted, Terms
 from trade._wire import Token
-from trade.errors import DeviceFault, LockedByOther, LockLost, MotionStopped, ServiceGone, Stopped
+from trade.errors import LockedByOther, LockLost, MotionStopped, NotStopped, ServiceGone, Stopped
 from waiting import wait_until
 
 
@@ -137,7 +137,7 @@ def test_leases_go_on_ending_after_a_stop_that_raised(table: Table) -> None:
         table.resources[name].moving = True
     table.advance(2.0)
     assert table.table.infos() == []
-    with pytest.raises(DeviceFault):
+    with pytest.raises(NotStopped):
         table.acquire("a")
 
 
@@ -174,13 +174,40 @@ def test_S14_who_waits_for_what_could_not_be_stopped_is_told_at_once_until_it_is
     [(resource, done)] = table.stopping
     done(resource, "no answer")
     for asking in waiting:
-        with pytest.raises(DeviceFault):
+        with pytest.raises(NotStopped):
             asking.result(60)
     resource.moving = False
-    with pytest.raises(DeviceFault):
+    with pytest.raises(NotStopped):
         table.acquire("ab")
     resource.resume()
     table.acquire("ab")
+
+
+def test_S14_who_waits_for_rest_does_not_get_what_could_not_be_stopped_meanwhile(table: Table) -> None:
+    resource = table.resources["a"]
+    resource.moving = True  # for somebody without a lock, who is gone then
+    asking = table.ask("a", "other")
+    wait_until(lambda: resource.pending is not None, "it is being emptied")
+    resource.stop_ended("no answer")
+    resource.moving = False
+    with pytest.raises(NotStopped):
+        asking.result(60)
+    assert table.table.infos() == []
+
+
+def test_S14_a_later_stop_that_goes_well_gives_nothing_free(table: Table) -> None:
+    token = table.take("a")
+    resource = table.resources["a"]
+    resource.moving = True
+    table.table.lose(token.number, "gone")
+    [(_, done)] = table.stopping
+    done(resource, "no answer")
+    resource.moving = False
+    resource.stop_ended("")
+    with pytest.raises(NotStopped):
+        table.acquire("a")
+    resource.resume()
+    table.acquire("a")
 
 
 def test_S14_a_refusal_says_what_could_not_be_stopped_when_why_and_what_to_do_and_it_is_listed(table: Table) -> None:
@@ -192,10 +219,10 @@ def test_S14_a_refusal_says_what_could_not_be_stopped_when_why_and_what_to_do_an
     done(resource, "no answer")
     resource.moving = False
     with pytest.raises(
-        DeviceFault, match=r"a on .*: could not be stopped at \d\d:\d\d:\d\d \(no answer\), so nobody gets a"
+        NotStopped, match=r"a on .*: could not be stopped at \d\d:\d\d:\d\d \(no answer\), so nobody gets a"
     ):
         table.acquire("a")
-    with pytest.raises(DeviceFault, match="look at it, then `trade resume a`"):
+    with pytest.raises(NotStopped, match="look at it, then `trade resume a`"):
         table.acquire("a")
     [info] = table.table.withheld()
     assert (info.resources, info.holder.owner) == (("a",), "nobody")

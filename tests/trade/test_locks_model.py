@@ -12,7 +12,7 @@ from lock_table import COUPLED, NAMES, Table
 from trade._resources import Permit
 from trade._terms import Granted
 from trade._wire import Token
-from trade.errors import DeviceFault, LockedByOther, LockLost, MotionStopped
+from trade.errors import LockedByOther, LockLost, MotionStopped, NotStopped
 from waiting import wait_until
 
 
@@ -66,7 +66,12 @@ class Model(RuleBasedStateMachine):
                 changed = True
                 break
             for who, names in list(self.emptying):
-                if not self._busy(names):
+                if names & self.unsafe:
+                    self.emptying.remove((who, names))
+                    self.free_from.update(dict.fromkeys(names, ""))
+                    self.refused.add(who)
+                    changed = True
+                elif not self._busy(names):
                     self.emptying.remove((who, names))
                     self.has[who], self.until[who] = names, self.real.now + 2.0
                     changed = True
@@ -80,6 +85,10 @@ class Model(RuleBasedStateMachine):
     def _lose(self, who: str) -> None:
         names = self._end(who)
         self.free_from.update({name: "!" for name in names if self._busy([name])})
+
+    def _is_pending(self, name: str, who: str) -> bool:
+        pending = self.real.resources[name].pending
+        return pending is not None and pending.session == who
 
     def _token(self, who: str) -> Token:
         token = self.asked[who].result(60).token
@@ -107,7 +116,7 @@ class Model(RuleBasedStateMachine):
             token = self.real.take(sorted(names), "try")
             assert free and not whole & self.unsafe
             self.real.table.release(token.number, "tester")
-        except DeviceFault:
+        except NotStopped:
             assert whole & self.unsafe
         except LockedByOther:
             assert not free
@@ -155,9 +164,12 @@ class Model(RuleBasedStateMachine):
     def stop_ends(self, problem: str) -> None:
         resource, done = self.real.stopping.pop(0)
         self.moving.discard(resource.name)
+        if problem:  # it is said before it rests: whoever waits for that would have it otherwise, or not, as it happens
+            self.unsafe.add(resource.name)
+            done(resource, problem)
         resource.moving = False
-        done(resource, problem)
-        (self.unsafe.add if problem else self.unsafe.discard)(resource.name)
+        if not problem:
+            done(resource, problem)
         if self.free_from[resource.name] == "!":
             self.free_from[resource.name] = ""
         self._settle()
@@ -209,6 +221,8 @@ class Model(RuleBasedStateMachine):
         wait_until(lambda: {info.holder.session: frozenset(info.resources) for info in self._infos()} == self.has)
         wait_until(lambda: all(self.asked[who].done() for who in (*self.has, *self.refused)))
         assert all(self.asked[who].exception(60) for who in self.refused)
+        for who, names in self.emptying:  # its thread may take its time to take its turn
+            wait_until(lambda who=who, names=names: all(self._is_pending(name, who) for name in names))
         waiting = {who for _, who, _ in self.queue} | {who for who, _ in self.emptying}
         assert not any(self.asked[who].done() for who in waiting)
 

@@ -135,6 +135,12 @@ def test_a_wrong_file_of_revoked_identities_is_named(tmp_path: Path) -> None:
     assert str(beside) in str(refused.value)
 
 
+def test_half_a_list_of_revoked_identities_takes_nobody_off_it(tmp_path: Path) -> None:
+    written(tmp_path, "", "r.toml")  # as it is while it is being copied
+    with pytest.raises(ConfigurationError, match=r"r.toml: revoked: missing; write revoked = \[\] if it is nobody"):
+        read_policy(written(tmp_path, 'revoked_file = "r.toml"\n' + ROLE.format("")))
+
+
 def test_a_policy_that_is_not_there_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError, match="cannot be read: No such file"):
         read_policy(tmp_path / "none.toml")

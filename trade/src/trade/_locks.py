@@ -17,7 +17,7 @@ from trade._resources import Holder, Latch, Resource, locked, not_stopped
 from trade._session import foreign
 from trade._terms import Granted, LockInfo, Terms
 from trade._wire import Token
-from trade.errors import DeviceFault, LockedByOther, ServiceGone, SessionEnded, TradeError
+from trade.errors import LockedByOther, NotStopped, ServiceGone, SessionEnded, TradeError
 
 _STOPPING: Final = Holder("trade", "", "", "stopping what moved under a lock that was lost", 0.0)
 
@@ -179,7 +179,7 @@ class LockTable:
 
         Raises:
             LockedByOther: not within the times given; nothing is held then.
-            DeviceFault: one could not be stopped when it had to be, and is given to nobody.
+            NotStopped: one could not be stopped when it had to be, and is given to nobody.
             ServiceGone: one is not here.
             SessionEnded: who asks is not there any more.
         """
@@ -223,9 +223,8 @@ class LockTable:
             resource.pending = waiter.holder
 
     def _obstacle(self, waiter: _Waiter) -> TradeError | None:
-        for resource in waiter.resources:
-            if resource.unsafe:
-                return not_stopped(resource, self._container)
+        if (unsafe := self._unsafe(waiter)) is not None:
+            return unsafe
         for resource in waiter.resources:
             if resource.live:
                 return locked(resource, resource.holder, waiter.holder.session)
@@ -239,15 +238,20 @@ class LockTable:
                 return locked(shared, earlier.holder, waiter.holder.session)
         return None
 
+    def _unsafe(self, waiter: _Waiter) -> NotStopped | None:
+        return next((not_stopped(one, self._container) for one in waiter.resources if one.unsafe), None)
+
     def _drain(self, waiter: _Waiter, until: float) -> None:
         while (running := self._running(waiter)) is not None:
             owner = ", ".join(running.movers) or "somebody"
             purpose = "a call or a motion that has not ended"
             self._wait(waiter, until, LockedByOther(resources=(running.name,), owner=owner, purpose=purpose))
+            if (unsafe := self._unsafe(waiter)) is not None:  # whoever moved it has gone meanwhile, and it went on
+                raise unsafe
 
     def _wait(self, waiter: _Waiter, until: float, obstacle: TradeError) -> None:
         left = until - self._clock()
-        if left <= 0 or waiter.gone or self._closed or isinstance(obstacle, DeviceFault):
+        if left <= 0 or waiter.gone or self._closed or isinstance(obstacle, NotStopped):
             raise obstacle
         self._changed.wait(left)
 

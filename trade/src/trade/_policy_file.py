@@ -14,8 +14,8 @@ from trade.errors import ConfigurationError
 
 __all__ = ["Seen", "look_at", "policy_files", "read_policy"]
 
-Seen = tuple[tuple[int, int, int] | None, ...]
-"""What files are like: inode, time of change and size of each; None: it is not there."""
+Seen = tuple[tuple[int, int, int, int] | None, ...]
+"""What files are like: inode, times of change of contents and of rights, and size of each; None: it is not there."""
 
 _PATTERN: Final = re.compile(r"[A-Za-z0-9_.@:*?-]{1,80}")
 _KEYS: Final = ("roles", "identities", "gateways", "revoked", "revoked_file", "approval")
@@ -70,12 +70,12 @@ def look_at(files: Iterable[Path]) -> Seen:
     return tuple(_stamp(file) for file in files)
 
 
-def _stamp(file: Path) -> tuple[int, int, int] | None:
+def _stamp(file: Path) -> tuple[int, int, int, int] | None:
     try:
         found = file.stat()
     except OSError:
         return None
-    return found.st_ino, found.st_mtime_ns, found.st_size
+    return found.st_ino, found.st_mtime_ns, found.st_ctime_ns, found.st_size
 
 
 def _load(path: Path) -> _Table:
@@ -165,6 +165,8 @@ def _revoked_elsewhere(path: Path, named_in: str) -> tuple[str, ...]:
         raise _wrong(f"{named_in}: revoked_file", problem)
     raw = _load(path)
     _only_known(raw, ("revoked",), str(path))
+    if "revoked" not in raw:  # half of a file that is being copied would take everybody off the list
+        raise _wrong(f"{path}: revoked", 'missing; write revoked = [] if it is nobody, or revoked = ["name"]')
     return _names(raw, "revoked", str(path))
 
 

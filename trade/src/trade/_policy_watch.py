@@ -15,6 +15,8 @@ __all__ = ["begin_watching", "different"]
 
 _logger = logging.getLogger("trade")
 _EVERY_NS: Final = 1_000_000_000
+_AGAIN_NS: Final = 10 * _EVERY_NS
+"""Files that were refused are tried again although they look the same: what kept them from being read may be over."""
 
 
 class _Audit(Protocol):
@@ -40,11 +42,13 @@ class _Watching:
         """At the look before: what is being written is let come to rest."""
         self._refused: Seen | None = None
         """Files that were wrong, which is said once."""
+        self._again_ns = 0
         clockwork.begin(self._look, time.monotonic_ns() + _EVERY_NS)
 
     def _look(self) -> int:
         now = self._access.look()
-        if now == self._last and now not in (self._access.seen, self._refused):
+        due = now != self._refused or time.monotonic_ns() >= self._again_ns
+        if now == self._last and now != self._access.seen and due:
             self._read(now)
         self._last = now
         return time.monotonic_ns() + _EVERY_NS
@@ -55,9 +59,11 @@ class _Watching:
         try:
             self._access.load(path)
         except ConfigurationError as wrong:
-            self._refused = now
-            _logger.warning("the policy was changed and is wrong; going on by the old one: %s", wrong)
+            if now != self._refused:
+                _logger.warning("the policy was changed and is wrong; going on by the old one: %s", wrong)
+            self._refused, self._again_ns = now, time.monotonic_ns() + _AGAIN_NS
             return
+        self._refused = None
         after = self._access.policy
         assert after is not None  # noqa: S101 - it has just been read
         said = f"{path}: {', '.join(different(before, after)) or 'nothing is different'}"

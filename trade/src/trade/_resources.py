@@ -15,7 +15,7 @@ from msgspec import Struct, structs
 from trade._context import CallContext, running
 from trade._session import foreign
 from trade._wire import Token
-from trade.errors import DeviceFault, LockedByOther, LockLost, MotionStopped, SessionEnded, Stopped
+from trade.errors import LockedByOther, LockLost, MotionStopped, NotStopped, SessionEnded, Stopped
 
 __all__ = ["Permit", "Resource", "permit"]
 
@@ -165,10 +165,13 @@ class Resource:
     def stop_ended(self, problem: str) -> None:
         """Note how a stop that had to be ended: with a problem nobody gets it before somebody resumes it (S14).
 
+        A later one that went well takes nothing back: it was not seen to rest when it had to.
+
         Args:
             problem: why it could not be stopped; empty if it was.
         """
-        self.unsafe_at, self.unsafe = time.time(), problem  # the time first: who sees the problem tells it
+        if problem:
+            self.unsafe_at, self.unsafe = time.time(), problem  # the time first: who sees the problem tells it
 
     def resume(self) -> None:
         """Let it move again after a stop that latched, and be granted again after one that failed."""
@@ -237,15 +240,11 @@ def locked(resource: Resource, holder: Holder | None, session: str = "") -> Lock
     )
 
 
-def not_stopped(resource: Resource, container: str) -> DeviceFault:
+def not_stopped(resource: Resource, container: str) -> NotStopped:
     """The error of who wants what could not be stopped."""
     when = time.strftime("%H:%M:%S", time.localtime(resource.unsafe_at))
-    return DeviceFault(
-        device=resource.name,
-        bus=container,
-        fault=f"could not be stopped at {when} ({resource.unsafe}), so nobody gets a lock on it",
-        remedy=f"look at it, then `trade resume {resource.name}`",
-    )
+    reason, waited_s = f"at {when} ({resource.unsafe})", max(0.0, time.time() - resource.unsafe_at)
+    return NotStopped(device=resource.name, bus=container, waited_s=waited_s, reason=reason)
 
 
 class Permit(Struct, eq=False):

@@ -47,6 +47,7 @@ __all__ = [
     "NobodyFound",
     "NotInstantiable",
     "NotSerialisable",
+    "NotStopped",
     "OutcomeUnknown",
     "RemoteError",
     "ServiceGone",
@@ -609,7 +610,7 @@ class DeviceSilent(DeviceError, TimeoutError):
 
 @dataclass(kw_only=True, eq=False)
 class DeviceFault(DeviceError, RuntimeError):
-    """A device reports a fault, refused a command, or could not be stopped when it had to be."""
+    """A device reports a fault, or refused a command."""
 
     fault: str
     remedy: str = "remove the cause, then enable it again"
@@ -630,6 +631,20 @@ class BusGone(DeviceSilent, ConnectionError):
         return (
             f"{self.device} cannot be reached: port {self.bus} is gone (for {self.waited_s:.1f} s): {why}. "
             "The driver reconnects by itself and moves nothing"
+        )
+
+
+@dataclass(kw_only=True, eq=False)
+class NotStopped(DeviceSilent):
+    """It could not be stopped when it had to be: nobody gets a lock on it before somebody has looked and resumes it."""
+
+    reason: str
+    """Why, and when that was."""
+
+    def describe(self) -> str:
+        return (
+            f"{self.device} on {self.bus}: could not be stopped {self.reason}, so nobody gets a lock on it; "
+            f"look at it, then `trade resume {self.device}`"
         )
 
 

@@ -3,7 +3,6 @@
 import queue
 import signal
 import tempfile
-import threading
 from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,6 +15,7 @@ from rich.markup import escape
 from trade import Container, Settings
 from trade.errors import ConfigurationError, TradeError
 from trade.policies import EVERYTHING
+from trade_gateway._asked import Asked
 from trade_gateway._gateway_file import Named, Plan, digest, named_by, read_gateway_file
 from trade_gateway._guests import Guests, opened
 from trade_gateway.commands._detached import Detach, detach_now, ready
@@ -182,9 +182,9 @@ class Gateway:
 
 
 @contextmanager
-def hangups() -> Generator[threading.Event]:
-    """An event that SIGHUP sets."""
-    event = threading.Event()
+def hangups() -> Generator[Asked]:
+    """What SIGHUP asks for."""
+    event = Asked()
 
     def heard(_number: int, _frame: FrameType | None) -> None:
         event.set()

@@ -15,6 +15,7 @@ from msgspec import Struct
 from trade import Container, ContainerInfo, Handle, where
 from trade.errors import CannotStart, ConfigurationError, NoSuchService, TooManyServices, TradeError
 from trade.starting import LONGEST_S, Started, end_there, launch, missing_there
+from trade_gateway._asked import Asked
 from trade_gateway._furnishing import GROUP, lacking, make
 from trade_gateway._parts import Part
 from trade_gateway._system_file import SystemPlan
@@ -66,7 +67,7 @@ class Bringing:
         self._wait_s = wait_s
         self._tell = tell
 
-    def up(self, *, keep: bool, interrupted: threading.Event) -> None:
+    def up(self, *, keep: bool, interrupted: threading.Event | Asked) -> None:
         """Start what is not up, in order; leave what is. What fails has what this began taken down again.
 
         Args:

@@ -2,7 +2,6 @@
 
 import gc
 import signal
-import threading
 from collections.abc import Generator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -16,6 +15,7 @@ from trade import Container
 from trade.errors import ConfigurationError
 from trade_drivers import attach, load, without
 from trade_drivers.robotfile import Robot
+from trade_gateway._asked import Asked
 from trade_gateway.commands._detached import Detach, detach_now, ready
 from trade_gateway.commands._faults import FaultWatch
 from trade_gateway.commands._list import Json
@@ -115,9 +115,9 @@ def ports_told(words: Sequence[str]) -> dict[str, str]:
 
 
 @contextmanager
-def leaving() -> Generator[threading.Event]:
-    """An event that Ctrl-C and SIGTERM set, so that devices are always left in order."""
-    event = threading.Event()
+def leaving() -> Generator[Asked]:
+    """What Ctrl-C and SIGTERM ask for, so that devices are always left in order."""
+    event = Asked()
 
     def leave(_number: int, _frame: FrameType | None) -> None:
         event.set()

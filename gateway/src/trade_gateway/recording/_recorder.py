@@ -8,6 +8,7 @@ from importlib.metadata import version
 from typing import Final, Protocol
 
 from trade import Container
+from trade_gateway._asked import Asked
 from trade_gateway.recording._channels import Message
 from trade_gateway.recording._sources import Sources, Wanted
 from trade_gateway.recording._watch import Watch
@@ -28,7 +29,7 @@ class Sink(Protocol):
 class Recorder:
     """Reads a system until it is told to end. Used by one thread; a context manager."""
 
-    def __init__(self, container: Container, wanted: Wanted, ending: threading.Event) -> None:
+    def __init__(self, container: Container, wanted: Wanted, ending: threading.Event | Asked) -> None:
         """Begin to watch.
 
         Args:
