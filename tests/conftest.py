@@ -86,7 +86,8 @@ def _files() -> set[str]:
             target = str(entry.readlink())
         except OSError:  # the descriptor of the listing itself
             continue
-        if not target.endswith(".zenoh"):  # shared memory of closed links: zenoh lets go of it in its own time
+        # Shared memory of closed links: zenoh lets go of it in its own time.
+        if not target.removesuffix(" (deleted)").endswith(".zenoh"):
             found.add(f"{entry.name} -> {target}")
     return found
 

@@ -54,6 +54,7 @@ def test_locks_resuming_and_clearing_are_the_clients_rights_too(door: Opened) ->
     assert bert.ask("POST", "/locks", {"group": "robot.a"}).title == "AccessDenied"
     assert anna.ask("POST", "/locks", {"group": "robot"}).title == "AccessDenied"
     assert anna.ask("POST", "/locks", {"group": "trade"}).title == "AccessDenied"
+    assert anna.ask("POST", "/locks", {"group": "robot.z", "wait_s": 60}).title == "NoSuchService"
     taken = anna.ask("POST", "/locks", {"group": "robot.a"})
     anna.call("robot.a.go_on", 1.0)
     assert bert.call("robot.a.stop").status == 200  # a stop needs no role

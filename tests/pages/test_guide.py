@@ -81,23 +81,27 @@ class Head:
 
 @of(PAGE, "Find and call")
 def test_find_and_call(play: Play, printed: Said) -> None:
-    oven, head = Oven(), Head()
+    oven = Oven()
     play.offer("kitchen", oven, "kitchen.oven")
     play.run_next()
     assert oven.heated == [(180, 10), (180, 5), (180, 10), (180, 10)]
     assert "kitchen.oven.heat heat(celsius: float, minutes: float = 10) -> float" in printed.text
 
-    def restart() -> None:
-        assert head.called.wait(60)
-        play.container("driver").close()
-        play.container("driver-2").register(Head("overload"), "rosie.head")
+    for loop in ("find", "lock"):
+        head = Head()
 
-    play.offer("driver", head, "rosie.head")
-    restarting = threading.Thread(target=restart)
-    restarting.start()
-    with pytest.raises(DeviceFault, match="overload"):
-        play.run_next()
-    restarting.join()
+        def restart(loop: str = loop, head: Head = head) -> None:
+            play.container(f"{loop}-1").register(head, "rosie.head")
+            assert head.called.wait(60)
+            play.container(f"{loop}-1").close()
+            play.container(f"{loop}-2").register(Head("overload"), "rosie.head")
+
+        restarting = threading.Thread(target=restart)
+        restarting.start()
+        with pytest.raises(DeviceFault, match="overload"):
+            play.run_next()
+        restarting.join()
+        play.container(f"{loop}-2").close()
     assert "overload" in printed.text
 
 
@@ -217,7 +221,26 @@ def test_listen(play: Play, printed: Said) -> None:
     play.offer("mind", listener, "mind")
     play.run(battery=trade.find(where(name="battery")), dock=trade.find(where(name="dock")))
     assert "moving=False" in printed.lines[-1]
-    wait_until(lambda: listener.told == [15])
+    wait_until(lambda: listener.told == [15, 15])  # of the stream, and of the one that is there already
+    play.offer("mind-2", Listener(), "mind")
+    wait_until(lambda: listener.told == [15, 15, 15])
+
+
+class MovingHead(Head, Joints):
+    """Moves, and tells of its joints."""
+
+    def __init__(self) -> None:
+        Head.__init__(self)
+        Joints.__init__(self)
+
+
+@of(PAGE, "From asyncio")
+def test_from_asyncio(play: Play, printed: Said) -> None:
+    head = MovingHead()
+    play.offer("robot", head, "rosie.head")
+    play.run()
+    assert printed.lines == ["[0.3, -0.2]"]
+    assert head.looks >= 3
 
 
 @of(PAGE, "Locks, stops, e-stop")

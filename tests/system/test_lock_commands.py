@@ -187,7 +187,7 @@ def test_a_lock_that_cannot_be_had_runs_nothing(locked, trade_command: Command, 
     [
         (["lock", "rosie.head"], 2, "UsageError: trade lock: say what to run"),
         (["lock", "--", "true"], 2, "UsageError: trade lock: say what to lock"),
-        (["lock", "nowhere", "--", "true"], 1, "ConfigurationError: lock of group='nowhere'"),
+        (["lock", "nowhere", "--wait", "0", "--", "true"], 1, "NoSuchService: no service matches group='nowhere'"),
         (["lock", "a b", "--", "true"], 2, "UsageError: lock a b:"),
         (["estop", "abc"], 2, "UsageError: trade estop: ids are for clearing"),
         (["estop", "--clear", "--limit", "0.2"], 1, "NobodyFound: nobody was found in system test-"),

@@ -6,7 +6,7 @@ import time
 from typing import Any
 
 import pytest
-from msgspec import Raw
+from msgspec import Raw, Struct
 
 import trade
 from trade import Container, current_call, service
@@ -22,6 +22,12 @@ from trade._wire import (
     reply_key,
 )
 from trade.errors import Cancelled, NotSerialisable
+from waiting import wait_until
+
+
+class Share(Struct):
+    share: float
+    left: list[int]
 
 
 class Walk:
@@ -42,6 +48,11 @@ class Walk:
             trade.progress({"share": value})
         self.open.wait(20)
         return "arrived"
+
+    @service
+    def tell_record(self) -> None:
+        trade.progress(Share(share=0.5, left=[1, 2]))
+        self.open.wait(20)
 
     @service
     def tell_nonsense(self) -> None:
@@ -152,6 +163,14 @@ def test_a_provider_may_answer_a_cancelled_call(offer: Any, walk: Walk) -> None:
     run.cancel()
     assert run.result(20) == "half way"
     run.cancel()
+
+
+def test_a_record_that_tells_of_progress_comes_as_plain_data(offer: Any, walk: Walk) -> None:
+    run = offer(walk)("tell_record").start()
+    wait_until(lambda: run.progress() is not None)
+    walk.open.set()
+    run.result(20)
+    assert run.progress() == {"share": 0.5, "left": [1, 2]}
 
 
 def test_a_provider_that_does_not_heed_it_goes_on(offer: Any, walk: Walk) -> None:

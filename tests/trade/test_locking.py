@@ -5,6 +5,7 @@ import contextvars
 import math
 import threading
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import pytest
@@ -15,6 +16,7 @@ from trade.errors import (
     ConfigurationError,
     IncompleteGroup,
     LockedByOther,
+    NoSuchService,
 )
 from trade.testing import memory_system
 from waiting import wait_until
@@ -38,8 +40,8 @@ def test_S13_services_of_several_containers_are_locked_together_or_not_at_all(ro
 
 
 def test_a_lock_is_only_held_once_it_is_whole(robot: Robot) -> None:
-    lock = robot.me.lock(where(group="nothing.there"))
-    with pytest.raises(ConfigurationError):
+    lock = robot.me.lock(where(group="nothing.there"), wait_s=0)
+    with pytest.raises(NoSuchService):
         lock.acquire()
     assert not lock.held
     with pytest.raises(ConfigurationError, match="a lock is taken once"):
@@ -291,6 +293,12 @@ def test_re_entry_takes_nothing_twice_and_gives_nothing_back_early(robot: Robot)
 # --- S16 and S17: what is locked
 
 
+class _Eye:
+    @service(effect="read")
+    def image(self) -> bytes:
+        return b""
+
+
 def test_a_single_handle_is_refused_with_what_to_write_instead(robot: Robot) -> None:
     handle: Any = robot.find("a")
     with pytest.raises(ConfigurationError, match=r"lock\(\[handle\]\)"):
@@ -298,9 +306,49 @@ def test_a_single_handle_is_refused_with_what_to_write_instead(robot: Robot) -> 
 
 
 def test_S16_an_empty_selection_locks_nothing(robot: Robot) -> None:
-    for nothing in ([], where(group="elsewhere"), where(group="robot", name="where_is_it")):
+    for nothing in ([], where(group="robot", name="where_is_it")):
         with pytest.raises(ConfigurationError):
             robot.me.lock(nothing).acquire()
+
+
+def test_S16_a_lock_of_what_is_not_there_tells_what_there_is(robot: Robot) -> None:
+    with pytest.raises(NoSuchService, match="did you mean robot") as refused:
+        robot.me.lock(where(group="robt"), wait_s=0).acquire()
+    assert robot.me.locks() == []
+    assert not isinstance(refused.value, ConfigurationError)
+
+
+def test_S16_a_lock_waits_until_what_it_is_for_is_there_as_a_whole(robot: Robot) -> None:
+    head = robot.system.container("head")
+    joints = [Joint(name) for name in ("pan", "tilt")]
+    for joint in joints:
+        joint.members = {"rosie.head": ("pan", "tilt")}  # type: ignore[attr-defined]
+    lock = robot.me.lock(where(group="rosie.head"), wait_s=20)
+    with ThreadPoolExecutor(1) as waiting:
+        taken = waiting.submit(lock.acquire)
+        wait_until(lambda: bool(robot.me._parts.registry._bell._gates), "it waits")
+        head.register(_Eye(), "rosie.head")
+        head.register(joints[0], "rosie.head")
+        robot.me.find(where(group="rosie.head", name="move"), wait_s=20)  # a part of it is seen, and not taken
+        assert robot.me.locks() == []
+        assert not taken.done()
+        head.register(joints[1], "rosie.head")
+        taken.result(20)
+        assert lock.resources == ("pan", "tilt")
+        lock.release()
+
+
+def test_S16_what_came_in_part_is_told_when_the_wait_is_over(robot: Robot) -> None:
+    joint, head = Joint("pan"), robot.system.container("head")
+    joint.members = {"rosie.head": ("pan", "tilt")}  # type: ignore[attr-defined]
+    lock = robot.me.lock(where(group="rosie.head"), wait_s=1)
+    with ThreadPoolExecutor(1) as waiting:
+        taken = waiting.submit(lock.acquire)
+        wait_until(lambda: bool(robot.me._parts.registry._bell._gates), "it waits")
+        head.register(joint, "rosie.head")
+        with pytest.raises(IncompleteGroup, match="tilt"):
+            taken.result(20)
+    assert robot.me.locks() == []
 
 
 def test_S16_an_incomplete_group_is_refused_unless_a_part_will_do(robot: Robot) -> None:

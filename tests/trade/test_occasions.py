@@ -1,5 +1,6 @@
 """``once``, ``after``, ``at``, ``every``: at this time, if this holds, make that call. By functions and by services."""
 
+import itertools
 import logging
 import queue
 import time
@@ -11,7 +12,7 @@ import pytest
 
 from trade import Container, Handle, service, where
 from trade import _notifications as notifications
-from trade.errors import ConfigurationError, NoSuchNotification
+from trade.errors import ConfigurationError, DeviceSilent, NoSuchNotification
 from waiting import wait_until
 
 SOON_S = 0.02
@@ -243,6 +244,10 @@ def test_after_counts_from_when_its_condition_holds(
         (lambda here: here.at("noon", print), "a datetime says when, not 'noon'"),
         (lambda here: here.once("go"), "call must be a handle"),
         (lambda here: here.once(print, if_=True), "a condition must be a handle"),
+        (lambda here: here.every(1, print, if_=lambda _percent: True), "a condition is called without arguments"),
+        (lambda here: here.every(1, print, when=lambda _percent: True), "a condition is called without arguments"),
+        (lambda here: here.every(1, lambda _handle: None), "call is called without arguments"),
+        (lambda here: here.joined(where(name="go"), lambda: None), "call is called with one argument"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
@@ -261,6 +266,29 @@ def test_a_condition_that_is_neither_true_nor_false_does_not_hold_and_is_told(
     assert "answers with True or False, not 0.5" in noted.info().last_error
     assert dock.came.empty()
     assert caplog.text.count("it stays attached") == 1  # the same again says nothing new
+
+
+def test_each_kind_of_failure_is_told_once_and_of_what(here: Container, caplog: pytest.LogCaptureFixture) -> None:
+    asked, called = itertools.count(), itertools.count()
+
+    def holds() -> bool:
+        count = next(asked)
+        if count % 2:
+            raise DeviceSilent(device="neck.pan", bus="/dev/ttyUSB0", waited_s=float(count))
+        if count % 4:
+            raise OSError(f"disk {count}")
+        return True
+
+    def go() -> None:
+        raise OSError(f"no coffee {next(called)}")
+
+    with caplog.at_level(logging.WARNING, "trade"):
+        noted = here.every(SOON_S, go, if_=holds)
+        wait_until(lambda: noted.info().failures >= 12)
+        noted.cancel()
+    told = [one for one in caplog.messages if noted.id in one]
+    assert [sum(f"the {part} of" in one for one in told) for part in ("condition", "call")] == [2, 1]
+    assert "holds" in next(one for one in told if "the condition of" in one)
 
 
 def test_a_callback_that_fails_kills_nothing(here: Container) -> None:

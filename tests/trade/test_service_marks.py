@@ -185,6 +185,14 @@ class Emptied(Lamp):
     switch = None  # type: ignore[assignment]
 
 
+class Heater(Protocol):
+    @service
+    def warm(self) -> None: ...
+
+    @service
+    def cool(self) -> None: ...
+
+
 class CancelsNothing:
     @service(cancel="halt")
     def walk(self) -> None: ...
@@ -258,6 +266,12 @@ REFUSED = {
         "",
         (),
         "Emptied.switch: the interface has this service, but the class does not implement it",
+    ),
+    "several missing": (
+        Emptied,
+        "",
+        (Heater,),
+        "Emptied: the interface has the services switch, warm, cool, but the class does not implement them",
     ),
     "cancel names nothing": (
         CancelsNothing,

@@ -37,6 +37,18 @@ def test_an_error_of_the_service_is_raised_and_the_stream_goes_on(two: Two) -> N
                 continue
 
 
+def test_async_with_ends_a_stream(two: Two) -> None:
+    async def first() -> bool:
+        stream = await asyncio.to_thread(two.here.stream, two.service("count"), hz=FAST_HZ)
+        async with stream as samples:
+            async for sample in samples:
+                assert sample.value >= 1
+                break
+        return stream.ended
+
+    assert asyncio.run(first())
+
+
 def test_a_service_that_is_withdrawn_ends_its_streams(two: Two) -> None:
     with two.here.stream(two.service("count"), hz=FAST_HZ) as stream:
         stream.next(PATIENCE_S)

@@ -1,11 +1,13 @@
 """The public surface: what ``trade`` exports is there, documented, and asks nothing special of the system."""
 
 import inspect
+import re
 from typing import Any
 
 import pytest
 
 import trade
+from pages.blocks import DOCS
 
 
 @pytest.mark.parametrize("name", trade.__all__)
@@ -27,6 +29,36 @@ def _public_methods() -> list[Any]:
 @pytest.mark.parametrize("member", _public_methods())
 def test_every_public_method_is_documented(member: Any) -> None:
     assert inspect.getdoc(member)
+
+
+@pytest.mark.parametrize("name", ["lock", "find", "stream", "every", "estop_clear", "set_tracing"])
+def test_help_of_a_function_says_what_its_method_says(name: str) -> None:
+    assert inspect.getdoc(getattr(trade, name)) == inspect.getdoc(getattr(trade.Container, name))
+
+
+def test_no_function_sends_its_reader_to_another_page() -> None:
+    functions = [getattr(trade, name) for name in trade.__all__ if inspect.isfunction(getattr(trade, name))]
+    assert [one.__name__ for one in functions if "see `Container." in (inspect.getdoc(one) or "").lower()] == []
+
+
+def _left_out() -> list[Any]:
+    text = (DOCS / "reference" / "trade.md").read_text(encoding="utf-8")
+    found = re.findall(
+        r"^::: trade\.(\w+)\n    options:\n(?:      merge.*\n)?      filters: .*\^\((.*)\)\$", text, re.MULTILINE
+    )
+    return [pytest.param(kind, name, id=f"{kind}.{name}") for kind, names in found for name in names.split("|")]
+
+
+@pytest.mark.parametrize(("kind", "name"), _left_out())
+def test_what_the_reference_leaves_out_is_there(kind: str, name: str) -> None:
+    """A name that was changed would be on the page again."""
+    made = getattr(trade, kind)
+    assert hasattr(made, name) or f"self.{name}" in inspect.getsource(made)
+
+
+def test_the_reference_leaves_out_what_the_rooms_tell_each_other() -> None:
+    left_out = {parameter.id for parameter in _left_out()}
+    assert {"Lock.add", "Stream.hear", "Run.fail", "Container.abandon", "Resource.latch"} <= left_out
 
 
 def test_public_names_are_sorted_and_complete() -> None:

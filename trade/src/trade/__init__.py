@@ -478,3 +478,8 @@ def estops() -> list[Estop]:
 def estop_clear(ids: Sequence[str], *, limit_s: float = LIMIT_S) -> EstopReport:
     """Clear e-stops by their ids; see `Container.estop_clear`."""
     return container().estop_clear(ids, limit_s=limit_s)
+
+
+for _name in __all__:  # `help(trade.lock)` says all that there is to say
+    if f"see `Container.{_name}`" in (_said := getattr(globals()[_name], "__doc__", None) or "").replace("See", "see"):
+        globals()[_name].__doc__ = getattr(Container, _name).__doc__

@@ -96,6 +96,8 @@ class Caller:
         self.new_id: Callable[[], int] = itertools.count(secrets.randbits(38) << 24 | 1).__next__
         self._peers: dict[Address, Peer] = {}
         self._publishers: dict[str, Publisher] = {}
+        self._urgent: set[Publisher] = set()
+        """Those of stops."""
         self._lock = threading.Lock()
         self._every: list[_Box] = []
         self._free: list[_Box] = []
@@ -133,6 +135,8 @@ class Caller:
             found = self._publishers.get(key)
             if found is None:
                 found = self._publishers[key] = self._transport.publish(key, urgent=stop)
+                if stop:
+                    self._urgent.add(found)
             return found
 
     def forget(self, callee: Address, domain: str, provider: str) -> None:
@@ -140,6 +144,7 @@ class Caller:
         keys = [call_key(self._own.identity, callee, domain, provider, stop=stop) for stop in (False, True)]
         with self._lock:
             gone = [self._publishers.pop(key, None) for key in keys]
+            self._urgent.difference_update(gone)
         for publisher in gone:
             if publisher is not None:
                 publisher.close()
@@ -399,6 +404,18 @@ class Caller:
         thread = threading.Thread(target=target, name=name, daemon=True)
         self._threads.append(thread)
         thread.start()
+
+    def finish_stops(self, limit_s: float) -> None:
+        """Wait until no stop is under way, at most so long, in seconds."""
+        if threading.current_thread() in self._threads:  # the one that hears of their ends
+            return
+        until = time.monotonic() + limit_s
+        while self._stopping() and time.monotonic() < until:
+            time.sleep(0.001)
+
+    def _stopping(self) -> bool:
+        sent = [box.sent for box in list(self._every)] + [pending.sent for pending in list(self._pending.values())]
+        return any(one is not None and one[0] in self._urgent for one in sent)
 
     def close(self) -> None:
         """End every wait and every thread. Idempotent."""

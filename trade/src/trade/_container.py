@@ -35,6 +35,8 @@ from trade.errors import ConfigurationError
 
 __all__ = ["Container"]
 
+_STOPPING_S: Final = 2.0
+
 
 class Container(Hosting, Moving, Streaming, Tracing, Guarding, Bordering):
     """A participant of a system; most programs use the default one through the functions of ``trade``.
@@ -263,19 +265,28 @@ class Container(Hosting, Moving, Streaming, Tracing, Guarding, Bordering):
         """Whether it can still take a call now; what feeds hardware watchdogs asks this."""
         return not self._closed and self._parts.dispatcher.draining
 
+    @property
+    def closed(self) -> bool:
+        """Whether it was closed."""
+        return self._closed
+
     def _check_open(self) -> None:
         _process.refuse_after_fork()
         if self._closed:
             raise container_closed(self.address)
 
     def close(self) -> None:
-        """Leave: services, handles and notifications end; nothing stays behind. Idempotent."""
+        """Leave: services, handles and notifications end; nothing stays behind. Idempotent.
+
+        Stops that are under way are waited for, up to 2 s; other calls end with ContainerLost.
+        """
         if _process.forked():
             return
         with self._closing:  # who comes second waits until it is done
             if self._closed:
                 return
             self.locking.keeper.close()  # gives back what it holds, while it can still be heard
+            self._parts.caller.finish_stops(_STOPPING_S)
             self._closed = True
             self._parts.close()
 

@@ -38,9 +38,10 @@ class Guarding(Member):
         Nothing is taken before the context is entered (or `Lock.acquire` called).
 
         Args:
-            which: the actuating services that match, as they are now, or handles.
+            which: the actuating services that match, as they are when it is taken, or handles. If nothing matches yet,
+                it waits for that, and then for the whole of a robot's group.
             purpose: what for, as others are told who would like to have them.
-            wait_s: how long to wait for others, in seconds; 0 tries.
+            wait_s: how long to wait for others, and for what is not there yet, in seconds; 0 tries.
             lease_s: how long it outlives its owner, in seconds.
             priority: who waits with a higher one comes first.
             delegates: identities that may use it, too.
@@ -49,9 +50,10 @@ class Guarding(Member):
             on_request: called with who and why, on a thread of its own, when somebody asks for it.
 
         Raises:
+            NoSuchService: nothing matches within ``wait_s``.
             LockedByOther: somebody has one of them, or something still moves, after ``wait_s``.
             IncompleteGroup: the robot file says that more belongs to the group.
-            ConfigurationError: nothing to lock.
+            ConfigurationError: there is nothing to lock in what matches: it only reads.
             AccessDenied: the policy does not let this container lock one of them.
             NotStopped: one of them could not be stopped when it had to be.
         """

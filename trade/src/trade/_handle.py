@@ -3,8 +3,8 @@
 import asyncio
 import contextlib
 import logging
-import threading
 from collections.abc import Callable, Generator, Mapping
+from contextvars import Context
 from types import MappingProxyType
 from typing import Any, Final, NoReturn, Protocol
 
@@ -27,6 +27,8 @@ class Home(Protocol):
 
     @property
     def address(self) -> Address: ...
+    @property
+    def closed(self) -> bool: ...
     def invoke(
         self, handle: "Handle", args: tuple[Any, ...], kwargs: dict[str, Any], deadline_s: float | None
     ) -> Any: ...
@@ -179,13 +181,6 @@ class Run:
         return self.result()
 
 
-def _cancel(run: Run) -> None:
-    try:
-        run.cancel()
-    except Exception:  # a container that is gone, say: the call is, too
-        _logger.exception("a call whose task was cancelled could not be cancelled")
-
-
 class Handle:
     """One service of one boot epoch: call it, compare it, keep it, pass it as argument or result.
 
@@ -220,8 +215,27 @@ class Handle:
             return await run
         except asyncio.CancelledError:
             if not run.done():
-                threading.Thread(target=_cancel, args=(run,), name="trade-cancel", daemon=True).start()
+                Context().run(self._cancel_soon, run)
             raise
+
+    def _cancel_soon(self, run: Run) -> None:
+        """What `Run.cancel` does, without waiting: what ends the call is under way when this returns."""
+
+        def look(stopping: Run) -> None:
+            if (error := stopping.exception()) is not None:
+                self._say_not_cancelled(error)
+
+        try:
+            run.ask_to_end()
+            if self.record.info.cancel is not None:
+                self.cancel_service().start().when_done(look)
+        except Exception as error:  # noqa: BLE001 - a container that is gone, say: the call is, too
+            self._say_not_cancelled(error)
+
+    def _say_not_cancelled(self, error: BaseException) -> None:
+        level = logging.DEBUG if self._home.closed else logging.WARNING
+        text = "%s, whose task was cancelled, could not be cancelled: %s: %s"
+        _logger.log(level, text, self.label, type(error).__name__, error)
 
     def with_(self, *, deadline_s: float) -> "Handle":
         """The same service, called with other options.
@@ -298,7 +312,7 @@ class Handle:
 
     @property
     def effect(self) -> str:
-        """``read``, ``actuate`` or ``stop``."""
+        """``read``, ``note``, ``actuate`` or ``stop``."""
         return self.record.info.effect
 
     @property

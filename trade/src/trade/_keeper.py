@@ -48,6 +48,10 @@ class Keeper:
     def owner(self) -> Address:
         return self._home.address
 
+    def over(self) -> bool:
+        """Whether its container closes, or has."""
+        return self._closed
+
     # --- taking
 
     def acquire(self, lock: Lock, wanted: dict[Address, list[str]], terms: Terms) -> Lock:
@@ -203,7 +207,7 @@ class Keeper:
             found = next((lock for lock in self._locks if token in lock.granted.values()), None)
         if found is None or found.on_request is None:
             return False
-        apart(found.on_request, who, reason)
+        apart(self.over, found.on_request, who, reason)
         return True
 
     def close(self) -> None:

@@ -10,11 +10,13 @@ from contextvars import Token as Reset
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Final
 
+from msgspec import structs
+
 from trade._context import Held, holding
 from trade._inherited import VARIABLE, passed_on
 from trade._terms import Granted, Terms
 from trade._wire import Address, Token
-from trade.errors import ConfigurationError, LockLost
+from trade.errors import ConfigurationError, LockLost, TradeError
 
 if TYPE_CHECKING:
     from trade._keeper import Keeper
@@ -22,7 +24,7 @@ if TYPE_CHECKING:
 _logger = logging.getLogger("trade")
 
 Wanted = Callable[[], dict[Address, list[str]]]
-"""Finds what to lock, by the container that judges it, at the moment it is taken."""
+"""Finds what to lock, by the container that judges it, at the moment it is taken; waits until it is there."""
 OnLost = Callable[[LockLost], object]
 OnRequest = Callable[[str, str], object]
 """Told who would like to have the lock, and why."""
@@ -61,8 +63,8 @@ class Lock:
         """Take it: what entering the context does. Once; whoever wants it again makes another one.
 
         Raises:
-            LockedByOther, NotStopped, IncompleteGroup, ServiceGone, ContainerLost, ConfigurationError: see
-                `Container.lock`; nothing is held then.
+            NoSuchService, LockedByOther, NotStopped, IncompleteGroup, ServiceGone, ContainerLost, ConfigurationError:
+                see `Container.lock`; nothing is held then.
             LockLost: what it had already was lost while it waited for the rest.
         """
         with self._guard:
@@ -70,7 +72,10 @@ class Lock:
                 problem = "a lock is taken once; make another one with trade.lock(...), or share this one with use()"
                 raise ConfigurationError(where=f"lock for {self.purpose!r}", problem=problem)
             self._taken = True
-        self._keeper.acquire(self, self._wanted(), self._terms)
+        begun = time.monotonic()
+        wanted = self._wanted()
+        left_s = max(0.0, self._terms.wait_s - (time.monotonic() - begun))
+        self._keeper.acquire(self, wanted, structs.replace(self._terms, wait_s=left_s))
         self._whole = True
         return self
 
@@ -139,7 +144,7 @@ class Lock:
         try:
             await asyncio.shield(taking)
         except asyncio.CancelledError:
-            taking.add_done_callback(lambda _: apart(self.release))
+            taking.add_done_callback(lambda _: apart(self._keeper.over, self.release))
             raise
         return self._enter()
 
@@ -211,18 +216,27 @@ class Lock:
                 return
             self._lost = LockLost(resources=self.resources, reason=reason)
         _logger.warning("%s", self._lost)
-        apart(self._keeper.let_go, self, reason)
+        apart(self._keeper.over, self._keeper.let_go, self, reason)
         if self._on_lost is not None:
-            apart(self._on_lost, self._lost)
+            apart(self._keeper.over, self._on_lost, self._lost)
 
 
-def apart(call: Callable[..., object], *arguments: Any) -> None:
-    """Call it on a thread of its own: nobody who tells of locks waits for whoever is told."""
+def apart(over: Callable[[], bool], call: Callable[..., object], *arguments: Any) -> None:
+    """Call it on a thread of its own: nobody who tells of locks waits for whoever is told.
+
+    Args:
+        over: whether the container closes; what that cuts off is no failure.
+        call: what to call.
+        arguments: with these.
+    """
 
     def guarded() -> None:
         try:
             call(*arguments)
-        except Exception:
-            _logger.exception("told of a lock, %r failed", call)
+        except Exception as error:
+            if over() and isinstance(error, TradeError):
+                _logger.debug("told of a lock, %r was cut off as its own container closed: %s", call, error)
+            else:
+                _logger.exception("told of a lock, %r failed", call)
 
     threading.Thread(target=guarded, name="trade-lock-told", daemon=True).start()

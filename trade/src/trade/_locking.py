@@ -12,7 +12,7 @@ from trade._lock import Lock, OnLost, OnRequest
 from trade._system import DOMAIN, PROVIDER
 from trade._terms import LockInfo, Terms
 from trade._wire import Address, ServiceKey
-from trade.errors import ConfigurationError, IncompleteGroup, TradeError
+from trade.errors import ConfigurationError, IncompleteGroup, NoSuchService, TradeError
 
 LONGEST_WAIT_S: Final = 3600.0
 LEASE_S: Final = 2.0
@@ -28,6 +28,7 @@ class Home(Protocol):
     def address(self) -> Address: ...
     def handle(self, key: ServiceKey) -> Handle: ...
     def services(self, constraint: Constraint | None = None) -> list[Handle]: ...
+    def await_services(self, constraint: Constraint, ready: Callable[[], bool], wait_s: float) -> None: ...
     def addresses(self) -> list[Address]: ...
 
 
@@ -59,13 +60,42 @@ class Locking:
         terms = Terms(purpose=purpose, lease_s=lease_s, wait_s=wait_s, priority=priority, delegates=tuple(delegates))
 
         def wanted() -> dict[Address, list[str]]:
-            handles = selected(which, self._home.services)
-            if not partial:
-                require_whole(which, handles)
+            handles = self._there(which, wait_s, partial=partial)
             self._require("lock", handles, which)
             return resources_of(handles)
 
         return Lock(self.keeper, terms, wanted, on_lost, on_request)
+
+    def _there(self, which: Constraint | Iterable[Handle], wait_s: float, *, partial: bool) -> list[Handle]:
+        """The services to lock. If nothing matches yet, that is waited for until it is there as a whole.
+
+        Raises:
+            NoSuchService: nothing matches within ``wait_s`` seconds.
+            ConfigurationError, IncompleteGroup: what matches cannot be locked.
+        """
+
+        def look() -> list[Handle]:
+            handles = selected(which, self._home.services)
+            if not partial:
+                require_whole(which, handles)
+            return handles
+
+        if not isinstance(which, Constraint) or self._home.services(which):
+            return look()
+        found: list[Handle] = []
+
+        def arrived() -> bool:
+            with contextlib.suppress(ConfigurationError, IncompleteGroup):  # it comes one by one
+                found[:] = look()
+            return bool(found)
+
+        try:
+            self._home.await_services(which, arrived, wait_s)
+        except NoSuchService:
+            if not self._home.services(which):
+                raise
+            return look()  # some of it came; it says what is missing
+        return found
 
     def locks(self) -> list[LockInfo]:
         """See `Container.locks`."""

@@ -1,7 +1,7 @@
 """The part of a container that looks services up, is told of them, and calls them by what they are."""
 
 import asyncio
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 from trade import _many
@@ -40,13 +40,27 @@ class Looking(Member):
             matches[:] = self._parts.registry.select(constraint)
             return bool(matches)
 
-        if not self._parts.registry.wait_for(found, wait_s):
-            apart = self._unanswered(wait_s) if len(self.addresses()) == 1 else ()
-            hidden = self.access.hidden(self.address.identity, asked_for(constraint, "group"))
-            raise no_such_service(constraint, self._parts.registry.select(where()), wait_s, apart, hidden)
+        self.await_services(constraint, found, wait_s)
         if len(matches) > 1:
             raise too_many_services(constraint, matches)
         return Handle(self, matches[0].key, matches[0])
+
+    def await_services(self, constraint: Constraint, ready: Callable[[], bool], wait_s: float) -> None:
+        """Wait until something holds of what the constraint is to match.
+
+        Args:
+            constraint: what was asked for; the error says what there is instead.
+            ready: whether it holds; asked now and after every change.
+            wait_s: how long to wait for it, in seconds.
+
+        Raises:
+            NoSuchService: it does not hold within ``wait_s`` seconds.
+        """
+        if self._parts.registry.wait_for(ready, wait_s):
+            return
+        apart = self._unanswered(wait_s) if len(self.addresses()) == 1 else ()
+        hidden = self.access.hidden(self.address.identity, asked_for(constraint, "group"))
+        raise no_such_service(constraint, self._parts.registry.select(where()), wait_s, apart, hidden)
 
     def _unanswered(self, wait_s: float) -> Sequence[str]:
         """Where nobody was found; why is only looked at for who has waited, as it takes half a second for each."""

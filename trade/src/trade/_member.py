@@ -22,6 +22,11 @@ class Member(ABC):
     def _check_open(self) -> None:
         """Raises ConfigurationError if it is closed, or if this is a forked child."""
 
+    @property
+    @abstractmethod
+    def closed(self) -> bool:
+        """Whether it was closed."""
+
     @abstractmethod
     def addresses(self) -> list[Address]:
         """Where the containers of the system are, this one included."""

@@ -149,6 +149,8 @@ class Standing(Notification):
         """Services that came, went or changed and were not told of yet."""
         self._fired = self._failures = self._merged = 0
         self._last_error = ""
+        self._said: set[tuple[str, str]] = set()
+        """What failed, and with which error, as far as it was told."""
         self._cancel_due: Callable[[], None] = lambda: None
 
     # --- being
@@ -266,7 +268,7 @@ class Standing(Notification):
             self._do(self._call, *given)
             self._fired += 1
         except BaseException as error:  # noqa: BLE001 - whatever a callback raises kills nothing
-            self._failed(error)
+            self._failed("call", self._call, error)
 
     def _asked(self, condition: Target | None) -> bool:
         """Whether a condition holds; one that fails does not."""
@@ -277,7 +279,7 @@ class Standing(Notification):
                 problem = f"a condition answers with True or False, not {held!r}"
                 raise ConfigurationError(where=text_of(condition), problem=problem)
         except BaseException as error:  # noqa: BLE001
-            self._failed(error)
+            self._failed("condition", condition, error)
             return False
         return held
 
@@ -294,13 +296,16 @@ class Standing(Notification):
                 self._home.require_call(self.owner.identity, handle)
             return handle(*given, *target.args, **target.kwargs)
 
-    def _failed(self, error: BaseException) -> None:
+    def _failed(self, part: str, target: Target, error: BaseException) -> None:
         self._failures += 1
-        text = f"{type(error).__name__}: {error}"
-        if text != self._last_error:  # the same again says nothing new
-            self._last_error = text
-            _logger.warning("the call of %r failed; it stays attached: %s", self, text)
-            self._tell_failed(self, text)
+        kind = type(error).__name__
+        self._last_error = f"{kind}: {error}"
+        if (part, kind) in self._said:  # the same again says nothing new, whatever numbers are in its text
+            return
+        self._said.add((part, kind))
+        text = "the %s of %r failed (%s, id %s); it stays attached, and this kind is told once: %s"
+        _logger.warning(text, part, self, text_of(target), self.id, self._last_error)
+        self._tell_failed(self, self._last_error)
 
 
 class Notifier:

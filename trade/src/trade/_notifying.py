@@ -8,7 +8,7 @@ from trade._constraints import Constraint, where
 from trade._looking import Looking
 from trade._notification_services import Hosted, placed
 from trade._notifications import Notification, NotificationInfo, Owner
-from trade._occasions import Terms, What, deed_of, epoch_s, target_of
+from trade._occasions import OF_SERVICES, Terms, What, deed_of, epoch_s, target_of
 from trade._session import speaking
 from trade._system import DOMAIN
 from trade.errors import NoSuchNotification
@@ -168,8 +168,8 @@ class Notifying(Looking):
         self._check_open()
         terms.check()
         named = f"trade.{terms.occasion}"
-        target = target_of(call, named, "call")
-        conditions = [None if what is None else target_of(what, named, "a condition") for what in (if_, when)]
+        target = target_of(call, named, "call", 1 if terms.occasion in OF_SERVICES else 0)
+        conditions = [None if what is None else target_of(what, named, "a condition", 0) for what in (if_, when)]
         if not host or host == self.address.container:
             client = speaking.get()
             mine = client if client is not None and client.owner == self.address else None

@@ -1,5 +1,6 @@
 """What a notification is asked for with: an occasion, a call to make, conditions. Data, so that it can be sent."""
 
+import inspect
 import math
 from collections.abc import Callable, Mapping
 from datetime import datetime, timezone
@@ -98,11 +99,17 @@ def epoch_s(moment: datetime, now_s: float) -> float:
     return moment.timestamp()
 
 
-def target_of(what: What, where: str, argument: str) -> Target:
+def target_of(what: What, where: str, argument: str, given: int) -> Target:
     """What to call, as data if it can be.
 
+    Args:
+        what: a service, a bound call, a constraint or a function.
+        where: for whom, for the error.
+        argument: which one it is, for the error.
+        given: so many values it is called with.
+
     Raises:
-        ConfigurationError: it cannot be called.
+        ConfigurationError: it cannot be called, or not with so many values.
     """
     if isinstance(what, Handle):
         return Deed(handle=what)
@@ -111,9 +118,23 @@ def target_of(what: What, where: str, argument: str) -> Target:
     if isinstance(what, Constraint):
         return Deed(constraint=what)
     if callable(what):
+        _check_takes(what, where, argument, given)
         return what
     problem = f"{argument} must be a handle, a bound call, where(...), or a function, not {what!r}"
     raise ConfigurationError(where=where, problem=problem)
+
+
+def _check_takes(function: Callable[..., Any], where: str, argument: str, given: int) -> None:
+    try:
+        signature = inspect.signature(function)
+    except (TypeError, ValueError):  # one of C: only calling it shows
+        return
+    try:
+        signature.bind(*range(given))
+    except TypeError as bad:
+        values = {0: "without arguments", 1: "with one argument"}[given]
+        problem = f"{argument} is called {values}, and {text_of(function)} takes {signature}: {bad}"
+        raise ConfigurationError(where=where, problem=problem) from None
 
 
 def deed_of(target: Target, host: str, where: str) -> Deed:

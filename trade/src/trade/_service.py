@@ -142,11 +142,15 @@ def _has_marks(cls: type) -> bool:
 
 
 def _check(cls: type, found: dict[str, tuple[ServiceMark, Callable[..., Any]]]) -> None:
+    lacking = [name for name in found if not _implements(cls, name)]
+    if len(lacking) == 1:
+        problem = "the interface has this service, but the class does not implement it"
+        raise ConfigurationError(where=f"{cls.__qualname__}.{lacking[0]}", problem=problem)
+    if lacking:
+        problem = f"the interface has the services {', '.join(lacking)}, but the class does not implement them"
+        raise ConfigurationError(where=cls.__qualname__, problem=problem)
     for name, (mark, _) in found.items():
         where = f"{cls.__qualname__}.{name}"
-        if not _implements(cls, name):
-            problem = "the interface has this service, but the class does not implement it"
-            raise ConfigurationError(where=where, problem=problem)
         if mark.cancel is not None and mark.cancel not in found:
             raise ConfigurationError(where=where, problem=f"cancel={mark.cancel!r} names no service of this class")
 

@@ -35,9 +35,9 @@ class _Heard(NamedTuple):
 class Stream:
     """Samples of one service, as they come: iterate over it, in a thread or with ``async for``, or ask for `latest`.
 
-    Made by `Container.stream`; a context manager. Who takes them too slowly has the newest, and each sample says how
-    many are missing before it. While its source cannot be reached nothing comes; when the same container is back, so
-    are its samples.
+    Made by `Container.stream`; a context manager, also of asyncio. Who takes them too slowly has the newest, and each
+    sample says how many are missing before it. While its source cannot be reached nothing comes; when the same
+    container is back, so are its samples.
     """
 
     def __init__(
@@ -205,6 +205,12 @@ class Stream:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+    async def __aenter__(self) -> "Stream":
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await asyncio.shield(asyncio.ensure_future(asyncio.to_thread(self.close)))
 
     def __repr__(self) -> str:
         return f"<Stream of {self.source.label}, {self.hz:g} Hz{', ended' if self.ended else ''}>"

@@ -4,6 +4,7 @@ import contextlib
 import logging
 import math
 import time
+from typing import Final
 
 from trade._clockwork import Clockwork
 from trade._constraints import Constraint
@@ -13,11 +14,12 @@ from trade._occasions import Deed, Target, What, target_of
 from trade._session import speaking
 from trade._stream import If, Stream
 from trade._streams import LEAST_HZ, MOST_HZ, check_sampled
-from trade.errors import ConfigurationError
+from trade.errors import ConfigurationError, ServiceGone, SourceLost
 
 _logger = logging.getLogger("trade")
 
 _MOST_KEPT = 100_000
+_AGAIN: Final = "; trade.joined(where(...), call=listen, existing=True) has another one opened whenever it comes again"
 
 
 class Streaming(Hooking):
@@ -63,7 +65,7 @@ class Streaming(Hooking):
         if if_ is not None and (isinstance(if_, Handle) or not callable(if_)):
             problem = f"if_ must be a function of the value, not {if_!r}"
             raise ConfigurationError(where="trade.stream", problem=problem)
-        pushed = None if call is None else target_of(call, "trade.stream", "call")
+        pushed = None if call is None else target_of(call, "trade.stream", "call", 1)
         source = target if isinstance(target, Handle) else self.find(target)
         check_sampled(source)
         client = speaking.get()
@@ -114,10 +116,11 @@ class _Push:
             handle(value, *target.args, **target.kwargs)
 
     def _failed(self, error: BaseException) -> None:
-        text = f"{type(error).__name__}: {error}"
-        if text != self._problem:  # the same again says nothing new
-            _logger.warning("a sample of %r was not passed on: %s", self._stream, text)
-        self._problem = text
+        kind = type(error).__name__
+        if kind != self._problem:  # the same again says nothing new, whatever numbers are in its text
+            hint = _AGAIN if isinstance(error, SourceLost | ServiceGone) else ""
+            _logger.warning("a sample of %r was not passed on: %s: %s%s", self._stream, kind, error, hint)
+        self._problem = kind
 
 
 def _check(name: str, value: float, least: float, most: float) -> None:

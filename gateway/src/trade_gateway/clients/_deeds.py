@@ -192,7 +192,7 @@ class Deeds:
         """Take a lock for a client.
 
         Raises:
-            TradeError: see `trade.Container.lock`; and TooMany.
+            TradeError: see `trade.Container.lock`; and TooMany. What is not there is not waited for.
         """
         client.locking()
         return await self.counted(client.identity, self._lock, client, body, on_lost)
@@ -201,8 +201,9 @@ class Deeds:
         self, client: Client, body: messages.LockBody, on_lost: Callable[[str, LockLost], object]
     ) -> messages.LockTaken:
         wanted = where(group=body.group)
-        handles = [one for one in self._container.services(wanted) if one.effect == "actuate"]
-        self.judge.require(client.identity, "lock", handles)
+        if not self._container.services(wanted):
+            raise NoSuchService(constraint=body.group, groups=_groups(self.seen(client.identity)))
+        handles = self._lockable(client, wanted)
         taken: list[Lock] = []
 
         def lost(error: LockLost) -> None:
@@ -218,7 +219,18 @@ class Deeds:
             )
             taken.append(lock)
             lock.acquire()
+        try:
+            self._lockable(client, wanted)  # with what came meanwhile
+        except TradeError:
+            lock.release()
+            raise
         return messages.LockTaken(client.keep(lock, handles), lock.resources)
+
+    def _lockable(self, client: Client, wanted: Constraint) -> list[Handle]:
+        """What a lock takes. Raises AccessDenied: the client may not lock all of it."""
+        handles = [one for one in self._container.services(wanted) if one.effect == "actuate"]
+        self.judge.require(client.identity, "lock", handles)
+        return handles
 
     async def locks(self, who: str) -> list[messages.LockView]:
         """The locks on what an identity may know of."""

@@ -49,7 +49,9 @@ def lock(
         list[str] | None, typer.Option(help="Only services of this name; * and ? stand for anything. Repeatable.")
     ] = None,
     purpose: Annotated[str | None, typer.Option(help="What for, as others are told; by default the command.")] = None,
-    wait: Annotated[float, typer.Option(min=0.0, help="Seconds to wait for others; 0 tries.")] = 10.0,
+    wait: Annotated[
+        float, typer.Option(min=0.0, help="Seconds to wait for others, and for what is not there yet; 0 tries.")
+    ] = 10.0,
     lease: Annotated[
         float, typer.Option(min=0.1, max=60.0, help="Seconds that it outlives a command line that dies.")
     ] = 2.0,

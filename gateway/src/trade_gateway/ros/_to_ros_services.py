@@ -120,10 +120,10 @@ class LocksToRos:
             return f"it has {', '.join(before.lock.resources)}"
         self._give_back(who)
         client.locking()
-        handles = [one for one in self._container.services(wanted) if one.effect == "actuate"]
         with client.session.use():
             purpose = f"of {who}, a node of ROS"
             lock = self._container.lock(wanted, purpose=purpose, wait_s=self._entry.wait_s).acquire()
+        handles = [one for one in self._container.services(wanted) if one.effect == "actuate"]
         taken = self._taken[who] = _Taken(client, lock, client.keep(lock, handles))
         client.when_closed(lambda: self._forget(who, taken))
         client.session.check()
