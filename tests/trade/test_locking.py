@@ -351,6 +351,32 @@ def test_S16_what_came_in_part_is_told_when_the_wait_is_over(robot: Robot) -> No
     assert robot.me.locks() == []
 
 
+def test_S16_a_lock_taken_while_its_driver_leaves_waits_for_the_next_one(robot: Robot) -> None:
+    def joints() -> list[Joint]:
+        pair = [Joint(name) for name in ("pan", "tilt")]
+        for joint in pair:
+            joint.members = {"rosie.head": ("pan", "tilt")}  # type: ignore[attr-defined]
+        return pair
+
+    old, new = robot.system.container("old"), robot.system.container("new")
+    leaving = joints()
+    for joint in leaving:
+        old.register(joint, "rosie.head")
+    old.deregister(leaving[0])  # as its container closes: one after the other
+    wait_until(lambda: len(robot.me.services(where(group="rosie.head", name="move"))) == 1, "a part is left")
+    lock = robot.me.lock(where(group="rosie.head"), wait_s=20)
+    with ThreadPoolExecutor(1) as waiting:
+        taken = waiting.submit(lock.acquire)
+        wait_until(lambda: bool(robot.me._parts.registry._bell._gates), "it waits")
+        old.deregister(leaving[1])
+        wait_until(lambda: not robot.me.services(where(group="rosie.head")), "nothing is left")
+        for joint in joints():
+            new.register(joint, "rosie.head")
+        taken.result(20)
+    assert lock.resources == ("pan", "tilt")
+    lock.release()
+
+
 def test_S16_an_incomplete_group_is_refused_unless_a_part_will_do(robot: Robot) -> None:
     joint = Joint("pan")
     joint.members = {"rosie.head": ("pan", "tilt")}  # type: ignore[attr-defined]

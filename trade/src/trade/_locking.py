@@ -17,6 +17,7 @@ from trade.errors import ConfigurationError, IncompleteGroup, NoSuchService, Tra
 LONGEST_WAIT_S: Final = 3600.0
 LEASE_S: Final = 2.0
 """The lease of a lock is the deadman's budget, too (S12)."""
+_SETTLE_S: Final = 1.0
 
 
 class Home(Protocol):
@@ -69,6 +70,8 @@ class Locking:
     def _there(self, which: Constraint | Iterable[Handle], wait_s: float, *, partial: bool) -> list[Handle]:
         """The services to lock. If nothing matches yet, that is waited for until it is there as a whole.
 
+        A part of it is given a moment to become whole or to leave, as when a driver starts or ends.
+
         Raises:
             NoSuchService: nothing matches within ``wait_s`` seconds.
             ConfigurationError, IncompleteGroup: what matches cannot be locked.
@@ -80,21 +83,26 @@ class Locking:
                 require_whole(which, handles)
             return handles
 
-        if not isinstance(which, Constraint) or self._home.services(which):
+        if not isinstance(which, Constraint):
             return look()
         found: list[Handle] = []
 
         def arrived() -> bool:
-            with contextlib.suppress(ConfigurationError, IncompleteGroup):  # it comes one by one
+            with contextlib.suppress(ConfigurationError, IncompleteGroup):  # it comes and goes one by one
                 found[:] = look()
             return bool(found)
 
+        def settled() -> bool:
+            return arrived() or not self._home.services(which)
+
         try:
-            self._home.await_services(which, arrived, wait_s)
+            self._home.await_services(which, settled, min(wait_s, _SETTLE_S))
+            if not found:
+                self._home.await_services(which, arrived, wait_s)
         except NoSuchService:
             if not self._home.services(which):
                 raise
-            return look()  # some of it came; it says what is missing
+            return look()  # there is some of it, and it says what is missing
         return found
 
     def locks(self) -> list[LockInfo]:
