@@ -113,7 +113,9 @@ _CIA402: Final = (
     _forgiven("cia402", "corrupt, five times", BadCrc(ids=ONE, instruction="tpdo1", count=5)),
     _silent("cia402", "cut short", Truncate(ids=ONE, instruction="tpdo1")),
     _silent("cia402", "garbage for measurements", Garbage(ids=ONE, instruction="tpdo1")),
-    _faulty("cia402", "frozen value", Freeze(ids=ONE), "it makes no progress", Stop.HOLD),
+    _faulty("cia402", "frozen value", Freeze(ids=ONE), "it makes no progress", Stop.HOLD)._replace(
+        stop_error=DeviceFault
+    ),
     _faulty("cia402", "blocked", Jam(ids=ONE), "error 8611h, following error", Stop.ITSELF),
     _silent("cia402", "cable off", Absent(ids=ONE), stop=Stop.WATCHDOG),
     _gone("cia402", "", Stop.WATCHDOG, Recovery.ENABLE, "degraded: CAN bus gone"),
@@ -298,8 +300,8 @@ through, row by row, with the simulator's log as the judge.
   and `dashboard` is a line that somebody else says to the controller.
 - *The move ends with* this error. While the fault lasts, further moves end in an error, too, unless it is
   "over at once".
-- *state()* and *stop()*: what they tell while it lasts. A stop that raises was tried, or could not be: nobody knows
-  that it was heard.
+- *state()* and *stop()*: what they tell while it lasts. A stop that raises was tried, or could not be: nobody saw
+  the device come to rest.
 - *Stopped by*: what ends the motion that was under way.
 - *Then*: what somebody has to call when the cause is gone. Until then **nothing moves**, in every row: what is heard
   again is neither enabled nor sent anywhere, and at most told to hold where it stands.

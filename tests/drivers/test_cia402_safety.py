@@ -15,7 +15,7 @@ import pytest
 
 from drivers.conftest import Outcome, sleep_past, written_now
 from drivers.legs import GO, HALT, HIP, KNEE, Leg, leg, rig
-from trade.errors import DeadlineExceeded, LimitExceeded, LockedByOther, MotionStopped
+from trade.errors import DeadlineExceeded, DeviceFault, LimitExceeded, LockedByOther, MotionStopped
 from trade_drivers.joints._motion import Move
 from trade_hil_sim import Entry, Mute
 from waiting import PATIENCE_S, wait_until
@@ -312,3 +312,21 @@ def test_S19_leaving_relaxed_switches_torque_off(rig: Leg) -> None:
     robot.close()
     rig.wait_for("torque_off", HIP, mark)
     assert not any(word & GO for word in rig.controlwords(HIP, mark))
+
+
+def test_S08_a_joint_with_a_fault_has_stopped_when_it_rests_and_not_before(rig: Leg) -> None:
+    """What speaks against moving on says nothing of its being at rest: it brakes for as long as any other."""
+    rig.configure(
+        ("max_accel_rad_s2 = 20.0", "max_accel_rad_s2 = 1.0"), ("max_speed_rad_s = 2.0", "max_speed_rad_s = 1.0")
+    )
+    rig.plug()
+    hip = rig.attach().motor("leg.hip")
+    axis = hip._axes[0]  # type: ignore[attr-defined]
+    moving = Outcome(lambda: hip.move_to(0.9, 0.8))
+    started = rig.wait_for("motion_started", HIP)
+    wait_until(lambda: hip.state().velocity_rad_s > 0.4, "it is on its way")
+    axis.latch("it does not take its goal (statusword bit 12)")
+    assert isinstance(moving.wait().error, DeviceFault)
+    hip.stop()
+    assert rig.events("at_rest", HIP, started.t)
+    assert rig.controlwords(HIP, started.t)[-1] & HALT

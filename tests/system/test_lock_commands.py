@@ -293,13 +293,17 @@ def test_S09_who_does_not_answer_may_have_one_open(rosie_up, trade_command: Comm
     )  # it may seem gone by then
 
 
-def test_S09_what_was_found_is_cleared_and_what_is_missing_is_told(
+def test_S09_what_was_found_is_stopped_and_cleared_and_what_is_missing_is_told(
     rosie_up, trade_command: Command, start_container: Callable[..., Container], nobody_there: str
 ) -> None:
     door = start_container("door", listen=[free_endpoint()])
     rosie_up()
-    assert trade_command("estop").returncode == 0
     both = ["--connect", door.settings.listen[0], "--connect", nobody_there]
+    said = trade_command(*both, "estop", "--limit", "2")
+    assert said.returncode == 1
+    assert re.search("stopped: .*rosie", said.stdout)
+    assert f"nobody answers at {nobody_there}" in said.stderr
+    assert "was not told to stop" in said.stderr
     said = trade_command(*both, "estop", "--clear", "--limit", "2")
     assert said.returncode == 1
     assert "cleared: " in said.stdout

@@ -167,9 +167,13 @@ class Exchange(BusExchange[Axis]):
         self.answer_stops(now_ns)
 
     def _watch_halt(self, axis: Axis, now_ns: int, again: list[Axis]) -> None:
-        if axis.still >= 2 or not axis.may_hold_torque or axis.fault:
+        """A fault says nothing of its having stopped; but who has one is told nothing more.
+
+        Of who is silent nobody sees the rest: a stop says so, and who is back is not told to hold by an old one.
+        """
+        if axis.still >= 2 or not axis.may_hold_torque or axis.silent:
             axis.halting_since_ns = 0
-        elif now_ns - axis.halting_since_ns <= HALT_NS and axis.moved_since_held:
+        elif not axis.fault and now_ns - axis.halting_since_ns <= HALT_NS and axis.moved_since_held:
             again.append(axis)  # it was still on its way: so it need not come back as far
 
     def hold(self, axes: Sequence[Axis], now_ns: int) -> None:

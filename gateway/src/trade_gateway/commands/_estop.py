@@ -22,8 +22,8 @@ def estop(
 ) -> None:
     """Stop everything in the system at once, and let nothing move before it is cleared.
 
-    The exit code is not 0 if a container did not confirm, could not stop something, or if none was found; with --clear
-    also if nobody answers at one of the endpoints of TRADE_CONNECT: who is not heard cannot tell what is open there.
+    The exit code is not 0 if a container did not confirm, could not stop something, or if none was found; also if
+    nobody answers at one of the endpoints of TRADE_CONNECT: who is there was told nothing, and tells nothing.
     This is software: it is not safety-rated and replaces no switch that cuts the power.
 
     For example: trade estop --reason "smoke", and later trade estop --clear
@@ -34,19 +34,23 @@ def estop(
         raise UsageError(where="trade estop", problem="--reason is for stopping, and --clear clears")
     out = Output(as_json=as_json)
     with visitor(context) as container:
+        system = container.settings.system
         sight = container.sight(limit_s=limit) if clear else None
         report = container.estop(reason, limit_s=limit) if sight is None else _clear(container, sight, ids, limit)
-        system, own = container.settings.system, container.address.who
-    if report is None:
+        if report is None:
+            if as_json:
+                out.data(None)
+            out.say(f"no e-stop is open in system {escape(system)}")
+            return
         if as_json:
-            out.data(None)
-        out.say(f"no e-stop is open in system {escape(system)}")
-        return
-    if as_json:
-        out.data(report)
-    else:
-        _say(out, report, system, "cleared" if clear else "stopped", own)
-    if sight is not None and not sight.complete:
+            out.data(report)
+        else:
+            _say(out, report, system, "cleared" if clear else "stopped", container.address.who)
+        if sight is None:
+            sight = container.sight(limit_s=0)  # only now: an order waits for nobody
+    if sight.apart and not clear:
+        raise sight.nobody(system, "who is there was not told to stop; use the switch that cuts the power")
+    if clear and not sight.complete:
         raise sight.nobody(system, "what is open there stays open until it is cleared once more")
     if not report.complete:
         raise typer.Exit(1)
