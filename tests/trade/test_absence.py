@@ -53,3 +53,30 @@ def test_nobody_is_told_of_anybody_after_the_end(told: "queue.SimpleQueue[str]")
     absences.begin("me/leg/1")
     assert told.empty()
     assert not [thread for thread in threading.enumerate() if thread.name == "trade-absence"]
+
+
+def test_who_returns_while_he_is_told_of_as_gone_returns_after_that() -> None:
+    """What is told of him last is that he is there; else he would be forgotten while he lives."""
+    telling, told = threading.Event(), threading.Event()
+    order: list[str] = []
+
+    def gone(session: str) -> None:
+        telling.set()
+        assert told.wait(60)
+        order.append(f"{session} is gone")
+
+    absences = Absences(gone, lambda: False)
+    absences.begin("me/arm/1")
+    assert telling.wait(60)
+
+    def back() -> None:
+        was_away = absences.end("me/arm/1")
+        order.append(f"me/arm/1 is back, {was_away}")
+
+    returning = threading.Thread(target=back)
+    returning.start()
+    returning.join(0.1)
+    told.set()
+    returning.join(60)
+    absences.close()
+    assert order == ["me/arm/1 is gone", "me/arm/1 is back, False"]

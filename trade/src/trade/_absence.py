@@ -37,6 +37,8 @@ class Absences:
         self._due: dict[str, tuple[float, bool]] = {}
         """When to look at a session, and whether it is gone then."""
         self._changed = threading.Condition()
+        self._telling = threading.Lock()
+        """Held while somebody's being gone is told: who returns just then waits, and is found anew."""
         self._thread: threading.Thread | None = None
         self._closed = False
 
@@ -50,16 +52,26 @@ class Absences:
             self._changed.notify_all()
 
     def end(self, session: str) -> bool:
-        """Its sign of life rose; returns whether it was away, and is not gone yet."""
+        """Its sign of life rose; returns whether it was away, and is not gone yet.
+
+        If that is being told just now, it waits until it was.
+        """
+        with self._telling:
+            return self._came_out(session)
+
+    def _came_out(self, session: str) -> bool:
+        """Nothing is to be seen to about it any more; returns whether there was."""
         with self._changed:
             return self._due.pop(session, None) is not None
 
     def _run(self) -> None:
         while (session := self._next()) is not None:
-            self._gone(session)
+            with self._telling:
+                if self._came_out(session):
+                    self._gone(session)
 
     def _next(self) -> str | None:
-        """The next one that is gone for good; none once this is closed."""
+        """The next one that is to be told of as gone for good; none once this is closed."""
         with self._changed:
             while not self._closed:
                 first = min(self._due, key=self._due.__getitem__, default=None)
@@ -70,7 +82,6 @@ class Absences:
                 if (left_s := at - time.monotonic()) > 0:
                     self._changed.wait(left_s)
                 elif last or not self._bridge_lost():
-                    del self._due[first]
                     return first
                 else:
                     self._due[first] = (at + self._grace_s - self._look_s, True)
