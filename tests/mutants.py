@@ -35,7 +35,7 @@ def _anybody_may(patch: Patch) -> None:
 
 def _never_late(patch: Patch) -> None:
     """Calls and commands run however late they come."""
-    from trade._dispatch import LocalService
+    from trade._local_service import LocalService
     from trade_drivers import _work
     from trade_drivers.joints import _jobs
 

@@ -10,11 +10,11 @@ import msgspec
 
 from trade import (
     _container,
-    _dispatch,
     _estop,
     _estop_line,
     _estop_messages,
     _estop_store,
+    _local_service,
     _locks,
     _ongoing,
     _resources,
@@ -55,14 +55,14 @@ def _no_renewal(self: _locks.LockTable, numbers: Any, identity: str) -> list[int
     return list(numbers)
 
 
-_run: Any = _dispatch.LocalService.run
+_run: Any = _local_service.LocalService.run
 
 
-def _run_but_stops(self: _dispatch.LocalService, raw: Any, context: Any) -> Any:
+def _run_but_stops(self: _local_service.LocalService, raw: Any, context: Any) -> Any:
     return None if self.label == "peer.halt" else _run(self, raw, context)
 
 
-def _run_stops_late(self: _dispatch.LocalService, raw: Any, context: Any) -> Any:
+def _run_stops_late(self: _local_service.LocalService, raw: Any, context: Any) -> Any:
     if self.label == "peer.halt":
         time.sleep(6.0)
     return _run(self, raw, context)
@@ -71,7 +71,7 @@ def _run_stops_late(self: _dispatch.LocalService, raw: Any, context: Any) -> Any
 _places = threading.Semaphore(20)  # fewer than may wait for a lock
 
 
-def _run_in_line(self: _dispatch.LocalService, raw: Any, context: Any) -> Any:
+def _run_in_line(self: _local_service.LocalService, raw: Any, context: Any) -> Any:
     with _places if self.effect != "read" else contextlib.nullcontext():
         return _run(self, raw, context)
 
@@ -115,7 +115,7 @@ def _of_our_version(payload: bytes, identity: str) -> _wire.EstopOrder:
     return _estop_messages.decode_estop_order(payload, identity)
 
 
-_encode: Any = _dispatch.Signature.encode_result
+_encode: Any = _local_service.Signature.encode_result
 
 
 def _nonsense(self: Any, label: str, result: Any) -> bytes:
@@ -123,14 +123,14 @@ def _nonsense(self: Any, label: str, result: Any) -> bytes:
 
 
 BREAK: dict[str, Callable[[], None]] = {
-    "runs-late": _put(_dispatch.LocalService, "too_late", lambda self, expires_ns: False),
+    "runs-late": _put(_local_service.LocalService, "too_late", lambda self, expires_ns: False),
     "runs-twice": _put(_ongoing.Once, "begin", _as_if_new),
     "forgets-the-latest": _put(_ongoing.Once, "end", _end_in_64_bits),
     "ignores-locks": _put(_resources.Resource, "check_lock", lambda self, tokens, caller, session="": None),
     "ignores-sessions": _put(Deadman, "session_ended", lambda self, session: None),
-    "ignores-stops": _put(_dispatch.LocalService, "run", _run_but_stops),
-    "stops-late": _put(_dispatch.LocalService, "run", _run_stops_late),
-    "stops-in-line": _put(_dispatch.LocalService, "run", _run_in_line),
+    "ignores-stops": _put(_local_service.LocalService, "run", _run_but_stops),
+    "stops-late": _put(_local_service.LocalService, "run", _run_stops_late),
+    "stops-in-line": _put(_local_service.LocalService, "run", _run_in_line),
     "trusts-its-namesakes": _put(_resources.Resource, "_is_of", _of_one_identity),
     "ignores-epochs": _put(_resources.Resource, "check_lock", _check_numbers),
     "outlives-its-caller": _put(_container, "new_request", _as_long_as_usual),
@@ -147,7 +147,7 @@ BREAK: dict[str, Callable[[], None]] = {
     "ignores-cancels": _put(_ongoing.Ongoing, "cancel", lambda self: None),
     "endless-leases": _put(_locks.LockTable, "expire", lambda self: None),
     "grants-what-moves": _put(_locks.LockTable, "_running", lambda self, waiter: None),
-    "answers-nonsense": _put(_dispatch.Signature, "encode_result", _nonsense),
+    "answers-nonsense": _put(_local_service.Signature, "encode_result", _nonsense),
     "tells-no-tally": _put(Announcer, "beat", lambda self: None),
 }
 """By name, what breaks it: called before the container begins."""

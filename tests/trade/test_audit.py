@@ -10,7 +10,7 @@ import pytest
 
 from trade import Container, Resource, Secret, Settings, service, where
 from trade._audit_store import reading
-from trade._dispatch import LocalService
+from trade._local_service import LocalService
 from trade.auditing import AuditRow, verify
 from trade.errors import AccessDenied, ConfigurationError, InvalidArgument, LockedByOther, Stopped
 

@@ -11,8 +11,8 @@ import pytest
 
 from trade import Called, Container, Handle, Secret, current_call, errors, service, where
 from trade._context import CallContext
-from trade._dispatch import LocalService
 from trade._hooking import Hook
+from trade._local_service import LocalService
 from trade.errors import AccessDenied, ConfigurationError, NoSuchHook
 from waiting import wait_until
 

@@ -11,7 +11,7 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from trade import Container, Measure, Resource, Settings, service, where
-from trade._dispatch import LocalService
+from trade._local_service import LocalService
 from trade.errors import AccessDenied, ConfigurationError, InvalidArgument
 
 Start = Callable[..., Container]

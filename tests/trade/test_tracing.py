@@ -12,7 +12,7 @@ import pytest
 
 import trade._spans as noted
 from trade import Called, Container, Handle, Resource, Secret, Trace, current_call, service, where
-from trade._dispatch import LocalService
+from trade._local_service import LocalService
 from trade.errors import AccessDenied, NoSuchCall
 from trade.testing import MemorySystem, memory_system
 

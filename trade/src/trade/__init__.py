@@ -17,7 +17,7 @@ from trade._container import Container
 from trade._context import CallContext, current_call, progress
 from trade._estop_line import EstopReport
 from trade._estopping import LIMIT_S
-from trade._handle import Bound, Handle, Run
+from trade._handle import Bound, Handle
 from trade._hooking import Hook
 from trade._hooks import Called, HookInfo
 from trade._load import LoadInfo
@@ -30,6 +30,7 @@ from trade._notifications import Notification, NotificationInfo
 from trade._notifying import POLL_S
 from trade._occasions import What
 from trade._resources import Permit, Resource, permit
+from trade._run import Run
 from trade._sample import Sample
 from trade._secret import Secret
 from trade._service import service

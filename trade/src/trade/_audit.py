@@ -33,7 +33,7 @@ from trade.errors import (
 )
 
 if TYPE_CHECKING:
-    from trade._dispatch import Around, LocalService
+    from trade._local_service import Around, LocalService
 
 Kind = Literal["call", "read", "stop", "lock", "configure", "refused", "audit"]
 

@@ -8,9 +8,9 @@ from msgspec import structs
 
 from trade._borrowed import Borrowed, SharedResource
 from trade._codec import Codec
-from trade._dispatch import LocalService
 from trade._estopping import Estopping
 from trade._handle import Handle
+from trade._local_service import LocalService
 from trade._locking import Locking
 from trade._member import Member
 from trade._passing import Speaking, passed_on_service

@@ -13,7 +13,7 @@ from trade._bordering import Bordering
 from trade._context import running
 from trade._estop_services import EstopServices
 from trade._guarding import Guarding
-from trade._handle import Handle, Run
+from trade._handle import Handle
 from trade._hosting import Hosting
 from trade._invoke import container_closed
 from trade._measures import Measure
@@ -23,6 +23,7 @@ from trade._parts import Parts
 from trade._reach import Reach
 from trade._registry import Record
 from trade._request import new_request
+from trade._run import Run
 from trade._session import Session
 from trade._settings import Settings
 from trade._streaming import Streaming

@@ -7,7 +7,7 @@ from typing import Final
 
 from trade._audit import Audit
 from trade._context import CallContext
-from trade._dispatch import LocalService
+from trade._local_service import LocalService
 from trade._locks import within
 from trade._resources import Resource
 

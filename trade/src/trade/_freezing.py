@@ -5,7 +5,7 @@ import time
 from collections.abc import Callable, Generator, Mapping
 from typing import Final
 
-from trade._dispatch import LocalService
+from trade._local_service import LocalService
 from trade._locks import LockTable
 from trade._resources import Holder, Resource, locked
 from trade._terms import Terms

@@ -1,20 +1,19 @@
-"""Handles: values that name one service of one boot, and calls that were started without waiting."""
+"""Handles: values that name one service of one boot."""
 
 import asyncio
-import contextlib
 import logging
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Mapping
 from contextvars import Context
 from types import MappingProxyType
 from typing import Any, Final, NoReturn, Protocol
 
-from trade._bell import Bell
 from trade._registry import Record
+from trade._run import Run
 from trade._schemas import read_schema
 from trade._wire import Address, Scalar, ServiceKey
 from trade.errors import ConfigurationError
 
-__all__ = ["Bound", "Handle", "Run"]
+__all__ = ["Bound", "Handle"]
 
 LONGEST_DEADLINE_S: Final = 86_400.0
 
@@ -38,147 +37,6 @@ class Home(Protocol):
     def record(self, handle: "Handle") -> Record: ...
     def has(self, key: ServiceKey) -> bool: ...
     def asked_for(self, handle: "Handle") -> tuple[str, tuple[str, ...]]: ...
-
-
-class Run:
-    """A call under way. Wait with ``result()`` or ``await``; every one ends at its deadline at the latest."""
-
-    def __init__(self, handle: "Handle") -> None:
-        self._handle = handle
-        self._outcome: tuple[Any, BaseException | None] | None = None
-        """Its result or its error, once it has ended."""
-        self._ended = Bell()
-        self._told: list[Callable[[Run], object]] = []
-        self._progress: Any = None
-        self._on_progress: Callable[[Any], object] | None = None
-        self._cancelling = False
-        self._cancel_call: Callable[[], None] | None = None
-
-    def result(self, timeout_s: float | None = None) -> Any:
-        """The service's result, or its error raised.
-
-        Args:
-            timeout_s: give up waiting (not the call) after this long; raises TimeoutError.
-        """
-        result, error = self._wait(timeout_s)
-        if error is not None:
-            raise error
-        return result
-
-    def done(self) -> bool:
-        """Whether it has ended, well or not."""
-        return self._outcome is not None
-
-    def exception(self, timeout_s: float | None = None) -> BaseException | None:
-        """The error it ended with, or None."""
-        return self._wait(timeout_s)[1]
-
-    def _wait(self, timeout_s: float | None) -> tuple[Any, BaseException | None]:
-        if self._outcome is None:
-            self._ended.wait_for(self.done, timeout_s)
-        if self._outcome is None:
-            raise TimeoutError(f"{self._handle} has not ended after {timeout_s} s; it goes on")
-        return self._outcome
-
-    def when_done(self, tell: "Callable[[Run], object]") -> None:
-        """Have this called once it has ended, on the thread that learns of it; at once if it has."""
-        self._told.append(tell)
-        if self._outcome is not None:
-            self._tell()
-
-    def _tell(self) -> None:
-        """Each once, whichever thread comes first."""
-        while self._told:
-            try:
-                tell = self._told.pop(0)
-            except IndexError:  # another thread has told the last one
-                return
-            try:
-                tell(self)
-            except Exception:
-                _logger.exception("who was to learn that %s has ended failed", self._handle)
-
-    def cancel(self) -> None:
-        """End it early; the result then tells how it ended.
-
-        A call that has not begun never will, and raises Cancelled. One that runs is asked to end, and goes on if
-        it does not heed that. If its provider names a service that ends it, that is called, and waited for.
-        """
-        if self._outcome is not None:
-            return
-        self.ask_to_end()
-        if self._handle.record.info.cancel is not None:
-            self._handle.cancel_service()()
-
-    def ask_to_end(self) -> None:
-        """What `cancel` does first: ask the call alone to end. Does not wait."""
-        self._cancelling = True
-        tell = self._cancel_call
-        if tell is not None:
-            tell()
-
-    def progress(self) -> Any:
-        """What the service said last of how far it is, or None."""
-        return self._progress
-
-    @property
-    def cancelling(self) -> bool:
-        """Whether ``cancel()`` was called."""
-        return self._cancelling
-
-    def on_cancel(self, tell: Callable[[], None]) -> None:
-        """Told by the container: how to ask the call to end. Idempotent itself, as it may be used twice."""
-        self._cancel_call = tell
-        if self._cancelling:
-            tell()
-
-    def note_progress(self, value: Any) -> None:
-        """Told by the container: the service said this of how far it is."""
-        self._progress = value
-        if self._on_progress is not None:
-            self._on_progress(value)
-
-    def on_progress(self, tell: Callable[[Any], object]) -> None:
-        """Have this called with each that comes, on the thread that hears of it; with the last one at once."""
-        self._on_progress = tell
-        if self._progress is not None:
-            tell(self._progress)
-
-    def fail(self, error: BaseException) -> None:
-        """Told by the container: it could not begin."""
-        self._end(None, error)
-
-    def end(self, outcome: Callable[[], Any]) -> None:
-        """Told by the container: the outcome is what this returns or raises."""
-        try:
-            result = outcome()
-        except BaseException as error:  # noqa: BLE001 - whatever the service raised belongs to who asks for the result
-            self._end(None, error)
-        else:
-            self._end(result, None)
-
-    def _end(self, result: Any, error: BaseException | None) -> None:
-        self._outcome = (result, error)
-        self._ended.ring()
-        self._tell()
-
-    async def settled(self) -> None:
-        """Wait for its end from asyncio, well or not; the service goes on if this waiting is cancelled."""
-        loop, ended = asyncio.get_running_loop(), asyncio.Event()
-
-        def tell(_: object) -> None:
-            with contextlib.suppress(RuntimeError):  # nobody waits any more: that loop has ended
-                loop.call_soon_threadsafe(ended.set)
-
-        self.when_done(tell)
-        await ended.wait()
-
-    def __await__(self) -> Generator[Any, None, Any]:
-        return self._awaited().__await__()
-
-    async def _awaited(self) -> Any:
-        await self.settled()
-        return self.result()
 
 
 class Handle:

@@ -5,10 +5,11 @@ import logging
 from typing import Final
 
 from trade._constraints import Constraint, where
-from trade._handle import Bound, Handle, Run
+from trade._handle import Bound, Handle
 from trade._hooks import HookInfo, Side
 from trade._notifications import Notification
 from trade._notifying import Notifying
+from trade._run import Run
 from trade._system import DOMAIN, PROVIDER
 from trade._wire import ServiceKey
 from trade.errors import AccessDenied, ConfigurationError, ContainerLost, NoSuchHook, ServiceGone, TradeError

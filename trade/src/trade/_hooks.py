@@ -14,8 +14,8 @@ from trade._clockwork import Clockwork
 from trade._codec import Codec
 from trade._constraints import Constraint
 from trade._context import CallContext, holding, running
-from trade._dispatch import LocalService
 from trade._handle import Handle
+from trade._local_service import LocalService
 from trade._registry import Change, Record
 from trade._session import speaking
 from trade._spans import Recorded, Spans, traceable

@@ -13,15 +13,15 @@ from trade._arguments import encode_arguments, encode_call, given
 from trade._calls import Caller
 from trade._codec import Codec
 from trade._context import CallContext, handed_down, holding, running
-from trade._dispatch import LocalService
 from trade._failures import unpack_error
-from trade._handle import Run
 from trade._hands import Hands
+from trade._local_service import LocalService
 from trade._ongoing import Ongoing
 from trade._peer import Peer
 from trade._records import type_from_schema
 from trade._registry import Record
 from trade._request import DEFAULT_DEADLINE_S, Request, in_ns, new_request
+from trade._run import Run
 from trade._schemas import read_schema
 from trade._serial import Serial, Turn
 from trade._session import speaking

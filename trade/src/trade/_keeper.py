@@ -10,8 +10,9 @@ from typing import Any, Final, NoReturn, Protocol
 
 from msgspec import structs
 
-from trade._handle import Bound, Handle, Run
+from trade._handle import Bound, Handle
 from trade._lock import Lock, apart
+from trade._run import Run
 from trade._system import DOMAIN, PROVIDER
 from trade._terms import Terms
 from trade._wire import Address, ServiceKey, Token

@@ -6,9 +6,10 @@ from typing import Final, Protocol
 
 from trade._access import Access
 from trade._constraints import Constraint
-from trade._handle import Handle, Run
+from trade._handle import Handle
 from trade._keeper import Keeper
 from trade._lock import Lock, OnLost, OnRequest
+from trade._run import Run
 from trade._system import DOMAIN, PROVIDER
 from trade._terms import LockInfo, Terms
 from trade._wire import Address, ServiceKey

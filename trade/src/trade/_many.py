@@ -5,7 +5,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
-from trade._handle import Bound, Handle, Run
+from trade._handle import Bound, Handle
+from trade._run import Run
 
 __all__ = ["Outcome"]
 

@@ -4,9 +4,10 @@ from abc import ABC, abstractmethod
 from typing import Any
 
 from trade._access import Access
-from trade._handle import Handle, Run
+from trade._handle import Handle
 from trade._parts import Parts
 from trade._registry import Record
+from trade._run import Run
 from trade._wire import Address, ServiceKey
 
 

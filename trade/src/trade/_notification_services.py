@@ -9,7 +9,8 @@ from typing import Protocol
 from trade._access import Access
 from trade._context import served_call
 from trade._handle import Handle
-from trade._notifications import Notification, NotificationInfo, Notifier, Owner, Standing
+from trade._notifications import Notification, NotificationInfo, Owner, Standing
+from trade._notifier import Notifier
 from trade._occasions import OF_SERVICES, Deed, Terms
 from trade._registry import Record, Registry
 from trade._service import service

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 from msgspec import Struct
 
-from trade._dispatch import LocalService
+from trade._local_service import LocalService
 from trade._wire import ProviderInfo, Scalar, ServiceKey
 
 

@@ -13,7 +13,7 @@ from trade._wire import Call, Status, encode_message
 from trade.errors import Cancelled, OutcomeUnknown
 
 if TYPE_CHECKING:
-    from trade._dispatch import LocalService
+    from trade._local_service import LocalService
 
 GRACE_NS: Final = 5_000_000_000
 """How long after its deadline a call's answer is kept."""

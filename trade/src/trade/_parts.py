@@ -33,7 +33,7 @@ from trade._locks import LockTable
 from trade._making import Making
 from trade._measures import Measure
 from trade._metrics import open_metrics
-from trade._notifications import Notifier
+from trade._notifier import Notifier
 from trade._otlp import open_export
 from trade._policy_watch import begin_watching
 from trade._providers import Providers

@@ -10,9 +10,9 @@ from msgspec import Raw
 from trade._codec import Codec
 from trade._context import CallContext, current_call
 from trade._coroutines import AsyncLoop
-from trade._dispatch import LocalService
 from trade._failures import passed_on
 from trade._handle import LONGEST_DEADLINE_S, Handle
+from trade._local_service import LocalService
 from trade._resources import Resource
 from trade._schemas import read_schema
 from trade._service import Effect, ServiceMark

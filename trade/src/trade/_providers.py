@@ -15,7 +15,7 @@ from trade._audit import Audit
 from trade._codec import Codec
 from trade._constraints import checked_meta
 from trade._coroutines import AsyncLoop
-from trade._dispatch import LocalService
+from trade._local_service import LocalService
 from trade._locks import LockTable
 from trade._offerable import require_stop
 from trade._offers import Built, Offer, Registered

@@ -16,7 +16,7 @@ from trade._system import DOMAIN
 from trade._wire import Address, ServiceKey, Token
 
 if TYPE_CHECKING:
-    from trade._dispatch import Around, LocalService
+    from trade._local_service import Around, LocalService
     from trade._locks import LockTable
 
 MOST: Final = 10_000

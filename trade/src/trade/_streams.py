@@ -14,8 +14,8 @@ from msgspec import Raw, Struct, structs
 
 from trade._clockwork import Clockwork
 from trade._context import CallContext
-from trade._dispatch import LocalService
 from trade._handle import Handle
+from trade._local_service import LocalService
 from trade._pace import Pace
 from trade._registry import Change
 from trade._sample import STEPS_HZ, StreamSample, stream_key
