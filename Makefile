@@ -34,7 +34,7 @@ $(UV):
 	@$(PYTHON) -m venv .uv && .uv/bin/python -m pip install --quiet --disable-pip-version-check 'uv==0.13.8'
 
 demo: $(UV) ## a simulated robot looks, walks and grips for behaviours beyond a gateway (ARGS=--stay keeps it up)
-	@$(RUN) python examples/demo.py $(ARGS)
+	@$(RUN) --no-dev --group demo python examples/demo.py $(ARGS)
 
 test: $(UV) ## the whole test suite; in parts; the others run also when one fails
 	@mkdir -p build; rm -f build/failures; export TEST_FAILURES=build/failures; \

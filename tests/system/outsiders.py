@@ -21,6 +21,7 @@ from websockets.exceptions import WebSocketException
 from websockets.sync.client import ClientConnection, connect
 
 from system.careless import CENTRE_COUNTS, Careless, Refused
+from system.siege_records import CAN_BUS
 
 _LATER_S = 0.5
 """What a busy computer may take to pass an order on."""
@@ -102,7 +103,13 @@ class Page(Outsider):
         self.ask("resume", _LOOKS_S, group=joint)
 
     def _hold(self, hold: str, joint: str, taken: Any) -> None:
-        """Hold to move: set-points that end by themselves, one after the other; at the end a stop, or nothing more."""
+        """Hold to move: set-points that end by themselves, one after the other; at the end a stop, or nothing more.
+
+        A drive is told speeds as such, and its log has no goal that would say whose motion it was.
+        """
+        if f".{CAN_BUS}." in joint:
+            self._go(hold, joint, taken)
+            return
         side, until = self.random.choice((-1, 1)), now() + 3 * self.random.random()
         while now() < until:
             self.order(

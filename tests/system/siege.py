@@ -1,5 +1,7 @@
 """The siege: two simulated robots on one host, a gateway on another, clients on two more, and all their troubles.
 
+One joint is a drive on a CAN bus, the others are servos on serial buses.
+
 Clients are containers, a dashboard's page and an agent; they reach the gateway through `slow_wire`.
 """
 
@@ -23,10 +25,10 @@ from tests.holds import Log
 
 from system import wall_clock
 from system.networks import Member, Networks, ip
-from system.siege_records import Fault
+from system.siege_records import CAN_BUS, Fault
 from system.sites import DOOR, SYSTEM, Site
 from trade_gateway.door import add_token
-from trade_hil_sim import SimProcess
+from trade_hil_sim import BusOff, SimProcess
 
 _HERE: Final = Path(__file__).parent
 _KINDS: Final = ("planner", "planner", "planner", "planner", "page", "agent")
@@ -67,20 +69,35 @@ _JOINT: Final = """
 [joint."{name}"]
 bus = "{bus}"
 id = {id}
-model = "XL430-W250"
+{model}
 min_rad = -1.4
 max_rad = 1.4
 max_speed_rad_s = 2.5
 max_accel_rad_s2 = 20.0
 """
-_ROBOTS: Final = {"rosie": ("neck", ("pan", "tilt")), "dora": ("arm", ("elbow", "wrist"))}
+_SERVO: Final = ('driver = "dynamixel"\nport = "NOWHERE"', 'model = "XL430-W250"')
+_DRIVE: Final = (
+    'driver = "cia402"\ninterface = "socketcand"\nchannel = "NOWHERE"\nwatchdog_s = 0.5',
+    'model = "ACME-EC60"\ncounts_per_rev = 4096\ngear = 1',
+)
+"""It has as many counts as a servo, so clients say of both in the same way where to."""
+_ROBOTS: Final = {
+    "rosie": {"neck": (_SERVO, ("pan", "tilt"))},
+    "dora": {"arm": (_SERVO, ("elbow",)), CAN_BUS: (_DRIVE, ("hip",))},
+}
 
 
-def _robot_file(robot: str) -> str:
-    bus, joints = _ROBOTS[robot]
-    return f'[robot]\nname = "{robot}"\n\n[bus.{bus}]\ndriver = "dynamixel"\nport = "/dev/ttyNOWHERE"\n' + "".join(
-        _JOINT.format(name=f"{bus}.{joint}", bus=bus, id=number) for number, joint in enumerate(joints, 1)
-    )
+def _robot_file(robot: str, ports: Mapping[str, str] = {}) -> str:
+    """Of a robot; before its devices are there, nobody knows where its buses are."""
+    text = f'[robot]\nname = "{robot}"\n'
+    for bus, ((driver, model), joints) in _ROBOTS[robot].items():
+        port = ports.get(bus, "can0" if bus == CAN_BUS else "/dev/ttyNOWHERE").removeprefix("socketcand:")
+        text += f"\n[bus.{bus}]\n{driver.replace('NOWHERE', port)}\n"
+        text += "".join(
+            _JOINT.format(name=f"{bus}.{joint}", bus=bus, id=number, model=model)
+            for number, joint in enumerate(joints, 1)
+        )
+    return text
 
 
 class Kept:
@@ -138,8 +155,16 @@ class Kept:
         self._complaints.close()
 
 
+def _python_on(site: Site, host: str) -> Path:
+    """A Python that runs on that host: sockets of the simulator are there."""
+    script = site.folder / f"python-on-{host}"
+    script.write_text(f'#!/bin/sh\nexec ip netns exec {site.networks.host(host)} {sys.executable} "$@"\n')
+    script.chmod(0o755)
+    return script
+
+
 class Driver(Kept):
-    """A robot's simulated servos, and beside them its driver, whose wall clock can be shifted."""
+    """A robot's simulated devices, and beside them its driver, whose wall clock can be shifted."""
 
     def __init__(self, site: Site, robot: str, mutant: str = "") -> None:
         self.robot = robot
@@ -147,11 +172,9 @@ class Driver(Kept):
         wall_clock.shift(self.clock, 0.0)
         file = site.folder / f"{robot}.toml"
         file.write_text(_robot_file(robot))
-        self.sim = SimProcess(file)
-        text = file.read_text()
-        for port in self.sim.ports.values():
-            text = text.replace("/dev/ttyNOWHERE", port)
-        file.write_text(text)
+        with mock.patch.object(sys, "executable", str(_python_on(site, "left"))):
+            self.sim = SimProcess(file)
+        file.write_text(_robot_file(robot, self.sim.ports))
         program = [str(_HERE / "broken_driver.py"), mutant] if mutant else ["-m", "trade_gateway"]
         self._file = file
         super().__init__(site, "left", robot, DOOR["private"], self._words(program))
@@ -309,6 +332,12 @@ class Stand:
         driver.sim.control.unplug()
         return self._noted("unplug", driver.robot, driver.sim.control.replug)
 
+    def bus_off(self) -> Callable[[], None]:
+        """The adapter of the CAN bus has seen too many errors: it neither hears nor says anything."""
+        control = self.drivers["dora"].sim.control
+        control.do(BusOff(bus=CAN_BUS))
+        return self._noted("bus off", "dora", lambda: control.do(BusOff(bus=CAN_BUS, on=False)))
+
     def kill_gateway(self) -> Callable[[], None]:
         self._noted("kill gateway", "door", None)
         self.site.end(signal.SIGKILL)
@@ -418,6 +447,7 @@ TROUBLES: Final[Mapping[str, Callable[[Stand], Callable[[], None]]]] = {
     "kill driver": Stand.kill_driver,
     "freeze driver": Stand.freeze_driver,
     "unplug": Stand.unplug,
+    "bus off": Stand.bus_off,
     "kill gateway": Stand.kill_gateway,
     "freeze gateway": Stand.freeze_gateway,
     "kill door": Stand.kill_door,

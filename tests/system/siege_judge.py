@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from tests.holds import Owned, Verdict, asks_without_end, by_kind, owned, two_owners
 
-from system.siege_records import Answer, AnyRecord, Fault, Order
+from system.siege_records import CAN_BUS, Answer, AnyRecord, Fault, Order
 from trade_hil_sim import Entry
 
 STOPS_S = 6.0
@@ -25,6 +25,10 @@ _FREE = ":free"
 """What holds are named that no lock was asked for: among these the last one wins."""
 _SPEED, _GOAL = 112, 116
 """Addresses of profile velocity and goal position, four bytes each: XL430 e-Manual, control table."""
+_GO, _HALT, _QUICK_STOP, _NO_QUICK_STOP = 1 << 4, 1 << 8, 1 << 1, 1 << 2
+"""Bits of a drive's controlword: new set-point, halt; a quick stop is the one without the other: CiA 402-2."""
+_CENTRE = 2048
+"""Where a servo counts from, and a drive does not."""
 
 
 class Motion(NamedTuple):
@@ -63,6 +67,8 @@ def judge(records: Iterable[AnyRecord], logs: Mapping[str, Iterable[Entry]]) -> 
     verdict.counts.update(f"answer {answer.how}" for answer in known[Answer])
     verdict.counts.update(f"order of a {_kind(order.number)}" for order in known[Order])
     verdict.counts["motion"] = sum(len(of) for of in motions.values())
+    of_drives = [of for resource, of in motions.items() if f".{CAN_BUS}." in resource]
+    verdict.counts["motion of a drive"] = sum(map(len, of_drives))
     verdict.counts["motion turned"] = sum(motion.turned for of in motions.values() for motion in of)
     surely = owned(known)
     killed = {fault.whom for fault in known[Fault] if fault.what == "kill client"}
@@ -78,8 +84,12 @@ def judge(records: Iterable[AnyRecord], logs: Mapping[str, Iterable[Entry]]) -> 
 def motions_of(entries: Iterable[Entry]) -> dict[str, list[Motion]]:
     """By joint, what it did: it tells of setting off and of rest; on its way, what it was told counts."""
     found: dict[str, list[Motion]] = defaultdict(list)
+    drives: dict[str, Drive] = defaultdict(Drive)
     for entry in entries:
         of = found[entry.joint]
+        if entry.joint.startswith(f"{CAN_BUS}."):
+            drives[entry.joint].take(entry, of)
+            continue
         going = bool(of) and of[-1].rests == inf
         match entry.kind, entry.name:
             case "event", "motion_started":
@@ -95,6 +105,35 @@ def motions_of(entries: Iterable[Entry]) -> dict[str, list[Motion]]:
                     of.append(Motion(entry.t, goal, entry.position_counts or 0, turned=True))
     found.pop("", None)
     return found
+
+
+class Drive:
+    """What a drive was told last: it tells that it sets off, but not where to."""
+
+    def __init__(self) -> None:
+        self._word = self._goal = 0
+
+    def take(self, entry: Entry, of: list[Motion]) -> None:
+        """Add to its motions what an entry of its log says."""
+        going, at = bool(of) and of[-1].rests == inf, (entry.position_counts or 0) + _CENTRE
+        match entry.kind, entry.name:
+            case "event", "motion_started" if not going:
+                of.append(Motion(entry.t, self._goal, at, stopped=_stops(self._word)))
+            case "event", "at_rest" | "torque_off" | "rebooted" if going:
+                of[-1] = of[-1]._replace(rests=entry.t)
+            case "instruction", _ if entry.registers[:2] == ("controlword", "target_position"):
+                before, self._word = self._word, int.from_bytes(entry.data[:2], "little")
+                if self._word & ~before & _GO:
+                    self._goal = int.from_bytes(entry.data[2:6], "little", signed=True) + _CENTRE
+                    if going:
+                        of[-1] = of[-1]._replace(rests=entry.t)
+                        of.append(Motion(entry.t, self._goal, at, turned=True))
+                elif going and _stops(self._word):
+                    of[-1] = of[-1]._replace(stopped=True)
+
+
+def _stops(word: int) -> bool:
+    return bool(word & _HALT) or word & (_QUICK_STOP | _NO_QUICK_STOP) == _QUICK_STOP
 
 
 def _written(entry: Entry, address: int) -> int | None:
@@ -205,6 +244,8 @@ def _must_rest_s(fault: Fault, order: Order, resource: str) -> float | None:
             return STOPS_S if _kind(order.number) == "page" else None
         case "kill gateway" | "freeze gateway" | "cut" | "one way":
             return STOPS_S
+        case "bus off":
+            return WATCHED_S if resource.startswith(f"{fault.whom}.{CAN_BUS}.") else None
         case "kill driver" | "freeze driver" | "unplug":
             return WATCHED_S if fault.whom == robot else None
         case _:

@@ -1,6 +1,11 @@
 """What clients of the siege note beyond what clients of locks do, and what is done to whom."""
 
+from typing import Final
+
 from tests.holds import Ask, Done, Held, Record, Seen
+
+CAN_BUS: Final = "leg"
+"""The bus with a drive; joints of all others are servos."""
 
 
 class Order(Record):

@@ -1,6 +1,8 @@
 """Two robots, a gateway and planners on four hosts under every trouble there is; the simulators' logs are the judge."""
 
+import math
 import os
+import struct
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -51,6 +53,7 @@ def test_nothing_moves_that_must_not_whatever_befalls_them(besieged: Stand) -> N
         assert threads <= before[name][1] + 30, f"{name} has {threads} threads, {before[name][1]} before"
     assert min(count[f"fault {kind}"] for kind in KINDS) >= FEWEST
     assert min(count["held"], count["answer arrived"], count["order carried out"]) > 5  # it was about something
+    assert count["motion of a drive"] > 0
     assert min(count[f"order of a {kind}"] for kind in ("planner", "page", "agent")) > 5
     assert count["held back"] > 0 or "delay" not in KINDS
 
@@ -134,6 +137,7 @@ STOP = 104
             "and on for 2.5 s",
         ),
         ((*GOOD, Fault(t=3, what="kill driver", whom="dora", until=1e12)), [begun(2.5, 2500), rest(5.5)], ""),
+        ((*GOOD, Fault(t=3, what="bus off", whom="rosie", until=1e12)), [begun(2.5, 2500), rest(5.5)], ""),
         ((*GOOD, Fault(t=3, what="cut", whom="net1", until=4)), [begun(2.5, 2500), rest(20)], ""),
         ((*GOOD, Fault(t=3, what="cut", whom="net1", until=19)), [begun(2.5, 2500), rest(20)], "after cut net1"),
         ((*GOOD, Fault(t=3, what="kill client", whom="a", until=1e12)), [begun(2.5, 2500)], "after kill client a"),
@@ -159,6 +163,43 @@ def test_motions_are_read_from_what_devices_did_and_were_told() -> None:
     assert one == (1, 2500, 2048, 2.1, True, False)
     assert two == (2.1, 1500, 2301, 3, False, True)
     assert two.far == 801
+
+
+def commanded(t: float, word: int, counts: int, at: int) -> Entry:
+    """A drive's first RPDO."""
+    return Entry(
+        t=t,
+        bus="leg",
+        kind="instruction",
+        name="rpdo1",
+        joint="leg.hip",
+        position_counts=at,
+        registers=("controlword", "target_position"),
+        hex=struct.pack("<Hi", word, counts).hex(),
+    )
+
+
+def drive_says(t: float, name: str, at: int) -> Entry:
+    return Entry(t=t, bus="leg", kind="event", name=name, joint="leg.hip", position_counts=at)
+
+
+def test_motions_of_a_drive_are_read_from_what_it_did_and_was_told() -> None:
+    [one, two, three] = motions_of(
+        [
+            commanded(1, 0x3F, 452, 0),
+            drive_says(1.01, "motion_started", 0),
+            commanded(1.02, 0x2F, 452, 1),  # the end of the handshake
+            commanded(2, 0x3F, -100, 242),
+            commanded(3, 0x12F, 30, 40),  # halt
+            drive_says(3.5, "at_rest", 20),
+            commanded(4, 0x3F, 500, 20),
+            drive_says(4.01, "motion_started", 20),
+            commanded(5, 0x0B, 500, 300),  # quick stop
+        ]
+    )["leg.hip"]
+    assert one == (1.01, 2500, 2048, 2, False, False)
+    assert two == (2, 1948, 2290, 3.5, True, True)
+    assert three == (4.01, 2548, 2068, math.inf, True, False)
 
 
 @pytest.mark.parametrize("guilty", [{"cut"}, {"cut", "unplug"}, {"kill client", "delay", "disk"}])

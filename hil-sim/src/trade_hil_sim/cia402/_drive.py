@@ -347,6 +347,7 @@ class Drive:
                 address=values[0][0].index if name == "sdo_write" else None,
                 registers=tuple(entry.name for entry, _ in values),
                 moves=moves,
+                position_counts=round(self._shaft.position(t) - self.modes.zero),
             )
         )
 
