@@ -1,8 +1,10 @@
-"""Tables of the command line: whole in a pipe, no wider than the terminal otherwise."""
+"""What people are shown on the command line: tables no wider than a terminal, and no more digits than they read."""
+
+import json
 
 import pytest
 
-from trade_gateway.commands._output import table_lines
+from trade_gateway.commands._output import Output, table_lines
 
 COLUMNS = ("SERVICE", "CALLED AS", "EFFECT", "HOST")
 ROWS = [
@@ -39,3 +41,17 @@ def test_what_does_not_fit_is_left_out_and_named() -> None:
     head, *_, last = table_lines(COLUMNS, ROWS, 50)
     assert head.split() == ["SERVICE", "CALLED", "AS", "EFFECT"]
     assert last == "(HOST: in a wider terminal, or with --json)"
+
+
+def test_people_get_no_more_digits_than_they_read_and_programs_get_all(capsys: pytest.CaptureFixture[str]) -> None:
+    value = {
+        "position_rad": 0.30000000000000004,
+        "small": 0.0000123456789,
+        "at": [1791234567.123456789, 3],
+        "none": None,
+    }
+    Output(as_json=False).data(value)
+    shown = capsys.readouterr().out
+    assert json.loads(shown) == {"position_rad": 0.3, "small": 1.235e-05, "at": [1791234567.123457, 3], "none": None}
+    Output(as_json=True).data(value)
+    assert json.loads(capsys.readouterr().out) == value

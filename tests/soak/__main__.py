@@ -209,7 +209,10 @@ def main() -> int:
         "--loopback", action="store_true", help="on loopback addresses, also where there could be namespaces"
     )
     parser.add_argument(
-        "--patience", type=float, default=0.0, help="share of rounds that may lose a device for a moment"
+        "--patience",
+        type=float,
+        default=0.01,
+        help="share of a planner's rounds that may lose a device for a moment, as the computer did not get round to it",
     )
     parser.add_argument("--json", type=Path, default=Path("build/soak.json"), help="where to leave the samples")
     parser.add_argument("--svg", type=Path, default=Path("build/soak.svg"), help="where to leave the plots")

@@ -38,6 +38,8 @@ def call(
 ) -> None:
     """Call a service and print its result; Ctrl-C cancels a motion under way.
 
+    What is printed for people is rounded to six places; --json has all digits.
+
     For example: trade call rosie.head.move_to '[0.3, -0.2]' speed_rad_s=0.5
     """
     args, kwargs = parse_arguments(arguments or [])

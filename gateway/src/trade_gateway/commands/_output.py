@@ -1,5 +1,6 @@
 """How the command line speaks: tables for people, JSON lines for programs, errors on stderr."""
 
+import json
 import shutil
 import sys
 from collections.abc import Sequence
@@ -12,6 +13,7 @@ from rich.markup import escape
 from trade.errors import ConfigurationError
 
 _GAP: Final = "  "
+_SMALL: Final = 1e-3
 _LEAST: Final = 20
 """No column is cut shorter than this; columns on the right are left out before."""
 
@@ -28,9 +30,11 @@ class Output:
         self._console = Console(highlight=False, soft_wrap=True)
 
     def data(self, value: Any) -> None:
-        """A result: one line of JSON, or indented for people."""
-        data = msgspec.json.encode(value)
-        print(data.decode() if self.as_json else msgspec.json.format(data, indent=2).decode(), flush=True)  # noqa: T201
+        """A result: one line of JSON, or indented for people, who get no more digits than anybody reads."""
+        text = msgspec.json.encode(value).decode()
+        if not self.as_json:
+            text = json.dumps(json.loads(text, parse_float=_readable), indent=2, ensure_ascii=False)
+        print(text, flush=True)  # noqa: T201
 
     def say(self, text: str) -> None:
         """A line for people; programs do not get it."""
@@ -46,6 +50,12 @@ class Output:
         for line in lines:
             self._console.print(line, markup=False)
         sys.stdout.flush()
+
+
+def _readable(number: str) -> float:
+    """Rounded to six places; where this leaves little, to four digits."""
+    value = float(number)
+    return round(value, 6) if abs(value) >= _SMALL else float(f"{value:.4g}")
 
 
 def table_lines(columns: Sequence[str], rows: Sequence[Sequence[str]], width: int | None) -> list[str]:
