@@ -56,6 +56,8 @@ class Soak:
         self._began = time.monotonic()
         self._ended = threading.Event()
         self._told = 0.0
+        self._known = set[str]()
+        """What went wrong, and was told."""
 
     def now(self) -> float:
         return time.monotonic() - self._began
@@ -167,8 +169,12 @@ class Soak:
         if time.monotonic() - self._told < 60:
             return
         self._told = time.monotonic()
-        errors = sum(sum(said.errors.values()) for said in {said.planner: said for said in self.run.said}.values())
-        print(f"{self.now() / 60:.0f} of {seconds / 60:.0f} min, {errors} errors", flush=True)
+        last = {said.planner: said for said in self.run.said}
+        errors = {f"{name}: {error}": count for name, said in last.items() for error, count in said.errors.items()}
+        print(f"{self.now() / 60:.0f} of {seconds / 60:.0f} min, {sum(errors.values())} errors", flush=True)
+        for error in errors.keys() - self._known:
+            print(f"  {error}", flush=True)
+        self._known |= errors.keys()
 
 
 def _named(command: list[str]) -> str:

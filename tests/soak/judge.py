@@ -17,7 +17,8 @@ _SILENT_S: Final = 120.0
 """A planner that got no round done in so long stands still."""
 _QUARTERS: Final = 4
 _SILENT: Final = ("DeviceSilent: ", "MotionStopped: ")
-"""A driver that was held up holds what moves, and says so."""
+_LET_GO: Final = ("watchdog", "heard nothing for too long", "it was away", "lost its activation", "is not activated")
+"""A driver that was held up holds what moves, and says so; a device that missed it may have stopped by itself."""
 
 
 class Sample(Struct, frozen=True):
@@ -83,11 +84,16 @@ def by_process(samples: Sequence[Sample]) -> Mapping[str, list[Sample]]:
 
 
 def _errors(planner: str, last: Said, patience: float) -> Iterator[str]:
-    silent = {error: count for error, count in last.errors.items() if error.startswith(_SILENT)}
+    silent = {error: count for error, count in last.errors.items() if _lost(error)}
     few = sum(silent.values()) <= patience * last.counts.get("rounds", 0)
     for error, count in last.errors.items():
         if not (few and error in silent):
             yield f"{planner}: {error} ({count} times)"
+
+
+def _lost(error: str) -> bool:
+    """Whether it says that a device was silent for a moment, or what came of that."""
+    return error.startswith(_SILENT) or (error.startswith("DeviceFault: ") and any(word in error for word in _LET_GO))
 
 
 def _by_planner(said: Sequence[Said]) -> Mapping[str, list[Said]]:

@@ -84,12 +84,10 @@ class Hand:
         self.of = where(group=group)
         names = ("activate", "open", "close", "state")
         self._activate, self._open, self._close, self.state = (found(self.of, name) for name in names)
-        self._active = False
 
     def act(self) -> None:
-        if not self._active:
+        if not self.state().activated:  # at first, and after a stop while it could not be heard
             self._activate()
-            self._active = True
         self._close()
         self._open()
 

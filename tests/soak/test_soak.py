@@ -30,6 +30,8 @@ def said(until: int = SECONDS, errors: dict[str, int] | None = None) -> list[Sai
     ]
 
 
+LET_GO = "DeviceFault: rosie.tail.tip on can0: error: watchdog timer expired; call enable()"
+FAULT = "DeviceFault: rosie.tail.tip on can0: overload; remove the cause, then call enable()"
 GOOD = Run(seconds=SECONDS, samples=samples(), said=said(), passers=3)
 
 
@@ -55,6 +57,8 @@ GOOD = Run(seconds=SECONDS, samples=samples(), said=said(), passers=3)
             "x (3 times)",
         ),
         (Run(seconds=SECONDS, samples=samples(), said=said(errors={"Timeout: x": 1}), patience=0.05), "Timeout: x"),
+        (Run(seconds=SECONDS, samples=samples(), said=said(errors={LET_GO: 1}), patience=0.05), ""),
+        (Run(seconds=SECONDS, samples=samples(), said=said(errors={FAULT: 1}), patience=0.05), "overload"),
         (Run(seconds=SECONDS, samples=samples(), said=said(), complaints=["a page was cut off"]), "cut off"),
     ],
 )
