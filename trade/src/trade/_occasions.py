@@ -16,6 +16,8 @@ Occasion = Literal["joined", "left", "changed", "once", "after", "at", "every"]
 OF_SERVICES: Final = frozenset({"joined", "left", "changed"})
 
 SHORTEST_S: Final = 0.001
+_YEAR_10000_S: Final = 253_402_300_800
+"""Since 1970."""
 LONGEST_S: Final = 10 * 366 * 86_400.0
 
 
@@ -61,6 +63,8 @@ class Terms(Struct, frozen=True, kw_only=True):
             _check_s(self.occasion, "s", self.s, SHORTEST_S)
         elif self.occasion == "after":
             _check_s(self.occasion, "s", self.s, 0.0)
+        elif self.occasion == "at" and not 0 <= self.at < _YEAR_10000_S:
+            raise ConfigurationError(where="trade.at", problem=f"there is no such moment: {self.at!r} s since 1970")
         _check_s(self.occasion, "poll_s", self.poll_s, SHORTEST_S)
 
     def __str__(self) -> str:

@@ -13,6 +13,7 @@ from typing import Any, Final, NamedTuple
 from msgspec import Struct, structs
 
 from trade._context import CallContext, running
+from trade._moments import clock
 from trade._session import foreign
 from trade._wire import Token
 from trade.errors import LockedByOther, LockLost, MotionStopped, NotStopped, SessionEnded, Stopped
@@ -242,7 +243,7 @@ def locked(resource: Resource, holder: Holder | None, session: str = "") -> Lock
 
 def not_stopped(resource: Resource, container: str) -> NotStopped:
     """The error of who wants what could not be stopped."""
-    when = time.strftime("%H:%M:%S", time.localtime(resource.unsafe_at))
+    when = clock(resource.unsafe_at)
     reason, waited_s = f"at {when} ({resource.unsafe})", max(0.0, time.time() - resource.unsafe_at)
     return NotStopped(device=resource.name, bus=container, waited_s=waited_s, reason=reason)
 

@@ -6,10 +6,11 @@ builtin a Python programmer would catch for it, so ``except TimeoutError`` finds
 One module on purpose, however long: whoever catches reads the tree as a whole.
 """
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Final
+
+from trade._moments import clock
 
 __all__ = [
     "AccessDenied",
@@ -400,7 +401,7 @@ class LockedByOther(CallerError, PermissionError):
     def describe(self) -> str:
         what = ", ".join(self.resources)
         aim = f" for {self.purpose!r}" if self.purpose else ""
-        when = f" since {time.strftime('%H:%M:%S', time.localtime(self.since))}" if self.since else ""
+        when = f" since {clock(self.since)}" if self.since else ""
         if self.own:
             hint = "that is this container itself: in another thread use `with lock.use():`"
         else:

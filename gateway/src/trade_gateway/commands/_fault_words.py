@@ -1,6 +1,5 @@
 """``trade faults``: what is or was wrong with devices, what they measured then, and that somebody has seen it."""
 
-import time
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated, Final
 
@@ -8,6 +7,7 @@ import typer
 from rich.markup import escape
 
 from trade import Container, where
+from trade._moments import day_and_clock
 from trade.errors import TradeError
 from trade_gateway.commands._by_default import FirstByDefault
 from trade_gateway.commands._list import Json, asked_for
@@ -82,7 +82,7 @@ def show(
     out.say(f"[bold]{escape(fault.text)}[/]" + (f"; {escape(fault.remedy)}" if fault.remedy else ""))
     out.say(f"{_state(fault)}; began {_times(fault)}, was there for {fault.lasted_s:.1f} s in all")
     if fault.acknowledged_at is not None:
-        out.say(f"seen by {escape(fault.acknowledged_by)} at {_clock(fault.acknowledged_at)}")
+        out.say(f"seen by {escape(fault.acknowledged_by)} at {day_and_clock(fault.acknowledged_at)}")
     for note in fault.evidence:
         out.say(f"evidence: {escape(note)}")
     samples = fault.first if first else fault.latest
@@ -129,8 +129,8 @@ def _row(info: "FaultInfo") -> tuple[str, ...]:
         info.kind,
         _state(info),
         str(info.count),
-        _clock(info.first_at),
-        _clock(info.last_at),
+        day_and_clock(info.first_at),
+        day_and_clock(info.last_at),
         info.acknowledged_by,
     )
 
@@ -141,12 +141,8 @@ def _state(info: "FaultInfo") -> str:
 
 def _times(info: "FaultInfo") -> str:
     if info.count == 1:
-        return f"once, {_clock(info.first_at)}"
-    return f"{info.count} times, first {_clock(info.first_at)}, last {_clock(info.last_at)}"
-
-
-def _clock(at: float) -> str:
-    return time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(at))
+        return f"once, {day_and_clock(info.first_at)}"
+    return f"{info.count} times, first {day_and_clock(info.first_at)}, last {day_and_clock(info.last_at)}"
 
 
 def _samples_table(samples: "Sequence[FaultSample]") -> tuple[tuple[str, ...], list[tuple[str, ...]]]:

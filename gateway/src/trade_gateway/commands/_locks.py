@@ -1,12 +1,12 @@
 """``trade locks``, ``unlock`` and ``resume``: who has what for himself, taking it away, letting it move again."""
 
-import time
 from typing import Annotated
 
 import typer
 from rich.markup import escape
 
 from trade import LockInfo
+from trade._moments import clock
 from trade_gateway.commands._list import Json, asked_for
 from trade_gateway.commands._output import Output
 from trade_gateway.commands._system_choice import visitor_among_others
@@ -55,7 +55,7 @@ def _row(info: LockInfo) -> tuple[str, ...]:
         ", ".join(info.resources),
         _owner(info),
         info.holder.purpose,
-        time.strftime("%H:%M:%S", time.localtime(info.holder.since)),
+        clock(info.holder.since),
         f"{info.left_s:.1f} s" if info.token.number else "",  # what nobody gets has no lease
         info.container,
         ", ".join(info.waiting),

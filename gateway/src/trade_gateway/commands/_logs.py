@@ -8,10 +8,11 @@ import typer
 from rich.markup import escape
 
 from trade import LogLine, LogReader
+from trade._moments import clock
 from trade_gateway.commands._list import Json
 from trade_gateway.commands._output import Output
 from trade_gateway.commands._system_choice import visitor_among_others
-from trade_gateway.commands._trace import Name, clock
+from trade_gateway.commands._trace import Name
 
 _EVERY_S: Final = 0.5
 Level = Literal["debug", "info", "warning", "error", "critical"]
@@ -53,4 +54,4 @@ def _say(out: Output, line: LogLine) -> None:
     if out.as_json:
         out.data(line)
     call = f"  (call {line.call_id})" if line.call_id else ""
-    out.say(escape(f"{clock(line.at)} {line.level_name:8} {line.container}: {line.text}{call}"))
+    out.say(escape(f"{clock(line.at, ms=True)} {line.level_name:8} {line.container}: {line.text}{call}"))

@@ -1,7 +1,6 @@
 """``trade rules``: have a system configure itself by a rules file, try one out, see what stands."""
 
 import queue
-import time
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -9,6 +8,7 @@ import typer
 from rich.markup import escape
 
 from trade import Container, where
+from trade._moments import clock
 from trade.errors import TradeError
 from trade.rules import GROUP, Did, Firing, Rehearsal, RuleInfo, Rules, read_rules, rehearse
 from trade_gateway.commands._detached import Detach, detach_now, ready
@@ -91,7 +91,7 @@ def _say_firings(out: Output, told: "queue.SimpleQueue[Firing]") -> None:
         if out.as_json:
             out.data(firing)
             continue
-        at = time.strftime("%H:%M:%S", time.localtime(firing.at))
+        at = clock(firing.at)
         about = f" ({firing.service})" if firing.service else ""
         out.say(f"{at} [bold]{firing.rule}[/]: {escape(f'{firing.occasion}{about}')}")
         for did in firing.steps:

@@ -1,13 +1,13 @@
 """``trade stream GROUP.NAME``: print what a service answers, again and again."""
 
 import itertools
-import time
 from typing import Annotated
 
 import msgspec
 import typer
 
 from trade import Sample
+from trade._moments import clock
 from trade_gateway.commands._call import find
 from trade_gateway.commands._list import Json
 from trade_gateway.commands._output import Output
@@ -41,6 +41,5 @@ def stream(
 
 
 def _line(sample: Sample) -> str:
-    at = time.strftime("%H:%M:%S", time.localtime(sample.at)) + f"{sample.at % 1:.3f}"[1:]
     missing = f"  ({sample.dropped} missing before it)" if sample.dropped else ""
-    return f"{at}  {msgspec.json.encode(sample.value).decode()}{missing}"
+    return f"{clock(sample.at, ms=True)}  {msgspec.json.encode(sample.value).decode()}{missing}"

@@ -15,6 +15,7 @@ from rich.live import Live
 from rich.text import Text
 
 from trade import Container, Handle, LoadInfo, where
+from trade._moments import clock
 from trade._wire import HEALTHY
 from trade_gateway._loads import loads_table
 from trade_gateway.commands._list import Json
@@ -134,8 +135,11 @@ def _lines(shown: Shown, width: int | None) -> list[str]:
     """The whole screen."""
     counts = [f"{len(shown.containers) + len(shown.silent)} containers", f"{shown.services} services"]
     counts += [f"{len(items)} {word}" for items, word in ((shown.unwell, "not well"), (shown.locks, "locked")) if items]
-    clock = time.strftime("%H:%M:%S", time.localtime(shown.at))
-    lines = [f"{shown.system}  {clock}  {', '.join(counts)}", *(f"E-STOP OPEN, by {one}" for one in shown.estops), ""]
+    lines = [
+        f"{shown.system}  {clock(shown.at)}  {', '.join(counts)}",
+        *(f"E-STOP OPEN, by {one}" for one in shown.estops),
+        "",
+    ]
     columns, rows = loads_table(shown.containers)
     rows += [(name, "no answer", *[""] * (len(columns) - 2)) for name in shown.silent]
     lines += table_lines(columns, rows, width)

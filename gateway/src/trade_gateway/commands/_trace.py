@@ -1,12 +1,12 @@
 """``trade tracing`` and ``trade trace``: have calls noted, and see the tree that one belongs to."""
 
-import time
 from collections.abc import Iterator
 from typing import Annotated, Final, Literal
 
 import typer
 
 from trade import Span, Trace
+from trade._moments import clock
 from trade_gateway.commands._list import Json
 from trade_gateway.commands._output import Output, UsageError
 from trade_gateway.commands._system_choice import visitor_among_others
@@ -72,7 +72,7 @@ def _list(out: Output, spans: list[Span]) -> None:
         out.say("no call has been noted; [bold]trade tracing on[/] has calls noted from now on")
     else:
         rows = [
-            (str(span.call_id), span.service, clock(span.began), _ms(span.took_s), span.outcome, span.caller)
+            (str(span.call_id), span.service, clock(span.began, ms=True), _ms(span.took_s), span.outcome, span.caller)
             for span in latest
         ]
         out.table(("ID", "SERVICE", "BEGAN", "TOOK", "OUTCOME", "CALLER"), rows)
@@ -102,11 +102,6 @@ def _rows(node: Trace, start: float, depth: int) -> Iterator[_Row]:
         told(line.at, f"{line.level_name}: {line.text.splitlines()[0]}")
     for _, rows in sorted(inner, key=lambda one: one[0]):
         yield from rows
-
-
-def clock(at: float) -> str:
-    """A moment as people read it, with milliseconds."""
-    return f"{time.strftime('%H:%M:%S', time.localtime(at))}.{int(at * 1000) % 1000:03d}"
 
 
 def _ms(s: float) -> str:

@@ -13,12 +13,12 @@ from msgspec import Struct
 from rich.markup import escape
 
 from trade import Constraint, Container, Estop, Handle, LockInfo, where
+from trade._moments import clock
 from trade._wire import HEALTHY
 from trade.errors import TradeError
 from trade_gateway.commands._list import Json, asked_for
 from trade_gateway.commands._output import Output
 from trade_gateway.commands._system_choice import visitor
-from trade_gateway.commands._trace import clock
 
 _EVERY_S: Final = 0.3
 """What happens to many services of a container within that is one line."""
@@ -164,7 +164,7 @@ def _say(out: Output, news: Iterable[Happening]) -> None:
         colour = _COLOURS.get(kind.what, "bold")
         about = escape(_some([one.about for one in alike]))
         said = f": {escape(kind.text)}" if kind.text else ""
-        out.say(f"{clock(alike[0].at)} {escape(kind.container):12} [{colour}]{kind.what:11}[/] {about}{said}")
+        out.say(f"{clock(alike[0].at, ms=True)} {escape(kind.container):12} [{colour}]{kind.what:11}[/] {about}{said}")
 
 
 def _some(names: list[str]) -> str:

@@ -1,13 +1,13 @@
 """What can be asked: each question is calls and look-ups that any program could make, and what came of them."""
 
 import re
-import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
 from msgspec import Struct
 
 from trade import Container, Handle, where
+from trade._moments import clock
 from trade._wire import HEALTHY
 from trade.errors import ConfigurationError
 from trade_gateway.talk._memory import Memory
@@ -91,7 +91,7 @@ def _locks(container: Container, _: Memory, gaps: Mapping[str, str]) -> Answer:
     said = [
         f"{info.holder.owner} has {', '.join(info.resources)}"
         + (f", for {info.holder.purpose!r}" if info.holder.purpose else "")
-        + f", since {time.strftime('%H:%M:%S', time.localtime(info.holder.since))}"
+        + f", since {clock(info.holder.since)}"
         + (f"; {', '.join(info.waiting)} waits" if info.waiting else "")
         for info in held
     ]
