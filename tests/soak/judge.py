@@ -17,7 +17,7 @@ _SILENT_S: Final = 120.0
 """A planner that got no round done in so long stands still."""
 _QUARTERS: Final = 4
 _SILENT: Final = ("DeviceSilent: ", "MotionStopped: ")
-_LET_GO: Final = ("watchdog", "heard nothing for too long", "it was away", "lost its activation", "is not activated")
+_LET_GO: Final = ("watchdog", "for too long", "it was away", "lost its activation", "is not activated")
 """A driver that was held up holds what moves, and says so; a device that missed it may have stopped by itself."""
 
 

@@ -30,7 +30,7 @@ def said(until: int = SECONDS, errors: dict[str, int] | None = None) -> list[Sai
     ]
 
 
-LET_GO = "DeviceFault: rosie.tail.tip on can0: error: watchdog timer expired; call enable()"
+LET_GO = "DeviceFault: rosie.legs.left.hip on can0: error 8130h, it has not heard this driver for too long; remove ..."
 FAULT = "DeviceFault: rosie.tail.tip on can0: overload; remove the cause, then call enable()"
 GOOD = Run(seconds=SECONDS, samples=samples(), said=said(), passers=3)
 
