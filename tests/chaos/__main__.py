@@ -8,6 +8,7 @@ import argparse
 import multiprocessing
 import os
 import random
+import shutil
 import signal
 import sys
 import tempfile
@@ -222,6 +223,11 @@ def main() -> None:
     multiprocessing.set_forkserver_preload(["tests.chaos._client", "tests.chaos._driver"])
     with tempfile.TemporaryDirectory(prefix="trade-chaos-") as folder:
         verdict = run(plan, Path(folder))
+        if verdict.violations:  # what everybody noted is what there is to look at
+            kept = Path("build", f"chaos-{plan.seed}")
+            shutil.rmtree(kept, ignore_errors=True)
+            shutil.copytree(Path(folder, "logs"), kept)
+            print(f"the notes of all are kept in {kept}")
     _print(plan, verdict)
     sys.exit(bool(verdict.violations))
 

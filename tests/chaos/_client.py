@@ -146,7 +146,9 @@ class Client:
         except TradeError as refused:
             self._log.note(Done(t=now(), hold=hold, how=type(refused).__name__))
             return
-        self._log.note(Held(t=now(), hold=hold))
+        had_t = now()
+        if lock.held:  # else it was frozen since it was told so, and may not have it at that moment any more
+            self._log.note(Held(t=had_t, hold=hold))
         try:
             with lock.use():
                 self._move(lock, some, hold)

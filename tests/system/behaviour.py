@@ -96,7 +96,9 @@ class Behaviour:
         how = "given back"
         try:
             lock.acquire()
-            self._log.note(Held(t=time.monotonic(), hold=hold))
+            had_t = time.monotonic()
+            if lock.held:
+                self._log.note(Held(t=had_t, hold=hold))
             with lock.use():
                 for move in moves:
                     self._get_ready(moves)

@@ -143,8 +143,9 @@ class Careless(ABC):
         except Refused as no:
             self._log.note(Done(t=now(), hold=hold, how=no.error))
             return
-        if self.feels_its_locks:
-            self._log.note(Held(t=now(), hold=hold))
+        had_t = now()
+        if self.feels_its_locks and self.has(taken):  # it may have been frozen since it was told so
+            self._log.note(Held(t=had_t, hold=hold))
         how = "lost"
         try:
             with self.under(taken):
