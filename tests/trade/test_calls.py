@@ -9,9 +9,10 @@ import msgspec
 import pytest
 
 from trade._calls import Caller
+from trade._keys import Address
 from trade._peer import Peer
 from trade._transport import Answer, Channel, ChannelClosed, Message, Publisher, Questions, Transport
-from trade._wire import EMPTY, EMPTY_ARGUMENTS, PROTOCOL, Address, Reply, Status, decode_call, encode_message
+from trade._wire import EMPTY, EMPTY_ARGUMENTS, PROTOCOL, Reply, Status, decode_call, encode_message
 
 OWN = Address("me", "here", "e0")
 OTHER = Address("arm", "driver", "e1")

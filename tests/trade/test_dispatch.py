@@ -7,9 +7,9 @@ from typing import Any
 import pytest
 
 from trade import Container, Handle, _crew, _dispatch, current_call, service, where
+from trade._keys import reply_key
 from trade._memory import MemoryTransport
 from trade._transport import Channel, Message
-from trade._wire import reply_key
 from trade.errors import Busy, Cancelled, OutcomeUnknown, RemoteError
 from trade.testing import memory_system
 

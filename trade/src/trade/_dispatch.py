@@ -19,6 +19,7 @@ from trade._context import CallContext, outer_of
 from trade._coroutines import AsyncLoop
 from trade._crew import Crew
 from trade._failures import pack_error
+from trade._keys import Address, calls_to, is_chunk, reply_key
 from trade._local_service import LocalService
 from trade._ongoing import Answer, Herald, Once, Ongoing, cancelled
 from trade._serial import Serial
@@ -30,17 +31,13 @@ from trade._wire import (
     EMPTY,
     PROTOCOL,
     UNREADABLE,
-    Address,
     Call,
     CancelArguments,
     Malformed,
     Reply,
     Status,
-    calls_to,
     decode_call,
     encode_message,
-    is_chunk,
-    reply_key,
 )
 from trade.errors import (
     AccessDenied,

@@ -26,6 +26,7 @@ from trade._handle_codec import handle_codec
 from trade._hooks import Hooks
 from trade._inherited import InheritedLock
 from trade._joining import join
+from trade._keys import Address, ServiceKey
 from trade._listening import Listening
 from trade._load import Load, resident_bytes
 from trade._locking import Locking
@@ -48,7 +49,7 @@ from trade._targets import Targets
 from trade._terminating import Terminating
 from trade._transport import Transport
 from trade._watch import Watch
-from trade._wire import Address, ServiceKey, Token
+from trade._wire import Token
 from trade._withdrawn import Withdrawn
 from trade._zenoh import ZenohTransport
 from trade.errors import AccessDenied

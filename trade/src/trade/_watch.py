@@ -8,24 +8,11 @@ from typing import Final
 from trade._absence import Absences
 from trade._asking import Asker
 from trade._estop_messages import decode_open_estops
+from trade._keys import ALIVE, REGISTRY, TALLY, Address, is_chunk, tally_key
 from trade._registry import ContainerState, Registry
 from trade._system import DOMAIN
 from trade._transport import Answer, Channel, ChannelClosed, Message, Transport
-from trade._wire import (
-    ALIVE,
-    PROTOCOL,
-    REGISTRY,
-    TALLY,
-    Address,
-    Estop,
-    Malformed,
-    OtherVersion,
-    ProviderInfo,
-    decode_provider,
-    decode_tally,
-    is_chunk,
-    tally_key,
-)
+from trade._wire import PROTOCOL, Estop, Malformed, OtherVersion, ProviderInfo, decode_provider, decode_tally
 
 _logger = logging.getLogger("trade")
 
