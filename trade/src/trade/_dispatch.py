@@ -304,6 +304,14 @@ class Dispatcher:
                 self._repliers[key] = self._transport.publish(reply_key(self._own.identity, caller, container, channel))
             return self._repliers[key]
 
+    def forget(self, caller: Address) -> None:
+        """A container is gone: nobody waits there for answers. For another one of its name keys are made anew."""
+        begin = f"{caller.who}/"
+        with self._lock:
+            gone = [self._repliers.pop(key) for key in list(self._repliers) if key.startswith(begin)]
+        for replier in gone:
+            replier.close()
+
     def close(self) -> None:
         """Take no more calls; those running may finish within two seconds. Idempotent."""
         with self._lock:

@@ -195,6 +195,7 @@ class Parts:
         if self.inherited is not None:
             self.inherited.lost(address)
         self.session_ended(str(address), f"its container {address.container} has ended or cannot be reached")
+        self.dispatcher.forget(address)
 
     def session_ended(self, session: str, reason: str = "it was closed") -> None:
         """Nobody of it is there any more: nothing more is let in for it, its locks fall, what it moves stops."""
