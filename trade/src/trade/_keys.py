@@ -90,6 +90,9 @@ def tally_key(address: Address) -> str:
 REGISTRY: Final = "registry/**"
 ALIVE: Final = "alive/**"
 
+PASSING: Final = {REGISTRY: "registry/*/**", ESTOPS: "estop/*/**"}
+"""What everybody subscribes to, and other patterns that match the same keys: see `ZenohTransport.settle`."""
+
 
 NO_GROUP: Final = "_"  # the domain of a provider without one
 

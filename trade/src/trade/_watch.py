@@ -1,7 +1,9 @@
 """The threads that listen to the rest of the system: who is there, and what they offer."""
 
 import logging
+import math
 import threading
+import time
 from collections.abc import Callable, Iterable
 from typing import Final
 
@@ -17,6 +19,8 @@ from trade._wire import PROTOCOL, Estop, Malformed, OtherVersion, ProviderInfo, 
 _logger = logging.getLogger("trade")
 
 _SYNC_S: Final = 2.0
+_STAYS_S: Final = 60.0
+"""Who has been here for so long is no passer-by."""
 
 
 class Watch:
@@ -40,7 +44,9 @@ class Watch:
         self._ended = ended
         self._returned = returned
         self.malformed = 0
-        self._asker = Asker(transport, registry, self._answer, beat)
+        self._beat = beat
+        self._stays_from = time.monotonic() + _STAYS_S
+        self._asker = Asker(transport, registry, self._answer, self._regularly)
         self._transport = transport
         self._absences = Absences(self._gone, transport.bridge_lost)
         entries, signs = transport.announcements(REGISTRY), transport.presences(ALIVE)
@@ -59,6 +65,12 @@ class Watch:
     def busy(self) -> bool:
         """Whether somebody is being asked for what was missed."""
         return self._asker.busy
+
+    def _regularly(self) -> None:
+        self._beat()
+        if time.monotonic() >= self._stays_from:
+            self._stays_from = math.inf
+            self._transport.settle()
 
     def _read(self, channel: Channel, take: Callable[[Message], None]) -> None:
         while True:
