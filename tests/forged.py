@@ -5,22 +5,9 @@ from typing import Any
 import msgspec
 
 from trade import Container, Handle, where
+from trade._keys import Address, alive_key, calls_to, registry_key, reply_key
 from trade._schemas import schema_message
-from trade._wire import (
-    PROTOCOL,
-    Address,
-    Call,
-    ProviderInfo,
-    Reply,
-    ServiceInfo,
-    Status,
-    alive_key,
-    calls_to,
-    decode_call,
-    encode_message,
-    registry_key,
-    reply_key,
-)
+from trade._wire import PROTOCOL, Call, ProviderInfo, Reply, ServiceInfo, Status, decode_call, encode_message
 
 FUTURE = 99
 """A version of the protocol that nobody speaks."""

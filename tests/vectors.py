@@ -10,12 +10,12 @@ from typing import Any, Final
 import msgspec
 from msgspec import Raw, msgpack
 
+from trade._keys import Address, ServiceKey
 from trade._resources import Holder
 from trade._sample import StreamSample
 from trade._terms import Granted, LockInfo, Terms
 from trade._wire import (
     PROTOCOL,
-    Address,
     Behalf,
     Call,
     CancelArguments,
@@ -27,7 +27,6 @@ from trade._wire import (
     ProviderInfo,
     Reply,
     ServiceInfo,
-    ServiceKey,
     Status,
     Tally,
     Token,

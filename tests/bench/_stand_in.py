@@ -12,18 +12,10 @@ from msgspec import structs
 
 from trade import Container
 from trade._announcing import Announcer
+from trade._keys import ALIVE, ESTOPS, REGISTRY, Address, calls_to, registry_key
 from trade._memory import MemoryTransport, Network
 from trade._transport import ChannelClosed, Message
-from trade._wire import (
-    ALIVE,
-    ESTOPS,
-    REGISTRY,
-    Address,
-    ProviderInfo,
-    calls_to,
-    decode_provider,
-    registry_key,
-)
+from trade._wire import ProviderInfo, decode_provider
 
 Offer = Mapping[tuple[str, str], ProviderInfo]
 """Providers by domain and name."""

@@ -16,8 +16,9 @@ from tests.holds import Ask, Done, Held, Log, Seen, now
 
 from trade import Container, Handle, Settings, where
 from trade._context import holding
+from trade._keys import Address
 from trade._transport import ChannelClosed
-from trade._wire import Address, Token
+from trade._wire import Token
 from trade._zenoh import ZenohTransport
 from trade.errors import TradeError
 

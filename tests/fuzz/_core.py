@@ -13,6 +13,7 @@ from trade._estop_messages import decode_estop_confirmed, decode_estop_order, de
 from trade._failures import pack_error, unpack_error
 from trade._handle_codec import handle_codec
 from trade._inherited import InheritedLock
+from trade._keys import Address, ServiceKey
 from trade._predicates import achieves_all, parse_predicates
 from trade._sample import decode_sample
 from trade._service import marked_methods
@@ -20,12 +21,10 @@ from trade._signature import Signature
 from trade._watch import _place as place_of
 from trade._wire import (
     UNREADABLE,
-    Address,
     ErrorInfo,
     Malformed,
     Parameter,
     ServiceInfo,
-    ServiceKey,
     decode_call,
     decode_provider,
     decode_reply,

@@ -23,8 +23,8 @@ from ruled import Desk, Engine
 from trade import Container, Handle, service, where
 from trade._credentials import user_secret
 from trade._endpoints import free_endpoint
+from trade._keys import ALIVE, alive_key
 from trade._rendezvous import Rendezvous
-from trade._wire import ALIVE, alive_key
 from trade._zenoh import ZenohTransport, configuration
 from trade.testing import MemorySystem, memory_system
 

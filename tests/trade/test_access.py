@@ -13,10 +13,11 @@ from trade._access import FUNCTIONS, Access
 from trade._context import CallContext, running
 from trade._estop_services import EstopServices
 from trade._hints import no_such_service
+from trade._keys import estop_key
 from trade._memory import MemoryTransport
 from trade._own_services import OwnServices
 from trade._service import marked_methods
-from trade._wire import PROTOCOL, Behalf, EstopOrder, encode_message, estop_key
+from trade._wire import PROTOCOL, Behalf, EstopOrder, encode_message
 from trade.errors import AccessDenied, ConfigurationError, LockedByOther, LockLost, NoSuchService, Stopped
 from trade.testing import MemorySystem
 

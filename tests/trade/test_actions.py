@@ -10,17 +10,8 @@ from msgspec import Raw, Struct
 
 import trade
 from trade import Container, current_call, service
-from trade._wire import (
-    EMPTY_ARGUMENTS,
-    PROTOCOL,
-    Call,
-    CancelArguments,
-    Status,
-    call_key,
-    decode_reply,
-    encode_message,
-    reply_key,
-)
+from trade._keys import call_key, reply_key
+from trade._wire import EMPTY_ARGUMENTS, PROTOCOL, Call, CancelArguments, Status, decode_reply, encode_message
 from trade.errors import Cancelled, NotSerialisable
 from waiting import wait_until
 

@@ -9,9 +9,10 @@ import msgspec
 import pytest
 
 from trade._calls import Caller
+from trade._keys import Address
 from trade._peer import Peer
 from trade._transport import Answer, Channel, ChannelClosed, Message, Publisher, Questions, Transport
-from trade._wire import EMPTY, EMPTY_ARGUMENTS, PROTOCOL, Address, Reply, Status, decode_call, encode_message
+from trade._wire import EMPTY, EMPTY_ARGUMENTS, PROTOCOL, Reply, Status, decode_call, encode_message
 
 OWN = Address("me", "here", "e0")
 OTHER = Address("arm", "driver", "e1")
@@ -93,7 +94,7 @@ def caller(transport: PaperTransport) -> Iterator[Caller]:
 
 
 def ask(caller: Caller, *, deadline_s: float = 60, to: Address = OTHER) -> Reply:
-    publisher = caller.publisher(to, "rosie", "Arm-1", stop=False)
+    publisher = caller.publishers.get(to, "rosie", "Arm-1", stop=False)
     deadline_ns = time.monotonic_ns() + int(deadline_s * SECOND_NS)
     return caller.ask(caller.peer(to), publisher, "go", EMPTY_ARGUMENTS, deadline_ns, None, ())
 
@@ -211,8 +212,8 @@ def test_a_call_to_a_lost_container_is_not_sent_until_it_is_back(caller: Caller,
 
 
 def test_a_call_whose_publisher_went_with_its_provider_is_not_sent(caller: Caller, transport: PaperTransport) -> None:
-    publisher = caller.publisher(OTHER, "rosie", "Arm-1", stop=False)
-    caller.forget(OTHER, "rosie", "Arm-1")
+    publisher = caller.publishers.get(OTHER, "rosie", "Arm-1", stop=False)
+    caller.publishers.forget(OTHER, "rosie", "Arm-1")
     deadline_ns = time.monotonic_ns() + 60 * SECOND_NS
     peer = caller.peer(OTHER)
     assert caller.ask(peer, publisher, "go", EMPTY_ARGUMENTS, deadline_ns, None, ()).status == Status.UNSENT
@@ -228,7 +229,7 @@ def test_closing_ends_blocked_and_started_calls_and_refuses_more(caller: Caller,
     blocked = threading.Thread(target=lambda: ended.append(ask(caller).status))
     blocked.start()
     assert sent.acquire(timeout=20)
-    publisher = caller.publisher(OTHER, "rosie", "Arm-1", stop=False)
+    publisher = caller.publishers.get(OTHER, "rosie", "Arm-1", stop=False)
     deadline_ns = time.monotonic_ns() + 60 * SECOND_NS
     caller.start(
         caller.peer(OTHER), publisher, "go", EMPTY_ARGUMENTS, deadline_ns, None, (), lambda r: ended.append(r.status)
@@ -244,7 +245,7 @@ def test_a_failing_receiver_of_an_answer_disturbs_no_other(
     caller: Caller, transport: PaperTransport, caplog: pytest.LogCaptureFixture
 ) -> None:
     transport.on_call = answered(transport)
-    publisher = caller.publisher(OTHER, "rosie", "Arm-1", stop=False)
+    publisher = caller.publishers.get(OTHER, "rosie", "Arm-1", stop=False)
     deadline_ns, heard = time.monotonic_ns() + 60 * SECOND_NS, threading.Event()
     peer = caller.peer(OTHER)
 

@@ -16,10 +16,11 @@ from msgspec import structs
 import trade._signature as signatures
 from trade import Container, Handle, Settings, service, where
 from trade._arguments import encode_call
+from trade._keys import TALLY, Address
 from trade._registry import Registry
 from trade._rendezvous import Rendezvous, free_endpoint
 from trade._transport import Publisher
-from trade._wire import PROTOCOL, TALLY, Address, Call, ProviderInfo, ServiceInfo, decode_provider, encode_message
+from trade._wire import PROTOCOL, Call, ProviderInfo, ServiceInfo, decode_provider, encode_message
 from trade._zenoh import ZenohTransport, configuration
 from trade.errors import InvalidArgument
 

@@ -11,19 +11,10 @@ from typing import Any
 import pytest
 
 from trade import Container, Handle, current_call, service, where
-from trade._calls import _Pending
+from trade._keys import call_key, reply_key
 from trade._peer import Peer
-from trade._wire import (
-    EMPTY_ARGUMENTS,
-    PROTOCOL,
-    Call,
-    Reply,
-    Status,
-    call_key,
-    decode_reply,
-    encode_message,
-    reply_key,
-)
+from trade._waits import Pending
+from trade._wire import EMPTY_ARGUMENTS, PROTOCOL, Call, Reply, Status, decode_reply, encode_message
 from trade.errors import DeadlineExceeded, OutcomeUnknown
 
 COUNTING = """
@@ -260,7 +251,7 @@ def test_calls_end_at_their_deadlines_although_others_begin_while_they_are_looke
         ended.append(reply.id)
 
     def begin(number: int) -> None:
-        caller._pending[number] = _Pending(peer, 0, note, None, (None, b""))  # type: ignore[arg-type]
+        caller._pending[number] = Pending(peer, 0, note, None, (None, b""))  # type: ignore[arg-type]
 
     others = itertools.count(10_000)
 

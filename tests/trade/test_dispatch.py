@@ -7,11 +7,12 @@ from typing import Any
 import pytest
 
 from trade import Container, Handle, _crew, _dispatch, current_call, service, where
+from trade._keys import reply_key
 from trade._memory import MemoryTransport
 from trade._transport import Channel, Message
-from trade._wire import reply_key
 from trade.errors import Busy, Cancelled, OutcomeUnknown, RemoteError
 from trade.testing import memory_system
+from waiting import wait_until
 
 
 def found(here: Container, name: str) -> Handle:
@@ -337,3 +338,13 @@ def test_no_thread_goes_back_into_a_transport_that_is_being_left(monkeypatch: py
         assert sum(thread.is_alive() for thread in callers) == 1  # the caller's own, which waits for calls
         with pytest.raises(ConnectionError):
             run.result(20)
+
+
+def test_of_a_caller_that_is_gone_no_reply_key_is_kept(here: Container, there: Container, crowd: Crowd) -> None:
+    there.register(crowd, "robot")
+    crowd.open.set()
+    repliers = there._parts.dispatcher._repliers
+    found(here, "enter")()
+    assert any("/here/" in key for key in repliers)
+    here.close()
+    wait_until(lambda: not any("/here/" in key for key in list(repliers)))

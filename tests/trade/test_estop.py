@@ -12,17 +12,9 @@ import pytest
 from trade import Container, Estop, EstopReport, Resource, current_call, service, where
 from trade._crew import MOST_THREADS
 from trade._estop_messages import decode_estop_order
+from trade._keys import Address, alive_key, registry_key
 from trade._memory import MemoryTransport, Passage
-from trade._wire import (
-    PROTOCOL,
-    Address,
-    EstopOrder,
-    ProviderInfo,
-    ServiceInfo,
-    alive_key,
-    encode_message,
-    registry_key,
-)
+from trade._wire import PROTOCOL, EstopOrder, ProviderInfo, ServiceInfo, encode_message
 from trade.errors import Busy, ConfigurationError, MotionStopped, NoSuchEstop, Stopped
 from trade.testing import Kind, MemorySystem, memory_system
 

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from trade import Container, Handle, current_call, service, where
-from trade._wire import ServiceKey
+from trade._keys import ServiceKey
 from trade.errors import ConfigurationError, ServiceGone
 
 

@@ -9,8 +9,9 @@ from hypothesis import strategies as st
 from trade import Constraint, where
 from trade._constraints import Term
 from trade._index import Index
+from trade._keys import Address, ServiceKey
 from trade._registry import Record, Registry
-from trade._wire import HEALTHY, Address, ProviderInfo, ServiceInfo, ServiceKey
+from trade._wire import HEALTHY, ProviderInfo, ServiceInfo
 
 
 def record(number: int, **told: Any) -> Record:

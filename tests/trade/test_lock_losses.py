@@ -6,7 +6,7 @@ import pytest
 
 from jointed import WHOLE, Robot
 from trade import Handle
-from trade._wire import Address
+from trade._keys import Address
 from trade.errors import (
     LockedByOther,
     LockLost,

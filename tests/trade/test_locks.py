@@ -1,6 +1,7 @@
 """The lock table by itself, on a clock of the test's."""
 
 import concurrent.futures
+import math
 import threading
 from collections.abc import Iterator
 
@@ -123,6 +124,18 @@ def test_a_lease_ends_on_its_own_thread_too() -> None:
     real.adopt("a")
     real.acquire(["a"], Holder("tester", "one", "one", "", 0.0), Terms(lease_s=0.1))
     wait_until(lambda: real.infos() == [])
+    real.close()
+
+
+def test_a_short_lease_ends_in_its_time_although_the_thread_sleeps_until_a_longer_one_ends() -> None:
+    real = LockTable(EPOCH, "home")
+    for name in "ab":
+        real.adopt(name)
+    holder = Holder("tester", "one", "one", "", 0.0)
+    real.acquire(["a"], holder, Terms(lease_s=3600))
+    wait_until(lambda: real._leases._next_look < math.inf)
+    real.acquire(["b"], holder, Terms(lease_s=0.1))
+    wait_until(lambda: [info.resources for info in real.infos()] == [("a",)])
     real.close()
 
 

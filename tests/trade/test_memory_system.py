@@ -14,8 +14,9 @@ import pytest
 from lamps import Lamp, Pair, found, labels
 from trade import Container, errors, where
 from trade._announcing import Announcer
+from trade._keys import Address
 from trade._memory import MemoryTransport, Passage
-from trade._wire import Address, ProviderInfo, ServiceInfo
+from trade._wire import ProviderInfo, ServiceInfo
 from trade.errors import ContainerLost, ServiceGone
 from trade.testing import Kind, MemorySystem, memory_system
 

@@ -9,20 +9,9 @@ import pytest
 from msgspec import structs
 
 from trade import Container, Handle, _ongoing, service, where
+from trade._keys import Address, call_key, reply_key
 from trade._ongoing import Once, Ongoing
-from trade._wire import (
-    EMPTY,
-    EMPTY_ARGUMENTS,
-    PROTOCOL,
-    Address,
-    Call,
-    Reply,
-    Status,
-    call_key,
-    decode_reply,
-    encode_message,
-    reply_key,
-)
+from trade._wire import EMPTY, EMPTY_ARGUMENTS, PROTOCOL, Call, Reply, Status, decode_reply, encode_message
 
 SECOND_NS = 10**9
 LATER = 2**62

@@ -8,8 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from trade._constraints import where
+from trade._keys import Address, ServiceKey
 from trade._registry import Change, Registry
-from trade._wire import Address, ProviderInfo, ServiceInfo, ServiceKey
+from trade._wire import ProviderInfo, ServiceInfo
 
 OWN = Address("me", "here", "e0")
 OTHER = Address("arm", "driver", "e1")

@@ -10,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from trade._rendezvous import free_endpoint
-from trade._transport import ChannelClosed, Presence, Questions
+from trade._transport import Channel, ChannelClosed, Presence, Questions
 from trade._zenoh import _CHANNEL_CAPACITY, ZenohTransport, configuration
 from trade.testing import LossConformance, Severable, TransportConformance
 
@@ -60,6 +60,58 @@ class TestZenoh(TransportConformance):
                 waiting = other.submit(read, questions)
                 questions.close()
                 waiting.result(60)
+
+    def test_nothing_is_missed_while_one_settles(self) -> None:
+        numbers = range(3000)
+        with self.network() as open_transport, ThreadPoolExecutor(1, "putting") as other:
+            here, there = open_transport(), open_transport()
+            orders, announced = there.subscribe("estop/**"), there.announcements("registry/**")
+            order = here.publish("estop/one")
+
+            def put_all() -> None:
+                for number in numbers:
+                    order.put(str(number).encode())
+                    here.announce(f"registry/{number}", str(number).encode())
+
+            putting = other.submit(put_all)
+            for channel in (orders, announced):
+                for number in range(500):
+                    assert channel.receive().payload == str(number).encode()
+            there.settle()
+            for channel in (orders, announced):
+                heard = _until(channel, numbers[-1])
+                assert sorted(set(heard)) == list(numbers[500:])
+            putting.result(60)
+
+    def test_who_settles_is_closed_as_ever(self) -> None:
+        def read(channel: Channel) -> None:
+            with contextlib.suppress(ChannelClosed):
+                while True:
+                    channel.receive()
+
+        with self.network() as open_transport, ThreadPoolExecutor(2, "reading") as other:
+            transport = open_transport()
+            channels = transport.subscribe("estop/**"), transport.announcements("registry/**")
+            reading = [other.submit(read, channel) for channel in channels]
+            transport.settle()
+            transport.settle()  # once more: it has nothing left to do
+            for channel in channels:
+                channel.close()
+            for each in reading:
+                each.result(60)
+            late = transport.subscribe("estop/**")
+            late.close()
+            transport.settle()  # of what is closed nothing is heard anew
+            with pytest.raises(ChannelClosed):
+                late.receive()
+
+
+def _until(channel: Channel, last: int) -> list[int]:
+    """The numbers that are heard, up to this one."""
+    heard = list[int]()
+    while not heard or heard[-1] != last:
+        heard.append(int(channel.receive().payload or b""))
+    return heard
 
 
 @pytest.mark.parametrize(("bridge", "shared"), [([], True), ([["eth0"], ["eth1"]], False)])

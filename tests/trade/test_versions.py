@@ -10,20 +10,10 @@ import pytest
 from msgspec import msgpack
 
 from trade import Container, service, where
+from trade._keys import ALIVE, ESTOPS, Address, alive_key, estop_confirmed_key, estop_key, registry_key, tally_key
 from trade._memory import MemoryTransport
 from trade._transport import ChannelClosed
-from trade._wire import (
-    ALIVE,
-    ESTOPS,
-    PROTOCOL,
-    Address,
-    alive_key,
-    encode_message,
-    estop_confirmed_key,
-    estop_key,
-    registry_key,
-    tally_key,
-)
+from trade._wire import PROTOCOL, encode_message
 from trade.errors import NoSuchService, Stopped
 from trade.testing import MemorySystem, memory_system
 

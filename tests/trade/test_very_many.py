@@ -7,7 +7,8 @@ import pytest
 
 from trade import Container, Handle, service, where
 from trade._announcing import Announcer
-from trade._wire import Address, ProviderInfo, ServiceInfo
+from trade._keys import Address
+from trade._wire import ProviderInfo, ServiceInfo
 
 HOST = Address("somebody", "host", "e1")
 

@@ -13,11 +13,11 @@ from hypothesis import strategies as st
 from forged import FORGED, FUTURE, PROVIDER, TEXT, FakeCallee
 from trade import Container, Secret, _wire, service, where
 from trade._announcing import Announcer
+from trade._keys import Address, alive_key, as_chunk, call_key, calls_to, is_chunk, registry_key, reply_key, tally_key
 from trade._wire import (
     EMPTY,
     EMPTY_ARGUMENTS,
     PROTOCOL,
-    Address,
     Call,
     Malformed,
     ProviderInfo,
@@ -25,18 +25,10 @@ from trade._wire import (
     ServiceInfo,
     Status,
     Tally,
-    alive_key,
-    as_chunk,
-    call_key,
-    calls_to,
     decode_call,
     decode_provider,
     decode_reply,
     encode_message,
-    is_chunk,
-    registry_key,
-    reply_key,
-    tally_key,
 )
 from trade.testing._ear import Ear, Teller
 

@@ -25,8 +25,8 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from msgspec import Struct
 
+from trade._keys import is_chunk
 from trade._toml import read_toml_text
-from trade._wire import is_chunk
 from trade.errors import ConfigurationError
 from trade_gateway._files import claim, replace
 

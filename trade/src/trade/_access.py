@@ -8,10 +8,10 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Final
 
+from trade._keys import domain_of
 from trade._policies import Decision, Policy
 from trade._policy_file import Seen, look_at, policy_files, read_policy
 from trade._system import DOMAIN, ESTOPS, PROVIDER
-from trade._wire import domain_of
 from trade.errors import AccessDenied
 
 _ALL: Final = ""

@@ -9,10 +9,10 @@ from math import inf
 from types import MappingProxyType
 from typing import Any, Final, Literal, NamedTuple
 
+from trade._keys import ALIVE, ESTOPS, REGISTRY
 from trade._policies import EVERYTHING, VERBS, Policy
 from trade._sample import STEPS_HZ, STREAMS
 from trade._system import DOMAIN
-from trade._wire import ALIVE, ESTOPS, REGISTRY
 
 __all__ = ["acl"]
 

@@ -4,8 +4,9 @@ import logging
 import threading
 from typing import Final
 
+from trade._keys import Address, alive_key, registry_key, tally_key
 from trade._transport import ChannelClosed, Presence, Question, Transport
-from trade._wire import PROTOCOL, Address, ProviderInfo, Tally, alive_key, encode_message, registry_key, tally_key
+from trade._wire import PROTOCOL, ProviderInfo, Tally, encode_message
 
 _logger = logging.getLogger("trade")
 

@@ -14,6 +14,7 @@ from trade._access import Access
 from trade._clockwork import Clockwork, Due
 from trade._codec import Codec
 from trade._freezing import Freezing
+from trade._keys import Address, ServiceKey, domain_of
 from trade._making import Making, end, path_of
 from trade._offerable import checked_groups
 from trade._offers import Built
@@ -22,7 +23,7 @@ from trade._records import imported
 from trade._service import marked_methods
 from trade._signature import Signature
 from trade._state import is_stateful, restore
-from trade._wire import Address, Scalar, ServiceKey, domain_of, encode_message
+from trade._wire import Scalar, encode_message
 from trade.errors import Busy, CannotInstantiate, CannotMigrate, LockedByOther, NoSuchClass
 
 TICKET_S: Final = 20.0

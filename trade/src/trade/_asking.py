@@ -7,9 +7,9 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Final
 
+from trade._keys import REGISTRY, Address, registry_key
 from trade._registry import ContainerState, Registry
 from trade._transport import Answer, ChannelClosed, Transport
-from trade._wire import REGISTRY, Address, registry_key
 
 _logger = logging.getLogger("trade")
 

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, Protocol
 from msgspec import Struct
 
 from trade._context import CallContext
+from trade._keys import Address
 from trade._measures import Calls
 from trade._session import foreign
 from trade._settings import Settings
 from trade._system import DOMAIN
-from trade._wire import Address
 from trade.errors import (
     AccessDenied,
     Busy,

@@ -17,8 +17,8 @@ from trade._audit import Event
 from trade._audit_chain import AuditRow, Head
 from trade._audit_store import SUFFIX, AuditStore, Keep, move_aside
 from trade._handle import Handle
+from trade._keys import Address
 from trade._settings import Settings
-from trade._wire import Address
 
 _logger = logging.getLogger("trade")
 

@@ -10,6 +10,7 @@ from trade._borrowed import Borrowed, SharedResource
 from trade._codec import Codec
 from trade._estopping import Estopping
 from trade._handle import Handle
+from trade._keys import Address, ServiceKey
 from trade._local_service import LocalService
 from trade._locking import Locking
 from trade._member import Member
@@ -18,7 +19,7 @@ from trade._registry import Registry
 from trade._resources import Resource
 from trade._session import Session
 from trade._system import DOMAIN, PROVIDER
-from trade._wire import Address, ProviderInfo, ServiceInfo, ServiceKey
+from trade._wire import ProviderInfo, ServiceInfo
 from trade.errors import ConfigurationError, SessionEnded
 
 _PATIENCE_S = 1.0

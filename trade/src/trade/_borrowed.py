@@ -9,11 +9,12 @@ from typing import Final, Protocol
 from msgspec import structs
 
 from trade._context import CallContext
+from trade._keys import Address
 from trade._lock import Lock, OnLost, OnRequest
 from trade._locks import LockTable
 from trade._resources import Resource
 from trade._terms import Granted, Terms
-from trade._wire import Address, Token
+from trade._wire import Token
 from trade.errors import LockLost
 
 Wanted = Mapping[Address, Sequence[str]]

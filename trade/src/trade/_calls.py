@@ -14,75 +14,34 @@ from typing import Any, Final
 
 from msgspec import Raw, structs
 
+from trade._call_publishers import CallPublishers
+from trade._keys import Address, reply_key
 from trade._peer import NEVER, Peer
 from trade._spans import Spans
 from trade._system import CLOCK, DOMAIN, PROVIDER
-from trade._transport import Channel, ChannelClosed, Message, Publisher, Transport
+from trade._transport import ChannelClosed, Message, Publisher, Transport
+from trade._waits import Box, OnReply, Pending
 from trade._wire import (
     CANCEL,
     EMPTY,
     EMPTY_ARGUMENTS,
     PROTOCOL,
-    Address,
     Behalf,
     Call,
     CancelArguments,
     Malformed,
     Reply,
     Status,
-    call_key,
     decode_call,
     decode_reply,
     encode_message,
-    reply_key,
 )
 
 _logger = logging.getLogger("trade")
 _CANCEL_S: Final = 2.0
 
-OnReply = Callable[[Reply], None]
-
-
-_Waiting = tuple[int, Peer, int]
-"""Call id, who is to answer, deadline: swapped as a whole, so that whoever ends a wait ends the one it looked at."""
-
-
 Encode = Callable[[Call], bytes]
 """Makes a message of a call whose arguments may still be values; raises what the caller is to know of them."""
-
-_Sent = tuple[Publisher, bytes]
-"""What was put where, to be put once more if the link had gone."""
-
-
-class _Box:
-    """A reply channel lent to one caller at a time."""
-
-    __slots__ = ("channel", "ended_id", "name", "sent", "waiting", "wake_key")
-
-    def __init__(self, name: str, wake_key: str, channel: Channel) -> None:
-        self.name = name
-        self.wake_key = wake_key
-        self.channel = channel
-        self.waiting: _Waiting | None = None
-        self.sent: _Sent | None = None
-        self.ended_id = 0
-        """The call whose wait was ended from our side last."""
-
-
-class _Pending:
-    """A started call that waits for its answer without a thread."""
-
-    __slots__ = ("deadline_ns", "on_progress", "on_reply", "peer", "sent", "sent_ns")
-
-    def __init__(
-        self, peer: Peer, deadline_ns: int, on_reply: OnReply, on_progress: OnReply | None, sent: _Sent
-    ) -> None:
-        self.peer = peer
-        self.deadline_ns = deadline_ns
-        self.on_reply = on_reply
-        self.on_progress = on_progress
-        self.sent = sent
-        self.sent_ns = time.monotonic_ns()
 
 
 class Caller:
@@ -95,14 +54,12 @@ class Caller:
         self._ends_on = f"reply/{own.identity}/"
         self.new_id: Callable[[], int] = itertools.count(secrets.randbits(38) << 24 | 1).__next__
         self._peers: dict[Address, Peer] = {}
-        self._publishers: dict[str, Publisher] = {}
-        self._urgent: set[Publisher] = set()
-        """Those of stops."""
+        self.publishers: Final = CallPublishers(transport, own.identity)
         self._lock = threading.Lock()
-        self._every: list[_Box] = []
-        self._free: list[_Box] = []
-        self._pending: dict[int, _Pending] = {}
-        self._shared: _Box | None = None
+        self._every: list[Box] = []
+        self._free: list[Box] = []
+        self._pending: dict[int, Pending] = {}
+        self._shared: Box | None = None
         self._threads: list[threading.Thread] = []
         self._closed = False
         self._next_deadline_ns: float = NEVER
@@ -127,27 +84,6 @@ class Caller:
     def peer(self, address: Address) -> Peer:
         """Another container; one whose sign of life does not stand is lost."""
         return self._peers.get(address) or Peer(address, lost=True)
-
-    def publisher(self, callee: Address, domain: str, provider: str, *, stop: bool) -> Publisher:
-        """The declared key of one provider's calls, made once."""
-        key = call_key(self._own.identity, callee, domain, provider, stop=stop)
-        with self._lock:
-            found = self._publishers.get(key)
-            if found is None:
-                found = self._publishers[key] = self._transport.publish(key, urgent=stop)
-                if stop:
-                    self._urgent.add(found)
-            return found
-
-    def forget(self, callee: Address, domain: str, provider: str) -> None:
-        """A provider is gone: its publishers with it."""
-        keys = [call_key(self._own.identity, callee, domain, provider, stop=stop) for stop in (False, True)]
-        with self._lock:
-            gone = [self._publishers.pop(key, None) for key in keys]
-            self._urgent.difference_update(gone)
-        for publisher in gone:
-            if publisher is not None:
-                publisher.close()
 
     # --- calling
 
@@ -189,7 +125,7 @@ class Caller:
             box.waiting = box.sent = None
             self._free.append(box)
 
-    def _await_reply(self, box: _Box, call_id: int, peer: Peer, sent_ns: int) -> Reply:
+    def _await_reply(self, box: Box, call_id: int, peer: Peer, sent_ns: int) -> Reply:
         while True:
             try:
                 message = box.channel.receive()
@@ -231,7 +167,7 @@ class Caller:
             return 0
         call_id, speaker = self.new_id(), session or self._session
         data = encode(Call(PROTOCOL, call_id, service, shared.name, speaker, expires_ns, chain, args, behalf))
-        self._pending[call_id] = _Pending(peer, deadline_ns, on_reply, on_progress, (publisher, data))
+        self._pending[call_id] = Pending(peer, deadline_ns, on_reply, on_progress, (publisher, data))
         if deadline_ns < self._next_deadline_ns:
             self._sooner.set()
         if peer.lost or self._closed:
@@ -249,7 +185,7 @@ class Caller:
         if call_id not in self._pending or now >= deadline_ns:
             return
         asked = Raw(encode_message(CancelArguments(call_id, service, min(86_400.0, (deadline_ns - now) / 1e9))))
-        publisher = self.publisher(peer.address, DOMAIN, PROVIDER, stop=True)
+        publisher = self.publishers.get(peer.address, DOMAIN, PROVIDER, stop=True)
         self.start(peer, publisher, CANCEL, asked, now + int(_CANCEL_S * 1e9), None, (), lambda _: None)
 
     # --- sending again
@@ -263,7 +199,7 @@ class Caller:
         sent += [pending.sent for pending in list(self._pending.values()) if pending.peer is peer]
         due = [one for one in sent if one is not None]
         if due:
-            clock = self.publisher(peer.address, DOMAIN, PROVIDER, stop=False)
+            clock = self.publishers.get(peer.address, DOMAIN, PROVIDER, stop=False)
             soon = time.monotonic_ns() + int(_CANCEL_S * 1e9)
 
             def clock_heard(reply: Reply) -> None:
@@ -305,22 +241,22 @@ class Caller:
 
     # --- reply channels
 
-    def _borrow(self) -> _Box:
+    def _borrow(self) -> Box:
         try:
             return self._free.pop()
         except IndexError:
             return self._new_box()
 
-    def _new_box(self) -> _Box:
+    def _new_box(self) -> Box:
         with self._lock:
             index = f"{self._own.epoch}-{len(self._every)}"  # another container may have our name: answers never cross
             key = reply_key("*", self._own.identity, self._own.container, index)
             own = reply_key(self._own.identity, self._own.identity, self._own.container, index)
-            box = _Box(f"{self._own.container}/{index}", own, self._transport.subscribe(key))
+            box = Box(f"{self._own.container}/{index}", own, self._transport.subscribe(key))
             self._every.append(box)
             return box
 
-    def _shared_box(self) -> _Box:
+    def _shared_box(self) -> Box:
         if self._shared is None:
             box = self._new_box()
             with self._lock:
@@ -415,7 +351,7 @@ class Caller:
 
     def _stopping(self) -> bool:
         sent = [box.sent for box in list(self._every)] + [pending.sent for pending in list(self._pending.values())]
-        return any(one is not None and one[0] in self._urgent for one in sent)
+        return any(one is not None and self.publishers.of_stops(one[0]) for one in sent)
 
     def close(self) -> None:
         """End every wait and every thread. Idempotent."""
@@ -428,8 +364,7 @@ class Caller:
         for thread in self._threads:
             if thread is not threading.current_thread():
                 thread.join(2)
-        for publisher in list(self._publishers.values()):
-            publisher.close()
+        self.publishers.close()
 
     def _wait_until_free(self, deadline: float) -> None:
         """Nobody may be left inside the transport when the interpreter ends: that would abort it."""

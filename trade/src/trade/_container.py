@@ -16,6 +16,7 @@ from trade._guarding import Guarding
 from trade._handle import Handle
 from trade._hosting import Hosting
 from trade._invoke import container_closed
+from trade._keys import Address, ServiceKey, alive_key, as_chunk
 from trade._measures import Measure
 from trade._moving import Moving
 from trade._own_services import OwnServices
@@ -31,7 +32,6 @@ from trade._system import ContainerInfo, System
 from trade._targets import Target
 from trade._tracing import Tracing
 from trade._transport import ChannelClosed, Transport
-from trade._wire import Address, ServiceKey, alive_key, as_chunk
 from trade.errors import ConfigurationError
 
 __all__ = ["Container"]

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from msgspec import Struct
 
+from trade._keys import Address
 from trade._ongoing import Ongoing
-from trade._wire import Address, Behalf, Token
+from trade._wire import Behalf, Token
 from trade.errors import Cancelled
 
 if TYPE_CHECKING:

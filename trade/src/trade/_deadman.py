@@ -7,8 +7,8 @@ from typing import Final
 
 from trade._audit import Audit
 from trade._context import CallContext
+from trade._ended_sessions import within
 from trade._local_service import LocalService
-from trade._locks import within
 from trade._resources import Resource
 
 _logger = logging.getLogger("trade")

@@ -17,13 +17,13 @@ from trade._constraints import Constraint, where
 from trade._context import running
 from trade._freezing import Freezing, Frozen
 from trade._handle import Handle
+from trade._keys import Address, ServiceKey
 from trade._load import LoadInfo
 from trade._making import Arguments, Making, path_of
 from trade._offers import Offer
 from trade._providers import Providers
 from trade._state import is_stateful, restore, save
 from trade._system import DOMAIN, PROVIDER
-from trade._wire import Address, ServiceKey
 from trade._withdrawn import Withdrawn
 from trade.errors import (
     CannotMigrate,

@@ -19,6 +19,7 @@ from trade._context import CallContext, outer_of
 from trade._coroutines import AsyncLoop
 from trade._crew import Crew
 from trade._failures import pack_error
+from trade._keys import Address, calls_to, is_chunk, reply_key
 from trade._local_service import LocalService
 from trade._ongoing import Answer, Herald, Once, Ongoing, cancelled
 from trade._serial import Serial
@@ -30,17 +31,13 @@ from trade._wire import (
     EMPTY,
     PROTOCOL,
     UNREADABLE,
-    Address,
     Call,
     CancelArguments,
     Malformed,
     Reply,
     Status,
-    calls_to,
     decode_call,
     encode_message,
-    is_chunk,
-    reply_key,
 )
 from trade.errors import (
     AccessDenied,
@@ -306,6 +303,14 @@ class Dispatcher:
                     self._repliers.pop(next(iter(self._repliers))).close()
                 self._repliers[key] = self._transport.publish(reply_key(self._own.identity, caller, container, channel))
             return self._repliers[key]
+
+    def forget(self, caller: Address) -> None:
+        """A container is gone: nobody waits there for answers. For another one of its name keys are made anew."""
+        begin = f"{caller.who}/"
+        with self._lock:
+            gone = [self._repliers.pop(key) for key in list(self._repliers) if key.startswith(begin)]
+        for replier in gone:
+            replier.close()
 
     def close(self) -> None:
         """Take no more calls; those running may finish within two seconds. Idempotent."""

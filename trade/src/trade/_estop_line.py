@@ -13,19 +13,9 @@ from msgspec import Struct
 from trade._access import Access
 from trade._audit import Audit
 from trade._estop_messages import decode_estop_confirmed, decode_estop_order
+from trade._keys import ESTOPS, Address, estop_confirmed_key, estop_key, is_chunk
 from trade._transport import ChannelClosed, Message, Transport
-from trade._wire import (
-    ESTOPS,
-    PROTOCOL,
-    Address,
-    EstopConfirmed,
-    EstopOrder,
-    Malformed,
-    encode_message,
-    estop_confirmed_key,
-    estop_key,
-    is_chunk,
-)
+from trade._wire import PROTOCOL, EstopConfirmed, EstopOrder, Malformed, encode_message
 
 _logger = logging.getLogger("trade")
 

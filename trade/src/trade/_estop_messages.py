@@ -9,17 +9,8 @@ from typing import Annotated, Final, TypeVar
 import msgspec
 from msgspec import Meta, Raw, Struct
 
-from trade._wire import (
-    NO_CHUNK,
-    UNREADABLE,
-    Estop,
-    EstopConfirmed,
-    EstopOrder,
-    Malformed,
-    decoded,
-    is_chunk,
-    read_any,
-)
+from trade._keys import is_chunk
+from trade._wire import NO_CHUNK, UNREADABLE, Estop, EstopConfirmed, EstopOrder, Malformed, decoded, read_any
 
 _LONGEST_REASON: Final = 500
 _Value = TypeVar("_Value")

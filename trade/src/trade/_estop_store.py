@@ -6,7 +6,8 @@ from pathlib import Path
 
 import msgspec
 
-from trade._wire import UNREADABLE, Estop, is_chunk
+from trade._keys import is_chunk
+from trade._wire import UNREADABLE, Estop
 
 
 class EstopStore:

@@ -15,12 +15,13 @@ from trade._deadman import Deadman
 from trade._estop import Estops
 from trade._estop_line import EstopLine, EstopReport
 from trade._estop_store import EstopStore
+from trade._keys import Address, is_chunk
 from trade._locks import LockTable
 from trade._providers import Providers
 from trade._registry import Change, ContainerState, Record, Registry
 from trade._system import DOMAIN
 from trade._transport import ChannelClosed, Transport
-from trade._wire import PROTOCOL, Address, Estop, EstopOrder, ProviderInfo, is_chunk
+from trade._wire import PROTOCOL, Estop, EstopOrder, ProviderInfo
 from trade.errors import ConfigurationError, NoSuchEstop
 
 _logger = logging.getLogger("trade")

@@ -5,11 +5,11 @@ import time
 from collections.abc import Callable, Generator, Mapping
 from typing import Final
 
+from trade._keys import Address
 from trade._local_service import LocalService
 from trade._locks import LockTable
 from trade._resources import Holder, Resource, locked
 from trade._terms import Terms
-from trade._wire import Address
 from trade.errors import ConfigurationError, LockedByOther
 
 CALLS_S: Final = 2.0

@@ -7,10 +7,11 @@ from contextvars import Context
 from types import MappingProxyType
 from typing import Any, Final, NoReturn, Protocol
 
+from trade._keys import Address, ServiceKey
 from trade._registry import Record
 from trade._run import Run
 from trade._schemas import read_schema
-from trade._wire import Address, Scalar, ServiceKey
+from trade._wire import Scalar
 from trade.errors import ConfigurationError
 
 __all__ = ["Bound", "Handle"]

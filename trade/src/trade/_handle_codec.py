@@ -7,7 +7,8 @@ import msgspec
 
 from trade._codec import Codec
 from trade._handle import Handle
-from trade._wire import ServiceKey, encode_message
+from trade._keys import ServiceKey
+from trade._wire import encode_message
 
 HANDLE_EXT: Final = 1
 """The number of the extension."""

@@ -8,10 +8,10 @@ from trade._constraints import Constraint
 from trade._context import served_call
 from trade._handle import Handle
 from trade._hooks import Attached, HookInfo, Hooks, Side
+from trade._keys import Address, ServiceKey
 from trade._notification_services import Home
 from trade._service import service
 from trade._system import DOMAIN, PROVIDER
-from trade._wire import Address, ServiceKey
 from trade.errors import CallerError, CallError, ConfigurationError
 
 _logger = logging.getLogger("trade")

@@ -7,11 +7,11 @@ from typing import Final
 from trade._constraints import Constraint, where
 from trade._handle import Bound, Handle
 from trade._hooks import HookInfo, Side
+from trade._keys import ServiceKey
 from trade._notifications import Notification
 from trade._notifying import Notifying
 from trade._run import Run
 from trade._system import DOMAIN, PROVIDER
-from trade._wire import ServiceKey
 from trade.errors import AccessDenied, ConfigurationError, ContainerLost, NoSuchHook, ServiceGone, TradeError
 
 _logger = logging.getLogger("trade")

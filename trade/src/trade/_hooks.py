@@ -15,12 +15,12 @@ from trade._codec import Codec
 from trade._constraints import Constraint
 from trade._context import CallContext, holding, running
 from trade._handle import Handle
+from trade._keys import ServiceKey
 from trade._local_service import LocalService
 from trade._registry import Change, Record
 from trade._session import speaking
 from trade._spans import Recorded, Spans, traceable
 from trade._system import DOMAIN
-from trade._wire import ServiceKey
 from trade.errors import AccessDenied, ConfigurationError, DeadlineExceeded
 
 _logger = logging.getLogger("trade")

@@ -4,8 +4,8 @@ from collections.abc import Iterator
 from typing import Generic, Protocol, TypeVar
 
 from trade._constraints import Candidate, Constraint, Term, is_exact
+from trade._keys import ServiceKey
 from trade._predicates import parse_predicates, read_achieved
-from trade._wire import ServiceKey
 
 _Slot = tuple[str, str]
 """A field and the one value of it."""

@@ -3,7 +3,8 @@
 import json
 from typing import Final
 
-from trade._wire import Address, Token
+from trade._keys import Address
+from trade._wire import Token
 from trade.errors import ConfigurationError, LockLost
 
 VARIABLE: Final = "TRADE_LOCK"

@@ -15,6 +15,7 @@ from trade._codec import Codec
 from trade._context import CallContext, handed_down, holding, running
 from trade._failures import unpack_error
 from trade._hands import Hands
+from trade._keys import Address
 from trade._local_service import LocalService
 from trade._ongoing import Ongoing
 from trade._peer import Peer
@@ -27,7 +28,7 @@ from trade._serial import Serial, Turn
 from trade._session import speaking
 from trade._spans import traceable
 from trade._system import CLOCK, DOMAIN, PROVIDER
-from trade._wire import EMPTY_ARGUMENTS, UNREADABLE, Address, Call, ErrorInfo, Reply, ServiceInfo, Status
+from trade._wire import EMPTY_ARGUMENTS, UNREADABLE, Call, ErrorInfo, Reply, ServiceInfo, Status
 from trade.errors import (
     Busy,
     Cancelled,
@@ -175,8 +176,8 @@ class RemoteTarget:
         self._caller = caller
         self._peer: Peer = caller.peer(address)
         self._is_stop = record.info.effect == "stop"
-        self._publisher = caller.publisher(address, key.domain, key.provider, stop=self._is_stop)
-        self._clock = caller.publisher(address, DOMAIN, PROVIDER, stop=False)
+        self._publisher = caller.publishers.get(address, key.domain, key.provider, stop=self._is_stop)
+        self._clock = caller.publishers.get(address, DOMAIN, PROVIDER, stop=False)
         self._decode = result_decoder(codec, known or record.info)
         self._decode_any = codec.decoder(Any)
         self._traceable = traceable(key)

@@ -11,11 +11,12 @@ from typing import Any, Final, NoReturn, Protocol
 from msgspec import structs
 
 from trade._handle import Bound, Handle
+from trade._keys import Address, ServiceKey
 from trade._lock import Lock, apart
 from trade._run import Run
 from trade._system import DOMAIN, PROVIDER
 from trade._terms import Terms
-from trade._wire import Address, ServiceKey, Token
+from trade._wire import Token
 from trade.errors import Busy, ContainerLost, LockedByOther, ServiceGone, TradeError
 
 _ANSWER_S: Final = 2.0

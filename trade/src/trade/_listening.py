@@ -17,6 +17,7 @@ from trade._clockwork import Clockwork
 from trade._codec import Codec
 from trade._handle import Handle
 from trade._invoke import container_closed, result_decoder
+from trade._keys import ServiceKey
 from trade._registry import Change
 from trade._sample import STEPS_HZ, decode_sample, rate_of, signs_of, stream_key
 from trade._session import Session
@@ -24,7 +25,7 @@ from trade._stream import If, Stream
 from trade._streams import Home
 from trade._system import DOMAIN, PROVIDER
 from trade._transport import Channel, ChannelClosed, Transport
-from trade._wire import Malformed, ServiceKey
+from trade._wire import Malformed
 from trade.errors import AccessDenied, ServiceGone, SessionEnded, SourceLost, TradeError
 
 _logger = logging.getLogger("trade")

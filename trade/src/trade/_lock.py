@@ -14,8 +14,9 @@ from msgspec import structs
 
 from trade._context import Held, holding
 from trade._inherited import VARIABLE, passed_on
+from trade._keys import Address
 from trade._terms import Granted, Terms
-from trade._wire import Address, Token
+from trade._wire import Token
 from trade.errors import ConfigurationError, LockLost, TradeError
 
 if TYPE_CHECKING:

@@ -10,12 +10,13 @@ from msgspec import structs
 from trade._access import Access
 from trade._borrowed import Borrowed
 from trade._context import CallContext, served_call
+from trade._keys import Address
 from trade._locks import LockTable
 from trade._resources import Holder, Resource
 from trade._service import service
 from trade._session import foreign
 from trade._terms import Granted, LockInfo, Terms
-from trade._wire import Address, Token
+from trade._wire import Token
 from trade.errors import Busy, LockedByOther, TradeError
 
 _MOST_WAITING: Final = 24

@@ -8,11 +8,11 @@ from trade._access import Access
 from trade._constraints import Constraint
 from trade._handle import Handle
 from trade._keeper import Keeper
+from trade._keys import Address, ServiceKey
 from trade._lock import Lock, OnLost, OnRequest
 from trade._run import Run
 from trade._system import DOMAIN, PROVIDER
 from trade._terms import LockInfo, Terms
-from trade._wire import Address, ServiceKey
 from trade.errors import ConfigurationError, IncompleteGroup, NoSuchService, TradeError
 
 LONGEST_WAIT_S: Final = 3600.0

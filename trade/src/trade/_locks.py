@@ -10,9 +10,12 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from typing import Final
 
-from msgspec import Struct, structs
+from msgspec import structs
 
 from trade._audit import Audit
+from trade._ended_sessions import EndedSessions, within
+from trade._grants import Grant, Waiter, withheld
+from trade._leases import Leases
 from trade._resources import Holder, Latch, Resource, locked, not_stopped
 from trade._session import foreign
 from trade._terms import Granted, LockInfo, Terms
@@ -23,29 +26,10 @@ _STOPPING: Final = Holder("trade", "", "", "stopping what moved under a lock tha
 
 _REMEMBERED: Final = 256
 """So many grants that ended are known with the reason."""
-_SESSIONS_REMEMBERED: Final = 4096
 _LEASE_ENDED: Final = "its lease ended"
 
 Stop = Callable[[Sequence[Resource], str, Callable[[Resource, str], None]], None]
 """Stops resources for a reason, without waiting; tells of each when it is over, and why if it could not be done."""
-
-
-class _Grant(Struct, eq=False):
-    number: int
-    resources: tuple[Resource, ...]
-    holder: Holder
-    lease_s: float
-    until: float
-
-
-class _Waiter(Struct, eq=False):
-    order: tuple[int, int]
-    resources: tuple[Resource, ...]
-    holder: Holder
-    calls: frozenset[int]
-    """Of the asking chain: they are not waited for."""
-    gone: str = ""
-    """Why it waits in vain."""
 
 
 class LockTable:
@@ -66,21 +50,17 @@ class LockTable:
         self._clock = clock
         self._resources: dict[str, tuple[Resource, int]] = {}
         """By name, with the number of services that use it."""
-        self._grants: dict[int, _Grant] = {}
+        self._grants: dict[int, Grant] = {}
         self._ended: dict[int, str] = {}
         """Why the last few grants ended."""
-        self._sessions_ended: dict[str, str] = {}
-        """The last few that did, and why."""
-        self._waiting: list[_Waiter] = []
+        self._sessions = EndedSessions()
+        self._waiting: list[Waiter] = []
         """For their turn, next first."""
-        self._acquiring: list[_Waiter] = []
+        self._acquiring: list[Waiter] = []
         """For their turn or for what still runs."""
         self._count = 0
         self._changed = threading.Condition(threading.RLock())
-        self._sooner = threading.Event()
-        self._next_end = math.inf
-        """When the thread of the leases looks again."""
-        self._thread: threading.Thread | None = None
+        self._leases = Leases(self.expire, clock)
         self._closed = False
         self._estop: Latch | None = None
 
@@ -192,7 +172,7 @@ class LockTable:
             if (ended := self.gone((holder.session,))) is not None:
                 raise ended
             self._count += 1
-            waiter = _Waiter((-terms.priority, self._count), resources, holder, frozenset(calls))
+            waiter = Waiter((-terms.priority, self._count), resources, holder, frozenset(calls))
             self._acquiring.append(waiter)
             try:
                 self._take_turn(waiter, asked + terms.wait_s)
@@ -200,7 +180,7 @@ class LockTable:
             finally:
                 self._acquiring.remove(waiter)
 
-    def _empty_and_grant(self, waiter: _Waiter, terms: Terms, asked: float) -> Granted:
+    def _empty_and_grant(self, waiter: Waiter, terms: Terms, asked: float) -> Granted:
         try:
             self._drain(waiter, asked + terms.wait_s)
             return self._grant(waiter, terms, asked)
@@ -209,7 +189,7 @@ class LockTable:
                 resource.pending = None
             self._changed.notify_all()
 
-    def _take_turn(self, waiter: _Waiter, until: float) -> None:
+    def _take_turn(self, waiter: Waiter, until: float) -> None:
         """Wait until nobody has any of them and nobody waits before us for any; they are ours to empty then."""
         self._waiting.append(waiter)
         self._waiting.sort(key=lambda one: one.order)
@@ -222,7 +202,7 @@ class LockTable:
         for resource in waiter.resources:
             resource.pending = waiter.holder
 
-    def _obstacle(self, waiter: _Waiter) -> TradeError | None:
+    def _obstacle(self, waiter: Waiter) -> TradeError | None:
         if (unsafe := self._unsafe(waiter)) is not None:
             return unsafe
         for resource in waiter.resources:
@@ -238,10 +218,10 @@ class LockTable:
                 return locked(shared, earlier.holder, waiter.holder.session)
         return None
 
-    def _unsafe(self, waiter: _Waiter) -> NotStopped | None:
+    def _unsafe(self, waiter: Waiter) -> NotStopped | None:
         return next((not_stopped(one, self._container) for one in waiter.resources if one.unsafe), None)
 
-    def _drain(self, waiter: _Waiter, until: float) -> None:
+    def _drain(self, waiter: Waiter, until: float) -> None:
         while (running := self._running(waiter)) is not None:
             owner = ", ".join(running.movers) or "somebody"
             purpose = "a call or a motion that has not ended"
@@ -249,13 +229,13 @@ class LockTable:
             if (unsafe := self._unsafe(waiter)) is not None:  # whoever moved it has gone meanwhile, and it went on
                 raise unsafe
 
-    def _wait(self, waiter: _Waiter, until: float, obstacle: TradeError) -> None:
+    def _wait(self, waiter: Waiter, until: float, obstacle: TradeError) -> None:
         left = until - self._clock()
         if left <= 0 or waiter.gone or self._closed or isinstance(obstacle, NotStopped):
             raise obstacle
         self._changed.wait(left)
 
-    def _running(self, waiter: _Waiter) -> Resource | None:
+    def _running(self, waiter: Waiter) -> Resource | None:
         """One of them that is still in use by others than the asking chain."""
         for resource in waiter.resources:
             others = [call for call in list(resource.calls) if call not in waiter.calls]
@@ -263,18 +243,18 @@ class LockTable:
                 return resource
         return None
 
-    def _grant(self, waiter: _Waiter, terms: Terms, asked: float) -> Granted:
+    def _grant(self, waiter: Waiter, terms: Terms, asked: float) -> Granted:
         if waiter.gone:
             raise ServiceGone(service=", ".join(one.name for one in waiter.resources), reason=waiter.gone)
         self._count += 1
         now, number = self._clock(), self._count
         holder = structs.replace(waiter.holder, since=time.time())
-        grant = _Grant(number, waiter.resources, holder, terms.lease_s, now + terms.lease_s)
+        grant = Grant(number, waiter.resources, holder, terms.lease_s, now + terms.lease_s)
         self._grants[number] = grant
         for resource in waiter.resources:
             resource.holder, resource.live = holder, number
             resource.uses, resource.used_at = 0, 0.0
-        self._watch_leases(grant.until)
+        self._leases.look_by(grant.until)
         self._note("locked", grant, holder.purpose and f"for {holder.purpose}")
         return Granted(Token(self._epoch, number), tuple(one.name for one in grant.resources), now - asked)
 
@@ -358,9 +338,7 @@ class LockTable:
         What comes from it later is refused: a call may have been under way, or have waited for its turn.
         """
         with self._changed:
-            self._sessions_ended[session] = reason
-            if len(self._sessions_ended) > _SESSIONS_REMEMBERED:
-                del self._sessions_ended[next(iter(self._sessions_ended))]
+            self._sessions.ended(session, reason)
             for waiter in self._acquiring:
                 if within(waiter.holder.session, session):
                     waiter.gone = reason
@@ -371,56 +349,25 @@ class LockTable:
 
     def session_back(self, session: str) -> None:
         """It could not be reached, and is there again."""
-        self._sessions_ended.pop(session, None)
+        self._sessions.back(session)
 
     def gone(self, sessions: Iterable[str]) -> SessionEnded | None:
         """Which of these has ended, as an error; None if all are there."""
-        if self._sessions_ended:
-            for session in sessions:
-                whole = "/".join(session.split("/")[:3])
-                if (reason := self._sessions_ended.get(session) or self._sessions_ended.get(whole)) is not None:
-                    return SessionEnded(session=session, reason=reason)
-        return None
+        return self._sessions.gone(sessions)
 
     def infos(self) -> list[LockInfo]:
         """What is held, and who waits."""
         with self._changed:
             now = self._clock()
-            return [self._info(grant, now) for grant in self._grants.values()]
+            return [grant.info(self._epoch, self._container, now, self._waiting) for grant in self._grants.values()]
 
     def withheld(self) -> list[LockInfo]:
         """What nobody gets before it is resumed, as it could not be stopped (S14): of "nobody", with number 0."""
-        return [self._withheld(resource) for resource in self.resources() if resource.unsafe]
-
-    def _withheld(self, resource: Resource) -> LockInfo:
-        purpose = f"could not be stopped ({resource.unsafe}); look at it, then `trade resume {resource.name}`"
-        return LockInfo(
-            token=Token(self._epoch, 0),
-            container=self._container,
-            resources=(resource.name,),
-            holder=Holder("nobody", "", "", purpose, resource.unsafe_at),
-            left_s=0.0,
-            uses=0,
-            last_use=0.0,
-            waiting=(),
-        )
-
-    def _info(self, grant: _Grant, now: float) -> LockInfo:
-        waiting = [one.holder for one in self._waiting if not set(one.resources).isdisjoint(grant.resources)]
-        return LockInfo(
-            token=Token(self._epoch, grant.number),
-            container=self._container,
-            resources=tuple(resource.name for resource in grant.resources),
-            holder=grant.holder,
-            left_s=max(0.0, grant.until - now),
-            uses=sum(resource.uses for resource in grant.resources),
-            last_use=max(resource.used_at for resource in grant.resources),
-            waiting=tuple(one.owner for one in waiting),
-        )
+        return [withheld(one, self._epoch, self._container) for one in self.resources() if one.unsafe]
 
     # --- its end
 
-    def _end(self, grant: _Grant, reason: str) -> None:
+    def _end(self, grant: Grant, reason: str) -> None:
         self._ended[grant.number] = reason  # first: who does not find the grant looks here
         del self._grants[grant.number]
         if len(self._ended) > _REMEMBERED:
@@ -430,7 +377,7 @@ class LockTable:
                 resource.live, resource.holder = 0, None
         self._changed.notify_all()
 
-    def _note(self, what: str, grant: _Grant, why: str = "") -> None:
+    def _note(self, what: str, grant: Grant, why: str = "") -> None:
         names, holder = [resource.name for resource in grant.resources], grant.holder
         who = foreign(holder.session) or holder.identity
         self._audit.note("lock", what, about=names, who=who, session=holder.session, why=why)
@@ -447,46 +394,24 @@ class LockTable:
             with self._changed:
                 self._changed.notify_all()
 
-    def _watch_leases(self, until: float) -> None:
-        if self._thread is None:
-            self._thread = threading.Thread(target=self._run, name="trade-leases", daemon=True)
-            self._thread.start()
-        if until < self._next_end:
-            self._sooner.set()
-
-    def _run(self) -> None:
-        while not self._closed:
-            self._sooner.clear()
-            self._sooner.wait(self.expire())
-
-    def expire(self) -> float | None:
-        """Take away what outlived its lease. Returns in how many seconds the next one may end, if any."""
+    def expire(self) -> float:
+        """Take away what outlived its lease. Returns when the next one may end, as this clock counts; or infinity."""
         with self._changed:
             now = self._clock()
             over = [grant.number for grant in self._grants.values() if grant.until <= now]
-            self._next_end = min(
-                (grant.until for grant in self._grants.values() if grant.until > now), default=math.inf
-            )
-            left_s = self._next_end - now
+            soonest = min((grant.until for grant in self._grants.values() if grant.until > now), default=math.inf)
         for number in over:
             self.lose(number, _LEASE_ENDED)
-        return None if left_s == math.inf else left_s
+        return soonest
 
     def close(self) -> None:
         """End every wait. Idempotent."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
-        self._sooner.set()
-        if self._thread is not None and self._thread is not threading.current_thread():
-            self._thread.join(2)
+        self._leases.close()
 
 
 def _leave_it(resources: Sequence[Resource], _: str, done: Callable[[Resource, str], None]) -> None:
     for resource in resources:
         done(resource, "")
-
-
-def within(session: str, whole: str) -> bool:
-    """Whether a session is that one or one of its parts."""
-    return session == whole or session.startswith(f"{whole}/")

@@ -9,8 +9,8 @@ from fnmatch import fnmatchcase
 from typing import Any, Final, NamedTuple, Protocol
 
 from trade._handle import Handle
+from trade._keys import Address
 from trade._providers import Providers
-from trade._wire import Address
 from trade._withdrawn import Withdrawn
 from trade.errors import CannotInstantiate, ConfigurationError, NoSuchClass, NotInstantiable
 

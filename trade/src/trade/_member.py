@@ -5,10 +5,10 @@ from typing import Any
 
 from trade._access import Access
 from trade._handle import Handle
+from trade._keys import Address, ServiceKey
 from trade._parts import Parts
 from trade._registry import Record
 from trade._run import Run
-from trade._wire import Address, ServiceKey
 
 
 class Member(ABC):

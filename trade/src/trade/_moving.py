@@ -5,9 +5,9 @@ from typing import Any, Final
 
 from trade._constraints import Constraint
 from trade._handle import Handle
+from trade._keys import ServiceKey
 from trade._looking import Looking
 from trade._system import DOMAIN, PROVIDER
-from trade._wire import ServiceKey
 from trade.errors import NoSuchService, TooManyServices
 
 _LONGEST_S: Final = 45.0

@@ -9,6 +9,7 @@ from typing import Protocol
 from trade._access import Access
 from trade._context import served_call
 from trade._handle import Handle
+from trade._keys import Address, ServiceKey
 from trade._notifications import Notification, NotificationInfo, Owner, Standing
 from trade._notifier import Notifier
 from trade._occasions import OF_SERVICES, Deed, Terms
@@ -16,7 +17,6 @@ from trade._registry import Record, Registry
 from trade._service import service
 from trade._session import Session
 from trade._system import DOMAIN, PROVIDER
-from trade._wire import Address, ServiceKey
 from trade.errors import CallerError, CallError, NoSuchNotification
 
 _logger = logging.getLogger("trade")

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from typing import Final
 
 from trade._constraints import GROUP
+from trade._keys import is_chunk
 from trade._service import ServiceMark
 from trade._system import DOMAIN
-from trade._wire import is_chunk
 from trade.errors import ConfigurationError
 
 _LONGEST_HEALTH: Final = 500

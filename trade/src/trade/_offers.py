@@ -5,8 +5,9 @@ from typing import Any, NamedTuple
 
 from msgspec import Struct
 
+from trade._keys import ServiceKey
 from trade._local_service import LocalService
-from trade._wire import ProviderInfo, Scalar, ServiceKey
+from trade._wire import ProviderInfo, Scalar
 
 
 class Registered(Struct, frozen=True):

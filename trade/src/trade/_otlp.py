@@ -4,9 +4,9 @@ from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Final
 
+from trade._keys import Address
 from trade._settings import Settings
 from trade._spans import Span
-from trade._wire import Address
 from trade.errors import ConfigurationError
 
 if TYPE_CHECKING:

@@ -26,6 +26,7 @@ from trade._handle_codec import handle_codec
 from trade._hooks import Hooks
 from trade._inherited import InheritedLock
 from trade._joining import join
+from trade._keys import Address, ServiceKey
 from trade._listening import Listening
 from trade._load import Load, resident_bytes
 from trade._locking import Locking
@@ -48,7 +49,7 @@ from trade._targets import Targets
 from trade._terminating import Terminating
 from trade._transport import Transport
 from trade._watch import Watch
-from trade._wire import Address, ServiceKey, Token
+from trade._wire import Token
 from trade._withdrawn import Withdrawn
 from trade._zenoh import ZenohTransport
 from trade.errors import AccessDenied
@@ -194,6 +195,7 @@ class Parts:
         if self.inherited is not None:
             self.inherited.lost(address)
         self.session_ended(str(address), f"its container {address.container} has ended or cannot be reached")
+        self.dispatcher.forget(address)
 
     def session_ended(self, session: str, reason: str = "it was closed") -> None:
         """Nobody of it is there any more: nothing more is let in for it, its locks fall, what it moves stops."""

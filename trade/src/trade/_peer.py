@@ -4,7 +4,7 @@ import math
 import time
 from typing import Final
 
-from trade._wire import Address
+from trade._keys import Address
 
 NEVER: Final = math.inf
 _DRIFT: Final = 200e-6

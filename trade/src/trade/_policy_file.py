@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Final, cast
 
 from trade._constraints import GROUP
+from trade._keys import NO_GROUP, is_chunk
 from trade._policies import EVERYTHING, VERBS, Policy, Role
 from trade._toml import read_toml_text
-from trade._wire import NO_GROUP, is_chunk
 from trade.errors import ConfigurationError
 
 __all__ = ["Seen", "look_at", "policy_files", "read_policy"]

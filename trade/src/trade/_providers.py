@@ -15,6 +15,7 @@ from trade._audit import Audit
 from trade._codec import Codec
 from trade._constraints import checked_meta
 from trade._coroutines import AsyncLoop
+from trade._keys import Address, ServiceKey, as_chunk, domain_of
 from trade._local_service import LocalService
 from trade._locks import LockTable
 from trade._offerable import require_stop
@@ -25,15 +26,7 @@ from trade._serial import Serial
 from trade._service import ServiceMark, kinds_of, marked_methods
 from trade._signature import Signature
 from trade._system import DOMAIN
-from trade._wire import (
-    Address,
-    ProviderInfo,
-    Scalar,
-    ServiceInfo,
-    ServiceKey,
-    as_chunk,
-    domain_of,
-)
+from trade._wire import ProviderInfo, Scalar, ServiceInfo
 from trade.errors import ConfigurationError
 
 _MOST_MOVED: Final = 4096

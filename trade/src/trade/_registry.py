@@ -9,7 +9,8 @@ from trade._bell import Bell
 from trade._constraints import Constraint
 from trade._heard import Heard
 from trade._index import Index
-from trade._wire import HEALTHY, PROTOCOL, Address, Estop, ProviderInfo, Scalar, ServiceInfo, ServiceKey
+from trade._keys import Address, ServiceKey
+from trade._wire import HEALTHY, PROTOCOL, Estop, ProviderInfo, Scalar, ServiceInfo
 from trade.errors import ServiceGone
 
 __all__ = ["ContainerState", "Record", "Registry"]

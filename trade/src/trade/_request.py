@@ -6,8 +6,9 @@ from typing import Final
 from msgspec import Struct
 
 from trade._context import CallContext, Held, handed_down, holding, running
+from trade._keys import Address
 from trade._session import Session, speaking
-from trade._wire import Address, Behalf, Token
+from trade._wire import Behalf, Token
 
 DEFAULT_DEADLINE_S: Final = 10.0
 _DEFAULT_DEADLINE_NS: Final = int(DEFAULT_DEADLINE_S * 1e9)

@@ -8,9 +8,9 @@ from msgspec import Struct
 
 from trade._constraints import Constraint
 from trade._handle import Handle
+from trade._keys import Address
 from trade._rule_causes import Way
 from trade._rules_file import SERVICE, Condition, Selection, Step, filled
-from trade._wire import Address
 from trade.errors import ConfigurationError
 
 _LONGEST_RESULT: Final = 200

@@ -11,9 +11,10 @@ from msgspec import UNSET, Struct, UnsetType
 
 from trade._constraints import Constraint, where
 from trade._handle import LONGEST_DEADLINE_S, Handle
+from trade._keys import is_chunk
 from trade._occasions import LONGEST_S, SHORTEST_S
 from trade._toml import read_toml_text
-from trade._wire import Scalar, is_chunk
+from trade._wire import Scalar
 from trade.errors import ConfigurationError
 
 SERVICE: Final = "$service"

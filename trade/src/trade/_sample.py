@@ -5,7 +5,8 @@ from typing import Annotated, Any, Final
 import msgspec
 from msgspec import Meta, Raw, Struct
 
-from trade._wire import MOST_BYTES, PROTOCOL, Malformed, OtherVersion, ServiceKey, unread
+from trade._keys import ServiceKey
+from trade._wire import MOST_BYTES, PROTOCOL, Malformed, OtherVersion, unread
 
 __all__ = [
     "STEPS_HZ",

@@ -5,8 +5,8 @@ from collections.abc import Callable, Generator
 from contextvars import ContextVar
 from typing import Final
 
+from trade._keys import Address
 from trade._transport import Presence
-from trade._wire import Address
 from trade.errors import SessionEnded
 
 __all__ = ["Session", "foreign", "speaking"]

@@ -14,10 +14,10 @@ from typing import Final
 from urllib.parse import SplitResult, urlsplit
 
 from trade._endpoints import Endpoint, dialled_from_here
+from trade._keys import as_chunk, is_chunk
 from trade._policies import EVERYTHING
 from trade._sample import STEPS_HZ
 from trade._tls import Certificate
-from trade._wire import as_chunk, is_chunk
 from trade.errors import ConfigurationError
 
 __all__ = ["Settings"]

@@ -19,6 +19,7 @@ from trade._context import CallContext, holding, running
 from trade._deadman import NOBODYS
 from trade._handle import Handle
 from trade._handle_codec import handle_codec
+from trade._keys import Address, ServiceKey
 from trade._lock import Lock, OnLost, OnRequest
 from trade._locking import LEASE_S
 from trade._registry import Change
@@ -26,7 +27,7 @@ from trade._session import speaking
 from trade._terms import Terms
 from trade._transport import ChannelClosed
 from trade._visitors import Visitors
-from trade._wire import Address, Behalf, Estop, ProviderInfo, ServiceKey
+from trade._wire import Behalf, Estop, ProviderInfo
 from trade.errors import ConfigurationError, TradeError
 
 __all__ = ["SHARED_FROM", "Border"]

@@ -5,9 +5,9 @@ from typing import Final
 
 from msgspec import Struct
 
+from trade._keys import Address
 from trade._reach import Reach
 from trade._registry import Registry
-from trade._wire import Address
 from trade.errors import NobodyFound
 
 __all__ = ["Sight", "look_around"]

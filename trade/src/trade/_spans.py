@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 from msgspec import Struct, structs
 
 from trade._context import CallContext
+from trade._keys import Address, ServiceKey
 from trade._logbook import listen
 from trade._request import Request
 from trade._system import DOMAIN
-from trade._wire import Address, ServiceKey, Token
+from trade._wire import Token
 
 if TYPE_CHECKING:
     from trade._local_service import Around, LocalService

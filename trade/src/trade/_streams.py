@@ -15,13 +15,14 @@ from msgspec import Raw, Struct, structs
 from trade._clockwork import Clockwork
 from trade._context import CallContext
 from trade._handle import Handle
+from trade._keys import Address, ServiceKey
 from trade._local_service import LocalService
 from trade._pace import Pace
 from trade._registry import Change
 from trade._sample import STEPS_HZ, StreamSample, stream_key
 from trade._serial import Turn
 from trade._transport import ChannelClosed, Publisher, Transport
-from trade._wire import EMPTY_ARGUMENTS, PROTOCOL, Address, ServiceKey, encode_message
+from trade._wire import EMPTY_ARGUMENTS, PROTOCOL, encode_message
 from trade.errors import AccessDenied, ConfigurationError, DeadlineExceeded, ServiceGone
 
 _logger = logging.getLogger("trade")

@@ -10,12 +10,13 @@ from msgspec import Struct
 
 from trade._constraints import Constraint, where
 from trade._handle import Handle
+from trade._keys import Address, ServiceKey
 from trade._load import Load, LoadInfo
 from trade._reach import Reach
 from trade._service import service
 from trade._settings import Settings
 from trade._starting import start
-from trade._wire import PROTOCOL, Address, ServiceKey
+from trade._wire import PROTOCOL
 from trade.errors import CannotStart, ConfigurationError, LinkStays, NoSuchService, TooManyServices
 
 DOMAIN: Final = "trade"

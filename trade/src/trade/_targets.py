@@ -9,11 +9,12 @@ from trade._codec import Codec
 from trade._handle import Handle
 from trade._hands import Hands
 from trade._invoke import LocalTarget, RemoteTarget, container_closed
+from trade._keys import Address, ServiceKey
 from trade._providers import Providers
 from trade._registry import Change, Record, Registry, gone_to
 from trade._system import DOMAIN, ESTOPS, PROVIDER
 from trade._transport import ChannelClosed
-from trade._wire import Address, ServiceInfo, ServiceKey
+from trade._wire import ServiceInfo
 from trade.errors import AccessDenied, ServiceGone
 
 Target = LocalTarget | RemoteTarget
@@ -121,7 +122,7 @@ class Targets:
         for record in change.left:
             key = record.key
             if not record.local and (self._registry.removed(key) or not self._registry.is_alive(key.address)):
-                self._caller.forget(key.address, key.domain, key.provider)
+                self._caller.publishers.forget(key.address, key.domain, key.provider)
 
     def judge_anew(self) -> None:
         """The policy is another one."""

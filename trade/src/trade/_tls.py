@@ -15,7 +15,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any, Final, cast
 
-from trade._wire import is_chunk
+from trade._keys import is_chunk
 from trade.errors import ConfigurationError
 
 __all__ = ["Certificate", "authority", "transport_settings"]

@@ -7,12 +7,12 @@ from typing import Final
 from msgspec import Struct
 
 from trade._constraints import where
+from trade._keys import ServiceKey
 from trade._logbook import LogLine
 from trade._looking import Looking
 from trade._many import Outcome
 from trade._spans import Span
 from trade._system import DOMAIN
-from trade._wire import ServiceKey
 from trade.errors import AccessDenied, NoSuchCall
 
 NOT_TRACED: Final = "(not traced)"

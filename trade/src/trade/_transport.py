@@ -165,6 +165,13 @@ class Transport(ABC):
         """Whether a bridge to others went a moment ago: who is out of sight now may be behind it, and come back."""
         return False
 
+    def settle(self) -> None:
+        """Whoever has this is here to stay: say so, where it makes a difference to others.
+
+        While it does, what is heard may come twice.
+        """
+        return
+
     @abstractmethod
     def wake(self, key: str, payload: bytes) -> None:
         """Put for the readers of this very transport only; nothing leaves the process."""

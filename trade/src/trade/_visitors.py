@@ -5,7 +5,7 @@ from collections.abc import Callable, Hashable
 from typing import Final, Protocol
 
 from trade._context import CallContext
-from trade._locks import within
+from trade._ended_sessions import within
 from trade._session import Session, foreign
 from trade.errors import Busy, SessionEnded
 

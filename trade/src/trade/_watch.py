@@ -1,35 +1,26 @@
 """The threads that listen to the rest of the system: who is there, and what they offer."""
 
 import logging
+import math
 import threading
+import time
 from collections.abc import Callable, Iterable
 from typing import Final
 
 from trade._absence import Absences
 from trade._asking import Asker
 from trade._estop_messages import decode_open_estops
+from trade._keys import ALIVE, REGISTRY, TALLY, Address, is_chunk, tally_key
 from trade._registry import ContainerState, Registry
 from trade._system import DOMAIN
 from trade._transport import Answer, Channel, ChannelClosed, Message, Transport
-from trade._wire import (
-    ALIVE,
-    PROTOCOL,
-    REGISTRY,
-    TALLY,
-    Address,
-    Estop,
-    Malformed,
-    OtherVersion,
-    ProviderInfo,
-    decode_provider,
-    decode_tally,
-    is_chunk,
-    tally_key,
-)
+from trade._wire import PROTOCOL, Estop, Malformed, OtherVersion, ProviderInfo, decode_provider, decode_tally
 
 _logger = logging.getLogger("trade")
 
 _SYNC_S: Final = 2.0
+_STAYS_S: Final = 60.0
+"""Who has been here for so long is no passer-by."""
 
 
 class Watch:
@@ -53,7 +44,9 @@ class Watch:
         self._ended = ended
         self._returned = returned
         self.malformed = 0
-        self._asker = Asker(transport, registry, self._answer, beat)
+        self._beat = beat
+        self._stays_from = time.monotonic() + _STAYS_S
+        self._asker = Asker(transport, registry, self._answer, self._regularly)
         self._transport = transport
         self._absences = Absences(self._gone, transport.bridge_lost)
         entries, signs = transport.announcements(REGISTRY), transport.presences(ALIVE)
@@ -72,6 +65,12 @@ class Watch:
     def busy(self) -> bool:
         """Whether somebody is being asked for what was missed."""
         return self._asker.busy
+
+    def _regularly(self) -> None:
+        self._beat()
+        if time.monotonic() >= self._stays_from:
+            self._stays_from = math.inf
+            self._transport.settle()
 
     def _read(self, channel: Channel, take: Callable[[Message], None]) -> None:
         while True:

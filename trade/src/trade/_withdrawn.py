@@ -4,12 +4,12 @@ import threading
 from collections.abc import Callable, Sequence
 from typing import Final
 
+from trade._keys import ServiceKey
 from trade._offerable import checked_groups
 from trade._offers import Offer
 from trade._providers import Providers
 from trade._resources import Resource
 from trade._system import DOMAIN, WithdrawnInfo
-from trade._wire import ServiceKey
 from trade.errors import ConfigurationError, DeviceFault
 
 

@@ -7,6 +7,7 @@ receiver instead of dropping (zenoh's default), and go out at once. All sessions
 """
 
 import contextlib
+import threading
 from collections.abc import Callable, Generator, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, Final
@@ -14,6 +15,7 @@ from typing import Any, Final
 import zenoh
 
 from trade._endpoints import Endpoint
+from trade._keys import PASSING
 from trade._links import Links, new_session_id, open_session
 from trade._tls import Certificate, transport_settings
 from trade._transport import (
@@ -104,14 +106,21 @@ class ZenohChannel(Channel):
 
     def __init__(self, subscriber: Any, declare_on: zenoh.Session | None = None) -> None:
         self._subscriber = subscriber
+        self._next_recv: Callable[[], zenoh.Sample] | None = None
+        """Of another subscriber, for when all is read that the one before it has got."""
+        self._closed = False
+        self._moving = threading.Lock()
         self._session = declare_on
         self._known: dict[str, zenoh.KeyExpr] = {}
-        self._recv = subscriber.handler.recv if hasattr(subscriber, "handler") else subscriber.recv
+        self._recv = _reader(subscriber)
 
     def receive(self) -> Message:
+        recv = self._recv
         try:
-            sample: zenoh.Sample = self._recv()
+            sample: zenoh.Sample = recv()
         except zenoh.ZError:
+            if self._go_on(recv):
+                return self.receive()
             raise ChannelClosed from None
         key, payload = str(sample.key_expr), sample.payload.to_bytes()
         if self._session is not None and key not in self._known:
@@ -128,10 +137,32 @@ class ZenohChannel(Channel):
         for declared in known.values():
             _quietly(lambda declared=declared: session.undeclare(declared))
 
+    def move(self, declare: Callable[[], Any]) -> None:
+        """Hear another subscriber from now on; what both have got is heard twice. Raises ZError of a closed session."""
+        with self._moving:
+            if self._closed:
+                return
+            before, self._subscriber = self._subscriber, declare()
+            self._next_recv = _reader(self._subscriber)
+        _quietly(before.undeclare)
+
+    def _go_on(self, ended: Any) -> bool:
+        """A subscriber has no more; returns whether there is another one."""
+        with self._moving:
+            if self._next_recv is not None:
+                self._recv, self._next_recv = self._next_recv, None
+            return self._recv is not ended and not self._closed
+
     def close(self) -> None:
+        with self._moving:
+            self._closed = True
         _quietly(self._subscriber.undeclare)
         if self._session is not None:
             self._forget(self._session)
+
+
+def _reader(subscriber: Any) -> Callable[[], zenoh.Sample]:
+    return subscriber.handler.recv if hasattr(subscriber, "handler") else subscriber.recv
 
 
 class ZenohPublisher(Publisher):
@@ -202,6 +233,8 @@ class ZenohTransport(Transport):
                 problem=f"cannot listen there: {reason}; is the address taken, or not of this host?",
             ) from None
         self.links: Final = Links(self._session, settings)
+        self._passing: list[tuple[ZenohChannel, Callable[[], Any]]] = []
+        """What is heard under another pattern until this is known to stay, and how to hear it then."""
 
     def publish(self, key: str, *, urgent: bool = False, droppable: bool = False) -> Publisher:
         behind = droppable and not urgent
@@ -214,19 +247,38 @@ class ZenohTransport(Transport):
         return ZenohPublisher(declared, lambda: self._session.undeclare(known))
 
     def subscribe(self, pattern: str, *, newest: int = 0) -> Channel:
-        kept = zenoh.handlers.RingChannel(newest) if newest else _fifo()
-        with _refusing():
-            return ZenohChannel(self._session.declare_subscriber(pattern, kept), declare_on=self._session)
+        def heard(pattern: str) -> Any:
+            return self._session.declare_subscriber(pattern, zenoh.handlers.RingChannel(newest) if newest else _fifo())
+
+        return self._hear(pattern, heard, declare_on=self._session)
 
     def announce(self, key: str, payload: bytes) -> None:
         with _refusing():
             self._session.put(key, payload, congestion_control=_BLOCK, express=True)
 
     def announcements(self, pattern: str) -> Channel:
+        def heard(pattern: str) -> Any:
+            return self._session.declare_subscriber(pattern, _fifo(), allowed_origin=zenoh.Locality.REMOTE)
+
+        return self._hear(pattern, heard)
+
+    def _hear(self, pattern: str, heard: Callable[[str], Any], declare_on: zenoh.Session | None = None) -> ZenohChannel:
+        """Who passes by hears what everybody hears under another pattern that matches the same keys.
+
+        zenoh 1.10 keeps the link to whoever subscribed to a pattern, 5 KiB or with TLS 30, for as long as anybody
+        subscribes to that one (https://github.com/eclipse-zenoh/zenoh/issues/2393).
+        """
         with _refusing():
-            return ZenohChannel(
-                self._session.declare_subscriber(pattern, _fifo(), allowed_origin=zenoh.Locality.REMOTE)
-            )
+            channel = ZenohChannel(heard(PASSING.get(pattern, pattern)), declare_on)
+        if pattern in PASSING:
+            self._passing.append((channel, lambda: heard(pattern)))
+        return channel
+
+    def settle(self) -> None:
+        passing, self._passing = self._passing, []
+        with _refusing():
+            for channel, heard in passing:
+                channel.move(heard)
 
     def questions(self, pattern: str) -> Questions:
         with _refusing():

@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 import msgspec
 
 from trade import Resource, current_call, errors, service, where
-from trade._wire import ServiceKey, Status
+from trade._keys import ServiceKey
+from trade._wire import Status
 from trade_gateway.conformance._check import check
 from trade_gateway.conformance._judging import eventually, require
 from trade_gateway.conformance._stage import Stage

@@ -3,7 +3,8 @@
 import signal
 from typing import Final
 
-from trade._wire import ServiceInfo, Tally, decode_tally, is_chunk, registry_key, tally_key
+from trade._keys import is_chunk, registry_key, tally_key
+from trade._wire import ServiceInfo, Tally, decode_tally
 from trade_gateway.conformance._check import check
 from trade_gateway.conformance._judging import NotHeld, eventually, require
 from trade_gateway.conformance._peer import GROUP, Offer

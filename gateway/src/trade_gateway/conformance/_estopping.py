@@ -7,16 +7,8 @@ from typing import Any
 
 from trade import errors, where
 from trade._estop_messages import decode_estop_confirmed
-from trade._wire import (
-    PROTOCOL,
-    Estop,
-    EstopConfirmed,
-    EstopOrder,
-    Malformed,
-    encode_message,
-    estop_confirmed_key,
-    estop_key,
-)
+from trade._keys import estop_confirmed_key, estop_key
+from trade._wire import PROTOCOL, Estop, EstopConfirmed, EstopOrder, Malformed, encode_message
 from trade_gateway.conformance._check import check
 from trade_gateway.conformance._judging import PATIENCE_S, eventually, require
 from trade_gateway.conformance._peer import GROUP

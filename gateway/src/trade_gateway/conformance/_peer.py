@@ -11,8 +11,9 @@ from typing import Final
 
 from msgspec import Struct
 
+from trade._keys import Address, registry_key
 from trade._transport import Answer
-from trade._wire import Address, Malformed, ProviderInfo, decode_provider, decode_tally, registry_key
+from trade._wire import Malformed, ProviderInfo, decode_provider, decode_tally
 from trade_gateway.conformance._judging import NotHeld, eventually, require
 from trade_gateway.conformance._voice import SYSTEM, Place
 

@@ -17,16 +17,11 @@ import msgspec
 
 from trade import Container
 from trade._endpoints import free_endpoint
+from trade._keys import ALIVE, Address, is_chunk, registry_key
 from trade._settings import Settings
 from trade._terms import Granted
 from trade._transport import Answer, ChannelClosed
-from trade._wire import (
-    ALIVE,
-    Address,
-    Token,
-    is_chunk,
-    registry_key,
-)
+from trade._wire import Token
 from trade._zenoh import ZenohTransport, configuration
 from trade.errors import ConfigurationError
 from trade_gateway.conformance._judging import SLACK_S, STOPPED_S, NotHeld, eventually, require

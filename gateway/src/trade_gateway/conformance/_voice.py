@@ -10,22 +10,19 @@ from typing import Any, Final
 import msgspec
 
 from trade._failures import unpack_error
+from trade._keys import Address, alive_key, call_key, reply_key
 from trade._transport import ChannelClosed, Publisher, Transport
 from trade._wire import (
     CANCEL,
     PROTOCOL,
-    Address,
     Behalf,
     ErrorInfo,
     Malformed,
     Reply,
     Status,
     Token,
-    alive_key,
-    call_key,
     decode_reply,
     encode_message,
-    reply_key,
 )
 from trade_gateway.conformance._judging import PATIENCE_S, NotHeld, eventually
 

@@ -10,7 +10,7 @@ from typing import Any, Final, cast
 import tomlkit
 from tomlkit.exceptions import TOMLKitError
 
-from trade._wire import is_chunk
+from trade._keys import is_chunk
 from trade.errors import ConfigurationError
 
 _logger = logging.getLogger("trade")
