@@ -339,9 +339,9 @@ class Stand:
         return self._noted("bus off", "dora", lambda: control.do(BusOff(bus=CAN_BUS, on=False)))
 
     def kill_gateway(self) -> Callable[[], None]:
-        self._noted("kill gateway", "door", None)
+        back = self._noted("kill gateway", "door", self.site.begin)  # it may be there again before anybody is missed
         self.site.end(signal.SIGKILL)
-        return self.site.begin
+        return back
 
     def freeze_gateway(self) -> Callable[[], None]:
         return self._noted("freeze gateway", "door", _frozen(self.site.gateway.pid))

@@ -85,9 +85,10 @@ class Stand:
     # --- from one version to another
 
     def change_gateway(self, version: int) -> None:
-        self._log.note(Fault(t=time.monotonic(), what="kill gateway", whom="door", until=1e12))
+        began = time.monotonic()
         self.site.through = self._through(version)
         self.site.end(signal.SIGTERM)
+        self._log.note(Fault(t=began, what="kill gateway", whom="door", until=time.monotonic()))
         self.site.begin()
 
     def change_driver(self, robot: str, version: int) -> None:
