@@ -88,7 +88,7 @@ class LockTable:
                 raise ValueError(f"resource {name} is another object already; share one trade.Resource")
             if known is None:  # what is offered anew is nobody's
                 resource.live, resource.holder = 0, None
-            resource.epoch, resource.over, resource.gone = self._epoch, self.over, self.gone
+            resource.epoch, resource.over, resource.gone = self._epoch, self.over, self._sessions.gone
             resource.estop = self._estop
             resource.on_rest(self._rested)
             self._resources[name] = (resource, uses + 1)
