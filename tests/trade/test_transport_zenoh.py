@@ -74,13 +74,11 @@ class TestZenoh(TransportConformance):
                     here.announce(f"registry/{number}", str(number).encode())
 
             putting = other.submit(put_all)
-            begun = [
-                _until(channel, 500) for channel in (orders, announced)
-            ]  # the first few went before it was heard of
+            begun = [_until(channel, 500) for channel in (orders, announced)]
             there.settle()
-            for channel, heard in zip((orders, announced), begun, strict=True):
-                heard += _until(channel, numbers[-1])
-                assert sorted(set(heard)) == list(numbers[heard[0] :])
+            for channel, before in zip((orders, announced), begun, strict=True):
+                heard = [before[-1], *_until(channel, numbers[-1])]
+                assert sorted(set(heard)) == list(numbers[before[-1] :])
             putting.result(60)
 
     def test_who_settles_is_closed_as_ever(self) -> None:
