@@ -18,7 +18,7 @@ from typing import Any
 
 from tests.holds import Ask, Done, Held, Log, Seen, now
 
-from system.siege_records import Answer, Order
+from system.siege_records import Answer, Order, of_robot
 from trade import errors
 
 ROBOTS = ("rosie", "dora")
@@ -75,7 +75,9 @@ class Careless(ABC):
         self._log = Log(told["folder"], name)
         self.ended = threading.Event()
         self._count = 0
-        self._asked = self._had = ""
+        self._asked: tuple[str, Sequence[str]] = ("", ())
+        """The hold that was asked for last, and of which joints."""
+        self._had = set[str]()
         """The hold that it asked for last, and the one that it knows it has had."""
         self._thread = threading.Thread(target=self._run_or_end)
         self.ways = [self._go]
@@ -137,7 +139,7 @@ class Careless(ABC):
         self._count += 1
         hold = f"{self._name}:{self._count}"
         self._log.note(Ask(t=now(), hold=hold, resources=tuple(sorted(joints))))
-        self._asked = hold
+        self._asked, self._had = (hold, joints), set()
         try:
             taken = self.take(robots, self.random.choice(_WAITS_S))
         except Refused as no:
@@ -213,11 +215,19 @@ class Careless(ABC):
             raise
         finally:
             self._log.note(Answer(t=now(), number=number, how=how))
-        if taken is not None and not self.feels_its_locks and hold == self._asked:
-            if self._had != hold:
-                self._had = hold
-                self._log.note(Held(t=asked, hold=hold))
-            self._log.note(Seen(t=asked, hold=hold))
+        if taken is not None and not self.feels_its_locks and hold == self._asked[0]:
+            self._had_for(joint, asked)
+
+    def _had_for(self, joint: str, t: float) -> None:
+        """A joint moved under a lock at that time: who cannot ask knows by that. The robots' locks fall one by one."""
+        hold, joints = self._asked
+        robot = joint.partition(".")[0]
+        part = of_robot(hold, robot)
+        if part not in self._had:
+            self._had.add(part)
+            self._log.note(Ask(t=t, hold=part, resources=tuple(one for one in joints if one.startswith(f"{robot}."))))
+            self._log.note(Held(t=t, hold=part))
+        self._log.note(Seen(t=t, hold=part))
 
     def _try(self, what: str, do: Callable[[], None]) -> None:
         try:

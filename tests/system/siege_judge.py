@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from tests.holds import Owned, Verdict, asks_without_end, by_kind, owned, two_owners
 
-from system.siege_records import CAN_BUS, Answer, AnyRecord, Fault, Order
+from system.siege_records import CAN_BUS, Answer, AnyRecord, Fault, Order, whole
 from trade_hil_sim import Entry
 
 STOPS_S = 6.0
@@ -205,7 +205,7 @@ def _motions(
         if motion.t > order.t + order.deadline_s + _held_up_s(faults, order):
             found.append(f"{at}: {order.number} is done after its deadline of {order.deadline_s:g} s")
         span = owned[bisect_right(since, motion.t) - 1] if since and since[0] <= motion.t else None
-        if span is not None and span.hold != order.hold and motion.t < span.until:
+        if span is not None and whole(span.hold) != order.hold and motion.t < span.until:
             found.append(f"{at} for {order.hold} while {span.hold} had it")
         found += _goes_on(at, motion, order, resource, faults)
     return found, len(done)

@@ -35,4 +35,14 @@ class Fault(Record):
     until: float
 
 
+def of_robot(hold: str, robot: str) -> str:
+    """A hold as far as it is of one robot."""
+    return f"{hold}@{robot}"
+
+
+def whole(hold: str) -> str:
+    """The hold that one is a part of."""
+    return hold.partition("@")[0]
+
+
 AnyRecord = Ask | Held | Seen | Done | Order | Answer | Fault
