@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from jointed import WHOLE, Joint, Robot
-from trade import Container, Handle, permit, service, where
+from trade import Container, Handle, _locking, permit, service, where
 from trade.errors import (
     ConfigurationError,
     IncompleteGroup,
@@ -46,6 +46,18 @@ def test_a_lock_is_only_held_once_it_is_whole(robot: Robot) -> None:
     assert not lock.held
     with pytest.raises(ConfigurationError, match="a lock is taken once"):
         lock.acquire()
+
+
+def test_whose_locks_are_not_known_is_told(
+    robot: Robot, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    asleep = threading.Event()
+    with robot.me.lock(WHOLE):
+        monkeypatch.setattr(robot.system.container("a")._parts.locks, "infos", lambda: asleep.wait(60) and [])
+        monkeypatch.setattr(_locking, "_ANSWER_S", 0.2)
+        assert [info.resources for info in robot.other.locks()] == [("b",)]
+        asleep.set()
+    assert "which locks there are in tester/a is not known" in caplog.text
 
 
 @pytest.mark.parametrize("where_it_is", ["local", "remote"])

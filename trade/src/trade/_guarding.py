@@ -71,7 +71,10 @@ class Guarding(Member):
         )
 
     def locks(self) -> list[LockInfo]:
-        """Every lock in the system: what, whose, what for, since when, who waits."""
+        """Every lock in the system: what, whose, what for, since when, who waits.
+
+        Containers that do not answer within 2 s are left out, and named in the log.
+        """
         self._check_open()
         return self.locking.locks()
 

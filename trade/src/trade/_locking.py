@@ -1,6 +1,7 @@
 """What one does with locks: take them over many services, look at them, ask for them, take them away; and resume."""
 
 import contextlib
+import logging
 from collections.abc import Callable, Iterable, Sequence
 from typing import Final, Protocol
 
@@ -13,12 +14,24 @@ from trade._lock import Lock, OnLost, OnRequest
 from trade._run import Run
 from trade._system import DOMAIN, PROVIDER
 from trade._terms import LockInfo, Terms
-from trade.errors import ConfigurationError, IncompleteGroup, NoSuchService, TradeError
+from trade.errors import (
+    Busy,
+    ConfigurationError,
+    DeadlineExceeded,
+    IncompleteGroup,
+    NoSuchService,
+    OutcomeUnknown,
+    TradeError,
+)
+
+_logger = logging.getLogger("trade")
 
 LONGEST_WAIT_S: Final = 3600.0
 LEASE_S: Final = 2.0
 """The lease of a lock is the deadman's budget, too (S12)."""
 _SETTLE_S: Final = 1.0
+_ANSWER_S: Final = 2.0
+"""So long it may take to tell what is locked."""
 
 
 class Home(Protocol):
@@ -108,14 +121,23 @@ class Locking:
 
     def locks(self) -> list[LockInfo]:
         """See `Container.locks`."""
-        runs: list[Run] = []
+        runs: list[tuple[Address, Run]] = []
         found: list[LockInfo] = []
+        silent: list[str] = []
         for address in self._home.addresses():
             with contextlib.suppress(TradeError):  # it left meanwhile
-                runs.append(self._service(address, "locks").start())
-        for run in runs:
-            with contextlib.suppress(TradeError):
+                runs.append((address, self._service(address, "locks").with_(deadline_s=_ANSWER_S).start()))
+        for address, run in runs:
+            try:
                 found.extend(run.result())
+            except (Busy, DeadlineExceeded, OutcomeUnknown):
+                silent.append(address.who)
+            except TradeError:
+                continue
+        if silent:
+            _logger.warning(
+                "no answer within %g s: which locks there are in %s is not known", _ANSWER_S, ", ".join(silent)
+            )
         return sorted(found, key=lambda info: (info.resources, info.container))
 
     def request_release(self, which: Constraint | Iterable[Handle], reason: str) -> list[str]:
