@@ -5,7 +5,7 @@ own times, the frames that a real wire would have carried meanwhile.
 """
 
 import heapq
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from math import inf
 from typing import Final, NamedTuple, Protocol
 
@@ -93,11 +93,6 @@ class Wire:
         self._under_way: tuple[Station, _Waiting, float] | None = None
         self.busy_s = 0.0
         """How long frames have held the wire, in all."""
-
-    @property
-    def stations(self) -> Iterable[Station]:
-        """Who is attached."""
-        return tuple(self._stations)
 
     def attach(self, station: Station) -> None:
         """Let a station take part."""

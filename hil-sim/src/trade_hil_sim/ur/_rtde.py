@@ -50,11 +50,6 @@ class Rtde:
         self.frozen: dict[str, Value] = {}
         """Fields that stay as they are, whatever the truth."""
 
-    @property
-    def streaming(self) -> bool:
-        """Whether anybody is sent data."""
-        return any(session.started for session in self._sessions)
-
     def joined(self, say: Say) -> RtdeSession:
         """A client has connected."""
         session = RtdeSession(say)
