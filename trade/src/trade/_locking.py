@@ -3,7 +3,7 @@
 import contextlib
 import logging
 from collections.abc import Callable, Iterable, Sequence
-from typing import Final, Protocol
+from typing import Final, NamedTuple, Protocol
 
 from trade._access import Access
 from trade._constraints import Constraint
@@ -32,6 +32,18 @@ LEASE_S: Final = 2.0
 _SETTLE_S: Final = 1.0
 _ANSWER_S: Final = 2.0
 """So long it may take to tell what is locked."""
+
+
+class Known(NamedTuple):
+    """What is known of all locks."""
+
+    locks: list[LockInfo]
+    silent: list[Address]
+    """Who is there and did not answer: what is locked in these is not known."""
+
+    def still(self, container: str) -> bool:
+        """Whether what was known of a container before is all that is known of it now."""
+        return any(address.container == container for address in self.silent)
 
 
 class Home(Protocol):
@@ -121,9 +133,16 @@ class Locking:
 
     def locks(self) -> list[LockInfo]:
         """See `Container.locks`."""
+        known = self.known()
+        if known.silent:
+            who = ", ".join(address.who for address in known.silent)
+            _logger.warning("which locks there are in %s is not known: no answer within %g s", who, _ANSWER_S)
+        return known.locks
+
+    def known(self) -> Known:
+        """The locks of the system, and whose are not known."""
         runs: list[tuple[Address, Run]] = []
-        found: list[LockInfo] = []
-        silent: list[str] = []
+        found, silent = list[LockInfo](), list[Address]()
         for address in self._home.addresses():
             with contextlib.suppress(TradeError):  # it left meanwhile
                 runs.append((address, self._service(address, "locks").with_(deadline_s=_ANSWER_S).start()))
@@ -131,14 +150,10 @@ class Locking:
             try:
                 found.extend(run.result())
             except (Busy, DeadlineExceeded, OutcomeUnknown):
-                silent.append(address.who)
+                silent.append(address)
             except TradeError:
                 continue
-        if silent:
-            _logger.warning(
-                "no answer within %g s: which locks there are in %s is not known", _ANSWER_S, ", ".join(silent)
-            )
-        return sorted(found, key=lambda info: (info.resources, info.container))
+        return Known(sorted(found, key=lambda info: (info.resources, info.container)), silent)
 
     def request_release(self, which: Constraint | Iterable[Handle], reason: str) -> list[str]:
         """See `Container.request_release`."""

@@ -128,8 +128,10 @@ class Watched:
 
     def _of_locks(self, at: float) -> Iterator[Happening]:
         uses = {use for handle in self._container.services(self._meant) for use in handle.resources}
-        found = {(", ".join(info.resources), info.holder.owner): info for info in self._container.locks()}
+        known = self._container.locking.known()
+        found = {(", ".join(info.resources), info.holder.owner): info for info in known.locks}
         found = {key: info for key, info in found.items() if not uses.isdisjoint(info.resources)}
+        found |= {key: info for key, info in self._locks.items() if known.still(info.container)}
         for info in _new(self._locks, found):
             yield _of_lock(at, "released", info)
         for info in _new(found, self._locks):

@@ -86,7 +86,9 @@ class Watch:
             self._put(CALLS, span.began + span.took_s, _call(span))
 
     def _look_at_locks(self) -> None:
-        locks = [_lock(info) for info in self._container.locks() if self._about(info.resources)]
+        known = self._container.locking.known()
+        locks = [_lock(info) for info in known.locks if self._about(info.resources)]
+        locks += [lock for lock in self._locks or () if known.still(lock.container)]
         now = time.monotonic()
         if locks != self._locks or now - self._locks_at >= _LOCKS_AGAIN_S:
             self._locks, self._locks_at = locks, now

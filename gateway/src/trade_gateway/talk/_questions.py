@@ -87,7 +87,8 @@ def _description(container: Container, _: Memory, gaps: Mapping[str, str]) -> An
 
 def _locks(container: Container, _: Memory, gaps: Mapping[str, str]) -> Answer:
     names = {name for handle in _matching(container, gaps) for name in handle.resources}
-    held = [info for info in container.locks() if not gaps or not names.isdisjoint(info.resources)]
+    known = container.locking.known()
+    held = [info for info in known.locks if not gaps or not names.isdisjoint(info.resources)]
     said = [
         f"{info.holder.owner} has {', '.join(info.resources)}"
         + (f", for {info.holder.purpose!r}" if info.holder.purpose else "")
@@ -95,8 +96,9 @@ def _locks(container: Container, _: Memory, gaps: Mapping[str, str]) -> Answer:
         + (f"; {', '.join(info.waiting)} waits" if info.waiting else "")
         for info in held
     ]
+    said += [f"of {silent.container} it is not known, it does not answer" for silent in known.silent]
     data = [{"owner": info.holder.owner, "resources": info.resources, "purpose": info.holder.purpose} for info in held]
-    return Answer(len(held), {"count": len(held), "locks": "; ".join(said)}, data)
+    return Answer(len(said), {"count": len(held), "locks": "; ".join(said)}, data)
 
 
 def _unwell(container: Container, _: Memory, gaps: Mapping[str, str]) -> Answer:
