@@ -265,7 +265,7 @@ class ZenohTransport(Transport):
     def _hear(self, pattern: str, heard: Callable[[str], Any], declare_on: zenoh.Session | None = None) -> ZenohChannel:
         """Who passes by hears what everybody hears under another pattern that matches the same keys.
 
-        zenoh 1.10 keeps the link to whoever subscribed to a pattern, 5 KiB or with TLS 30, for as long as anybody
+        zenoh 1.10 keeps the link to whoever subscribed to a pattern, 6 KiB and more, for as long as anybody
         subscribes to that one (https://github.com/eclipse-zenoh/zenoh/issues/2393).
         """
         with _refusing():
