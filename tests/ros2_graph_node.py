@@ -9,13 +9,9 @@ import json
 import sys
 import threading
 import time
-from typing import Any
 
+from ros2_tells import tell
 from trade_gateway.ros.ros2 import Ros2
-
-
-def tell(what: str, **told: Any) -> None:
-    print(json.dumps({"what": what, **told}), flush=True)
 
 
 class Node:

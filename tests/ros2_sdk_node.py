@@ -15,6 +15,8 @@ from typing import Any
 from zenoh_ros2_sdk import ROS2Publisher, ROS2ServiceClient, ROS2ServiceServer, ROS2Subscriber
 from zenoh_ros2_sdk.qos import QosDurability, QosProfile
 
+from ros2_tells import tell
+
 STRING = {"msg_type": "std_msgs/msg/String", "msg_definition": "string data\n"}
 ADD = {
     "srv_type": "example_interfaces/srv/AddTwoInts",
@@ -33,10 +35,6 @@ TYPES = {
     "response_definition": "uint8[] types\n",
 }
 LATCHED = QosProfile(durability=QosDurability.TRANSIENT_LOCAL, history_depth=1)
-
-
-def tell(what: str, **told: Any) -> None:
-    print(json.dumps({"what": what, **told}), flush=True)
 
 
 def until_served(client: ROS2ServiceClient) -> None:

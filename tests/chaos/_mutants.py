@@ -3,6 +3,7 @@
 They exist in the checker's own driver processes only, and nowhere else.
 """
 
+import math
 import os
 from collections.abc import Callable
 from typing import Any
@@ -36,7 +37,7 @@ def _no_drain() -> None:
 
 def _no_expiry() -> None:
     """Leases never end."""
-    LockTable.expire = lambda self: None  # type: ignore[method-assign]
+    LockTable.expire = lambda self: math.inf  # type: ignore[method-assign]
     LockTable.over = lambda self, number: "" if number in self._grants else "it ended"  # type: ignore[method-assign]
 
 
