@@ -67,8 +67,10 @@ def test_calls_and_their_errors_are_answered_under_their_ids(door: Opened) -> No
         assert moved == {"id": 1, "result": 1.0}
         refused = ask(page, do="call", id=2, group="robot.a", name="move", args=["far"])
         assert refused["problem"]["title"] == "InvalidArgument"
-        assert ask(page, do="call", id=3, group="robot.axis", name="stop") == {"id": 3, "result": None}
-        assert heard(page) == {"id": "slow", "result": 2.0}
+        say(page, do="call", id=3, group="robot.axis", name="stop")
+        told = [heard(page), heard(page)]  # the call that the stop ends may be answered before the stop is
+        assert {"id": 3, "result": None} in told
+        assert {"id": "slow", "result": 2.0} in told
 
 
 def test_a_call_tells_how_far_it_is(door: Opened) -> None:

@@ -53,5 +53,12 @@ def test_the_table_of_containers_has_a_column_for_versions_while_there_are_two()
         ("dora", "dora", str(PROTOCOL), "desk", "7", "5", "dora-1"),
         ("rosie", "rosie", f"{OTHER} (here {PROTOCOL})", "?", "?", "?", "rosie-1"),
     ]
+    columns, rows = _containers_table([info("dora", PROTOCOL), info("silent", 0)])
+    assert dict(zip(columns, rows[1], strict=True)) == {
+        "CONTAINER": "silent",
+        "IDENTITY": "silent",
+        "EPOCH": "silent-1",
+        **dict.fromkeys(("PROTOCOL", "HOST", "PID", "SERVICES"), "?"),
+    }
     columns, _ = _containers_table([info("dora", PROTOCOL)])
     assert "PROTOCOL" not in columns

@@ -125,10 +125,20 @@ class Stand:
         )
 
     def versions(self, host: str, version: int) -> dict[str, int]:
-        """By identity, the version of each container that ``trade containers`` of a version tells of there."""
-        ended = self.command(host, version, "containers", "--json")
-        assert ended.returncode == 0, ended.stderr
-        return {info["identity"]: info["protocol"] for info in json.loads(ended.stdout)}
+        """By identity, the version of each container that ``trade containers`` of a version tells of there.
+
+        On a busy host one may not have answered yet; then that is said, and it is asked again.
+        """
+        told: dict[str, int] = {}
+
+        def all_known() -> bool:
+            ended = self.command(host, version, "containers", "--json")
+            assert ended.returncode == 0, ended.stderr
+            told.update((info["identity"], info["protocol"]) for info in json.loads(ended.stdout))
+            return 0 not in told.values()
+
+        wait_until(all_known, f"{host} knows the version of each container")
+        return told
 
     def sees(self, name: str) -> list[str]:
         return self.behaviours[name].ask("sees")

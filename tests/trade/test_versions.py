@@ -163,6 +163,17 @@ def test_a_container_of_another_version_is_shown_with_it_and_offers_nothing(
     assert f"speaks protocol version {OTHER}, this one speaks {PROTOCOL}" in said[0]
 
 
+def test_of_who_has_said_nothing_yet_the_version_is_not_known(memory: MemorySystem, eventually: Eventually) -> None:
+    here = memory.container("here")
+    silent = Address("tester", "silent", "e1")
+    transport = MemoryTransport(memory.network, "silent")
+    transport.appear(alive_key(silent))
+    assert eventually(lambda: any(info.name == "silent" for info in here.containers()))
+    assert {info.name: info.protocol for info in here.containers()} == {"here": PROTOCOL, "silent": 0}
+    assert here._parts.estopping._others() == []  # nobody is told that it speaks another one
+    transport.close()
+
+
 def test_what_has_answered_in_another_version_is_asked_no_more(
     memory: MemorySystem, stranger: Strangers, eventually: Eventually
 ) -> None:

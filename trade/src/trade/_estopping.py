@@ -173,7 +173,7 @@ class Estopping:
 
     def _others(self) -> list[ContainerState]:
         """Those that speak another version."""
-        return [state for state in self._registry.containers() if state.protocol != PROTOCOL]
+        return [state for state in self._registry.containers() if state.protocol not in (0, PROTOCOL)]
 
     def _own_records(self) -> list[Record]:
         """One record of each container, of the provider that tells what is open there."""

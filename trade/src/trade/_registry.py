@@ -78,8 +78,8 @@ class ContainerState:
     removed: dict[str, str] = field(default_factory=dict)
     """Deregistered, in this order, and where they moved, if they did: a name is never used twice in one boot."""
     heard: Heard = field(default_factory=Heard)
-    protocol: int = PROTOCOL
-    """The version that it speaks. If it is not ours, it has no providers here."""
+    protocol: int = 0
+    """The version that it speaks; 0 before it has said anything. If it is not ours, it has no providers here."""
     estops: dict[str, tuple[Estop, ...]] = field(default_factory=dict)
     """Of one that speaks another version: what is open there, by the provider that tells of it."""
 
@@ -122,6 +122,7 @@ class Registry:
         self._telling = threading.RLock()
         self._listeners: list[Callable[[Change], None]] = []
         self.appear(own)
+        self.speaks(own, PROTOCOL)
 
     def listen(self, listener: Callable[[Change], None]) -> None:
         self._listeners.append(listener)
@@ -146,6 +147,7 @@ class Registry:
                     return True
                 if info.revision <= state.heard.answered:  # its answer told of that, and of what came after it
                     return state.heard.complete
+                state.protocol = PROTOCOL
                 state.heard.told(info.revision)
                 change = self._change(state, {provider: (domain, info)}, [] if info.services else [provider])
             self._tell(change)
@@ -157,11 +159,12 @@ class Registry:
             state = self._containers.get(address)
             if state is None:
                 return True
+            state.protocol = PROTOCOL
             state.heard.counted(revision)
             return state.heard.complete
 
     def speaks(self, address: Address, version: int) -> bool:
-        """A container speaks another version. Returns whether that is news."""
+        """A container speaks a version. Returns whether that is news."""
         with self._lock:
             state = self._containers.get(address)
             if state is None or state.protocol == version:
@@ -193,6 +196,7 @@ class Registry:
                     return
                 known = state.providers.items()
                 gone = [name for name, entry in known if name not in offered and entry.info.revision <= revision]
+                state.protocol = PROTOCOL
                 state.heard.all_told(revision)
                 change = self._change(state, offered, gone)
                 self._bell.ring()

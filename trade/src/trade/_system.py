@@ -37,7 +37,8 @@ class ContainerInfo(Struct, frozen=True):
     providers: int
     services: int
     protocol: int = PROTOCOL
-    """The version that it speaks. If it is another one than ours, nothing of what it offers is known here."""
+    """The version that it speaks; 0 before it has said anything to the one that tells of it. If it is another one than
+    that one's, nothing of what it offers is known there."""
 
 
 class WithdrawnInfo(Struct, frozen=True):

@@ -135,20 +135,24 @@ def containers(
 
 
 def _containers_table(found: Sequence[ContainerInfo]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
-    """Where one speaks another version of the protocol, there is a column for it."""
+    """Where one speaks another version of the protocol, or has not answered yet, there is a column for it."""
     columns: dict[str, list[str]] = {
         "CONTAINER": [info.name for info in found],
         "IDENTITY": [info.identity for info in found],
     }
     if any(info.protocol != PROTOCOL for info in found):
-        columns["PROTOCOL"] = [
-            str(info.protocol) if info.protocol == PROTOCOL else f"{info.protocol} (here {PROTOCOL})" for info in found
-        ]
+        columns["PROTOCOL"] = [_version(info) for info in found]
     columns["HOST"] = [info.host or "?" for info in found]
     columns["PID"] = [str(info.pid or "?") for info in found]
     columns["SERVICES"] = [str(info.services) if info.protocol == PROTOCOL else "?" for info in found]
     columns["EPOCH"] = [info.epoch for info in found]
     return tuple(columns), list(zip(*columns.values(), strict=True))
+
+
+def _version(info: ContainerInfo) -> str:
+    if info.protocol in (0, PROTOCOL):
+        return str(info.protocol or "?")
+    return f"{info.protocol} (here {PROTOCOL})"
 
 
 def _say_loads(out: Output, container: Container, found: Sequence[LoadInfo]) -> None:
