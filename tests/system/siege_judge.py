@@ -82,8 +82,13 @@ def judge(records: Iterable[AnyRecord], logs: Mapping[str, Iterable[Entry]]) -> 
 
 
 def motions_of(entries: Iterable[Entry]) -> dict[str, list[Motion]]:
-    """By joint, what it did: it tells of setting off and of rest; on its way, what it was told counts."""
+    """By joint, what it did: it tells of setting off and of rest; on its way, what it was told counts.
+
+    Who comes to rest after a goal has come and before it reads it sets off for it later: that is the same motion.
+    """
     found: dict[str, list[Motion]] = defaultdict(list)
+    unread: set[str] = set()
+    """Joints that were given a goal on their way, and have not been seen to do anything for it."""
     drives: dict[str, Drive] = defaultdict(Drive)
     for entry in entries:
         of = found[entry.joint]
@@ -91,11 +96,18 @@ def motions_of(entries: Iterable[Entry]) -> dict[str, list[Motion]]:
             drives[entry.joint].take(entry, of)
             continue
         going = bool(of) and of[-1].rests == inf
+        if entry.kind == "instruction":
+            unread.discard(entry.joint)
         match entry.kind, entry.name:
+            case "event", "motion_started" if entry.joint in unread:
+                unread.discard(entry.joint)
+                of[-1] = of[-1]._replace(rests=inf)
             case "event", "motion_started":
                 of.append(Motion(entry.t, int(entry.detail.rpartition(" ")[2]), entry.position_counts or 0))
             case "event", "at_rest" | "torque_off" | "rebooted" if going:
                 of[-1] = of[-1]._replace(rests=entry.t)
+                if entry.name != "at_rest" or _there(of[-1], entry.position_counts or 0):
+                    unread.discard(entry.joint)
             case "instruction", _ if going and "goal_position" in entry.registers:
                 speed, goal = _written(entry, _SPEED), _written(entry, _GOAL)
                 if speed is None or goal is None or speed >= FULL_SPEED:
@@ -103,6 +115,7 @@ def motions_of(entries: Iterable[Entry]) -> dict[str, list[Motion]]:
                 else:
                     of[-1] = of[-1]._replace(rests=entry.t)
                     of.append(Motion(entry.t, goal, entry.position_counts or 0, turned=True))
+                    unread.add(entry.joint)
     found.pop("", None)
     return found
 
@@ -112,24 +125,37 @@ class Drive:
 
     def __init__(self) -> None:
         self._word = self._goal = 0
+        self._unread = False
+        """See `motions_of`."""
 
     def take(self, entry: Entry, of: list[Motion]) -> None:
         """Add to its motions what an entry of its log says."""
         going, at = bool(of) and of[-1].rests == inf, (entry.position_counts or 0) + _CENTRE
         match entry.kind, entry.name:
+            case "event", "motion_started" if not going and self._unread:
+                self._unread = False
+                of[-1] = of[-1]._replace(rests=inf)
             case "event", "motion_started" if not going:
                 of.append(Motion(entry.t, self._goal, at, stopped=_stops(self._word)))
             case "event", "at_rest" | "torque_off" | "rebooted" if going:
                 of[-1] = of[-1]._replace(rests=entry.t)
+                if entry.name != "at_rest" or _there(of[-1], at):
+                    self._unread = False
             case "instruction", _ if entry.registers[:2] == ("controlword", "target_position"):
                 before, self._word = self._word, int.from_bytes(entry.data[:2], "little")
+                self._unread &= not _stops(self._word)
                 if self._word & ~before & _GO:
                     self._goal = int.from_bytes(entry.data[2:6], "little", signed=True) + _CENTRE
+                    self._unread = going
                     if going:
                         of[-1] = of[-1]._replace(rests=entry.t)
                         of.append(Motion(entry.t, self._goal, at, turned=True))
                 elif going and _stops(self._word):
                     of[-1] = of[-1]._replace(stopped=True)
+
+
+def _there(motion: Motion, counts: int) -> bool:
+    return abs(motion.counts - counts) <= _FAR_COUNTS
 
 
 def _stops(word: int) -> bool:

@@ -212,6 +212,23 @@ def drive_says(t: float, name: str, at: int) -> Entry:
     return Entry(t=t, bus="leg", kind="event", name=name, joint="leg.hip", position_counts=at)
 
 
+def test_who_comes_to_rest_before_it_has_read_its_next_goal_sets_off_once_for_that() -> None:
+    """Its log has the bytes as they came, and on a busy host the servo reads them some milliseconds later."""
+    before = [begun(2, 2500), told(3, 2310, 2300, STOP), told(3.1, 2700, 2309), rest(3.102)]
+    [one, two] = motions_of([*before, begun(3.104, 2700, 2310), rest(5)])["pan"]
+    assert (one.stopped, one.rests) == (True, 3.1)
+    assert (two.t, two.counts, two.at, two.rests) == (3.1, 2700, 2309, 5)
+    again = motions_of([*before, begun(3.104, 2700, 2310), told(4, 2700, 2500), rest(5)])["pan"]
+    assert [motion.t for motion in again] == [2, 3.1, 4]
+    again = motions_of([*before, told(3.103, 2700, 2310), begun(3.104, 2700, 2310), rest(5)])["pan"]
+    assert [motion.t for motion in again] == [2, 3.1, 3.104]
+    again = motions_of([*before, begun(3.104, 2700, 2310), rest(5), begun(6, 2700, 2310)])["pan"]
+    assert [motion.t for motion in again] == [2, 3.1, 6]  # once is enough
+    there = structs.replace(rest(5), position_counts=2690)
+    again = motions_of([*before[:3], there, begun(6, 2700, 2690)])["pan"]
+    assert [motion.t for motion in again] == [2, 3.1, 6]  # it had done what it was told
+
+
 def test_motions_of_a_drive_are_read_from_what_it_did_and_was_told() -> None:
     [one, two, three] = motions_of(
         [
@@ -229,6 +246,14 @@ def test_motions_of_a_drive_are_read_from_what_it_did_and_was_told() -> None:
     assert one == (1.01, 2500, 2048, 2, False, False)
     assert two == (2, 1948, 2290, 3.5, True, True)
     assert three == (4.01, 2548, 2068, math.inf, True, False)
+    late = [
+        *(commanded(1, 0x3F, 452, 0), drive_says(1.01, "motion_started", 0)),
+        *(commanded(2, 0x12F, 452, 300), commanded(2.1, 0x3F, 800, 310)),
+        *(drive_says(2.101, "at_rest", 310), drive_says(2.103, "motion_started", 310), drive_says(3, "at_rest", 800)),
+    ]
+    [one, two] = motions_of(late)["leg.hip"]
+    assert one == (1.01, 2500, 2048, 2.1, True, False)
+    assert two == (2.1, 2848, 2358, 3, False, True)
 
 
 @pytest.mark.parametrize("guilty", [{"cut"}, {"cut", "unplug"}, {"kill client", "delay", "disk"}])
