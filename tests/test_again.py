@@ -59,6 +59,8 @@ def _run(tmp_path: Path, body: str, times: int = 1, options: tuple[str, ...] = (
         "did not answer on /dev/x for 0.3 s",
         "did not answer on /dev/x",
         "did not answer within 36 ms",
+        "it heard nothing for too long; remove the cause",
+        "it was away; remove the cause",
     ],
 )
 def test_what_was_late_once_runs_again_and_is_told(tmp_path: Path, said: str) -> None:

@@ -77,7 +77,7 @@ max_accel_rad_s2 = 20.0
 """
 _SERVO: Final = ('driver = "dynamixel"\nport = "NOWHERE"', 'model = "XL430-W250"')
 _DRIVE: Final = (
-    'driver = "cia402"\ninterface = "socketcand"\nchannel = "NOWHERE"\nwatchdog_s = 0.5',
+    'driver = "cia402"\ninterface = "socketcand"\nchannel = "NOWHERE"',
     'model = "ACME-EC60"\ncounts_per_rev = 4096\ngear = 1',
 )
 """It has as many counts as a servo, so clients say of both in the same way where to."""
@@ -87,12 +87,12 @@ _ROBOTS: Final = {
 }
 
 
-def _robot_file(robot: str, ports: Mapping[str, str] = {}) -> str:
+def _robot_file(robot: str, patience: str, ports: Mapping[str, str] = {}) -> str:
     """Of a robot; before its devices are there, nobody knows where its buses are."""
     text = f'[robot]\nname = "{robot}"\n'
     for bus, ((driver, model), joints) in _ROBOTS[robot].items():
         port = ports.get(bus, "can0" if bus == CAN_BUS else "/dev/ttyNOWHERE").removeprefix("socketcand:")
-        text += f"\n[bus.{bus}]\n{driver.replace('NOWHERE', port)}\n"
+        text += f"\n[bus.{bus}]\n{driver.replace('NOWHERE', port)}\n{patience}\n"
         text += "".join(
             _JOINT.format(name=f"{bus}.{joint}", bus=bus, id=number, model=model)
             for number, joint in enumerate(joints, 1)
@@ -164,17 +164,24 @@ def _python_on(site: Site, host: str) -> Path:
 
 
 class Driver(Kept):
-    """A robot's simulated devices, and beside them its driver, whose wall clock can be shifted."""
+    """A robot's simulated devices, and beside them its driver, whose wall clock can be shifted.
 
-    def __init__(self, site: Site, robot: str, mutant: str = "") -> None:
+    Args:
+        site: where they are.
+        robot: ``rosie`` or ``dora``.
+        mutant: what is broken in its driver, or nothing.
+        patience: keys of each bus: for how long devices and driver bear to hear nothing of each other.
+    """
+
+    def __init__(self, site: Site, robot: str, mutant: str = "", patience: str = "watchdog_s = 0.5") -> None:
         self.robot = robot
         self.clock = site.folder / f"{robot}.clock"
         wall_clock.shift(self.clock, 0.0)
         file = site.folder / f"{robot}.toml"
-        file.write_text(_robot_file(robot))
+        file.write_text(_robot_file(robot, patience))
         with mock.patch.object(sys, "executable", str(_python_on(site, "left"))):
             self.sim = SimProcess(file)
-        file.write_text(_robot_file(robot, self.sim.ports))
+        file.write_text(_robot_file(robot, patience, self.sim.ports))
         program = [str(_HERE / "broken_driver.py"), mutant] if mutant else ["-m", "trade_gateway"]
         self._file = file
         super().__init__(site, "left", robot, DOOR["private"], self._words(program))

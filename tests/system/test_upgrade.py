@@ -48,6 +48,8 @@ dora = ["driver"]
 chief = ["chief"]
 {"".join(f'{name} = ["operator"]' + chr(10) for name in _HOSTS)}"""
 _FAST_RAD_S, _SLOW_RAD_S = 2.0, 0.05
+_PATIENCE: Final = "stale_after_s = 1\nwatchdog_s = 1"
+"""On a busy host a driver or a simulation gets no time for half a second, whatever the version."""
 _FEW: Final = 4
 """Moves that show that somebody goes on."""
 pytestmark = pytest.mark.timeout(600)
@@ -62,7 +64,7 @@ class Stand:
         self._log = Log(self.records, "faults")
         self.site = Site(networks, folder, _POLICY, private='["rosie", "dora"]')
         (folder / "kept.toml").write_text(_POLICY)
-        self.drivers = {robot: Driver(self.site, robot) for robot in ("rosie", "dora")}
+        self.drivers = {robot: Driver(self.site, robot, patience=_PATIENCE) for robot in ("rosie", "dora")}
         self.behaviours: dict[str, Member] = {}
         self._turns = 0
 
