@@ -94,6 +94,15 @@ def test_a_caller_sees_the_latest_progress(offer: Any, walk: Walk, eventually: A
     assert run.progress() == {"share": 3}
 
 
+def test_what_is_said_last_comes_before_the_answer(offer: Any, walk: Walk) -> None:
+    walk.open.set()
+    tell = offer(walk)("tell")
+    for _ in range(20):
+        run = tell.start([1, 2, 3])
+        assert run.result(20) == "arrived"
+        assert run.progress() == {"share": 3}
+
+
 def test_a_call_that_says_nothing_has_no_progress(offer: Any, walk: Walk) -> None:
     run = offer(walk)("walk").start()
     assert run.progress() is None

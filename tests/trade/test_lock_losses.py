@@ -1,10 +1,11 @@
 """Locks that are lost, and what moved under them: S08, S12 and S14."""
 
 import threading
+import traceback
 
 import pytest
 
-from jointed import WHOLE, Robot
+from jointed import WHOLE, Joint, Robot
 from trade import Handle
 from trade._keys import Address
 from trade.errors import (
@@ -188,3 +189,48 @@ def test_a_call_under_a_lock_that_is_taken_away_writes_nothing_any_more(robot: R
     robot["a"].hold.set()
     assert run.exception(20) is not None
     assert robot["a"].written == []
+
+
+# --- what its owner is told
+
+
+def test_each_refusal_is_an_error_of_its_own(robot: Robot) -> None:
+    """One that is raised again keeps every frame that it went through, and what is in them."""
+    handle, refusals = robot.find("a"), list[LockLost]()
+    with pytest.raises(LockLost), robot.me.lock([handle], lease_s=60):
+        robot.other.break_lock([robot.find("a", whose=robot.other)], "to see")
+        for _ in range(5):
+            with pytest.raises(LockLost) as refused:
+                handle(0.1)
+            refusals.append(refused.value)
+    assert len(set(map(id, refusals))) == 5
+    assert len({len(traceback.extract_tb(one.__traceback__)) for one in refusals[1:]}) == 1
+
+
+def test_a_refusal_tells_the_lock_at_once(robot: Robot) -> None:
+    losses, handle = Losses(), robot.find("a")
+    lock = robot.me.lock(WHOLE, lease_s=60, on_lost=losses).acquire()
+    robot.other.break_lock([robot.find("a", whose=robot.other)], "to see")
+    with lock.use(), pytest.raises(LockLost, match="to see"):
+        handle(0.1)
+    assert not lock.held  # which a renewal would tell in 15 s
+    with pytest.raises(LockLost, match="to see"):
+        lock.check()
+    wait_until(lambda: losses.told)
+    wait_until(lambda: robot.other.locks() == [])
+
+
+def test_a_lock_of_ones_own_container_learns_of_a_refusal_at_once(robot: Robot) -> None:
+    robot.me.register(Joint("own"), "robot.own")
+    handle = robot.find("own")
+    lock = robot.me.lock([handle], lease_s=60).acquire()
+    robot.other.break_lock([robot.find("own", whose=robot.other)], "to see")
+    with lock.use(), pytest.raises(LockLost, match="to see"):
+        handle(0.1)
+    assert not lock.held
+
+
+def test_giving_back_what_was_taken_away_meanwhile_says_so(robot: Robot) -> None:
+    with pytest.raises(LockLost, match="not held any more when it was given back"), robot.me.lock(WHOLE, lease_s=60):
+        robot.other.break_lock([robot.find("a", whose=robot.other)], "to see")
+    assert robot.other.locks() == []

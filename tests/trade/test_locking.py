@@ -97,7 +97,7 @@ def test_S15_another_thread_needs_use_and_the_refusal_says_so(robot: Robot) -> N
             thread.start()
             thread.join(20)
     assert outcomes[0].own
-    assert "in another thread use `with lock.use():`" in str(outcomes[0])
+    assert "make the call inside `with lock.use():`" in str(outcomes[0])
     assert outcomes[1] == 0.2
 
 

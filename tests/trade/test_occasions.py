@@ -268,6 +268,17 @@ def test_a_condition_that_is_neither_true_nor_false_does_not_hold_and_is_told(
     assert caplog.text.count("it stays attached") == 1  # the same again says nothing new
 
 
+def test_what_happens_once_and_fails_is_not_said_to_stay(here: Container, caplog: pytest.LogCaptureFixture) -> None:
+    def fails() -> None:
+        raise RuntimeError("no")
+
+    with caplog.at_level(logging.WARNING, "trade"):
+        noted = here.once(call=fails)
+        wait_until(lambda: noted.info().state == "ended")
+    assert "failed" in caplog.text
+    assert "it stays attached" not in caplog.text
+
+
 def test_each_kind_of_failure_is_told_once_and_of_what(here: Container, caplog: pytest.LogCaptureFixture) -> None:
     asked, called = itertools.count(), itertools.count()
 

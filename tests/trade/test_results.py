@@ -1,9 +1,15 @@
 """Results of types that the caller has no code for: decoded from their description."""
 
 import datetime as dt
+import enum
+import importlib
+import os
+import subprocess
 import sys
+import types
 from collections.abc import Callable
-from typing import Any
+from pathlib import Path
+from typing import Any, get_args
 
 import msgspec
 import pytest
@@ -169,3 +175,65 @@ def test_a_result_with_a_description_that_makes_no_sense_stays_plain_data(
 ) -> None:
     info = ServiceInfo(name="go", signature="go()", result_schema=schema_message(broken, {}))
     assert result_decoder(here._parts.codec, info)(msgspec.msgpack.encode([1])) == [1]
+
+
+DOOR = """
+import enum, trade
+from trade import service
+
+class Lid(enum.Enum):
+    OPEN, SHUT = "open", "shut"
+
+class Jammed(Exception): pass
+
+class Door:
+    @service(effect="read")
+    def lid(self) -> Lid:
+        return Lid.SHUT
+
+    @service
+    def open(self) -> None:
+        raise Jammed("it is nailed up")
+
+if __name__ == "__main__":
+    import sys
+    trade.register(Door(), "door")
+    print("ready", flush=True)
+    sys.stdin.read()
+"""
+
+
+def test_what_a_program_defines_is_known_by_the_name_it_is_imported_by(
+    tmp_path: Path, system: str, here: Container, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It runs as ``__main__``, and each process has another one."""
+    script = tmp_path / "hinged_door.py"
+    script.write_text(DOOR)
+    monkeypatch.syspath_prepend(tmp_path)
+    hinged_door = importlib.import_module("hinged_door")
+    command, environment = [sys.executable, str(script)], {**os.environ, "TRADE_SYSTEM": system}
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment) as program:
+        assert program.stdout is not None
+        assert program.stdout.readline() == b"ready\n"
+        assert here.find(where(name="lid", group="door"), wait_s=20)() is hinged_door.Lid.SHUT
+        with pytest.raises(hinged_door.Jammed, match="it is nailed up"):
+            here.find(where(name="open", group="door"), wait_s=20)()
+
+
+def test_what_another_process_imports_may_be_defined_by_ones_own_program(monkeypatch: pytest.MonkeyPatch) -> None:
+    program = types.ModuleType("__main__")
+    program.__file__, program.__dict__["Pose"] = "/lab/sliding_door.py", Pose
+    monkeypatch.setitem(sys.modules, "__main__", program)
+    assert type_from_schema(schema({"x_m": {"type": "number"}}), {"Pose": "sliding_door:Pose"}) is Pose
+    assert type_from_schema(schema({"x_m": {"type": "number"}}), {"Pose": "other_door:Pose"}) is not Pose
+
+
+def test_an_enum_with_other_members_is_another_type() -> None:
+    definition = {"title": "Lid", "enum": ["open", "ajar"]}
+    made = type_from_schema({"$ref": "#/$defs/Lid", "$defs": {"Lid": definition}}, {"Lid": f"{__name__}:Lid"})
+    assert made is not Lid
+    assert get_args(made) == ("open", "ajar")
+
+
+class Lid(enum.Enum):
+    OPEN, SHUT = "open", "shut"

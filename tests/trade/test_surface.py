@@ -1,6 +1,7 @@
 """The public surface: what ``trade`` exports is there, documented, and asks nothing special of the system."""
 
 import inspect
+import pydoc
 import re
 from typing import Any
 
@@ -13,6 +14,13 @@ from pages.blocks import DOCS
 @pytest.mark.parametrize("name", trade.__all__)
 def test_every_public_name_exists_and_is_documented(name: str) -> None:
     assert inspect.getdoc(getattr(trade, name))
+
+
+@pytest.mark.parametrize("name", trade.__all__)
+def test_help_can_be_asked_for_and_shows_nothing_of_the_environment(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    secret = "sesame-of-the-environment"
+    monkeypatch.setenv("TRADE_CREDENTIALS", f"me:{secret}")
+    assert secret not in pydoc.render_doc(getattr(trade, name))
 
 
 def _public_methods() -> list[Any]:

@@ -3,17 +3,14 @@
 import time
 from collections.abc import Callable, Iterable
 from contextvars import ContextVar
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import Any, Final, Protocol
 
 from msgspec import Struct
 
 from trade._keys import Address
 from trade._ongoing import Ongoing
 from trade._wire import Behalf, Token
-from trade.errors import Cancelled
-
-if TYPE_CHECKING:
-    from trade._resources import Permit
+from trade.errors import Cancelled, LockLost
 
 __all__ = ["CallContext", "current_call", "progress"]
 
@@ -23,6 +20,12 @@ _MOST_EVENTS: Final = 100
 def outer_of(call_id: int, behalf: Behalf | None) -> int:
     """The id of the call that began it all, of a call with that id and what it inherited."""
     return behalf.calls[-1] if behalf is not None and behalf.calls else call_id
+
+
+class Permitted(Protocol):
+    """What a call was admitted under; see `trade.Permit`."""
+
+    def gate(self) -> None: ...
 
 
 class CallContext(Struct, frozen=True, gc=False):
@@ -44,7 +47,7 @@ class CallContext(Struct, frozen=True, gc=False):
     """The middleware's own notes on it."""
     behalf: Behalf | None = None
     """What it inherited; its own calls inherit it, too, while it runs."""
-    permit: "Permit | None" = None
+    permit: Permitted | None = None
     """What it may do to the resources of its service."""
     events: list[tuple[int, str]] | None = None
     """What was noted of it, and when by ``time.monotonic_ns()``; None if it is not traced."""
@@ -139,6 +142,10 @@ class Held(Protocol):
 
     def tokens(self) -> Iterable[Token]:
         """What shows it to those it was granted by; raises LockLost if it holds no more."""
+        ...
+
+    def refused(self, by: Address, error: LockLost) -> None:
+        """Told that a container refused a call made under it."""
         ...
 
 

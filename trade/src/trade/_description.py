@@ -10,7 +10,7 @@ import msgspec
 from msgspec import UNSET, UnsetType
 
 from trade._codec import Codec
-from trade._records import noted
+from trade._records import name_of, noted
 from trade._schemas import schema_message, type_text
 from trade._secret import MASK, is_secret
 from trade._service import ServiceMark
@@ -64,7 +64,7 @@ def describe(
         parameters=tuple(_parameter(parameter) for parameter in parameters),
         arguments_schema=schema_message(arguments_schema, inside),
         result_schema=schema_message(result_schema, definitions),
-        types={name: f"{kind.__module__}:{kind.__qualname__}" for name, kind in known.items()},
+        types={name: name_of(kind) for name, kind in known.items()},
     )
 
 

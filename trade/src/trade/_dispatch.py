@@ -185,6 +185,8 @@ class Dispatcher:
         self._end(ongoing, service, replier, call, answer)
 
     def _end(self, ongoing: Ongoing, service: LocalService, replier: Publisher, call: Call, answer: Answer) -> None:
+        if ongoing.said is not None:
+            self._herald.send(ongoing)
         also = self._once.end(ongoing, call, answer, keep=service.effect != "read")
         self._answer(replier, ongoing.caller, call, *answer)
         for again in also or ():

@@ -8,7 +8,7 @@ from typing import Any, Final
 import msgspec
 from msgspec import structs
 
-from trade._records import imported
+from trade._records import imported, name_of
 from trade._wire import ErrorInfo
 from trade.errors import RemoteError, TradeError
 
@@ -33,7 +33,7 @@ def pack_error(error: BaseException) -> ErrorInfo:
     """An exception as data. Values that cannot be sent are sent as their text; it never fails."""
     kind = type(error)
     return ErrorInfo(
-        type=f"{kind.__module__}:{kind.__qualname__}",
+        type=name_of(kind),
         message=_text(error),
         fields={name: _sendable(value) for name, value in _data(error).items()},
         traceback=_traceback(error)[-_MOST_TRACEBACK:],

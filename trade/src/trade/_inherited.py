@@ -37,7 +37,8 @@ class InheritedLock:
         except (ValueError, TypeError, RecursionError):
             problem = "is what `trade lock` passes to the command it runs; unset it"
             raise ConfigurationError(where=VARIABLE, problem=problem) from None
-        self._lost = False
+        self._lost = ""
+        """Why, once it is."""
 
     @property
     def held(self) -> bool:
@@ -47,10 +48,15 @@ class InheritedLock:
     def tokens(self) -> list[Token]:
         """What shows it to those it was granted by; raises LockLost once its holder is gone."""
         if self._lost:
-            reason = f"{self._holder.container}, which held it, has ended or cannot be reached"
-            raise LockLost(resources=self._resources, reason=reason)
+            raise LockLost(resources=self._resources, reason=self._lost)
         return self._tokens
+
+    def refused(self, by: Address, error: LockLost) -> None:  # noqa: ARG002
+        """A call under it was refused."""
+        if not set(self._resources).isdisjoint(error.resources):
+            self._lost = self._lost or error.reason
 
     def lost(self, address: Address) -> None:
         """A container has ended or cannot be reached."""
-        self._lost = self._lost or address == self._holder
+        if address == self._holder:
+            self._lost = f"{address.container}, which held it, has ended or cannot be reached"

@@ -36,6 +36,7 @@ from trade.errors import (
     ContainerLost,
     DeadlineExceeded,
     InvalidResult,
+    LockLost,
     OutcomeUnknown,
     RemoteError,
     ServiceGone,
@@ -135,9 +136,11 @@ class LocalTarget:
         if ongoing is not None and ongoing.cancelled:
             raise Cancelled(service=service.label)
         context = self._context(request, ongoing)
-        if isinstance(taken, tuple):
-            return service.call(*taken, context)
-        return self._copied(taken, context)
+        try:
+            return service.call(*taken, context) if isinstance(taken, tuple) else self._copied(taken, context)
+        except LockLost as lost:
+            request.refused(self._own, lost)
+            raise
 
     def _context(self, request: Request, ongoing: Ongoing | None) -> CallContext:
         expires_ns = None if self._is_stop else request.deadline_ns
@@ -277,6 +280,7 @@ class RemoteTarget:
         if spans is not None and self._traceable:
             spans.asked(reply.id, self._label, request, error)
         if error is not None:
+            request.refused(self._peer.address, error)
             raise error
         try:
             return self._decode(reply.body)

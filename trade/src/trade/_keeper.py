@@ -114,22 +114,28 @@ class Keeper:
 
     # --- giving back
 
-    def let_go(self, lock: Lock, lost: str = "") -> None:
-        """Renew it no more, and give back what is held of it; if it is lost, what it moves stops."""
+    def let_go(self, lock: Lock, lost: str = "") -> bool:
+        """Renew it no more, and give back what is held of it; if it is lost, what it moves stops.
+
+        Returns:
+            Whether it was held until then, as far as those say who answer.
+        """
         with self._changed:
             if lock in self._locks:
                 self._locks.remove(lock)
-        self._give_back(lock, lost)
+        return self._give_back(lock, lost)
 
-    def _give_back(self, lock: Lock, lost: str = "") -> None:
+    def _give_back(self, lock: Lock, lost: str = "") -> bool:
         parts = lock.take_parts()
         gifts = [
             (address, self._service(address, "release").with_(deadline_s=_ANSWER_S).bind(token.number, lost))
             for address, token in parts.items()
         ]
+        held = True
         for _, result in _at_once(gifts):
             with contextlib.suppress(TradeError):  # where it is not heard, its lease ends it
-                result()
+                held &= result()
+        return held
 
     # --- keeping
 

@@ -54,6 +54,7 @@ class Lock:
         self._granted: dict[Address, Token] = {}
         self._confirmed: dict[Address, float] = {}
         self._lost: LockLost | None = None
+        """Why, once it is; it is never raised itself, as it would keep every frame that it went through."""
         self._taken = self._whole = self._ended = False
         self._guard = threading.Lock()
         self._resets: list[Reset[tuple[Held, ...]]] = []
@@ -61,7 +62,9 @@ class Lock:
     # --- being used
 
     def acquire(self) -> "Lock":
-        """Take it: what entering the context does. Once; whoever wants it again makes another one.
+        """Take it, once; calls are made under it inside `use`. Entering the context does both.
+
+        Until `release`, or the end of this process, it is renewed and kept from others, used or not.
 
         Raises:
             NoSuchService, LockedByOther, NotStopped, IncompleteGroup, ServiceGone, ContainerLost, ConfigurationError:
@@ -124,7 +127,9 @@ class Lock:
             if self._ended:
                 return
             self._ended = True
-        self._keeper.let_go(self)
+        resources = self.resources
+        if not self._keeper.let_go(self) and self._lost is None:
+            self._lost = LockLost(resources=resources, reason="it was not held any more when it was given back")
 
     def __enter__(self) -> "Lock":
         self.acquire()
@@ -138,7 +143,7 @@ class Lock:
         holding.reset(self._resets.pop())
         self.release()
         if kind is None and self._lost is not None:
-            raise self._lost
+            raise _again(self._lost)
 
     async def __aenter__(self) -> "Lock":
         taking = asyncio.ensure_future(asyncio.to_thread(self.acquire))
@@ -155,7 +160,7 @@ class Lock:
         holding.reset(self._resets.pop())
         await asyncio.shield(asyncio.ensure_future(asyncio.to_thread(self.release)))
         if kind is None and self._lost is not None:
-            raise self._lost
+            raise _again(self._lost)
 
     def __repr__(self) -> str:
         state = "not taken" if not self._taken else "lost" if self._lost else "released" if self._ended else "held"
@@ -202,7 +207,12 @@ class Lock:
         """Raises LockLost if it is lost."""
         self._look()
         if self._lost is not None:
-            raise self._lost
+            raise _again(self._lost)
+
+    def refused(self, by: Address, error: LockLost) -> None:
+        """A call under it was refused by a container: what that granted is lost, and with it the rest."""
+        if by in self._granted and not set(self.resources).isdisjoint(error.resources):
+            self.lose(error.reason)
 
     def _look(self) -> None:
         """On waking, what was not confirmed within the lease is lost before anything is done (S12)."""
@@ -219,7 +229,11 @@ class Lock:
         _logger.warning("%s", self._lost)
         apart(self._keeper.over, self._keeper.let_go, self, reason)
         if self._on_lost is not None:
-            apart(self._keeper.over, self._on_lost, self._lost)
+            apart(self._keeper.over, self._on_lost, _again(self._lost))
+
+
+def _again(lost: LockLost) -> LockLost:
+    return LockLost(resources=lost.resources, reason=lost.reason)
 
 
 def apart(over: Callable[[], bool], call: Callable[..., object], *arguments: Any) -> None:

@@ -21,6 +21,7 @@ from trade.errors import ConfigurationError
 
 _logger = logging.getLogger("trade")
 
+_SINGLE: Final = ("at", "after", "once")
 _LOOK_NS: Final = 1_000_000_000
 """How often the clock on the wall is looked at: it may be set."""
 
@@ -300,6 +301,8 @@ class Standing(Notification):
         if (part, kind) in self._said:  # the same again says nothing new, whatever numbers are in its text
             return
         self._said.add((part, kind))
-        text = "the %s of %r failed (%s, id %s); it stays attached, and this kind is told once: %s"
-        _logger.warning(text, part, self, text_of(target), self.id, self._last_error)
+        over = self._state is not State.WAITING and self.terms.occasion in _SINGLE
+        stays = "" if over else "; it stays attached, and this kind is told once"
+        text = "the %s of %r failed (%s, id %s)%s: %s"
+        _logger.warning(text, part, self, text_of(target), self.id, stays, self._last_error)
         self._tell_failed(self, self._last_error)

@@ -34,7 +34,7 @@ class Ongoing:
 
     __slots__ = (
         *("_event", "_on_cancel", "also", "answer", "call", "caller"),
-        *("cancelled", "queued_ns", "report", "service", "size"),
+        *("cancelled", "queued_ns", "report", "said", "service", "size"),
     )
 
     def __init__(
@@ -49,6 +49,8 @@ class Ongoing:
         self.call = call
         self.report = report
         """Takes what the provider says of its progress, and keeps nobody waiting."""
+        self.said: Raw | None = None
+        """The latest that was said of it and is not sent yet."""
         self.cancelled = False
         self.answer: Answer | None = None
         self.also: list[Call] | None = None
@@ -189,13 +191,16 @@ def cancelled(service: str) -> Answer:
 
 
 class Herald:
-    """Sends what providers say of their progress: the latest of each call, at most every 50 ms, on its own thread."""
+    """Sends what providers say of their progress: the latest of each call, at most every 50 ms, on its own thread.
+
+    What was said last goes out before the answer, whenever that comes.
+    """
 
     EVERY_S: Final = 0.05
 
     def __init__(self, send: Callable[[Ongoing, Raw], None]) -> None:
         self._send = send
-        self._news: dict[Ongoing, Raw] = {}
+        self._news = set[Ongoing]()
         self._lock = threading.Lock()
         self._some = threading.Event()
         self._ended = threading.Event()
@@ -204,7 +209,8 @@ class Herald:
     def tell(self, ongoing: Ongoing, body: Raw) -> None:
         """Have this sent soon, unless something newer comes first."""
         with self._lock:
-            self._news[ongoing] = body
+            ongoing.said = body
+            self._news.add(ongoing)
             self._some.set()
             if self._thread is None and not self._ended.is_set():
                 self._thread = threading.Thread(target=self._main, name="trade-progress", daemon=True)
@@ -215,11 +221,19 @@ class Herald:
             self._some.wait()
             with self._lock:
                 self._some.clear()
-                news, self._news = self._news, {}
-            for ongoing, body in news.items():
-                if ongoing.answer is None:
-                    self._send(ongoing, body)
+                news, self._news = self._news, set()
+            for ongoing in news:
+                self.send(ongoing)
             self._ended.wait(self.EVERY_S)
+
+    def send(self, ongoing: Ongoing) -> None:
+        """Send what was said last of it, unless it has been or is of no use any more."""
+        body = ongoing.said
+        if body is None or ongoing.answer is not None:
+            return
+        self._send(ongoing, body)
+        if ongoing.said is body:  # only now: rather twice than never
+            ongoing.said = None
 
     def close(self) -> None:
         """End the thread. Idempotent."""

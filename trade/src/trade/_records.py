@@ -15,6 +15,7 @@ import uuid
 from collections.abc import Mapping
 from functools import reduce
 from operator import or_
+from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Union, get_args, get_origin, is_typeddict
 
 import msgspec
@@ -26,6 +27,7 @@ _PLAIN: Final[dict[str, Any]] = {
     "boolean": bool,
     "null": None,
 }
+_MAIN: Final = "__main__"
 _NOTE: Final = "x-trade-kind"
 _NOTED: Final[dict[str, Any]] = {
     kind.__name__: kind
@@ -140,16 +142,31 @@ def loaded_type(path: str) -> type | None:
 
 
 def _same_fields(kind: type, definition: Mapping[str, Any]) -> bool:
-    """Whether our type of that name is theirs: every program has a ``__main__``, and versions differ."""
+    """Whether our type of that name is theirs: programs have the same name, and versions differ."""
     [_], ours = msgspec.json.schema_components([kind], schema_hook=lambda _: {})
     own = ours.get(kind.__name__, {})
-    return all(set(own.get(part, ())) == set(definition.get(part, ())) for part in ("properties", "required"))
+    return all(set(own.get(part, ())) == set(definition.get(part, ())) for part in ("properties", "required", "enum"))
+
+
+def name_of(kind: type) -> str:
+    """``module:qualified name``, for other processes: what a program defines by the name it would be imported by."""
+    module_name = _program() if kind.__module__ == _MAIN else kind.__module__
+    return f"{module_name}:{kind.__qualname__}"
+
+
+def _program() -> str:
+    """The name of the module that runs as ``__main__``."""
+    main = sys.modules[_MAIN]
+    spec, file = getattr(main, "__spec__", None), getattr(main, "__file__", None)
+    return spec.name if spec is not None else Path(file).stem if file else _MAIN
 
 
 def imported(path: str) -> Any:
     """What stands under ``module:qualified name`` in this process; looking runs no code, not even a module's."""
     module_name, _, qualified = path.partition(":")
     found: Any = sys.modules.get(module_name)
+    if found is None and module_name == _program():
+        found = sys.modules[_MAIN]
     for part in qualified.split("."):
         found = getattr(found, "__dict__", {}).get(part)
     return found

@@ -9,6 +9,7 @@ from trade._context import CallContext, Held, handed_down, holding, running
 from trade._keys import Address
 from trade._session import Session, speaking
 from trade._wire import Behalf, Token
+from trade.errors import LockLost
 
 DEFAULT_DEADLINE_S: Final = 10.0
 _DEFAULT_DEADLINE_NS: Final = int(DEFAULT_DEADLINE_S * 1e9)
@@ -78,6 +79,12 @@ class Request(Struct, gc=False):
         """
         inherited = self.inherited
         return (None, "") if inherited is None else (inherited.behalf(effect, own), inherited.session(own))
+
+    def refused(self, by: Address, error: BaseException) -> None:
+        """The locks around it learn of a refusal at once, and not when they are renewed."""
+        if isinstance(error, LockLost) and self.inherited is not None:
+            for lock in (*self.inherited.around, *handed_down.values()):
+                lock.refused(by, error)
 
     def ignore_outer_deadline(self) -> None:
         if self.inherited is not None:

@@ -8,7 +8,7 @@ import contextlib
 import itertools
 import time
 from collections.abc import Callable, Generator, Iterable, Sequence
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from msgspec import Struct, structs
 
@@ -345,8 +345,8 @@ def permit(resources: Sequence[Resource]) -> Generator[Permit, None, None]:
         Stopped, LockedByOther: see `Resource.check`.
     """
     call = running.get()
-    own: Any = None if call is None else call.permit
-    if own is not None and own.covers(resources):
+    own = None if call is None else call.permit
+    if isinstance(own, Permit) and own.covers(resources):
         yield own
         return
     sessions = () if call is None else call.sessions

@@ -252,7 +252,7 @@ class Settings:
         instantiable: Sequence[str] | None = None,
         audit: Path | None = None,
         metrics: str | None = None,
-        environment: Mapping[str, str] = os.environ,
+        environment: Mapping[str, str] | None = None,
     ) -> "Settings":
         """Settings from arguments, else from the environment, else the defaults.
 
@@ -265,6 +265,7 @@ class Settings:
         ``TRADE_STATE_DIR`` (else the user's folder for state).
         Others that begin with ``TRADE_`` are warned of.
         """
+        environment = os.environ if environment is None else environment
         _warn_of_unknown(environment)
         named = system or environment.get("TRADE_SYSTEM") or None
         folder = tls or environment.get("TRADE_TLS")

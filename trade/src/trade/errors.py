@@ -403,7 +403,7 @@ class LockedByOther(CallerError, PermissionError):
         aim = f" for {self.purpose!r}" if self.purpose else ""
         when = f" since {clock(self.since)}" if self.since else ""
         if self.own:
-            hint = "that is this container itself: in another thread use `with lock.use():`"
+            hint = "that is this container itself: make the call inside `with lock.use():`"
         else:
             hint = "wait with trade.lock(..., wait_s=...) or ask with trade.request_release(...)"
         return f"{what} is locked by {self.owner}{aim}{when}; {hint}"
