@@ -94,6 +94,14 @@ def test_a_caller_sees_the_latest_progress(offer: Any, walk: Walk, eventually: A
     assert run.progress() == {"share": 3}
 
 
+def test_a_run_shows_what_it_is_and_how_far(offer: Any, walk: Walk) -> None:
+    run = offer(walk)("walk").start()
+    assert repr(run) == "<Run of robot.walk, under way>"
+    walk.open.set()
+    run.result(20)
+    assert repr(run) == "<Run of robot.walk, ended>"
+
+
 def test_what_is_said_last_comes_before_the_answer(offer: Any, walk: Walk) -> None:
     walk.open.set()
     tell = offer(walk)("tell")

@@ -460,8 +460,33 @@ def test_reading_services_may_be_asked_about_infinity(offer: Any) -> None:
 
 
 def test_an_argument_that_cannot_be_sent_is_named(offer: Any) -> None:
-    with pytest.raises(NotSerialisable, match=r"robot.two: argument 'b' cannot be sent: a CallerOnly is no plain data"):
+    with pytest.raises(NotSerialisable, match=r"robot.two: argument 'b' cannot be sent: CallerOnly is no plain data"):
         offer(Provider())("two")(1, b=CallerOnly())
+
+
+class Measured(float):
+    """As the numbers that an array has."""
+
+
+class Counted:
+    def __index__(self) -> int:
+        return 3
+
+
+class Array:
+    def tolist(self) -> list[float]:
+        return [0.5]
+
+
+def test_numbers_of_other_kinds_are_sent_as_numbers(offer: Any) -> None:
+    find = offer(Provider())
+    assert find("number")(Measured(0.25)) == 0.25
+    assert find("two")(Counted()) == "3b"
+
+
+def test_an_array_is_to_be_sent_as_a_list(offer: Any) -> None:
+    with pytest.raises(NotSerialisable, match=r"Array is no plain data; send value.tolist\(\)"):
+        offer(Provider())("two")(1, b=Array())
 
 
 def test_a_result_that_cannot_be_sent_is_the_providers_fault(offer: Any) -> None:

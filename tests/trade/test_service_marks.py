@@ -6,7 +6,7 @@ from typing import Protocol
 
 import pytest
 
-from trade import Container, service, where
+from trade import Container, Resource, service, where
 from trade.errors import ConfigurationError, LockedByOther
 
 
@@ -399,3 +399,32 @@ def test_what_only_writes_something_down_is_neither_locked_nor_held_up_by_a_lock
 def test_a_note_needs_nothing_physical() -> None:
     with pytest.raises(ConfigurationError, match="a note needs nothing physical"):
         service(effect="note", uses=["pen"])(lambda: None)
+
+
+def test_a_class_in_the_place_of_an_object_is_refused(here: Container) -> None:
+    with pytest.raises(ConfigurationError, match="Lamp: it is a class; register an object of it"):
+        here.register(Lamp, "lab")
+
+
+class Press:
+    """Names the same thing as an object and by its name."""
+
+    def __init__(self) -> None:
+        self.resources = [Resource("lab.press")]
+
+    @service(uses=["lab.press", "lab.door"])
+    def close(self) -> None: ...
+
+    @service(effect="stop")
+    def stop(self) -> None: ...
+
+
+def test_what_an_object_and_a_mark_name_is_one_resource(here: Container) -> None:
+    press = Press()
+    here.register(press, "lab")
+    close = here.find(where(name="close"))
+    assert close.resources == ("lab.press", "lab.door")
+    with here.lock([close]):
+        assert press.resources[0].holder is not None
+    here.deregister(press)
+    here.register(Press(), "lab")  # as nothing of the first one is left

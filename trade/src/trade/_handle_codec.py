@@ -1,5 +1,6 @@
 """How handles travel among values: as the key of their service, in a MessagePack extension of their own."""
 
+import operator
 from collections.abc import Callable
 from typing import Any, Final
 
@@ -25,7 +26,12 @@ def handle_codec(key_of: Callable[[Handle], ServiceKey], handle_of: Callable[[Se
     def to_data(value: Any) -> Any:
         if isinstance(value, Handle):
             return msgspec.msgpack.Ext(HANDLE_EXT, encode_message(key_of(value)))
-        raise TypeError(f"a {type(value).__qualname__} is no plain data")
+        if isinstance(value, float):  # of a kind of its own, as those of arrays
+            return float(value)
+        if hasattr(value, "__index__"):
+            return operator.index(value)
+        hint = "; send value.tolist()" if hasattr(value, "tolist") else ""
+        raise TypeError(f"{type(value).__qualname__} is no plain data{hint}")
 
     def from_data(code: int, data: memoryview) -> Any:
         if code != HANDLE_EXT:

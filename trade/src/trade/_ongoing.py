@@ -221,7 +221,7 @@ class Herald:
             self._some.wait()
             with self._lock:
                 self._some.clear()
-                news, self._news = self._news, set()
+                news, self._news = self._news, set[Ongoing]()
             for ongoing in news:
                 self.send(ongoing)
             self._ended.wait(self.EVERY_S)

@@ -331,6 +331,8 @@ class Providers:
         marked = marked_methods(type(provider), implements)
         if not marked:
             problem = "it has no services; mark methods of its class with @trade.service"
+            if isinstance(provider, type):
+                kind, problem = provider.__qualname__, "it is a class; register an object of it"
             raise ConfigurationError(where=kind, problem=problem)
         resources = cast("tuple[Resource | str, ...]", tuple(getattr(provider, "resources", ())))
         require_stop(kind, resources, [mark for mark, _ in marked.values()])
@@ -344,8 +346,8 @@ class Providers:
             signature = self._signature(label, name, mark, function)
             info = signature.info
             if resources and mark.effect not in {"read", "note"}:
-                names = tuple(one if isinstance(one, str) else one.name for one in resources)
-                info = structs.replace(info, uses=(*mark.uses, *names))
+                names = [one if isinstance(one, str) else one.name for one in resources]
+                info = structs.replace(info, uses=tuple(dict.fromkeys((*mark.uses, *names))))
             services[name] = LocalService(
                 label,
                 info,
@@ -354,7 +356,7 @@ class Providers:
                 mark,
                 self._loop,
                 serial if mark.serial else None,
-                self._adopt(mark, (*mark.uses, *resources), f"{place}/{name}"),
+                self._adopt(mark, (*resources, *mark.uses), f"{place}/{name}"),
             )
         return services
 
@@ -372,8 +374,9 @@ class Providers:
             return ()
         if mark.effect == "read" or (not needed and mark.effect == "actuate"):
             needed = (itself,)
+        given = {one.name for one in needed if isinstance(one, Resource)}
         try:
-            return tuple(self._table.adopt(one) for one in dict.fromkeys(needed))
+            return tuple(self._table.adopt(one) for one in dict.fromkeys(needed) if one not in given)
         except ValueError as twice:
             raise ConfigurationError(where=itself, problem=str(twice)) from None
 

@@ -30,6 +30,10 @@ class Run:
         self._cancelling = False
         self._cancel_call: Callable[[], None] | None = None
 
+    def __repr__(self) -> str:
+        state = "under way" if self._outcome is None else "ended" if self._outcome[1] is None else "failed"
+        return f"<Run of {self._handle.label}, {state}>"
+
     def result(self, timeout_s: float | None = None) -> Any:
         """The service's result, or its error raised.
 
