@@ -354,7 +354,7 @@ def test_what_may_no_longer_be_offered_leaves_and_returns_with_the_right(
 
 def test_a_lock_that_may_no_longer_be_held_is_lost(member: Member, neck: Neck, policy: Path) -> None:
     planner, drv = member("planner"), member("drv")
-    with planner.lock(where(group="rosie.neck")):
+    with pytest.raises(LockLost, match="planner may not lock"), planner.lock(where(group="rosie.neck")):
         drv.load_policy(rewritten(policy, 'lock = ["rosie.neck"]', ""))
         assert drv.locks() == []
         with pytest.raises(LockLost, match="planner may not lock"):

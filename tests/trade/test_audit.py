@@ -12,7 +12,7 @@ from trade import Container, Resource, Secret, Settings, service, where
 from trade._audit_store import reading
 from trade._local_service import LocalService
 from trade.auditing import AuditRow, verify
-from trade.errors import AccessDenied, ConfigurationError, InvalidArgument, LockedByOther, Stopped
+from trade.errors import AccessDenied, ConfigurationError, InvalidArgument, LockedByOther, LockLost, Stopped
 
 Eventually = Callable[[Callable[[], bool]], bool]
 Start = Callable[..., Container]
@@ -184,7 +184,7 @@ def test_who_locks_what_and_who_is_refused_for_it(
 
 def test_a_lock_that_is_taken_away_says_by_whom(here: Container, there: Container, folder: Path) -> None:
     here.find(where(name="reach"), wait_s=20)
-    with here.lock(where(group="rosie.arm")):
+    with pytest.raises(LockLost), here.lock(where(group="rosie.arm")):
         there.break_lock(where(group="rosie.arm"), "the door is open")
     found = [(row.what, row.session, row.why) for row in rows(there, folder) if row.kind == "lock"]
     assert found[1] == (
