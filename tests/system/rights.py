@@ -80,8 +80,11 @@ class Stage:
             return True
 
     def break_lock(self, actor: Container) -> bool:
-        with self.planner.lock(where(group=ARM)):
+        lock = self.planner.lock(where(group=ARM)).acquire()
+        try:
             return bool(actor.break_lock(where(group=ARM), "it is needed"))
+        finally:
+            lock.release()
 
     def estop(self, actor: Container) -> bool:
         given = actor.estop("a test", limit_s=1.0).id
