@@ -8,21 +8,24 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
+import msgspec
 import pytest
 import typer
 
 from pages.blocks import blocks
 from trade import errors
 from trade_gateway.cli import build
-from trade_hil_sim import SimProcess, events
+from trade_hil_sim import AnswerFault, Command, SimProcess, events
+from trade_hil_sim._faults import kinds_of
 
 if sys.version_info >= (3, 11):
     import tomllib
 else:
     import tomli as tomllib
 
+KINDS: Final = kinds_of(Command)
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
@@ -68,11 +71,33 @@ def test_every_error_is_in_the_guides_table() -> None:
 
 def test_the_command_for_the_simulator_strikes_it() -> None:
     page = (ROOT / "docs" / "simulators.md").read_text(encoding="utf-8")
-    [command] = re.findall(r"```sh\n(python .*?)\n```", page)
+    [command] = re.findall(r"```sh\n(trade-hil-sim --do .*?)\n```", page)
     with SimProcess(ROOT / "examples" / "head.toml") as sim:
-        words = [sys.executable, *shlex.split(command)[1:-1], str(sim.control_path)]
+        words = [str(sim.control_path) if word.endswith("/_control") else word for word in shlex.split(command)[1:]]
+        words = [sys.executable, "-m", "trade_hil_sim", *words]
         subprocess.run(words, timeout=60, check=True)
         assert events(sim.entries(), "brown_out", device_id=1)
+
+
+@pytest.mark.parametrize("word", KINDS)
+def test_the_page_on_the_simulators_has_each_fault_with_its_fields(word: str) -> None:
+    page = (ROOT / "docs" / "simulators.md").read_text(encoding="utf-8")
+    [cells] = re.findall(rf"^\| (?:`\w+`, )?`{word}`(?:, `\w+`)? \|(.*?)\| ", page, re.MULTILINE)
+    told = dict(re.findall(r"`(\w+)`(?: \((.*?)\))?", cells))
+    kind = KINDS[word]
+    common = AnswerFault.__struct_fields__ if issubclass(kind, AnswerFault) else ("bus",)
+    assert told.keys() == set(kind.__struct_fields__) - set(common)
+    given = msgspec.inspect.type_info(kind)
+    assert isinstance(given, msgspec.inspect.StructType)
+    for field in given.fields:
+        if field.name in told:
+            assert field.required == (f"**`{field.name}`**" in cells)
+            default = told[field.name].strip("`").replace(" ", "")
+            assert default == ("" if field.required or field.default is None else json_text(field.default))
+
+
+def json_text(value: object) -> str:
+    return msgspec.json.encode(int(value) if isinstance(value, float) else value).decode()
 
 
 def commands(page: Path) -> Iterator[list[str]]:

@@ -1,17 +1,47 @@
 """The control socket: commands in, the truth out, and errors that say what would be right."""
 
+import inspect
 import json
 import socket
 import tempfile
 import threading
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import pytest
 
-from trade_hil_sim import DynamixelBus, Late, Servo, SimControl, SimulationError
+from trade_hil_sim import Command, DynamixelBus, Late, Servo, SimControl, SimulationError
 from trade_hil_sim._control import ControlServer
+from trade_hil_sim._faults import kinds_of
+from trade_hil_sim._strikes import Strikes
+
+KINDS: Final = kinds_of(Command)
+FIELDS: Final[dict[str, Any]] = {
+    "bus": "neck",
+    "ids": (1, 2),
+    "instruction": "read",
+    "skip": 2,
+    "count": 3,
+    "s": 0.5,
+    "missing": 4,
+    "hex": "00",
+    "on": False,
+    "kind": "rtde",
+    "nth": 2,
+    "tick": True,
+    "number": 7,
+    "bits": 4,
+    "code": 0x2310,
+    "lasting": True,
+    "voltage_v": 11.0,
+    "temperature_c": 70,
+    "counts": 100,
+    "width_m": 0.02,
+    "stiffness_n_m": 900.0,
+    "inside": True,
+}
+"""A value for each field that a fault has, other than what it is without."""
 
 
 @pytest.fixture
@@ -81,7 +111,7 @@ def test_commands_reach_the_bus_they_name(control: SimControl, buses: list[Dynam
 def test_ids_are_looked_up_on_every_bus_unless_one_is_named(control: SimControl) -> None:
     control.place(100, [2, 3])
     assert [control.device(k).position_counts for k in (1, 2, 3)] == [2048, 100, 100]
-    with pytest.raises(SimulationError, match=r"no bus has a device \[9\]"):
+    with pytest.raises(SimulationError, match=r"no bus has a device \[9\]; there is \[1, 2\] on neck, \[3\] on arm"):
         control.mute([9])
     with pytest.raises(SimulationError, match=r"bus arm has no device \[1\]; it has \[3\]"):
         control.mute([1], bus="arm")
@@ -89,13 +119,41 @@ def test_ids_are_looked_up_on_every_bus_unless_one_is_named(control: SimControl)
         control.unplug("leg")
 
 
-def test_every_method_of_the_client_is_understood(control: SimControl) -> None:
+class Listener(Strikes):
+    """Keeps what it is told to do."""
+
+    def __init__(self) -> None:
+        self.done: list[Command] = []
+
+    def do(self, command: Command) -> None:
+        self.done.append(command)
+
+
+@pytest.mark.parametrize("word", KINDS)
+def test_each_fault_is_a_method_that_takes_its_fields(word: str) -> None:
+    kind, listener = KINDS[word], Listener()
+    given = {name: FIELDS[name] for name in kind.__struct_fields__}
+    method = getattr(listener, word)
+    assert inspect.signature(method).parameters.keys() == given.keys()
+    method(**given)
+    assert listener.done == [kind(**given)]
+
+
+def test_what_is_left_out_is_as_in_the_value() -> None:
+    listener = Listener()
+    for word in KINDS.keys() - {"late", "dribble", "hang_up", "emergency", "wrong_model", "place"}:
+        getattr(listener, word)()
+        assert listener.done.pop() == KINDS[word]()
+
+
+def test_faults_reach_the_simulator_by_their_methods(control: SimControl) -> None:
     control.mute([1], instruction="read", count=1)
     control.unmute()
     control.late(0.01, [1], count=1)
     control.bad_crc(count=1)
     control.hardware_fault(0x20, [1])
     control.freeze([1])
+    control.jam([1], bus="neck")
     control.absent([1])
     assert (control.device(1).absent, control.device(1).hardware_error) == (True, 0x20)
     control.heal()

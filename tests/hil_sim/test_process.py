@@ -1,6 +1,7 @@
 """The simulator as a process of its own: ready line, clean end, and no life after its parent."""
 
 import json
+import re
 import shutil
 import signal
 import subprocess
@@ -13,7 +14,9 @@ import psutil
 import pytest
 import serial
 
-from trade_hil_sim import SimProcess, SimulationError, events, instructions, read_log, remove_leftovers
+from trade_hil_sim import Command, SimProcess, SimulationError, events, instructions, read_log, remove_leftovers
+from trade_hil_sim.__main__ import main
+from trade_hil_sim._faults import kinds_of
 from trade_hil_sim.dynamixel import encode
 from waiting import wait_until
 
@@ -132,6 +135,82 @@ def test_help_says_how_to_talk_to_it(robot_file: Path) -> None:
     said = subprocess.run([*COMMAND, "--help"], capture_output=True, text=True, timeout=60, check=True).stdout
     for word in ("--bus", "--log", "--control", "--unpaced", "--parent", "--stdin", '{"do": "mute", "ids": [1]}'):
         assert word in said
+
+
+@pytest.mark.parametrize(
+    ("words", "done"),
+    [
+        ("unplug bus=neck", ["unplugged"]),
+        ("brown_out ids=1", ["brown_out"]),
+        ("hardware_fault bits=0x20 ids=1 bus=neck", ["shutdown"]),
+    ],
+)
+def test_one_that_runs_is_struck_by_a_command(robot_file: Path, words: str, done: list[str]) -> None:
+    with SimProcess(robot_file) as sim:
+        before = len(sim.entries())
+        assert strike(str(sim.control_path), words) == (0, "", "")
+        assert [one.name for one in sim.entries()[before:] if one.name in done] == done
+
+
+def test_the_state_is_told_by_a_command(robot_file: Path) -> None:
+    with SimProcess(robot_file) as sim:
+        assert strike(str(sim.control_path), "absent ids=1 on=false") == (0, "", "")
+        code, said, _ = strike(str(sim.control_path), "state")
+        assert (code, json.loads(said.splitlines()[0])["name"]) == (0, "neck")
+
+
+def test_what_the_simulator_refuses_is_told_in_one_line(robot_file: Path) -> None:
+    with SimProcess(robot_file) as sim:
+        for words, why in (
+            ("jam ids=99", "no bus has a device [99]; there is [1, 2] on neck, [3] on arm"),
+            ("jam ids=3 bus=neck", "bus neck has no device [3]; it has [1, 2]"),
+            ("unplug bus=leg", "there is no bus 'leg'; there is neck, arm"),
+        ):
+            assert strike(str(sim.control_path), words) == (1, "", f"trade-hil-sim: {why}\n")
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        ("dance", "there is no fault 'dance'; there is absent, bad_crc"),
+        ("jam ids=one", "jam: Expected `int`, got `str` - at `$.ids[0]`; its keys are bus, ids, on"),
+        ("jam 4", "'4' is no KEY=VALUE, such as ids=1,2"),
+        ("late", "late: Object missing required field `s`; its keys are bus, ids, instruction, skip, count, s"),
+        ("garbage hex=xy", "garbage: non-hexadecimal"),
+        ("hardware_fault bits=0xg", "hardware_fault: invalid literal"),
+        ("jam id=4", "unknown field `id`; its keys are"),
+        ("state bus=neck", "state: Object contains unknown field `bus`; it has no keys"),
+        ("", "--do takes the control socket"),
+    ],
+)
+def test_wrong_words_are_told_in_one_line_before_anything_is_sent(
+    words: str, why: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["--do", "/nowhere/_control", *words.split()]) == 2
+    said, problem = capsys.readouterr()
+    assert (said, problem.count("\n")) == ("", 1)
+    assert problem.startswith("trade-hil-sim: ")
+    assert why in problem
+
+
+def test_a_command_for_nobody_says_where_it_looked(tmp_path: Path) -> None:
+    code, _, problem = strike(str(tmp_path / "none"), "heal")
+    assert (code, problem.count("\n")) == (1, 1)
+    assert f"no simulator listens on {tmp_path / 'none'}" in problem
+
+
+def strike(control: str, words: str) -> tuple[int, str, str]:
+    """Exit code, output and errors of a command to a simulator that runs."""
+    command = [*COMMAND, "--do", control, *words.split()]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    return ended.returncode, ended.stdout, ended.stderr
+
+
+def test_help_lists_every_fault() -> None:
+    said = subprocess.run([*COMMAND, "--help"], capture_output=True, text=True, timeout=60, check=True).stdout
+    for word, kind in kinds_of(Command).items():
+        [line] = re.findall(rf"^  {word} .*", said, re.MULTILINE)
+        assert all(key in line for key in kind.__struct_fields__ if key != "bus")
 
 
 def test_the_package_alone_imports_nothing_of_ours() -> None:

@@ -11,10 +11,11 @@ from pages.blocks import DOCS, ROOT, Section, of, said, sections
 from robots import HEAD
 from trade._policy_file import read_policy
 from trade.rules import read_rules
-from trade_drivers import Robot, parse
+from trade_drivers import Robot, attach, load, parse
 from trade_gateway._gateway_file import Plan, read_gateway_file
 from trade_gateway._system_file import read_system_file
 from trade_gateway.talk import read_lexicon
+from trade_hil_sim import SimProcess
 
 ROSIE = '[robot]\nname = "rosie"\n'
 POLICY = '[roles.viewer]\nread = ["*"]\n[identities]\nann = ["viewer"]\n'
@@ -121,6 +122,26 @@ def test_a_share(tmp_path: Path, text: str) -> None:
 
 
 # --- docs/drivers.md
+
+
+@of("drivers.md", "The robot file")
+def test_a_robot_file(tmp_path: Path, text: str) -> None:
+    """What its drivers have to say of it is said by them, on the simulated devices."""
+    whole = load(save(tmp_path, "rosie.toml", text))
+    nobody: dict[str, Any] = {"register": lambda *_: None, "deregister": lambda _: None}
+    with SimProcess(tmp_path / "rosie.toml") as sim, attach(whole, ports=sim.ports, **nobody) as rosie:
+        assert rosie.group("head").joints() == ["rosie.neck.pan", "rosie.neck.tilt"]
+        assert rosie.gripper("left.hand").limits().max_width_m == 0.085
+
+
+@of("drivers.md", "Dynamixel")
+def test_servos(text: str) -> None:
+    assert robot(ROSIE + text).joints[0].name == "neck.pan"
+
+
+@of("drivers.md", "Feetech")
+def test_other_servos(text: str) -> None:
+    assert robot(ROSIE + text).joints[0].name == "right.elbow"
 
 
 @of("drivers.md", "CiA 402")

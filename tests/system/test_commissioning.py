@@ -42,14 +42,12 @@ STEPS: Final = (
     Step("Who is on the line of the servos?", "trade scan --port lines/neck"),
     Step(
         "Both have id 1, as all that come from the factory. Unplug the second one (the simulated one: by this line).",
-        """python -c 'import sys; from trade_hil_sim import SimControl; """
-        """SimControl(sys.argv[1]).absent(nth=2, bus="neck")' lines/_control""",
+        "trade-hil-sim --do lines/_control absent nth=2 bus=neck",
     ),
     Step("The one that is left gets an id of its own.", "trade set-id --port lines/neck --from 1 --to 2"),
     Step(
         "Plug the other one in again.",
-        """python -c 'import sys; from trade_hil_sim import SimControl; """
-        """SimControl(sys.argv[1]).absent(nth=2, on=False, bus="neck")' lines/_control""",
+        "trade-hil-sim --do lines/_control absent nth=2 on=false bus=neck",
     ),
     Step(
         "At 57600 baud there is no time for a hundred cycles a second, so both are to speak faster.",
@@ -67,8 +65,8 @@ STEPS: Final = (
     ),
     Step(
         "Where are zero and ends of each joint? It is moved by hand; its torque stays off. In another terminal, this "
-        "line is the hand that moves a simulated one, to a position in counts: `python -c 'import sys; from "
-        """trade_hil_sim import SimControl; SimControl(sys.argv[1]).place(2100, [1], bus="neck")' lines/_control`.""",
+        "line is the hand that moves a simulated one, to a position in counts: `trade-hil-sim --do lines/_control "
+        "place counts=2100 ids=1 bus=neck`.",
         "trade calibrate rosie.toml neck.pan",
         "calibrate",
         (2100, 1500, 2700),

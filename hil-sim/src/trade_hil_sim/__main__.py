@@ -1,4 +1,4 @@
-"""``trade-hil-sim ROBOT.toml``: simulate the buses of a robot file until told to stop."""
+"""``trade-hil-sim ROBOT.toml``: simulate the buses of a robot file until told to stop; ``--do`` strikes them."""
 
 import argparse
 import gc
@@ -14,35 +14,74 @@ from types import FrameType
 
 import msgspec
 
-from ._control import ControlServer
+from ._client import SimControl
+from ._control import ControlServer, State
 from ._errors import SimulationError
 from ._fresh import fresh_bus
 from ._log import ByteLog
 from ._process import Ready
 from ._ready import ready
 from ._robot import buses_of, read_robot
+from ._words import command_of, listing
 
-EPILOG = """\
+EPILOG = f"""\
 When all ports can be opened, one line of JSON appears on standard output:
-  {"ready": true, "ports": {"neck": "/tmp/trade-sim-x/neck"}, "log": null, "control": "/tmp/trade-sim-x/_control"}
+  {{"ready": true, "ports": {{"neck": "/tmp/trade-sim-x/neck"}}, "log": null, "control": "/tmp/trade-sim-x/_control"}}
 Give such a port to any client in place of a real one. The control socket takes lines of JSON, for instance
-  {"do": "mute", "ids": [1]}   {"do": "unplug", "bus": "neck"}   {"do": "state"}
+  {{"do": "mute", "ids": [1]}}   {{"do": "unplug", "bus": "neck"}}   {{"do": "state"}}
 SIGTERM, SIGINT, the end of --parent or (with --stdin) the end of standard input end the simulator.
+
+With --do, one that runs is struck; for instance
+  trade-hil-sim --do /tmp/trade-sim-x/_control jam ids=1,2 bus=neck
+  trade-hil-sim --do /tmp/trade-sim-x/_control heal
+The exit code is 0 if it was done, 1 if the simulator refused it or is not there, 2 if the words are wrong. There is, in
+brackets what it takes besides bus=NAME:
+{listing()}
+docs/simulators.md says more of each.
 """
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the simulator; return its exit status: 0 after a signal, 2 if it could not start."""
+    """Run the simulator; return its exit status: 0 after a signal, 2 if it could not start.
+
+    With ``--do`` strike one that runs: 0 if it was done, 1 if not, 2 if the words are wrong.
+    """
     options = _parser().parse_args(argv)
+    if options.do is not None:
+        return _strike(options)
     stop = _Stop()
     try:
         with ExitStack() as stack:
             stack.callback(stop.close)
             _run(options, stack, stop)
     except (SimulationError, OSError, ValueError) as problem:
-        sys.stderr.write(f"trade-hil-sim: {problem}\n")
-        return 2
+        return _failed(problem, 2)
     return 0
+
+
+def _strike(options: argparse.Namespace) -> int:
+    control, *words = options.do
+    try:
+        if options.robot is not None or options.fresh or not words:
+            raise SimulationError("--do takes the control socket of a simulator that runs, and what to do to it")
+        command = command_of(words)
+    except SimulationError as problem:
+        return _failed(problem, 2)
+    try:
+        with SimControl(control) as simulator:
+            if not isinstance(command, State):
+                simulator.do(command)
+                return 0
+            for bus in simulator.state():
+                sys.stdout.write(msgspec.json.encode(bus).decode() + "\n")
+    except SimulationError as problem:
+        return _failed(problem, 1)
+    return 0
+
+
+def _failed(problem: Exception, code: int) -> int:
+    sys.stderr.write(f"trade-hil-sim: {problem}\n")
+    return code
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -65,6 +104,12 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--dir", type=Path, metavar="DIR", help="put the ports here (default: a temporary directory)")
     parser.add_argument("--control", type=Path, metavar="PATH", help="control socket (default: DIR/_control)")
     parser.add_argument("--unpaced", action="store_true", help="answer as fast as possible, not at the baud rate")
+    parser.add_argument(
+        "--do",
+        nargs="+",
+        metavar=("CONTROL", "FAULT"),
+        help="strike the simulator that has this control socket: a fault and its KEY=VALUE, listed below",
+    )
     parser.add_argument("--parent", type=int, metavar="PID", help="end when this process ends")
     parser.add_argument("--stdin", action="store_true", help="end when standard input ends")
     return parser

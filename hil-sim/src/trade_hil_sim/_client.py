@@ -2,7 +2,6 @@
 
 import socket
 import threading
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
 
@@ -12,6 +11,7 @@ from . import _faults as faults
 from ._control import Answer, State
 from ._errors import SimulationError
 from ._state import ArmTruth, BusState, DeviceState, GripperTruth
+from ._strikes import Strikes
 
 __all__ = ["SimControl"]
 
@@ -19,11 +19,13 @@ ANSWER_S: Final = 10.0
 """How long a simulator may take over a command."""
 
 
-class SimControl:
+class SimControl(Strikes):
     """Makes things happen in a running simulator. Threads may share one.
 
-    In every method, `ids` are device ids (default: all) and `bus` is the name of a bus (default: every bus); `count` is
-    how many answers a fault strikes (default: all until `heal`), and `instruction` the one whose answers it strikes.
+    Each fault and order is a method of its name, and `do` takes it as a value. In every method, `ids` are device ids
+    (default: all) and `bus` is the name of a bus (default: every bus). Of a fault of answers, `instruction` is the one
+    whose answers it strikes (default: any), `skip` how many of them go out unharmed first, and `count` how many it
+    strikes (default: all until `heal`).
 
     Args:
         path: the socket, as the simulator's ready line names it.
@@ -96,83 +98,6 @@ class SimControl:
             raise SimulationError(f"no arm is called {which!r}; there is {', '.join(arms) or 'none'}")
         return arms[which]
 
-    # faults of answers
-
-    def mute(
-        self,
-        ids: Iterable[int] | None = None,
-        *,
-        bus: str | None = None,
-        instruction: str | None = None,
-        count: int | None = None,
-    ) -> None:
-        """Devices obey, but do not answer."""
-        self.do(faults.Mute(ids=_ids(ids), bus=bus, instruction=instruction, count=count))
-
-    def unmute(self, ids: Iterable[int] | None = None, *, bus: str | None = None) -> None:
-        """End every mute of these devices."""
-        self.do(faults.Unmute(ids=_ids(ids), bus=bus))
-
-    def late(
-        self,
-        s: float,
-        ids: Iterable[int] | None = None,
-        *,
-        bus: str | None = None,
-        instruction: str | None = None,
-        count: int | None = None,
-    ) -> None:
-        """Answers come `s` seconds late."""
-        self.do(faults.Late(s=s, ids=_ids(ids), bus=bus, instruction=instruction, count=count))
-
-    def bad_crc(self, ids: Iterable[int] | None = None, *, bus: str | None = None, count: int | None = None) -> None:
-        """The last byte of answers is wrong."""
-        self.do(faults.BadCrc(ids=_ids(ids), bus=bus, count=count))
-
-    def heal(self, *, bus: str | None = None) -> None:
-        """End every fault of answers, echo, frozen sensors, jams, absences and wrong models."""
-        self.do(faults.Heal(bus=bus))
-
-    # the line and the devices
-
-    def unplug(self, bus: str | None = None) -> None:
-        """Pull the serial adapter. The devices stay powered."""
-        self.do(faults.Unplug(bus=bus))
-
-    def replug(self, bus: str | None = None) -> None:
-        """Plug the serial adapter in again; clients must open the port anew."""
-        self.do(faults.Replug(bus=bus))
-
-    def absent(
-        self, ids: Iterable[int] | None = None, *, nth: int | None = None, on: bool = True, bus: str | None = None
-    ) -> None:
-        """Take devices off the bus, or only its `nth` one; with `on` false put them back."""
-        self.do(faults.Absent(ids=_ids(ids), nth=nth, on=on, bus=bus))
-
-    def brown_out(self, ids: Iterable[int] | None = None, *, bus: str | None = None) -> None:
-        """Let the supply dip: RAM at its defaults, torque off."""
-        self.do(faults.BrownOut(ids=_ids(ids), bus=bus))
-
-    def hardware_fault(self, bits: int, ids: Iterable[int] | None = None, *, bus: str | None = None) -> None:
-        """Latch bits of the hardware error register; 32 is overload."""
-        self.do(faults.HardwareFault(bits=bits, ids=_ids(ids), bus=bus))
-
-    def freeze(
-        self, ids: Iterable[int] | None = None, *, on: bool = True, tick: bool = False, bus: str | None = None
-    ) -> None:
-        """Let the measured position stand still, and with `tick` the device's clock."""
-        self.do(faults.Freeze(ids=_ids(ids), on=on, tick=tick, bus=bus))
-
-    def place(self, counts: int, ids: Iterable[int] | None = None, *, bus: str | None = None) -> None:
-        """Turn shafts by hand, to a position in counts."""
-        self.do(faults.Place(counts=counts, ids=_ids(ids), bus=bus))
-
-    def put(
-        self, width_m: float | None, ids: Iterable[int] | None = None, *, inside: bool = False, bus: str | None = None
-    ) -> None:
-        """Put an object between the fingers of grippers, or with None take it away."""
-        self.do(faults.Put(width_m=width_m, inside=inside, ids=_ids(ids), bus=bus))
-
     def do(self, command: faults.Command) -> None:
         """Send any command of the simulator."""
         self._ask(command)
@@ -197,7 +122,3 @@ class SimControl:
             self._held += data
         line, _, self._held = self._held.partition(b"\n")
         return line
-
-
-def _ids(ids: Iterable[int] | None) -> tuple[int, ...] | None:
-    return None if ids is None else tuple(ids)

@@ -132,7 +132,8 @@ class ControlServer:
         states = {name: bus.state() for name, bus in self._buses.items()}
         here = {name: {device.device_id for device in (*s.devices, *s.grippers, *s.arms)} for name, s in states.items()}
         if unknown := set(ids).difference(*here.values()):
-            raise SimulationError(f"no bus has a device {sorted(unknown)}; there is {here}")
+            known = ", ".join(f"{sorted(there)} on {name}" for name, there in here.items())
+            raise SimulationError(f"no bus has a device {sorted(unknown)}; there is {known}")
         mine = {name: tuple(i for i in ids if i in there) for name, there in here.items()}
         return [(self._buses[name], replace(command, ids=some)) for name, some in mine.items() if some]
 
