@@ -67,7 +67,7 @@ class Recovery(Enum):
 
     NOTHING = "nothing"
     ENABLE = "`enable()`"
-    ACTIVATE = "`clear_fault()`, `activate()`"
+    ACTIVATE = "`activate()`"
     UNLOCK = "`unlock_protective_stop()`"
     START = "`power_on()`, `release_brakes()`"
 

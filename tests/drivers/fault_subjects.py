@@ -227,7 +227,6 @@ class Hand(Subject):
 
     def recover(self, recovery: Recovery, since: float) -> None:
         if recovery is not Recovery.NOTHING:
-            self.provider.clear_fault()
             self.provider.activate()
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from trade.errors import DeviceFault, InvalidArgument
+from trade.errors import DeviceFault, DeviceSilent, InvalidArgument
 from trade_drivers import FaultInfo, FaultLog, MotorState
 from trade_drivers.faults import FaultStore
 from trade_drivers.faults._lookout import Found, found_in
@@ -179,6 +179,19 @@ def test_what_a_device_reports_in_one_text_is_taken_apart(prefix: str) -> None:
 def test_numbers_make_no_other_kind_but_codes_do(one: str, other: str, same: bool) -> None:
     kinds = {found_in(PAN, DeviceFault(device=PAN, bus="x", fault=text))[0].kind for text in (one, other)}
     assert (len(kinds) == 1) is same
+
+
+def test_people_are_told_what_was_said_last_with_its_numbers(bench: Bench) -> None:
+    log = bench.open()
+    for short in ("0.3", "0.12"):
+        error = DeviceFault(device=PAN, bus="x", fault=f"it makes no progress, {short} rad short of its goal")
+        bench.begin(*found_in(PAN, error))
+        said = f"it makes no progress, {short} rad short of its goal"
+        assert (only(log).said, log.health(PAN)) == (said, said)
+        bench.end(*found_in(PAN, error))
+    bench.begin(*found_in(PAN, DeviceSilent(device=PAN, bus="x", waited_s=0.3)))
+    assert ([info.said for info in log.faults(open_only=True)], log.health(PAN)) == (["silent"], "silent")
+    assert len(log.faults()) == 2
 
 
 def test_who_acknowledges_is_noted_and_a_fault_that_begins_again_is_unseen_again(bench: Bench) -> None:

@@ -294,6 +294,34 @@ def test_S11_who_has_no_lock_writes_nothing(
     assert not hand.writes(mark)
 
 
+def test_S09_what_an_estop_ended_tells_of_the_estop_and_after_it_a_plain_stop_does_not(
+    hand: HandRig, gripper: Gripper, planner: Container, operator: Container
+) -> None:
+    run = service(planner, "close").start(SLOW_M_S)
+    hand.under_way()
+    report = operator.estop("smoke")
+    with pytest.raises(MotionStopped, match=f"before its goal: e-stop {report.id}: smoke") as ended:
+        run.result()
+    assert "until it is moved again" not in str(ended.value)
+    operator.estop_clear([report.id])
+    operator.locking.resume(HAND_SERVICES)
+    run = service(planner, "open").start(SLOW_M_S)
+    hand.under_way()
+    gripper.stop()
+    with pytest.raises(MotionStopped, match=r"before its goal: stop\(\) was called\."):
+        run.result()
+
+
+def test_S14_what_is_withdrawn_while_it_moves_says_so(
+    hand: HandRig, gripper: Gripper, planner: Container, driver: Container
+) -> None:
+    run = service(planner, "close").start(SLOW_M_S)
+    hand.under_way()
+    driver.deregister(gripper)
+    with pytest.raises(MotionStopped, match="before its goal: its services are withdrawn"):
+        run.result()
+
+
 def test_S08_a_foreign_stop_holds_until_somebody_resumes(
     hand: HandRig, gripper: Gripper, planner: Container, operator: Container
 ) -> None:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
-from math import pi
+from math import inf, pi
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ from typer.testing import CliRunner, Result
 
 from robots import HAND, HEAD
 from trade.errors import ConfigurationError, WrongDevice
-from trade_drivers import Joint, parse
+from trade_drivers import Joint, WireError, parse
 from trade_gateway.cli import app
 from trade_gateway.commands._calibrate import Ends, Sweep, _measure, homed, measured, with_values
 from trade_gateway.commands._output import Output, UsageError
@@ -45,6 +45,9 @@ def test_what_was_hardly_moved_has_no_range() -> None:
         measured(joint(), None, Ends(0.0, 0.05, 0.0))
 
 
+PLACE = "neck.pan (id 1 on /dev/ttyUSB0)"
+
+
 class Hand:
     """A bench whose device is where a hand has moved it."""
 
@@ -55,31 +58,57 @@ class Hand:
         return next(self._angles)
 
 
+class Loose(Hand):
+    """Its plug is loose: some questions are not answered."""
+
+    def __init__(self, angles: Sequence[float], missed: float) -> None:
+        super().__init__(angles)
+        self._missed = missed
+
+    def angle_rad(self, device_id: int) -> float:
+        self._missed -= 1
+        if self._missed >= 0:
+            raise WireError(f"id {device_id} did not answer within 51 ms")
+        return super().angle_rad(device_id)
+
+
 def done_after(looks: int) -> Callable[[], bool]:
     left = iter([False] * looks)
     return lambda: next(left, True)
 
 
 def test_a_sweep_knows_both_ends_and_where_it_stopped() -> None:
-    ends = Sweep(Hand([0.0, 1.0, -2.0, 0.5]), 1).until(done_after(3), 60.0)  # type: ignore[arg-type]
+    ends = Sweep(Hand([0.0, 1.0, -2.0, 0.5]), 1, PLACE).until(done_after(3), 60.0)  # type: ignore[arg-type]
     assert ends == Ends(-2.0, 1.0, 0.5)
+
+
+def test_answers_that_are_missed_for_a_moment_throw_nothing_away() -> None:
+    ends = Sweep(Loose([0.0, 1.0, -2.0], 10), 1, PLACE).until(done_after(2), 60.0)  # type: ignore[arg-type]
+    assert ends == Ends(-2.0, 1.0, -2.0)
+
+
+def test_who_answers_no_more_is_named_with_its_port_and_once() -> None:
+    with pytest.raises(ConfigurationError) as gone:
+        Sweep(Loose([], inf), 1, PLACE, patience_s=0.05).read()  # type: ignore[arg-type]
+    said = f"{PLACE}: did not answer within 51 ms, asked for 0.05 s; check its cable. Nothing was written"
+    assert str(gone.value) == said
 
 
 @pytest.mark.parametrize("beyond", [[3.0, -3.0], [3.0, pi + 0.1]])
 def test_a_joint_that_turns_past_the_end_of_its_encoder_is_refused(beyond: list[float]) -> None:
     with pytest.raises(ConfigurationError, match="mount its horn"):
-        Sweep(Hand(beyond), 1).until(done_after(1), 60.0)  # type: ignore[arg-type]
+        Sweep(Hand(beyond), 1, PLACE).until(done_after(1), 60.0)  # type: ignore[arg-type]
 
 
 def test_nobody_is_waited_for_without_an_end() -> None:
     with pytest.raises(ConfigurationError, match="nobody went on"):
-        Sweep(Hand([0.0, 0.0, 0.0]), 1).until(lambda: False, 0.0)  # type: ignore[arg-type]
+        Sweep(Hand([0.0, 0.0, 0.0]), 1, PLACE).until(lambda: False, 0.0)  # type: ignore[arg-type]
 
 
 def test_the_zero_of_a_joint_that_moves_is_refused() -> None:
     def zero(*angles: float) -> dict[str, float]:
         hand: Any = Hand(angles)
-        return _measure(Output(as_json=False), joint(), Sweep(hand, 1), zero_here=True, seconds=None)
+        return _measure(Output(as_json=False), joint(), Sweep(hand, 1, PLACE), zero_here=True, seconds=None)
 
     with pytest.raises(ConfigurationError, match=r"it moves \(by 0\.030 rad in .* s\); hold it still"):
         zero(0.5, 0.53)

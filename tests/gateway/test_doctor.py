@@ -16,6 +16,7 @@ from trade_gateway._pki import Authority
 from trade_gateway.cli import app
 from trade_gateway.commands import _doctor_host as host
 from trade_gateway.commands import _doctor_robot as robots
+from trade_gateway.commands._doctor import _of_robot
 from trade_gateway.commands._doctor_host import Finding
 from trade_gateway.commands._first_file import first_file
 from trade_hil_sim import DynamixelBus, Mute
@@ -222,3 +223,12 @@ def test_a_file_of_another_kind_is_told_by_its_name(system: str, tmp_path: Path,
     [error] = [one for one in found if one["about"] == str(path)]
     assert error["fix"] == said.format(path)
     assert "robot file" in error["text"] and "unknown table" not in error["text"]
+
+
+@pytest.mark.parametrize("text", ["[robot", "[robot]\nname = 3\n"], ids=["no TOML", "a wrong key"])
+def test_a_file_that_is_wrong_is_named_once(tmp_path: Path, text: str) -> None:
+    wrong = tmp_path / "wrong.toml"
+    wrong.write_text(text, encoding="utf-8")
+    [finding] = _of_robot(wrong)
+    assert finding.about == str(wrong)
+    assert str(wrong) not in finding.text

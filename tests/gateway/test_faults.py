@@ -6,7 +6,7 @@ from unittest.mock import create_autospec
 
 import pytest
 
-from trade_drivers import FaultLog, Motor
+from trade_drivers import FaultLog, Gripper, Motor
 from trade_drivers.faults._lookout import Found
 from trade_gateway.commands._faults import FaultWatch
 from trade_gateway.commands._output import Output
@@ -46,6 +46,13 @@ def test_each_change_is_told_once_in_both_directions(
     assert told(capsys) == [("rosie.pan", "")]
 
 
+def test_of_a_gripper_that_is_said_which_is_enough(log: FaultLog, capsys: pytest.CaptureFixture[str]) -> None:
+    watch = FaultWatch(log, {"rosie.pan": create_autospec(Gripper, instance=True)})
+    log.begin("rosie.pan", OVERLOAD, 0.0, 0.0)
+    watch.tell(Output(as_json=True))
+    assert told(capsys) == [("rosie.pan", "rosie.pan: overload. When you have looked: trade call rosie.pan.activate")]
+
+
 def test_of_two_faults_the_newest_is_told_and_it_is_well_when_both_are_gone(
     log: FaultLog, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -57,5 +64,5 @@ def test_of_two_faults_the_newest_is_told_and_it_is_well_when_both_are_gone(
     watch.tell(out)
     log.end("rosie.pan", "protective stop", 1.0, 1.0)
     watch.tell(out)
-    remedied = "rosie.pan: protective stop; call unlock_protective_stop()"
+    remedied = "rosie.pan: protective stop; `trade call rosie.pan.unlock_protective_stop`"
     assert [text for _, text in told(capsys)] == ["rosie.pan did not answer", remedied, ""]

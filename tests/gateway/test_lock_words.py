@@ -5,7 +5,17 @@ import re
 import pytest
 from typer.testing import CliRunner
 
-from trade.errors import LockedByOther, LockLost, ServiceGone
+from trade.errors import (
+    DeviceFault,
+    InvalidArgument,
+    LockedByOther,
+    LockLost,
+    MotionStopped,
+    OutcomeUnknown,
+    ServiceGone,
+    Stopped,
+    TooManyServices,
+)
 from trade_gateway.cli import app
 from trade_gateway.commands._lock import _wanted
 from trade_gateway.commands._output import REMEDIES, UsageError, say_error
@@ -47,10 +57,28 @@ def test_what_helps_is_said_in_words_of_the_command_line(capsys: pytest.CaptureF
     assert "trade.find(" not in told
 
 
+def test_what_a_device_needs_is_said_as_it_is_typed(capsys: pytest.CaptureFixture[str]) -> None:
+    remedy = "remove the cause, then call power_on() and release_brakes()"
+    say_error(DeviceFault(device="rosie.arm", bus="/dev/x", fault="overload", remedy=remedy))
+    say_error(Stopped(resource="rosie.pan", by="anna/desk", reason="stop"))
+    say_error(MotionStopped(device="rosie.pan", reason="the deadline of its call came; give it a longer one"))
+    fault, stopped, ended = capsys.readouterr().err.splitlines()
+    assert fault.endswith(
+        "remove the cause, then `trade call rosie.arm.power_on` and `trade call rosie.arm.release_brakes`"
+    )
+    assert stopped.endswith("When it is safe to move, call `trade resume rosie.pan`")
+    assert "--deadline SECONDS gives it more" in ended
+
+
 def test_every_remedy_that_is_put_in_other_words_is_one_of_an_error() -> None:
     errors = (
         LockedByOther(resources=("a",), owner="b"),
         LockLost(resources=("a",), reason="b"),
         ServiceGone(service="a"),
+        TooManyServices(constraint="a", matches=["b"]),
+        OutcomeUnknown(service="a", deadline_s=1),
+        Stopped(resource="a", by="b", reason="c"),
+        MotionStopped(device="a", reason="the deadline of its call came; give it a longer one"),
+        InvalidArgument(service="a", argument="b", problem="with_(deadline_s=...) gives it more"),
     )
     assert all(any(remedy in str(error) for error in errors) for remedy in REMEDIES)

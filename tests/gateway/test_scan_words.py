@@ -144,3 +144,26 @@ def test_a_driver_whose_devices_are_set_up_otherwise_says_so(line: DynamixelBus)
     error = trade("scan", "--port", line.port, "--driver", "ur").exception
     assert isinstance(error, ConfigurationError)
     assert "it has no scan" in str(error)
+
+
+def test_a_scan_that_finds_a_problem_tells_its_exit_code(tmp_path: Path) -> None:
+    with DynamixelBus([Servo(1), Servo(1)], tmp_path / "line", paced=False) as sim:
+        said = trade("scan", "--port", sim.port, "--bauds", 1_000_000, "--driver", "dynamixel")
+    assert "Unplug all devices but one" in said.output
+    assert said.exit_code == 1
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("scan", "--bauds", "1000000", "--driver", "dynamixel"),
+        ("set-id", "--from", "1", "--to", "2", "--driver", "dynamixel"),
+        ("scan", "--bauds", "1000000", "--driver", "feetech"),
+        ("scan", "--driver", "robotiq"),
+    ],
+    ids=" ".join,
+)
+def test_a_port_that_is_none_is_named_without_a_key_that_nobody_wrote(tmp_path: Path, words: tuple[str, ...]) -> None:
+    (tmp_path / "no").write_text("no port", encoding="utf-8")
+    error = trade(*words, "--port", tmp_path / "no").exception
+    assert str(error).startswith(f"{tmp_path / 'no'}: is no serial port")

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 import trade
-from system.conftest import ROSIES_HEAD, Program
+from system.conftest import ROSIES_HEAD, Program, Rosie
 from trade import Container, where
 from trade._endpoints import free_endpoint
 from trade.errors import LockedByOther, Stopped
@@ -221,10 +221,12 @@ def test_a_call_of_nobody_says_where_nobody_answers(trade_command: Command, nobo
     assert "TRADE_SYSTEM" not in said.stderr
 
 
-def test_resume_of_nothing_speaks_of_resuming(trade_command: Command) -> None:
-    said = trade_command("resume", "rosie")
-    assert said.returncode == 1
-    assert "resume of group='rosie': nothing that matches actuates, so there is nothing to resume" in said.stderr
+def test_a_group_that_is_not_there_is_guessed(rosie_up: Callable[[], Rosie], trade_command: Command) -> None:
+    rosie_up()
+    for words in (["resume", "rosie.nekc"], ["unlock", "rosie.nekc", "--break", "it hangs"]):
+        said = trade_command(*words)
+        assert said.returncode == 1
+        assert "did you mean rosie.neck" in said.stderr
 
 
 # --- stops

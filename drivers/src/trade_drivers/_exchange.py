@@ -126,6 +126,10 @@ class BusExchange(ABC, Generic[_Device]):
         else:
             self._inbox.append(job)
 
+    def why(self, devices: Sequence[_Device]) -> str:
+        """Why their ``stop()`` is called: an e-stop, a session that ended, services withdrawn, or just so."""
+        return next((device.resource.why for device in devices if device.resource.why), "stop() was called")
+
     def order_stop(self, devices: Sequence[_Device], reason: str, halt: Callable[[], None]) -> StopTicket[_Device]:
         """Void what was admitted for these devices, and have ``halt`` called before anything else happens on the bus.
 
@@ -133,6 +137,7 @@ class BusExchange(ABC, Generic[_Device]):
         """
         for device in devices:
             device.resource.stop("its driver", reason=reason)
+            device.resource.why = ""
         ticket = StopTicket(devices, halt)
         if self.refusing is not None:
             ticket.finish(self.refusing(devices[0]))

@@ -113,7 +113,7 @@ class SerialWire:
     def __init__(self, path: str, baud: int, where: str = "bus") -> None:
         self.path = path
         self._where = where
-        """The table of the robot file that describes this bus, for messages."""
+        """The table of the robot file that describes this bus, for messages; empty: there is none."""
         self.settled_at = 0.0
         self.pause: Callable[[float], None] = time.sleep
         self._line = SerialLine(path, baud)
@@ -143,7 +143,13 @@ class SerialWire:
                 return _lost("there is no such device")
             case _:
                 return _lost(_text(bad))
-        return ConfigurationError(where=f"{self._where}.port", problem=f"{self.path}: {problem}")
+        return self._wrong("port", problem)
+
+    def _wrong(self, key: str, problem: str) -> ConfigurationError:
+        if not self._where:
+            return ConfigurationError(where=self.path, problem=problem)
+        said = f"{self.path}: {problem}" if key == "port" else problem
+        return ConfigurationError(where=f"{self._where}.{key}", problem=said)
 
     def close(self) -> None:
         """Let go of the port; more than once is fine."""

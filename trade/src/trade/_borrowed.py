@@ -46,7 +46,7 @@ class SharedResource(Resource):
         self,
         by: str,
         sessions: Iterable[str] = (),  # noqa: ARG002
-        reason: str = "stop was called",
+        reason: str = "stop() was called",
         *,
         estop: bool = False,
     ) -> None:

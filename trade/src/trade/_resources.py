@@ -68,8 +68,8 @@ class Resource:
     """
 
     __slots__ = (
-        *("_moving", "_rested", "calls", "coupled", "epoch", "estop", "gone", "holder"),
-        *("latch", "live", "movers", "name", "over", "pending", "stops", "unsafe", "unsafe_at", "used_at", "uses"),
+        *("_moving", "_rested", "calls", "coupled", "epoch", "estop", "gone", "holder", "latch", "live"),
+        *("movers", "name", "over", "pending", "stops", "unsafe", "unsafe_at", "used_at", "uses", "why"),
     )
 
     def __init__(self, name: str, *, coupled: Sequence[str] = ()) -> None:
@@ -90,6 +90,8 @@ class Resource:
         self.stops = 0
         self.latch: Latch | None = None
         self.estop: Latch | None = None
+        self.why = ""
+        """Why it is to stop, for whoever drives it; empty once that has begun to."""
         self.unsafe = ""
         """Why it is not granted on: it could not be stopped when it had to be."""
         self.unsafe_at = 0.0
@@ -125,7 +127,7 @@ class Resource:
             self._rested()
 
     def stop(
-        self, by: str, sessions: Iterable[str] = (), reason: str = "stop was called", *, estop: bool = False
+        self, by: str, sessions: Iterable[str] = (), reason: str = "stop() was called", *, estop: bool = False
     ) -> None:
         """Void everything admitted so far; by a session other than the motion's own or the lock owner's, latch (S08).
 
@@ -139,6 +141,7 @@ class Resource:
         used = self.holder is not None or self.busy or self.movers
         if asking and used and not self._is_of(asking):
             self.latch = Latch(by, reason, estop)  # first: who is let in under the new number has seen it
+        self.why = reason
         self.stops = _stop_numbers()  # not += 1: of two at once one would be lost
 
     def _is_of(self, asking: set[str]) -> bool:

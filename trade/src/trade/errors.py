@@ -268,7 +268,7 @@ class MotionStopped(CallerError, RuntimeError):
     reason: str
 
     def describe(self) -> str:
-        return f"{self.device} stopped before its goal: {self.reason}. It holds its position until it is moved again"
+        return f"{self.device} stopped before its goal: {self.reason}. It holds its position"
 
 
 @dataclass(kw_only=True, eq=False)
@@ -284,7 +284,7 @@ class Stopped(CallerError, RuntimeError):
     """Whether an e-stop did it that is cleared by now: what it stopped waits for who resumes it."""
 
     def describe(self) -> str:
-        remedy = "`trade estop --clear`" if self.estop else "trade.resume(...) or `trade resume`"
+        remedy = "`trade estop --clear`" if self.estop else f"trade.resume(...) or `trade resume {self.resource}`"
         cleared = " That e-stop is cleared, and nobody has resumed what it stopped." if self.cleared else ""
         said = f"{self.resource} was stopped by {self.by}: {self.reason}.{cleared}"
         return f"{said} When it is safe to move, call {remedy}"

@@ -37,7 +37,7 @@ class CanBench(Bench):
                 command there.
             PortLost: it is not there, or down.
         """
-        wire = CanPort(port, bitrate, "bus")
+        wire = CanPort(port, bitrate, "")
         wire.open()
         try:
             bench = cls(wire, bitrate, overhear(wire, _LISTEN_S))

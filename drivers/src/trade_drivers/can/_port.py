@@ -60,7 +60,8 @@ class CanPort:
         self.bus_offs = 0
         """How often it went bus-off."""
         self._where = where
-        self._interface, self._channel = split_port(path, where)
+        """The table of the robot file that describes this bus, for messages; empty: there is none."""
+        self._interface, self._channel = split_port(path, where or path)
         self._bitrate = bitrate
         self._bus: can.BusABC | None = None
         self.meter = LoadMeter(bitrate, time.monotonic_ns())
@@ -86,7 +87,7 @@ class CanPort:
                 else:
                     self._bus = can.Bus(interface=self._interface, **options)
             except (can.CanInterfaceNotImplementedError, ImportError) as unknown:
-                raise ConfigurationError(where=f"{self._where}.interface", problem=f"{self.path}: {unknown}") from None
+                raise self._wrong("interface", f"{self.path}: {unknown}") from None
 
     def _look_over(self) -> None:
         """What the system knows of the interface already.
@@ -127,12 +128,15 @@ class CanPort:
             case _:
                 return {"channel": self._channel, "bitrate": self._bitrate}
 
+    def _wrong(self, key: str, problem: str) -> ConfigurationError:
+        return ConfigurationError(where=f"{self._where}.{key}" if self._where else "", problem=problem)
+
     def _server(self) -> tuple[str, int, str]:
         server, slash, channel = self._channel.partition("/")
         host, _, port = server.partition(":")
         if not (host and slash and channel) or (port and not port.isdecimal()):
             problem = f"{self._channel!r}: write HOST:PORT/CHANNEL, such as 127.0.0.1:29536/can0"
-            raise ConfigurationError(where=f"{self._where}.channel", problem=problem)
+            raise self._wrong("channel", problem)
         return host, int(port or _SOCKETCAND_PORT), channel
 
     def close(self) -> None:

@@ -32,7 +32,7 @@ def enabling(bus: "DriveExchange", job: Job, axis: DriveAxis, mode: int) -> Step
     if axis.motion is not None and not axis.fault:
         bus.end_motion(axis, f"{axis.name} was enabled anew")
     if not axis.statusword & machine.REMOTE:
-        raise axis.faulty("it does not obey the bus (statusword bit 9); is it operated from its panel?")
+        raise axis.faulty("it does not obey the bus (statusword bit 9), as if operated from its panel")
     if axis.state_now is State.FAULT:
         yield from _reset(bus, job, axis)
     yield from _begin_at_rest(bus, job, axis)

@@ -22,7 +22,7 @@ class DynamixelCommissioner(Commissioner):
     def open(self, port: str, baud: int) -> Bench:
         from trade_drivers.dynamixel._driver import wire_at  # noqa: PLC0415 - the driver knows us
 
-        wire = wire_at(port, baud, "line")
+        wire = wire_at(port, baud, "")
         wire.open()
         return DynamixelBench(wire, baud)
 

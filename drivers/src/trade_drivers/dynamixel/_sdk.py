@@ -13,7 +13,6 @@ from typing import Final
 
 from dynamixel_sdk import COMM_RX_CORRUPT, COMM_RX_TIMEOUT, COMM_SUCCESS, PortHandler, Protocol2PacketHandler
 
-from trade.errors import ConfigurationError
 from trade_drivers._serial import SerialLine
 from trade_drivers.dynamixel._frames import HEADER, OVERHEAD, Corrupt, crc16, take_status, unstuffed
 from trade_drivers.dynamixel._table import BAUD_CODES, STATUS_ERRORS
@@ -107,7 +106,7 @@ class Wire(ServoWire):
     def open(self) -> None:
         if self._port.getCFlagBaud(self._baud) <= 0:
             problem = f"{self._baud} cannot be set; the servos know {', '.join(map(str, BAUD_CODES))}"
-            raise ConfigurationError(where=f"{self._where}.baud", problem=problem)
+            raise self._wrong("baud", problem)
         super().open()
 
     def ping(self, device_id: int) -> int:

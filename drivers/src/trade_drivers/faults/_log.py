@@ -167,7 +167,7 @@ class FaultLog:
         """What is wrong with a device, in few words; empty if nothing is."""
         with self._lock:
             found = [entry for entry in self._entries.values() if entry.fault.open and entry.fault.device == device]
-            return max(found, key=lambda entry: entry.number).fault.kind if found else ""
+            return max(found, key=lambda entry: entry.number).fault.said if found else ""
 
     def save(self) -> None:
         """Have the disk take what has changed, at most once a second; waits for nothing."""

@@ -58,6 +58,12 @@ class FaultInfo(Struct, frozen=True, kw_only=True):
     evidence: list[str] = []
     """What others have found out about it, oldest first."""
 
+    @property
+    def said(self) -> str:
+        """What was wrong the latest time, in few words: ``silent``, or the text without the device's name."""
+        begin = f"{self.device}: "
+        return self.text.removeprefix(begin) if self.text.startswith(begin) else self.kind
+
 
 class Fault(FaultInfo, frozen=True, kw_only=True):
     """The same, with what was measured before it began."""

@@ -19,7 +19,7 @@ class FeetechCommissioner(Commissioner):
     def open(self, port: str, baud: int) -> Bench:
         from trade_drivers.feetech._driver import wire_at  # noqa: PLC0415 - the driver knows us
 
-        wire = wire_at(port, baud, "line")
+        wire = wire_at(port, baud, "")
         wire.open()
         return FeetechBench(wire, baud)
 

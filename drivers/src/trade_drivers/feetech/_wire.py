@@ -2,7 +2,6 @@
 
 from collections.abc import Container, Iterator, Mapping, Sequence
 
-from trade.errors import ConfigurationError
 from trade_drivers.feetech._frames import OVERHEAD, Corrupt, Instruction, Status, packet, take_status
 from trade_drivers.feetech._table import BAUD_CODES, MODEL_NUMBER
 from trade_drivers.joints import Gate, PortLost
@@ -23,7 +22,7 @@ class Wire(ServoWire):
     def open(self) -> None:
         if self._baud not in BAUD_CODES:
             problem = f"{self._baud} is no rate of these servos; they know {', '.join(map(str, sorted(BAUD_CODES)))}"
-            raise ConfigurationError(where=f"{self._where}.baud", problem=problem)
+            raise self._wrong("baud", problem)
         super().open()
 
     def ping(self, device_id: int) -> int:

@@ -77,8 +77,9 @@ class Exchange(BusExchange[Axis]):
 
     # --- from any thread
 
-    def stop(self, axes: Sequence[Axis], reason: str = "stop() was called") -> StopTicket[Axis]:
+    def stop(self, axes: Sequence[Axis], reason: str = "") -> StopTicket[Axis]:
         """Void what was admitted for these joints, and have them hold before anything else happens on the bus."""
+        reason = reason or self.why(axes)
         return self.order_stop(axes, reason, lambda: self.halt(axes, reason))
 
     def leave(self, alive: Callable[[], bool], *, relax: bool) -> None:

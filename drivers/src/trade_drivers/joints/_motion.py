@@ -157,7 +157,7 @@ class Move(Motion):
             blocked = progress.closest > axis.grain.near and progress.waiting_s > _STUCK_S
             if late or blocked:
                 short_rad = progress.closest * axis.grain.rad
-                fault = f"it makes no progress, {short_rad:.3g} rad short of its goal; is it blocked?"
+                fault = f"it makes no progress, {short_rad:.3g} rad short of its goal, as if blocked"
                 if blocked:  # it stands: nothing moves it until somebody has looked
                     axis.fault, axis.ready = fault, False
                 return axis.faulty(fault)

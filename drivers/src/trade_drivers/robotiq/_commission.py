@@ -23,7 +23,7 @@ class RobotiqCommissioner(Commissioner):
     def open(self, port: str, baud: int) -> Bench:
         from trade_drivers.robotiq._driver import wire_at  # noqa: PLC0415 - the driver knows us
 
-        wire = wire_at(port, baud, "line")
+        wire = wire_at(port, baud, "")
         wire.open()
         return RobotiqBench(wire, port, baud)
 

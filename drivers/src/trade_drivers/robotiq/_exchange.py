@@ -37,11 +37,12 @@ class Exchange(BusExchange[Hand]):
 
     # --- from any thread
 
-    def stop(self, hands: Sequence[Hand], reason: str = "stop() was called", *, grip: bool = False) -> StopTicket[Hand]:
+    def stop(self, hands: Sequence[Hand], reason: str = "", *, grip: bool = False) -> StopTicket[Hand]:
         """Void what was admitted for these grippers, and have them stand before anything else happens on the bus.
 
         With ``grip``, those at rest are left as they are, pressing on what they hold.
         """
+        reason = reason or self.why(hands)
         return self.order_stop(hands, reason, lambda: self._halt(hands, reason, grip=grip))
 
     def leave(self, alive: Callable[[], bool], *, relax: bool) -> None:  # noqa: ARG002 - no robot file here says so

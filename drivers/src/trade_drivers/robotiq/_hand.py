@@ -17,7 +17,7 @@ __all__ = ["Hand"]
 
 _HELD: Final[dict[int, Literal["outside", "inside"]]] = {Contact.CLOSING: "outside", Contact.OPENING: "inside"}
 _HELD_COUNTS: Final = 1
-_REMEDY: Final = "remove the cause, then call clear_fault() and activate(), which moves the fingers"
+_REMEDY: Final = "remove the cause, then call activate(): it moves the fingers all the way, and what they hold falls"
 _NOT_ACTIVATED: Final = "it is not activated"
 
 

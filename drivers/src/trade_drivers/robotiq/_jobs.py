@@ -151,7 +151,7 @@ class Motion(Command):
         self._patience_s -= elapsed_s
         if self._patience_s > 0 and self._waiting_s <= _STUCK_S:
             return None
-        self.hand.fault = "it says that it moves, but its fingers stand; is its position sensor sound?"
+        self.hand.fault = "it says that it moves, but its fingers stand: its position sensor may be broken"
         return self.hand.faulty()
 
     def _trouble(self, now_ns: int) -> TradeError | None:
@@ -185,7 +185,7 @@ class Activate(Motion):
             return self.hand.inactive("it did not begin its activation, or lost its power in the middle of it")
         problem = super().stuck(sample, now_ns)
         if problem is not None:
-            self.hand.fault = "its activation does not end; is something in the way of its fingers?"
+            self.hand.fault = "its activation does not end: something may be in the way of its fingers"
             return self.hand.faulty()
         return None
 

@@ -55,8 +55,9 @@ class Exchange(BusExchange[Limb]):
 
     # --- from any thread
 
-    def stop(self, reason: str = "stop() was called") -> StopTicket[Limb]:
+    def stop(self, reason: str = "") -> StopTicket[Limb]:
         """Void what was admitted, and have the arm stand before anything else happens."""
+        reason = reason or self.why([self.limb])
         return self.order_stop([self.limb], reason, lambda: self._stop(reason))
 
     def leave(self, alive: Callable[[], bool], *, relax: bool) -> None:  # noqa: ARG002 - no robot file here says so

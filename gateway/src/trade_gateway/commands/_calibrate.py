@@ -35,7 +35,9 @@ _STILL_RAD: Final = 0.01
 _LONGEST_S: Final = 600.0
 """How long somebody may take between two prompts."""
 _DIGITS: Final = 4
-_ATTEMPTS: Final = 3
+_PATIENCE_S: Final = 2.0
+"""So long a device that does not answer is asked again: what was shown by hand before is not lost by a loose plug."""
+_AGAIN_S: Final = 0.02
 
 _Number = TypeVar("_Number", int, float)
 
@@ -61,7 +63,7 @@ def calibrate(
     text = robot_file.read_text(encoding="utf-8")
     record, bus = _joint(robot, joint)
     with _slack(bus, record) as bench:
-        sweep = Sweep(bench, record.id)
+        sweep = Sweep(bench, record.id, _place(bus, record))
         values = _measure(out, record, sweep, zero_here=zero_here, seconds=range_from_motion)
         values |= homed(record, sweep.homing_counts(), zero_measured="offset_rad" in values)
     changed = with_values(text, joint, values)
@@ -78,10 +80,17 @@ class Ends(Struct, frozen=True):
 
 
 class Sweep:
-    """Readings of one device while it is moved by hand."""
+    """Readings of one device while it is moved by hand.
 
-    def __init__(self, bench: Bench, device_id: int) -> None:
-        self._bench, self._id = bench, device_id
+    Args:
+        bench: its line.
+        device_id: its id there.
+        where: which joint that is and on which port, for messages.
+        patience_s: how long it is asked again if it does not answer.
+    """
+
+    def __init__(self, bench: Bench, device_id: int, where: str, patience_s: float = _PATIENCE_S) -> None:
+        self._bench, self._id, self._where, self._patience_s = bench, device_id, where, patience_s
 
     def until(self, done: Callable[[], bool], longest_s: float) -> Ends:
         """Read until something holds.
@@ -94,11 +103,11 @@ class Sweep:
         while not done():
             if time.monotonic() > until:
                 problem = f"nobody went on for {longest_s:g} s; nothing was written"
-                raise ConfigurationError(where=f"id {self._id}", problem=problem)
+                raise ConfigurationError(where=self._where, problem=problem)
             now = self.read()
             if abs(now - last) > pi or abs(now) > pi:
                 problem = "it turns past the end of its encoder: mount its horn so that it cannot, then try again"
-                raise ConfigurationError(where=f"id {self._id}", problem=problem)
+                raise ConfigurationError(where=self._where, problem=problem)
             low, high, last = min(low, now), max(high, now), now
         return Ends(low, high, last)
 
@@ -113,7 +122,7 @@ class Sweep:
         now = self.read()
         if abs(now - before) > _STILL_RAD:
             problem = f"it moves (by {abs(now - before):.3f} rad in {_APART_S:g} s); hold it still, then try again"
-            raise ConfigurationError(where=f"id {self._id}", problem=problem)
+            raise ConfigurationError(where=self._where, problem=problem)
         return now
 
     def read(self) -> float:
@@ -125,13 +134,16 @@ class Sweep:
         return self._told(self._bench.homing_counts)
 
     def _told(self, ask: Callable[[int], _Number]) -> _Number:
-        trouble = ""
-        for _ in range(_ATTEMPTS):
+        until = time.monotonic() + self._patience_s
+        while True:
             try:
                 return ask(self._id)
             except WireError as bad:
-                trouble = str(bad)
-        raise ConfigurationError(where=f"id {self._id}", problem=f"{trouble}; check its cable")
+                trouble = str(bad).removeprefix(f"id {self._id} ")
+            if time.monotonic() > until:
+                problem = f"{trouble}, asked for {self._patience_s:g} s; check its cable. Nothing was written"
+                raise ConfigurationError(where=self._where, problem=problem)
+            time.sleep(_AGAIN_S)
 
 
 def measured(joint: Joint, zero: float | None, ends: Ends | None) -> dict[str, float]:
@@ -224,6 +236,10 @@ def _joint(robot: Robot, name: str) -> tuple[Joint, SerialBus]:
     return joint, bus
 
 
+def _place(bus: SerialBus, joint: Joint) -> str:
+    return f"{joint.name} (id {joint.id} on {bus.port})"
+
+
 @contextmanager
 def _slack(bus: SerialBus, joint: Joint) -> Generator[Bench, None, None]:
     """The line of a joint whose torque is off."""
@@ -231,7 +247,7 @@ def _slack(bus: SerialBus, joint: Joint) -> Generator[Bench, None, None]:
     if commissioner is None:
         raise ConfigurationError(where=joint.name, problem=f"driver {bus.driver} has nothing to calibrate by hand")
     with commissioner().at(bus.port, bus.baud) as bench:
-        found = bench.alone(joint.id, joint.name)
+        found = bench.alone(joint.id, _place(bus, joint))
         if found.model != joint.model:
             raise WrongDevice(where=f'joint."{joint.name}"', key="model", expected=joint.model, found=found.model)
         yield bench

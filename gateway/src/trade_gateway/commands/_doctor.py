@@ -89,7 +89,10 @@ def _of_robot(path: Path) -> Iterator[Finding]:
         robot = load(path)
     except TradeError as bad:
         yield _no_robot(path) or Finding(
-            level="error", about=str(path), text=str(bad), fix="correct the file; the message says where"
+            level="error",
+            about=str(path),
+            text=str(bad).removeprefix(f"{path}: "),
+            fix="correct the file; the message says where",
         )
         return
     yield from host.libraries(sorted({bus.driver for bus in robot.buses}), needed=True)

@@ -11,7 +11,7 @@ from trade._moments import day_and_clock
 from trade.errors import TradeError
 from trade_gateway.commands._by_default import FirstByDefault
 from trade_gateway.commands._list import Json, asked_for
-from trade_gateway.commands._output import Output, UsageError, complain
+from trade_gateway.commands._output import Output, UsageError, as_commands, complain
 from trade_gateway.commands._system_choice import visitor_among_others
 
 if TYPE_CHECKING:
@@ -79,7 +79,8 @@ def show(
     if as_json:
         out.data(fault)
         return
-    out.say(f"[bold]{escape(fault.text)}[/]" + (f"; {escape(fault.remedy)}" if fault.remedy else ""))
+    remedy = as_commands(fault.device, fault.remedy)
+    out.say(f"[bold]{escape(fault.text)}[/]" + (f"; {escape(remedy)}" if remedy else ""))
     out.say(f"{_state(fault)}; began {_times(fault)}, was there for {fault.lasted_s:.1f} s in all")
     if fault.acknowledged_at is not None:
         out.say(f"seen by {escape(fault.acknowledged_by)} at {day_and_clock(fault.acknowledged_at)}")
@@ -104,7 +105,7 @@ def ack(context: typer.Context, fault_id: Id, as_json: Json = False) -> None:
     if as_json:
         out.data(seen)
     else:
-        out.say(f"{escape(seen.device)}: {escape(seen.kind)}: seen by {escape(seen.acknowledged_by)}; {_state(seen)}")
+        out.say(f"{escape(seen.device)}: {escape(seen.said)}: seen by {escape(seen.acknowledged_by)}; {_state(seen)}")
 
 
 def _logs(container: Container, robot: str | None) -> "Sequence[Handle]":
@@ -126,7 +127,7 @@ def _row(info: "FaultInfo") -> tuple[str, ...]:
     return (
         info.id,
         info.device,
-        info.kind,
+        info.said,
         _state(info),
         str(info.count),
         day_and_clock(info.first_at),

@@ -7,11 +7,11 @@ from typing import Final
 from rich.markup import escape
 
 from trade_drivers import FaultInfo, FaultLog, Gripper, Motor
-from trade_gateway.commands._output import Output
+from trade_gateway.commands._output import Output, as_commands
 
 __all__ = ["FaultWatch"]
 
-_CALLS: Final = ((Motor, "enable"), (Gripper, "clear_fault"))
+_CALLS: Final = ((Motor, "enable"), (Gripper, "activate"))
 """What helps once the cause is gone."""
 
 
@@ -57,7 +57,7 @@ class FaultWatch:
         device = self._providers.get(info.device)
         call = next((name for kind, name in _CALLS if isinstance(device, kind)), "")
         if not info.remedy or not call:
-            return f"{info.text}; {info.remedy}" if info.remedy else info.text
+            return f"{info.text}; {as_commands(info.device, info.remedy)}" if info.remedy else info.text
         end = "" if info.text.endswith("?") else "."
         return f"{info.text}{end} When you have looked: trade call {info.device}.{call}"
 

@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
-from trade import LockInfo
+from trade import Constraint, Container, LockInfo
 from trade._moments import clock
 from trade_gateway.commands._list import Json, asked_for
 from trade_gateway.commands._output import Output
@@ -73,11 +73,18 @@ def unlock(
     """
     out = Output(as_json=False)
     with visitor_among_others(context) as container:
-        broken = container.break_lock(asked_for(f"group {group!r}", group=group, name=None), reason)
+        broken = container.break_lock(_there(container, group), reason)
     for info in broken:
         out.say(f"taken from {escape(_owner(info))}: {escape(', '.join(info.resources))}")
     if not broken:
         out.say(f"nothing of {escape(group)} was locked")
+
+
+def _there(container: Container, group: str) -> Constraint:
+    """The services of a group. Raises NoSuchService, with what there is that looks like it."""
+    constraint = asked_for(f"group {group!r}", group=group, name=None)
+    container.await_services(constraint, lambda: bool(container.services(constraint)), 0.0)
+    return constraint
 
 
 def resume(context: typer.Context, group: Group) -> None:
@@ -89,7 +96,7 @@ def resume(context: typer.Context, group: Group) -> None:
     """
     out = Output(as_json=False)
     with visitor_among_others(context) as container:
-        resumed = container.resume(asked_for(f"group {group!r}", group=group, name=None))
+        resumed = container.resume(_there(container, group))
         still = container.estops()
     for estop in still:
         why = f": {escape(estop.reason)}" if estop.reason else ""

@@ -1,6 +1,7 @@
 """How the command line speaks: tables for people, JSON lines for programs, errors on stderr."""
 
 import json
+import re
 import shutil
 import sys
 from collections.abc import Sequence
@@ -10,10 +11,11 @@ import msgspec
 from rich.console import Console
 from rich.markup import escape
 
-from trade.errors import ConfigurationError
+from trade.errors import ConfigurationError, DeviceFault
 
 _GAP: Final = "  "
-_SMALL: Final = 1e-3
+_SMALL: Final = re.compile(r'^( *(?:"(?:[^"\\]|\\.)*": )?)(-?[\d.]+e-\d+)(?=,?$)', re.MULTILINE)
+"""A number with an exponent, on its line of indented JSON."""
 _LEAST: Final = 20
 """No column is cut shorter than this; columns on the right are left out before."""
 
@@ -34,6 +36,7 @@ class Output:
         text = msgspec.json.encode(value).decode()
         if not self.as_json:
             text = json.dumps(json.loads(text, parse_float=_readable), indent=2, ensure_ascii=False)
+            text = _SMALL.sub(_without_exponent, text)
         print(text, flush=True)  # noqa: T201
 
     def say(self, text: str) -> None:
@@ -53,9 +56,12 @@ class Output:
 
 
 def _readable(number: str) -> float:
-    """Rounded to six places; where this leaves little, to four digits."""
-    value = float(number)
-    return round(value, 6) if abs(value) >= _SMALL else float(f"{value:.4g}")
+    """Rounded to six places, and never a zero below zero."""
+    return round(float(number), 6) + 0.0
+
+
+def _without_exponent(found: re.Match[str]) -> str:
+    return f"{found[1]}{float(found[2]):.6f}".rstrip("0")
 
 
 def table_lines(columns: Sequence[str], rows: Sequence[Sequence[str]], width: int | None) -> list[str]:
@@ -105,8 +111,19 @@ REMEDIES: Final = {
     ),
     "take it anew with trade.lock(...)": "take it anew with `trade lock`",
     "look it up again with trade.find(...)": "`trade services` lists what there is",
+    "take them all with trade.services(...)": "see all of them with `trade services`",
+    "handle.with_(deadline_s=...) waits longer": "--deadline SECONDS waits longer",
+    "give it a longer one": "--deadline SECONDS gives it more",
+    "with_(deadline_s=...) gives it more": "--deadline SECONDS gives it more",
+    "trade.resume(...) or `trade resume": "`trade resume",
 }
 """What errors tell a program to do, and what somebody at a terminal does instead."""
+_CALLED: Final = re.compile(r"(?:\bcall )?\b([a-z_]+)\(\)")
+
+
+def as_commands(device: str, remedy: str) -> str:
+    """What a driver says to call, as it is typed: ``call enable()`` is ``trade call rosie.neck.pan.enable``."""
+    return _CALLED.sub(lambda found: f"`trade call {device}.{found[1]}`", remedy)
 
 
 def say_error(error: BaseException) -> None:
@@ -115,5 +132,7 @@ def say_error(error: BaseException) -> None:
     message = str(error)
     for remedy, ours in REMEDIES.items():
         message = message.replace(remedy, ours)
+    if isinstance(error, DeviceFault):
+        message = as_commands(error.device, message)
     console.print(f"[bold red]{type(error).__name__}[/]: {escape(message)}")
     sys.stderr.flush()

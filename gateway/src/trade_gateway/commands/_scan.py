@@ -52,7 +52,8 @@ def scan(
     """Find out who is on a serial line or a CAN bus: ids, models, rates. Nothing is written to any device.
 
     It needs the line for itself, and ends at the first device whose torque is on. One driver asks after the
-    other, until one finds something; --driver, --bauds and --ids make it faster.
+    other, until one finds something; --driver, --bauds and --ids make it faster. The exit code is 1 if nobody answers,
+    or one that does cannot be used as it is.
 
     For example: trade scan --port /dev/ttyUSB0 --write rosie.toml
     """
@@ -79,6 +80,8 @@ def scan(
         write.write_text(first_file([(one.port, one) for one in found], write), encoding="utf-8")
         out.say(f"{escape(str(write))} is a robot file to begin with: give its devices names, then measure each joint")
         out.say(f"Next: [bold]trade calibrate {escape(str(write))} JOINT[/]")
+    if any(one.problem for one in found):
+        raise typer.Exit(1)
 
 
 def set_id(

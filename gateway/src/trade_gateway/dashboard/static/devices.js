@@ -248,7 +248,7 @@ export class Joint extends Device {
 
 export class Gripper extends Device {
   static offers = [["open", "Open"], ["close", "Close"], ["activate", "Activate"], ["clear_fault", "Clear fault"]];
-  static cure = "clear_fault";
+  static cure = "activate";
 
   picture() {
     this.fingers = [draw("rect", { y: 6, width: 5, height: 22, rx: 2 }), draw("rect", { y: 6, width: 5, height: 22, rx: 2 })];

@@ -24,7 +24,13 @@ async function faultsOf(log, open_only) {
 function rowOf(one) {
   const see = { label: "I have seen it", act: () => acknowledge(one), name: `I have seen: ${one.text}` };
   const seen = one.acknowledged_by || (one.may ? see : "nobody");
-  return [one.device, one.kind, one.open ? "✕ there" : "gone", seen, one.remedy || "—", `${one.count}`, moment(one.last_at)];
+  return [one.device, said(one), one.open ? "✕ there" : "gone", seen, one.remedy || "—", `${one.count}`, moment(one.last_at)];
+}
+
+// What was wrong the latest time, with its numbers: a kind has none.
+function said(one) {
+  const begin = `${one.device}: `;
+  return one.text.startsWith(begin) ? one.text.slice(begin.length) : one.kind;
 }
 
 async function acknowledge(one) {
