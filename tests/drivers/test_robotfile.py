@@ -114,6 +114,11 @@ MISTAKES = [
     ('name = "rosie"', 'name = "rosie"\nage = 3', "robot.age: unknown key; [robot] has only name"),
     ("[robot]", "[robots]", "[robots]: unknown table"),
     ("[bus.neck]", "[bus.", "not valid TOML"),
+    (
+        '[joint."neck.tilt"]',
+        '[joint."neck.pan"]',
+        'head.toml: not valid TOML: there are two of the name [joint."neck.pan"] (at line',
+    ),
     ('driver = "dynamixel"\n', "", "bus.neck: missing required key 'driver'; write driver = \"dynamixel\""),
     ('port = "/dev/ttyNOWHERE"\n', "", "bus.neck: missing required key 'port'; write port = \"/dev/serial/by-id/"),
     ('port = "/dev/ttyNOWHERE"', 'port = ""', "bus.neck.port: Expected `str` of length >= 1, but it is ''"),

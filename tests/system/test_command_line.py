@@ -2,6 +2,7 @@ import json
 import re
 import signal
 import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import trade
 from system.conftest import DORA, ROOT, ROSIES_HEAD
 from trade import where
 from trade_hil_sim import SimControl, SimProcess, events, motion_writes, read_log
-from waiting import wait_until
+from waiting import PATIENCE_S, wait_until
 
 Command = Callable[..., subprocess.CompletedProcess[str]]
 
@@ -187,10 +188,22 @@ def test_the_path_of_the_simulators_socket_and_that_nothing_is_wrong_are_said(ru
     up = run("-m", "trade_gateway", "up", ROSIES_HEAD, "--sim")
     while "to strike the simulator with faults" not in (line := up.line()):
         pass
-    with SimControl(line.split(": ")[1].strip()) as control:
-        assert [device.joint for bus in control.state() for device in bus.devices] == ["neck.pan", "neck.tilt"]
+    program, *words = line.split(": ")[1].partition(" FAULT")[0].split()
+    assert program == "trade-hil-sim"
+    command = [sys.executable, "-m", "trade_hil_sim", *words, "state"]
+    told = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=True).stdout
+    assert [device["joint"] for device in json.loads(told)["devices"]] == ["neck.pan", "neck.tilt"]
     assert up.line() == "Ctrl-C leaves\n"
     assert re.fullmatch(r"\d\d:\d\d:\d\d no joint has a fault\n", up.line())
+
+
+def test_each_bus_is_announced_with_its_devices(run, system: str, tmp_path: Path) -> None:
+    hand = (ROOT / "examples" / "hand.toml").read_text()
+    spare = '[bus.spare]\ndriver = "dynamixel"\nport = "/dev/ttyUSB7"\n'
+    (tmp_path / "rosie.toml").write_text(hand + spare)
+    up = run("-m", "trade_gateway", "up", tmp_path / "rosie.toml", "--sim")
+    assert up.line().endswith("/hand: left.hand (2F-85, id 9)\n")
+    assert up.line().endswith('/spare: no device; one that is on it says bus = "spare"\n')
 
 
 def test_help_names_every_command(trade_command: Command) -> None:

@@ -30,6 +30,8 @@ __all__ = [
 ]
 
 _SEGMENTS = re.compile(r"[a-z][a-z0-9_]*(\.[a-z][a-z0-9_]*)*")
+_TWICE = re.compile(r"Cannot declare \('(\w+)', '([^']*)'\) twice")
+"""What the reader of TOML says of two tables of one name."""
 _SERIAL_KEYS = ("port", "baud", "fast_sync")
 _CAN_KEYS = ("interface", "channel", "bitrate")
 _UR_KEYS = ("host",)
@@ -187,7 +189,8 @@ def parse(text: str, where: str) -> Robot:
     try:
         raw = read_toml_text(text)
     except ValueError as bad:
-        raise ConfigurationError(where=where, problem=f"not valid TOML: {bad}") from None
+        said = _TWICE.sub(r'there are two of the name [\1."\2"]', str(bad))
+        raise ConfigurationError(where=where, problem=f"not valid TOML: {said}") from None
     _only_known(raw, where)
     name = _robot_name(raw.get("robot"), where)
     buses = _tables(raw, "bus", where)

@@ -169,7 +169,8 @@ def _say_attaching(out: Output, robot: Robot, ports: dict[str, str]) -> None:
                 *(f"{arm.name} ({arm.model})" for arm in robot.arms_on(bus.name)),
             ]
         )
-        out.say(f"[bold]{robot.name}[/]: attaching bus {bus.name} on {ports.get(bus.name, bus.port)}: {named}")
+        told = named or f'no device; one that is on it says bus = "{bus.name}"'
+        out.say(f"[bold]{robot.name}[/]: attaching bus {bus.name} on {ports.get(bus.name, bus.port)}: {told}")
     for sense in (*robot.cameras, *robot.sensors):
         place = f" on {ports[sense.name]}" if sense.name in ports else ""
         out.say(f"[bold]{robot.name}[/]: attaching {type(sense).__name__.lower()} {sense.name} ({sense.driver}){place}")
@@ -188,7 +189,9 @@ def _say_ready(out: Output, robot: Robot, container: Container, simulation: Any)
     if example:
         out.say(f"in another terminal: [bold]trade services --group {robot.name}[/] or [bold]trade call {example}[/]")
     if simulation:
-        out.say(f"to strike the simulator with faults (docs/simulators.md): {simulation.control_path}")
+        out.say(
+            f"to strike the simulator with faults: trade-hil-sim --do {simulation.control_path} FAULT (--help has them)"
+        )
     out.say("Ctrl-C leaves")
     for estop in container.estops():
         why = f": {escape(estop.reason)}" if estop.reason else ""
