@@ -114,6 +114,7 @@ def test_S19_a_joint_that_cannot_be_heard_keeps_its_watchdog(head: Rig) -> None:
     head.sim.do(trade_hil_sim.Mute(ids=(1,)))
     wait_until(lambda: is_silent(robot, "neck.pan"), "it is silent")
     robot.close()
+    assert robot.unseen() == ["rosie.neck.pan"]
     assert head.truth(2).watchdog == 0
     head.wait_for("watchdog_expired", 1)
 

@@ -153,6 +153,18 @@ def test_faults_that_latch_and_heal_are_told_with_what_to_do(rosie_up, trade_com
     assert rosie.program.wait_for(lambda line: line["joint"] == "rosie.neck.pan")["fault"] == ""
 
 
+def test_S19_silence_is_told_once_and_with_its_time_and_who_was_not_seen_at_rest_is_named(rosie_up) -> None:
+    rosie = rosie_up()
+    with SimControl(rosie.ready["control"]) as control:
+        control.mute([1, 2])
+    told = {rosie.program.wait_for(lambda line: "did not answer" in line["fault"])["joint"] for _ in range(2)}
+    assert told == {"rosie.neck.pan", "rosie.neck.tilt"}
+    rosie.program.signal(signal.SIGINT)
+    rosie.program.wait()
+    said = [line for line in rosie.program.errors if "rosie.neck.pan" in line]
+    assert said == ["warning: left without being seen at rest: rosie.neck.pan, rosie.neck.tilt\n"]
+
+
 def test_a_watchdog_that_expired_under_an_earlier_driver_is_told_at_attach(system: str, run, tmp_path) -> None:
     with SimProcess(ROSIES_HEAD) as sim:
         robot_file = tmp_path / "rosie.toml"

@@ -94,6 +94,10 @@ class AttachedRobot:
         """What is known of buses and joints, for `trade.Container.measured_by`; nothing is asked of a device."""
         return measures_of(self.robot, self._buses, self.providers)
 
+    def unseen(self) -> list[str]:
+        """Once it is closed: the devices that were not seen at rest when they were left. Look at them."""
+        return [name for bus in self._buses.values() for name in bus.unseen()]
+
     def _provider(self, name: str, kind: type[_Provider]) -> _Provider:
         provider = self.providers[f"{self.robot.name}.{name}"]
         if not isinstance(provider, kind):

@@ -56,6 +56,8 @@ class BusThread(Generic[_Exchange_co]):
         self._reopen_at = 0.0
         self._reopen_s = _REOPEN_FIRST_S
         self._leaving = False
+        self.unseen: list[str] = []
+        """The devices that were not seen at rest when they were left."""
         self._lookout: Lookout | None = None
         self.cycles = 0
         """Since it started."""
@@ -102,6 +104,7 @@ class BusThread(Generic[_Exchange_co]):
             if self.alive():
                 self.exchange.leave(self.alive, relax=self._bus.leave == "relax")
         finally:
+            self.unseen = self.exchange.unseen()
             self._leaving = True
             self.exchange.wake.set()
             self._thread.join()

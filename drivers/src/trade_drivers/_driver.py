@@ -65,6 +65,10 @@ class AttachedBus(ABC):
         """
         return False
 
+    def unseen(self) -> Sequence[str]:
+        """The names of the devices that were not seen at rest when they were left; whoever cannot tell names none."""
+        return ()
+
     @abstractmethod
     def close(self) -> None:
         """Stop everything, leave the devices as the robot file asks, let go of the port; more than once is fine.

@@ -126,6 +126,10 @@ class BusExchange(ABC, Generic[_Device]):
         else:
             self._inbox.append(job)
 
+    def unseen(self) -> list[str]:
+        """The names of the devices that nobody sees at rest: silent, or told to stop and still moving."""
+        return [device.name for device in self._devices if device.silent or device.halting_since_ns]
+
     def why(self, devices: Sequence[_Device]) -> str:
         """Why their ``stop()`` is called: an e-stop, a session that ended, services withdrawn, or just so."""
         return next((device.resource.why for device in devices if device.resource.why), "stop() was called")
@@ -224,7 +228,7 @@ class BusExchange(ABC, Generic[_Device]):
         device.misses += 1
         device.doubted = True
         if device.misses >= _RETRIES and not device.silent:
-            _log.warning("%s does not answer on %s", device.name, device.bus)
+            _log.info("%s does not answer on %s", device.name, device.bus)
             device.silent, device.silent_since_ns = True, now_ns
         if device.silent:
             device.probe_at_ns = now_ns + PROBE_NS * max(1, min(4, device.misses - _RETRIES + 1))

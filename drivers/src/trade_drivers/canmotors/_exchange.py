@@ -119,7 +119,7 @@ class MotorExchange(Exchange, Generic[_Axis]):
         for axis in self.motors:
             old = not axis.hushed and axis.age_ns(now_ns) > self.stale_after_ns
             if not axis.silent and (old or now_ns - axis.beat_ns > self.deaf_ns):
-                _log.warning("%s is not heard on %s", axis.name, axis.bus)
+                _log.info("%s is not heard on %s", axis.name, axis.bus)
                 axis.forget(now_ns)
                 axis.probe_at_ns = now_ns + _AGAIN_NS
 

@@ -233,7 +233,7 @@ class DriveExchange(Exchange):
             if axis.silent:
                 continue
             if axis.age_ns(now_ns) > self.stale_after_ns or now_ns - axis.beat_ns > self.deaf_ns:
-                _log.warning("%s is not heard on %s", axis.name, axis.bus)
+                _log.info("%s is not heard on %s", axis.name, axis.bus)
                 axis.forget(now_ns)
                 axis.probe_at_ns = now_ns + PROBE_NS
 

@@ -60,9 +60,9 @@ class FaultInfo(Struct, frozen=True, kw_only=True):
 
     @property
     def said(self) -> str:
-        """What was wrong the latest time, in few words: ``silent``, or the text without the device's name."""
-        begin = f"{self.device}: "
-        return self.text.removeprefix(begin) if self.text.startswith(begin) else self.kind
+        """What was wrong the latest time, in few words: its kind, with the numbers that it had then."""
+        text = self.text.removeprefix(f"{self.device}: ")
+        return text if kind_of(text) == self.kind else self.kind
 
 
 class Fault(FaultInfo, frozen=True, kw_only=True):

@@ -58,6 +58,9 @@ class AttachedGrippers(AttachedBus):
         self._thread.watched(tell)
         return True
 
+    def unseen(self) -> list[str]:
+        return self._thread.unseen
+
     def close(self) -> None:
         self._thread.close()
 

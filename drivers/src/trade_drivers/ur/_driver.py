@@ -58,6 +58,9 @@ class AttachedController(AttachedBus):
         self._thread.watched(tell)
         return True
 
+    def unseen(self) -> list[str]:
+        return self._thread.unseen
+
     def close(self) -> None:
         try:
             self._thread.close()

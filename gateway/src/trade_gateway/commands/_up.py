@@ -13,14 +13,14 @@ from rich.markup import escape
 
 from trade import Container
 from trade.errors import ConfigurationError
-from trade_drivers import attach, load, without
+from trade_drivers import AttachedRobot, attach, load, without
 from trade_drivers.robotfile import Robot
 from trade_gateway._asked import Asked
 from trade_gateway.commands._detached import Detach, detach_now, ready
 from trade_gateway.commands._faults import FaultWatch
 from trade_gateway.commands._list import Json
 from trade_gateway.commands._notify import Notifier
-from trade_gateway.commands._output import Output, UsageError
+from trade_gateway.commands._output import Output, UsageError, complain
 from trade_gateway.commands._system_choice import choice_of
 
 _LOOK_EVERY_S = 0.5
@@ -70,17 +70,17 @@ def up(
             out.say(f"[bold]{robot.name}[/]: left out: {', '.join(left_out)}")
         _say_attaching(out, robot, ports)
         state_dir = container.settings.state_dir
-        attached = stack.enter_context(
-            attach(
-                robot,
-                register=container.register,
-                deregister=container.deregister,
-                set_health=container.set_health,
-                ports=ports,
-                healthy=container.healthy,
-                state_dir=state_dir and state_dir / container.settings.system,
-            )
+        attached = attach(
+            robot,
+            register=container.register,
+            deregister=container.deregister,
+            set_health=container.set_health,
+            ports=ports,
+            healthy=container.healthy,
+            state_dir=state_dir and state_dir / container.settings.system,
         )
+        stack.callback(_say_left, attached)
+        stack.enter_context(attached)
         container.measured_by(attached.measures)
         settle()
         _say_ready(out, robot, container, simulation)
@@ -158,6 +158,11 @@ def refuse_twice(container: Container, command: str) -> None:
         if other.name == container.name and other.epoch != container.address.epoch:
             problem = f"{other.name!r} is up already (process {other.pid} on {other.host}); stop it, or choose a --name"
             raise ConfigurationError(where=command, problem=problem)
+
+
+def _say_left(attached: AttachedRobot) -> None:
+    if unseen := attached.unseen():
+        complain(f"left without being seen at rest: {', '.join(unseen)}")
 
 
 def _say_attaching(out: Output, robot: Robot, ports: dict[str, str]) -> None:
