@@ -70,13 +70,6 @@ def test_it_is_a_service_of_the_robot_that_anybody_can_call(
     assert not [handle for handle in asker.services(where(group="rosie.bus")) if handle.effect != "read"]
 
 
-def test_a_joint_by_the_name_of_the_bus_is_refused(leg: Leg) -> None:
-    leg.configure(('"leg.knee"', '"bus.legs"'))
-    with pytest.raises(ConfigurationError, match=r"rosie\.bus\.legs is the bus itself; name the joints otherwise"):
-        leg.attach()
-    assert not leg.announced
-
-
 # --- health
 
 

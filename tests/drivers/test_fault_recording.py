@@ -196,15 +196,6 @@ def test_they_are_services_that_anybody_may_ask_and_to_acknowledge_names_who_did
     wait_until(lambda: healths() == wanted, "the registry says so")
 
 
-def test_a_joint_by_the_name_of_the_log_is_refused(rig: Rig) -> None:
-    rig.configure(
-        ('[joint."neck.tilt"]', "[joint.faults]"), ('joints = ["neck.pan", "neck.tilt"]', 'joints = ["neck.pan"]')
-    )
-    rig.plug()
-    with pytest.raises(ConfigurationError, match=r"rosie\.faults is what tells of faults; name the joints otherwise"):
-        rig.attach()
-
-
 def test_to_look_costs_the_bus_thread_a_small_part_of_its_cycle(head: Rig) -> None:
     robot = head.attach()
     bus: Any = robot._buses["neck"]
