@@ -9,7 +9,6 @@ import pytest
 
 from drivers.legs import HIP, Leg, leg, rig
 from trade import Container, where
-from trade.errors import ConfigurationError
 from trade_drivers import CanBusState, CanMonitor
 from trade_drivers.can import CanPort, ErrorState, frame_bits
 from trade_drivers.can._netlink import Link, look_at, parse_link

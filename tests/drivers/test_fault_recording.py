@@ -12,7 +12,7 @@ import trade_hil_sim as sim
 from drivers.conftest import Outcome, Rig
 from drivers.gripper_rig import HandRig, made_rig
 from trade import Container, where
-from trade.errors import ConfigurationError, DeviceSilent
+from trade.errors import DeviceSilent
 from trade_drivers import AttachedRobot, Camera, FaultInfo, FaultLog, Motor, MotorState, Reading, Sensor
 from trade_drivers.faults import FaultRecorder
 from waiting import wait_until
