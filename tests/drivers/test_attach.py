@@ -161,7 +161,7 @@ def test_a_gear_is_refused_where_it_would_not_be_heeded(head: Rig) -> None:
         (('driver = "dynamixel"', 'driver = "dynamixel"\nbaud = 57600\nrate_hz = 200'), "at most"),
         (
             ('driver = "dynamixel"', 'driver = "dynamixel"\nbaud = 1234567'),
-            "head.toml: bus.neck.baud: 1234567 cannot be set; the servos know 9600, 57600, ",
+            "head.toml: bus.neck.baud: 1234567 is no rate of these servos; they know 9600, 57600, ",
         ),
         (("max_accel_rad_s2 = 20.0", "max_accel_rad_s2 = 1.0"), "a stop from max_speed_rad_s takes 2.5 s"),
         (("max_speed_rad_s = 2.5", "max_speed_rad_s = 0.01"), "is below 0.024, the least"),

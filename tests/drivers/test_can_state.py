@@ -9,7 +9,6 @@ import pytest
 
 from drivers.legs import HIP, Leg, leg, rig
 from trade import Container, where
-from trade.errors import ConfigurationError
 from trade_drivers import CanBusState, CanMonitor
 from trade_drivers.can import CanPort, ErrorState, frame_bits
 from trade_drivers.can._netlink import Link, look_at, parse_link
@@ -68,13 +67,6 @@ def test_it_is_a_service_of_the_robot_that_anybody_can_call(
     assert isinstance(state, CanBusState)
     assert state.state == "error-active"
     assert not [handle for handle in asker.services(where(group="rosie.bus")) if handle.effect != "read"]
-
-
-def test_a_joint_by_the_name_of_the_bus_is_refused(leg: Leg) -> None:
-    leg.configure(('"leg.knee"', '"bus.legs"'))
-    with pytest.raises(ConfigurationError, match=r"rosie\.bus\.legs is the bus itself; name the joints otherwise"):
-        leg.attach()
-    assert not leg.announced
 
 
 # --- health

@@ -12,7 +12,7 @@ import trade_hil_sim as sim
 from drivers.conftest import Outcome, Rig
 from drivers.gripper_rig import HandRig, made_rig
 from trade import Container, where
-from trade.errors import ConfigurationError, DeviceSilent
+from trade.errors import DeviceSilent
 from trade_drivers import AttachedRobot, Camera, FaultInfo, FaultLog, Motor, MotorState, Reading, Sensor
 from trade_drivers.faults import FaultRecorder
 from waiting import wait_until
@@ -194,15 +194,6 @@ def test_they_are_services_that_anybody_may_ask_and_to_acknowledge_names_who_did
         ("rosie.neck.tilt", "healthy"),
     }
     wait_until(lambda: healths() == wanted, "the registry says so")
-
-
-def test_a_joint_by_the_name_of_the_log_is_refused(rig: Rig) -> None:
-    rig.configure(
-        ('[joint."neck.tilt"]', "[joint.faults]"), ('joints = ["neck.pan", "neck.tilt"]', 'joints = ["neck.pan"]')
-    )
-    rig.plug()
-    with pytest.raises(ConfigurationError, match=r"rosie\.faults is what tells of faults; name the joints otherwise"):
-        rig.attach()
 
 
 def test_to_look_costs_the_bus_thread_a_small_part_of_its_cycle(head: Rig) -> None:

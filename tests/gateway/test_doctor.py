@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from robots import HAND, HEAD
+from robots import HAND, HEAD, TAIL
 from trade_drivers import CanBus, Found, parse
 from trade_drivers.can import ErrorState, Link
 from trade_gateway._pki import Authority
@@ -19,7 +19,7 @@ from trade_gateway.commands import _doctor_robot as robots
 from trade_gateway.commands._doctor import _of_robot
 from trade_gateway.commands._doctor_host import Finding
 from trade_gateway.commands._first_file import first_file
-from trade_hil_sim import DynamixelBus, Mute
+from trade_hil_sim import DynamixelBus, Mute, writes
 
 
 def only(found: Iterable[Finding]) -> Finding:
@@ -199,6 +199,38 @@ def test_a_line_in_use_is_left_alone(robot_file: Path) -> None:
         finally:
             bench.close()
     assert (found.level, "another driver owns this port" in found.text) == ("warning", True)
+
+
+def test_a_range_that_is_more_than_the_device_is_set_to_is_told_as_trade_up_tells_it(robot_file: Path) -> None:
+    with simulated(robot_file) as sim:
+        sim.devices[0].table.set("max_position_limit", 2500)
+        pan, tilt = of_devices(robot_file)
+        assert not writes(list(sim.log.entries))
+    assert (pan.level, tilt.level) == ("error", "ok")
+    assert (
+        'joint."neck.pan": min_rad -1.4 to max_rad 1.4 is more than the device\'s own range (registers 52' in pan.text
+    )
+
+
+def test_a_port_that_is_no_line_is_an_error_that_names_file_and_key(robot_file: Path, tmp_path: Path) -> None:
+    (tmp_path / "neck").write_text("a file\n")
+    found = only(of_devices(robot_file))
+    assert (found.level, "head.toml: bus.neck.port" in found.text) == ("error", True)
+    assert "is no serial port" in found.text and "end what uses it" not in found.fix
+
+
+WRONG = TAIL.replace("feetech", "feetek") + HAND.replace("0.085", "85").split('"rosie"')[1] + HEAD.split('"rosie"')[1]
+
+
+def test_what_drivers_refuse_of_a_file_is_told_of_all_its_parts_and_ends_nothing(system: str, tmp_path: Path) -> None:
+    path = tmp_path / "wrong.toml"
+    path.write_text(WRONG)
+    said = CliRunner().invoke(app, ["doctor", str(path), "--json"])
+    assert said.exit_code == 1
+    errors = {one["about"]: one["text"] for one in json.loads(said.stdout) if one["level"] == "error"}
+    assert errors.keys() == {"bus tail", "bus hand", "bus neck"}
+    assert f"{path}: bus.tail.driver: there is no driver 'feetek'" in errors["bus tail"]
+    assert f'{path}: gripper."left.hand".max_width_m: 85 is outside' in errors["bus hand"]
 
 
 def test_the_exit_code_tells_of_errors(system: str, robot_file: Path) -> None:

@@ -9,6 +9,7 @@ from trade_drivers._interfaces import Gripper, GripperLimits, GripperState, Join
 from trade_drivers._load import load
 from trade_drivers._plan import FollowProgress, JointLimits, Plan, Tolerances
 from trade_drivers._polled import Measured, PolledSensor
+from trade_drivers._refusals import check, refusals
 from trade_drivers._senses import UNITS, Camera, CameraInfo, Image, Reading, Sensor, SensorInfo
 from trade_drivers._trajectory import Trajectory, TrajectoryPoint, planned
 from trade_drivers._without import without
@@ -66,11 +67,13 @@ __all__ = [
     "UrBus",
     "WireError",
     "attach",
+    "check",
     "drivers",
     "load",
     "load_driver",
     "parse",
     "planned",
+    "refusals",
     "scan",
     "without",
 ]

@@ -19,6 +19,7 @@ from trade_drivers._driver import AttachedBus, Driver, SenseDriver, load_driver
 from trade_drivers._health import HEALTHY, HealthTeller
 from trade_drivers._interfaces import Gripper, JointGroup, Motor
 from trade_drivers._measured import measures_of
+from trade_drivers._refusals import check
 from trade_drivers._senses import Camera, Sensor
 from trade_drivers.faults import FaultLog, FaultRecorder, FaultStore
 from trade_drivers.robotfile import Group, Robot
@@ -161,6 +162,7 @@ def attach(
     """
     with ExitStack() as undo:
         _check_ports(robot, ports or {})
+        check(robot)
         faults = _fault_log(robot, state_dir if register is not None else state_dir or _default_state_dir(), undo)
         recorder = FaultRecorder(faults, f"faults of {robot.name}")
         undo.callback(recorder.close)  # after the devices: what befalls them while they are left is noted, too
@@ -254,28 +256,16 @@ def _providers(
     members = robot.members()
     for provider in providers.values():
         provider.members = members
-    named: dict[str, Provider] = {**providers, **senses}
-    if (taken := f"{robot.name}.{_FAULTS}") in named:
-        raise ConfigurationError(
-            where=robot.where, problem=f"{taken} is what tells of faults; name the joints otherwise"
-        )
-    return named | _monitors(robot, buses, named)
+    return {**providers, **senses, **_monitors(robot, buses)}
 
 
 def _bus_group(robot: Robot, bus: str) -> str:
     return f"{robot.name}.bus.{bus}"
 
 
-def _monitors(robot: Robot, buses: Mapping[str, AttachedBus], others: Mapping[str, object]) -> dict[str, CanMonitor]:
-    monitors: dict[str, CanMonitor] = {}
-    for bus, attached in buses.items():
-        name = _bus_group(robot, bus)
-        if (monitor := attached.monitor(name)) is None:
-            continue
-        if name in others:
-            raise ConfigurationError(where=robot.where, problem=f"{name} is the bus itself; name the joints otherwise")
-        monitors[name] = monitor
-    return monitors
+def _monitors(robot: Robot, buses: Mapping[str, AttachedBus]) -> dict[str, CanMonitor]:
+    named = ((name := _bus_group(robot, bus), attached.monitor(name)) for bus, attached in buses.items())
+    return {name: monitor for name, monitor in named if monitor is not None}
 
 
 def _tell_health(

@@ -6,12 +6,14 @@ from importlib.metadata import EntryPoint, entry_points
 from importlib.util import find_spec
 from typing import ClassVar, TypeVar
 
+from msgspec import Struct
+
 from trade import Measure
 from trade.errors import ConfigurationError
 from trade_drivers import robotfile
 from trade_drivers._arm import Arm
 from trade_drivers._can_monitor import CanMonitor
-from trade_drivers._commission import Commissioner
+from trade_drivers._commission import Bench, Commissioner
 from trade_drivers._interfaces import Gripper, JointGroup, Motor
 from trade_drivers._senses import Camera, Sensor
 from trade_drivers.faults import Tell
@@ -97,6 +99,23 @@ class Driver(AnyDriver, ABC):
 
     without_watchdog: ClassVar[str] = ""
     """What its devices do when their driver is gone, if they have no watchdog; empty if they have one."""
+    devices: ClassVar[tuple[type[Struct], ...]] = (robotfile.Joint, robotfile.Gripper, robotfile.Arm)
+    """What a bus of it can have."""
+
+    def check(self, robot: Robot, bus: Bus) -> None:
+        """Look at what the file alone can tell of a bus and its devices; nothing is opened, and nobody is asked.
+
+        Raises:
+            ConfigurationError: the vendor library is missing, or ``attach`` would refuse the file; names file and key.
+        """
+
+    def fits(self, bench: Bench, robot: Robot, bus: Bus, device: robotfile.Joint | robotfile.Gripper) -> None:
+        """Look whether a device on an open line is set up as the robot file needs it. Nothing is written.
+
+        Raises:
+            ConfigurationError: ``attach`` would refuse it; names file and key.
+            WireError: it does not answer reliably.
+        """
 
     @abstractmethod
     def attach(self, robot: Robot, bus: Bus, port: str, healthy: Callable[[], bool]) -> AttachedBus:
@@ -117,6 +136,13 @@ class Driver(AnyDriver, ABC):
 
 class SenseDriver(AnyDriver, ABC):
     """Cameras or sensors of one kind, each with a table of its own; made without arguments, and harmless to make."""
+
+    def check(self, device: robotfile.Camera | robotfile.Sensor) -> None:
+        """Look at its options; nothing is opened, and nobody is asked.
+
+        Raises:
+            ConfigurationError: ``attach`` would refuse them; names file and key.
+        """
 
     @abstractmethod
     def attach(self, name: str, device: robotfile.Camera | robotfile.Sensor, port: str | None) -> Camera | Sensor:

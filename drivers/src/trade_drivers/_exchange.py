@@ -13,9 +13,10 @@ from trade.errors import DeviceSilent, TradeError
 from trade_drivers._work import Device, Work
 from trade_drivers.robotfile import Bus
 
-__all__ = ["HALT_NS", "PROBE_NS", "BusDevice", "BusExchange", "StopTicket"]
+__all__ = ["HALT_NS", "PROBE_NS", "BusDevice", "BusExchange", "StopTicket", "silences"]
 
-_log = logging.getLogger("trade")
+silences: Final = logging.getLogger("trade.silences")
+"""Where a device that is not heard is warned of; who tells of faults by itself raises its level."""
 PROBE_NS: Final = 500_000_000
 """How long a device that does not answer is left alone, at first, before it is asked again."""
 HALT_NS: Final = 2_000_000_000
@@ -228,7 +229,7 @@ class BusExchange(ABC, Generic[_Device]):
         device.misses += 1
         device.doubted = True
         if device.misses >= _RETRIES and not device.silent:
-            _log.info("%s does not answer on %s", device.name, device.bus)
+            silences.warning("%s does not answer on %s", device.name, device.bus)
             device.silent, device.silent_since_ns = True, now_ns
         if device.silent:
             device.probe_at_ns = now_ns + PROBE_NS * max(1, min(4, device.misses - _RETRIES + 1))

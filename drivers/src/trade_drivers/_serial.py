@@ -15,7 +15,7 @@ from typing import Final
 import serial
 
 from trade.errors import ConfigurationError, TradeError
-from trade_drivers._work import Gate, PortLost
+from trade_drivers._work import TAKEN, Gate, PortLost
 
 __all__ = ["ANSWER_MARGIN_S", "DRAIN_S", "LONGEST_WAIT_S", "SerialLine", "SerialWire"]
 
@@ -134,7 +134,7 @@ class SerialWire:
     def _cannot_open(self, bad: Exception) -> Exception:
         match _error_number(bad):
             case errno.EAGAIN | errno.EBUSY:
-                problem = f"another driver owns this port; stop it first (`fuser {self.path}` names the process)"
+                problem = f"{TAKEN}; stop it first (`fuser {self.path}` names the process)"
             case errno.EACCES | errno.EPERM:
                 problem = "no permission to open it; add yourself to its group (often dialout) and log in again"
             case errno.ENOTTY | errno.EISDIR:

@@ -9,6 +9,7 @@ from trade import Permit, current_call
 from trade.errors import DeadlineExceeded, DeviceFault, TradeError
 
 __all__ = [
+    "TAKEN",
     "Device",
     "Gate",
     "NoAnswer",
@@ -27,6 +28,8 @@ Steps = Generator[None, None, None]
 Gate = Callable[[], None]
 """Called right before the bytes go out; what it raises keeps them in."""
 
+TAKEN: Final = "another driver owns this port"
+"""What is said of a port that somebody else has."""
 
 _TELL_S: Final = 0.1
 

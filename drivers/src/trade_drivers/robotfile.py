@@ -7,6 +7,7 @@ from typing import Annotated, Literal, TypeVar, cast
 import msgspec
 from msgspec import Meta, Struct
 
+from trade._system import DOMAIN
 from trade._toml import read_toml_text
 from trade.errors import ConfigurationError
 from trade_drivers._records import Arm, Camera, Coupled, Drill, Gripper, Group, Positive, Sensor, arm_problem
@@ -228,6 +229,8 @@ def _robot_name(table: object, where: str) -> str:
         raise wrong(where, f"robot.{extra[0]}", "unknown key; [robot] has only name")
     name = str(table["name"])  # pyright: ignore[reportUnknownArgumentType]
     _check_name(name, f"{where}: robot.name")
+    if name.split(".", maxsplit=1)[0] == DOMAIN:
+        raise wrong(where, "robot.name", f"{name!r} is the middleware's own; name the robot otherwise")
     return name
 
 
@@ -321,6 +324,18 @@ def _check_links(robot: Robot) -> None:
         if (bad := arm_problem(arm)) is not None:
             raise wrong(robot.where, f'arm."{arm.name}".{bad[0]}', bad[1])
     _check_groups(robot)
+    _check_taken(robot)
+
+
+def _check_taken(robot: Robot) -> None:
+    """Names below the robot's that its drivers take for themselves."""
+    devices = (*robot.joints, *robot.grippers, *robot.arms, *robot.cameras, *robot.sensors, *robot.groups)
+    taken = {"faults": "what tells of faults"}
+    taken |= {f"bus.{bus.name}": "the bus itself" for bus in robot.buses if isinstance(bus, CanBus)}
+    for device in devices:
+        if (what := taken.get(device.name)) is not None:
+            kind, full = type(device).__name__.lower(), f"{robot.name}.{device.name}"
+            raise wrong(robot.where, f'{kind}."{device.name}"', f"{full} is {what}; name the {kind}s otherwise")
 
 
 def _check_devices(robot: Robot) -> None:

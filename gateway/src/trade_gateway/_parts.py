@@ -17,7 +17,7 @@ from trade._toml import read_toml_text
 from trade.errors import ConfigurationError
 from trade.policies import read_policy
 from trade.rules import read_rules
-from trade_drivers import load, without
+from trade_drivers import check, load, without
 
 __all__ = ["LOCAL", "Around", "Entry", "Made", "Part", "Tables", "at", "converted", "line_of", "read_toml"]
 
@@ -219,7 +219,7 @@ class Tables:
             self.refuse(name, "door", f"there is no {tokens}; make it: trade door token NAME --tokens {tokens}")
         with self.about(name, entry):
             if entry.robot:
-                without(load(self.beside(entry.robot)), entry.without)
+                check(without(load(self.beside(entry.robot)), entry.without)[0])
             if entry.rules:
                 read_rules(self.beside(entry.rules))
             if policy := environment.get("TRADE_POLICY"):

@@ -13,7 +13,7 @@ from trade_drivers._driver import AttachedBus, Driver
 from trade_drivers._work import NoAnswer
 from trade_drivers.canmotors._axis import Another, MotorAxis, Unfit
 from trade_drivers.joints import AttachedJoints, BusThread, PortLost
-from trade_drivers.robotfile import Bus, CanBus, Robot
+from trade_drivers.robotfile import Bus, CanBus, Joint, Robot
 
 if TYPE_CHECKING:
     from trade_drivers.can import CanPort
@@ -31,6 +31,7 @@ class CanMotorDriver(Driver):
     """One vendor's motors on a CAN bus, through python-can."""
 
     modules = ("can",)
+    devices = (Joint,)
     name: ClassVar[str]
     models: ClassVar[Collection[str]]
     """What it knows, as printed on them."""
@@ -42,17 +43,29 @@ class CanMotorDriver(Driver):
     def listen(self, exchange: "MotorExchange[Any]", bus: CanBus, where: str) -> None:
         """Before anything is sent. Raises ``ConfigurationError`` if the bus is not to be used."""
 
+    def check(self, robot: Robot, bus: Bus) -> None:
+        can = self._can(robot, bus)
+        self._built(robot, can, can.port)
+
     def attach(self, robot: Robot, bus: Bus, port: str, healthy: Callable[[], bool]) -> AttachedBus:
-        if not isinstance(bus, CanBus):
-            problem = f"driver {self.name} needs a CAN bus: interface and channel instead of port"
-            raise ConfigurationError(where=f"{robot.where}: bus.{bus.name}", problem=problem)
         with ExitStack() as undo:
-            exchange = self.open_exchange(robot, bus, port)
+            exchange = self.open_exchange(robot, bus := self._can(robot, bus), port)
             undo.callback(exchange.port.close)
             thread = BusThread(exchange, exchange.port, bus, healthy, name=f"bus {robot.name}.{bus.name}")
             thread.start()
             undo.pop_all()
         return _AttachedMotors(thread, exchange.port)
+
+    def _can(self, robot: Robot, bus: Bus) -> CanBus:
+        if not isinstance(bus, CanBus):
+            problem = f"driver {self.name} needs a CAN bus: interface and channel instead of port"
+            raise ConfigurationError(where=f"{robot.where}: bus.{bus.name}", problem=problem)
+        return bus
+
+    def _built(self, robot: Robot, bus: CanBus, port: str) -> "MotorExchange[Any]":
+        """What it is driven by, out of the file; not open yet."""
+        self._check_models(robot, bus)
+        return self.exchange(robot, bus, self._wire(port, bus, f"{robot.where}: bus.{bus.name}"), port)
 
     def _check_models(self, robot: Robot, bus: CanBus) -> None:
         for joint in robot.joints_on(bus.name):
@@ -67,9 +80,8 @@ class CanMotorDriver(Driver):
             ConfigurationError: the port cannot be had, or a motor is absent, another, or cannot be used as it is.
         """
         where = f"{robot.where}: bus.{bus.name}"
-        self._check_models(robot, bus)
-        wire = self._wire(port, bus, where)
-        exchange = self.exchange(robot, bus, wire, port)
+        exchange = self._built(robot, bus, port)
+        wire = exchange.port
         with ExitStack() as undo:
             undo.callback(wire.close)
             try:

@@ -6,6 +6,7 @@ from abc import abstractmethod
 from collections.abc import Callable, Generator, Sequence
 from typing import TYPE_CHECKING, Final, Generic, TypeVar
 
+from trade_drivers._exchange import silences
 from trade_drivers._work import NoAnswer
 from trade_drivers.can import Frame, Listeners
 from trade_drivers.canmotors._axis import MotorAxis, Unfit
@@ -119,7 +120,7 @@ class MotorExchange(Exchange, Generic[_Axis]):
         for axis in self.motors:
             old = not axis.hushed and axis.age_ns(now_ns) > self.stale_after_ns
             if not axis.silent and (old or now_ns - axis.beat_ns > self.deaf_ns):
-                _log.info("%s is not heard on %s", axis.name, axis.bus)
+                silences.warning("%s is not heard on %s", axis.name, axis.bus)
                 axis.forget(now_ns)
                 axis.probe_at_ns = now_ns + _AGAIN_NS
 

@@ -9,10 +9,11 @@ from trade.errors import ConfigurationError, WrongDevice
 from trade_drivers._driver import AttachedBus, Driver
 from trade_drivers.cia402._commission import Cia402Commissioner
 from trade_drivers.joints import BusThread, PortLost
-from trade_drivers.robotfile import Bus, CanBus, Robot
+from trade_drivers.robotfile import Bus, CanBus, Joint, Robot
 
 if TYPE_CHECKING:
     from trade_drivers.cia402._admission import Admission
+    from trade_drivers.cia402._axis import DriveAxis
     from trade_drivers.cia402._exchange import DriveExchange
 
 __all__ = ["Cia402Driver", "open_exchange"]
@@ -27,14 +28,16 @@ class Cia402Driver(Driver):
     """Drives in profile position mode on a CAN bus, through python-can and canopen."""
 
     modules = ("can", "canopen")
+    devices = (Joint,)
     commissioner = Cia402Commissioner
 
+    def check(self, robot: Robot, bus: Bus) -> None:
+        can = _can(robot, bus)
+        _axes(robot, can, can.port)
+
     def attach(self, robot: Robot, bus: Bus, port: str, healthy: Callable[[], bool]) -> AttachedBus:
-        if not isinstance(bus, CanBus):
-            problem = "driver cia402 needs a CAN bus: interface and channel instead of port"
-            raise ConfigurationError(where=f"{robot.where}: bus.{bus.name}", problem=problem)
         with ExitStack() as undo:
-            exchange = open_exchange(robot, bus, port)
+            exchange = open_exchange(robot, _can(robot, bus), port)
             undo.callback(exchange.port.close)
             thread = BusThread(exchange, exchange.port, bus, healthy, name=f"bus {robot.name}.{bus.name}")
             thread.start()
@@ -44,17 +47,18 @@ class Cia402Driver(Driver):
         return AttachedDrives(thread, exchange.port)
 
 
-def open_exchange(robot: Robot, bus: CanBus, port: str) -> "DriveExchange":
-    """Open the port and look every drive over, without a thread: ``cycle()`` is the caller's to call.
+def _can(robot: Robot, bus: Bus) -> CanBus:
+    if not isinstance(bus, CanBus):
+        problem = "driver cia402 needs a CAN bus: interface and channel instead of port"
+        raise ConfigurationError(where=f"{robot.where}: bus.{bus.name}", problem=problem)
+    return bus
 
-    Raises:
-        ConfigurationError: the port cannot be had, or a drive is absent, another, or cannot be used as it is.
-    """
+
+def _axes(robot: Robot, bus: CanBus, port: str) -> "list[DriveAxis]":
+    """The drives of a bus, as far as the file tells."""
     try:
-        from trade_drivers.can import CanPort  # noqa: PLC0415 - the libraries are optional
-        from trade_drivers.cia402._attach import check_bus  # noqa: PLC0415
+        from trade_drivers.cia402._attach import check_bus  # noqa: PLC0415 - the libraries are optional
         from trade_drivers.cia402._axis import DriveAxis  # noqa: PLC0415
-        from trade_drivers.cia402._exchange import DriveExchange  # noqa: PLC0415
     except ImportError as missing:
         problem = f'needs canopen and python-can ({missing}); pip install "trade-drivers[cia402]"'
         raise ConfigurationError(where="driver cia402", problem=problem) from None
@@ -63,6 +67,19 @@ def open_exchange(robot: Robot, bus: CanBus, port: str) -> "DriveExchange":
         for joint in robot.joints_on(bus.name)
     ]
     check_bus(bus, axes, robot.where)
+    return axes
+
+
+def open_exchange(robot: Robot, bus: CanBus, port: str) -> "DriveExchange":
+    """Open the port and look every drive over, without a thread: ``cycle()`` is the caller's to call.
+
+    Raises:
+        ConfigurationError: the port cannot be had, or a drive is absent, another, or cannot be used as it is.
+    """
+    axes = _axes(robot, bus, port)
+    from trade_drivers.can import CanPort  # noqa: PLC0415 - the libraries are optional
+    from trade_drivers.cia402._exchange import DriveExchange  # noqa: PLC0415
+
     where = f"{robot.where}: bus.{bus.name}"
     wire = CanPort(port, bus.bitrate, where)
     with ExitStack() as undo:

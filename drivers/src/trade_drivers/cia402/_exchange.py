@@ -5,7 +5,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Final, cast
 
-from trade_drivers._exchange import PROBE_NS
+from trade_drivers._exchange import PROBE_NS, silences
 from trade_drivers.can import Frame
 from trade_drivers.cia402 import _jobs as jobs
 from trade_drivers.cia402 import _machine as machine
@@ -233,7 +233,7 @@ class DriveExchange(Exchange):
             if axis.silent:
                 continue
             if axis.age_ns(now_ns) > self.stale_after_ns or now_ns - axis.beat_ns > self.deaf_ns:
-                _log.info("%s is not heard on %s", axis.name, axis.bus)
+                silences.warning("%s is not heard on %s", axis.name, axis.bus)
                 axis.forget(now_ns)
                 axis.probe_at_ns = now_ns + PROBE_NS
 

@@ -1,6 +1,7 @@
 """Bringing a Dynamixel bus up."""
 
 import logging
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Final, cast
 
 from trade.errors import ConfigurationError
@@ -14,6 +15,7 @@ from trade_drivers.servos import ServoAxis, ServoDriver, ServoExchange
 
 if TYPE_CHECKING:
     from trade_drivers.dynamixel._sdk import Wire
+    from trade_drivers.servos._wire import ServoWire
 
 __all__ = ["DynamixelDriver", "open_exchange"]
 
@@ -26,6 +28,7 @@ class DynamixelDriver(ServoDriver):
 
     name = "dynamixel"
     models = table.BY_MODEL_NAME
+    bauds = table.BAUD_CODES
     modules = ("dynamixel_sdk", "serial")
     commissioner = DynamixelCommissioner
 
@@ -37,9 +40,10 @@ class DynamixelDriver(ServoDriver):
         wire = wire_at(port, bus.baud, f"{robot.where}: bus.{bus.name}", fast=bus.fast_sync)
         return DynamixelExchange(wire, bus, axes)
 
-    def look_over(self, exchange: ServoExchange, bus: SerialBus, axis: ServoAxis[Any], where: str) -> None:
-        wire = cast("Wire", exchange.wire)
-        delay_s = look_over(wire, bus, cast("DynamixelAxis", axis), exchange.clock, where)
+    def look_over(
+        self, wire: "ServoWire", bus: SerialBus, axis: ServoAxis[Any], clock_ns: Callable[[], int], where: str
+    ) -> None:
+        delay_s = look_over(cast("Wire", wire), bus, cast("DynamixelAxis", axis), clock_ns, where)
         if delay_s > _SLOW_ANSWER_S:
             _log.info("%s waits %.0f us before it answers (register 9); 0 is faster", axis.name, delay_s * 1e6)
 

@@ -1,5 +1,6 @@
 """Bringing a Feetech bus up."""
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, cast
 
 from trade.errors import ConfigurationError
@@ -13,6 +14,7 @@ from trade_drivers.servos import ServoAxis, ServoDriver, ServoExchange
 
 if TYPE_CHECKING:
     from trade_drivers.feetech._wire import Wire
+    from trade_drivers.servos._wire import ServoWire
 
 __all__ = ["FeetechDriver", "open_exchange"]
 
@@ -22,6 +24,7 @@ class FeetechDriver(ServoDriver):
 
     name = "feetech"
     models = table.BY_MODEL_NAME
+    bauds = table.BAUD_CODES
     modules = ("serial",)
     without_watchdog = "no watchdog: without its driver it goes on to the goal it has, which is never far ahead"
     commissioner = FeetechCommissioner
@@ -34,8 +37,10 @@ class FeetechDriver(ServoDriver):
         check_bus(robot, bus, axes)
         return FeetechExchange(wire_at(port, bus.baud, f"{robot.where}: bus.{bus.name}"), bus, axes)
 
-    def look_over(self, exchange: ServoExchange, bus: SerialBus, axis: ServoAxis[Any], where: str) -> None:
-        look_over(exchange.wire, bus, cast("FeetechAxis", axis), exchange.clock, where)
+    def look_over(
+        self, wire: "ServoWire", bus: SerialBus, axis: ServoAxis[Any], clock_ns: Callable[[], int], where: str
+    ) -> None:
+        look_over(wire, bus, cast("FeetechAxis", axis), clock_ns, where)
 
 
 def open_exchange(robot: Robot, bus: SerialBus, port: str) -> ServoExchange:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Final, NoReturn
 
 from trade import Measure
 from trade.errors import ConfigurationError
+from trade_drivers import robotfile
 from trade_drivers._bus_thread import BusThread
 from trade_drivers._driver import AttachedBus, Driver
 from trade_drivers._interfaces import Gripper, JointGroup, Motor
@@ -69,19 +70,29 @@ class RobotiqDriver(Driver):
     """2F-85 grippers on a serial bus, through pymodbus."""
 
     modules = ("pymodbus", "serial")
+    devices = (robotfile.Gripper,)
     without_watchdog = "no watchdog: without its driver it ends the stroke it was told"
     commissioner = RobotiqCommissioner
 
+    def check(self, robot: Robot, bus: Bus) -> None:
+        serial = _serial(robot, bus)
+        _check(robot, serial)
+        wire_at(serial.port, serial.baud, f"{robot.where}: bus.{bus.name}")
+
     def attach(self, robot: Robot, bus: Bus, port: str, healthy: Callable[[], bool]) -> AttachedBus:
-        if not isinstance(bus, SerialBus):
-            _wrong(f"{robot.where}: bus.{bus.name}", "driver robotiq needs a serial bus: a port, no channel")
         with ExitStack() as undo:
-            exchange = open_exchange(robot, bus, port)
+            exchange = open_exchange(robot, _serial(robot, bus), port)
             undo.callback(exchange.wire.close)
             thread = BusThread(exchange, exchange.wire, bus, healthy, name=f"bus {robot.name}.{bus.name}")
             thread.start()
             undo.pop_all()
         return AttachedGrippers(thread)
+
+
+def _serial(robot: Robot, bus: Bus) -> SerialBus:
+    if not isinstance(bus, SerialBus):
+        _wrong(f"{robot.where}: bus.{bus.name}", "driver robotiq needs a serial bus: a port, no channel")
+    return bus
 
 
 def open_exchange(robot: Robot, bus: SerialBus, port: str) -> Exchange:
@@ -119,8 +130,6 @@ def open_exchange(robot: Robot, bus: SerialBus, port: str) -> Exchange:
 def _check(robot: Robot, bus: SerialBus) -> None:
     """What the file alone can tell: models, limits, and whether the bytes of a cycle fit into it."""
     where, grippers = f"{robot.where}: bus.{bus.name}", robot.grippers_on(bus.name)
-    if joints := robot.joints_on(bus.name):
-        _wrong(f'{robot.where}: joint."{joints[0].name}".bus', "driver robotiq has no joints, only grippers")
     for gripper in grippers:
         key = f'{robot.where}: gripper."{gripper.name}"'
         model = table.BY_MODEL_NAME.get(gripper.model)
@@ -137,6 +146,11 @@ def _check(robot: Robot, bus: SerialBus) -> None:
     for key, problem in _MEANINGLESS.items():
         if key in robot.given.get(bus.name, ()):
             _wrong(f"{where}.{key}", problem)
+    if bus.baud not in table.BAUDS:
+        known = ", ".join(map(str, table.BAUDS))
+        _wrong(
+            f"{where}.baud", f"{bus.baud} is no rate of a 2F-85; it knows {known}, and leaves the factory with 115200"
+        )
     if bus.leave != "hold":
         problem = '"relax" is nothing a 2F-85 can: its fingers stand without power, too; use "hold"'
         _wrong(f"{where}.leave", problem)

@@ -16,6 +16,9 @@ STATUS: Final = 0x07D0
 """First of three registers to read: gripper status, fault and echo of the position request, position and current."""
 COUNT: Final = 3
 
+BAUDS: Final = (9_600, 19_200, 38_400, 57_600, 115_200)
+"""Rates it can be set to by the vendor's tool."""
+
 _ACTIVATE: Final = 0x01
 _GO: Final = 0x08
 _RESERVED: Final = 0x06

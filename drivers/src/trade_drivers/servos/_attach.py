@@ -1,6 +1,7 @@
 """Looking a bus of servos over before anything may be commanded: what the file tells, and who is there."""
 
 from collections.abc import Callable, Sequence
+from math import tau
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from trade.errors import ConfigurationError, WrongDevice
@@ -20,12 +21,13 @@ _Result = TypeVar("_Result")
 
 
 def check_ranges(axis: ServoAxis[Any], where: str) -> None:
-    """Whether a joint's speed and acceleration can be set at all, and brake it in time.
+    """Whether a joint's range is one of its device, and its speed and acceleration can be set and brake it in time.
 
     Raises:
         ConfigurationError: names the key and what would be right.
     """
     joint, grain = axis.joint, axis.grain
+    _check_turn(axis, where)
     for key, value, least in (
         ("max_speed_rad_s", joint.max_speed_rad_s, grain.rad_s),
         ("max_accel_rad_s2", joint.max_accel_rad_s2, grain.rad_s2),
@@ -37,6 +39,18 @@ def check_ranges(axis: ServoAxis[Any], where: str) -> None:
     if braking_s > _BRAKING_S:
         problem = f"a stop from max_speed_rad_s takes {braking_s:.2g} s with it; it must take {_BRAKING_S} s at most"
         raise ConfigurationError(where=f'{where}: joint."{joint.name}".max_accel_rad_s2', problem=problem)
+
+
+def _check_turn(axis: ServoAxis[Any], where: str) -> None:
+    """In position control a servo has one turn."""
+    joint, last = axis.joint, int(2 * axis.grain.centre) - 1
+    if axis.low >= 0 and axis.high <= last:
+        return
+    low, high = sorted((axis.scale.angle_rad(0), axis.scale.angle_rad(last)))
+    key, value = ("min_rad", joint.min_rad) if joint.min_rad < low else ("max_rad", joint.max_rad)
+    degrees = "; degrees? radians are meant" if max(abs(joint.min_rad), abs(joint.max_rad)) > tau else ""
+    problem = f"{value:.6g} is outside of what an {joint.model} can: {low:.6g} to {high:.6g} rad{degrees}"
+    raise ConfigurationError(where=f'{where}: joint."{joint.name}".{key}', problem=problem)
 
 
 def check_rate(bus: "SerialBus", count: int, cycle_bytes: int, where: str) -> None:

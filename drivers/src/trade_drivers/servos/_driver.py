@@ -1,19 +1,23 @@
 """Bringing a bus of servos up, and handing out its motors."""
 
+import time
 from abc import abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from contextlib import ExitStack
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 from trade.errors import ConfigurationError
+from trade_drivers._commission import Bench
 from trade_drivers._driver import AttachedBus, Driver
 from trade_drivers.joints import AttachedJoints, BusThread, PortLost
-from trade_drivers.robotfile import Bus, Joint, Robot, SerialBus
+from trade_drivers.robotfile import Bus, Gripper, Joint, Robot, SerialBus
 from trade_drivers.servos._answers import WireError
+from trade_drivers.servos._commission import ServoBench
 from trade_drivers.servos._exchange import ServoExchange
 
 if TYPE_CHECKING:
     from trade_drivers.servos._axis import ServoAxis
+    from trade_drivers.servos._wire import ServoWire
 
 __all__ = ["ServoDriver"]
 
@@ -21,24 +25,35 @@ __all__ = ["ServoDriver"]
 class ServoDriver(Driver):
     """One vendor's servos in position control on a serial bus."""
 
+    devices = (Joint,)
     name: ClassVar[str]
     models: ClassVar[Mapping[str, object]]
     """Those it knows, by the name printed on them."""
+    bauds: ClassVar[Collection[int]]
+    """Rates they can be set to."""
 
     @abstractmethod
     def exchange(self, robot: Robot, bus: SerialBus, port: str, joints: list[Joint]) -> ServoExchange:
         """What the file alone can tell is checked; the port is not open yet. Raises ``ConfigurationError``."""
 
     @abstractmethod
-    def look_over(self, exchange: ServoExchange, bus: SerialBus, axis: "ServoAxis[Any]", where: str) -> None:
+    def look_over(
+        self, wire: "ServoWire", bus: SerialBus, axis: "ServoAxis[Any]", clock_ns: Callable[[], int], where: str
+    ) -> None:
         """Check one joint's device and take its first measurements. Raises ``ConfigurationError``."""
 
+    def check(self, robot: Robot, bus: Bus) -> None:
+        serial = self._serial(robot, bus)
+        self.exchange(robot, serial, serial.port, self._known(robot, serial))
+
+    def fits(self, bench: Bench, robot: Robot, bus: Bus, device: Joint | Gripper) -> None:
+        serial, wire = self._serial(robot, bus), cast("ServoBench", bench).wire
+        [axis] = self.exchange(robot, serial, serial.port, [cast("Joint", device)]).servos
+        self.look_over(wire, serial, axis, time.monotonic_ns, robot.where)
+
     def attach(self, robot: Robot, bus: Bus, port: str, healthy: Callable[[], bool]) -> AttachedBus:
-        if not isinstance(bus, SerialBus):
-            problem = f"driver {self.name} needs a serial bus: port instead of interface and channel"
-            raise ConfigurationError(where=f"{robot.where}: bus.{bus.name}", problem=problem)
         with ExitStack() as undo:
-            exchange = self.open_exchange(robot, bus, port)
+            exchange = self.open_exchange(robot, self._serial(robot, bus), port)
             undo.callback(exchange.wire.close)
             thread = BusThread(exchange, exchange.wire, bus, healthy, name=f"bus {robot.name}.{bus.name}")
             thread.start()
@@ -58,7 +73,7 @@ class ServoDriver(Driver):
             try:
                 exchange.wire.open()
                 for axis in exchange.servos:
-                    self.look_over(exchange, bus, axis, robot.where)
+                    self.look_over(exchange.wire, bus, axis, exchange.clock, robot.where)
                 for axis in exchange.servos:
                     exchange.admit(axis)
                 exchange.cycle()
@@ -71,7 +86,16 @@ class ServoDriver(Driver):
             undo.pop_all()
         return exchange
 
+    def _serial(self, robot: Robot, bus: Bus) -> SerialBus:
+        if not isinstance(bus, SerialBus):
+            problem = f"driver {self.name} needs a serial bus: port instead of interface and channel"
+            raise ConfigurationError(where=f"{robot.where}: bus.{bus.name}", problem=problem)
+        return bus
+
     def _known(self, robot: Robot, bus: SerialBus) -> list[Joint]:
+        if bus.baud not in self.bauds:
+            problem = f"{bus.baud} is no rate of these servos; they know {', '.join(map(str, sorted(self.bauds)))}"
+            raise ConfigurationError(where=f"{robot.where}: bus.{bus.name}.baud", problem=problem)
         joints = robot.joints_on(bus.name)
         for joint in joints:
             if joint.model not in self.models:

@@ -35,6 +35,13 @@ class Options(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 class SnapshotDriver(SenseDriver):
     """Network cameras that answer an HTTP request with a picture."""
 
+    def check(self, device: robotfile.Camera | robotfile.Sensor) -> None:
+        options = device.options_as(Options)
+        try:
+            place_of(options.url)
+        except ValueError as bad:
+            raise ConfigurationError(where=f"{device.where}: {device.key}.url", problem=str(bad)) from None
+
     def attach(self, name: str, device: robotfile.Camera | robotfile.Sensor, port: str | None) -> Camera | Sensor:
         options = device.options_as(Options)
         where = f"{device.where}: {device.key}"

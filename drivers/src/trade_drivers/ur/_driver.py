@@ -8,6 +8,7 @@ from msgspec import structs
 
 from trade import Measure
 from trade.errors import ConfigurationError
+from trade_drivers import robotfile
 from trade_drivers._arm import Arm
 from trade_drivers._bus_thread import BusThread
 from trade_drivers._driver import AttachedBus, Driver
@@ -73,17 +74,26 @@ class UrDriver(Driver):
 
     modules = ("rtde_control", "rtde_receive", "rtde_io")
 
-    def attach(self, robot: Robot, bus: Bus, port: str, healthy: Callable[[], bool]) -> AttachedBus:
-        where = f"{robot.where}: bus.{bus.name}"
+    devices = (robotfile.Arm,)
+
+    def check(self, robot: Robot, bus: Bus) -> None:
+        self._limb_of(robot, bus, bus.name)
+
+    def _limb_of(self, robot: Robot, bus: Bus, port: str) -> tuple[Limb, UrBus]:
+        """What the file alone can tell is checked."""
         if not isinstance(bus, UrBus):
-            _wrong(where, 'driver ur needs a controller: host = "192.168.0.10"')
+            _wrong(f"{robot.where}: bus.{bus.name}", 'driver ur needs a controller: host = "192.168.0.10"')
         if missing := self.missing():
             problem = (
                 f'needs ur-rtde ({missing[0]} is missing); pip install "trade-drivers[ur]", or on platforms without'
             )
             _wrong("driver ur", f"{problem} its wheel (all but Linux x86_64 with Python 3.10-3.12) build ur-rtde 1.6.5")
         limb = _limb(robot, bus, port)
-        bus = structs.replace(bus, rate_hz=bus.rate_hz or _CYCLES_HZ[limb.arm.model])
+        return limb, structs.replace(bus, rate_hz=bus.rate_hz or _CYCLES_HZ[limb.arm.model])
+
+    def attach(self, robot: Robot, bus: Bus, port: str, healthy: Callable[[], bool]) -> AttachedBus:
+        where = f"{robot.where}: bus.{bus.name}"
+        limb, bus = self._limb_of(robot, bus, port)
         link = Link(port)
         with ExitStack() as undo:
             undo.callback(link.wait_closed)

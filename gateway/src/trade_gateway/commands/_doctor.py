@@ -5,11 +5,12 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from msgspec.structs import replace
 from rich.markup import escape
 
 from trade._toml import read_toml_text
 from trade.errors import TradeError
-from trade_drivers import SerialBus, drivers, load
+from trade_drivers import SerialBus, drivers, load, refusals
 from trade_gateway.commands import _doctor_host as host
 from trade_gateway.commands import _doctor_robot as robots
 from trade_gateway.commands._doctor_host import Finding
@@ -32,8 +33,8 @@ def doctor(
     """Look for what keeps a robot from working, and say what helps. Nothing is changed; the exit code is 1 on errors.
 
     Of the host: rights and latency of serial ports, libraries, clock, certificates, who is in sight. With a robot file:
-    its ports and CAN interfaces, whether its devices answer and are those it names, and which have no watchdog. Lines
-    that a driver holds are left alone.
+    what its drivers refuse of it, its ports and CAN interfaces, whether its devices answer and are set up as it says,
+    and which have no watchdog. Lines that a driver holds are left alone.
 
     For example: trade doctor rosie.toml
     """
@@ -95,12 +96,16 @@ def _of_robot(path: Path) -> Iterator[Finding]:
             fix="correct the file; the message says where",
         )
         return
-    yield from host.libraries(sorted({bus.driver for bus in robot.buses}), needed=True)
-    yield from robots.unwatched(robot)
+    known = {bus.driver for bus in robot.buses} & drivers().keys()
+    yield from host.libraries(sorted(known), needed=True)
+    wrong = dict(refusals(robot))
+    yield from robots.refused(robot, wrong)
+    sound = replace(robot, buses=[bus for bus in robot.buses if bus.name not in wrong])
+    yield from robots.unwatched(sound)
     yield from robots.unmeasured(robot, path)
-    yield from robots.interfaces(robot)
-    yield from robots.devices(robot)
-    yield from robots.controllers(robot)
+    yield from robots.interfaces(sound)
+    yield from robots.devices(sound)
+    yield from robots.controllers(sound)
 
 
 def _no_robot(path: Path) -> Finding | None:

@@ -2,12 +2,25 @@
 
 import socket
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from trade.errors import ConfigurationError
-from trade_drivers import Bench, CanBus, Commissioner, Driver, Found, Joint, Robot, SerialBus, UrBus, load_driver
+from trade_drivers import (
+    Bench,
+    CanBus,
+    Commissioner,
+    Driver,
+    Found,
+    Joint,
+    Robot,
+    SerialBus,
+    UrBus,
+    WireError,
+    load_driver,
+)
+from trade_drivers._work import TAKEN
 from trade_drivers.robotfile import Gripper
 from trade_gateway.commands._doctor_host import Finding
 from trade_gateway.commands._first_file import UNMEASURED_RAD
@@ -15,7 +28,7 @@ from trade_gateway.commands._first_file import UNMEASURED_RAD
 if TYPE_CHECKING:
     from trade_drivers.can import Link
 
-__all__ = ["controllers", "devices", "interfaces", "judged", "unmeasured", "unwatched"]
+__all__ = ["controllers", "devices", "interfaces", "judged", "refused", "unmeasured", "unwatched"]
 
 _LOOKS: Final = 10
 """How often a device is asked: a bad line shows in some of them."""
@@ -85,28 +98,62 @@ def judged(bus: CanBus, link: "Link") -> Finding:
     return Finding(level="ok", about=about, text="is up" + (f" at {link.bitrate} bit/s" if link.bitrate else ""))
 
 
+def refused(robot: Robot, refusals: Mapping[str, ConfigurationError]) -> Iterator[Finding]:
+    """What drivers refuse of the file, before any device is asked."""
+    buses = {bus.name for bus in robot.buses}
+    for part, refusal in refusals.items():
+        about, then = (
+            (f"bus {part}", "; its line was not looked at, so look again then") if part in buses else (part, "")
+        )
+        yield Finding(level="error", about=about, text=str(refusal), fix=f"correct the file{then}")
+
+
 def devices(robot: Robot) -> Iterator[Finding]:
     """Whether the devices on serial lines answer, reliably, and are those of the file. Nothing is written to them."""
     for bus in robot.buses:
-        commissioner = load_driver(bus.driver, bus.name, Driver).commissioner
-        if not isinstance(bus, SerialBus) or commissioner is None:
+        driver = load_driver(bus.driver, bus.name, Driver)
+        if not isinstance(bus, SerialBus) or driver.commissioner is None:
             continue
-        made = commissioner()
         if not Path(bus.port).exists():
             fix = "plug its adapter in; `trade scan` lists the ports there are, /dev/serial/by-id has lasting names"
             yield Finding(level="error", about=f"bus {bus.name}", text=f"there is no {bus.port}", fix=fix)
             continue
         try:
-            yield from _on_line(robot, bus, made)
+            yield from _on_line(robot, bus, driver, driver.commissioner())
         except ConfigurationError as bad:
-            fix = "end what uses it and look again; while a robot is up, `trade up` tells of its devices"
-            yield Finding(level="warning", about=f"bus {bus.name}", text=f"was not looked at: {bad}", fix=fix)
+            yield _unseen(robot, bus, bad)
 
 
-def _on_line(robot: Robot, bus: SerialBus, commissioner: Commissioner) -> Iterator[Finding]:
+def _unseen(robot: Robot, bus: SerialBus, bad: ConfigurationError) -> Finding:
+    """A line that could not be had."""
+    about = f"bus {bus.name}"
+    if TAKEN in bad.problem:
+        fix = "end what uses it and look again; while a robot is up, `trade up` tells of its devices"
+        return Finding(level="warning", about=about, text=f"was not looked at: {bad}", fix=fix)
+    text = f"was not looked at: {robot.where}: bus.{bus.name}.port: {bad.problem}"
+    return Finding(
+        level="error", about=about, text=text, fix="have port name the line of these devices, and look again"
+    )
+
+
+def _on_line(robot: Robot, bus: SerialBus, driver: Driver, commissioner: Commissioner) -> Iterator[Finding]:
     with commissioner.at(bus.port, bus.baud) as bench:
         for device in (*robot.joints_on(bus.name), *robot.grippers_on(bus.name)):
-            yield _of_device(bench, device, bus)
+            found = _of_device(bench, device, bus)
+            yield found if found.level != "ok" else _unfit(driver, bench, robot, bus, device, found.about) or found
+
+
+def _unfit(
+    driver: Driver, bench: Bench, robot: Robot, bus: SerialBus, device: Joint | Gripper, about: str
+) -> Finding | None:
+    """What `trade up` would refuse of a device that answers; None if nothing."""
+    try:
+        driver.fits(bench, robot, bus, device)
+    except ConfigurationError as bad:
+        return Finding(level="error", about=about, text=str(bad), fix="set the device up so, or correct the file")
+    except WireError as bad:
+        return Finding(level="error", about=about, text=f"answers, but not always: {bad}", fix=_BAD_LINE)
+    return None
 
 
 def _of_device(bench: Bench, device: Joint | Gripper, bus: SerialBus) -> Finding:

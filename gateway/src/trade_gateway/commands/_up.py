@@ -1,6 +1,7 @@
 """``trade up ROBOT.toml``: attach a robot's devices and offer them as services until told to leave."""
 
 import gc
+import logging
 import signal
 from collections.abc import Generator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -14,6 +15,7 @@ from rich.markup import escape
 from trade import Container
 from trade.errors import ConfigurationError
 from trade_drivers import AttachedRobot, attach, load, without
+from trade_drivers import check as drivers_check
 from trade_drivers.robotfile import Robot
 from trade_gateway._asked import Asked
 from trade_gateway.commands._detached import Detach, detach_now, ready
@@ -40,6 +42,7 @@ def up(
         typer.Option("--without", metavar="PART", help="A bus, camera or sensor to leave out; again for another."),
     ] = None,
     name: Annotated[str | None, typer.Option(help="Name of the container; by default the robot's.")] = None,
+    check: Annotated[bool, typer.Option("--check", help="Only say whether its drivers take the file.")] = False,
     detach: Detach = False,
     as_json: Json = False,
 ) -> None:
@@ -56,6 +59,10 @@ def up(
     out = Output(as_json=as_json)
     robot, left_out = without(load(robot_file), leave_out or [])
     told = ports_told(port or [])
+    if check:
+        drivers_check(robot)
+        out.say(f"{robot_file} is right")
+        return
     if detach:
         detach_now(out, choice_of(context).settings(name or robot.name))
         return
@@ -79,6 +86,7 @@ def up(
             healthy=container.healthy,
             state_dir=state_dir and state_dir / container.settings.system,
         )
+        logging.getLogger("trade.silences").setLevel(logging.ERROR)  # FaultWatch tells of them, once and with the time
         stack.callback(_say_left, attached)
         stack.enter_context(attached)
         container.measured_by(attached.measures)
