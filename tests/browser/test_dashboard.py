@@ -9,6 +9,7 @@ from playwright.sync_api import expect
 
 from browser.conftest import PAN, Browsers, Doorway, View, renderers
 from system.conftest import Bench
+from trade._endpoints import free_endpoint
 from trade_hil_sim import events
 from waiting import wait_until
 
@@ -129,8 +130,9 @@ def test_an_e_stop_from_the_second_page_stops_what_the_first_moves(bench: Bench,
     chief.page.keyboard.press("Escape")
     stands(bench)
     expect(chief.stopped).to_contain_text("Confirmed by")
-    expect(chief.stopped).not_to_contain_text("NOT CONFIRMED")
+    expect(chief.stopped.locator("strong")).to_have_text("E-STOP: nothing moves until it is cleared.")
     expect(anna.stopped).to_contain_text("chief: dashboard")
+    expect(anna.stopped).to_contain_text("who has heard it moves nothing")
     anna.page.mouse.up()
     expect(anna.stopped.get_by_role("button")).to_have_count(0)  # she does not administer the system
     at = pan_rad(bench)
@@ -148,6 +150,26 @@ def test_an_e_stop_from_the_second_page_stops_what_the_first_moves(bench: Bench,
     jog(bench, anna, anna.plus)
     anna.page.mouse.up()
     stands(bench)
+
+
+def test_S09_an_e_stop_that_no_robot_confirmed_never_says_that_nothing_moves(
+    browsers: Browsers, doorway: Doorway, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    nowhere = free_endpoint()
+    doorway.program.signal(signal.SIGKILL)
+    monkeypatch.setenv("TRADE_CONNECT", nowhere)
+    doorway.start()
+    chief = browsers.view("chief")
+    expect(chief.page.locator("#apart")).to_contain_text(f"The door reaches nobody at {nowhere}")
+    expect(chief.page.locator("#apart")).to_contain_text("nothing accepts connections there")
+    expect(chief.page.locator("#apart")).to_contain_text("no robot hears an e-stop")
+    expect(chief.page.locator("#robot-list")).to_contain_text("No robot is there")
+    chief.page.keyboard.press("Escape")
+    loudest = chief.stopped.locator("strong")
+    expect(loudest).to_contain_text("CONFIRMED")  # at once, and as long as it is tried
+    expect(loudest).to_have_text("✕ NO ROBOT CONFIRMED: use the switch that cuts the power.")
+    expect(chief.stopped).to_contain_text("chief: dashboard")
+    expect(chief.stopped).not_to_contain_text("nothing moves")
 
 
 def test_a_page_comes_back_by_itself_when_the_door_does(bench: Bench, browsers: Browsers, doorway: Doorway) -> None:

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from http.client import HTTPConnection
 from pathlib import Path
 
@@ -15,7 +16,8 @@ from typer.testing import CliRunner
 from certificates import Papers
 from doors import Axis, Client, Opened, opened
 from jointed import Robot
-from trade import Handle, service, where
+from trade import Handle, Sight, service, where
+from trade.errors import Stopped
 from trade.testing import memory_system
 from trade_gateway.cli import app
 from trade_gateway.door import add_token
@@ -248,6 +250,39 @@ def test_S09_a_door_that_finds_nobody_does_not_say_that_none_is_open(tmp_path: P
     with memory_system() as system, opened(system.container("alone"), tmp_path) as (made, tokens):
         refused = Client(made.url, add_token(tokens, "anna")).ask("POST", "/estop/clear")
         assert (refused.status, refused.title) == (503, "NobodyFound")
+
+
+def test_S09_an_e_stop_that_nobody_was_told_is_no_success_and_stays_open(tmp_path: Path) -> None:
+    with memory_system() as system, opened(system.container("alone"), tmp_path) as (made, tokens):
+        anna = Client(made.url, add_token(tokens, "anna"))
+        assert anna.ask("GET", "/sight").body == {"others": [], "silent": [], "apart": {}}
+        refused = anna.ask("POST", "/estop", {"reason": "smoke"})
+        assert (refused.status, refused.title) == (503, "NobodyFound")
+        assert "use the switch that cuts the power" in refused.body["detail"]
+        [known] = anna.ask("GET", "/estops").body
+        assert known["id"] in refused.body["detail"]
+        robot = Robot(system)  # who comes into sight is told
+        move = robot.find("a")
+
+        def stopped() -> bool:
+            with suppress(Stopped):
+                move(1.0)
+                return False
+            return True
+
+        wait_until(stopped, "it has heard of the e-stop")
+
+
+def test_S09_a_door_tells_where_it_reached_nobody_and_calls_no_e_stop_complete_then(
+    door: Opened, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    anna = door.client()
+    assert anna.ask("GET", "/sight").body["apart"] == {}
+    apart = {"tls/10.0.0.7:7450": "nothing accepts connections there"}
+    monkeypatch.setattr(door.robot.me, "sight", lambda **_: Sight(("tester/a",), apart=apart))
+    told = anna.ask("POST", "/estop").body
+    assert (told["complete"], told["apart"]) == (False, apart)
+    assert set(told["confirmed"]) >= {"tester/a", "tester/b"}
 
 
 def test_S07_of_too_much_at_once_some_is_refused_and_a_stop_is_not(door: Opened) -> None:

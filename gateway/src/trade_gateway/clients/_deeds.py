@@ -17,6 +17,7 @@ from trade import (
     Lock,
     Notification,
     Run,
+    Sight,
     where,
 )
 from trade import Stream as Samples
@@ -43,6 +44,7 @@ _THREADS: Final = MOST + 16
 _HEARD_S: Final = 1.0
 """How long to wait for everybody to be heard."""
 _NO_GROUP: Final = "_"
+_NOT_TOLD: Final = "nobody with something to stop is known to have been told; use the switch that cuts the power"
 
 Gone = Callable[[], Awaitable[object]]
 """Returns when whoever asked is there no more."""
@@ -274,9 +276,17 @@ class Deeds:
         return await self.counted(client.identity, resume)
 
     async def estop(self, who: str, body: messages.EstopBody) -> messages.Stopped:
-        """Stop everything in the system."""
+        """Stop everything in the system.
+
+        Raises:
+            NobodyFound: nobody is known to have been told; it is open here, and who comes into sight is told then.
+        """
         reason = f"{who}: {body.reason}" if body.reason else f"by {who}"
-        return _stopped(await self.apart(self._container.estop, reason, stops=True))
+        report = await self.apart(self._container.estop, reason, stops=True)
+        sight = await self.apart(partial(self._container.sight, limit_s=0), stops=True)  # not before: it waits
+        if not (report.confirmed or report.missing or report.failed):
+            raise sight.nobody(self._container.settings.system, f"e-stop {report.id}: {_NOT_TOLD}")
+        return _stopped(report, sight)
 
     async def clear(self, who: str, body: messages.ClearBody) -> messages.Stopped:
         """Clear e-stops. Raises AccessDenied, NoSuchEstop; NobodyFound: none is known, and not everybody was heard."""
@@ -351,5 +361,7 @@ def _groups(handles: Sequence[Handle]) -> list[str]:
     return sorted({group for handle in handles for group in handle.groups})
 
 
-def _stopped(report: EstopReport) -> messages.Stopped:
-    return messages.Stopped(report.id, report.complete, report.confirmed, report.missing, report.failed)
+def _stopped(report: EstopReport, sight: Sight | None = None) -> messages.Stopped:
+    apart = sight.apart if sight is not None else {}
+    complete = report.complete and not apart
+    return messages.Stopped(report.id, complete, report.confirmed, report.missing, report.failed, apart)

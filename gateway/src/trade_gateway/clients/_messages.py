@@ -252,6 +252,8 @@ class Stopped(Struct, frozen=True):
     confirmed: tuple[str, ...]
     missing: tuple[str, ...]
     failed: dict[str, str]
+    apart: dict[str, str] = {}
+    """Endpoints that the door dials and where nobody was found: who is there was not told."""
 
 
 def service_view(handle: Handle, *, allowed: bool) -> ServiceView:

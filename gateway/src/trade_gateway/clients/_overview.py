@@ -1,9 +1,11 @@
 """What clients are told of the system itself: who may read, instrument or administer it is judged by the policy."""
 
+import threading
+import time
 from collections.abc import Callable, Coroutine
 from typing import Any, Final
 
-from trade import Container, HookInfo, LoadInfo, LogLine, LogReader, NotificationInfo, Span
+from trade import Container, HookInfo, LoadInfo, LogLine, LogReader, NotificationInfo, Sight, Span
 from trade_gateway._loads import loads
 from trade_gateway.clients import _messages as messages
 from trade_gateway.clients._calls import CallReader
@@ -13,6 +15,8 @@ from trade_gateway.clients._records import newest
 
 _ROWS: Final = 200
 """Of the audit records."""
+_SIGHT_S: Final = 2.0
+"""How old it may be: finding out why there is no link takes as long."""
 
 Counted = Callable[..., Coroutine[Any, Any, Any]]
 """Does something in a thread, as one of what an identity may have under way."""
@@ -31,6 +35,9 @@ class Overview:
         self._container = container
         self._judge = judge
         self._counted = counted
+        self._looking = threading.Lock()
+        self._sight: Sight | None = None
+        self._looked_at = 0.0
 
     def me(self, who: str) -> messages.Me:
         """What an identity is here."""
@@ -65,6 +72,17 @@ class Overview:
     def ended(self, *, reads: bool) -> CallReader:
         """Of the calls of the system that are noted, from what is kept of them."""
         return CallReader(self._container, reads=reads)
+
+    async def sight(self, who: str) -> Sight:
+        """Whom the door has found, and where nobody; looked at once for all who ask within two seconds."""
+        return await self._counted(who, self._look)
+
+    def _look(self) -> Sight:
+        with self._looking:
+            if self._sight is None or time.monotonic() - self._looked_at > _SIGHT_S:
+                self._sight = self._container.sight(limit_s=0)
+                self._looked_at = time.monotonic()
+            return self._sight
 
     def containers(self) -> list[messages.ContainerView]:
         """Those of the system."""

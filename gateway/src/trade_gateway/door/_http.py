@@ -44,6 +44,7 @@ class Http:
             _route("/services", "group", "name", GET=self.services),
             _route("/me", GET=self.me),
             _route("/containers", GET=self.containers),
+            _route("/sight", GET=self.sight),
             _route("/loads", GET=self.loads),
             _route("/notifications", GET=self.notifications),
             _route("/hooks", GET=self.hooks),
@@ -98,6 +99,9 @@ class Http:
     async def containers(self, request: Request) -> Response:
         self._who(request)
         return _answer(self._deeds.overview.containers())
+
+    async def sight(self, request: Request) -> Response:
+        return _answer(await self._deeds.overview.sight(self._who(request)))
 
     # --- calling
 

@@ -6,7 +6,7 @@ from typing import Any, Final, cast
 
 import msgspec
 
-from trade import Handle, HookInfo, LoadInfo, NotificationInfo
+from trade import Handle, HookInfo, LoadInfo, NotificationInfo, Sight
 from trade_gateway.clients import _messages as messages
 from trade_gateway.door._problems import MEDIA_TYPE, Problem
 
@@ -32,6 +32,7 @@ _BODIES: Final = (
     LoadInfo,
     NotificationInfo,
     HookInfo,
+    Sight,
     Problem,
 )
 _COMPONENTS: Final = "#/components/schemas/"
@@ -151,6 +152,7 @@ def _fixed() -> Schema:
         "/services": {"get": _operation("Services.", _list("ServiceView"), parameters=query)},
         "/me": {"get": _operation("As whom the client is known, and its rights over the system.", _ref("Me"))},
         "/containers": {"get": _operation("Containers.", _list("ContainerView"))},
+        "/sight": {"get": _operation("Whom the door has found, and where nobody.", _ref("Sight"))},
         "/loads": {"get": _operation("How busy they are, over the second that this takes.", _list("LoadInfo"))},
         "/notifications": {"get": _operation("Notifications that stand.", _list("NotificationInfo"))},
         "/hooks": {"get": _operation("Hooks that are attached.", _list("HookInfo"))},

@@ -4,6 +4,7 @@ import { sleep, tell } from "./page.js";
 
 const ESTOP_WITHIN_MS = 1000;
 const SILENT_MS = 3000; // a door that answers nothing for so long is as good as gone
+export const LONG_MS = 15000; // for what waits for others
 
 /** What the door or the system would not do, with the problem as it was told. */
 export class Refused extends Error {
@@ -30,22 +31,22 @@ class Door {
     return this.#socket?.readyState === WebSocket.OPEN;
   }
 
-  async request(method, path, body) {
+  async request(method, path, body, within_ms) {
     const headers = this.token ? { Authorization: `Bearer ${this.token}` } : {};
     if (body) headers["Content-Type"] = "application/json";
     const options = { method, headers, body: body && JSON.stringify(body), cache: "no-store" };
-    const answer = await fetch(path, { ...options, signal: AbortSignal.timeout(method === "GET" ? SILENT_MS : 15000) });
+    const answer = await fetch(path, { ...options, signal: AbortSignal.timeout(within_ms) });
     const told = await answer.json();
     if (!answer.ok) throw new Refused(told);
     return told;
   }
 
-  get(path) {
-    return this.request("GET", path);
+  get(path, within_ms = SILENT_MS) {
+    return this.request("GET", path, undefined, within_ms);
   }
 
   post(path, body) {
-    return this.request("POST", path, body);
+    return this.request("POST", path, body, LONG_MS);
   }
 
   /** Connect; resolves once connected, with a promise of the end. */

@@ -1,32 +1,41 @@
-// The e-stop: always there, and Esc presses it.
+// The e-stop: always there, and Esc presses it. What it says of robots is never more than what they have confirmed.
 
 import { door } from "./door.js";
 import { releaseAll } from "./jog.js";
 import { $, button, clock, make, show, tell } from "./page.js";
 
+const CUT = "use the switch that cuts the power.";
+
 let open_estops = [];
-let said_of_estop = ""; // what came of the last press here
+let pressed = null; // what came of the last press here: the id that all have confirmed, or what is wrong; and the rest
 
 async function pressEstop() {
   releaseAll();
-  said_of_estop = "Stopping everything …";
-  showEstops();
+  say({ wrong: "Stopping everything … NOBODY HAS CONFIRMED IT YET." });
   try {
-    said_of_estop = reportOf(await door.estop("dashboard"));
+    say(outcomeOf(await door.estop("dashboard")));
   } catch (error) {
-    said_of_estop = `✕ THE E-STOP WAS NOT CONFIRMED: ${error.message} Use the hardware’s own.`;
+    say({ wrong: `✕ NO ROBOT CONFIRMED: ${CUT}`, rest: error.message });
   }
-  showEstops();
   await lookForEstops().catch(() => {}); // what came of it stays
 }
 
-function reportOf(told) {
+function say(outcome) {
+  pressed = outcome;
+  showEstops();
+}
+
+function outcomeOf(told) {
   const failed = Object.entries(told.failed).map(([who, why]) => `${who}: ${why}`);
-  return [
-    `Confirmed by ${told.confirmed.join(", ") || "nobody"}.`,
-    told.missing.length ? `✕ NOT CONFIRMED by ${told.missing.join(", ")}.` : "",
-    failed.length ? `✕ Failed: ${failed.join("; ")}.` : "",
-  ].filter(Boolean).join(" ");
+  const apart = Object.entries(told.apart).map(([where, why]) => `${where}: ${why}`);
+  const wrong = [
+    told.confirmed.length ? "" : "NO ROBOT CONFIRMED",
+    told.missing.length ? `NOT CONFIRMED by ${told.missing.join(", ")}` : "",
+    failed.length ? `FAILED at ${failed.join("; ")}` : "",
+    apart.length ? `NOT TOLD to who is at ${apart.join("; ")}` : "",
+  ].filter(Boolean).join("; ");
+  const rest = told.confirmed.length ? `Confirmed by ${told.confirmed.join(", ")}.` : "";
+  return wrong || !told.complete ? { wrong: `✕ ${wrong || "NOT CONFIRMED BY ALL"}: ${CUT}`, rest } : { id: told.id, rest };
 }
 
 export async function lookForEstops() {
@@ -34,28 +43,30 @@ export async function lookForEstops() {
   showEstops();
 }
 
-function showEstops() {
-  const open = open_estops;
-  show($("stopped"), JSON.stringify([open, said_of_estop, door.me?.administers]), () => [
-    open.length ? make("strong", {}, "E-STOP: nothing moves until it is cleared.") : "",
-    ...open.map((one) => make("p", {}, `${clock(one.at)} ${one.by}: ${one.reason}`)),
-    said_of_estop ? make("p", {}, said_of_estop) : "",
-    open.length && door.me?.administers ? button("Clear the e-stop", () => clearEstop(open)) : "",
-    open.length && !door.me?.administers ? make("p", {}, "Who administers the system may clear it.") : "",
-    !open.length && said_of_estop ? button("Understood", forgetEstop) : "",
-  ].filter(Boolean));
+/** Only the page that has pressed it knows who has confirmed it. */
+function headline() {
+  if (pressed?.wrong) return pressed.wrong;
+  if (open_estops.some((one) => one.id === pressed?.id)) return "E-STOP: nothing moves until it is cleared.";
+  return open_estops.length ? "E-STOP: who has heard it moves nothing until it is cleared. Who has not is not known here." : "";
 }
 
-function forgetEstop() {
-  said_of_estop = "";
-  showEstops();
+function showEstops() {
+  const open = open_estops;
+  show($("stopped"), JSON.stringify([open, pressed, door.me?.administers]), () => [
+    headline() ? make("strong", {}, headline()) : "",
+    pressed?.rest ? make("p", {}, pressed.rest) : "",
+    ...open.map((one) => make("p", {}, `${clock(one.at)} ${one.by}: ${one.reason}`)),
+    open.length && door.me?.administers ? button("Clear the e-stop", () => clearEstop(open)) : "",
+    open.length && !door.me?.administers ? make("p", {}, "Who administers the system may clear it.") : "",
+    !open.length && pressed ? button("Understood", () => say(null)) : "",
+  ].filter(Boolean));
 }
 
 async function clearEstop(open) {
   try {
     const told = await door.post("/estop/clear", { ids: open.map((one) => one.id) });
-    said_of_estop = "";
-    tell(told.complete ? "The e-stop is cleared. Nothing moves by itself, and what it stopped not before it is let." : `Not cleared by ${told.missing.join(", ")}.`);
+    pressed = null;
+    tell(told.complete ? "The e-stop is cleared. Nothing moves by itself, and what it stopped not before it is let." : `Not cleared by ${told.missing.join(", ") || "anybody that is in sight"}.`);
   } catch (error) {
     tell(`${error.title}: ${error.message}`);
   }

@@ -1,10 +1,19 @@
 // The system: containers, notifications and hooks, rules and policy, the audit record.
 
-import { door } from "./door.js";
-import { $, measure, moment, table } from "./page.js";
+import { LONG_MS, door } from "./door.js";
+import { $, make, measure, moment, show, table } from "./page.js";
 import { services } from "./schemas.js";
 
 const VERBS = ["call", "read", "register", "lock", "instrument", "administer"];
+
+/** Whom the door itself does not reach: what is behind it is not on this page, and hears no e-stop. */
+export async function lookAtSight() {
+  const { others, apart } = await door.get("/sight", LONG_MS);
+  const said = Object.entries(apart).map(([where, why]) => `✕ The door reaches nobody at ${where} (its TRADE_CONNECT): ${why}`);
+  if (!others.length) said.push("✕ The door finds nobody else in its system: no robot hears an e-stop from here.");
+  else if (said.length) said.push("The robots there are not on this page, and hear no e-stop from here.");
+  show($("apart"), JSON.stringify(said), () => said.map((one) => make("p", {}, one)));
+}
 
 export async function lookAtContainers() {
   const [there, loads] = await Promise.all([door.get("/containers"), door.get("/loads")]);
