@@ -318,6 +318,8 @@ def test_S09_an_estop_that_misses_somebody_or_finds_nobody_is_no_success(rosie_u
     nobody = trade_command("estop", "--limit", "0.2")
     assert nobody.returncode == 1
     assert "nobody was found" in nobody.stdout
+    assert "NOT GIVEN to anybody that is known: use the switch that cuts the power" in nobody.stdout
+    assert "is open" not in nobody.stdout
     rosie = rosie_up()
     rosie.program.signal(signal.SIGSTOP)
     try:

@@ -52,7 +52,7 @@ def estop(
         raise sight.nobody(system, "who is there was not told to stop; use the switch that cuts the power")
     if clear and not sight.complete:
         raise sight.nobody(system, "what is open there stays open until it is cleared once more")
-    if not report.complete:
+    if not report.complete or not (clear or _known(report, container.address.who)):
         raise typer.Exit(1)
 
 
@@ -85,12 +85,22 @@ def _say(out: Output, report: EstopReport, system: str, done: str, own: str) -> 
         hears = done == "stopped" or name not in report.versions
         missed = "did not answer" if hears else "is cleared by a `trade` of its version only"
         out.say(f"[bold red]MISSING: {escape(name)}{_version(report, name)} {missed}[/]")
-    if not (report.confirmed or report.failed or report.missing):
+    known = _known(report, own)
+    if not known:
         out.say(f"[bold red]nobody was found[/] in system {escape(system)} that has something to stop")
     if done == "cleared" and others:
         out.say("nothing moves by itself: what others had in use waits for [bold]trade resume GROUP[/]")
-    if done == "stopped":
-        out.say(f"e-stop {report.id} is open; when it is safe: [bold]trade estop --clear {report.id}[/]")
+    clear = f"[bold]trade estop --clear {report.id}[/]"
+    if done == "stopped" and known:
+        out.say(f"e-stop {report.id} is open; when it is safe: {clear}")
+    elif done == "stopped":
+        out.say("[bold red]NOT GIVEN to anybody that is known: use the switch that cuts the power[/]")
+        out.say(f"whoever was out of sight may have heard e-stop {report.id} all the same, and then needs {clear}")
+
+
+def _known(report: EstopReport, own: str) -> set[str]:
+    """Who is known to have been told, or to be there; that this command has heard of it itself says nothing."""
+    return {*report.confirmed, *report.missing, *report.failed} - {own}
 
 
 def _version(report: EstopReport, name: str) -> str:
