@@ -6,8 +6,9 @@ from typing import Any
 
 import pytest
 
+from jointed import Joint
 from trade import Container, Settings, service, where
-from trade.errors import ConfigurationError, LockedByOther, LockLost
+from trade.errors import ConfigurationError, LockedByOther, LockLost, Stopped
 
 Eventually = Callable[[Callable[[], bool]], bool]
 
@@ -62,6 +63,25 @@ def test_a_child_calls_under_the_lock_of_its_parent_until_it_is_given_back(
         assert program.heard() == answer
         program.tell("end")
         assert program.ends() == 0
+
+
+def test_S08_a_child_resumes_as_the_owner_of_the_lock_does(
+    there: Container, here: Container, start_container: Callable[..., Container], eventually: Eventually
+) -> None:
+    joint = Joint()
+    there.register(joint, "hall")
+    move = here.find(where(name="move"), wait_s=20)
+    with here.lock(where(group="hall"), purpose="go") as lock:
+        child = start_container("child", environment={**os.environ, **lock.environment()})
+        other = start_container("other")
+        other.find(where(name="stop", group="hall"), wait_s=20)()
+        with pytest.raises(Stopped):
+            move(0.1)
+        with pytest.raises(LockedByOther):
+            other.resume(where(group="hall"))
+        child.find(where(name="move"), wait_s=20)
+        assert child.resume(where(group="hall")) == ["joint"]
+        assert move(0.1) == 0.1
 
 
 def test_once_the_holder_is_gone_nothing_is_sent(

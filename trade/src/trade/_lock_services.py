@@ -145,7 +145,7 @@ class LockServices:
         call = served_call()
         found = self._table.named(resources)
         for resource in found:
-            if resource.holder is not None and not _is_for(resource.holder, call):
+            if resource.holder is not None and not self._is_for(resource, resource.holder, call):
                 raise LockedByOther(
                     resources=(resource.name,),
                     owner=resource.holder.owner,
@@ -156,6 +156,14 @@ class LockServices:
         there = self._borrowed.resume(call, found)
         return [resource.name for resource in found if _resumed(resource) or resource.name in there]
 
+    def _is_for(self, resource: Resource, holder: Holder, call: CallContext) -> bool:
+        """Whether a call is made for whoever holds a lock, or under it, as by the command of `trade lock`.
+
+        For whom else than itself, and under what, is what its caller says: who that is has to fit.
+        """
+        mine = holder.session in call.sessions or Token(self._own.epoch, resource.live) in call.tokens
+        return mine and (call.caller == holder.identity or call.caller in holder.delegates)
+
     def _require(self, call: CallContext, verb: str, resources: Iterable[str]) -> None:
         """Of each resource one service that uses it is enough for the caller to have the right over.
 
@@ -164,11 +172,6 @@ class LockServices:
         """
         for name in resources if self._access.policy is not None else ():
             self._access.require_any(call.caller, verb, self._groups(name), name)
-
-
-def _is_for(holder: Holder, call: CallContext) -> bool:
-    """Whether a call is made for whoever holds a lock; for whom else than itself is what its caller says."""
-    return holder.session in call.sessions and (call.caller == holder.identity or call.caller in holder.delegates)
 
 
 def _resumed(resource: Resource) -> bool:
