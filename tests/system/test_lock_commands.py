@@ -229,6 +229,12 @@ def test_a_group_that_is_not_there_is_guessed(rosie_up: Callable[[], Rosie], tra
         assert "did you mean rosie.neck" in said.stderr
 
 
+def test_resume_of_nothing_is_of_no_such_service(trade_command: Command) -> None:
+    said = trade_command("resume", "rosie")
+    assert said.returncode == 1
+    assert said.stderr.startswith("NoSuchService: no service matches group='rosie'")
+
+
 # --- stops
 
 

@@ -6,11 +6,14 @@ import traceback
 import pytest
 
 from jointed import WHOLE, Joint, Robot
-from trade import Handle
+from trade import Handle, where
 from trade._keys import Address
+from trade._resources import Latch
 from trade.errors import (
+    ConfigurationError,
     LockedByOther,
     LockLost,
+    NoSuchService,
     NotStopped,
     ServiceGone,
     Stopped,
@@ -176,6 +179,19 @@ def test_S08_a_stop_by_another_latches_until_the_owner_of_the_lock_resumes(robot
             robot.other.resume(WHOLE)
         assert robot.me.resume(WHOLE) == ["a"]
         assert robot.find("a")(0.3) == 0.3
+
+
+def test_resuming_waits_for_what_it_names_and_says_what_looks_like_it(robot: Robot) -> None:
+    late = Joint("late")
+    late.resource.latch = Latch("somebody", "stopped")
+    timer = threading.Timer(0.1, lambda: robot.system.container("late").register(late, "hall.late"))
+    timer.start()
+    assert robot.me.resume(where(group="hall"), wait_s=20) == ["late"]
+    with pytest.raises(NoSuchService, match="hall.late") as refused:
+        robot.me.resume(where(group="hall.lat"), wait_s=0)
+    assert refused.value.near == ("hall.late",)
+    with pytest.raises(ConfigurationError, match="nothing that matches actuates, so there is nothing to resume"):
+        robot.me.resume(where(group="robot", name="where_is_it"), wait_s=0)
 
 
 def test_a_call_under_a_lock_that_is_taken_away_writes_nothing_any_more(robot: Robot) -> None:

@@ -22,7 +22,7 @@ from trade._hooking import Hook
 from trade._hooks import Called, HookInfo
 from trade._load import LoadInfo
 from trade._lock import Lock, OnLost, OnRequest
-from trade._locking import LEASE_S
+from trade._locking import LEASE_S, RESUME_WAIT_S
 from trade._logbook import LogLine
 from trade._many import Outcome
 from trade._measures import Measure
@@ -456,9 +456,9 @@ def break_lock(which: Constraint | Iterable[Handle], reason: str) -> list[LockIn
     return container().break_lock(which, reason)
 
 
-def resume(which: Constraint | Iterable[Handle]) -> list[str]:
+def resume(which: Constraint | Iterable[Handle], *, wait_s: float = RESUME_WAIT_S) -> list[str]:
     """Let services move again after a stop by somebody else; see `Container.resume`."""
-    return container().resume(which)
+    return container().resume(which, wait_s=wait_s)
 
 
 def estop(reason: str = "", *, limit_s: float = LIMIT_S) -> EstopReport:

@@ -7,7 +7,7 @@ from trade._estop_line import EstopReport
 from trade._estopping import LIMIT_S
 from trade._handle import Handle
 from trade._lock import Lock, OnLost, OnRequest
-from trade._locking import LEASE_S, Locking
+from trade._locking import LEASE_S, RESUME_WAIT_S, Locking
 from trade._member import Member
 from trade._terms import LockInfo
 from trade._wire import Estop
@@ -99,18 +99,23 @@ class Guarding(Member):
         self._check_open()
         return self.locking.break_lock(which, reason)
 
-    def resume(self, which: Constraint | Iterable[Handle]) -> list[str]:
+    def resume(self, which: Constraint | Iterable[Handle], *, wait_s: float = RESUME_WAIT_S) -> list[str]:
         """Let services move again after a stop by somebody else.
+
+        Args:
+            which: handles, or a constraint: the actuating services that match.
+            wait_s: how long to wait for what a constraint matches to be there, in seconds.
 
         Returns:
             The resources that were stopped.
 
         Raises:
+            NoSuchService: nothing matches within ``wait_s`` seconds.
             LockedByOther: it is the owner of their lock who resumes.
             AccessDenied: without a lock of one's own it is for who administers them, says the policy.
         """
         self._check_open()
-        return self.locking.resume(which)
+        return self.locking.resume(which, wait_s)
 
     # --- e-stops
 

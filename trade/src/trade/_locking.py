@@ -29,6 +29,7 @@ _logger = logging.getLogger("trade")
 LONGEST_WAIT_S: Final = 3600.0
 LEASE_S: Final = 2.0
 """The lease of a lock is the deadman's budget, too (S12)."""
+RESUME_WAIT_S: Final = 2.0
 _SETTLE_S: Final = 1.0
 _ANSWER_S: Final = 2.0
 """So long it may take to tell what is locked."""
@@ -159,9 +160,38 @@ class Locking:
         """See `Container.request_release`."""
         return self._everywhere("request_release", which, reason)
 
-    def resume(self, which: Constraint | Iterable[Handle]) -> list[str]:
+    def resume(self, which: Constraint | Iterable[Handle], wait_s: float = RESUME_WAIT_S) -> list[str]:
         """See `Container.resume`."""
+        if not 0 <= wait_s <= LONGEST_WAIT_S:
+            raise ConfigurationError(where="resume", problem=f"wait_s must be 0 to {LONGEST_WAIT_S:g}, not {wait_s!r}")
+        if isinstance(which, Constraint):
+            self._await_some(which, wait_s)
         return self._everywhere("resume", which)
+
+    def _await_some(self, which: Constraint, wait_s: float) -> None:
+        """Wait until some of it can be resumed, and a moment for the rest; what is missing then is left out.
+
+        Raises:
+            NoSuchService: nothing matches within ``wait_s`` seconds.
+        """
+
+        def found() -> list[Handle]:
+            return [handle for handle in self._home.services(which) if handle.effect == "actuate"]
+
+        def whole() -> bool:
+            with contextlib.suppress(IncompleteGroup):
+                require_whole(which, found())
+                return True
+            return False
+
+        try:
+            self._home.await_services(which, lambda: bool(found()), wait_s)
+        except NoSuchService:
+            if not self._home.services(which):
+                raise
+            return  # what matches does not actuate, and that is said next
+        with contextlib.suppress(NoSuchService):
+            self._home.await_services(which, whole, min(wait_s, _SETTLE_S))
 
     def break_lock(self, which: Constraint | Iterable[Handle], reason: str) -> list[LockInfo]:
         """See `Container.break_lock`."""

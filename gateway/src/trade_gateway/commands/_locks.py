@@ -96,7 +96,7 @@ def resume(context: typer.Context, group: Group) -> None:
     """
     out = Output(as_json=False)
     with visitor_among_others(context) as container:
-        resumed = container.resume(_there(container, group))
+        resumed = container.resume(asked_for(f"group {group!r}", group=group, name=None))
         still = container.estops()
     for estop in still:
         why = f": {escape(estop.reason)}" if estop.reason else ""
