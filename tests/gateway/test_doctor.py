@@ -10,6 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from robots import HAND, HEAD, TAIL
+from trade._endpoints import free_endpoint
 from trade_drivers import CanBus, Found, parse
 from trade_drivers.can import ErrorState, Link
 from trade_gateway._pki import Authority
@@ -242,6 +243,31 @@ def test_the_exit_code_tells_of_errors(system: str, robot_file: Path) -> None:
         well = CliRunner().invoke(app, ["doctor", str(robot_file)])
     assert well.exit_code == 0, well.output
     assert "0 errors" in well.output
+
+
+def test_where_it_is_to_connect_and_nobody_answers_is_an_error(system: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    nowhere = free_endpoint()
+    monkeypatch.setenv("TRADE_CONNECT", nowhere)
+    said = CliRunner().invoke(app, ["doctor", "--json"])
+    assert said.exit_code == 1
+    [error] = [one for one in json.loads(said.stdout) if one["about"] == nowhere]
+    assert error["level"] == "error"
+    assert "nothing accepts connections there" in error["text"]
+    assert "no container is in sight" not in said.stdout
+
+
+def test_who_has_bad_papers_is_not_told_to_do_without(
+    system: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, where, fix in (
+        ("TRADE_TLS", str(tmp_path), "the message says what helps"),
+        ("TRADE_CONNECT", "nonsense", "correct that variable, or leave it out"),
+    ):
+        with monkeypatch.context() as changed:
+            changed.setenv(name, where)
+            found = json.loads(CliRunner().invoke(app, ["doctor", "--json"]).stdout)
+        [error] = [one for one in found if one["about"] == "settings"]
+        assert error["fix"] == fix, error
 
 
 @pytest.mark.parametrize(

@@ -229,6 +229,15 @@ def test_a_group_that_is_not_there_is_guessed(rosie_up: Callable[[], Rosie], tra
         assert "did you mean rosie.neck" in said.stderr
 
 
+def test_where_there_is_a_link_and_nobody_it_may_be_another_system(
+    trade_command: Command, start_container: Callable[..., Container]
+) -> None:
+    door = start_container("door", listen=[free_endpoint()])
+    said = trade_command("--system", "hoem", "--connect", door.settings.listen[0], "containers")
+    assert said.returncode == 1
+    assert "or is it another system than hoem there?" in said.stderr
+
+
 def test_resume_of_nothing_is_of_no_such_service(trade_command: Command) -> None:
     said = trade_command("resume", "rosie")
     assert said.returncode == 1

@@ -52,7 +52,7 @@ class Container(Hosting, Moving, Streaming, Tracing, Guarding, Bordering):
     def __init__(self, settings: Settings | None = None, *, transport: Transport | None = None) -> None:
         _process.refuse_after_fork()
         _process.note_start()
-        self.settings: Final = settings or Settings.read()
+        self.settings = settings or Settings.read()
         """What it was started with."""
         self.address = Address(self.settings.identity, self.settings.container, secrets.token_hex(6))
         self.session = str(self.address)

@@ -79,7 +79,7 @@ class Looking(Member):
                 an endpoint takes up to 3 s more for each.
         """
         self._check_open()
-        return look_around(self._parts.registry, self._parts.reach, self.address, limit_s)
+        return look_around(self._parts.registry, self._parts.reach, self.address, self.settings.system, limit_s)
 
     # --- calling
 

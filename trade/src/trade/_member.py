@@ -9,11 +9,13 @@ from trade._keys import Address, ServiceKey
 from trade._parts import Parts
 from trade._registry import Record
 from trade._run import Run
+from trade._settings import Settings
 
 
 class Member(ABC):
     """A container, as its parts see it: one part hosts, one looks up and calls, one guards."""
 
+    settings: Settings
     address: Address
     session: str
     access: Access

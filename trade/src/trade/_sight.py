@@ -14,8 +14,8 @@ __all__ = ["Sight", "look_around"]
 
 _LOOK_S: Final = 0.02
 _HIDDEN: Final = (
-    "there is a link, and nobody shows himself to {identity}; is its certificate revoked, or does the policy there not "
-    "know it?"
+    "there is a link, and nobody shows himself to {identity}; is its certificate revoked, does the policy there not "
+    "know it, or is it another system than {system} there?"
 )
 
 
@@ -49,12 +49,12 @@ class Sight(Struct, frozen=True):
         return NobodyFound(system=system, so=so, others=bool(self.others), silent=self.silent, apart=self.unanswered)
 
 
-def look_around(registry: Registry, reach: Reach | None, own: Address, limit_s: float) -> Sight:
+def look_around(registry: Registry, reach: Reach | None, own: Address, system: str, limit_s: float) -> Sight:
     """Wait until the sight is complete, for ``limit_s`` seconds at most; what it is then."""
     until = time.monotonic() + limit_s
     while not (sight := _sight(registry, reach, own)).complete and time.monotonic() < until:
         time.sleep(_LOOK_S)
-    return sight if reach is None else Sight(sight.others, sight.silent, _apart(reach, own, sight))
+    return sight if reach is None else Sight(sight.others, sight.silent, _apart(reach, own, system, sight))
 
 
 def _sight(registry: Registry, reach: Reach | None, own: Address) -> Sight:
@@ -67,11 +67,11 @@ def _sight(registry: Registry, reach: Reach | None, own: Address) -> Sight:
     )
 
 
-def _apart(reach: Reach, own: Address, sight: Sight) -> dict[str, str]:
+def _apart(reach: Reach, own: Address, system: str, sight: Sight) -> dict[str, str]:
     """Those without a link, and why; an endpoint may be linked by a link that leads from there to here."""
     found = {endpoint: reach.why_apart(endpoint, certain=not sight.others) for endpoint in sight.apart}
     apart = {endpoint: why for endpoint, why in found.items() if why}
     if not sight.others:
-        hidden = _HIDDEN.format(identity=own.identity)
+        hidden = _HIDDEN.format(identity=own.identity, system=system)
         apart |= {endpoint: hidden for endpoint in reach.configured if endpoint not in apart}
     return apart

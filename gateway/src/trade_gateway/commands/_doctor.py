@@ -9,7 +9,7 @@ from msgspec.structs import replace
 from rich.markup import escape
 
 from trade._toml import read_toml_text
-from trade.errors import TradeError
+from trade.errors import ConfigurationError, TradeError
 from trade_drivers import SerialBus, drivers, load, refusals
 from trade_gateway.commands import _doctor_host as host
 from trade_gateway.commands import _doctor_robot as robots
@@ -63,7 +63,7 @@ def _of_host(context: typer.Context, robot_file: Path | None) -> Iterator[Findin
     try:
         settings = choice_of(context).settings()
     except TradeError as bad:
-        yield Finding(level="error", about="settings", text=str(bad), fix="correct that variable, or leave it out")
+        yield Finding(level="error", about="settings", text=str(bad), fix=_fix_of(bad))
         return
     if settings.tls is not None:
         yield from host.certificate(settings.tls)
@@ -75,6 +75,12 @@ def _of_host(context: typer.Context, robot_file: Path | None) -> Iterator[Findin
         yield Finding(
             level="error", about=f"system {settings.system}", text=str(bad), fix="the message says what helps"
         )
+
+
+def _fix_of(bad: TradeError) -> str:
+    """Papers are not left out: without TRADE_TLS a system that has them lets nobody in."""
+    papers = isinstance(bad, ConfigurationError) and bad.where.endswith(".pem")
+    return "the message says what helps" if papers else "correct that variable, or leave it out"
 
 
 def _lines_of(path: Path | None) -> list[str]:
