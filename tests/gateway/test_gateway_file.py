@@ -1,5 +1,6 @@
 """Gateway files: what is right is taken as it stands, what is wrong is named with its remedy before anything starts."""
 
+import shutil
 from datetime import timedelta
 from pathlib import Path
 
@@ -7,12 +8,16 @@ import pytest
 from typer.testing import CliRunner
 
 from certificates import Papers
+from trade._endpoints import loopback_interface
 from trade._tls import Certificate
 from trade.errors import ConfigurationError
+from trade_gateway import _gateway_file
 from trade_gateway._gateway_changes import Named, digest, named_by
 from trade_gateway._gateway_file import read_gateway_file
+from trade_gateway._hosts import addresses, forwarding
 from trade_gateway._pki import Authority
 from trade_gateway.cli import app
+from trade_gateway.commands import _gateway
 from trade_gateway.supervisor import Child
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "gateway.toml"
@@ -283,6 +288,87 @@ def test_check_starts_nothing(file: Path) -> None:
     change(file, 'interface = "eth1"', 'interface = "eth0"')
     with pytest.raises(ConfigurationError):
         CliRunner().invoke(app, ["gateway", str(file), "--check"], catch_exceptions=False)
+
+
+# --- what this host is like
+
+
+def has(monkeypatch: pytest.MonkeyPatch, **addresses: str) -> None:
+    """This host has these interfaces alone, each with its addresses, separated by spaces."""
+    known = {name: frozenset(each.split()) for name, each in addresses.items()}
+    monkeypatch.setattr(_gateway_file, "addresses", lambda: {"lo": frozenset({"127.0.0.1"}), **known})
+
+
+def checked(file: Path) -> str:
+    told = CliRunner().invoke(app, ["gateway", str(file), "--check"])
+    return str(told.exception) if told.exception else told.stderr
+
+
+def test_interfaces_that_were_swapped_are_refused_before_anything_starts(
+    file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    has(monkeypatch, eth0="192.168.7.1", eth1="10.0.0.7")
+    assert "is an address" not in checked(file)
+    has(monkeypatch, eth0="10.0.0.7", eth1="192.168.7.1 192.168.8.1")
+    said = checked(file)
+    assert said.startswith(f"{file}: network.robot.listen: tls/192.168.7.1:7450 is an address of eth1 on this host")
+    assert "interface is eth0" in said and "(10.0.0.7)" in said
+    started = CliRunner().invoke(app, ["gateway", str(file)])  # no other way to start it
+    assert str(started.exception) == said
+    assert read_gateway_file(file)  # as `trade system` reads it for other hosts
+
+
+def test_a_host_that_has_the_address_nowhere_or_twice_says_nothing(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    has(monkeypatch, eth0="172.16.0.1")
+    assert "is an address" not in checked(file)
+    has(monkeypatch, eth0="192.168.7.1", eth1="10.0.0.7", br0="192.168.7.1 10.0.0.7")
+    assert "is an address" not in checked(file)
+
+
+def test_loopback_is_of_the_first_network_and_everywhere_of_all(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    has(monkeypatch, eth0="192.168.7.1", eth1="10.0.0.7")
+    file = tmp_path / "gateway.toml"
+
+    def lab(first: str, second: str) -> Path:
+        networks = (
+            f'[network.a]\ninterface = "eth0"\nlisten = ["{first}"]\n[network.b]\ninterface = "eth1"\n'
+            f'listen = ["{second}"]\n'
+        )
+        file.write_text(f'{ALONE}insecure_lan = true\ncredentials = "a:b"\n{networks}')
+        return file
+
+    assert "is an address" not in checked(lab("tcp/127.0.0.1:7450", "tcp/10.0.0.7:7450"))
+    assert "is an address" not in checked(lab("tcp/0.0.0.0:7450", "tcp/[::]:7450"))
+    assert "network.b.listen: tcp/127.0.0.1:7451 is an address of lo" in checked(
+        lab("tcp/192.168.7.1:7450", "tcp/127.0.0.1:7451")
+    )
+
+
+def test_the_addresses_of_this_host_are_told_by_interface(tmp_path: Path) -> None:
+    listing = tmp_path / "if_inet6"
+    listing.write_text("fd000000000000000000000000000002 02 40 00 80     eth7\n")
+    found = addresses(listing)
+    assert "127.0.0.1" in found[loopback_interface()]
+    assert found["eth7"] == {"fd00::2"}
+    assert "127.0.0.1" in addresses(tmp_path / "no IPv6")[loopback_interface()]
+
+
+def test_a_host_that_forwards_between_the_networks_is_told_of(
+    file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sysctls = tmp_path / "net"
+    for version, name, value in (("ipv4", "eth0", 1), ("ipv4", "eth1", 0), ("ipv6", "eth1", 2)):
+        (sysctls / version / "conf" / name).mkdir(parents=True)
+        (sysctls / version / "conf" / name / "forwarding").write_text(f"{value}\n")
+    on = forwarding(["eth0", "eth1", "eth2"], sysctls)
+    assert on == ["net.ipv4.conf.eth0.forwarding", "net.ipv6.conf.eth1.forwarding"]
+    has(monkeypatch)
+    monkeypatch.setattr(_gateway, "forwarding", lambda names: forwarding(names, sysctls))
+    assert "packets on between its networks (net.ipv4.conf.eth0.forwarding, net" in checked(file)
+    shutil.rmtree(sysctls)
+    assert checked(file) == ""
 
 
 # --- other systems

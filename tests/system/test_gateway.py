@@ -1,6 +1,8 @@
 """``trade gateway`` between networks: what crosses, what does not, and what becomes of it on bad days."""
 
 import signal
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -137,6 +139,22 @@ def test_a_wrong_file_changes_nothing_and_says_why(site: Site, planner: Member) 
     site.change(site.file, 'polcy = "policy.toml"', 'policy = "policy.toml"\nconnect = ["tcp/10.231.2.9:1"]')
     wait_until(lambda: "must be tls/10.231.2.9:1" in site.complaints(), "so is this")
     planner.ask("move", "rosie.arm", "1")
+
+
+def test_a_file_with_its_interfaces_swapped_starts_nothing(site: Site) -> None:
+    """Else `left`, which exports one group, would be taken for `right`, and the other way round."""
+    swapped = (
+        site.file.read_text().replace('"net1"', '"other"').replace('"net2"', '"net1"').replace('"other"', '"net2"')
+    )
+    site.end(signal.SIGTERM)
+    site.file.write_text(swapped)
+    for more in ([], ["--check"]):
+        command = ["ip", "netns", "exec", site.networks.host("between"), sys.executable, "-m", "trade_gateway"]
+        ended = subprocess.run(
+            [*command, "gateway", str(site.file), *more], capture_output=True, text=True, timeout=60, check=False
+        )
+        assert ended.returncode == 1
+        assert "network.private.listen: tls/10.231.1.1:7450 is an address of net1 on this host" in ended.stderr
 
 
 def test_S12_a_gateway_that_opens_anew_loses_nobody_no_call_and_no_lock(

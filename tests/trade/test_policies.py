@@ -115,7 +115,10 @@ WRONG = {
     ),
     "no identity": ("[roles.a]\n[identities]\n'a/b' = ['a']\n", r"identities: 'a/b' is no identity"),
     "revoked pattern": ("revoked = ['a*']\n" + ROLE.format(""), r"revoked: 'a\*' is no identity; name each in full"),
-    "no revoked file": ("revoked_file = 'r.toml'\n" + ROLE.format(""), r"revoked_file: there is no .*r.toml; write it"),
+    "no revoked file": (
+        "revoked_file = 'r.toml'\n" + ROLE.format(""),
+        r"revoked_file: there is no .*r.toml; copy revoked.toml there from the authority",
+    ),
     "revoked file no path": ("revoked_file = 1\n" + ROLE.format(""), r"revoked_file: must be a path"),
 }
 

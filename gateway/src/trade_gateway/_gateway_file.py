@@ -2,7 +2,7 @@
 
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Final, NamedTuple, cast
 
@@ -10,9 +10,11 @@ import msgspec
 from msgspec import Meta, Struct
 
 from trade import Settings
+from trade._endpoints import Endpoint, loopback_interface
 from trade._toml import read_toml_text
 from trade.errors import ConfigurationError
 from trade.policies import EVERYTHING, read_policy
+from trade_gateway._hosts import addresses
 from trade_gateway._parts import Around
 from trade_gateway.supervisor import Child, read_children
 
@@ -210,6 +212,48 @@ class Plan(NamedTuple):
         return (
             f"does not name the gateway {name!r}, so nobody believes it whom it speaks for; write gateways = [{said}]"
         )
+
+    def check_here(self, where: Path) -> None:
+        """That each network listens at addresses of its own interface, as far as this host has them.
+
+        Who dials is taken to be of the network whose interface has the address, so that with two of them swapped the
+        one would see what is of the other.
+
+        Raises:
+            ConfigurationError: an address is of another interface of this host.
+        """
+        here, known = loopback_interface(), addresses()
+        interfaces = [network.interface for network in self.file.network.values()]
+        for name, network in self.file.network.items():
+            own = {network.interface}
+            if network.interface == interfaces[0] and here not in interfaces:
+                own.add(here)  # containers of the gateway's host belong to the first network
+            for endpoint in network.listen:
+                if others := _others_at(endpoint, own, known):
+                    problem = (
+                        f"{endpoint} is an address of {', '.join(others)} on this host, and interface is "
+                        f"{network.interface}: who dials there would count as of another network, and see what that "
+                        f"does not export; write an address of {network.interface} "
+                        f"({_listed(known.get(network.interface, ()))}), or the interface that has this one"
+                    )
+                    raise ConfigurationError(where=f"{where}: network.{name}.listen", problem=problem)
+
+
+def _others_at(endpoint: str, own: set[str], known: Mapping[str, frozenset[str]]) -> list[str]:
+    """The interfaces of this host that have an address of an endpoint, if none of its own has."""
+    place = Endpoint.read(endpoint)
+    if place.everywhere:
+        return []
+    for one in place.resolved():
+        address = Endpoint.read(one).host.strip("[]").partition("%")[0]
+        having = sorted(name for name, has in known.items() if address in has)
+        if having and not own.intersection(having):
+            return having
+    return []
+
+
+def _listed(known: Iterable[str]) -> str:
+    return ", ".join(sorted(known)) or "this host has none of it"
 
 
 def read_gateway_file(path: Path) -> Plan:

@@ -161,7 +161,10 @@ def _names(raw: _Table, key: str, where: str) -> tuple[str, ...]:
 
 def _revoked_elsewhere(path: Path, named_in: str) -> tuple[str, ...]:
     if not path.exists():
-        problem = f'there is no {path}; write it, with revoked = [] or revoked = ["name"]'
+        problem = (
+            f"there is no {path}; copy revoked.toml there from the authority's folder (trade pki keeps it beside "
+            "ca.pem), and again after each trade pki revoke: an empty one in its place would let the revoked in"
+        )
         raise _wrong(f"{named_in}: revoked_file", problem)
     raw = _load(path)
     _only_known(raw, ("revoked",), str(path))

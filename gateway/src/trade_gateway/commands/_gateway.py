@@ -19,6 +19,7 @@ from trade_gateway._asked import Asked
 from trade_gateway._gateway_changes import Named, digest, named_by
 from trade_gateway._gateway_file import Plan, read_gateway_file
 from trade_gateway._guests import Guests, opened
+from trade_gateway._hosts import forwarding
 from trade_gateway.commands._detached import Detach, detach_now, ready
 from trade_gateway.commands._list import Json
 from trade_gateway.commands._notify import Notifier
@@ -47,6 +48,8 @@ def gateway(
     """
     out, notifier = Output(as_json=as_json), Notifier()
     plan = read_gateway_file(file)
+    plan.check_here(file)
+    _warn_of_forwarding(plan)
     if check:
         if unnamed := plan.unnamed:
             raise ConfigurationError(where=str(plan.settings.policy), problem=unnamed)
@@ -128,6 +131,7 @@ class Gateway:
         """
         try:
             plan = read_gateway_file(file)
+            plan.check_here(file)
             named = named_by(file, plan)
         except TradeError as wrong:
             complain(f"{file} was changed and is wrong; going on as before: {wrong}")
@@ -197,6 +201,17 @@ def hangups() -> Generator[Asked]:
     finally:
         if number is not None:
             signal.signal(number, before)
+
+
+def _warn_of_forwarding(plan: Plan) -> None:
+    """The host's kernel would carry what the gateway does not."""
+    interfaces = [network.interface for network in plan.file.network.values()]
+    if len(plan.file.network) + len(plan.file.share) > 1 and (on := forwarding(interfaces)):
+        complain(
+            f"this host passes packets on between its networks ({', '.join(on)}), so who has a route through it can "
+            "dial containers beyond the gateway, and no `export` counts there; sudo sysctl -w net.ipv4.ip_forward=0 "
+            "net.ipv6.conf.all.forwarding=0, or have a firewall drop what is forwarded between them"
+        )
 
 
 def _status(running: Gateway) -> str:

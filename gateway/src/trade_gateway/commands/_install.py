@@ -49,7 +49,9 @@ def install(
         if not form.fullmatch(given):
             raise UsageError(where=f"{option} {given}", problem="is no such name; use letters, digits, _ and -")
     _require_there(file, root)
-    read_gateway_file(file)
+    plan = read_gateway_file(file)
+    if root == Path("/"):
+        plan.check_here(file)
     named = named_files(file)
     bodies = {root / _UNITS / f"{name}.service": _unit(named, user, root), root / _RULES: UDEV_RULES}
     texts = {path: _marked(body) for path, body in bodies.items()}
