@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from msgspec import structs
 from typer.testing import CliRunner
 
 from trade._audit_chain import AuditRow
@@ -73,6 +74,16 @@ def test_the_records_of_all_containers_are_shown_in_order_of_time(folder: Path) 
     ]
     last = trade("audit", folder).stdout.splitlines()[-1]
     assert "refused   arm: anna rosie.arm.grip AccessDenied: no rule gives berta [call]  (call 7)" in last
+
+
+def test_who_acted_through_a_door_is_shown_and_found_by_name(tmp_path: Path) -> None:
+    by_anna = structs.replace(row("rosie.neck.look", time.time(), who="page"), session="page/door/1f/anna.6")
+    write(tmp_path / "neck.sqlite", [by_anna, structs.replace(by_anna, session="page/door/1f/bert.7")])
+    shown = trade("audit", tmp_path, "--who", "anna").stdout.splitlines()
+    assert len(shown) == 1
+    assert "neck: page for anna rosie.neck.look" in shown[0]
+    assert len(whats(tmp_path, "--who", "page")) == 2
+    assert whats(tmp_path, "--who", "carl") == []
 
 
 def test_the_folder_of_the_containers_is_the_one_that_is_meant(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

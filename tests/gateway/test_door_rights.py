@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from doors import POLICY, Client, Opened, ask, govern, governed, heard, say
+from trade._audit import Event
 from trade._audit_chain import AuditRow
 from trade._audit_store import AuditStore
 from trade.errors import ConfigurationError
@@ -70,6 +71,27 @@ def test_locks_resuming_and_clearing_are_the_clients_rights_too(door: Opened) ->
     assert given["complete"]
     assert anna.ask("POST", "/estop/clear", {"ids": [given["id"]]}).title == "AccessDenied"
     assert chief.ask("POST", "/estop/clear", {"ids": [given["id"]]}).body["complete"]
+
+
+def test_what_a_client_is_refused_and_who_cleared_an_e_stop_is_on_record(
+    door: Opened, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[Event] = []
+    monkeypatch.setattr(door.robot.me._parts.audit, "_tell", told.append)
+    bert, chief = door.client("bert"), door.client("chief")
+    bert.call("robot.a.move", 2.0)
+    with bert.socket() as page:
+        ask(page, do="call", id=1, group="robot.a", name="move", args=[1.0])
+    given = bert.ask("POST", "/estop").body
+    bert.ask("POST", "/estop/clear", {"ids": [given["id"]]})
+    chief.ask("POST", "/estop/clear", {"ids": [given["id"]]})
+    refused = [(one.who, one.what, one.outcome) for one in told if one.kind == "refused"]
+    move, clear = ("robot.a.move", "AccessDenied"), (f"e-stop {given['id']}", "AccessDenied")
+    assert refused == [("bert", *move), ("bert", *move), ("bert", *clear)]
+    assert "no rule of role viewer" in told[0].why
+    assert [(one.who, one.about) for one in told if one.what == "e-stop clearing"] == [("chief", given["id"])]
+    Client(door.door.url, "not a token").ask("GET", "/services")
+    assert len([one for one in told if one.kind == "refused"]) == 3  # else anybody could fill the record
 
 
 def test_a_client_is_told_who_it_is_and_what_it_may_do(door: Opened) -> None:

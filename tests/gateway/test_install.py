@@ -1,6 +1,7 @@
 """What `trade install` writes: only what is its own, and a unit that may do no more than its gateway needs."""
 
 import os
+import pwd
 import re
 import shutil
 import subprocess
@@ -15,6 +16,7 @@ from trade.errors import ConfigurationError
 from trade_drivers import load
 from trade_gateway.cli import app
 from trade_gateway.commands import _install
+from trade_gateway.commands._install import _closed_to
 from trade_gateway.commands._output import UsageError
 from trade_gateway.commands._unit import UDEV_RULES, Needs, needs_of, unit_text
 
@@ -109,6 +111,26 @@ def test_what_somebody_else_wrote_or_changed_is_overwritten_only_by_force(file: 
     assert (rules(root).read_text(), unit(root).exists()) == (theirs, False)
     install(file, root, "--force")
     assert UDEV_RULES in rules(root).read_text()
+
+
+def test_what_the_services_user_may_not_read_is_warned_of_with_the_remedy(tmp_path: Path) -> None:
+    own, papers = tmp_path / "etc", tmp_path / "etc" / "gate"
+    papers.mkdir(parents=True)
+    user = pwd.getpwnam("nobody")
+    file, key, elsewhere = own / "gateway.toml", papers / "key.pem", tmp_path / "elsewhere"
+    for path, mode in ((file, 0o644), (key, 0o600), (elsewhere, 0o600), (own, 0o755), (papers, 0o700)):
+        path.touch()
+        path.chmod(mode)
+    told = list(_closed_to("nobody", [file, key, elsewhere]))
+    assert [words.split(", so")[0] for words in told] == [
+        f"user nobody cannot enter {papers}",
+        f"user nobody cannot read {key}",
+    ]
+    assert f"sudo chgrp {user.pw_gid} {papers} && sudo chmod 0750 {papers}" in told[0]
+    papers.chmod(0o755)
+    key.chmod(0o644)
+    assert not list(_closed_to("nobody", [file, key]))
+    assert not list(_closed_to("no-such-user", [file, key]))
 
 
 def test_what_the_service_may_not_find_is_warned_of(file: Path, root: Path, tmp_path: Path) -> None:

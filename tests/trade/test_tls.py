@@ -292,6 +292,23 @@ def said_of_the_end(caplog: pytest.LogCaptureFixture, name: str) -> int:
     return caplog.text.count(f"the certificate of {name} ends")
 
 
+def test_a_folder_that_this_user_may_not_enter_is_named_with_its_owner(
+    papers: Papers, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = papers.of("arm")
+
+    def denied(_self: Path, **_: object) -> str:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "read_text", denied)
+    monkeypatch.setattr(os, "access", lambda path, _mode: Path(path) != folder)
+    with pytest.raises(ConfigurationError) as refused:
+        Certificate.read(folder)
+    assert f"{folder} is of {folder.owner()}:{folder.group()}, with mode 0700; give it to a group" in str(refused.value)
+    assert f"chmod 0750 {folder}" in str(refused.value)
+    assert "trade pki issue" not in str(refused.value)
+
+
 def test_with_and_without_certificates_are_not_linked_and_it_says_so(
     start_container: Any, papers: Papers, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -5,7 +5,7 @@ import secrets
 import threading
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 from trade import _process
 from trade._access import Access, verb_of
@@ -107,21 +107,34 @@ class Container(Hosting, Moving, Streaming, Tracing, Guarding, Bordering):
         """
         self._parts.audit.changed(what, about, running.get())
 
-    def note_asked(self, what: str, about: str = "", *, outcome: str = "ok", why: str = "", took_ns: int = 0) -> None:
+    def note_asked(
+        self,
+        what: str,
+        about: str = "",
+        *,
+        kind: Literal["call", "stop", "refused"] = "call",
+        who: str = "",
+        outcome: str = "ok",
+        why: str = "",
+        took_ns: int = 0,
+    ) -> None:
         """Have in the record, if one is kept, what somebody asked of a program that speaks for him: an agent's tool.
 
         Args:
             what: in a few words.
             about: which service; no arguments, as these may be secret.
+            kind: of the row.
+            who: whom it speaks for, where that is another one each time; else it is this container.
             outcome: ``ok``, or the type of the error.
             why: what the error says.
             took_ns: how long it took.
         """
         own = self.address
         self._parts.audit.note(
-            *("call", what),
+            kind,
+            what,
             about=about,
-            who=own.identity,
+            who=who or own.identity,
             session=str(own),
             outcome=outcome,
             why=why,

@@ -9,6 +9,7 @@ from msgspec import Struct
 
 from trade._keys import Address
 from trade._ongoing import Ongoing
+from trade._session import client_of
 from trade._wire import Behalf, Token
 from trade.errors import Cancelled, LockLost
 
@@ -55,8 +56,8 @@ class CallContext(Struct, frozen=True, gc=False):
     @property
     def asker(self) -> str:
         """Who asks, for people: its caller, and the client that this one acts for: ``page for anna``."""
-        client = self.session.split("/")[3:]
-        return f"{self.caller} for {client[0].rpartition('.')[0]}" if client else self.caller
+        client = client_of(self.session)
+        return f"{self.caller} for {client}" if client else self.caller
 
     @property
     def sessions(self) -> tuple[str, ...]:

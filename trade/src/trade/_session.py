@@ -9,7 +9,7 @@ from trade._keys import Address
 from trade._transport import Presence
 from trade.errors import SessionEnded
 
-__all__ = ["Session", "foreign", "speaking"]
+__all__ = ["Session", "client_of", "foreign", "speaking"]
 
 speaking: ContextVar["Session | None"] = ContextVar("trade_session", default=None)
 """The session that calls are made in now; none: the container's own."""
@@ -23,6 +23,12 @@ def foreign(session: str) -> str:
     identity, *chunks = session.split("/")
     system, crossed, client = chunks[2].partition(":") if len(chunks) == 3 else ("", "", "")
     return f"{system}/{client.rpartition('.')[0]} via {identity}" if crossed else ""
+
+
+def client_of(session: str) -> str:
+    """``anna``, if that session is one of a client for whom a container acts; else nothing."""
+    client = session.split("/")[3:]
+    return client[0].rpartition(".")[0] if client else ""
 
 
 class Session:

@@ -105,6 +105,8 @@ def _check_file(path: Path, mark: str) -> None:
     try:
         text = path.read_text(encoding="ascii", errors="replace")
         mode = path.stat().st_mode
+    except PermissionError as bad:
+        raise ConfigurationError(where=str(path), problem=f"cannot be read ({bad.strerror}): {_closed(path)}") from None
     except OSError as bad:
         problem = f"cannot be read ({bad.strerror}); {_ISSUE}"
         raise ConfigurationError(where=str(path), problem=problem) from None
@@ -113,6 +115,18 @@ def _check_file(path: Path, mark: str) -> None:
         raise ConfigurationError(where=str(path), problem=f"is no {kind} in PEM form; {_ISSUE}")
     if path.name == _KEY and os.name == "posix" and stat.S_IMODE(mode) & _OTHERS:
         raise ConfigurationError(where=str(path), problem=f"others can read it: chmod 600 {path}")
+
+
+def _closed(path: Path) -> str:
+    """What keeps this user from reading a file, and what helps."""
+    folder = next((above for above in reversed(path.absolute().parents) if not os.access(above, os.X_OK)), None)
+    what, mode = (path, "0640") if folder is None else (folder, "0750")
+    try:
+        whose = f"is of {what.owner()}:{what.group()}, with mode {stat.S_IMODE(what.stat().st_mode):04o}"
+    except (OSError, KeyError, NotImplementedError):
+        whose = "is closed to this user"
+    remedy = f"sudo chgrp GROUP {what} && sudo chmod {mode} {what}"
+    return f"{what} {whose}; give it to a group that this user is of: {remedy}"
 
 
 def _proven(folder: Path) -> dict[str, Any]:

@@ -22,6 +22,7 @@ from trade import (
 )
 from trade import Stream as Samples
 from trade.errors import (
+    AccessDenied,
     Cancelled,
     ConfigurationError,
     LockLost,
@@ -295,7 +296,15 @@ class Deeds:
         if not ids:
             await self.counted(who, self._require_all_heard)
             return messages.Stopped("", True, (), (), {})
-        return _stopped(await self.counted(who, self._container.estop_clear, ids))
+        report = await self.counted(who, self._container.estop_clear, ids)
+        self._container.note_asked("e-stop clearing", ", ".join(ids), kind="stop", who=who)
+        return _stopped(report)
+
+    def note_refused(self, error: BaseException) -> None:
+        """Have in the record what the policy lets a client not do; what it lets this container not do is there."""
+        if isinstance(error, AccessDenied) and error.who != self._container.address.identity:
+            why, outcome = str(error), type(error).__name__
+            self._container.note_asked(error.what, kind="refused", who=error.who, outcome=outcome, why=why)
 
     def _require_all_heard(self) -> None:
         sight = self._container.sight(limit_s=_HEARD_S)

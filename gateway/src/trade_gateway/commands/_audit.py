@@ -15,6 +15,7 @@ import msgspec
 import typer
 from rich.markup import escape
 
+from trade._session import client_of
 from trade.auditing import AuditRow, Verdict, moved_aside_in, reading, records_in, verify
 from trade.errors import ConfigurationError
 from trade_gateway.commands._by_default import FirstByDefault
@@ -47,7 +48,7 @@ class Told(NamedTuple):
 def show(
     folder: Folder,
     since: Annotated[str, typer.Option(help="30m, 12h or 7d ago, or a moment: 2026-11-21T08:00.")] = "",
-    who: Annotated[str, typer.Option(help="Only of this identity; * and ? stand for anything.")] = "*",
+    who: Annotated[str, typer.Option(help="Only of this identity, or a door's client; * and ? are anything.")] = "*",
     service: Annotated[str, typer.Option(help="Only this service; likewise.")] = "*",
     container: Annotated[str, typer.Option(help="Only from the record of this container; likewise.")] = "*",
     kind: Annotated[
@@ -70,7 +71,8 @@ def show(
         for told in heapq.merge(*found, key=lambda told: told.row.at_ns):
             row = told.row
             meant = row.at_ns >= after_ns and kind in (None, row.kind) and call in (None, row.call_id, row.outer_id)
-            patterns = ((row.who, who), (row.what, service), (told.container, container))
+            patterns = ((row.what, service), (told.container, container))
+            meant = meant and any(fnmatch.fnmatchcase(name, who) for name in (row.who, client_of(row.session)))
             if meant and all(fnmatch.fnmatchcase(text, pattern) for text, pattern in patterns):
                 _say(out, told)
         if not follow:
@@ -214,7 +216,8 @@ def _say(out: Output, told: Told) -> None:
     why = f": {row.why}" if row.why else ""
     began = f" of {row.outer_id}" if row.outer_id != row.call_id else ""
     call = f"  (call {row.call_id}{began})" if row.call_id else ""
-    who = row.who or "-"
+    client = client_of(row.session)
+    who = f"{row.who} for {client}" if client else row.who or "-"
     out.say(escape(f"{at} {row.kind:9} {told.container}: {who} {row.what}{about}{end}{why}{call}"))
 
 

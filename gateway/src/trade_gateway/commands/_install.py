@@ -6,7 +6,8 @@ import pwd
 import re
 import shlex
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -86,9 +87,33 @@ def _doubts(named: Named, user: str, root: Path) -> Iterable[str]:
             yield f"{what} {seen} lies in {hidden}: {why}"
         elif checkout := next((one for one in path.parents if (one / ".git").exists()), None):
             yield f"{what} {seen} lies in the checkout {checkout}: a change of it changes the service"
+    yield from _closed_to(user, named.files) if root == Path("/") else ()
     for port in needs_of(map(load, named.robots)).devices:
         if (hidden := hidden_in(Path(port))) is not None:
             yield f"port {port} lies in {hidden}, which the service does not see: is it a simulated one?"
+
+
+def _closed_to(user: str, files: Sequence[Path]) -> Iterable[str]:
+    """What beside the gateway file, or above it there, is in the way of a user who is to read it all; each once."""
+    try:
+        known = pwd.getpwnam(user)
+    except KeyError:  # to be made yet, which is said
+        return
+    groups, own = os.getgrouplist(user, known.pw_gid), files[0].parent
+    beside = (path for file in files for path in (*reversed(file.parents), file) if path.is_relative_to(own))
+    for path in dict.fromkeys(beside):
+        with suppress(OSError):
+            if not _may(path.stat(), known.pw_uid, groups, is_folder=path.is_dir()):
+                deed, mode = ("enter", "0750") if path.is_dir() else ("read", "0640")
+                named = shlex.quote(str(path))
+                remedy = f"sudo chgrp {known.pw_gid} {named} && sudo chmod {mode} {named}"
+                yield f"user {user} cannot {deed} {path}, so the service will not start: {remedy}"
+
+
+def _may(path: os.stat_result, uid: int, groups: Sequence[int], *, is_folder: bool) -> bool:
+    """Whether that user may enter a folder, or read a file."""
+    shift = 6 if path.st_uid == uid else 3 if path.st_gid in groups else 0
+    return bool(path.st_mode >> shift & (0o1 if is_folder else 0o4))
 
 
 def _seen(path: Path, root: Path) -> Path:

@@ -40,28 +40,43 @@ class Http:
     def routes(self) -> list[Route]:
         """All of them, for an application."""
         return [
-            _route("/openapi.json", GET=self.openapi),
-            _route("/services", "group", "name", GET=self.services),
-            _route("/me", GET=self.me),
-            _route("/containers", GET=self.containers),
-            _route("/sight", GET=self.sight),
-            _route("/loads", GET=self.loads),
-            _route("/notifications", GET=self.notifications),
-            _route("/hooks", GET=self.hooks),
-            _route("/policy", GET=self.policy),
-            _route("/audit", GET=self.audit),
-            _route("/tracing", POST=self.tracing),
-            _route("/call/{group}/{name}", POST=self.call),
-            _route("/session", POST=self.open_session, GET=self.session, DELETE=self.close_session),
-            _route("/locks", GET=self.locks, POST=self.lock),
-            _route("/locks/request", POST=self.request_release),
-            _route("/locks/break", POST=self.break_locks),
-            _route("/locks/{lock}", DELETE=self.unlock),
-            _route("/resume", POST=self.resume),
-            _route("/estops", GET=self.estops),
-            _route("/estop", POST=self.estop),
-            _route("/estop/clear", POST=self.clear),
+            self._route("/openapi.json", GET=self.openapi),
+            self._route("/services", "group", "name", GET=self.services),
+            self._route("/me", GET=self.me),
+            self._route("/containers", GET=self.containers),
+            self._route("/sight", GET=self.sight),
+            self._route("/loads", GET=self.loads),
+            self._route("/notifications", GET=self.notifications),
+            self._route("/hooks", GET=self.hooks),
+            self._route("/policy", GET=self.policy),
+            self._route("/audit", GET=self.audit),
+            self._route("/tracing", POST=self.tracing),
+            self._route("/call/{group}/{name}", POST=self.call),
+            self._route("/session", POST=self.open_session, GET=self.session, DELETE=self.close_session),
+            self._route("/locks", GET=self.locks, POST=self.lock),
+            self._route("/locks/request", POST=self.request_release),
+            self._route("/locks/break", POST=self.break_locks),
+            self._route("/locks/{lock}", DELETE=self.unlock),
+            self._route("/resume", POST=self.resume),
+            self._route("/estops", GET=self.estops),
+            self._route("/estop", POST=self.estop),
+            self._route("/estop/clear", POST=self.clear),
         ]
+
+    def _route(self, path: str, *query: str, **by_method: Answer) -> Route:
+        async def answer(request: Request) -> Response:
+            method = "GET" if request.method == "HEAD" else request.method
+            asked = [name for name, _ in request.query_params.multi_items()]
+            try:
+                if unknown := sorted({name for name in asked if name not in query or asked.count(name) > 1}):
+                    raise BadMessage(problem=f"{', '.join(unknown)} cannot be asked for here, or not twice")
+                return await by_method[method](request)
+            except TradeError as error:
+                self._deeds.note_refused(error)
+                headers = {"WWW-Authenticate": 'Bearer realm="trade"'} if isinstance(error, NotLetIn) else None
+                return problem_response(error, headers)
+
+        return Route(path, answer, methods=list(by_method))
 
     # --- looking
 
@@ -260,21 +275,6 @@ async def _read(request: Request) -> bytes:
 
 def _answer(value: Any, status: int = 200) -> Response:
     return Response(messages.encoder.encode(value), status, media_type="application/json")
-
-
-def _route(path: str, *query: str, **by_method: Answer) -> Route:
-    async def answer(request: Request) -> Response:
-        method = "GET" if request.method == "HEAD" else request.method
-        asked = [name for name, _ in request.query_params.multi_items()]
-        try:
-            if unknown := sorted({name for name in asked if name not in query or asked.count(name) > 1}):
-                raise BadMessage(problem=f"{', '.join(unknown)} cannot be asked for here, or not twice")
-            return await by_method[method](request)
-        except TradeError as error:
-            headers = {"WWW-Authenticate": 'Bearer realm="trade"'} if isinstance(error, NotLetIn) else None
-            return problem_response(error, headers)
-
-    return Route(path, answer, methods=list(by_method))
 
 
 async def refused(_request: Request, error: Exception) -> Response:

@@ -149,6 +149,7 @@ class Conversation:
         try:
             ongoing = self._admitted(asked)
         except TradeError as error:
+            self._deeds.note_refused(error)
             self._note({"id": asked.id, "problem": problem_of(error)})
             return
         self._ongoing[asked.id] = ongoing
@@ -173,6 +174,7 @@ class Conversation:
                 result = await self._done(ongoing)
             answer = {"id": name, "result": result}
         except Exception as error:  # noqa: BLE001 - whatever a provider raises is for the client
+            self._deeds.note_refused(error)
             answer = {"id": name, "problem": problem_of(error)}
         del self._ongoing[name]
         await self._say(answer)
