@@ -222,7 +222,7 @@ def test_a_limit_that_would_not_hold_is_refused(file: Path, limit: str, said: st
         ('policy = "policy.toml"', 'polcy = "policy.toml"', r"polcy: unknown key; there is system, name, tls, policy"),
         ("export = []", 'exports = ["rosie"]', r"exports: unknown key; there is interface, listen, export"),
         ("export = []", 'export = ["rosie.*"]', r"network.lab.export: 'rosie.\*' is no group"),
-        ("export = []", 'export = "rosie"', r"network.export: Expected `array"),
+        ("export = []", 'export = "rosie"', r"network.lab.export: Expected `array"),
         ('tls = "pki/issued/door"', "", r"tls: missing; name the folder with its certificate: trade pki issue"),
         ('tls = "pki/issued/door"', 'tls = "pki/issued/dor"', r"dor/ca.pem: cannot be read"),
         ('policy = "policy.toml"', 'policy = "none.toml"', r"none.toml: the policy cannot be read"),
@@ -241,6 +241,14 @@ def test_a_limit_that_would_not_hold_is_refused(file: Path, limit: str, said: st
 def test_what_is_wrong_is_named(file: Path, before: str, after: str, said: str) -> None:
     change(file, before, after)
     with pytest.raises(ConfigurationError, match=said):
+        read_gateway_file(file)
+
+
+def test_papers_of_a_container_are_told_from_those_of_a_gateway(file: Path) -> None:
+    Papers(file.parent / "more").of("rosie")
+    change(file, 'tls = "pki/issued/door"', 'tls = "more/issued/rosie"')
+    said = r"gateway.toml: tls: .* has the papers of 'rosie', which the policy does not call a gateway \(door\)"
+    with pytest.raises(ConfigurationError, match=rf"{said}.*trade pki issue NAME --for gateway --address 192.168.7.1"):
         read_gateway_file(file)
 
 

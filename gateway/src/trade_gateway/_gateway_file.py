@@ -2,7 +2,7 @@
 
 import os
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Final, NamedTuple, cast
 
@@ -11,6 +11,7 @@ from msgspec import Meta, Struct
 
 from trade import Settings
 from trade._endpoints import Endpoint, loopback_interface
+from trade._tls import Certificate
 from trade._toml import read_toml_text
 from trade.errors import ConfigurationError
 from trade.policies import EVERYTHING, read_policy
@@ -136,7 +137,8 @@ class GatewayFile(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
         """
         beside = where.parent
         if self.policy:
-            read_policy(beside / self.policy)  # wrong is wrong before anything is closed for it
+            policy = read_policy(beside / self.policy)  # wrong is wrong before anything is closed for it
+            self._check_papers(where, policy.gateways)
         networks = [] if self.alone else list(self.network.values())
         limited = any(network.export is not None or network.limits for network in networks)
         exports = {network.interface: tuple(_or_all(network.export)) for network in networks}
@@ -156,6 +158,20 @@ class GatewayFile(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
             metrics=self.metrics,
             environment=_without_system(),
         )
+
+    def _check_papers(self, where: Path, gateways: Collection[str]) -> None:
+        """Raises ConfigurationError: they are a container's, and for none of the addresses."""
+        if not (self.tls and gateways):
+            return
+        papers = Certificate.read((where.parent / self.tls).absolute())
+        hosts = [Endpoint.read(one).host for network in self.network.values() for one in network.listen]
+        if papers.identity not in gateways and hosts and not papers.hosts.intersection(hosts):
+            problem = (
+                f"{papers.folder} has the papers of {papers.identity!r}, which the policy does not call a gateway "
+                f"({', '.join(gateways)}) and which are not for {hosts[0]}; a gateway's are needed here: trade pki "
+                f"issue NAME --for gateway --address {hosts[0]}"
+            )
+            raise ConfigurationError(where=f"{where}: tls", problem=problem)
 
     def audit_folder(self, where: Path) -> Path | None:
         """Beside the file."""
@@ -366,9 +382,19 @@ def _explained(said: str, raw: Mapping[str, Any], where: str) -> ConfigurationEr
     return ConfigurationError(where=f"{where}: {prefix.rstrip('.')}", problem=said[: at.start()] if at else said)
 
 
+def _fits(part: object, kind: type[Struct] | None) -> bool:
+    try:
+        msgspec.convert(part, kind or dict[str, Any])
+    except msgspec.ValidationError:
+        return False
+    return True
+
+
 def _named(path: str, raw: Mapping[str, Any]) -> str:
     """The place of a value, with its network's or share's own name where the check only says that it is one of them."""
     if "[...]" in path:
-        named = cast("Mapping[str, object]", raw.get(path.partition("[")[0], {}))
-        path = path.replace("[...]", f".{next(iter(named))}" if len(named) == 1 else "", 1)
+        table = path.partition("[")[0]
+        named = cast("Mapping[str, object]", raw.get(table, {}))
+        wrong = next((name for name, part in named.items() if not _fits(part, _KINDS.get(table))), "")
+        path = path.replace("[...]", f".{wrong}" if wrong else "", 1)
     return f"{path}." if path else ""

@@ -44,7 +44,8 @@ class Ending:
             who, until = self._certificate.identity, f"{self._certificate.until:%Y-%m-%d %H:%M} UTC"
             _logger.warning(
                 "the certificate of %s ends %s: renew it (trade pki issue %s) and start this container again before "
-                "that; it listens with the one it was started with, and else all its links end then",
+                "that (`trade gateway` takes the new one by itself); it listens with the one it was started with, "
+                "and else all its links end then",
                 *(who, until, who),
             )
 

@@ -145,6 +145,6 @@ def _check_bridged(bridge: Sequence[str], links: Links) -> None:
         if name not in heard:
             problem = (
                 f"nothing listens on it, only on {', '.join(map(str, links.listen))}; let TRADE_LISTEN name an address "
-                f"of {name}, too, or tcp/0.0.0.0:PORT"
+                f"of {name}, too (in a gateway file: listen), or {links.listen[0].protocol}/0.0.0.0:PORT"
             )
             raise ConfigurationError(where=f"bridge {name}", problem=problem)

@@ -200,7 +200,7 @@ class Settings:
 
     def _refused_certified(self, endpoint: Endpoint) -> str:
         if endpoint.protocol != "tls":
-            return f"TRADE_TLS is set, so it must be tls/{endpoint.host}:{endpoint.port}"
+            return f"who has a certificate links by tls alone, so it must be tls/{endpoint.host}:{endpoint.port}"
         if endpoint.host.startswith("["):
             return "the transport does not link with certificates at IPv6 addresses; use an IPv4 address or a name"
         if endpoint.rest:  # it could switch off what makes a link safe
@@ -212,7 +212,8 @@ class Settings:
     def _check_governed(self, where: str, endpoint: Endpoint) -> None:
         if not (endpoint.loopback or self.policy or self.insecure_lan):
             problem = (
-                "listening beyond loopback needs a policy, and none is loaded; set TRADE_POLICY, or listen on "
+                "listening beyond loopback needs a policy, and none is loaded; set TRADE_POLICY (in a gateway file: "
+                "policy), or listen on "
                 f"{endpoint.protocol}/127.0.0.1:PORT"
             )
             raise ConfigurationError(where=where, problem=problem)
