@@ -34,7 +34,7 @@ listen = ["tls/127.0.0.1:7450"]
 
 [network.lab]
 interface = "eth1"
-listen = ["tls/127.0.0.1:7451"]
+listen = ["tls/0.0.0.0:7451"]
 """
 SYSTEM_FILE = """
 [system]

@@ -52,6 +52,6 @@ def test_people_get_no_more_digits_than_they_read_and_programs_get_all(capsys: p
     }
     Output(as_json=False).data(value)
     shown = capsys.readouterr().out
-    assert json.loads(shown) == {"position_rad": 0.3, "small": 1.235e-05, "at": [1791234567.123457, 3], "none": None}
+    assert json.loads(shown) == {"position_rad": 0.3, "small": 0.000012, "at": [1791234567.123457, 3], "none": None}
     Output(as_json=True).data(value)
     assert json.loads(capsys.readouterr().out) == value

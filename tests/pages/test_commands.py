@@ -39,6 +39,9 @@ NOT_TYPED: Final = {
     Section("guide.md", "Several networks"): "settings, not commands, for a host in two networks",
     Section("deployment.md", "Taking one back"): "takes two hosts: trade/test_policy_watch.py has what is done there",
     Section("deployment.md", "Updating"): "takes root, systemd and a newer version",
+    Section(
+        "deployment.md", "A gateway between networks"
+    ): "changes the kernel: gateway/test_gateway_file.py has the warning",
     Section("deployment.md", "Real time"): "takes a right, and the processor from all other tests",
     Section("deployment.md", "In a container"): "takes podman or docker: tests/test_container.py, where there is one",
 }
