@@ -105,7 +105,7 @@ def ack(context: typer.Context, fault_id: Id, as_json: Json = False) -> None:
     if as_json:
         out.data(seen)
     else:
-        out.say(f"{escape(seen.device)}: {escape(seen.said)}: seen by {escape(seen.acknowledged_by)}; {_state(seen)}")
+        out.say(f"{escape(seen.device)}: {escape(_said(seen))}: seen by {escape(seen.acknowledged_by)}; {_state(seen)}")
 
 
 def _logs(container: Container, robot: str | None) -> "Sequence[Handle]":
@@ -123,11 +123,17 @@ def _service(container: Container, fault_id: str, name: str) -> "Handle":
     return container.find(asked_for(f"id {fault_id!r}", name=name, group=f"{robot}.faults"), wait_s=_WAIT_S)
 
 
+def _said(info: "FaultInfo") -> str:
+    """`FaultInfo.said`, of what came from a driver: here it has the fields alone."""
+    begin = f"{info.device}: "
+    return info.text.removeprefix(begin) if info.text.startswith(begin) else info.kind
+
+
 def _row(info: "FaultInfo") -> tuple[str, ...]:
     return (
         info.id,
         info.device,
-        info.said,
+        _said(info),
         _state(info),
         str(info.count),
         day_and_clock(info.first_at),
