@@ -25,12 +25,12 @@ class ArmRig:
     """A simulated arm, and whoever is attached to it."""
 
     def __init__(self, undo: ExitStack, arm: SimArm | None = None, text: str = ARM) -> None:
-        self._undo, self._text = undo, text
+        self.undo, self._text = undo, text
         self.sim = undo.enter_context(UrBus(arm or SimArm(name="right", unlock_s=0.3), name="ur"))
 
     def attach(self, **options: Any) -> AttachedRobot:
         """Attach the driver; it is closed with the test, whatever that says."""
-        self.robot = attached(self._undo, self.sim.port, self._text, **options)
+        self.robot = attached(self.undo, self.sim.port, self._text, **options)
         self.arm: Arm = self.robot.arm("right")
         return self.robot
 

@@ -164,6 +164,13 @@ def fault_of(motor: Motor) -> str:
         return ""
 
 
+def stop_by_nmt(leg: Leg, node: int) -> None:
+    """Have network management stop a drive; returns once its heartbeat says so."""
+    with leg.listen() as other:
+        other.send(can.Message(arbitration_id=0, data=bytes((0x02, node)), is_extended_id=False))
+        wait_until(lambda: any(e.data == b"\x04" for e in leg.frames("heartbeat", node)[-1:]), "it is stopped")
+
+
 @pytest.fixture
 def rig() -> Iterator[Leg]:
     with ExitStack() as undo:

@@ -4,11 +4,22 @@ from collections.abc import Callable
 
 import pytest
 
+import trade
 from drivers.conftest import Outcome, call, sleep_past, written_now
 from drivers.gate import Gate
 from drivers.legs import COUNTS_PER_RAD, HALT, HIP, KNEE, PATIENT, Leg, rig
 from trade import Container, Handle, where
-from trade.errors import DeadlineExceeded, DeviceFault, LockedByOther, LockLost, MotionStopped, Stopped, TradeError
+from trade.errors import (
+    DeadlineExceeded,
+    DeviceFault,
+    IncompleteGroup,
+    LockedByOther,
+    LockLost,
+    MotionStopped,
+    NotLocked,
+    Stopped,
+    TradeError,
+)
 from trade_drivers import AttachedRobot, Motor
 from trade_hil_sim import Entry, Place, Replug, Unplug
 from waiting import wait_until
@@ -93,6 +104,45 @@ def test_S01_a_command_that_expires_while_the_bus_is_held_up_is_never_sent(
     gate.let_go()
     assert isinstance(late.wait().error, DeadlineExceeded)
     assert not commanded(leg, mark)
+
+
+def test_S01_a_search_for_home_that_does_not_end_in_time_is_halted_and_told_before_its_deadline(
+    leg: Leg, hip: Motor, planner: Container
+) -> None:
+    hip.enable()
+    with pytest.raises(DeviceFault, match="has not found its home in time"):
+        service(planner, "home").with_(deadline_s=1.5)(34, 0.01)
+    assert any(halts(e) for e in leg.frames("rpdo1", HIP, leg.wait_for("motion_started", HIP).t))
+
+
+# --- S13
+
+
+def test_S13_a_joint_that_comes_after_its_group_was_locked_is_sent_nothing_under_that_lock(
+    leg: Leg, gate: Gate, driver: Container, start_container: Callable[..., Container]
+) -> None:
+    """A lock over a robot and a lamp, while the robot's driver is away."""
+
+    class Lamp:
+        @trade.service
+        def light(self) -> None: ...
+
+    planner, either = start_container("planner"), where(group="rosie.leg") | where(group="lamp")
+    driver.register(Lamp(), "lamp")
+    planner.find(where(group="lamp"), wait_s=20)
+    with pytest.raises(IncompleteGroup, match=r"group='rosie\.leg' missing"):
+        planner.lock(either, wait_s=0).acquire()
+    with planner.lock(either, partial=True):
+        leg.attach(register=driver.register, deregister=driver.deregister, healthy=gate)
+        services = [(service(planner, name), args) for name, args in (("enable", ()), ("move_to", (0.3,)))]
+        mark = written_now()
+        for handle, args in services:
+            with pytest.raises(NotLocked):
+                handle(*args)
+        assert not commanded(leg, mark)
+        service(planner, "stop")()
+    with planner.lock(either):
+        assert services[1][0](0.1) == pytest.approx(0.1, abs=0.01)
 
 
 # --- S05

@@ -1,6 +1,7 @@
 """Attaching drives: every mistake of wiring, setting and installation is named with what would be right."""
 
 import builtins
+import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -8,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from drivers.conftest import Outcome, written_now
 from drivers.legs import HIP, KNEE, Leg, leg, rig
 from trade.errors import ConfigurationError
 from trade_drivers import load
@@ -110,11 +112,17 @@ def test_a_channel_that_is_not_there_is_named(leg: Leg) -> None:
 
 
 def test_S20_a_bus_that_has_a_driver_is_not_taken_by_a_second(leg: Leg) -> None:
-    leg.attach()
+    hip = leg.attach().motor("leg.hip")
+    hip.enable()
+    mark = written_now()
+    moving = Outcome(lambda: hip.move_to(0.3, 0.5))
+    leg.wait_for("motion_started", HIP, mark)
     first = len(leg.announced)
-    with pytest.raises(ConfigurationError, match="another driver commands the drives of this bus already"):
+    with pytest.raises(ConfigurationError, match=f"another driver has this bus: process {os.getpid()} "):
         leg.attach()
     assert len(leg.announced) == first
+    assert not [name for name in ("nmt", "sdo_request") if leg.frames(name, since=mark)]
+    assert moving.wait().result == pytest.approx(0.3, abs=0.01)
 
 
 def test_a_missing_library_is_named_with_its_remedy(leg: Leg, monkeypatch: pytest.MonkeyPatch) -> None:

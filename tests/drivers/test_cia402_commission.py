@@ -2,10 +2,8 @@
 
 from typing import Any
 
-import pytest
-
-from drivers.legs import HIP, KNEE, Leg, leg, rig
-from trade.errors import ConfigurationError
+from drivers.conftest import written_now
+from drivers.legs import HIP, KNEE, Leg, leg, rig, stop_by_nmt
 from trade_drivers import scan
 from trade_drivers.cia402 import Cia402Driver
 from trade_hil_sim import Absent
@@ -34,7 +32,10 @@ def test_a_node_that_is_asked_for_alone(leg: Leg) -> None:
     assert not looked(leg, ids=[KNEE])
 
 
-def test_a_bus_whose_drives_are_commanded_is_left_alone(leg: Leg) -> None:
-    leg.attach()
-    with pytest.raises(ConfigurationError, match="another driver commands the cia402 devices"):
-        looked(leg)
+def test_a_node_that_network_management_has_stopped_is_shown_and_left_so(leg: Leg) -> None:
+    leg.attach().close()
+    stop_by_nmt(leg, KNEE)
+    mark = written_now()
+    [knee] = scan(Cia402Driver.commissioner(), leg.sim.port, ids=[KNEE])
+    assert "network management has stopped it" in knee.problem
+    assert not leg.frames("nmt", since=mark)

@@ -14,8 +14,8 @@ import can
 import pytest
 
 from drivers.conftest import Outcome, sleep_past, written_now
-from drivers.legs import HIP, KNEE, LEG, Leg, fault_of, leg, rig
-from trade.errors import DeviceSilent, TradeError
+from drivers.legs import HIP, KNEE, LEG, Leg, fault_of, leg, rig, stop_by_nmt
+from trade.errors import DeviceFault, DeviceSilent, TradeError
 from trade_drivers import AttachedRobot, Motor, attach, parse
 from trade_drivers.cia402 import _table as table
 from trade_drivers.cia402._axis import Stage
@@ -230,3 +230,47 @@ def ask(process: "subprocess.Popen[str]", line: str) -> str:
     assert process.stdout is not None
     print(line, file=process.stdin, flush=True)
     return process.stdout.readline().strip()
+
+
+# --- drives that network management has stopped
+
+
+def test_a_drive_that_network_management_has_stopped_says_so_and_enable_takes_it_back(
+    leg: Leg, caplog: pytest.LogCaptureFixture
+) -> None:
+    hip = leg.attach().motor("leg.hip")
+    hip.enable()
+    stop_by_nmt(leg, HIP)
+    wait_until(lambda: hip._axes[0].silent, "it is left out")  # type: ignore[attr-defined]
+    mark = written_now()
+    for refused in (hip.state, lambda: hip.move_to(0.1)):
+        with pytest.raises(DeviceFault, match=r"network management has stopped it.*call enable\(\)"):
+            refused()
+    assert not leg.frames("nmt", since=mark)  # nobody has asked for it
+    hip.enable()
+    assert leg.frames("nmt", HIP, mark)[0].data == bytes((table.NMT_PREOPERATIONAL, HIP))
+    assert [entry.message for entry in caplog.records if "put to pre-operational" in entry.message]
+    assert not leg.events("motion_started", HIP, mark)
+    assert hip.move_to(0.1) == pytest.approx(0.1, abs=0.01)
+
+
+def test_a_drive_found_stopped_is_taken_back_by_attaching(leg: Leg, caplog: pytest.LogCaptureFixture) -> None:
+    leg.attach().close()
+    stop_by_nmt(leg, HIP)
+    mark = written_now()
+    hip = leg.attach().motor("leg.hip")
+    assert leg.frames("nmt", HIP, mark)[0].data == bytes((table.NMT_PREOPERATIONAL, HIP))
+    assert not leg.frames("rpdo1", since=mark)
+    assert [entry.message for entry in caplog.records if "put to pre-operational" in entry.message]
+    hip.enable()
+    assert hip.move_to(0.1) == pytest.approx(0.1, abs=0.01)
+
+
+def test_a_group_with_two_stopped_drives_is_enabled_although_a_frame_of_it_is_lost(leg: Leg) -> None:
+    group = leg.attach().group("leg")
+    for node in (HIP, KNEE):
+        stop_by_nmt(leg, node)
+    wait_until(lambda: all(axis.silent for axis in group._axes), "both are left out")  # type: ignore[attr-defined]
+    leg.sim.do(Mute(ids=(KNEE,), instruction="nmt", count=1))
+    group.enable()
+    assert group.move_to([0.1, 0.1]) == pytest.approx([0.1, 0.1], abs=0.01)

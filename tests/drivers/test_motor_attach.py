@@ -98,13 +98,6 @@ def test_a_damiao_with_other_ranges_than_its_model_is_refused(damiaos: MotorRig)
     assert not damiaos.commanded()
 
 
-def test_S20_odrives_that_somebody_else_commands_are_not_taken(odrives: MotorRig) -> None:
-    odrives.plug()
-    odrives.attach()
-    with pytest.raises(ConfigurationError, match="another driver"):
-        odrives.attach()
-
-
 def test_an_odrive_without_a_watchdog_is_not_enabled(odrives: MotorRig) -> None:
     odrives.plug(prepare=lambda bus: setattr(bus.devices[0], "watchdog_s", None))
     root = odrives.attach().motor("tail.root")

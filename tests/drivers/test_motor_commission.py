@@ -26,6 +26,7 @@ from trade_hil_sim.odrive import Axis
 __all__ = ["motor_rig", "wag"]
 
 COMMISSIONERS = {"odrive": OdriveDriver.commissioner, "damiao": DamiaoDriver.commissioner}
+ENABLE = {"odrive": (ROOT << 5 | 7, struct.pack("<I", 8)), "damiao": (ROOT, bytes(7 * (0xFF,) + (0xFC,)))}
 MODELS = {"odrive": ("ODrive S1", "0.6.10"), "damiao": ("DM4310", "5014")}
 
 
@@ -77,9 +78,11 @@ def test_a_motor_that_is_asked_for_alone(wag: MotorRig) -> None:
 
 
 def test_a_motor_under_torque_ends_the_scan(wag: MotorRig) -> None:
-    robot = wag.attach()
-    robot.motor("tail.root").enable()
-    with pytest.raises(ConfigurationError, match=r"has its torque on|another driver commands"):
+    wag.sim.devices[0].watchdog_s = None  # an ODrive's
+    with wag.listen() as other:
+        other.send(message(*ENABLE[wag.kind]))
+        wag.wait_for("torque_on", ROOT)
+    with pytest.raises(ConfigurationError, match="has its torque on"):
         look(wag)
 
 

@@ -2,10 +2,11 @@
 
 import pytest
 
-from arms import AT_HOME
+from arms import AT_HOME, attached
 from drivers.arm_rig import FAR, SLOW, ArmRig, answers, arm_rig, free_rig
 from drivers.conftest import Outcome, written_now
 from trade.errors import (
+    ConfigurationError,
     DeviceFault,
     DeviceSilent,
     InvalidArgument,
@@ -18,6 +19,14 @@ from waiting import wait_until
 
 pytest.importorskip("rtde_control", reason="ur-rtde has no wheel for this platform")
 __all__ = ["arm_rig", "free_rig"]
+
+NEAR = [0.6, *AT_HOME[1:]]
+
+
+def elsewhere(rig: ArmRig) -> str:
+    """The controller as another host reaches it: by another text for its address."""
+    first, second, third, fourth = map(int, str(rig.sim.port).split("."))
+    return f"{first}.{second}.{third * 256 + fourth}"
 
 
 # --- S19, S20
@@ -34,12 +43,24 @@ def test_S19_leaving_while_moving_stops_first_and_the_arm_holds(rig: ArmRig) -> 
     assert (rig.truth.robot_mode, rig.truth.safety_mode) == ("RUNNING", "NORMAL")
 
 
-def test_S20_while_one_driver_has_control_a_second_one_gets_none_and_moves_nothing(rig: ArmRig) -> None:
+def test_S20_a_second_driver_is_refused_and_the_arm_goes_on(rig: ArmRig) -> None:
+    moving = Outcome(lambda: rig.arm.move_joints(NEAR, SLOW))
+    wait_until(lambda: moving.error or rig.base_rad > 0.05, "it is under way")
+    mark = written_now()
+    for host, why in ((rig.sim.port, "another driver of this host has it: process"), (elsewhere(rig), "has control")):
+        with pytest.raises(ConfigurationError, match=why):
+            attached(rig.undo, host)
+    assert not rig.moves(mark)
+    assert not [entry for entry in instructions(rig.log, since=mark) if entry.name == "stop"]
+    assert moving.wait().result == pytest.approx(NEAR, abs=0.01)
+
+
+def test_S20_of_two_drivers_of_an_arm_at_rest_one_gets_control(rig: ArmRig) -> None:
+    second = attached(rig.undo, elsewhere(rig)).arm("right")
     rig.arm.move_joints([0.05, *AT_HOME[1:]])
-    rig.attach()
     mark = written_now()
     with pytest.raises(DeviceFault, match="control was not granted"):
-        rig.arm.move_joints(AT_HOME)
+        second.move_joints(AT_HOME)
     assert not rig.moves(mark)
 
 

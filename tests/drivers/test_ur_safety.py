@@ -26,7 +26,7 @@ from trade.errors import (
     Stopped,
     TradeError,
 )
-from trade_drivers import Arm
+from trade_drivers import Arm, Tolerances, Trajectory, TrajectoryPoint
 from trade_hil_sim import Absent, Local, Mute, Unplug, events, instructions
 from waiting import wait_until
 
@@ -117,6 +117,34 @@ def test_S06_a_process_that_commands_and_is_killed_leaves_the_stop_to_the_watchd
     wait_until(lambda: rig.arm.state().measured_at > mark + 0.2, "time has passed")
     assert not rig.moves(mark)  # restarted, but not into motion
     assert rig.arm.move_to_pose("home")[0] == pytest.approx(0.0, abs=0.01)
+
+
+@pytest.mark.parametrize("how", ["move_joints", "servo", "follow"])
+def test_S06_an_arm_that_moved_when_its_host_was_suspended_does_not_go_on(
+    rig: ArmRig, monkeypatch: pytest.MonkeyPatch, how: str
+) -> None:
+    joints = [limit.name for limit in rig.arm.limits().joints]
+    ends = [TrajectoryPoint(time_from_start_s=s, positions_rad=[s * SLOW, *AT_HOME[1:]]) for s in (0.0, 8.0)]
+    way = Trajectory(joints=joints, points=ends)
+    acts: dict[str, Callable[[], object]] = {
+        "move_joints": lambda: rig.arm.move_joints(FAR, SLOW),
+        "servo": lambda: rig.arm.servo(FAR, 1.0),
+        "follow": lambda: rig.arm.follow(way, Tolerances(path_rad=1.0)),
+    }
+    moving = Outcome(acts[how])
+    wait_until(lambda: moving.error or rig.base_rad > 0.05, "it is under way")
+    exchange = rig.arm._exchange  # type: ignore[attr-defined]
+    clock, asleep = exchange.lasting_clock, written_now()
+    monkeypatch.setattr(exchange, "lasting_clock", lambda: clock() + 3600 * 10**9)
+    error = moving.wait().error
+    rig.stands()
+    assert len(rig.moves(asleep)) < 20  # a set-point that goes on for its second is sent more than a hundred times
+    mark = written_now()
+    if how != "servo":  # whose call was answered when it began
+        assert isinstance(error, DeviceFault)
+        assert "held up for 3600." in str(error)
+    wait_until(lambda: answers(rig.arm, mark + 0.3), "time has passed")
+    assert not rig.moves(mark)
 
 
 def test_S06_an_unhealthy_process_holds_once_and_does_not_feed_the_watchdog(free: ArmRig) -> None:

@@ -50,6 +50,7 @@ def test_a_port_follows_its_controller(adapter: SlcanAdapter, port: CanPort) -> 
 def test_a_port_that_is_opened_later_knows_what_was_before(adapter: SlcanAdapter, port: CanPort) -> None:
     adapter.say("p", 128)
     wait_until(lambda: heard(port, "error-passive"), "the system knows")
+    port.close()
     later = CanPort(port.path, 1_000_000)
     later.open()
     assert later.look("x").state == "error-passive"

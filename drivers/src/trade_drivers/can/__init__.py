@@ -6,7 +6,7 @@ from trade_drivers.can._listeners import Listeners
 from trade_drivers.can._load import LoadMeter, frame_bits
 from trade_drivers.can._netlink import Link, look_at
 from trade_drivers.can._port import CanPort, Frame, split_port
-from trade_drivers.can._talk import Talk, overhear
+from trade_drivers.can._talk import Talk
 
 __all__ = [
     "CanBench",
@@ -20,6 +20,5 @@ __all__ = [
     "error_state",
     "frame_bits",
     "look_at",
-    "overhear",
     "split_port",
 ]

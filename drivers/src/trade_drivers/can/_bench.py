@@ -1,12 +1,13 @@
 """An open CAN bus, looked at before a robot file names its devices: who is there. Reads; commands nothing."""
 
 from abc import abstractmethod
+from collections.abc import Collection
 from typing import ClassVar, Final, NoReturn, TypeVar
 
 from trade.errors import ConfigurationError
 from trade_drivers._commission import Bench, Found
 from trade_drivers.can._port import CanPort
-from trade_drivers.can._talk import Talk, overhear
+from trade_drivers.can._talk import Talk
 
 __all__ = ["CanBench"]
 
@@ -25,8 +26,8 @@ class CanBench(Bench):
     zero: ClassVar[str]
     """How the zero of its devices is found."""
 
-    def __init__(self, port: CanPort, bitrate: int, talk: Talk) -> None:
-        self._port, self._bitrate, self._talk = port, bitrate, talk
+    def __init__(self, port: CanPort, bitrate: int) -> None:
+        self._port, self._bitrate, self._talk = port, bitrate, port.talk
 
     @classmethod
     def open(cls: type[_Self], port: str, bitrate: int) -> _Self:
@@ -37,22 +38,20 @@ class CanBench(Bench):
                 command there.
             PortLost: it is not there, or down.
         """
-        wire = CanPort(port, bitrate, "")
+        wire = CanPort(port, bitrate, "", _LISTEN_S, cls.orders)
         wire.open()
         try:
-            bench = cls(wire, bitrate, overhear(wire, _LISTEN_S))
-            if bench.commanded():
-                problem = f"another driver commands the {cls.driver} devices of this bus; stop it first"
-                raise ConfigurationError(where=port, problem=problem)
+            bench = cls(wire, bitrate)
             bench.refuse()
         except BaseException:
             wire.close()
             raise
         return bench
 
+    @staticmethod
     @abstractmethod
-    def commanded(self) -> bool:
-        """Whether what was heard comes from somebody who commands such devices."""
+    def orders(talk: Talk) -> Collection[int]:
+        """What of it comes from somebody who commands or asks such devices."""
 
     def refuse(self) -> None:
         """ODrives would take questions that are not theirs for commands. Raises ``ConfigurationError``."""

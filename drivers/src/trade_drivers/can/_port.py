@@ -1,21 +1,27 @@
 """One end of a CAN bus, through python-can: frames out and in, and everything that can go wrong as ``PortLost``."""
 
 import logging
+import os
 import socket
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
-from typing import Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import can
 
 from trade.errors import ConfigurationError
 from trade_drivers._can_monitor import CanBusState
+from trade_drivers._host_lock import HostLock, Taken
 from trade_drivers._work import PortLost, losing
 from trade_drivers.can._errors import ErrorState, error_state
 from trade_drivers.can._load import LoadMeter, frame_bits
 from trade_drivers.can._netlink import look_at
 from trade_drivers.can._socketcand import ServerBus
+from trade_drivers.can._talk import Talk
+
+if TYPE_CHECKING:
+    from trade_drivers.robotfile import CanBus
 
 __all__ = ["CanPort", "Frame", "split_port"]
 
@@ -27,6 +33,9 @@ _HELLO: Final = b"< hi >"
 _TROUBLE: Final = (can.CanError, OSError, ValueError, IndexError)
 """What python-can's interfaces raise: not only its own errors."""
 _FULL: Final = 0.9
+_SLICE_S: Final = 0.01
+_SLOWEST_S: Final = 0.8
+"""Every driver of this project that is not held up says something in it: the slowest cycle there may be is 0.67 s."""
 
 
 class Frame(NamedTuple):
@@ -49,32 +58,87 @@ def split_port(port: str, where: str) -> tuple[str, str]:
     return interface, channel
 
 
-class CanPort:
-    """A CAN bus as one thread uses it."""
+def _nobody(_: Talk) -> Collection[int]:
+    """Whoever talks does not matter."""
+    return ()
 
-    def __init__(self, path: str, bitrate: int, where: str = "bus") -> None:
+
+class CanPort:
+    """A CAN bus as one thread uses it, and no other driver of this host.
+
+    Args:
+        path: ``INTERFACE:CHANNEL``.
+        bitrate: bits a second.
+        where: the table of the robot file that describes this bus, for messages; empty: there is none.
+        listen_s: how long to listen, each time it is opened, before anything may be sent.
+        orders: identifiers among what was heard then that only another driver sends.
+    """
+
+    def __init__(
+        self,
+        path: str,
+        bitrate: int,
+        where: str = "bus",
+        listen_s: float = 0.0,
+        orders: Callable[[Talk], Collection[int]] = _nobody,
+    ) -> None:
         self.path = path
         self.state = ErrorState.ACTIVE
         self.errors = 0
         """Error frames received, ever."""
         self.bus_offs = 0
         """How often it went bus-off."""
+        self.talk = Talk({})
+        """What was heard when it was opened."""
         self._where = where
-        """The table of the robot file that describes this bus, for messages; empty: there is none."""
+        self._listen_s, self._orders = listen_s, orders
         self._interface, self._channel = split_port(path, where or path)
+        device = self._channel.partition("@")[0] if self._channel.startswith("/") else ""
+        self._lock = HostLock(self._known_as(), where or "a scan", device)
         self._bitrate = bitrate
         self._bus: can.BusABC | None = None
         self.meter = LoadMeter(bitrate, time.monotonic_ns())
         self._told_full = False
 
+    @classmethod
+    def of(cls, path: str, bus: "CanBus", where: str, orders: Callable[[Talk], Collection[int]]) -> "CanPort":
+        """For a driver: it listens for as long as watchdogs take.
+
+        What has torque then is fed by somebody else, or is not watched.
+        """
+        return cls(path, bus.bitrate, where, max(_SLOWEST_S, bus.watchdog_s + 0.1), orders)
+
+    def _known_as(self) -> str:
+        """What this bus is to all of this host."""
+        match self._interface:
+            case "virtual":  # each process has its own
+                return f"{self.path} of {os.getpid()}"
+            case _ if self._channel.startswith("/"):
+                return f"{self._interface}:{os.path.realpath(self._channel)}"
+            case _:
+                return self.path
+
     def open(self) -> None:
-        """Begin to use it.
+        """Begin to use it, after listening who talks there. Nothing is sent.
 
         Raises:
             PortLost: it is not there, at present.
-            ConfigurationError: python-can knows no such interface, or it needs another package.
+            ConfigurationError: another driver has it, on this host or elsewhere; python-can knows no such interface, or
+                it needs another package.
         """
         self.close()
+        try:
+            self._lock.take()
+            self._begin()
+            self._listen()
+        except Taken as taken:
+            problem = f"{self.path}: another driver has this bus: {taken}; stop it first"
+            raise self._wrong("channel", problem) from None
+        except BaseException:
+            self.close()
+            raise
+
+    def _begin(self) -> None:
         options = self._options()
         if self.state is not ErrorState.BUS_OFF:  # of that only a frame, or the system, says that it is over
             self.state = ErrorState.ACTIVE
@@ -88,6 +152,19 @@ class CanPort:
                     self._bus = can.Bus(interface=self._interface, **options)
             except (can.CanInterfaceNotImplementedError, ImportError) as unknown:
                 raise self._wrong("interface", f"{self.path}: {unknown}") from None
+
+    def _listen(self) -> None:
+        heard: dict[int, list[bytes]] = {}
+        until = time.monotonic() + self._listen_s
+        while (left_s := until - time.monotonic()) > 0:
+            frame = self.receive(min(left_s, _SLICE_S))
+            if frame is not None:
+                heard.setdefault(frame.id, []).append(frame.data)
+        self.talk = Talk(heard)
+        if orders := self._orders(self.talk):
+            said = ", ".join(f"{one:03X}h" for one in sorted(orders))
+            problem = f"{self.path}: another driver commands the devices of this bus (it sends {said}); stop it first"
+            raise self._wrong("channel", problem)
 
     def _look_over(self) -> None:
         """What the system knows of the interface already.
@@ -146,6 +223,7 @@ class CanPort:
         if bus is not None:
             with suppress(*_TROUBLE):
                 bus.shutdown()
+        self._lock.release()
 
     def send(self, frame_id: int, data: bytes) -> None:
         """One frame out; never waits.

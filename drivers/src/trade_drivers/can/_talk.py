@@ -3,13 +3,10 @@
 Sources: ODrive documentation, "CANSimple protocol" (heartbeat); CiA 301 (error control).
 """
 
-import time
 from collections.abc import Mapping, Sequence
 from typing import Final
 
-from trade_drivers.can._port import CanPort
-
-__all__ = ["Talk", "overhear"]
+__all__ = ["Talk"]
 
 _BEAT: Final = 0x01
 """The low five bits of an ODrive's heartbeat; the others are its node."""
@@ -20,7 +17,6 @@ _ERROR_CONTROL: Final = 0x700
 """Added to the node of a CANopen device, which tells its state in one byte."""
 _STATES: Final = frozenset({0x00, 0x04, 0x05, 0x7F})
 _NODE: Final = 0x7F
-_SLICE_S: Final = 0.01
 
 
 class Talk:
@@ -58,18 +54,3 @@ def _beats(data: bytes) -> bool:
         return False
     state, result, flags, last = data[4:]
     return state <= _MOST_STATE and result <= _MOST_RESULT and flags <= 1 and last == 0
-
-
-def overhear(port: CanPort, seconds: float) -> Talk:
-    """Listen for that long.
-
-    Raises:
-        PortLost: the bus is gone.
-    """
-    heard: dict[int, list[bytes]] = {}
-    until = time.monotonic() + seconds
-    while (left_s := until - time.monotonic()) > 0:
-        frame = port.receive(min(left_s, _SLICE_S))
-        if frame is not None:
-            heard.setdefault(frame.id, []).append(frame.data)
-    return Talk(heard)

@@ -16,7 +16,7 @@ from trade_drivers.joints import AttachedJoints, BusThread, PortLost
 from trade_drivers.robotfile import Bus, CanBus, Joint, Robot
 
 if TYPE_CHECKING:
-    from trade_drivers.can import CanPort
+    from trade_drivers.can import CanPort, Talk
     from trade_drivers.canmotors._exchange import MotorExchange
 
 __all__ = ["CanMotorDriver"]
@@ -40,8 +40,9 @@ class CanMotorDriver(Driver):
     def exchange(self, robot: Robot, bus: CanBus, wire: "CanPort", port: str) -> "MotorExchange[Any]":
         """What the file alone can tell is checked; the port is not open yet. Raises ``ConfigurationError``."""
 
-    def listen(self, exchange: "MotorExchange[Any]", bus: CanBus, where: str) -> None:
-        """Before anything is sent. Raises ``ConfigurationError`` if the bus is not to be used."""
+    @abstractmethod
+    def orders(self, talk: "Talk", nodes: Collection[int]) -> Collection[int]:
+        """Identifiers among what was heard that only another driver sends, to these nodes or any."""
 
     def check(self, robot: Robot, bus: Bus) -> None:
         can = self._can(robot, bus)
@@ -65,7 +66,8 @@ class CanMotorDriver(Driver):
     def _built(self, robot: Robot, bus: CanBus, port: str) -> "MotorExchange[Any]":
         """What it is driven by, out of the file; not open yet."""
         self._check_models(robot, bus)
-        return self.exchange(robot, bus, self._wire(port, bus, f"{robot.where}: bus.{bus.name}"), port)
+        nodes = [joint.id for joint in robot.joints_on(bus.name)]
+        return self.exchange(robot, bus, self._wire(port, bus, f"{robot.where}: bus.{bus.name}", nodes), port)
 
     def _check_models(self, robot: Robot, bus: CanBus) -> None:
         for joint in robot.joints_on(bus.name):
@@ -86,7 +88,6 @@ class CanMotorDriver(Driver):
             undo.callback(wire.close)
             try:
                 wire.open()
-                self.listen(exchange, bus, where)
                 self._bring_in(exchange, robot.where)
             except PortLost as lost:
                 problem = f"{port}: {lost}; is the interface up? `ip link` shows those there are"
@@ -94,13 +95,13 @@ class CanMotorDriver(Driver):
             undo.pop_all()
         return exchange
 
-    def _wire(self, port: str, bus: CanBus, where: str) -> "CanPort":
+    def _wire(self, port: str, bus: CanBus, where: str, nodes: Collection[int]) -> "CanPort":
         try:
             from trade_drivers.can import CanPort  # noqa: PLC0415 - python-can is optional
         except ImportError as missing:
             problem = f'needs python-can ({missing}); pip install "trade-drivers[{self.name}]"'
             raise ConfigurationError(where=f"driver {self.name}", problem=problem) from None
-        return CanPort(port, bus.bitrate, where)
+        return CanPort.of(port, bus, where, partial(self.orders, nodes=nodes))
 
     def _bring_in(self, exchange: "MotorExchange[Any]", where: str) -> None:
         """Cycle until every motor is taken on and measured."""

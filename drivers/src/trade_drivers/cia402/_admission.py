@@ -39,6 +39,7 @@ class Admission:
         """Why it was not taken on when it was last tried."""
         self._exchange = exchange
         self._bus = bus
+        self._recall_at_ns = 0
         self._steps = set_up(exchange.net, axis, bus)
 
     def advance(self) -> None:
@@ -53,9 +54,18 @@ class Admission:
             case Stage.HERE:
                 pass
 
+    def recall(self) -> None:
+        """Take a drive back that network management has stopped, as often as it takes: nobody confirms that."""
+        axis, now_ns = self.axis, self._exchange.clock()
+        if axis.stopped and now_ns >= self._recall_at_ns:
+            _log.warning("%s: network management has stopped it; it is put to pre-operational and set up", axis.name)
+            self._exchange.net.command(axis.id, table.NMT_PREOPERATIONAL)
+            self._recall_at_ns, axis.probe_at_ns = now_ns + PROBE_NS, now_ns
+
     def _begin(self) -> None:
         axis, exchange = self.axis, self._exchange
-        if exchange.clock() >= axis.probe_at_ns and not exchange.worked_on(axis):  # who is asked twice answers one
+        busy = exchange.worked_on(axis) and not axis.recalled  # who is asked twice answers one
+        if exchange.clock() >= axis.probe_at_ns and not busy:
             axis.stage, self._steps = Stage.LOOKED_OVER, set_up(exchange.net, axis, self._bus)
             self._look_over()
 
@@ -64,6 +74,7 @@ class Admission:
             next(self._steps)
         except StopIteration:
             self.axis.be_awaited(self._exchange.clock())
+            self._exchange.beat_next()
         except NoAnswer as silent:
             self._try_later(silent)
         except (Unfit, Refused) as unfit:

@@ -6,6 +6,7 @@ from math import tau
 from struct import error as BadLength  # noqa: N812 - what unpacking raises for another number of bytes
 from typing import Final
 
+from trade.errors import DeviceError
 from trade_drivers._interfaces import MotorState
 from trade_drivers.cia402 import _machine as machine
 from trade_drivers.cia402 import _table as table
@@ -22,6 +23,7 @@ _ARRIVED_RAD: Final = 0.004
 _NEAR_RAD: Final = 0.03
 _FAULTS: Final = (State.FAULT, State.FAULT_REACTION)
 _SOME_FAULT: Final = "it reports a fault"
+_STOPPED: Final = "network management has stopped it: it answers nothing until it is taken back"
 _ACKNOWLEDGE_NS: Final = 250_000_000
 """How long a drive may take to take a set-point."""
 
@@ -82,6 +84,10 @@ class DriveAxis(Axis):
         """When it was last looked over and set up."""
         self.answered_ns = 0
         """When it was asked for a measurement that came while it was left out."""
+        self.stopped = False
+        """Network management has stopped it, so its last heartbeat said: it answers nothing until it is taken back."""
+        self.recalled = False
+        """Who works on it waits until it is taken back and set up."""
         self.to_start = False
         """It was started, and its heartbeat says that it is not: the frame was lost, or it went back."""
 
@@ -122,6 +128,7 @@ class DriveAxis(Axis):
     def take_heartbeat(self, data: bytes, now_ns: int) -> None:
         """Its heartbeat, or that it has started anew: then what it was told before is gone."""
         state = data[0] & 0x7F if data else table.BOOT_UP
+        self.stopped = state == table.STOPPED
         if state == table.BOOT_UP:
             self._lose("it has restarted; is its supply sound?", now_ns)
         elif state == table.OPERATIONAL:
@@ -129,7 +136,8 @@ class DriveAxis(Axis):
         elif self.stage is Stage.SET_UP:
             self.to_start = True
         elif not self.silent:
-            self._lose(f"somebody has made it {table.NMT_STATES.get(state, hex(state))}", now_ns)
+            why = f"somebody has made it {table.NMT_STATES.get(state, hex(state))}"
+            self._lose(_STOPPED if self.stopped else why, now_ns)
 
     def _lose(self, why: str, now_ns: int) -> None:
         if self.ready:
@@ -217,8 +225,12 @@ class DriveAxis(Axis):
 
     def fresh(self, now_ns: int, stale_after_ns: int) -> Sample:
         if self.silent:  # also if it was measured a moment ago: it is not taken on again yet
-            raise self.deaf(now_ns)
+            raise self.absence(now_ns)
         return super().fresh(now_ns, stale_after_ns)
+
+    def absence(self, now_ns: int) -> DeviceError:
+        """The error of a drive that is left out."""
+        return self.faulty(_STOPPED) if self.stopped else self.deaf(now_ns)
 
     def state(self, now_ns: int, stale_after_ns: int) -> MotorState:
         sample = self.fresh(now_ns, stale_after_ns)

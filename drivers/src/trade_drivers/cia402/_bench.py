@@ -5,7 +5,7 @@ from itertools import islice
 from typing import Final
 
 from trade_drivers._commission import Found
-from trade_drivers.can import CanBench, CanPort, Talk
+from trade_drivers.can import CanBench, CanPort
 from trade_drivers.cia402 import _table as table
 from trade_drivers.cia402._machine import state_of
 from trade_drivers.cia402._net import Answer, Net, NoAnswer, Refused
@@ -15,6 +15,7 @@ __all__ = ["DriveBench"]
 _AT_ONCE: Final = 8
 """Nodes asked at the same time: the queues of interfaces are short."""
 _SLICE_S: Final = 0.01
+_STOPPED: Final = "network management has stopped it, and it answers nothing; a driver that attaches takes it back"
 
 
 class DriveBench(CanBench):
@@ -24,13 +25,12 @@ class DriveBench(CanBench):
     remedy = "its own switches, or by the vendor's tool"
     zero = "the zero of a drive is found by its homing"
 
-    def __init__(self, port: CanPort, bitrate: int, talk: Talk) -> None:
-        super().__init__(port, bitrate, talk)
+    orders = staticmethod(table.orders)
+
+    def __init__(self, port: CanPort, bitrate: int) -> None:
+        super().__init__(port, bitrate)
         self._net = Net(port, _nothing, _nothing)
         self._known: dict[int, Found | None] = {}
-
-    def commanded(self) -> bool:
-        return table.HEARTBEAT + table.OUR_NODE in self._talk.frames
 
     def anybody(self) -> bool:
         """Asks all nodes, some at a time, so that those that are not there cost little."""
@@ -59,7 +59,8 @@ class DriveBench(CanBench):
         try:
             kind = (yield from self._net.read(node, table.DEVICE_TYPE)) & 0xFFFF
         except NoAnswer:
-            return None
+            beats = self._talk.frames.get(table.HEARTBEAT + node, ())
+            return self.found(node, problem=_STOPPED) if bytes((table.STOPPED,)) in beats[-1:] else None
         except Refused as refused:
             return self.found(node, problem=f"it refuses to be read: {refused}")
         if kind != table.DRIVE_PROFILE:

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
+from functools import partial
 from typing import TYPE_CHECKING, Final
 
 from trade.errors import ConfigurationError, WrongDevice
@@ -78,19 +79,20 @@ def open_exchange(robot: Robot, bus: CanBus, port: str) -> "DriveExchange":
     """
     axes = _axes(robot, bus, port)
     from trade_drivers.can import CanPort  # noqa: PLC0415 - the libraries are optional
+    from trade_drivers.cia402 import _table as table  # noqa: PLC0415
     from trade_drivers.cia402._exchange import DriveExchange  # noqa: PLC0415
 
     where = f"{robot.where}: bus.{bus.name}"
-    wire = CanPort(port, bus.bitrate, where)
+    nodes = [axis.id for axis in axes]
+    wire = CanPort.of(port, bus, where, partial(table.orders, nodes=nodes))
     with ExitStack() as undo:
         undo.callback(wire.close)
         try:
             wire.open()
             exchange = DriveExchange(wire, bus, axes)
-            exchange.net.take_in(bus.watchdog_s)
-            if exchange.rival:
-                problem = f"{port}: another driver commands the drives of this bus already; stop it first"
-                raise ConfigurationError(where=f"{where}.channel", problem=problem)
+            for axis in axes:
+                for data in wire.talk.frames.get(table.HEARTBEAT + axis.id, ()):
+                    axis.take_heartbeat(data, exchange.clock())
             _bring_in(exchange, robot.where)
         except PortLost as lost:
             problem = f"{port}: {lost}; is the interface up? `ip link` shows those there are"
@@ -109,6 +111,7 @@ def _bring_in(exchange: "DriveExchange", where: str) -> None:
     while away := [admission for admission in exchange.admissions if admission.axis.silent]:
         for admission in away:
             _check(admission, where, last=time.monotonic() > until)
+            admission.recall()
         exchange.cycle()
         exchange.idle(exchange.period_ns / 1e9)
     for _ in range(_FIRST_CYCLES):

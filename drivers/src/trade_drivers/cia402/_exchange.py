@@ -134,6 +134,14 @@ class DriveExchange(Exchange):
     def enabling(self, job: Job, axis: Axis) -> Steps:
         return jobs.enabling(self, job, cast("DriveAxis", axis), self.mode_for(job, cast("DriveAxis", axis)))
 
+    def require_answering(self, axis: Axis) -> None:
+        if axis.silent:
+            raise cast("DriveAxis", axis).absence(self.clock())
+
+    def recall(self, axis: DriveAxis) -> None:
+        """Take it back if network management has stopped it."""
+        self.admissions[self.drives.index(axis)].recall()
+
     def mode_for(self, job: Job, axis: DriveAxis) -> int:
         """The mode of operation for what a job is going to tell this drive."""
         match job.manner:
@@ -215,6 +223,10 @@ class DriveExchange(Exchange):
         if now_ns - self._beaten_ns >= self._beat_ns:
             self._beaten_ns = now_ns
             self.port.send(table.HEARTBEAT + table.OUR_NODE, bytes((table.OPERATIONAL,)))
+
+    def beat_next(self) -> None:
+        """Send a heartbeat in the next cycle: a drive watches for them only once it has heard one (CiA 301, 1016h)."""
+        self._beaten_ns = 0
 
     def _measure(self, began_ns: int) -> None:
         self._synced_ns = began_ns

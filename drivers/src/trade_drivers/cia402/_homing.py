@@ -66,7 +66,7 @@ class Homing(Motion):
         return axis.sample.position if axis.sample is not None else 0
 
     def watch(self, now_ns: int) -> None:
-        ending = self._trouble(now_ns)
+        ending = self.trouble(now_ns, None) or self._trouble(now_ns)
         if ending is not None or self._found():
             self._bus.command(self._axis, machine.HOLD)
             self.exchange.release(self, ending)
@@ -80,10 +80,6 @@ class Homing(Motion):
 
     def _trouble(self, now_ns: int) -> TradeError | None:
         axis = self._axis
-        if axis.fault:
-            return axis.faulty()
-        if axis.silent or axis.age_ns(now_ns) > self.exchange.stale_after_ns:
-            return axis.deaf(now_ns)
         if axis.statusword & machine.HOMING_ERROR:
             return axis.faulty("it has not found its home (statusword bit 13)")
         if now_ns >= min(self._until_ns or now_ns + 1, self._began_ns + _LONGEST_NS):

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 __all__ = ["enabling", "leaving", "looking", "relaxing", "resting", "set_mode", "write"]
 
 _WAIT_S: Final = 0.001
+_TAKEN_BACK_NS: Final = 5_000_000_000
 _AT_REST: Final = 2
 """Measurements in a row in which it did not move."""
 
@@ -28,6 +29,8 @@ def enabling(bus: "DriveExchange", job: Job, axis: DriveAxis, mode: int) -> Step
 
     A drive that is enabled already must be at rest: then only its mode changes. A search for its zero ends.
     """
+    if axis.stopped:
+        yield from _take_back(bus, job, axis)
     yield from looking(bus, axis)
     if axis.motion is not None and not axis.fault:
         bus.end_motion(axis, f"{axis.name} was enabled anew")
@@ -46,6 +49,23 @@ def enabling(bus: "DriveExchange", job: Job, axis: DriveAxis, mode: int) -> Step
     yield from _climb(bus, job, axis, mode)
     axis.fault, axis.ready, axis.entered = "", True, mode
     axis.stream = bus.stream_for(axis, mode, axis.target)
+
+
+def _take_back(bus: "DriveExchange", job: Job, axis: DriveAxis) -> Steps:
+    """Out of a stop by network management, and set up like one that has come back."""
+    give_up_ns = bus.clock() + _TAKEN_BACK_NS
+    axis.recalled = True
+    try:
+        while axis.silent:
+            job.gate()
+            if bus.clock() > give_up_ns:
+                raise axis.absence(bus.clock())
+            bus.recall(axis)
+            bus.idle(_WAIT_S)
+            yield
+    finally:
+        axis.recalled = False
+    job.note("taken back from network management's stop: pre-operational, and set up")
 
 
 def _begin_at_rest(bus: "DriveExchange", job: Job, axis: DriveAxis) -> Steps:

@@ -4,7 +4,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Annotated, cast
 
 from trade import Meta, permit, service
-from trade_drivers._asked import expiry
+from trade_drivers._asked import span
 from trade_drivers._can_monitor import CanMonitor
 from trade_drivers._checks import within
 from trade_drivers.cia402._axis import DriveAxis
@@ -40,7 +40,7 @@ class Drive(BusMotor):
         fastest = axis.joint.max_speed_rad_s
         speed = fastest / 10 if speed_rad_s is None else speed_rad_s
         within(speed, axis.grain.rad_s, fastest, f"{axis.name} speed", "rad/s")
-        expires_ns, ends = expiry(self._exchange.clock)
+        expires_ns, until_ns = span(self._exchange.clock)
         with permit(self.resources) as permitted:
             homing = Homing(
                 cast("DriveExchange", self._exchange),
@@ -49,7 +49,7 @@ class Drive(BusMotor):
                 speed_counts=int(speed / axis.grain.rad_s),
                 service=f"{self._name}.home",
                 expires_ns=expires_ns,
-                until_ns=expires_ns if ends else None,
+                until_ns=until_ns,
                 permit=permitted,
             )
             self._finish(homing)

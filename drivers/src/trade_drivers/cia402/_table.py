@@ -4,9 +4,13 @@ Sources: CiA 301 (1000h to 1FFFh, identifiers) and CiA 402-2 (6000h on).
 """
 
 import struct
-from typing import Final, Literal
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Final, Literal
 
 from msgspec import Struct
+
+if TYPE_CHECKING:
+    from trade_drivers.can import Talk
 
 __all__ = ["OUR_NODE", "Entry", "Pdo"]
 
@@ -97,6 +101,13 @@ BOOT_UP, STOPPED, OPERATIONAL, PREOPERATIONAL = 0x00, 0x04, 0x05, 0x7F
 NMT_STATES: Final = {BOOT_UP: "booting", STOPPED: "stopped", OPERATIONAL: "operational", PREOPERATIONAL: "pre-op"}
 
 NO_SUCH_OBJECT: Final = (0x06020000, 0x06090011)
+
+
+def orders(talk: "Talk", nodes: Iterable[int] = ()) -> set[int]:
+    """Identifiers among what was heard that only who commands drives sends: those with these nodes, or that tell."""
+    everybody = {NMT, SYNC, HEARTBEAT + OUR_NODE}
+    bases = (SDO_REQUEST, *(pdo.base for pdo in (COMMAND, PROFILE, BRAKING, FOLLOWING)))
+    return talk.frames.keys() & (everybody | {base + node for base in bases for node in {*nodes, *talk.canopen}})
 
 
 class Pdo(Struct, frozen=True):

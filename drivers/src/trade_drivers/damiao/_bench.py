@@ -34,11 +34,7 @@ class DamiaoBench(CanBench):
     remedy = "the vendor's tool"
     zero = "its zero is set by the vendor's tool"
 
-    def commanded(self) -> bool:
-        ours = {frames.EVERYBODY} | {
-            base + motor for base in (0, frames.POSITION_VELOCITY) for motor in range(1, MASTER)
-        }
-        return not ours.isdisjoint(self._talk.frames)
+    orders = staticmethod(frames.orders)
 
     def anybody(self) -> bool:
         return True

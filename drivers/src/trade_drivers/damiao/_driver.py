@@ -1,15 +1,16 @@
 """Bringing a bus of Damiao motors up."""
 
+from collections.abc import Collection
 from typing import TYPE_CHECKING, Any
 
 from trade_drivers.canmotors import CanMotorDriver
 from trade_drivers.damiao._axis import DamiaoAxis
 from trade_drivers.damiao._commission import DamiaoCommissioner
-from trade_drivers.damiao._frames import MODELS
+from trade_drivers.damiao._frames import MODELS, orders
 from trade_drivers.robotfile import CanBus, Robot
 
 if TYPE_CHECKING:
-    from trade_drivers.can import CanPort
+    from trade_drivers.can import CanPort, Talk
     from trade_drivers.canmotors._exchange import MotorExchange
     from trade_drivers.damiao._exchange import DamiaoExchange
 
@@ -33,6 +34,9 @@ class DamiaoDriver(CanMotorDriver):
         ]
         check_bus(bus, axes, robot.where)
         return DamiaoExchange(wire, bus, axes)
+
+    def orders(self, talk: "Talk", nodes: Collection[int]) -> Collection[int]:
+        return orders(talk, nodes)
 
 
 def open_exchange(robot: Robot, bus: CanBus, port: str) -> "MotorExchange[Any]":

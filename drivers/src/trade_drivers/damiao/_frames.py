@@ -5,8 +5,12 @@ it listens to (ESC_ID, register 8) and that it answers with (MST_ID, register 7)
 """
 
 import struct
+from collections.abc import Iterable
 from enum import IntEnum
-from typing import Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+if TYPE_CHECKING:
+    from trade_drivers.can import Talk
 
 __all__ = ["MODELS", "Feedback", "Ranges", "Register", "Status"]
 
@@ -17,6 +21,8 @@ POSITION_VELOCITY: Final = 0x100
 MASTER: Final = 0x10
 """A motor's own identifier and this make that of its answers: what its vendor's tool sets."""
 ENABLE, DISABLE, CLEAR = (bytes(7 * (0xFF,) + (last,)) for last in (0xFC, 0xFD, 0xFB))
+_MODES: Final = (0, POSITION_VELOCITY, 0x200, 0x300)
+"""Added to a motor's identifier, by its mode of control."""
 TICKS_PER_S: Final = 20_000
 """Of the time after which a motor that hears nothing lets go."""
 _POSITION: Final = struct.Struct("<ff")
@@ -24,6 +30,11 @@ _READ, _WRITE, _REFRESH = 0x33, 0x55, 0xCC
 _FEEDBACK: Final = 8
 FULL: Final = 1000
 """Parts of the torque that a motor can tell."""
+
+
+def orders(talk: "Talk", nodes: Iterable[int] = ()) -> set[int]:  # noqa: ARG001 - nobody else has such identifiers
+    """Identifiers among what was heard that only who commands or asks motors sends."""
+    return talk.frames.keys() & ({EVERYBODY} | {base + motor for base in _MODES for motor in range(1, MASTER)})
 
 
 class Register(IntEnum):

@@ -7,13 +7,12 @@ from typing import Final
 from trade_drivers._commission import Found
 from trade_drivers.can import CanBench
 from trade_drivers.odrive._axis import MODELS
-from trade_drivers.odrive._frames import NODES, Command, Heartbeat, State, Version, frame_id
+from trade_drivers.odrive._frames import NODES, Command, Heartbeat, State, Version, frame_id, orders
 
 __all__ = ["OdriveBench"]
 
 _ANSWER_S: Final = 0.25
 _ATTEMPTS: Final = 3
-_COMMANDS: Final = frozenset({Command.SET_STATE, Command.SET_MODE, Command.SET_POSITION, Command.SET_VELOCITY})
 
 
 class OdriveBench(CanBench):
@@ -23,9 +22,7 @@ class OdriveBench(CanBench):
     remedy = "odrivetool or its web interface"
     zero = "its zero is set by odrivetool or its web interface"
 
-    def commanded(self) -> bool:
-        orders = {frame_id(node, command) for node in self._talk.odrives for command in _COMMANDS}
-        return not orders.isdisjoint(self._talk.frames)
+    orders = staticmethod(orders)
 
     def refuse(self) -> None:
         """It asks nobody else."""

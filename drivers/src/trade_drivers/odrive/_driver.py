@@ -1,15 +1,16 @@
 """Bringing a bus of ODrives up."""
 
-from typing import TYPE_CHECKING, Any, cast
+from collections.abc import Collection
+from typing import TYPE_CHECKING, Any
 
-from trade.errors import ConfigurationError
 from trade_drivers.canmotors import CanMotorDriver
 from trade_drivers.odrive._axis import MODELS, OdriveAxis
 from trade_drivers.odrive._commission import OdriveCommissioner
+from trade_drivers.odrive._frames import orders
 from trade_drivers.robotfile import CanBus, Robot
 
 if TYPE_CHECKING:
-    from trade_drivers.can import CanPort
+    from trade_drivers.can import CanPort, Talk
     from trade_drivers.canmotors._exchange import MotorExchange
     from trade_drivers.odrive._exchange import OdriveExchange
 
@@ -34,15 +35,8 @@ class OdriveDriver(CanMotorDriver):
         check_bus(bus, axes, robot.where)
         return OdriveExchange(wire, bus, axes)
 
-    def listen(self, exchange: "MotorExchange[Any]", bus: CanBus, where: str) -> None:
-        """For as long as the watchdogs take: then only what is fed by somebody else, or is not watched, has torque."""
-        listen_s = bus.watchdog_s + 0.1
-        for axis in exchange.motors:
-            axis.probe_at_ns = exchange.clock() + int(listen_s * 1e9)
-        exchange.net.take_in(listen_s)
-        if cast("OdriveExchange", exchange).rival:
-            problem = f"{exchange.port.path}: another driver commands the axes of this bus already; stop it first"
-            raise ConfigurationError(where=f"{where}.channel", problem=problem)
+    def orders(self, talk: "Talk", nodes: Collection[int]) -> Collection[int]:
+        return orders(talk, nodes)
 
 
 def open_exchange(robot: Robot, bus: CanBus, port: str) -> "MotorExchange[Any]":

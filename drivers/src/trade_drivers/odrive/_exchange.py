@@ -25,14 +25,6 @@ _log = logging.getLogger("trade")
 _HEALTH: Final = (Command.ERRORS, Command.CURRENTS, Command.TEMPERATURES, Command.SUPPLY)
 _BEATS_MISSED_NS: Final = 500_000_000
 """Five heartbeats, as an ODrive sends them if nobody has changed that."""
-_ORDERS: Final = (
-    Command.ESTOP,
-    Command.SET_STATE,
-    Command.SET_MODE,
-    Command.SET_POSITION,
-    Command.SET_VELOCITY,
-    Command.SET_TORQUE,
-)
 
 
 class OdriveExchange(MotorExchange[OdriveAxis]):
@@ -47,7 +39,6 @@ class OdriveExchange(MotorExchange[OdriveAxis]):
         self, port: "CanPort", bus: "CanBus", axes: Sequence[OdriveAxis], clock: Callable[[], int] = time.monotonic_ns
     ) -> None:
         super().__init__(port, bus, axes, clock)
-        self.watchdog_ns = int(bus.watchdog_s * 1e9)
         self.rival = False
         """Somebody else commands these axes."""
         for axis in axes:
@@ -57,7 +48,7 @@ class OdriveExchange(MotorExchange[OdriveAxis]):
 
     def _listen_for_rivals(self, axis: OdriveAxis) -> None:
         """Whoever commands or asks an axis feeds its watchdog, too, and it would not notice that this driver dies."""
-        for command in _ORDERS:
+        for command in frames.ORDERS:
             self.net.hear(frame_id(axis.id, command), self._hear_rival)
         take = axis.listeners(self.clock)[Command.ESTIMATES]
         self.net.hear(frame_id(axis.id, Command.ESTIMATES), lambda data: take(data) if data else self._hear_rival(data))

@@ -5,8 +5,12 @@ the motor, speeds in turns a second.
 """
 
 import struct
+from collections.abc import Iterable
 from enum import IntEnum, IntFlag
-from typing import Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+if TYPE_CHECKING:
+    from trade_drivers.can import Talk
 
 __all__ = [
     "Command",
@@ -50,6 +54,34 @@ class Command(IntEnum):
     TEMPERATURES = 0x15
     SUPPLY = 0x17
     CLEAR_ERRORS = 0x18
+
+
+ORDERS: Final = frozenset(
+    {
+        Command.ESTOP,
+        Command.SET_STATE,
+        Command.SET_MODE,
+        Command.SET_POSITION,
+        Command.SET_VELOCITY,
+        Command.SET_TORQUE,
+        Command.SET_TRAJECTORY_SPEED,
+        Command.SET_TRAJECTORY_ACCEL,
+        Command.CLEAR_ERRORS,
+    }
+)
+
+
+def orders(talk: "Talk", nodes: Iterable[int] = ()) -> set[int]:
+    """Identifiers among what was heard that only who commands or asks axes sends: these nodes, or those that tell.
+
+    A question is one, too: it feeds the watchdog of an axis, which would not notice that its driver dies.
+    """
+    known = {*nodes, *talk.odrives}
+    return {
+        can_id
+        for can_id, frames in talk.frames.items()
+        if can_id >> 5 in known and (can_id & 0x1F in ORDERS or not all(frames))
+    }
 
 
 class State(IntEnum):

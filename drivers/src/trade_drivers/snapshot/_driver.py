@@ -76,7 +76,7 @@ class SnapshotCamera(Camera):
             DeviceFault: an HTTP error, no picture, or one of another size than when it was attached.
         """
         asked_ns = time.monotonic_ns()
-        shown, data = _look(self._place, self._name, self._url, self._patience_s(asked_ns))
+        shown, data = _look(self._place, self._name, self._url, self._patience_s())
         if shown != self._shown:
             fault = f"its pictures were {_text(self._shown)} when it was attached and are {_text(shown)} now"
             raise DeviceFault(device=self._name, bus=self._url, fault=fault, remedy="attach it anew")
@@ -99,11 +99,9 @@ class SnapshotCamera(Camera):
     def close(self) -> None:
         """Nothing is open."""
 
-    def _patience_s(self, now_ns: int) -> float:
+    def _patience_s(self) -> float:
         call = current_call()
-        if call is None or call.expires_ns is None:
-            return self._timeout_s
-        return max(0.001, min(self._timeout_s, (call.expires_ns - now_ns) / 1e9))
+        return self._timeout_s if call is None else max(0.001, call.patience_s(self._timeout_s))
 
 
 def _look(place: Place, name: str, url: str, within_s: float) -> tuple[Picture, bytes]:

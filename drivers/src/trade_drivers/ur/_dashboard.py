@@ -1,12 +1,13 @@
 """The dashboard server of a controller: one connection a question, each with a deadline. Plain sockets, no library."""
 
 import socket
+import struct
 import threading
 import time
 from contextlib import suppress
 from typing import Final
 
-__all__ = ["DashboardError", "ask", "probe", "tell"]
+__all__ = ["DashboardError", "ask", "commanded", "probe", "tell"]
 
 _PORT: Final = 29999
 _RTDE: Final = 30004
@@ -16,6 +17,10 @@ _HELLO: Final = bytes.fromhex("0005560002")
 """RTDE: protocol version 2, please."""
 _WELCOME: Final = bytes.fromhex("00045601")
 _LONGEST: Final = 4096
+_HEAD: Final = struct.Struct(">HB")
+_INPUTS: Final = ord("I")
+_REGISTER: Final = b"input_int_register_0"
+"""It tells the control script of ur-rtde what to do."""
 
 
 class DashboardError(Exception):
@@ -71,6 +76,27 @@ def probe(host: str, timeout_s: float) -> None:
         socket.create_connection((host, _SCRIPT), timeout_s).close()
     except OSError as problem:
         raise DashboardError(f"{host}:{_SCRIPT}: {problem or 'no answer'}") from None
+
+
+def commanded(host: str, timeout_s: float) -> bool:
+    """Whether another program has control of its arm: a controller gives each register to one client.
+
+    Nothing is written. If nobody has the register it is taken, until the connection ends with this question.
+
+    Raises:
+        DashboardError: no answer in time.
+    """
+    until = time.monotonic() + timeout_s
+    try:
+        with socket.create_connection((host, _RTDE), timeout_s) as connection:
+            connection.sendall(_HELLO + _HEAD.pack(_HEAD.size + len(_REGISTER), _INPUTS) + _REGISTER)
+            while True:
+                size, kind = _HEAD.unpack(_bytes(connection, _HEAD.size, until))
+                told = _bytes(connection, max(0, size - _HEAD.size), until)
+                if kind == _INPUTS:
+                    return b"IN_USE" in told
+    except OSError as problem:
+        raise DashboardError(f"{host}:{_RTDE}: {problem or 'no answer'}") from None
 
 
 def _line(connection: socket.socket, until: float) -> str:

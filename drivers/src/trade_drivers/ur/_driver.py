@@ -1,5 +1,6 @@
 """Bringing a controller's arm up, and handing it out."""
 
+import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from typing import Final, NoReturn
@@ -12,11 +13,12 @@ from trade_drivers import robotfile
 from trade_drivers._arm import Arm
 from trade_drivers._bus_thread import BusThread
 from trade_drivers._driver import AttachedBus, Driver
+from trade_drivers._host_lock import HostLock, Taken
 from trade_drivers._interfaces import JointGroup, Motor
 from trade_drivers._work import PortLost
 from trade_drivers.faults import Tell
 from trade_drivers.robotfile import Bus, Robot, UrBus
-from trade_drivers.ur._dashboard import DashboardError, ask
+from trade_drivers.ur._dashboard import DashboardError, ask, commanded
 from trade_drivers.ur._exchange import Exchange
 from trade_drivers.ur._limb import Limb
 from trade_drivers.ur._link import Link
@@ -35,13 +37,15 @@ _CYCLES_HZ: Final = {
 }
 """Models of the CB3 and of the e-Series, and how many cycles a second their controllers have."""
 _ASK_S: Final = 1.0
+_LET_GO_S: Final = 2.0
+_AGAIN_S: Final = 0.1
 
 
 class AttachedController(AttachedBus):
     """A controller with its arm, and the thread that owns it."""
 
-    def __init__(self, thread: BusThread[Exchange], link: Link) -> None:
-        self._thread, self._link = thread, link
+    def __init__(self, thread: BusThread[Exchange], link: Link, lock: HostLock) -> None:
+        self._thread, self._link, self._lock = thread, link, lock
 
     def motor(self, joint: str) -> Motor:
         raise ConfigurationError(where=f'joint."{joint}"', problem="driver ur has no joints, only an arm: [arm.NAME]")
@@ -67,6 +71,7 @@ class AttachedController(AttachedBus):
             self._thread.close()
         finally:
             self._link.wait_closed()
+            self._lock.release()
 
 
 class UrDriver(Driver):
@@ -94,12 +99,18 @@ class UrDriver(Driver):
     def attach(self, robot: Robot, bus: Bus, port: str, healthy: Callable[[], bool]) -> AttachedBus:
         where = f"{robot.where}: bus.{bus.name}"
         limb, bus = self._limb_of(robot, bus, port)
-        link = Link(port)
+        link, lock = Link(port), HostLock(f"ur:{port}", where)
         with ExitStack() as undo:
+            try:
+                lock.take()
+            except Taken as taken:
+                _wrong(f"{where}.host", f"{port}: another driver of this host has it: {taken}; stop it first")
+            undo.callback(lock.release)
             undo.callback(link.wait_closed)
             undo.callback(link.close)
             try:
                 link.wait_open()
+                _refuse_company(port, where)
                 _look_over(limb, f"{robot.where}: arm.{limb.arm.name}")
             except (PortLost, DashboardError) as problem:
                 _wrong(f"{where}.host", f"{problem}; is it switched on, and is this its address?")
@@ -109,7 +120,7 @@ class UrDriver(Driver):
             thread = BusThread(exchange, link, bus, healthy, name=f"bus {robot.name}.{bus.name}")
             thread.start()
             undo.pop_all()
-        return AttachedController(thread, link)
+        return AttachedController(thread, link, lock)
 
 
 def _limb(robot: Robot, bus: UrBus, port: str) -> Limb:
@@ -126,6 +137,15 @@ def _limb(robot: Robot, bus: UrBus, port: str) -> Limb:
     if bus.leave != "hold":
         _wrong(f"{robot.where}: bus.{bus.name}.leave", '"relax" is nothing an arm can: it would fall; use "hold"')
     return Limb(f"{robot.name}.{arm.name}", port, arm)
+
+
+def _refuse_company(port: str, where: str) -> None:
+    """One that another program has control of is left alone. A process that was killed keeps that for a moment."""
+    until = time.monotonic() + _LET_GO_S
+    while commanded(port, _ASK_S):
+        if time.monotonic() > until:
+            _wrong(f"{where}.host", f"{port}: another program has control of this arm; stop it first")
+        time.sleep(_AGAIN_S)
 
 
 def _look_over(limb: Limb, where: str) -> None:

@@ -106,6 +106,7 @@ class Exchange(BusExchange[Limb]):
         if self.limb.motion not in {None, motion}:
             self.end_motion("another move took over")
         self.limb.motion, self.limb.still, self.limb.halting_since_ns = motion, 0, 0
+        motion.attended_ns = self.lasting_clock()
         self.limb.tell_moving()
 
     def end_motion(self, reason: str) -> None:

@@ -86,13 +86,18 @@ class Motion(Command):
 
     streams = False
     """It is a stream of set-points, which has to be ended also when it ends well."""
+    attended_ns = 0
+    """When it was last looked after, by the lasting clock."""
 
     def watch(self, now_ns: int) -> None:
         """Look at the newest measurement; end it if it is over or must not go on."""
         raise NotImplementedError
 
     def trouble(self, now_ns: int, until_ns: int | None) -> TradeError | None:
-        """Why it may not go on: silence, a fault, or the end of its call."""
+        """Why it may not go on: a driver that was held up, silence, a fault, or the end of its call."""
+        attended_ns, self.attended_ns = self.attended_ns, self.exchange.lasting_clock()
+        if held_up := self.exchange.held_up(attended_ns):
+            return self.limb.faulty(f"{self.limb.fault}; {held_up}" if self.limb.fault else held_up)
         try:
             self.usable()
         except TradeError as problem:
@@ -185,6 +190,7 @@ class Move(Motion):
             self.exchange.release(self, problem)
             raise
         self.note("began its move")
+        self.attended_ns = self.exchange.lasting_clock()
         control = self.exchange.link.control
         self._pulses = 0 if control is None else control.pulses
 
@@ -293,8 +299,8 @@ class SetPoint(Motion):
 
     def _send(self, now_ns: int) -> None:
         self.gate()
-        if (astray := self.astray(self.usable())) is not None:
-            raise astray
+        if (ending := self.trouble(now_ns, None) or self.astray(self.usable())) is not None:
+            raise ending
         if self._chase is not None and now_ns - self._sent_ns >= self.exchange.period_ns // 2:
             dt = min(now_ns - self._sent_ns, 5 * self.exchange.period_ns) / 1e9
             self._sent_ns = now_ns

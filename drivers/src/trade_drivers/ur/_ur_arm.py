@@ -205,8 +205,8 @@ class UrArm(Arm):
     def _switch(self, line: str, expected: str, reached: Callable[[], bool]) -> None:
         """Ask the dashboard for something, and wait until the controller shows it."""
         clock, service = self._exchange.clock, f"{self._name}.{line.replace(' ', '_')}"
-        expires_ns, ends = expiry(clock)
-        until_ns = expires_ns if ends else clock() + _SWITCH_NS
+        _, until_ns = span(clock)
+        until_ns = until_ns or clock() + _SWITCH_NS
         self.state()
         with permit(self.resources) as permitted:
             self._ordered(line, expected, permitted)
