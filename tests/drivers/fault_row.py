@@ -58,6 +58,7 @@ class Stop(Enum):
     HOLD_OR_PROGRAM = "the driver has it hold and gets no answer; then it has the controller end the program"
     PROGRAM = "the driver has the controller end the program, by its dashboard; else its own watchdog"
     BLOCKED = "what blocks it; the driver has it hold, or its own overload protection lets go, whichever is first"
+    UNTOLD = "nothing is sent: a hold could switch torque on; it ends at its last goal, which is never far ahead"
     NEAR = "nothing can reach it, and it has no watchdog: its last goal, which is never far ahead"
     GOAL = "nothing can reach it, and it has no watchdog: it ends the move it was told"
 

@@ -98,7 +98,7 @@ class Model(RuleBasedStateMachine):
         self.now = 0
         self.numbers = itertools.count(1)
         self.joints = [Joint(name) for name in "abc"]
-        bus = SimpleNamespace(rate_hz=1e9 / PERIOD_NS, stale_after_s=STALE_NS / 1e9)
+        bus = SimpleNamespace(rate_hz=1e9 / PERIOD_NS, stale_after_s=STALE_NS / 1e9, watchdog_s=0.3)
         self.exchange = Exchange(bus, self.joints, lambda: self.now)  # type: ignore[arg-type]
         self.jobs: list[Job] = []
         """In the order in which they were taken on; those that ended, too."""

@@ -100,6 +100,9 @@ def _check_stop(row: Row, subject: Subject, struck: float) -> None:
     if row.stop in {Stop.HOLD, Stop.BOTH, Stop.HOLD_OR_PROGRAM}:
         wait_until(lambda: subject.holds(struck), "it has heard that it is to hold")
         wait_until(lambda: not subject.truth.moving, "it is at rest there")  # it may have stood for a moment before
+    if row.stop is Stop.UNTOLD:
+        wait_until(lambda: _tells(subject, row.state), "its silence is noticed")
+        assert not subject.holds(struck)
     if row.stop is Stop.BLOCKED:
         wait_until(lambda: subject.holds(struck) or _ended_itself(subject, struck), "it holds, or has let go")
     if row.stop is Stop.HOLD:

@@ -20,6 +20,7 @@ from trade_hil_sim.feetech import STS3215, PacketReader, encode, status
 
 REGISTERS = {name: value for name, value in vars(table).items() if isinstance(value, table.Register)}
 IDS = (1, 2, 3)
+BLIND_NS = 300_000_000
 
 
 def taken(data: bytes, size: int, ids: Sequence[int] = IDS) -> list[Status]:
@@ -169,9 +170,9 @@ def test_a_joint_that_is_not_heard_is_told_to_hold_until_it_surely_rests_by_itse
     axis = FeetechAxis("rosie.a", "/dev/x", joint(), 0.3)
     axis.note(Sample(2200, 160, 0, 10**9))
     axis.sent_ns = 10**9 + 1
-    assert axis.hold_counts(axis.sent_ns + int(passed_s * 1e9)) == hold
+    assert axis.hold_counts(axis.sent_ns + int(passed_s * 1e9), BLIND_NS) == hold
     axis.note(Sample(2300, 0, 0, axis.sent_ns + 1))
-    assert axis.hold_counts(axis.sent_ns + 10**10) == 2300
+    assert axis.hold_counts(axis.sent_ns + 10**10, BLIND_NS) == 2300
 
 
 def test_a_joint_that_is_not_heard_on_its_way_is_not_told_to_hold_beyond_where_it_was_sent() -> None:
@@ -179,8 +180,8 @@ def test_a_joint_that_is_not_heard_on_its_way_is_not_told_to_hold_beyond_where_i
     axis.note(Sample(2200, 160, 0, 10**9))
     axis.motion = SimpleNamespace(goal_of=lambda _: 4000)  # type: ignore[assignment]
     axis.sent, axis.sent_ns = 2300, 10**9 + 1
-    assert axis.hold_counts(10**9 + 60_000_000) == 2296  # where it must have got to
-    assert axis.hold_counts(10**9 + 200_000_000) == 2300
+    assert axis.hold_counts(10**9 + 60_000_000, BLIND_NS) == 2296  # where it must have got to
+    assert axis.hold_counts(10**9 + 200_000_000, BLIND_NS) == 2300
 
 
 def test_importing_the_driver_needs_no_serial_library() -> None:

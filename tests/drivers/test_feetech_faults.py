@@ -17,8 +17,6 @@ from waiting import wait_until
 
 COUNT_RAD = 6.283185 / 4096
 OVERLOAD, OVERHEATING = 0x20, 0x04
-FULL_SPEED = (1620).to_bytes(2, "little")
-"""A joint that is told to hold is told so with its full speed; its move was slower."""
 
 
 @pytest.fixture
@@ -101,17 +99,16 @@ def test_a_silent_joint_leaves_the_other_usable(tail: TailRig, robot: AttachedRo
     assert robot.motor("tail.tip").move_to(0.4) == pytest.approx(0.4, abs=0.03)
 
 
-def test_a_joint_that_fell_silent_on_its_way_is_told_to_hold_no_farther_than_it_was_sent(
+def test_a_joint_that_fell_silent_on_its_way_is_told_nothing_and_goes_no_farther_than_it_was_sent(
     tail: TailRig, robot: AttachedRobot
 ) -> None:
     moving = Outcome(lambda: robot.motor("tail.root").move_to(1.3, 1.0))
     wait_until(lambda: tail.truth().position_rad > 0.2, "it is under way")
     tail.sim.do(sim.Mute(ids=(1,)))
     assert isinstance(moving.wait().error, DeviceSilent)
-    wait_until(lambda: tail.goals(1)[-1].data[5:7] == FULL_SPEED, "it was told to hold")
-    hold = goal_of(tail.goals(1)[-1])
-    assert hold <= max(goal_of(entry) for entry in tail.goals(1) if entry.data[5:7] != FULL_SPEED)
+    sent = goal_of(tail.goals(1)[-1])
     wait_until(lambda: not tail.truth().moving, "it rests")
+    assert tail.truth().position_counts == sent == goal_of(tail.goals(1)[-1])
     assert tail.truth().position_rad < 1.2
 
 
@@ -214,3 +211,68 @@ def test_a_restart_is_noticed_and_only_an_enable_lets_it_move_again(tail: TailRi
         root.move_to(0.0)
     root.enable()
     assert root.move_to(0.0) == pytest.approx(0.0, abs=0.03)
+
+
+# --- a goal switches torque on: who may have restarted without it gets none
+
+
+@pytest.mark.parametrize("under_way_rad", [0.1, 0.25])
+@pytest.mark.parametrize("goal_switches_on", [True, False])
+def test_S18_a_servo_that_browns_out_on_its_way_gets_no_goal_after_it_has_booted_limp(
+    tail: TailRig, robot: AttachedRobot, under_way_rad: float, goal_switches_on: bool
+) -> None:
+    tail.servo().goal_switches_on = goal_switches_on
+    moving = Outcome(lambda: robot.group("tail").move_to([1.3, 0.4], 0.5))
+    wait_until(lambda: tail.truth().position_rad > under_way_rad, "it is under way")
+    browned_out = written_now()
+    tail.sim.do(sim.BrownOut(ids=(1,)))
+    assert isinstance(moving.wait().error, (DeviceFault, DeviceSilent))
+    await_fault(robot, "its torque went off")
+    booted = tail.wait_for("booted", 1, browned_out)
+    assert not tail.moves(1, booted.t)
+    assert not tail.truth().torque
+
+
+def test_S18_a_servo_that_has_let_go_and_missed_an_exchange_gets_no_goal(tail: TailRig, robot: AttachedRobot) -> None:
+    moving = Outcome(lambda: robot.motor("tail.root").move_to(1.3, 0.5))
+    wait_until(lambda: tail.truth().position_rad > 0.2, "it is under way")
+    tail.sim.do(sim.Mute(ids=(1,), count=2))
+    seen = len(sim.received(tail.log))
+    wait_until(lambda: len(sim.received(tail.log)) > seen, "it is asked in vain")
+    tail.poke(40, 0)  # back without torque, as one that boots quicker than it is missed
+    limp = tail.wait_for("torque_off", 1)
+    assert isinstance(moving.wait().error, DeviceFault)
+    await_fault(robot, "its torque went off")
+    assert not tail.events("torque_on", 1, limp.t)
+
+
+def test_S18_a_stop_of_a_servo_that_has_booted_limp_and_was_not_heard_since_sends_it_no_hold(
+    tail: TailRig, robot: AttachedRobot
+) -> None:
+    root = robot.motor("tail.root")
+    moving = Outcome(lambda: root.move_to(1.3, 0.5))
+    wait_until(lambda: tail.truth().position_rad > 0.2, "it is under way")
+    tail.sim.do(sim.BrownOut(ids=(1,)))
+    tail.sim.do(sim.Mute(ids=(1,)))
+    booted = tail.wait_for("booted", 1)
+    with pytest.raises(DeviceSilent):
+        root.stop()
+    assert moving.wait().error is not None
+    assert not tail.moves(1, booted.t)
+    assert not tail.truth().torque
+
+
+def test_S07_a_stop_of_a_servo_that_misses_one_exchange_holds_it_as_soon_as_it_is_heard_again(
+    tail: TailRig, robot: AttachedRobot
+) -> None:
+    root = robot.motor("tail.root")
+    moving = Outcome(lambda: root.move_to(1.3, 0.5))
+    wait_until(lambda: tail.truth().position_rad > 0.2, "it is under way")
+    tail.sim.do(sim.Mute(ids=(1,), count=1))
+    asked = written_now()
+    root.stop()
+    assert moving.wait().error is not None
+    rested = tail.wait_for("at_rest", 1, asked)
+    assert tail.goals(1, asked)
+    assert abs(goal_of(tail.goals(1)[-1]) - tail.truth().position_counts) <= 1
+    assert tail.truth().position_rad < 0.2 + 0.5 * (rested.t - asked) + 0.2

@@ -127,10 +127,17 @@ def test_S05_a_motion_ends_with_its_session_whoever_else_used_the_joint_meanwhil
 
 
 def test_S20_a_second_driver_on_the_port_is_refused_and_sends_not_one_byte(tail: TailRig, gate: Gate) -> None:
-    tail.attach(healthy=gate)
+    first = tail.root(healthy=gate)
+    first.enable()
     gate.hold_up()
     mark = written_now()
     with pytest.raises(ConfigurationError, match="another driver owns this port") as refused:
         tail.attach()
     assert str(tail.sim.port) in str(refused.value)
     assert not [entry for entry in tail.log if entry.direction == "in" and entry.t >= mark]
+    gate.let_go()
+    moving = Outcome(lambda: first.move_to(0.5, 0.5))
+    tail.wait_for("motion_started", 1, mark)
+    with pytest.raises(ConfigurationError, match="another driver owns this port"):
+        tail.attach()
+    assert moving.wait().result == pytest.approx(0.5, abs=0.01)

@@ -166,7 +166,7 @@ def test_S06_a_driver_that_wakes_up_moves_nothing_and_says_why(tail: TailRig, ch
     where = tail.truth().position_counts
     threading.Event().wait(LEAD_S)
     child.signal(signal.SIGCONT)
-    assert "MotionStopped" in (said := child.line())
+    assert "DeviceFault" in (said := child.line())
     assert "held up" in said
     assert abs(tail.truth().position_counts - where) <= 1
     assert not [entry for entry in tail.goals(1, rested.t) if abs(goal_of(entry) - where) > 1]

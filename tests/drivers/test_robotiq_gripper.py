@@ -166,12 +166,6 @@ def test_an_absent_gripper_is_named(hand: HandRig) -> None:
         hand.attach()
 
 
-def test_a_port_that_another_driver_has_is_not_taken(hand: HandRig) -> None:
-    hand.attach()
-    with pytest.raises(ConfigurationError, match="another driver owns this port"):
-        hand.attach()
-
-
 def test_a_port_that_is_not_there_is_named(hand: HandRig, tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError, match="there is no such device"):
         hand.attach(ports={"hand": str(tmp_path / "nowhere")})

@@ -16,6 +16,7 @@ from drivers.gripper_rig import HandRig, made_rig, silent
 from robots import HAND
 from trade import Container, Handle, where
 from trade.errors import (
+    ConfigurationError,
     DeadlineExceeded,
     DeviceError,
     DeviceSilent,
@@ -371,3 +372,21 @@ def test_S22_what_is_refused_is_not_written(hand: HandRig) -> None:
         with pytest.raises((LimitExceeded, InvalidArgument)):
             gripper.move_to(width, speed, force)
     assert not hand.writes(mark)
+
+
+# --- S20
+
+
+def test_S20_a_second_driver_on_the_port_is_refused_and_sends_not_one_byte(hand: HandRig, gate: Gate) -> None:
+    gripper = hand.active(healthy=gate)
+    gate.hold_up()
+    mark = written_now()
+    with pytest.raises(ConfigurationError, match="another driver owns this port"):
+        hand.attach()
+    assert not received(hand.log, since=mark)
+    gate.let_go()
+    moving = Outcome(lambda: gripper.move_to(0.02, SLOW_M_S))
+    hand.under_way()
+    with pytest.raises(ConfigurationError, match="another driver owns this port"):
+        hand.attach()
+    assert moving.wait().result.width_m == pytest.approx(0.02, abs=0.001)

@@ -123,13 +123,20 @@ def test_S19_a_joint_that_cannot_be_heard_keeps_its_watchdog(head: Rig) -> None:
 
 
 def test_S20_a_second_driver_on_the_port_is_refused_and_sends_not_one_byte(head: Rig, gate: Gate) -> None:
-    head.attach(healthy=gate)
+    first = head.attach(healthy=gate).motor("neck.pan")
+    first.enable()
     gate.hold_up()
     mark = written_now()
     with pytest.raises(ConfigurationError, match="another driver owns this port") as refused:
         head.attach()
     assert str(head.sim.port) in str(refused.value)
     assert not received(head.log, since=mark)
+    gate.let_go()
+    moving = Outcome(lambda: first.move_to(0.5, 0.5))
+    head.wait_for("motion_started", 1, mark)
+    with pytest.raises(ConfigurationError, match="another driver owns this port"):
+        head.attach()
+    assert moving.wait().result == pytest.approx(0.5, abs=0.01)
 
 
 def test_S20_the_port_is_free_again_after_close(head: Rig) -> None:

@@ -2,14 +2,15 @@
 
 import math
 from collections.abc import Callable
+from contextlib import suppress
 
 import pytest
 
 from drivers.conftest import Outcome, Rig, call, goal_counts, sleep_past, written_now
 from drivers.gate import Gate
-from trade.errors import DeadlineExceeded, InvalidArgument, LimitExceeded, MotionStopped
+from trade.errors import DeadlineExceeded, InvalidArgument, LimitExceeded, MotionStopped, TradeError
 from trade_drivers import AttachedRobot, Motor
-from trade_hil_sim import Servo
+from trade_hil_sim import BrownOut, Servo
 from waiting import wait_until
 
 COUNTS_PER_RAD = 4096 / math.tau
@@ -62,6 +63,22 @@ def test_S04_renewed_in_time_it_goes_on(head: Rig, robot: AttachedRobot) -> None
     assert len(head.events("motion_started", 1, began)) == 1
     assert not head.events("at_rest", 1, began)
     assert end_of(head, began) <= 1.4 + 0.01
+
+
+def test_S18_a_servo_that_browns_out_is_sent_no_set_point_after_it_has_booted_limp(
+    head: Rig, robot: AttachedRobot
+) -> None:
+    pan = robot.motor("neck.pan")
+    pan.move_to(-1.4)
+    head.sim.do(BrownOut(ids=(1,)))
+    with suppress(TradeError):
+        while True:
+            pan.set_velocity(0.5, 1.0)
+    booted = head.wait_for("booted", 1)
+    wait_until(lambda: "restarted" in pan.state().fault, "it is noticed")
+    where = head.truth(1).position_counts
+    assert all(abs(goal_counts(entry) - where) <= 1 for entry in head.goals(1, booted.t))  # held blind, at most
+    assert not head.truth(1).torque
 
 
 def test_S04_a_renewal_that_is_refused_renews_nothing(head: Rig, robot: AttachedRobot) -> None:

@@ -52,6 +52,8 @@ def test_ping_scan_read_write(client: Any, bus: FeetechBus) -> None:
 
 
 def test_sync_read_and_sync_write_move_what_has_torque(client: Any, bus: FeetechBus) -> None:
+    for servo in bus.devices:
+        servo.goal_switches_on = False
     client.write_torque_enable(1, True)
     client.write_torque_enable(3, True)
     client.sync_write_raw_goal_position([1, 2, 3], [2101, 2102, 2103])

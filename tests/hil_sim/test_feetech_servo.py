@@ -114,7 +114,15 @@ def test_it_goes_to_its_goal_at_its_speed_and_says_so_while_it_does(rig: Rig) ->
     assert rig.told == ["torque_on", "motion_started", "at_rest"]
 
 
-def test_without_torque_a_goal_moves_nothing_and_torque_goes_for_it(rig: Rig) -> None:
+def test_a_goal_switches_torque_on_as_on_real_servos(rig: Rig) -> None:
+    rig.write(GOAL, 3000)
+    rig.pass_s(2)
+    assert (rig.read(TORQUE), rig.read(POSITION)) == (1, 3000)
+    assert rig.told == ["torque_on", "motion_started", "at_rest"]
+
+
+def test_one_told_not_to_keeps_a_goal_without_torque_and_torque_goes_for_it(clock: Any) -> None:
+    rig = Rig(clock, goal_switches_on=False)
     rig.write(GOAL, 3000)
     rig.pass_s(2)
     assert rig.read(POSITION) == 2048

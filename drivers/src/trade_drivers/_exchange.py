@@ -1,6 +1,7 @@
 """The exchange with the devices of one bus, whatever they are: work that waits its turn, and stops that do not."""
 
 import logging
+import sys
 import threading
 import time
 from abc import ABC, abstractmethod
@@ -22,6 +23,11 @@ PROBE_NS: Final = 500_000_000
 HALT_NS: Final = 2_000_000_000
 """How long a device that was told to stop may take to come to rest."""
 _RETRIES: Final = 3
+
+
+def _lasting_ns() -> int:
+    """A clock that goes on while the host is suspended, too."""
+    return time.clock_gettime_ns(time.CLOCK_BOOTTIME) if sys.platform == "linux" else time.monotonic_ns()
 
 
 class BusDevice(Device, Protocol):
@@ -75,10 +81,13 @@ class BusExchange(ABC, Generic[_Device]):
 
     def __init__(self, bus: Bus, devices: Sequence[_Device], clock: Callable[[], int] = time.monotonic_ns) -> None:
         self.clock = clock
+        self.lasting_clock = _lasting_ns
+        """Tells how long nothing was looked after, also while the whole host was suspended."""
         self.wake = threading.Event()
         """Set when something should not wait for the next cycle."""
         self.stale_after_ns = int(bus.stale_after_s * 1e9)
         self.period_ns = int(1e9 / bus.rate_hz)
+        self.watchdog_ns = int(bus.watchdog_s * 1e9)
         self.refusing: Callable[[Device], TradeError] | None = None
         """Why nothing is taken on at present."""
         self.missed_answers = 0
@@ -212,6 +221,16 @@ class BusExchange(ABC, Generic[_Device]):
                 return
         self._stopping.remove(ticket)
         ticket.finish(error)
+
+    def held_up(self, since_ns: int) -> str:
+        """Why a motion that was last looked after then, by the lasting clock, must not go on; empty if it may.
+
+        Its devices have stopped by themselves, and where it would be by now is far from where they are.
+        """
+        gap_ns = self.lasting_clock() - since_ns
+        if gap_ns <= self.watchdog_ns:
+            return ""
+        return f"its driver was held up for {gap_ns / 1e9:.1f} s, longer than watchdog_s, and it stopped by itself"
 
     def fail_all(self, error_of: Callable[[Device], TradeError]) -> None:
         """End everything anyone waits for."""

@@ -71,11 +71,7 @@ def enabling(bus: "DynamixelExchange", job: Job, axis: DynamixelAxis) -> Steps:
     yield from still_homed(bus, axis)
     if health.watchdog:
         yield from _write(bus, job, axis, table.BUS_WATCHDOG, 0)
-    register = table.PRESENT_POSITION
-    answer = yield from tried(bus, axis, lambda: bus.wire.read(axis.id, register.address, register.size))
-    position = register.decode(answer.data, register.address)
-    block = goal_block(Goal(position, axis.accel_counts, axis.speed_counts))
-    yield from told(bus, job, axis, _GOAL_BLOCK[0], block)
+    block = yield from tried(bus, axis, lambda: _seeded(bus, job, axis))
     armed = bus.watchdog_counts
     yield from _write(bus, job, axis, table.BUS_WATCHDOG, armed)
     yield from _write(bus, job, axis, table.TORQUE_ENABLE, 1)
@@ -85,6 +81,16 @@ def enabling(bus: "DynamixelExchange", job: Job, axis: DynamixelAxis) -> Steps:
     if not health.torque or health.watchdog != armed or kept != block:
         raise axis.faulty("it did not keep what enabling it wrote")
     axis.fault, axis.ready = "", True
+
+
+def _seeded(bus: "DynamixelExchange", job: Job, axis: DynamixelAxis) -> bytes:
+    """Its goal is where it is; tried again, it is measured again, as it may have sagged."""
+    register = table.PRESENT_POSITION
+    answer = bus.wire.read(axis.id, register.address, register.size)
+    position = register.decode(answer.data, register.address)
+    block = goal_block(Goal(position, axis.accel_counts, axis.speed_counts))
+    bus.wire.write(axis.id, _GOAL_BLOCK[0], block, job.gate)
+    return block
 
 
 def _restarted(bus: "DynamixelExchange", job: Job, axis: DynamixelAxis) -> Generator[None, None, DynamixelHealth]:

@@ -109,13 +109,14 @@ class FeetechAxis(ServoAxis[FeetechHealth]):
         lead = max(grain.near, round(lead_rad / grain.rad))
         return Goal(max(here - lead, min(here + lead, aim.position)), aim.accel, aim.speed)
 
-    def hold_counts(self, now_ns: int) -> int | None:
+    def hold_counts(self, now_ns: int, blind_ns: int) -> int | None:
         """As every joint, but it cannot have got farther than it was sent, and rests there soon.
 
-        Not heard since, and surely at rest, it is told nothing: whether it heard the last goal, nobody knows.
+        In doubt it is told nothing: without torque by now, it would switch that on. Nor is it if it is surely at rest
+        and was not heard since: whether it heard the last goal, nobody knows.
         """
-        counts, sample = super().hold_counts(now_ns), self.sample
-        if counts is None or sample is None:
+        counts, sample = super().hold_counts(now_ns, blind_ns), self.sample
+        if counts is None or sample is None or self.in_doubt:
             return None
         if sample.at_ns <= self.sent_ns < now_ns - self._at_rest_ns:
             return None

@@ -4,8 +4,7 @@ They have no watchdog. So a joint on its way is sent a little ahead in every cyc
 after the cycles end: that is all a driver that dies or freezes leaves behind.
 """
 
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Final, cast
 
 from trade.errors import TradeError
@@ -16,8 +15,7 @@ from trade_drivers.joints import Axis, Gate, Goal, Job, Motion, Steps
 from trade_drivers.servos import ServoAxis, ServoExchange, health_of
 
 if TYPE_CHECKING:
-    from trade_drivers.robotfile import SerialBus
-    from trade_drivers.servos._wire import ServoWire
+    pass
 
 __all__ = ["FeetechExchange"]
 
@@ -29,16 +27,6 @@ class FeetechExchange(ServoExchange):
 
     sizes = _SIZES
     answer_overhead = 7
-
-    def __init__(
-        self,
-        wire: "ServoWire",
-        bus: "SerialBus",
-        axes: Sequence[FeetechAxis],
-        clock: Callable[[], int] = time.monotonic_ns,
-    ) -> None:
-        super().__init__(wire, bus, axes, clock)
-        self._lead_ns = int(bus.watchdog_s * 1e9)
 
     # --- what a servo is told
 
@@ -84,12 +72,6 @@ class FeetechExchange(ServoExchange):
     def admit(self, axis: ServoAxis[Any]) -> None:
         self.stop_found_moving(axis)
 
-    def after_a_gap(self, gap_ns: int) -> None:
-        """Frozen for longer than joints are sent ahead, their motions have ended by themselves, and are not resumed."""
-        if gap_ns > self._lead_ns:
-            on_their_way = [axis for axis in self.axes if axis.motion is not None]
-            self.halt(on_their_way, f"its driver was held up for {gap_ns / 1e9:.2g} s")
-
     def look_after(self, axis: ServoAxis[Any]) -> None:
         """Cut off by its own protection, it is switched off: else it would go on by itself once the cause is gone."""
         servo = cast("FeetechAxis", axis)
@@ -128,6 +110,8 @@ def _due(motion: Motion, now_ns: int) -> dict[FeetechAxis, Goal]:
     due: dict[FeetechAxis, Goal] = {}
     for axis in motion.axes:
         servo = cast("FeetechAxis", axis)
-        if servo.aim is not None and (step := servo.step(servo.aim, now_ns)).position != servo.sent:
+        if servo.aim is None or servo.in_doubt:
+            continue
+        if (step := servo.step(servo.aim, now_ns)).position != servo.sent:
             due[servo] = step
     return due

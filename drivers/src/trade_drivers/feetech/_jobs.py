@@ -58,16 +58,24 @@ def enabling(bus: "FeetechExchange", job: Job, axis: FeetechAxis) -> Steps:
     if not health.locked:
         yield from _write(bus, job, axis, table.LOCK, 1)
         health = yield from health_of(bus, axis)
-    block = goal_block(Goal(health.position, axis.accel_counts, axis.speed_counts))
-    yield from told(bus, job, axis, GOAL_BLOCK[0], block)
+    block = yield from tried(bus, axis, lambda: _seeded(bus, job, axis))
     yield from _write(bus, job, axis, table.TORQUE, table.TORQUE_ON)
     axis.ready = False
-    axis.aim, axis.sent = None, health.position
     health = yield from health_of(bus, axis)
     kept = yield from tried(bus, axis, lambda: bus.wire.read(axis.id, *GOAL_BLOCK).data)
     if not health.torque or kept != block:
         raise axis.faulty("it did not keep what enabling it wrote")
     axis.fault, axis.ready = "", True
+
+
+def _seeded(bus: "FeetechExchange", job: Job, axis: FeetechAxis) -> bytes:
+    """Its goal is where it is. It may switch torque on: tried again, it is measured again, as it may have sagged."""
+    asked_ns = bus.clock()
+    health = axis.take_health(bus.wire.read(axis.id, *axis.slow).data, asked_ns)
+    block = goal_block(Goal(health.position, axis.accel_counts, axis.speed_counts))
+    axis.aim, axis.sent = None, health.position
+    bus.wire.write(axis.id, GOAL_BLOCK[0], block, job.gate)
+    return block
 
 
 def _write(bus: "FeetechExchange", job: Job, axis: FeetechAxis, register: table.Register, value: int) -> Steps:

@@ -163,10 +163,11 @@ class Axis(ABC):
         """Age of the newest measurement, or the time it has been silent if there is none."""
         return now_ns - (self.sample.at_ns if self.sample else self.silent_since_ns)
 
-    def hold_counts(self, now_ns: int) -> int | None:
+    def hold_counts(self, now_ns: int, blind_ns: int) -> int | None:
         """Where to hold: where it was measured, or, if that is old, where it must have got to since on its way.
 
-        Told to hold and not measured since, it stays there: to go back to the measurement would be motion.
+        Not heard for longer than ``blind_ns``, it has stopped by itself, no farther than where it got by then. Told to
+        hold and not measured since, it stays there: to go back to the measurement would be motion.
         """
         sample = self.sample
         if sample is None:
@@ -177,7 +178,7 @@ class Axis(ABC):
         if self.motion is None or age_s < 0.05:
             return sample.position
         goal = self.motion.goal_of(self)
-        travelled = sample.velocity * self.grain.rad_s / self.grain.rad * age_s
+        travelled = sample.velocity * self.grain.rad_s / self.grain.rad * min(age_s, blind_ns / 1e9)
         low, high = sorted((sample.position, goal))
         return round(max(low, min(high, sample.position + travelled)))
 

@@ -133,6 +133,7 @@ class Exchange(BusExchange[Axis]):
     def take_over(self, motion: Motion) -> None:
         """A motion's goals are out: those it replaces have ended, and what they left behind holds."""
         motion.note("wrote goal")
+        motion.attended_ns = self.lasting_clock()
         replaced = dict.fromkeys(axis.motion for axis in motion.axes if axis.motion is not None)
         for axis in motion.axes:
             axis.motion, axis.still, axis.halting_since_ns = motion, 0, 0
@@ -181,8 +182,9 @@ class Exchange(BusExchange[Axis]):
         """Have joints hold, and watch them until they are at rest."""
         positions: dict[Axis, int] = {}
         for axis in axes:
-            if (position := axis.hold_counts(now_ns)) is not None:
-                positions[axis] = axis.held_counts = position
+            axis.held_counts = axis.hold_counts(now_ns, self.watchdog_ns)
+            if axis.held_counts is not None:
+                positions[axis] = axis.held_counts
             axis.still, axis.held_ns = 0, now_ns
             axis.halting_since_ns = axis.halting_since_ns or now_ns
         if positions:

@@ -36,6 +36,9 @@ class _Progress(Struct):
 class Motion(Command):
     """What sets joints moving, and is watched until something ends it."""
 
+    attended_ns = 0
+    """When it was last looked after, by the lasting clock."""
+
     def steps(self) -> Steps:
         """Enable what is relaxed, then launch."""
         exchange = self.exchange
@@ -60,7 +63,11 @@ class Motion(Command):
         raise NotImplementedError
 
     def trouble(self, now_ns: int, until_ns: int | None) -> TradeError | None:
-        """Why none of its joints may go on: a fault, silence, or the end of its call."""
+        """Why none of its joints may go on: a driver that was held up, a fault, silence, or the end of its call."""
+        attended_ns, self.attended_ns = self.attended_ns, self.exchange.lasting_clock()
+        if held_up := self.exchange.held_up(attended_ns):
+            axis = next((axis for axis in self.axes if axis.fault), self.axes[0])
+            return axis.faulty(f"{axis.fault}; {held_up}" if axis.fault else held_up)
         for axis in self.axes:
             if axis.fault:
                 return axis.faulty()

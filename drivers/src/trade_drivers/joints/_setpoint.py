@@ -44,8 +44,10 @@ class SetPoint(Motion):
         return self._goals[axis]
 
     def launch(self) -> None:
+        now_ns = self.exchange.clock()
         goals: dict[Axis, Goal] = {}
         for axis in self.axes:
+            axis.check_usable(now_ns, self.exchange.stale_after_ns)
             axis.check_goal(self._goals[axis])
             goals[axis] = Goal(self._goals[axis], axis.accel_counts, self._speeds[axis])
         self.exchange.write_goals(goals, self.gate)
@@ -57,7 +59,7 @@ class SetPoint(Motion):
         """What would keep it off the wire ends it, too: its time, a stop, a lock, a fault, silence."""
         try:
             self.gate()
-            for axis in self.axes:
-                axis.check_usable(now_ns, self.exchange.stale_after_ns)
+            if ending := self.trouble(now_ns, None):
+                raise ending
         except TradeError as ending:
             self.exchange.release(self, ending)

@@ -46,6 +46,7 @@ def tried(bus: ServoExchange, axis: ServoAxis[_Health], act: Callable[[], _Resul
             raise
         except NoAnswer as silent:
             asked, waited_s = True, silent.waited_s
+            axis.doubted = True
             yield
         except Refused as refused:
             raise axis.faulty(f"it refused a command: {refused}") from None

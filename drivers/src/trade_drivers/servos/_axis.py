@@ -97,6 +97,11 @@ class ServoAxis(Axis, Generic[_Health]):
         return self.health
 
     @property
+    def in_doubt(self) -> bool:
+        """It missed an exchange, and its torque was not read since."""
+        return self.doubted or self.silent
+
+    @property
     def may_hold_torque(self) -> bool:
         """Torque is on, or nobody knows."""
         return self.health is None or self.health.torque

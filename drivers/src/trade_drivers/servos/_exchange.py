@@ -4,10 +4,10 @@ import logging
 import time
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Final
+from typing import TYPE_CHECKING, Any, ClassVar, Final, cast
 
 from trade_drivers._exchange import PROBE_NS
-from trade_drivers.joints import Axis, Exchange
+from trade_drivers.joints import Axis, Exchange, Motion, Steps
 from trade_drivers.servos._answers import NoAnswer, Refused
 from trade_drivers.servos._axis import ServoAxis
 
@@ -20,6 +20,7 @@ __all__ = ["ServoExchange"]
 _log = logging.getLogger("trade")
 _HEALTH_NS: Final = 500_000_000
 _CLEAN_NS: Final = 1_000_000_000
+_WAIT_S: Final = 0.001
 _CHUNK_S: Final = 0.014
 """A group is read in pieces that take no longer than this on the wire, so that a stop can come in between."""
 
@@ -42,9 +43,8 @@ class ServoExchange(Exchange):
         super().__init__(bus, axes, clock)
         self.wire = wire
         self.servos = tuple(axes)
-        self._gap_ns = int(bus.watchdog_s * 5e8)
         self._chunk = max(1, int(_CHUNK_S * bus.baud / 10 / (self.answer_overhead + self.sizes[0])))
-        self._cycle_ns = clock()
+        self._attended_ns = self.lasting_clock()
         self._size = 0
         self._failed_ns = 0
         wire.pause = self.pause
@@ -59,11 +59,20 @@ class ServoExchange(Exchange):
         """What a model is called, or its number."""
         return str(model_number)
 
-    def after_a_gap(self, gap_ns: int) -> None:
-        """The process was frozen for so long: before anything else is done, health was asked for."""
-
     def look_after(self, axis: ServoAxis[Any]) -> None:
         """Do at once what the health just read asks for. Raises ``NoAnswer``."""
+
+    # --- who missed an exchange may have restarted without torque: it is sent no goal before that was read
+
+    def can_take_goals(self, axes: Sequence[Axis]) -> bool:
+        return not any(cast("ServoAxis[Any]", axis).in_doubt for axis in axes)
+
+    def making_way(self, job: Motion) -> Steps:
+        while not self.can_take_goals(job.axes):
+            for axis in job.axes:
+                self.require_answering(axis)
+            self.idle(_WAIT_S)
+            yield
 
     # --- from the bus thread
 
@@ -71,10 +80,9 @@ class ServoExchange(Exchange):
         """One round: stops, gaps, measurements, work, motions, one joint's health."""
         began_ns = self.clock()
         self.serve_stops()
-        if (gap_ns := began_ns - self._cycle_ns) > self._gap_ns:
+        attended_ns, self._attended_ns = self._attended_ns, self.lasting_clock()
+        if self._attended_ns - attended_ns > self.watchdog_ns // 2:
             self._look_after_a_gap()
-            self.after_a_gap(gap_ns)
-        self._cycle_ns = began_ns
         self._read()
         self._recover()
         self.work(began_ns + self.period_ns // 2)
@@ -82,7 +90,7 @@ class ServoExchange(Exchange):
         self._read_health()
 
     def readmit(self, axis: ServoAxis[Any]) -> None:
-        """Look a joint over that was away: its model, its health.
+        """Look a joint over that was away, or missed an exchange: its model, its health.
 
         Never enables, never moves; found moving and owned by nobody, it is stopped.
 
@@ -95,12 +103,13 @@ class ServoExchange(Exchange):
             axis.fault = f"another model answers with its id: {found}, not {axis.joint.model}"
             axis.ready = False
             axis.sample = None  # what was measured of ours means nothing to this one: it is told nothing
+            axis.silent = True
             return
         self._refresh_health(axis)
         if axis.silent:
             _log.info("%s answers again", axis.name)
+            axis.misses = 0
         axis.silent = axis.doubted = False
-        axis.misses = 0
         if axis.motion is None:
             self.stop_found_moving(axis)
 
@@ -143,24 +152,19 @@ class ServoExchange(Exchange):
         super().missed(device)
 
     def _recover(self) -> None:
-        """Ping those in doubt, and those long silent when it is their turn; the first that fails ends the round."""
+        """Look over those in doubt, and those silent when it is their turn; the first that fails ends the round."""
         now_ns = self.clock()
         for axis in self.servos:
             due = axis.silent and now_ns >= axis.probe_at_ns
             if not due and (axis.silent or not axis.doubted):
                 continue
             try:
-                if axis.silent:
-                    self.readmit(axis)
-                else:
-                    self.wire.ping(axis.id)
-                    axis.doubted = False
-                    axis.health_due_ns = self.clock() + self.period_ns  # it may have restarted; measured comes first
+                self.readmit(axis)
             except NoAnswer:
                 self.missed(axis)
                 return
             except Refused as refused:
-                axis.fault = f"it refuses to be read: {refused}"
+                axis.fault, axis.doubted = f"it refuses to be read: {refused}", False
             if axis.silent:
                 axis.probe_at_ns = self.clock() + PROBE_NS
 

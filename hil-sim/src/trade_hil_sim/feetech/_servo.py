@@ -51,6 +51,7 @@ class Servo:
         reversed_: whether the joint turns against the device.
         offset_rad: joint angle when the device reads its centre.
         t: the time, in seconds, on the clock of all later calls.
+        goal_switches_on: a goal written while torque is off switches it on, as on real servos; else it is only kept.
         emit: told what happens: servo, event, time, detail.
     """
 
@@ -65,9 +66,11 @@ class Servo:
         reversed_: bool = False,
         offset_rad: float = 0.0,
         t: float = 0.0,
+        goal_switches_on: bool = True,
         emit: Emit = _nowhere,
     ) -> None:
         self.model, self.joint, self.emit = model, joint, emit
+        self.goal_switches_on = goal_switches_on
         self._sign, self._offset_rad = -1 if reversed_ else 1, offset_rad
         self.memory = Memory(model)
         for name, value in (("id", device_id), ("baud_rate", BAUDS.index(baud))):
@@ -220,8 +223,8 @@ class Servo:
                 self.memory.keep(name)
         if torque is not None:
             self._switch(torque, t)
-        elif "goal_position" in changes and self.torque:
-            self._set_off(t)
+        elif "goal_position" in changes and (self.torque or self.goal_switches_on):
+            self._switch(1, t)
 
     def reg_write(self, address: int, data: bytes) -> None:
         """Keep a write for later."""
