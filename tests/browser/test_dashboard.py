@@ -2,6 +2,7 @@
 
 import re
 import signal
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -153,11 +154,12 @@ def test_an_e_stop_from_the_second_page_stops_what_the_first_moves(bench: Bench,
 
 
 def test_S09_an_e_stop_that_no_robot_confirmed_never_says_that_nothing_moves(
-    browsers: Browsers, doorway: Doorway, monkeypatch: pytest.MonkeyPatch
+    browsers: Browsers, doorway: Doorway, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     nowhere = free_endpoint()
     doorway.program.signal(signal.SIGKILL)
     monkeypatch.setenv("TRADE_CONNECT", nowhere)
+    monkeypatch.setenv("TRADE_RUNTIME_DIR", str(tmp_path / "elsewhere"))  # where no robot has its stop line
     doorway.start()
     chief = browsers.view("chief")
     expect(chief.page.locator("#apart")).to_contain_text(f"The door reaches nobody at {nowhere}")

@@ -13,7 +13,7 @@ from trade._access import FUNCTIONS, Access
 from trade._context import CallContext, running
 from trade._estop_services import EstopServices
 from trade._hints import no_such_service
-from trade._keys import estop_key
+from trade._keys import Address, alive_key, estop_key
 from trade._memory import MemoryTransport
 from trade._own_services import OwnServices
 from trade._service import marked_methods
@@ -75,6 +75,34 @@ def test_a_handle_tells_what_it_asks_of_its_callers(member: Member, neck: Neck) 
     assert asked == {"move": ("call", ("operator",)), "angle": ("read", ("operator", "viewer")), "stop": ("", ())}
     clear = find(dash, "estop_clear", "trade")
     assert (clear.verb, clear.roles) == ("administer", ("chief",))
+
+
+def test_S09_containers_that_may_offer_nothing_keep_no_estop_from_being_complete(
+    memory: MemorySystem, policy: Path, member: Member, neck: Neck, eventually: Callable[[Callable[[], bool]], bool]
+) -> None:
+    """One sign of life, of an identity without a role, had every e-stop and each clearing end as incomplete."""
+    chief, driver = member("chief"), memory.container("of-drv", identity="drv")
+    raw = MemoryTransport(memory.network, "raw")
+    _signs = [raw.appear(alive_key(Address("nobody", f"x{number}", "e"))) for number in range(3 * 64)]
+    assert eventually(lambda: len(chief.addresses()) > 60)
+    report = chief.estop(limit_s=30)
+    assert report.complete, report
+    assert set(report.apart) < {f"nobody/x{number}" for number in range(3 * 64)}
+    assert len(report.apart) == 64
+    assert len(driver.addresses()) < 2 * 64
+    assert chief.estop_clear([report.id], limit_s=30).complete
+
+
+def test_S09_a_container_that_may_offer_and_says_nothing_is_missing(
+    memory: MemorySystem, member: Member, neck: Neck, eventually: Callable[[Callable[[], bool]], bool]
+) -> None:
+    chief = member("chief")
+    raw = MemoryTransport(memory.network, "raw")
+    _sign = raw.appear(alive_key(Address("drv", "x", "e")))
+    assert eventually(lambda: any(address.container == "x" for address in chief.addresses()))
+    report = chief.estop(limit_s=0.5)
+    assert report.missing == ("drv/x",)
+    assert not report.complete
 
 
 def test_without_a_policy_a_service_asks_for_no_role(memory: MemorySystem) -> None:

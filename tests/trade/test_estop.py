@@ -1,5 +1,6 @@
 """S09: one e-stop for the whole system, with messages lost, drivers restarted, and ids cleared."""
 
+import os
 import random
 import tempfile
 import threading
@@ -10,8 +11,11 @@ from pathlib import Path
 import pytest
 
 from trade import Container, Estop, EstopReport, Resource, current_call, service, where
+from trade._audit import Event
 from trade._crew import MOST_THREADS
-from trade._estop_messages import decode_estop_order
+from trade._estop_ledger import MOST_OF_ONE
+from trade._estop_messages import decode_estop_confirmed, decode_estop_order
+from trade._estop_work import SHARED_S
 from trade._keys import Address, alive_key, registry_key
 from trade._memory import MemoryTransport, Passage
 from trade._wire import PROTOCOL, EstopOrder, ProviderInfo, ServiceInfo, encode_message
@@ -255,6 +259,51 @@ def test_S09_what_cannot_be_read_is_open_all_the_same(tmp_path: Path, text: byte
         assert "cannot be read" in estop.reason
 
 
+def test_S09_who_is_down_during_a_clearing_is_latched_when_it_starts_again(tmp_path: Path) -> None:
+    """Others of its host heard the clearing; its own note is its own."""
+    with memory_system(state_dir=tmp_path) as system:
+        drivers(system, "one", "other")
+        other = system.container("other")
+        report = other.estop("spill", limit_s=GENEROUS_S)
+        system.container("one").close()
+        assert other.estop_clear([report.id], limit_s=GENEROUS_S).complete
+        assert call(other, "move_to", "other", 0.1) == 0.1
+        drivers(system, "one")
+        with pytest.raises(Stopped, match="spill"):
+            call(other, "move_to", "one", 0.1)
+        assert other.estop_clear([report.id], limit_s=GENEROUS_S).complete
+        system.container("one").close()
+        drivers(system, "one")
+        assert call(other, "move_to", "one", 0.1) == 0.1
+
+
+def test_S09_a_program_without_a_name_of_its_own_finds_its_notes_under_another_process_id(tmp_path: Path) -> None:
+    program = f"steering-{os.getpid()}"
+    with memory_system(state_dir=tmp_path) as system:
+        drivers(system, program)
+        system.container(program).estop("spill", limit_s=GENEROUS_S)
+    assert [path.parent.name for path in tmp_path.rglob("*.json")] == ["steering"]
+
+
+def test_S09_notes_of_the_release_before_latch_everybody_and_are_cleared_for_good(tmp_path: Path) -> None:
+    """It kept one folder for all containers of a host."""
+    folder = tmp_path / "memory" / "estop"
+    folder.mkdir(parents=True)
+    (folder / "abc.json").write_text('["abc", "anna/desk/e1", "spill", 1.5]')
+    with memory_system(state_dir=tmp_path) as system:
+        drivers(system, "one", "two")
+        for name in ("one", "two"):
+            with pytest.raises(Stopped, match="spill"):
+                call(system.container("one"), "move_to", name, 0.1)
+        system.container("two").close()
+        assert system.container("one").estop_clear(["abc"], limit_s=GENEROUS_S).complete
+        drivers(system, "three")
+        assert call(system.container("one"), "move_to", "three", 0.1) == 0.1
+        drivers(system, "two")
+        with pytest.raises(Stopped, match="spill"):
+            call(system.container("one"), "move_to", "two", 0.1)
+
+
 def test_S09_who_cannot_write_it_down_stops_and_says_so(tmp_path: Path) -> None:
     (tmp_path / "memory").write_text("a file where a folder should be")
     with memory_system(state_dir=tmp_path) as system:
@@ -293,6 +342,95 @@ def test_S09_two_at_once_are_cleared_one_by_one(system: MemorySystem) -> None:
         call(caller, "move_to", "one", 0.1)
     assert caller.estop_clear([second.id], limit_s=GENEROUS_S).complete
     assert call(caller, "move_to", "one", 0.1) == 0.1
+
+
+def ordered(system: MemorySystem, identity: str, number: int) -> list[str]:
+    """Orders to stop, of an identity that is nobody's container; their ids."""
+    puts = MemoryTransport(system.network, f"raw-{identity}").publish(f"estop/{identity}")
+    ids = [f"{identity}-{count}" for count in range(number)]
+    for name in ids:
+        puts.put(encode_message(EstopOrder(PROTOCOL, name, Estop(name, f"{identity}/x/e", "", 0.0))))
+    return ids
+
+
+def test_S09_however_many_are_open_all_are_cleared_at_once(tmp_path: Path, eventually: Eventually) -> None:
+    with memory_system(state_dir=tmp_path) as system:
+        drivers(system, "one", "other")
+        caller = system.container("caller")
+        for identity in "abcdefgh":
+            ordered(system, identity, 10)
+        for container in (caller, system.container("one"), system.container("other")):
+            assert eventually(lambda container=container: len(container.estops()) == 80)
+        assert eventually(lambda: len(list(tmp_path.rglob("*.json"))) == 2 * 80)
+        report = caller.estop_clear([estop.id for estop in caller.estops()], limit_s=GENEROUS_S)
+        assert report.complete, report
+        assert len(report.id.split(",")) == 80
+        assert caller.estops() == []
+        assert not list(tmp_path.rglob("*.json"))
+        assert call(caller, "move_to", "one", 0.1) == 0.1
+
+
+def test_S09_one_identity_holds_a_bounded_number_and_each_of_its_orders_stops_and_is_confirmed(
+    tmp_path: Path, eventually: Eventually
+) -> None:
+    number = 500
+    with memory_system(state_dir=tmp_path) as system:
+        [axis] = drivers(system, "one")
+        one, caller, confirmed = system.container("one"), system.container("caller"), set[str]()
+
+        def hear(passage: Passage) -> None:
+            if passage.key.startswith("estop/tester/one/"):
+                confirmed.add(decode_estop_confirmed(passage.payload or b"").request)
+
+        system.tap(hear)
+        threads = threading.active_count()
+        ids = ordered(system, "mallory", number)
+        more = threading.active_count() - threads
+        assert eventually(lambda: confirmed >= set(ids))
+        assert more < 12
+        kept = [*ids[: MOST_OF_ONE - 1], ids[-1]]  # the first ones, and the one that nobody can have looked at
+        assert {estop.id for estop in one.estops()} == set(kept)
+        assert eventually(lambda: sorted(path.stem for path in tmp_path.rglob("*.json")) == sorted(kept))
+        stopped = axis.stopped
+        report = caller.estop("of somebody else", limit_s=GENEROUS_S)
+        assert report.complete
+        assert axis.stopped >= stopped
+        assert caller.estop_clear(kept, limit_s=GENEROUS_S).complete
+        with pytest.raises(Stopped, match="of somebody else"):
+            call(caller, "move_to", "one", 0.1)
+        assert caller.estop_clear([report.id], limit_s=GENEROUS_S).complete
+        assert call(caller, "move_to", "one", 0.1) == 0.1
+
+
+def test_S09_one_that_made_room_for_others_is_not_over_while_somebody_has_it_open(
+    system: MemorySystem, eventually: Eventually
+) -> None:
+    drivers(system, "one", "other")
+    one, other = system.container("one"), system.container("other")
+    ids = ordered(system, "mallory", MOST_OF_ONE)
+    assert eventually(lambda: len(other.estops()) == MOST_OF_ONE)
+    puts = MemoryTransport(system.network, "raw-mallory-2").publish("estop/mallory")
+    system.lose(lambda passage: passage.source == "raw-mallory-2" and passage.target == "other")
+    puts.put(encode_message(EstopOrder(PROTOCOL, "newest", Estop("newest", "mallory/x/e", "", 0.0))))
+    assert eventually(lambda: one._parts.estopping._estops.is_open("newest"))
+    assert ids[-1] not in {estop.id for estop in one._parts.estopping.open_here()}
+    assert one.estop_clear([*ids[:-1], "newest"], limit_s=GENEROUS_S).complete
+    assert eventually(lambda: ids[-1] in {estop.id for estop in one._parts.estopping.open_here()})
+    assert one.estop_clear([ids[-1]], limit_s=GENEROUS_S).complete
+    assert one.estops() == []
+
+
+def test_S09_a_second_e_stop_while_the_first_one_is_open_calls_the_stops_again(system: MemorySystem) -> None:
+    """What could not be stopped is tried again by who presses again."""
+    [axis] = drivers(system, "one")
+    caller = system.container("caller")
+    ids = [caller.estop(limit_s=GENEROUS_S).id]
+    threading.Event().wait(2 * SHARED_S)
+    ids.append(caller.estop(limit_s=GENEROUS_S).id)
+    assert axis.stopped == 2
+    assert caller.estop_clear(ids, limit_s=GENEROUS_S).complete
+    assert caller.estop(limit_s=GENEROUS_S).complete  # at once, and what had no latch in between is stopped anew
+    assert axis.stopped == 3
 
 
 def test_S09_clearing_what_nobody_knows_tells_what_is_open(system: MemorySystem) -> None:
@@ -368,6 +506,19 @@ def test_a_malformed_message_is_dropped_counted_and_latches_nothing(
     assert call(one, "move_to", "one", 0.1) == 0.1
 
 
+def entry_with(estop: Estop) -> ProviderInfo:
+    """What a container says that has it open."""
+    return ProviderInfo(
+        revision=1,
+        groups=("trade",),
+        kind="Estops",
+        host="h",
+        pid=1,
+        services=(ServiceInfo(name="estops", signature="estops()"),),
+        estops=(estop,),
+    )
+
+
 def test_an_e_stop_that_is_told_under_a_path_is_dropped_and_written_nowhere(eventually: Eventually) -> None:
     """Its id names a file."""
     with tempfile.TemporaryDirectory() as folder, memory_system(state_dir=Path(folder)) as system:  # ids are short
@@ -378,15 +529,7 @@ def test_an_e_stop_that_is_told_under_a_path_is_dropped_and_written_nowhere(even
             Address("mallory", "x", "e"),
         )
         up = "/.." * len((Path(folder) / "memory" / "estop").parts[1:])
-        told = ProviderInfo(
-            revision=1,
-            groups=("trade",),
-            kind="Estops",
-            host="h",
-            pid=1,
-            services=(ServiceInfo(name="estops", signature="estops()"),),
-            estops=(Estop(f"{up}{folder}/found", str(mallory), "", 0.0),),
-        )
+        told = entry_with(Estop(f"{up}{folder}/found", str(mallory), "", 0.0))
         before, _sign = one.dropped_messages, raw.appear(alive_key(mallory))
         system.settle()
         raw.announce(registry_key("trade", mallory, "estops"), encode_message(told))
@@ -394,6 +537,33 @@ def test_an_e_stop_that_is_told_under_a_path_is_dropped_and_written_nowhere(even
         one.close()  # what it writes is written
         assert not list(Path(folder).glob("found*"))
         assert one.dropped_messages > before
+
+
+def test_S09_an_estop_that_another_one_tells_of_is_on_record_with_who_told(
+    system: MemorySystem, eventually: Eventually
+) -> None:
+    """Its giver never gave it, perhaps."""
+    drivers(system, "one")
+    one, raw, mallory = (
+        system.container("one"),
+        MemoryTransport(system.network, "raw"),
+        Address("mallory", "x", "e"),
+    )
+    rows: list[Event] = []
+    one._parts.audit._tell = rows.append
+    told = entry_with(Estop("abc", "boss/desk/e1", "fire", 0.0, told_by="boss/desk"))
+    _sign = raw.appear(alive_key(mallory))
+    system.settle()
+    raw.announce(registry_key("trade", mallory, "estops"), encode_message(told))
+    assert eventually(lambda: bool(one.estops()))
+    assert [(known.by, known.told_by) for known in one.estops()] == [("boss/desk/e1", "mallory/x")]
+    late = system.container("late")
+    assert eventually(lambda: bool(late.estops()))
+    assert late.estops()[0].giver != "boss/desk/e1"
+    heard = one.estop("smoke", limit_s=GENEROUS_S)
+    assert {known.id: known.told_by for known in late.estops()}[heard.id] == ""
+    [row] = [row for row in rows if row.about == "abc"]
+    assert (row.who, row.why) == ("boss", "fire (told by mallory/x)")
 
 
 def test_S09_what_an_estop_has_everybody_tell_everybody_is_small(system: MemorySystem) -> None:

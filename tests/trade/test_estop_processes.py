@@ -5,9 +5,13 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+import psutil
 import pytest
 
-from trade import Container, where
+from trade import Container, Estop, where
+from trade._estop_ledger import MOST_OF_ONE
+from trade._keys import estop_key
+from trade._wire import PROTOCOL, EstopOrder, encode_message
 from trade.errors import Stopped, TradeError
 
 Eventually = Callable[[Callable[[], bool]], bool]
@@ -135,3 +139,48 @@ def test_S09_a_killed_driver_is_latched_after_its_restart_though_nobody_else_kne
         other.find(where(name="move_to"), wait_s=PATIENCE_S)(0.1)
     assert other.estop_clear([estop.id for estop in other.estops()], limit_s=PATIENCE_S).complete
     assert other.find(where(name="move_to"), wait_s=PATIENCE_S)(0.1) == 0.1
+
+
+def test_S09_a_killed_driver_that_missed_the_clearing_is_latched_after_its_restart(
+    here: Container, driver: Callable[[str], Any]
+) -> None:
+    first, _ = driver("arm"), driver("base")
+    for group in ("arm", "base"):
+        here.find(where(name="stopped", group=group), wait_s=PATIENCE_S)
+    report = here.estop("spill", limit_s=PATIENCE_S)
+    first.kill()
+    here.estop_clear([report.id], limit_s=PATIENCE_S)
+    assert here.find(where(name="move_to", group="base"), wait_s=PATIENCE_S)(0.1) == 0.1
+    driver("arm")
+    with pytest.raises(Stopped, match="spill"):
+        here.find(where(name="move_to", group="arm"), wait_s=PATIENCE_S)(0.1)
+
+
+def test_S09_thousands_of_e_stops_of_one_identity_cost_a_driver_neither_threads_nor_memory(
+    here: Container, driver: Callable[[str], Any], eventually: Eventually
+) -> None:
+    program = driver("arm")
+    stopped = here.find(where(name="stopped"), wait_s=PATIENCE_S)
+    process = psutil.Process(program.process.pid)
+    threads, resident = process.num_threads(), process.memory_info().rss
+    orders = here._parts.transport.publish(estop_key(here.address.identity), urgent=True)
+    most = 0
+    for count in range(3000):
+        name = f"flood{count}"
+        orders.put(encode_message(EstopOrder(PROTOCOL, name, Estop(name, str(here.address), "", time.time()))))
+        if count % 300 == 0:
+            most = max(most, process.num_threads())
+    report = here.estop("the last one", limit_s=PATIENCE_S)
+    assert report.complete
+    assert max(most, process.num_threads()) < threads + 20
+    assert process.memory_info().rss < resident + (50 << 20)
+    assert stopped() > 0
+    there = here.find(where(name="estops", group="trade", container="arm"), wait_s=PATIENCE_S)
+    assert len(there()) < 2 * MOST_OF_ONE  # what others have open is in it
+
+    def all_cleared() -> bool:
+        ids = [one.id for one in here.estops()]
+        return not ids or (here.estop_clear(ids).complete and not here.estops())
+
+    assert eventually(all_cleared)
+    assert here.find(where(name="move_to"), wait_s=PATIENCE_S)(0.1) == 0.1

@@ -103,7 +103,7 @@ impl Container {
                     self.ask_later(who); // something of it may have been missed
                 }
             }
-            _ => wire::told_estops(&payload).into_iter().for_each(|told| self.learnt(&told)),
+            _ => wire::told_estops(&payload, &who).into_iter().for_each(|told| self.learnt(&told)),
         }
     }
 
@@ -123,7 +123,8 @@ impl Container {
             if key == format!("registry/trade/{who}/tally") {
                 whole = true; // what it tells last: nothing was cut off
             } else {
-                wire::told_estops(&sample.payload().to_bytes()).into_iter().for_each(|told| self.learnt(&told));
+                let told = wire::told_estops(&sample.payload().to_bytes(), who);
+                told.into_iter().for_each(|told| self.learnt(&told));
             }
         }
         whole || !self.asking.alive(who)

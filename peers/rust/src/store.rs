@@ -17,7 +17,13 @@ impl Store {
             let file = file?;
             let Some(id) = file.file_name().to_str().filter(|id| is_chunk(id)).map(str::to_owned) else { continue };
             let told = decode(&fs::read(file.path())?).as_ref().and_then(Estop::read).filter(|one| one.id == id);
-            let unread = || Estop { id, by: "unknown/".into(), reason: "its note cannot be read".into(), at: 0.0 };
+            let unread = || Estop {
+                id,
+                by: "unknown/".into(),
+                reason: "its note cannot be read".into(),
+                at: 0.0,
+                told_by: String::new(),
+            };
             found.push(told.unwrap_or_else(unread));
         }
         Ok(found)

@@ -79,6 +79,16 @@ fn messages_are_read_and_written_as_the_vectors_say() {
 }
 
 #[test]
+fn an_estop_learnt_from_an_entry_says_who_told_of_it() {
+    let given =
+        Value::Array(vec!["5c0ffee5".into(), "anna/desk/4f2a".into(), "smoke".into(), 1.0.into(), "eve/x".into()]);
+    let entry = wire::encode(&Value::Map(vec![("estops".into(), Value::Array(vec![given]))]));
+    let told_by = |teller: &str| wire::told_estops(&entry, teller).unwrap().remove(0).told_by;
+    assert_eq!(told_by("bob/page/77"), "bob/page");
+    assert_eq!(told_by("anna/panel/88"), "");
+}
+
+#[test]
 fn what_is_no_message_is_dropped() {
     for vector in vectors("dropped") {
         let (data, name) = (bytes(&vector), &vector["name"]);

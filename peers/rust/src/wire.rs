@@ -196,6 +196,8 @@ pub struct Estop {
     pub by: String,
     pub reason: String,
     pub at: f64,
+    /// `<identity>/<container>` of the container that told of it; empty: the order itself was heard.
+    pub told_by: String,
 }
 
 impl Estop {
@@ -206,12 +208,22 @@ impl Estop {
         let by = parts[1].as_str().filter(|by| by.chars().count() <= 300)?.to_owned();
         let reason = parts.get(2).and_then(Value::as_str).unwrap_or("").chars().take(500).collect();
         let at = parts.get(3).and_then(Value::as_f64).filter(|at| at.is_finite()).unwrap_or(0.0);
-        Some(Estop { id, by, reason, at })
+        let told_by = parts.get(4).and_then(Value::as_str).unwrap_or("").chars().take(300).collect();
+        Some(Estop { id, by, reason, at, told_by })
+    }
+
+    /// The same, learnt from the entry of a container: only its giver's identity speaks for itself.
+    fn told(self, teller: &str) -> Estop {
+        let speaks_for_itself = self.by.split('/').next() == teller.split('/').next();
+        let told_by = if speaks_for_itself { "" } else { teller.rsplit_once('/').map_or(teller, |(who, _)| who) };
+        let told_by = told_by.to_owned();
+        Estop { told_by, ..self }
     }
 
     pub fn value(&self) -> Value {
-        let texts = [&self.id, &self.by, &self.reason].map(|text| Value::from(text.as_str()));
-        Value::Array(texts.into_iter().chain([self.at.into()]).collect())
+        let [id, by, reason, told_by] =
+            [&self.id, &self.by, &self.reason, &self.told_by].map(|text| Value::from(text.as_str()));
+        Value::Array(vec![id, by, reason, self.at.into(), told_by])
     }
 }
 
@@ -242,10 +254,11 @@ pub fn estop_confirmed(request: &str, problem: &str) -> Vec<u8> {
     encode(&Value::Array(vec![VERSION.into(), request.into(), problem.into()]))
 }
 
-/// The open e-stops that a container's own entry tells of, in whatever version.
-pub fn told_estops(payload: &[u8]) -> Option<Vec<Estop>> {
+/// The open e-stops that a container's own entry tells of, in whatever version. The teller is its address.
+pub fn told_estops(payload: &[u8], teller: &str) -> Option<Vec<Estop>> {
     let entry = decode(payload)?;
-    field(&entry, "estops").map_or(Some(vec![]), |told| told.as_array()?.iter().map(Estop::read).collect())
+    let estop = |told: &Value| Some(Estop::read(told)?.told(teller));
+    field(&entry, "estops").map_or(Some(vec![]), |told| told.as_array()?.iter().map(estop).collect())
 }
 
 /// A service of one boot of one container: what a handle says.

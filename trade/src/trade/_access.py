@@ -186,6 +186,10 @@ class Access:
         decision = self.policy.decide(who, verb, DOMAIN) if clears else self.policy.authenticated(who)
         return None if decision.allowed else AccessDenied(who=who, verb=verb, what="estop", rule=decision.rule)
 
+    def may_have_stops(self, who: str) -> bool:
+        """Whether an identity may offer anything at all: else it has nothing to stop."""
+        return self.policy is None or bool(self.policy.groups_of(who, ("register",)))
+
     def may_offer(self, who: str, domain: str, provider: str, groups: Sequence[str]) -> bool:
         """Whether an identity may have offered what a registry entry tells of: its own functions, and what it may."""
         if self.policy is None:

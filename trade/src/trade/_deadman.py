@@ -9,6 +9,7 @@ from trade._audit import Audit
 from trade._context import CallContext
 from trade._ended_sessions import within
 from trade._local_service import LocalService
+from trade._ongoing import end_calls
 from trade._resources import Resource
 
 _logger = logging.getLogger("trade")
@@ -160,18 +161,8 @@ def _each(resources: Sequence[Resource], done: Callable[[Resource, str], None]) 
 
 
 def _ask_to_end(resources: Sequence[Resource]) -> None:
-    """What runs on these is to end; what it does then keeps nobody waiting."""
-    cancels = [one.cancel for resource in resources for one in list(resource.calls.values()) if one.cancel]
-    if cancels:
-        threading.Thread(target=_end_calls, args=(cancels,), name="trade-deadman", daemon=True).start()
-
-
-def _end_calls(cancels: Sequence[Callable[[], None]]) -> None:
-    for cancel in cancels:
-        try:
-            cancel()
-        except Exception:
-            _logger.exception("a call whose lock or session has ended failed to end")
+    """What runs on these is to end."""
+    end_calls([one.cancel for resource in resources for one in list(resource.calls.values()) if one.cancel])
 
 
 def _unsafe(resource: Resource, problem: str) -> None:

@@ -7,12 +7,14 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
-from functools import partial
 from typing import Final
 
 from trade._audit import Audit
 from trade._deadman import Deadman
+from trade._estop_ledger import Ledger, age, as_told, identity_of
 from trade._estop_store import EstopStore
+from trade._estop_work import SHARED_S, Pending, Relay, Round, Worker
+from trade._keys import Address
 from trade._locks import LockTable
 from trade._resources import Latch
 from trade._session import foreign
@@ -20,10 +22,7 @@ from trade._wire import Estop, EstopOrder
 
 _logger = logging.getLogger("trade")
 
-_ANSWER_S: Final = 2.5
-"""When a container says what did not come to rest; a stop service that does not return is reported after 2 s."""
 _LOOK_AGAIN_S: Final = 0.005
-_MOST_REQUESTS: Final = 4096
 
 Confirm = Callable[[str, str], None]
 """Says that a request was done, and what of it failed; waits for nobody."""
@@ -59,35 +58,73 @@ class Estops:
         self._changed = changed
         self._keeps = keeps
         self._guard = threading.Lock()
-        self._open = {estop.id: estop for estop in store.read()}
-        self._answers: dict[str, str | None] = dict.fromkeys(self._open, "")
-        """What was asked already, with what failed of it; None: not done yet. What is here is not begun again."""
-        self._threads: list[threading.Thread] = []
-        self.heard: list[Callable[[Estop], None]] = []
-        """Called, each on a thread of its own, with every e-stop that is opened."""
+        self._ledger = Ledger(store.read())
+        self._pending: dict[str, Pending] = {}
+        self._round: Round | None = None
+        """The last one, if something was open here ever since it began."""
+        self._finished = 0.0
+        self._worker = Worker(self._work, "trade-estop-work")
+        self._relays: list[Relay] = []
         self._latch()
 
     def open(self) -> tuple[Estop, ...]:
         """Those that are open, oldest first."""
         with self._guard:
-            return tuple(sorted(self._open.values(), key=_age))
+            return tuple(sorted(self._ledger.open.values(), key=age))
+
+    def is_open(self, estop_id: str) -> bool:
+        """Whether that one is open here."""
+        return estop_id in self._ledger.open
+
+    def is_cleared(self, estop_id: str) -> bool:
+        """Whether somebody has cleared it here, lately."""
+        return estop_id in self._ledger.cleared
+
+    def knows(self, estop_id: str) -> bool:
+        """Whether an e-stop of that id was opened or cleared here."""
+        with self._guard:
+            return self._ledger.knows(estop_id)
+
+    def hear(self, tell: Callable[[Estop], None]) -> None:
+        """Have this called, on a thread of its own, with every e-stop: those that are open, and those to come."""
+        relay = Relay(tell, self.is_open)
+        self._relays = [*self._relays, relay]
+        for estop in self.open():
+            relay.give(estop)
+
+    def deafen(self, tell: Callable[[Estop], None]) -> None:
+        """Have it called no more."""
+        for relay in [one for one in self._relays if one.tell == tell]:
+            self._relays = [one for one in self._relays if one is not relay]
+            relay.close()
 
     def take(self, order: EstopOrder, who: str) -> None:
         """Do what that identity asks, without waiting; an order that comes again is confirmed again."""
-        answer = self._first(order.request, order.opened)
+        with self._guard:
+            known = self._ledger.knows(order.request)
+            if known and order.opened is not None:
+                self._ledger.hear(order.opened)
+            answer = self._ledger.answer(order.request) if known else None
+            if not known:
+                self._start(order.request, order.opened)
         if answer is not None:
-            if answer[0] is not None:
-                self._confirm(order.request, answer[0])
-        elif order.opened is not None:
+            self._confirm(order.request, answer)
+        elif not known and order.opened is not None:
             self._begin(order.opened)
-        else:
+        elif not known:
             self._clear(order.request, order.cleared, who)
 
-    def learn(self, estops: Iterable[Estop]) -> None:
-        """Others have these open: take the union. One that was cleared here is not opened again."""
-        for estop in estops:
-            if self._first(estop.id, estop) is None:
-                self._begin(estop)
+    def learn(self, estops: Iterable[Estop], teller: Address) -> None:
+        """Another container has these open: take the union. One that was cleared here is not opened again."""
+        for estop in as_told(estops, teller):
+            with self._guard:
+                if not self._ledger.wants(estop):
+                    continue
+                self._start(estop.id, estop)
+            self._begin(estop)
+
+    def _start(self, request: str, opened: Estop | None) -> None:
+        self._pending.pop(self._ledger.begin(request, opened), None)
 
     def keep(self) -> None:
         """This container has something to stop from now on: what is open is written down."""
@@ -95,119 +132,109 @@ class Estops:
             if problem := self._written(estop):
                 _logger.error("e-stop %s %s", estop.id, problem)
 
-    def _first(self, request: str, opened: Estop | None) -> tuple[str | None] | None:
-        """None if it is asked for the first time, and what it opens is open then; else how far it is."""
-        with self._guard:
-            if request in self._answers:
-                return (self._answers[request],)
-            self._answers[request] = None
-            if opened is not None:
-                self._open[opened.id] = opened
-            while len(self._answers) > _MOST_REQUESTS:
-                self._answers.pop(next(iter(self._answers)))
-            return None
-
     # --- stopping
 
     def _begin(self, estop: Estop) -> None:
-        begun = time.monotonic()
         reason = f"e-stop {estop.id}{f': {estop.reason}' if estop.reason else ''}"
-        who = foreign(estop.by) or estop.by.partition("/")[0]
-        self._audit.note("stop", "e-stop", about=estop.id, who=who, session=estop.by, why=estop.reason)
+        who = foreign(estop.by) or identity_of(estop)
+        why = f"{estop.reason} (told by {estop.told_by})".lstrip() if estop.told_by else estop.reason
+        self._audit.note("stop", "e-stop", about=estop.id, who=who, session=estop.by, why=why)
         with self._guard:
             self._latch()
-        for resource in self._table.resources():
-            resource.stop(estop.by, (estop.by,), reason, estop=True)
-        ended = threading.Event()
-        problems: list[str] = []
-
-        def stopped(failed: Sequence[str]) -> None:
-            problems.extend(failed)
-            ended.set()
-
-        self._deadman.everything(stopped)
-        if self._keeps():
-            _logger.error("%s, by %s: everything here stops", reason, estop.by)
-
-        def finish() -> None:
-            unwritten = self._written(estop) if self._keeps() else ""
-            ended.wait(max(0.0, begun + _ANSWER_S - time.monotonic()))
-            failed = [*problems, *self._still_moving(begun + _ANSWER_S), *([unwritten] if unwritten else [])]
-            self._done(estop.id, "; ".join(failed))
-
-        self._apart(finish)
-        for tell in self.heard:
-            self._apart(partial(tell, estop))
-
-    def knows(self, estop_id: str) -> bool:
-        """Whether an e-stop of that id was opened or cleared here."""
-        with self._guard:
-            return estop_id in self._answers
+            fresh = self._round is None or not self._round.serves
+            stopping = Round(self._table.resources) if self._round is None or fresh else self._round
+            self._round = stopping
+        try:
+            for resource in self._table.resources():
+                resource.stop(estop.by, (estop.by,), reason, estop=True)
+            if fresh:
+                stopping.begin(self._deadman)
+        finally:
+            self._wait(Pending(estop.id, stopping, opened=estop))
+        if fresh and self._keeps():
+            _logger.error("%s, by %s: everything here stops", reason, estop.giver)
+        for relay in self._relays:
+            relay.give(estop)
 
     def _written(self, estop: Estop) -> str:
         """Write it down unless it is cleared meanwhile; what went wrong."""
         try:
             self._store.write(estop)
-            with self._guard:
-                cleared = estop.id not in self._open
-            if cleared:
+            if not self.is_open(estop.id):
                 self._store.remove(estop.id)
         except OSError as bad:
             return f"is not written down and will not outlive this process: {bad}"
         return ""
-
-    def _still_moving(self, until: float) -> list[str]:
-        while moving := [resource.name for resource in self._table.resources() if resource.moving]:
-            if time.monotonic() >= until:
-                return [f"{name} still moves" for name in moving]
-            threading.Event().wait(_LOOK_AGAIN_S)
-        return []
 
     # --- clearing
 
     def _clear(self, request: str, ids: Sequence[str], who: str) -> None:
         self._audit.note("stop", "e-stop cleared", about=list(ids), who=who)
         with self._guard:
-            for estop_id in ids:
-                self._open.pop(estop_id, None)
-                self._answers.setdefault(estop_id, "")  # what still travels of it opens nothing again
+            self._ledger.clear(ids)
+            if not self._ledger.open:
+                self._round = None
             self._latch()
+        self._wait(Pending(request, cleared=ids))
 
-        def finish() -> None:
-            try:
-                for estop_id in ids:
-                    self._store.remove(estop_id)
-                problem = ""
-            except OSError as bad:
-                problem = f"is cleared, but its note on disk stays and will be read at the next start: {bad}"
-            self._done(request, problem)
-
-        self._apart(finish)
+    def _removed(self, ids: Sequence[str]) -> str:
+        try:
+            for estop_id in ids:
+                self._store.remove(estop_id)
+        except OSError as bad:
+            return f"is cleared, but its note on disk stays and will be read at the next start: {bad}"
+        return ""
 
     # --- both
 
     def _latch(self) -> None:
-        first = min(self._open.values(), key=_age, default=None)
+        first = self._ledger.first
         self._table.estop(None if first is None else Latch(first.by, f"e-stop {first.id}: {first.reason}"))
 
-    def _done(self, request: str, problem: str) -> None:
+    def _wait(self, pending: Pending) -> None:
         with self._guard:
-            self._answers[request] = problem
-        if problem:
-            _logger.error("e-stop %s: %s", request, problem)
-        self._changed()  # first: who has heard of everybody may look at once
-        self._confirm(request, problem)
+            self._pending[pending.request] = pending
+        self._worker.wake()
 
-    def _apart(self, work: Callable[[], None]) -> None:
-        thread = threading.Thread(target=work, name="trade-estop-work", daemon=True)
-        self._threads = [*(known for known in self._threads if known.is_alive()), thread]
-        thread.start()
+    def _work(self) -> float | None:
+        """Write down what is new, and confirm what is over; when to look again, in seconds."""
+        with self._guard:
+            pending, replaced = list(self._pending.values()), list(self._ledger.replaced)
+        if replaced and (early_s := self._finished + SHARED_S - time.monotonic()) > 0:
+            return early_s  # there are more than anybody needs, and each that is told costs everybody
+        for one in pending:
+            self._note(one)
+        if problem := self._removed([name for name in replaced if not self.is_open(name)]):
+            _logger.error("an e-stop that a newer one stands for %s", problem)
+        del self._ledger.replaced[: len(replaced)]
+        over = [(one, result) for one in pending if (result := one.result()) is not None]
+        if over:
+            self._done(over)
+        return _LOOK_AGAIN_S if self._pending else None
+
+    def _note(self, one: Pending) -> None:
+        if one.noted:
+            return
+        one.noted = True
+        if one.opened is None:
+            one.problem = self._removed(one.cleared)
+        elif self._keeps() and self.is_open(one.opened.id):
+            one.problem = self._written(one.opened)
+
+    def _done(self, over: Sequence[tuple[Pending, str]]) -> None:
+        with self._guard:
+            for one, problem in over:
+                self._ledger.answered(one.request, problem)
+                self._pending.pop(one.request, None)
+        self._finished = time.monotonic()
+        self._changed()  # first: who has heard of everybody may look at once
+        for one, problem in over:
+            if problem:
+                _logger.error("e-stop %s: %s", one.request, problem)
+            self._confirm(one.request, problem)
 
     def close(self) -> None:
         """Wait for what is being done. Idempotent."""
-        for thread in self._threads:
-            thread.join(_ANSWER_S)
-
-
-def _age(estop: Estop) -> tuple[float, str]:
-    return estop.at, estop.id
+        self._worker.close()
+        for relay in self._relays:
+            relay.close()

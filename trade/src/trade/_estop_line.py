@@ -3,8 +3,9 @@
 import logging
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
+from itertools import chain
 from typing import Final
 
 import msgspec
@@ -39,6 +40,9 @@ class EstopReport(Struct, frozen=True):
     """Those of the above that speak another version of the protocol, and which. What they offer cannot be read here, so
     each of them counts as one with something to stop. A clearing they do not heed: one of their version is needed."""
 
+    apart: tuple[str, ...] = ()
+    """Containers that did not say what they offer and, by the policy, may offer nothing: they have nothing to stop."""
+
     @property
     def complete(self) -> bool:
         """Whether somebody was found, and all of them did it."""
@@ -56,8 +60,8 @@ class EstopLine:
         self._confirmations = transport.publish(estop_confirmed_key(own), urgent=True, droppable=True)
         self._channel = transport.subscribe(ESTOPS)
         self._take: Callable[[EstopOrder, str], None] | None = None
-        self._asked: dict[str, dict[Address, str]] = {}
-        """By request: who has confirmed it, and what failed there."""
+        self._asked: list[dict[str, dict[Address, str]]] = []
+        """Of each who asks, by request: who has confirmed it, and what failed there."""
         self._changed = threading.Condition()
         self._thread = threading.Thread(target=self._read, name="trade-estop", daemon=True)
         self.malformed = 0
@@ -74,37 +78,43 @@ class EstopLine:
         except ChannelClosed:
             _logger.debug("e-stop %s is not confirmed: the container is closing", request)
 
-    def ask(self, order: EstopOrder, expected: Expected, limit_s: float, over: Callable[[], bool]) -> EstopReport:
-        """Repeat an order until all that are expected have confirmed it.
+    def ask(
+        self,
+        orders: Sequence[EstopOrder],
+        expected: Expected,
+        limit_s: float,
+        over: Callable[[], bool],
+        *,
+        beyond: bool = True,
+    ) -> EstopReport:
+        """Repeat orders until all that are expected have confirmed each of them.
 
         Args:
-            order: what to do.
+            orders: what to do.
             expected: whose confirmation to wait for, as far as is known; who was expected once stays expected.
             limit_s: how long to try, in seconds; also if nobody is found.
-            over: whether it is to be repeated no more, for somebody has cleared it.
+            over: whether they are to be repeated no more: somebody has cleared it, or it is known to be done.
+            beyond: whether others are told, too; else this container alone does it.
         """
         until = time.monotonic() + limit_s
-        data = encode_message(order)
+        data = [encode_message(order) for order in orders]
         awaited: set[Address] = set()
-        heard: dict[Address, str] = {}
+        heard: dict[str, dict[Address, str]] = {order.request: {} for order in orders}
         with self._changed:
-            self._asked[order.request] = heard
-        if self._take is not None:
-            self._take(order, self._own.identity)
+            self._asked.append(heard)
+        if (take := self._take) is not None:
+            for order in orders:
+                take(order, self._own.identity)
         while (left_s := until - time.monotonic()) > 0 and not over():
-            self._orders.put(data)
+            for payload in data if beyond else ():
+                self._orders.put(payload)
             awaited.update(expected())
             with self._changed:
-                if self._changed.wait_for(partial(_all_of, awaited, heard), min(_AGAIN_S, left_s)):
+                if self._changed.wait_for(partial(_confirmed, awaited, heard), min(_AGAIN_S, left_s)):
                     break
         with self._changed:
-            del self._asked[order.request]
-        return EstopReport(
-            id=order.opened.id if order.opened is not None else ",".join(order.cleared),
-            confirmed=_names(address for address in awaited & heard.keys() if not heard[address]),
-            missing=_names(awaited - heard.keys()),
-            failed={address.who: problem for address, problem in heard.items() if problem},
-        )
+            self._asked = [one for one in self._asked if one is not heard]
+        return _report(orders, awaited, list(heard.values()))
 
     # --- hearing
 
@@ -137,10 +147,10 @@ class EstopLine:
 
     def _hear_confirmed(self, address: Address, confirmed: EstopConfirmed) -> None:
         with self._changed:
-            heard = self._asked.get(confirmed.request)
-            if heard is not None:
-                heard[address] = confirmed.problem
-                self._changed.notify_all()
+            for asked in self._asked:
+                if (heard := asked.get(confirmed.request)) is not None:
+                    heard[address] = confirmed.problem
+            self._changed.notify_all()
 
     def close(self) -> None:
         """End the thread. Idempotent."""
@@ -149,8 +159,41 @@ class EstopLine:
             self._thread.join(2)
 
 
-def _all_of(awaited: set[Address], heard: dict[Address, str]) -> bool:
-    return bool(awaited) and awaited <= heard.keys()
+def all_of(estop_id: str, reports: Iterable[EstopReport]) -> EstopReport:
+    """What several containers report of one e-stop, as one: who confirmed it to one of them has done it."""
+    confirmed, missing = set[str](), set[str]()
+    failed, versions, apart = dict[str, str](), dict[str, int](), set[str]()
+    for report in reports:
+        confirmed.update(report.confirmed)
+        missing.update(report.missing)
+        failed.update(report.failed)
+        versions.update(report.versions)
+        apart.update(report.apart)
+    confirmed -= failed.keys()
+    missing -= confirmed | failed.keys()
+    apart -= confirmed | missing | failed.keys()
+    return EstopReport(
+        estop_id, tuple(sorted(confirmed)), tuple(sorted(missing)), failed, versions, tuple(sorted(apart))
+    )
+
+
+def _confirmed(awaited: set[Address], heard: Mapping[str, Mapping[Address, str]]) -> bool:
+    return bool(awaited) and all(awaited <= who.keys() for who in heard.values())
+
+
+def _report(orders: Sequence[EstopOrder], awaited: set[Address], heard: Sequence[Mapping[Address, str]]) -> EstopReport:
+    """What became of orders that were given together, by what was heard of each."""
+    done = awaited.intersection(*heard)
+    problems: dict[Address, str] = {}
+    for address, problem in chain.from_iterable(one.items() for one in heard):
+        problems[address] = "; ".join(filter(None, (problems.get(address, ""), problem)))
+    names = (order.cleared if order.opened is None else (order.opened.id,) for order in orders)
+    return EstopReport(
+        id=",".join(chain.from_iterable(names)),
+        confirmed=_names(address for address in done if not problems[address]),
+        missing=_names(awaited - done),
+        failed={address.who: problem for address, problem in problems.items() if problem},
+    )
 
 
 def _names(addresses: Iterable[Address]) -> tuple[str, ...]:

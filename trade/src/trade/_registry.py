@@ -1,5 +1,6 @@
 """Which services exist, here and elsewhere; every container looks them up locally."""
 
+import logging
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -44,6 +45,12 @@ class Record:
     @property
     def container(self) -> str:
         return self.key.address.container
+
+    @property
+    def used(self) -> tuple[str, ...]:
+        """What to lock for its use: a service that names no resources stands for itself."""
+        uses = () if self.info.effect == "read" else self.info.uses
+        return uses or (f"{self.key.domain}/{self.key.provider}/{self.key.name}",)
 
     @property
     def label(self) -> str:
@@ -99,8 +106,12 @@ class Change(NamedTuple):
     """What was known of those, in the same order."""
 
 
+_logger = logging.getLogger("trade")
+
 _SLASHES: Final = 4
 """In what says where a provider moved."""
+_MOST_GUESTS: Final = 64
+"""So many containers of one identity are known that may offer nothing."""
 _MOST_PROVIDERS: Final = 65_536
 """Of one container: what it announces beyond that is ignored, and of more no withdrawal is remembered."""
 
@@ -112,9 +123,17 @@ class Registry:
     offers. Listeners are told in order, after the change, on the thread that fed it, with no lock held.
     """
 
-    def __init__(self, own: Address, may_offer: MayOffer = _anybody) -> None:
+    def __init__(
+        self,
+        own: Address,
+        may_offer: MayOffer = _anybody,
+        may_offer_anything: Callable[[str], bool] = lambda _: True,
+    ) -> None:
         self._own = own
         self._may_offer = may_offer
+        self._may_offer_anything = may_offer_anything
+        self._crowds: set[str] = set()
+        """Identities that were logged for having too many containers."""
         self._containers: dict[Address, ContainerState] = {}
         self._records: Index[Record] = Index()
         self._lock = threading.RLock()
@@ -205,11 +224,22 @@ class Registry:
     def appear(self, address: Address) -> bool:
         """A container's sign of life rose. Returns whether it is news."""
         with self._lock:
-            if address in self._containers:
+            if address in self._containers or not self._has_room_for(address):
                 return False
             self._containers[address] = ContainerState(address)
             self._bell.ring()
             return True
+
+    def _has_room_for(self, address: Address) -> bool:
+        if self._may_offer_anything(address.identity):
+            return True
+        known = sum(other.identity == address.identity for other in self._containers)
+        if known < _MOST_GUESTS:
+            return True
+        if address.identity not in self._crowds:
+            self._crowds.add(address.identity)
+            _logger.warning("%s has %d containers and may offer nothing: no more are known", address.identity, known)
+        return False
 
     def vanish(self, address: Address) -> None:
         """A container's sign of life fell; it is known no more, until it returns and is asked."""

@@ -35,7 +35,7 @@ class Watch:
         ended: Callable[[str], None],
         returned: Callable[[str], None],
         beat: Callable[[], None],
-        learn: Callable[[Iterable[Estop]], None],
+        learn: Callable[[Iterable[Estop], Address], None],
     ) -> None:
         self._registry = registry
         self._learn = learn
@@ -116,7 +116,7 @@ class Watch:
             self._drop(message.key, bad)
             return
         if self._registry.tells_open(address, domain, provider, estops):
-            self._learn(estops)
+            self._learn(estops, address)
 
     def _sign(self, message: Message) -> None:
         try:

@@ -141,6 +141,18 @@ class Estop(Struct, frozen=True, array_like=True, gc=False):
     reason: Annotated[str, Meta(max_length=500)]
     at: float
     """``time.time()`` there."""
+    told_by: Annotated[str, Meta(max_length=300)] = ""
+    """``identity/container`` of who told of it, if that is not its giver, nor of the giver's identity; empty: its order
+    was heard. Who told may have made it up."""
+
+    @property
+    def giver(self) -> str:
+        """Who gave it and, where it was not heard from him, who says so."""
+        return f"{self.by} (told by {self.told_by})" if self.told_by else self.by
+
+
+MOST_CLEARED: Final = 64
+"""By one order."""
 
 
 class EstopOrder(Struct, array_like=True, gc=False):
@@ -153,7 +165,8 @@ class EstopOrder(Struct, array_like=True, gc=False):
     request: Annotated[str, Meta(min_length=1, max_length=80)]
     """Names the order; of an e-stop, its id."""
     opened: Estop | None = None
-    cleared: Annotated[tuple[str, ...], Meta(max_length=64)] = ()
+    cleared: Annotated[tuple[str, ...], Meta(max_length=MOST_CLEARED)] = ()
+    """More are cleared by several orders."""
 
 
 class EstopConfirmed(Struct, array_like=True, gc=False):

@@ -95,7 +95,7 @@ def look(container: Container) -> Shown:
             Locked(info.resources, info.holder.owner, info.holder.purpose, info.holder.since, tuple(info.waiting))
             for info in container.locks()
         ],
-        estops=[f"{known.by}: {known.reason}" if known.reason else known.by for known in container.estops()],
+        estops=[f"{known.giver}: {known.reason}" if known.reason else known.giver for known in container.estops()],
     )
 
 

@@ -153,7 +153,7 @@ def _of_lock(at: float, what: What, info: LockInfo) -> Happening:
 
 
 def _of_estop(at: float, what: What, known: Estop) -> Happening:
-    return Happening(at, what, known.id, "", f"{known.by}: {known.reason}" if known.reason else known.by)
+    return Happening(at, what, known.id, "", f"{known.giver}: {known.reason}" if known.reason else known.giver)
 
 
 def _say(out: Output, news: Iterable[Happening]) -> None:

@@ -55,7 +55,7 @@ function showEstops() {
   show($("stopped"), JSON.stringify([open, pressed, door.me?.administers]), () => [
     headline() ? make("strong", {}, headline()) : "",
     pressed?.rest ? make("p", {}, pressed.rest) : "",
-    ...open.map((one) => make("p", {}, `${clock(one.at)} ${one.by}: ${one.reason}`)),
+    ...open.map((one) => make("p", {}, `${clock(one.at)} ${one.by}${one.told_by ? ` (told by ${one.told_by})` : ""}: ${one.reason}`)),
     open.length && door.me?.administers ? button("Clear the e-stop", () => clearEstop(open)) : "",
     open.length && !door.me?.administers ? make("p", {}, "Who administers the system may clear it.") : "",
     !open.length && pressed ? button("Understood", () => say(null)) : "",

@@ -46,7 +46,7 @@ function newCard(one) {
 
 function formOf(one) {
   const body = operationOf(one)?.requestBody.content["application/json"].schema;
-  const schema = resolve(body)?.properties.args.anyOf[0] ?? { properties: {} };
+  const schema = resolve(body)?.properties.args ?? { properties: {} };
   const required = new Set(schema.required ?? []);
   const fields = Object.entries(schema.properties ?? {}).map(([name, inner]) => field(one, name, inner, required.has(name)));
   const result = make("output", { class: "result", role: "status" });
