@@ -117,6 +117,24 @@ def test_a_host_that_says_nothing_is_given_up(sshd: Sshd, monkeypatch: pytest.Mo
         assert refused(sshd).reason == "timeout"
 
 
+def test_a_host_that_says_nothing_is_told_of_before_the_deadline_of_the_call(
+    sshd: Sshd, start_container: Callable[[str], trade.Container]
+) -> None:
+    """By default the call has as long as ssh waits for a link."""
+
+    class Starter:
+        @trade.service
+        def start(self) -> None:
+            trade.system.start_container("robot", "eyes", ssh_config=sshd.config)
+
+    start_container("starter").register(Starter(), "starter")
+    start = trade.find(where(name="start", group="starter"), wait_s=30)
+    with socket.create_server(("127.0.0.1", 0)) as mute:
+        sshd.write_config(port=mute.getsockname()[1])
+        with pytest.raises(CannotStart, match="timeout"):
+            start.with_(deadline_s=2.0)()
+
+
 def test_where_there_is_no_trade_that_is_said(sshd: Sshd) -> None:
     error = refused(sshd, "no-such-trade")
     assert (error.reason, "'no-such-trade' is not found" in error.remedy) == ("no trade there", True)

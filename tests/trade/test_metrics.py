@@ -1,7 +1,9 @@
 """Metrics of a container, as Prometheus reads them: calls, durations, refusals, locks, what drivers add."""
 
+import socket
 import subprocess
 import sys
+import threading
 import urllib.error
 import urllib.request
 from collections.abc import Callable
@@ -13,6 +15,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from trade import Container, Measure, Resource, Settings, service, where
 from trade._local_service import LocalService
 from trade.errors import AccessDenied, ConfigurationError, InvalidArgument
+from waiting import wait_until
 
 Start = Callable[..., Container]
 Samples = dict[tuple[str, ...], float]
@@ -41,6 +44,36 @@ def there(start_container: Start) -> Container:
     container = start_container("there", metrics="127.0.0.1:0")
     container.register(Arm(), "rosie.arm")
     return container
+
+
+def test_strangers_take_a_bounded_number_of_descriptors_and_threads(there: Container) -> None:
+    before, strangers = threading.active_count(), list[socket.socket]()
+    try:
+        for _ in range(200):
+            strangers.append(socket.create_connection(("127.0.0.1", there.metrics_port), timeout=20))
+        wait_until(lambda: sum(_is_closed(one) for one in strangers) >= 150, "most are closed at once")
+        assert threading.active_count() - before <= 40
+    finally:
+        for one in strangers:
+            one.close()
+    wait_until(lambda: _answers(there), "it answers again")
+
+
+def _is_closed(stranger: socket.socket) -> bool:
+    stranger.settimeout(0)
+    try:
+        return stranger.recv(1) == b""
+    except BlockingIOError:
+        return False
+    except OSError:
+        return True
+
+
+def _answers(container: Container) -> bool:
+    try:
+        return bool(scraped(container))
+    except OSError:
+        return False
 
 
 def scraped(container: Container) -> Samples:

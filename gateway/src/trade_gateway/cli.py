@@ -53,6 +53,7 @@ _COMMANDS: Final = {
     "locks": (_MOTION, "commands._locks:locks"),
     "unlock": (_MOTION, "commands._locks:unlock"),
     "resume": (_MOTION, "commands._locks:resume"),
+    "stop": (_MOTION, "commands._stop:stop"),
     "estop": (_MOTION, "commands._estop:estop"),
     "watch": (_WATCHING, "commands._watch:watch"),
     "top": (_WATCHING, "commands._top:top"),

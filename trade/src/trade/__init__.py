@@ -43,6 +43,7 @@ from trade._system import ContainerInfo, System
 from trade._terms import LockInfo
 from trade._tracing import LogReader, Trace
 from trade._wire import HEALTHY, Estop, Scalar
+from trade.stop_line import StopReport
 
 __all__ = [
     "Bound",
@@ -75,6 +76,7 @@ __all__ = [
     "Settings",
     "Sight",
     "Span",
+    "StopReport",
     "Stream",
     "System",
     "Trace",
@@ -130,6 +132,7 @@ __all__ = [
     "set_tracing",
     "spans",
     "start",
+    "stop",
     "stream",
     "system",
     "trace",
@@ -461,9 +464,14 @@ def resume(which: Constraint | Iterable[Handle], *, wait_s: float = RESUME_WAIT_
     return container().resume(which, wait_s=wait_s)
 
 
-def estop(reason: str = "", *, limit_s: float = LIMIT_S) -> EstopReport:
+def stop(group: str, reason: str = "", *, limit_s: float = LIMIT_S) -> StopReport:
+    """Stop all that moves in a group; see `Container.stop`. Not safety-rated."""
+    return container().stop(group, reason, limit_s=limit_s)
+
+
+def estop(reason: str = "", *, limit_s: float = LIMIT_S, estop_id: str = "") -> EstopReport:
     """Stop everything in the whole system until it is cleared; see `Container.estop`. Not safety-rated."""
-    return container().estop(reason, limit_s=limit_s)
+    return container().estop(reason, limit_s=limit_s, estop_id=estop_id)
 
 
 def open_session(client: str) -> Session:

@@ -208,6 +208,9 @@ class Container(Hosting, Moving, Streaming, Tracing, Guarding, Bordering):
 
     def invoke(self, handle: Handle, args: tuple[Any, ...], kwargs: dict[str, Any], deadline_s: float | None) -> Any:
         """Call a service and wait; what ``handle(...)`` does."""
+        outer = running.get()
+        if outer is not None and outer.ongoing is not None:
+            return self._begin(handle, args, kwargs, deadline_s, here=True).result()
         target = self._known.get(handle.key)
         if target is not None:
             return target.call(args, kwargs, deadline_s)
@@ -216,9 +219,22 @@ class Container(Hosting, Moving, Streaming, Tracing, Guarding, Bordering):
 
     def begin(self, handle: Handle, args: tuple[Any, ...], kwargs: dict[str, Any], deadline_s: float | None) -> Run:
         """Call a service without waiting; what ``handle.start(...)`` does."""
-        request, run = new_request(deadline_s), Run(handle)
+        return self._begin(handle, args, kwargs, deadline_s, here=False)
+
+    def _begin(
+        self, handle: Handle, args: tuple[Any, ...], kwargs: dict[str, Any], deadline_s: float | None, *, here: bool
+    ) -> Run:
+        """The same; what is made inside another call ends with that."""
+        request, run, outer = new_request(deadline_s), Run(handle), running.get()
         target = self._known.get(handle.key) or self._look_up(handle)
-        target.begin(args, kwargs, request, run)
+        alone = outer is None or outer.cancelled or target.is_stop  # one that was cancelled may look, and stop
+        ongoing = None if outer is None or alone else outer.ongoing
+        forget = _nothing if ongoing is None else run.end_with(ongoing)
+        try:
+            target.begin(args, kwargs, request, run, here=here)
+        except BaseException:
+            forget()
+            raise
         return run
 
     def _look_up(self, handle: Handle) -> Target:
@@ -317,3 +333,7 @@ class Container(Hosting, Moving, Streaming, Tracing, Guarding, Bordering):
 
     def __repr__(self) -> str:
         return f"<Container {self.address} of {self.settings.system}>"
+
+
+def _nothing() -> None:
+    pass

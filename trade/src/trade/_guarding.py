@@ -11,6 +11,7 @@ from trade._locking import LEASE_S, RESUME_WAIT_S, Locking
 from trade._member import Member
 from trade._terms import LockInfo
 from trade._wire import Estop
+from trade.stop_line import StopReport
 
 
 class Guarding(Member):
@@ -39,20 +40,23 @@ class Guarding(Member):
 
         Args:
             which: the actuating services that match, as they are when it is taken, or handles. If nothing matches yet,
-                it waits for that, and then for the whole of a robot's group.
+                it waits for that, and then for the whole of a robot's group. Of ``A | B`` it takes a part of each, or
+                nothing. What such a constraint selects and the lock does not hold is not commanded under it.
             purpose: what for, as others are told who would like to have them.
-            wait_s: how long to wait for others, and for what is not there yet, in seconds; 0 tries.
+            wait_s: how long to wait for others, and for what is not there yet, in seconds; 0 tries. Inside a call it
+                ends before that call's deadline.
             lease_s: how long it outlives its owner, in seconds.
             priority: who waits with a higher one comes first.
             delegates: identities that may use it, too.
-            partial: take a robot's group even if members of it are not there.
+            partial: take a robot's group even if members of it are not there, and of ``A | B`` what there is; then
+                `Lock.missing` says what is not.
             on_lost: called with the error, on a thread of its own, when it is lost.
             on_request: called with who and why, on a thread of its own, when somebody asks for it.
 
         Raises:
             NoSuchService: nothing matches within ``wait_s``.
             LockedByOther: somebody has one of them, or something still moves, after ``wait_s``.
-            IncompleteGroup: the robot file says that more belongs to the group.
+            IncompleteGroup: the robot file says that more belongs to the group, or nothing of an alternative is there.
             ConfigurationError: there is nothing to lock in what matches: it only reads.
             AccessDenied: the policy does not let this container lock one of them.
             NotStopped: one of them could not be stopped when it had to be.
@@ -117,9 +121,28 @@ class Guarding(Member):
         self._check_open()
         return self.locking.resume(which, wait_s)
 
+    # --- stops
+
+    def stop(self, group: str, reason: str = "", *, limit_s: float = LIMIT_S) -> StopReport:
+        """Stop all that moves in a group, and wait until it is at rest: every stop service there is, at once (S07).
+
+        It needs no lock, and no link that stands already: containers are asked on the stop line, too, and what one of
+        them stopped is stopped. Read the report: `StopReport.complete`. This is software, not safety-rated.
+
+        Args:
+            group: such as ``rosie.left``; all beneath it, too.
+            reason: why, for the record.
+            limit_s: how long to try, in seconds; also if nothing is found.
+
+        Raises:
+            ConfigurationError: that is no group, or no limit.
+        """
+        self._check_open()
+        return self._parts.stop_all_of(group, reason, limit_s)
+
     # --- e-stops
 
-    def estop(self, reason: str = "", *, limit_s: float = LIMIT_S) -> EstopReport:
+    def estop(self, reason: str = "", *, limit_s: float = LIMIT_S, estop_id: str = "") -> EstopReport:
         """Stop everything in the whole system, and let nothing move until the e-stop is cleared (S09).
 
         It waits for nobody to be told, and is repeated until every container that has a stop service has confirmed
@@ -128,9 +151,11 @@ class Guarding(Member):
         Args:
             reason: why, for people.
             limit_s: how long to try, in seconds; also if nobody is found.
+            estop_id: names it, in letters, digits, ``.``, ``_`` and ``-``; given again, it is the same e-stop. Empty: a
+                new one.
         """
         self._check_open()
-        return self._parts.estopping.estop(reason, limit_s)
+        return self._parts.estopping.estop(reason, limit_s, estop_id)
 
     def estops(self) -> list[Estop]:
         """The e-stops that are open anywhere in the system, oldest first."""

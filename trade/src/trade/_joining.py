@@ -12,6 +12,7 @@ from trade._ending import Ending
 from trade._endpoints import Endpoint, dialled_from_here, loopback_interface, with_free_port
 from trade._links import Links
 from trade._policy_file import read_policy
+from trade._port_guard import PortGuard
 from trade._rendezvous import Rendezvous
 from trade._settings import Settings
 from trade._tls import Certificate
@@ -33,6 +34,8 @@ def join(settings: Settings, leaving: contextlib.ExitStack) -> ZenohTransport:
     except ConfigurationError:
         transport.close()
         raise
+    guard = PortGuard((own.port for own in transport.links.listen), transport.links.count)
+    leaving.callback(guard.close)
     if certificate is not None:
         leaving.callback(Ending(certificate).close)
     return transport

@@ -112,6 +112,13 @@ class Links:
         """Whether the main session is linked to a bridge, or was within the last second."""
         return self.bridge_lost() or bool(self._routers)
 
+    def count(self) -> int:
+        """How many links the main session has."""
+        try:
+            return len(_others(self._session))
+        except zenoh.ZError:  # closed
+            return 0
+
     def linked(self, session: str) -> bool:
         """Whether the main session is linked to one whose id begins so."""
         try:

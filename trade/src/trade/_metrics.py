@@ -5,6 +5,7 @@ from contextlib import ExitStack
 from itertools import accumulate
 from typing import TYPE_CHECKING, Final
 
+from trade._bounded_listener import BoundedListener
 from trade._endpoints import Endpoint
 from trade._measures import BOUNDS_S, Calls, Measure
 from trade._settings import Settings
@@ -15,6 +16,10 @@ if TYPE_CHECKING:
 
 INSTALL: Final = 'needs prometheus-client; pip install "trade-core[metrics]"'
 _PREFIX: Final = "trade_"
+_MOST_CONNECTIONS: Final = 32
+"""At once; each has a thread until it has been answered."""
+_ASKED_WITHIN_S: Final = 5.0
+"""How long a connection may say nothing."""
 
 
 class Metrics:
@@ -88,6 +93,9 @@ def open_metrics(
     except OSError as taken:
         problem = f"{settings.metrics}: {taken.strerror}; each container of a host needs a port of its own"
         raise ConfigurationError(where="TRADE_METRICS", problem=problem) from None
+
+    server.socket = BoundedListener(server.socket, _MOST_CONNECTIONS)
+    server.RequestHandlerClass.timeout = _ASKED_WITHIN_S  # type: ignore[attr-defined] # as for every stream handler
 
     def close() -> None:
         server.shutdown()

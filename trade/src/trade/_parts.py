@@ -18,7 +18,7 @@ from trade._context import handed_down
 from trade._coroutines import AsyncLoop
 from trade._departing import Departing
 from trade._dispatch import Dispatcher
-from trade._estopping import Estopping
+from trade._estopping import Estopping, check_limit, is_stop
 from trade._freezing import Freezing
 from trade._handle import Handle
 from trade._handle import Home as HandleHome
@@ -39,7 +39,7 @@ from trade._otlp import open_export
 from trade._policy_watch import begin_watching
 from trade._providers import Providers
 from trade._reach import Reach
-from trade._registry import Record, Registry
+from trade._registry import Change, Record, Registry
 from trade._resources import Holder
 from trade._settings import Settings
 from trade._spans import Spans, new_spans
@@ -53,6 +53,9 @@ from trade._wire import Token
 from trade._withdrawn import Withdrawn
 from trade._zenoh import ZenohTransport
 from trade.errors import AccessDenied
+from trade.stop_line import StopLines, StopLineService, StopReport, stop_group, stops_of, together
+
+_LOOK_S: Final = 0.1
 
 
 class Home(_hooks.Home, _locking.Home, _making.Home, _notifications.Home, _streams.Home, HandleHome, Protocol):
@@ -80,7 +83,7 @@ class Parts:
                 self.reach = Reach(self.transport.links, settings.check_may_dial, settings.connect)
                 leaving.callback(self.reach.close)
             self.codec = handle_codec(lambda handle: handle.key, home.handle)
-            self.registry = Registry(address, access.may_offer)
+            self.registry = Registry(address, access.may_offer, access.may_have_stops)
             self.caller = Caller(self.transport, address, session)
             leaving.callback(self.caller.close)
             self.clockwork = Clockwork("trade-clock")
@@ -147,6 +150,15 @@ class Parts:
                 self.transport, address, self.providers.lookup, self.coroutines, access, self.audit, access.callers()
             )
             leaving.callback(self.dispatcher.close)
+            self.lines = StopLines(settings, lambda: () if self.stop_line is None else self.stop_line.own_places)
+            self.stop_line: StopLineService | None = None
+            """Its own end of the stop line; None on a transport without a host."""
+            if self.reach is not None:
+                self.stop_line = StopLineService(address, settings, access, self.audit, self.estopping, self.stop_known)
+                leaving.callback(self.stop_line.close)
+                self.registry.listen(self._mind_stops)
+                if settings.bridge:
+                    self.stop_line.listen_on_host()
             self.meter = Load(home.name, lambda: list(self.dispatcher._crews), self.providers.waiting)
             self.terminating = Terminating(
                 home.name, self.deadman.rest, self.locks.resources, lambda: self.meter.running, home.close
@@ -167,7 +179,7 @@ class Parts:
             undone.callback(self.close)
             self.providers.add(own, (DOMAIN,), name=PROVIDER)
             self.providers.add(estops, (DOMAIN,), name=ESTOPS)
-            self.estopping.begin(estops)
+            self.estopping.begin(estops, self.lines.estop)
             self._leaving.callback(self.announcer.appear().close)
             self.watch = Watch(
                 self.transport,
@@ -184,7 +196,27 @@ class Parts:
                 begin_watching(self._home.access, self.clockwork, self.audit, self.judge_anew)
             undone.pop_all()
 
+    def stop_known(self, group: str, limit_s: float) -> StopReport:
+        """Call the stop services of a group that are known here, for some seconds at most."""
+        return stop_group(self._home, stops_of(self.registry, group), group, limit_s)
+
+    def stop_all_of(self, group: str, reason: str, limit_s: float) -> StopReport:
+        """See `Container.stop`."""
+        check_limit(limit_s, "stop")
+        until = time.monotonic() + limit_s
+        wanted = where(group=group)
+        beside = self.lines.stop(group, reason, limit_s)
+        while not (self.registry.select(wanted) or beside.over()) and (left_s := until - time.monotonic()) > 0:
+            self.registry.wait_for(lambda: bool(self.registry.select(wanted)), min(_LOOK_S, left_s))
+        report = self.stop_known(group, max(_LOOK_S, until - time.monotonic()))
+        return together(group, [report, beside.report() if report.complete else beside.wait()])
+
     # --- being told
+
+    def _mind_stops(self, change: Change) -> None:
+        """Told by the registry: once there is something to stop here, this host can ask for that."""
+        if self.stop_line is not None and any(record.local and is_stop(record) for record in change.joined):
+            self.stop_line.listen_on_host()
 
     def _lost(self, address: Address, *, back: bool = False) -> None:
         """Told by the watch: a container is out of sight, or there again."""
@@ -201,6 +233,7 @@ class Parts:
         """Nobody of it is there any more: nothing more is let in for it, its locks fall, what it moves stops."""
         self.locks.session_ended(session, reason)
         self.deadman.session_ended(session)
+        self.dispatcher.session_ended(session)
         for tell in list(self.told_of_ends):
             tell(session)
 
@@ -268,6 +301,7 @@ class Parts:
 
     def close(self) -> None:
         """End all of it."""
+        self.dispatcher.leave()
         self.targets.close()
         self._leaving.close()
 

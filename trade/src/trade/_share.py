@@ -14,6 +14,7 @@ from msgspec import structs
 
 from trade._bordering import Bordering, Home, Place, inside, shown
 from trade._borrowed import SharedResource, Wanted
+from trade._claims import Claim, Selection
 from trade._container import Container
 from trade._context import CallContext, holding, running
 from trade._deadman import NOBODYS
@@ -253,7 +254,9 @@ class Passage:
         ours = Terms(purpose=terms.purpose, lease_s=LEASE_S, wait_s=terms.wait_s)
         asked = {address: list(names) for address, names in wanted.items()}
         with self._speaking(call, None):
-            return Lock(self._home.locking.keeper, ours, lambda: asked, on_lost, on_request).acquire()
+            return Lock(
+                self._home.locking.keeper, ours, lambda: Selection(asked), on_lost, on_request, Claim()
+            ).acquire()
 
     def resume(self, call: CallContext, address: Address, names: Sequence[str]) -> list[str]:
         """Let them move again at home, if a client from abroad may say so; which were stopped."""

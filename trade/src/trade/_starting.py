@@ -9,6 +9,7 @@ from typing import Final
 
 import msgspec
 
+from trade._context import patience_s
 from trade.errors import CannotStart, ConfigurationError
 
 CONNECT_S: Final = 10
@@ -146,13 +147,14 @@ def ssh_words(host: str, ssh_config: Path | None, words: Sequence[str]) -> list[
 
 
 def _run(host: str, name: str, words: Sequence[str]) -> "subprocess.CompletedProcess[str]":
+    longest_s = patience_s(LONGEST_S)
     try:
         return subprocess.run(  # noqa: S603 - the host is checked, and the words are quoted for its shell
             words,
             stdin=subprocess.DEVNULL,
             capture_output=True,
             text=True,
-            timeout=LONGEST_S,
+            timeout=longest_s,
             check=False,
             start_new_session=True,  # Ctrl-C is for whoever starts it, who is told what came of it
         )
@@ -160,7 +162,7 @@ def _run(host: str, name: str, words: Sequence[str]) -> "subprocess.CompletedPro
         remedy = "install it (Debian: apt-get install openssh-client)"
         raise CannotStart(host=host, container=name, reason="no ssh here", said="", remedy=remedy) from None
     except subprocess.TimeoutExpired:
-        said, remedy = f"no end within {LONGEST_S:g} s", "look there whether it is up: `trade containers`"
+        said, remedy = f"no end within {longest_s:.3g} s", "look there whether it is up: `trade containers`"
         raise CannotStart(host=host, container=name, reason="timeout", said=said, remedy=remedy) from None
 
 

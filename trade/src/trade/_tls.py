@@ -18,7 +18,7 @@ from typing import Any, Final, cast
 from trade._keys import is_chunk
 from trade.errors import ConfigurationError
 
-__all__ = ["Certificate", "authority", "transport_settings"]
+__all__ = ["Certificate", "authority", "common_name", "line_context", "transport_settings"]
 
 _CA: Final = "ca.pem"
 _CERTIFICATE: Final = "cert.pem"
@@ -84,6 +84,23 @@ def transport_settings(certificate: Certificate) -> dict[str, Any]:
         "verify_name_on_connect": True,
         "close_link_on_expiration": True,
     }
+
+
+def line_context(certificate: Certificate, *, server: bool) -> ssl.SSLContext:
+    """What the stop line is encrypted with: both ends show certificates, and who dials looks at the name."""
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER if server else ssl.PROTOCOL_TLS_CLIENT)
+    context.minimum_version = ssl.TLSVersion.TLSv1_3
+    context.verify_mode = ssl.CERT_REQUIRED
+    context.load_verify_locations(certificate.folder / _CA)
+    context.load_cert_chain(certificate.folder / _CERTIFICATE, certificate.folder / _KEY)
+    return context
+
+
+def common_name(sock: ssl.SSLSocket) -> str:
+    """Who is at the other end, by the certificate it has proven; empty: by none that is an identity."""
+    fields = cast("dict[str, Any]", sock.getpeercert() or {})
+    names = [text for part in fields.get("subject", ()) for kind, text in part if kind == "commonName"]
+    return names[0] if len(names) == 1 and is_chunk(names[0]) else ""
 
 
 def authority(settings: dict[str, Any]) -> bytes:

@@ -32,6 +32,7 @@ from trade._transport import (
 from trade.errors import ConfigurationError
 
 LEASE_MS: Final = 2000
+_COMING_IN_MS: Final = 4000
 _CHANNEL_CAPACITY: Final = 4096
 _MOST_KNOWN_KEYS: Final = 1024
 _BLOCK: Final = zenoh.CongestionControl.BLOCK
@@ -86,6 +87,9 @@ def configuration(
         **rules,
         # The first message above it takes a pool of 16 MiB of locked memory that lives as long as the process.
         "transport/shared_memory/transport_optimization/message_size_threshold": _SHARED_FROM_BYTES,
+        # Whoever is slow to come in takes one of 100 places; zenoh would leave it that for 10 s.
+        "transport/unicast/accept_timeout": _COMING_IN_MS,
+        "transport/unicast/open_timeout": _COMING_IN_MS,
         "transport/link/tx/lease": LEASE_MS,
         "transport/link/tx/keep_alive": 4,
         "transport/link/tx/queue/congestion_control/block/wait_before_close": 1_000_000,

@@ -47,6 +47,7 @@ __all__ = [
     "NoSuchService",
     "NobodyFound",
     "NotInstantiable",
+    "NotLocked",
     "NotSerialisable",
     "NotStopped",
     "OutcomeUnknown",
@@ -444,7 +445,7 @@ class SessionEnded(CallerError, ConnectionError):
 
 @dataclass(kw_only=True, eq=False)
 class IncompleteGroup(CallerError, LookupError):
-    """Members of a robot's group are not there, so the whole group cannot be locked."""
+    """Members of a robot's group, or alternatives of a constraint, are not there: no lock over the whole of it."""
 
     group: str
     missing: Sequence[str]
@@ -453,6 +454,21 @@ class IncompleteGroup(CallerError, LookupError):
         return (
             f"{self.group} is not complete: {', '.join(self.missing)} missing; start what drives it, or lock what is "
             "there with partial=True"
+        )
+
+
+@dataclass(kw_only=True, eq=False)
+class NotLocked(CallerError, PermissionError):
+    """The lock around a command selects the service and does not hold it; nothing was sent."""
+
+    service: str
+    selected_by: str
+    """The constraint of the lock."""
+
+    def describe(self) -> str:
+        return (
+            f"{self.service} is selected by the lock of {self.selected_by}, which does not hold it: it was not there "
+            "when the lock was taken. Give it back and take the lock again"
         )
 
 

@@ -6,10 +6,12 @@ import typer
 from rich.markup import escape
 
 from trade import Container, EstopReport, Sight
+from trade._estopping import new_estop_id
 from trade.errors import NoSuchEstop
+from trade.stop_line import StopLines
 from trade_gateway.commands._list import Json
 from trade_gateway.commands._output import Output, UsageError
-from trade_gateway.commands._system_choice import visitor
+from trade_gateway.commands._system_choice import choice_of, visitor
 
 
 def estop(
@@ -28,15 +30,16 @@ def estop(
 
     For example: trade estop --reason "smoke", and later trade estop --clear
     """
-    if ids and not clear:
-        raise UsageError(where="trade estop", problem="ids are for clearing: trade estop --clear ID")
-    if reason and clear:
-        raise UsageError(where="trade estop", problem="--reason is for stopping, and --clear clears")
+    _check_words(ids, reason, clear=clear)
     out = Output(as_json=as_json)
+    given = "" if clear else _given(context, reason, limit)
     with visitor(context) as container:
         system = container.settings.system
         sight = container.sight(limit_s=limit) if clear else None
-        report = container.estop(reason, limit_s=limit) if sight is None else _clear(container, sight, ids, limit)
+        if sight is None:
+            report = container.estop(reason, limit_s=limit, estop_id=given)
+        else:
+            report = _clear(container, sight, ids, limit)
         if report is None:
             if as_json:
                 out.data(None)
@@ -54,6 +57,20 @@ def estop(
         raise sight.nobody(system, "what is open there stays open until it is cleared once more")
     if not report.complete or not (clear or _known(report, container.address.who)):
         raise typer.Exit(1)
+
+
+def _check_words(ids: list[str] | None, reason: str, *, clear: bool) -> None:
+    if ids and not clear:
+        raise UsageError(where="trade estop", problem="ids are for clearing: trade estop --clear ID")
+    if reason and clear:
+        raise UsageError(where="trade estop", problem="--reason is for stopping, and --clear clears")
+
+
+def _given(context: typer.Context, reason: str, limit_s: float) -> str:
+    """Give an e-stop on the stop line, before there is a link; its id, under which it is given again on the links."""
+    estop_id = new_estop_id()
+    StopLines(choice_of(context).settings()).estop(estop_id, reason, limit_s)
+    return estop_id
 
 
 def _clear(container: Container, sight: Sight, ids: list[str] | None, limit_s: float) -> EstopReport | None:
@@ -85,6 +102,8 @@ def _say(out: Output, report: EstopReport, system: str, done: str, own: str) -> 
         hears = done == "stopped" or name not in report.versions
         missed = "did not answer" if hears else "is cleared by a `trade` of its version only"
         out.say(f"[bold red]MISSING: {escape(name)}{_version(report, name)} {missed}[/]")
+    if report.apart:
+        out.say(f"{len(report.apart)} that said nothing may offer nothing, so there is nothing of theirs to stop")
     known = _known(report, own)
     if not known:
         out.say(f"[bold red]nobody was found[/] in system {escape(system)} that has something to stop")

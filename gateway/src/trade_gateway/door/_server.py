@@ -19,6 +19,7 @@ from starlette.routing import WebSocketRoute
 
 from trade import Container
 from trade.errors import ConfigurationError
+from trade.listening import BoundedListener
 from trade_gateway._hosts import in_url, is_loopback
 from trade_gateway.clients import Deeds
 from trade_gateway.dashboard import pages
@@ -33,6 +34,8 @@ from trade_gateway.door._tokens import Tokens
 _logger = logging.getLogger("trade")
 
 MOST_CONNECTIONS: Final = 256
+_MOST_DESCRIPTORS: Final = 2 * MOST_CONNECTIONS
+"""Of connections, also of those that have not asked for anything, or shown a certificate, yet."""
 MOST_MESSAGE_BYTES: Final = 1 << 20
 _PING_EVERY_S: Final = 0.5
 _PONG_WITHIN_S: Final = 1.5
@@ -79,7 +82,7 @@ class Door:
         names = {*LOOPBACK_NAMES, *hosts} if is_loopback(host) else {in_url(host), *hosts}
         self._app = _application(deeds, tokens, names, origins)
         context = None if tls is None else _context(tls)
-        self._socket = _bound(host, port)
+        self._socket = BoundedListener(_bound(host, port), _MOST_DESCRIPTORS)
         self.url: Final = f"http{'s' if tls else ''}://{in_url(host)}:{self._socket.getsockname()[1]}"
         """Where it is."""
         config = uvicorn.Config(
