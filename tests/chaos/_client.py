@@ -15,6 +15,7 @@ from typing import Any
 from tests.holds import Ask, Done, Held, Log, Seen, now
 
 from trade import Container, Handle, Settings, where
+from trade._claims import Claim
 from trade._context import holding
 from trade._keys import Address
 from trade._transport import ChannelClosed
@@ -91,6 +92,7 @@ class Zombie:
     """Shows the tokens of another boot, all numbers of them, as if it had a lock."""
 
     held = True
+    claim = Claim()
 
     def __init__(self, owner: Address) -> None:
         self.owner = owner

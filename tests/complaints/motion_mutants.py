@@ -84,6 +84,7 @@ def a_port_that_was_lost_is_not_opened_again(patch: pytest.MonkeyPatch) -> None:
 
 def two_motions_have_one_joint(patch: pytest.MonkeyPatch) -> None:
     def take_over(self: Exchange, motion: Motion) -> None:
+        motion.attended_ns = self.lasting_clock()
         for axis in motion.axes:
             axis.motion, axis.still, axis.halting_since_ns = motion, 0, 0
 

@@ -8,6 +8,7 @@ import pytest
 
 from trade import Container, Handle, _process, service, where
 from trade.errors import Busy, Cancelled, ConfigurationError, DeadlineExceeded
+from trade.stop_line._listener import Listener
 
 
 class Bench:
@@ -170,7 +171,7 @@ def test_a_stop_cannot_be_serial() -> None:
 
 
 def test_what_waits_when_its_container_closes_never_runs(
-    here: Container, there: Container, bench: Bench, eventually: Any
+    here: Container, there: Container, bench: Bench, eventually: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     there.register(bench, "robot")
     work = here.find(where(name="work"), wait_s=20)
@@ -179,6 +180,16 @@ def test_what_waits_when_its_container_closes_never_runs(
     runs.append(work.start(1))
     assert eventually(lambda: len(work_serial(work)._queue) == 1)
     serial = work_serial(work)
+    line, close = there._parts.stop_line, Listener.close
+    assert line is not None
+    line.listen_on_host()
+
+    def close_late(listener: Listener) -> None:
+        """The stop line closes after the others have seen the container leave: until then a queue may go on."""
+        assert eventually(lambda: not serial._taken)
+        close(listener)
+
+    monkeypatch.setattr(Listener, "close", close_late)
     closing = threading.Thread(target=there.close)
     closing.start()
     assert all(isinstance(run.exception(20), ConnectionError) for run in runs)

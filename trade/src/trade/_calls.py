@@ -62,6 +62,8 @@ class Caller:
         self._shared: Box | None = None
         self._threads: list[threading.Thread] = []
         self._closed = False
+        self.leaving = False
+        """Whether its container closes: who is called sees that, and ends what was asked for."""
         self._next_deadline_ns: float = NEVER
         self._sooner = threading.Event()
         self.malformed = 0
@@ -342,7 +344,8 @@ class Caller:
         thread.start()
 
     def finish_stops(self, limit_s: float) -> None:
-        """Wait until no stop is under way, at most so long, in seconds."""
+        """The container leaves: wait until no stop is under way, at most so long, in seconds."""
+        self.leaving = True
         if threading.current_thread() in self._threads:  # the one that hears of their ends
             return
         until = time.monotonic() + limit_s

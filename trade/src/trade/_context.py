@@ -7,6 +7,7 @@ from typing import Any, Final, Protocol
 
 from msgspec import Struct
 
+from trade._claims import Claim
 from trade._keys import Address
 from trade._ongoing import Ongoing
 from trade._session import client_of
@@ -16,6 +17,8 @@ from trade.errors import Cancelled, LockLost
 __all__ = ["CallContext", "current_call", "progress"]
 
 _MOST_EVENTS: Final = 100
+_ANSWER_S: Final = 0.3
+"""For an answer to be made, and to travel back through whatever lies between."""
 
 
 def outer_of(call_id: int, behalf: Behalf | None) -> int:
@@ -127,6 +130,15 @@ class CallContext(Struct, frozen=True, gc=False):
         """Seconds until it expires, never below zero; None if it does not."""
         return None if self.expires_ns is None else max(0.0, (self.expires_ns - time.monotonic_ns()) / 1e9)
 
+    def patience_s(self, wait_s: float) -> float:
+        """How long it may wait for others so that its caller is told of it if that was in vain, in seconds.
+
+        Args:
+            wait_s: how long it would wait if it had no deadline.
+        """
+        left_s = self.remaining_s
+        return wait_s if left_s is None else min(wait_s, left_s - min(_ANSWER_S, left_s / 5))
+
 
 class Held(Protocol):
     """A lock that the running code holds or uses."""
@@ -139,6 +151,11 @@ class Held(Protocol):
     @property
     def held(self) -> bool:
         """Whether it holds now."""
+        ...
+
+    @property
+    def claim(self) -> Claim:
+        """What it selects, and what of that it holds."""
         ...
 
     def tokens(self) -> Iterable[Token]:
@@ -169,6 +186,12 @@ def served_call() -> CallContext:
     call = running.get()
     assert call is not None  # noqa: S101
     return call
+
+
+def patience_s(wait_s: float) -> float:
+    """How long the running code may wait for others, in seconds; see `CallContext.patience_s`."""
+    call = running.get()
+    return wait_s if call is None else call.patience_s(wait_s)
 
 
 def progress(value: Any) -> None:

@@ -21,7 +21,7 @@ from trade._crew import Crew
 from trade._failures import pack_error
 from trade._keys import Address, calls_to, is_chunk, reply_key
 from trade._local_service import LocalService
-from trade._ongoing import Answer, Herald, Once, Ongoing, cancelled
+from trade._ongoing import Answer, Herald, Once, Ongoing, cancelled, end_calls
 from trade._serial import Serial
 from trade._session import foreign
 from trade._system import DOMAIN, PROVIDER
@@ -92,6 +92,7 @@ class Dispatcher:
         self._lookup = lookup
         self._repliers: dict[str, Publisher] = {}
         self._lock = threading.Lock()
+        self._leaving = False
         self._closed = False
         self._once = Once()
         self._herald = Herald(self._send_progress)
@@ -194,7 +195,7 @@ class Dispatcher:
 
     def _queue(self, serial: Serial, ongoing: Ongoing, service: LocalService, replier: Publisher, call: Call) -> None:
         def begin() -> None:
-            if not self._closed:
+            if not self._leaving:
                 with serial.held():
                     self._perform(ongoing, service, replier, call)
 
@@ -314,8 +315,17 @@ class Dispatcher:
         for replier in gone:
             replier.close()
 
+    def session_ended(self, session: str) -> None:
+        """Nobody of it is there any more: what runs for it is asked to end, and with it what that has called."""
+        end_calls([one.cancel for one in self._once.made_for(session)])
+
+    def leave(self) -> None:
+        """Start no call that waits for its turn: its caller is about to hear that this container has left."""
+        self._leaving = True
+
     def close(self) -> None:
         """Take no more calls; those running may finish within two seconds. Idempotent."""
+        self.leave()
         with self._lock:
             self._closed = True
         for crew in self._crews:

@@ -16,10 +16,9 @@ from trade.errors import ConfigurationError
 
 __all__ = ["Bound", "Handle"]
 
-LONGEST_DEADLINE_S: Final = 86_400.0
-
-
 _logger = logging.getLogger("trade")
+
+LONGEST_DEADLINE_S: Final = 86_400.0
 
 
 class Home(Protocol):
@@ -74,27 +73,13 @@ class Handle:
             return await run
         except asyncio.CancelledError:
             if not run.done():
-                Context().run(self._cancel_soon, run)
+                Context().run(run.end_soon)
             raise
 
-    def _cancel_soon(self, run: Run) -> None:
-        """What `Run.cancel` does, without waiting: what ends the call is under way when this returns."""
-
-        def look(stopping: Run) -> None:
-            if (error := stopping.exception()) is not None:
-                self._say_not_cancelled(error)
-
-        try:
-            run.ask_to_end()
-            if self.record.info.cancel is not None:
-                self.cancel_service().start().when_done(look)
-        except Exception as error:  # noqa: BLE001 - a container that is gone, say: the call is, too
-            self._say_not_cancelled(error)
-
-    def _say_not_cancelled(self, error: BaseException) -> None:
+    def note_not_cancelled(self, error: BaseException) -> None:
+        """Told by a call of it: it was to end, and could not be ended."""
         level = logging.DEBUG if self._home.closed else logging.WARNING
-        text = "%s, whose task was cancelled, could not be cancelled: %s: %s"
-        _logger.log(level, text, self.label, type(error).__name__, error)
+        _logger.log(level, "%s could not be cancelled: %s: %s", self.label, type(error).__name__, error)
 
     def with_(self, *, deadline_s: float) -> "Handle":
         """The same service, called with other options.

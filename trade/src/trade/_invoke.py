@@ -12,7 +12,7 @@ from msgspec import Raw
 from trade._arguments import encode_arguments, encode_call, given
 from trade._calls import Caller
 from trade._codec import Codec
-from trade._context import CallContext, handed_down, holding, running
+from trade._context import CallContext, handed_down, holding, patience_s, running
 from trade._failures import unpack_error
 from trade._hands import Hands
 from trade._keys import Address
@@ -57,6 +57,7 @@ class LocalTarget:
     def __init__(
         self,
         service: LocalService,
+        record: Record,
         codec: Codec,
         own: Address,
         session: str,
@@ -64,12 +65,12 @@ class LocalTarget:
         hands: Hands,
     ) -> None:
         self._service = service
+        self._record = record
         self._hands = hands
         self._thread_name = f"trade-run-{service.label}"
         self._codec = codec
         self._label = service.label
-        self._is_stop = service.effect == "stop"
-        self._effect = service.effect
+        self.is_stop = service.effect == "stop"
         self._own = own
         self._identity = own.identity
         self._session = session
@@ -80,7 +81,7 @@ class LocalTarget:
         inherits = running.get() is not None or speaking.get() is not None or holding.get() or handed_down
         if inherits or self._service.serial is not None:
             return self.invoke(args, kwargs, new_request(deadline_s))
-        expires_ns = None if self._is_stop else monotonic_ns() + in_ns(deadline_s)
+        expires_ns = None if self.is_stop else monotonic_ns() + in_ns(deadline_s)
         context = CallContext(self._new_id(), self._label, self._identity, self._session, expires_ns)
         if not self._service.strict:
             return self._service.call(args, kwargs, context)
@@ -95,8 +96,8 @@ class LocalTarget:
             return self._run(taken, request, None)
         return self._take_turn(self._service.serial, taken, request, None)
 
-    def begin(self, args: tuple[Any, ...], kwargs: dict[str, Any], request: Request, run: Run) -> None:
-        """The same on a thread of its own, with the arguments as they are now."""
+    def begin(self, args: tuple[Any, ...], kwargs: dict[str, Any], request: Request, run: Run, *, here: bool) -> None:
+        """The same on a thread of its own, or on this one (``here``), with the arguments as they are now."""
         service = self._service
         taken = self._taken(args, kwargs) if service.strict else (args, kwargs)
 
@@ -109,7 +110,10 @@ class LocalTarget:
             outcome = partial(self._run, taken, request, ongoing)
         else:
             outcome = partial(self._take_turn, service.serial, taken, request, ongoing)
-        self._hands.begin(partial(run.end, outcome), self._thread_name)
+        if here:
+            run.end(outcome)
+        else:
+            self._hands.begin(partial(run.end, outcome), self._thread_name)
 
     def _taken(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> bytes:
         """The arguments as they are now, whatever becomes of them."""
@@ -121,7 +125,7 @@ class LocalTarget:
         turn = Turn()
         if ongoing is not None:
             ongoing.on_cancel(lambda: serial.drop(turn))
-        if not serial.enter(turn, (request.deadline_ns - monotonic_ns()) / 1e9):
+        if not serial.enter(turn, patience_s((request.deadline_ns - monotonic_ns()) / 1e9)):
             if ongoing is not None and ongoing.cancelled:
                 raise Cancelled(service=self._service.label)
             raise DeadlineExceeded(service=self._service.label, deadline_s=request.deadline_s)
@@ -143,11 +147,11 @@ class LocalTarget:
             raise
 
     def _context(self, request: Request, ongoing: Ongoing | None) -> CallContext:
-        expires_ns = None if self._is_stop else request.deadline_ns
+        expires_ns = None if self.is_stop else request.deadline_ns
         self._check_time(expires_ns, request.deadline_s)
         behalf, session = None, self._session
         if request.inherited is not None:
-            behalf, client = request.presence(self._effect, self._own)
+            behalf, client = request.presence(self._record, self._own)
             session = client or session
         call_id, chain = self._new_id(), request.chain
         return CallContext(call_id, self._label, self._identity, session, expires_ns, chain, ongoing, behalf)
@@ -174,12 +178,13 @@ class RemoteTarget:
         """``known`` describes the result, if that is not to be what the callee says of it."""
         address, key = record.key.address, record.key
         self._label = record.label
+        self._record = record
         self._info: ServiceInfo = record.info
         self._codec = codec
         self._caller = caller
         self._peer: Peer = caller.peer(address)
-        self._is_stop = record.info.effect == "stop"
-        self._publisher = caller.publishers.get(address, key.domain, key.provider, stop=self._is_stop)
+        self.is_stop = record.info.effect == "stop"
+        self._publisher = caller.publishers.get(address, key.domain, key.provider, stop=self.is_stop)
         self._clock = caller.publishers.get(address, DOMAIN, PROVIDER, stop=False)
         self._decode = result_decoder(codec, known or record.info)
         self._decode_any = codec.decoder(Any)
@@ -199,7 +204,15 @@ class RemoteTarget:
         reply = self._ask(self._publisher, self._info.name, values, self._expiry(request), request)
         return self._unpack(reply, request)
 
-    def begin(self, args: tuple[Any, ...], kwargs: dict[str, Any], request: Request, run: Run) -> None:
+    def begin(
+        self,
+        args: tuple[Any, ...],
+        kwargs: dict[str, Any],
+        request: Request,
+        run: Run,
+        *,
+        here: bool,  # noqa: ARG002 - it runs elsewhere
+    ) -> None:
         """The same without waiting; the outcome goes into the run."""
         values = self._values(args, kwargs, request)
 
@@ -232,11 +245,11 @@ class RemoteTarget:
     @property
     def _may_go(self) -> bool:
         """Whether nothing need be asked first."""
-        return self._is_stop or self._peer.clock_known
+        return self.is_stop or self._peer.clock_known
 
     def _values(self, args: tuple[Any, ...], kwargs: dict[str, Any], request: Request) -> Any:
         """The arguments, for a message that is made now; as bytes, checked already, for one that comes later."""
-        if self._is_stop:
+        if self.is_stop:
             request.ignore_outer_deadline()
         elif request.deadline_s <= 0:
             raise DeadlineExceeded(service=self._label, deadline_s=request.deadline_s)
@@ -248,11 +261,11 @@ class RemoteTarget:
         return encode_call(self._codec, self._info, self._label, call)
 
     def _expiry(self, request: Request) -> int | None:
-        return None if self._is_stop else self._peer.expiry_ns(request.deadline_ns)
+        return None if self.is_stop else self._peer.expiry_ns(request.deadline_ns)
 
     def _ask(self, publisher: Any, service: str, args: Any, expires_ns: int | None, request: Request) -> Reply:
         chain = request.chain
-        behalf, session = request.presence(self._info.effect, self._caller.own)
+        behalf, session = request.presence(self._record, self._caller.own)
         return self._caller.ask(
             self._peer, publisher, service, args, request.deadline_ns, expires_ns, chain, behalf, self._message, session
         )
@@ -269,7 +282,7 @@ class RemoteTarget:
     ) -> int:
         peer, deadline_ns, chain = self._peer, request.deadline_ns, request.chain
         encode = self._message
-        behalf, session = request.presence(self._info.effect, self._caller.own)
+        behalf, session = request.presence(self._record, self._caller.own)
         return self._caller.start(
             peer, publisher, service, args, deadline_ns, expires_ns, chain, then, on_progress, behalf, encode, session
         )
@@ -305,7 +318,10 @@ class RemoteTarget:
         container = self._peer.address.container
         match reply.status:
             case Status.ERROR:
-                return self._error(reply)
+                error = self._error(reply)
+                if self._caller.leaving and isinstance(error, Cancelled):  # as its session has ended
+                    return ContainerLost(service=self._label, container=self._caller.own.container)
+                return error
             case Status.BUSY:
                 return Busy(service=self._label, container=container)
             case Status.EXPIRED:

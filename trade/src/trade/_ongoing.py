@@ -1,19 +1,23 @@
 """What a container runs and has run: every call id once, cancelled on request, telling how far it is."""
 
+import logging
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from heapq import heappop, heappush
 from typing import TYPE_CHECKING, Any, Final
 
 from msgspec import Raw
 
+from trade._ended_sessions import within
 from trade._failures import pack_error
 from trade._wire import Call, Status, encode_message
 from trade.errors import Cancelled, OutcomeUnknown
 
 if TYPE_CHECKING:
     from trade._local_service import LocalService
+
+_logger = logging.getLogger("trade")
 
 GRACE_NS: Final = 5_000_000_000
 """How long after its deadline a call's answer is kept."""
@@ -73,13 +77,20 @@ class Ongoing:
         for tell in told or ():
             tell()
 
-    def on_cancel(self, tell: Callable[[], object]) -> None:
-        """Call this when it is cancelled, at once if it was."""
+    def on_cancel(self, tell: Callable[[], object]) -> Callable[[], None]:
+        """Call this when it is cancelled, at once if it was. Returns what takes that back."""
         with _rare:
-            if not self.cancelled:
+            known = not self.cancelled
+            if known:
                 self._on_cancel = [*(self._on_cancel or ()), tell]
-                return
-        tell()
+        if not known:
+            tell()
+
+        def forget() -> None:
+            with _rare:
+                self._on_cancel = [one for one in self._on_cancel or () if one is not tell]
+
+        return forget
 
     def wait_cancelled(self, timeout_s: float | None) -> bool:
         with _rare:
@@ -89,6 +100,20 @@ class Ongoing:
                     self._event.set()
             event = self._event
         return event.wait(timeout_s)
+
+
+def end_calls(cancels: Sequence[Callable[[], object]]) -> None:
+    """Ask calls to end, on a thread of their own: what they do then keeps nobody waiting."""
+    if cancels:
+        threading.Thread(target=_end, args=(cancels,), name="trade-cancel", daemon=True).start()
+
+
+def _end(cancels: Sequence[Callable[[], object]]) -> None:
+    for cancel in cancels:
+        try:
+            cancel()
+        except Exception:
+            _logger.exception("a call that was to end failed to")
 
 
 class Once:
@@ -155,6 +180,10 @@ class Once:
         if found is not None and found.answer is None:
             found.cancel()
 
+    def made_for(self, session: str) -> list[Ongoing]:
+        """Calls under way that are made for a session, or for a part of it: by itself, or on its behalf."""
+        return [one for one in list(self._calls.values()) if one.answer is None and _is_for(one.call, session)]
+
     def _keep_body(self, key: Key, ongoing: Ongoing, size: int, service: str) -> None:
         ongoing.size = size
         self._bytes += size
@@ -179,6 +208,11 @@ class Once:
         self._evicted[place] = max(call_id, self._evicted.pop(place, -1))
         if len(self._evicted) > _MOST_CALLERS:
             del self._evicted[next(iter(self._evicted))]
+
+
+def _is_for(call: Call | None, session: str) -> bool:
+    behalf = () if call is None or call.behalf is None else call.behalf.sessions
+    return call is not None and any(within(one, session) for one in (call.session, *behalf))
 
 
 def _unknown(service: str) -> Answer:

@@ -4,7 +4,6 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from typing import Any, Final
 
-import msgspec
 from msgspec import Raw
 
 from trade._codec import Codec
@@ -17,7 +16,7 @@ from trade._resources import Resource
 from trade._schemas import read_schema
 from trade._service import Effect, ServiceMark
 from trade._signature import Signature
-from trade._wire import MOST_BYTES, ErrorInfo, ServiceInfo
+from trade._wire import MOST_BYTES, UNREADABLE, ErrorInfo, ServiceInfo
 from trade.errors import InvalidArgument, NotSerialisable, TooLarge
 
 _AT_LEAST_S: Final = 0.001
@@ -42,7 +41,7 @@ class _Passed(Signature):
     def decode(self, service: str, raw: Raw | bytes) -> tuple[Sequence[Any], dict[str, Any]]:
         try:
             given = self._plain(raw)
-        except (msgspec.ValidationError, msgspec.DecodeError) as bad:
+        except UNREADABLE as bad:
             raise self._refused(service, str(bad)) from None
         if isinstance(given, list):
             return given, {}  # pyright: ignore[reportUnknownVariableType]

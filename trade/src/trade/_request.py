@@ -5,11 +5,14 @@ from typing import Final
 
 from msgspec import Struct
 
+from trade._claims import require_held
 from trade._context import CallContext, Held, handed_down, holding, running
 from trade._keys import Address
+from trade._registry import Record
 from trade._session import Session, speaking
+from trade._system import DOMAIN
 from trade._wire import Behalf, Token
-from trade.errors import LockLost
+from trade.errors import Cancelled, LockLost
 
 DEFAULT_DEADLINE_S: Final = 10.0
 _DEFAULT_DEADLINE_NS: Final = int(DEFAULT_DEADLINE_S * 1e9)
@@ -40,21 +43,29 @@ class Inherited(Struct, gc=False):
         self.client.check()
         return self.client.name
 
-    def behalf(self, effect: str, own: Address) -> Behalf | None:
+    def behalf(self, record: Record, own: Address) -> Behalf | None:
         """What the call passes on; the locks around it unless it stops, which needs none.
 
         Raises:
             LockLost: it actuates, and would do so under a lock that holds no more.
+            NotLocked: it actuates, and the locks around it select its service and do not hold it.
+            Cancelled: it actuates, and the call that makes it was cancelled.
         """
+        effect = record.info.effect
+        commands = effect == "actuate" and record.key.domain != DOMAIN  # the middleware's own functions are nobody's
         outer, around = self.outer, self.around
         if own in handed_down:
             around = (handed_down[own], *around)
         if outer is None and not around:
             return None
+        if commands and outer is not None and outer.cancelled:
+            raise Cancelled(service=record.label)
         locks = [lock for lock in around if lock.owner == own]
         tokens: tuple[Token, ...] = ()
         if effect != "stop":
             tokens = tuple(token for lock in locks if effect == "actuate" or lock.held for token in lock.tokens())
+        if commands:
+            require_held(locks, record)
         if outer is None:
             return Behalf((), (), tokens) if tokens else None
         inherited = outer.behalf or _NOBODY
@@ -71,14 +82,15 @@ class Request(Struct, gc=False):
     chain: tuple[str, ...] = ()
     inherited: Inherited | None = None
 
-    def presence(self, effect: str, own: Address) -> tuple[Behalf | None, str]:
+    def presence(self, record: Record, own: Address) -> tuple[Behalf | None, str]:
         """On whose behalf it is made, and in which session if not the container's own.
 
         Raises:
-            LockLost, SessionEnded: it would be made under a lock that holds no more, or for a client that is gone.
+            LockLost, NotLocked: it would be made under a lock that holds no more, or that selects it and has it not.
+            SessionEnded, Cancelled: it would be made for a client that is gone, or by a call that was cancelled.
         """
         inherited = self.inherited
-        return (None, "") if inherited is None else (inherited.behalf(effect, own), inherited.session(own))
+        return (None, "") if inherited is None else (inherited.behalf(record, own), inherited.session(own))
 
     def refused(self, by: Address, error: BaseException) -> None:
         """The locks around it learn of a refusal at once, and not when they are renewed."""

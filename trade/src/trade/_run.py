@@ -4,9 +4,13 @@ import asyncio
 import contextlib
 import logging
 from collections.abc import Callable, Generator
+from contextvars import copy_context
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from trade._bell import Bell
+from trade._ongoing import Ongoing, end_calls
+from trade.errors import OutcomeUnknown
 
 if TYPE_CHECKING:
     from trade._handle import Handle
@@ -90,6 +94,28 @@ class Run:
         if self._handle.record.info.cancel is not None:
             self._handle.cancel_service()()
 
+    def end_soon(self) -> None:
+        """What `cancel` does, without waiting: what ends the call is under way when this returns. Once."""
+        if not self._cancelling and self._outcome is None:
+            self._soon(self.ask_to_end)
+            self._soon(self._call_off)
+
+    def _call_off(self) -> None:
+        """Have the service called that ends it, if its provider names one."""
+
+        def look(stopping: Run) -> None:
+            if (error := stopping.exception()) is not None:
+                self._handle.note_not_cancelled(error)
+
+        if self._handle.record.info.cancel is not None:
+            self._handle.cancel_service().start().when_done(look)
+
+    def _soon(self, do: Callable[[], None]) -> None:
+        try:
+            do()
+        except Exception as error:  # noqa: BLE001 - a container that is gone, say: the call is, too
+            self._handle.note_not_cancelled(error)
+
     def ask_to_end(self) -> None:
         """What `cancel` does first: ask the call alone to end. Does not wait."""
         self._cancelling = True
@@ -141,6 +167,28 @@ class Run:
         self._outcome = (result, error)
         self._ended.ring()
         self._tell()
+
+    def end_with(self, outer: Ongoing) -> Callable[[], None]:
+        """Told by the container: it is made inside another call, and ends with that. Returns what takes that back.
+
+        Also at its deadline, when nobody knows whether it ended: what ends it is called all the same.
+        """
+        around = copy_context()  # for whom, and under which locks
+
+        def end() -> None:
+            end_calls([partial(around.run, self.end_soon)])
+
+        def call_off() -> None:
+            self._soon(self._call_off)
+
+        def look(_: object) -> None:
+            forget()
+            if isinstance(self.exception(0), OutcomeUnknown):
+                end_calls([partial(around.run, call_off)])
+
+        forget = outer.on_cancel(end)
+        self.when_done(look)
+        return forget
 
     async def settled(self) -> None:
         """Wait for its end from asyncio, well or not; the service goes on if this waiting is cancelled."""

@@ -91,7 +91,7 @@ class Targets:
         service = self._providers.lookup(f"{record.key.domain}/{record.key.provider}", record.key.name)
         if service is None:  # deregistered since we looked
             return None
-        return LocalTarget(service, self._codec, self._own, self._session, self._caller.new_id, self._hands)
+        return LocalTarget(service, record, self._codec, self._own, self._session, self._caller.new_id, self._hands)
 
     def _our_own(self, record: Record) -> ServiceInfo | None:
         """How this container describes a function of the middleware that another one has, too.
