@@ -12,6 +12,8 @@ import pytest
 
 from jointed import WHOLE, Joint, Robot
 from trade import Container, Handle, _locking, permit, service, where
+from trade._keys import ServiceKey
+from trade._terms import Terms
 from trade.errors import (
     ConfigurationError,
     IncompleteGroup,
@@ -58,6 +60,24 @@ def test_whose_locks_are_not_known_is_told(
         assert [info.resources for info in robot.other.locks()] == [("b",)]
         asleep.set()
     assert "which locks there are in tester/a is not known" in caplog.text
+
+
+def test_P51_how_a_lock_is_used_is_seen_from_elsewhere(robot: Robot) -> None:
+    def seen() -> dict[str, tuple[int, float]]:
+        return {info.resources[0]: (info.uses, info.last_use) for info in robot.other.locks()}
+
+    with robot.me.lock(WHOLE):
+        assert seen() == {"a": (0, 0.0), "b": (0, 0.0)}
+        for _ in range(2):
+            robot.find("a")(0.1)
+        with pytest.raises(LockedByOther):
+            robot.find("b", whose=robot.other)(0.9)
+        used = seen()
+        assert (used["a"][0], used["b"]) == (2, (0, 0.0))
+        robot.find("a")(0.2)
+        assert seen()["a"][1] > used["a"][1] > 0.0
+    with robot.me.lock(WHOLE):
+        assert seen() == {"a": (0, 0.0), "b": (0, 0.0)}
 
 
 @pytest.mark.parametrize("where_it_is", ["local", "remote"])
@@ -243,6 +263,24 @@ def test_request_release_reaches_the_owner(robot: Robot) -> None:
     assert robot.other.request_release(WHOLE, "again") == []
 
 
+def test_P52_of_two_that_wait_the_one_with_the_higher_priority_comes_first(robot: Robot) -> None:
+    turns = list[str]()
+
+    def take(whose: Container, priority: int) -> None:
+        with whose.lock(WHOLE, wait_s=60, priority=priority):
+            turns.append(whose.name)
+
+    waiting = list[threading.Thread]()
+    with robot.me.lock(WHOLE):
+        for name, priority in (("low", -1), ("middle", 0), ("high", 1)):
+            waiting.append(threading.Thread(target=take, args=(robot.system.container(name), priority)))
+            waiting[-1].start()
+            wait_until(lambda: len(robot.other.locks()[0].waiting) == len(waiting))
+    for thread in waiting:
+        thread.join(60)
+    assert turns == ["high", "middle", "low"]
+
+
 def test_two_who_want_the_same_in_opposite_order_both_get_it(robot: Robot) -> None:
     turns = list[str]()
 
@@ -300,6 +338,63 @@ def test_re_entry_takes_nothing_twice_and_gives_nothing_back_early(robot: Robot)
         assert outer.held
         with pytest.raises(LockedByOther):
             robot.find("a", whose=robot.other)(0.2)
+
+
+# --- inside a call
+
+
+class _Walker:
+    """A service that takes locks, or looks for services, as far as its caller's deadline lets it."""
+
+    def __init__(self, container: Container) -> None:
+        self._container = container
+
+    @service
+    def walk(self) -> None:
+        with self._container.lock(WHOLE, purpose="walk"):
+            pass
+
+    @service
+    def walk_what_is_not_there(self) -> None:
+        with self._container.lock(where(group="nothing.there")):
+            pass
+
+    @service
+    def look_for(self, name: str) -> None:
+        self._container.find(where(name=name), wait_s=60)
+
+
+@pytest.fixture
+def walker(robot: Robot) -> Callable[[str], Handle]:
+    home = robot.system.container("walker")
+    home.register(_Walker(home), "walker")
+    return lambda name: robot.me.find(where(name=name, group="walker"), wait_s=20).with_(deadline_s=1.5)
+
+
+def test_S13_a_lock_that_a_service_waits_for_in_vain_is_told_before_the_deadline_of_its_call(
+    robot: Robot, walker: Callable[[str], Handle]
+) -> None:
+    """By default a lock waits as long as a call lasts: who has it, and what for, is told all the same."""
+    refused = pytest.raises(LockedByOther, match="is locked by tester/other for 'dance'")
+    with robot.other.lock(WHOLE, purpose="dance"), refused:
+        walker("walk")()
+    assert robot.me.locks() == []
+
+
+def test_whoever_asks_a_container_for_a_lock_by_itself_is_told_in_time(robot: Robot) -> None:
+    """As containers in other languages do, whose wait may be the deadline of the call."""
+    acquire = ServiceKey(robot.find("a").key.address, "trade", "system", "acquire")
+    with robot.other.lock(WHOLE, purpose="dance"), pytest.raises(LockedByOther, match="for 'dance'"):
+        robot.me.handle(acquire).with_(deadline_s=1.5)(["a"], Terms(wait_s=1.5))
+
+
+def test_what_a_service_waits_for_in_vain_is_told_before_the_deadline_of_its_call(
+    walker: Callable[[str], Handle],
+) -> None:
+    with pytest.raises(NoSuchService, match=r"nothing\.there"):
+        walker("walk_what_is_not_there")()
+    with pytest.raises(NoSuchService, match="not_there"):
+        walker("look_for")("not_there")
 
 
 # --- S16 and S17: what is locked

@@ -3,6 +3,9 @@
 import json
 from typing import Final
 
+import msgspec
+
+from trade._claims import Claim
 from trade._keys import Address
 from trade._wire import Token
 from trade.errors import ConfigurationError, LockLost
@@ -10,10 +13,11 @@ from trade.errors import ConfigurationError, LockLost
 VARIABLE: Final = "TRADE_LOCK"
 
 
-def passed_on(holder: Address, resources: tuple[str, ...], tokens: list[Token]) -> str:
+def passed_on(holder: Address, resources: tuple[str, ...], tokens: list[Token], claim: Claim) -> str:
     """What stands in the variable."""
     numbers = [[token.epoch, token.number] for token in tokens]
-    return json.dumps([[holder.identity, holder.container, holder.epoch], list(resources), numbers])
+    claimed = msgspec.to_builtins(claim)
+    return json.dumps([[holder.identity, holder.container, holder.epoch], list(resources), numbers, claimed])
 
 
 class InheritedLock:
@@ -30,10 +34,11 @@ class InheritedLock:
     def __init__(self, text: str, owner: Address) -> None:
         self.owner: Final = owner
         try:
-            holder, resources, tokens = json.loads(text)
+            holder, resources, tokens, *claimed = json.loads(text)
             self._holder = Address(*map(str, holder))
             self._resources = tuple(map(str, resources))
             self._tokens = [Token(str(epoch), int(number)) for epoch, number in tokens]
+            self.claim: Final = msgspec.convert(claimed[0], Claim) if claimed else Claim()
         except (ValueError, TypeError, RecursionError):
             problem = "is what `trade lock` passes to the command it runs; unset it"
             raise ConfigurationError(where=VARIABLE, problem=problem) from None

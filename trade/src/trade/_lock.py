@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 from msgspec import structs
 
-from trade._context import Held, holding
+from trade._claims import Claim, Selection
+from trade._context import Held, holding, patience_s
 from trade._inherited import VARIABLE, passed_on
 from trade._keys import Address
 from trade._terms import Granted, Terms
@@ -24,8 +25,8 @@ if TYPE_CHECKING:
 
 _logger = logging.getLogger("trade")
 
-Wanted = Callable[[], dict[Address, list[str]]]
-"""Finds what to lock, by the container that judges it, at the moment it is taken; waits until it is there."""
+Wanted = Callable[[], Selection]
+"""Finds what to lock at the moment it is taken; waits until it is there."""
 OnLost = Callable[[LockLost], object]
 OnRequest = Callable[[str, str], object]
 """Told who would like to have the lock, and why."""
@@ -39,7 +40,13 @@ class Lock:
     """
 
     def __init__(
-        self, keeper: "Keeper", terms: Terms, wanted: Wanted, on_lost: OnLost | None, on_request: OnRequest | None
+        self,
+        keeper: "Keeper",
+        terms: Terms,
+        wanted: Wanted,
+        on_lost: OnLost | None,
+        on_request: OnRequest | None,
+        claim: Claim,
     ) -> None:
         self._keeper = keeper
         self._terms = terms
@@ -51,6 +58,11 @@ class Lock:
         self.lease_s: Final = terms.lease_s
         self.resources: tuple[str, ...] = ()
         """What it holds, by name."""
+        self.missing: tuple[str, ...] = ()
+        """What its constraint is for and was not there when it was taken, with ``partial=True``: members of a robot's
+        group, and alternatives."""
+        self.claim = claim
+        """What it selects, and where what it holds of that is."""
         self._granted: dict[Address, Token] = {}
         self._confirmed: dict[Address, float] = {}
         self._lost: LockLost | None = None
@@ -76,11 +88,16 @@ class Lock:
                 problem = "a lock is taken once; make another one with trade.lock(...), or share this one with use()"
                 raise ConfigurationError(where=f"lock for {self.purpose!r}", problem=problem)
             self._taken = True
-        begun = time.monotonic()
-        wanted = self._wanted()
-        left_s = max(0.0, self._terms.wait_s - (time.monotonic() - begun))
+        until = time.monotonic() + patience_s(self._terms.wait_s)
+        wanted, self.missing = self._wanted()
+        left_s = max(0.0, until - time.monotonic())
+        for address, names in wanted.items():
+            self.claim = self.claim.with_held(address, names)
         self._keeper.acquire(self, wanted, structs.replace(self._terms, wait_s=left_s))
         self._whole = True
+        if self.missing:
+            told = self.purpose, ", ".join(self.resources), ", ".join(self.missing)
+            _logger.warning("the lock for %r holds %s; missing: %s", *told)
         return self
 
     @property
@@ -119,7 +136,7 @@ class Lock:
 
     def environment(self) -> dict[str, str]:
         """What lets a child process make all its calls under it; raises LockLost if it holds no more."""
-        return {VARIABLE: passed_on(self.owner, self.resources, list(self.tokens()))}
+        return {VARIABLE: passed_on(self.owner, self.resources, list(self.tokens()), self.claim)}
 
     def release(self) -> None:
         """Give it back. Idempotent."""
@@ -164,7 +181,8 @@ class Lock:
 
     def __repr__(self) -> str:
         state = "not taken" if not self._taken else "lost" if self._lost else "released" if self._ended else "held"
-        return f"<Lock of {', '.join(self.resources)}, {state}>"
+        missing = f", without {', '.join(self.missing)}" if self.missing else ""
+        return f"<Lock of {', '.join(self.resources)}, {state}{missing}>"
 
     # --- being kept
 
@@ -186,6 +204,7 @@ class Lock:
                 self._confirmed = {**self._confirmed, address: asked_at + granted.waited_s}
                 self._granted = {**self._granted, address: granted.token}
             self.resources = tuple(sorted({*self.resources, *granted.resources}))
+            self.claim = self.claim.with_held(address, granted.resources)
 
     def confirm(self, address: Address, number: int, asked_at: float) -> None:
         """One container still holds its part of that number; it was asked at that time."""

@@ -69,6 +69,7 @@ class LockServices:
         )
         if not self._places.acquire(blocking=False):
             raise Busy(service="trade.acquire", container=self._own.container)
+        terms = structs.replace(terms, wait_s=call.patience_s(terms.wait_s))
         try:
             with self._borrowed.behind(call, named, terms, self._pass_wish) as loan:  # elsewhere first: judged there
                 wait = structs.replace(terms, wait_s=max(0.0, terms.wait_s - loan.waited_s))

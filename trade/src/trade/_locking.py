@@ -6,7 +6,8 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Final, NamedTuple, Protocol
 
 from trade._access import Access
-from trade._constraints import Constraint
+from trade._claims import Claim, Selection
+from trade._constraints import Constraint, Term, under
 from trade._handle import Handle
 from trade._keeper import Keeper
 from trade._keys import Address, ServiceKey
@@ -87,12 +88,13 @@ class Locking:
             raise ConfigurationError(where="lock", problem=f"lease_s must be 0.1 to 60, not {lease_s!r}")
         terms = Terms(purpose=purpose, lease_s=lease_s, wait_s=wait_s, priority=priority, delegates=tuple(delegates))
 
-        def wanted() -> dict[Address, list[str]]:
+        def wanted() -> Selection:
             handles = self._there(which, wait_s, partial=partial)
             self._require("lock", handles, which)
-            return resources_of(handles)
+            return Selection(resources_of(handles), tuple(absent(which, handles)))
 
-        return Lock(self.keeper, terms, wanted, on_lost, on_request)
+        claim = Claim(which if isinstance(which, Constraint) else None)
+        return Lock(self.keeper, terms, wanted, on_lost, on_request, claim)
 
     def _there(self, which: Constraint | Iterable[Handle], wait_s: float, *, partial: bool) -> list[Handle]:
         """The services to lock. If nothing matches yet, that is waited for until it is there as a whole.
@@ -225,15 +227,8 @@ def resources_of(handles: Sequence[Handle]) -> dict[Address, list[str]]:
     """What to lock for the use of services, by the container that judges it."""
     wanted: dict[Address, dict[str, None]] = {}
     for handle in handles:
-        uses = () if handle.effect == "read" else handle.record.info.uses
-        names = uses or (own_resource(handle.key),)
-        wanted.setdefault(handle.key.address, {}).update(dict.fromkeys(names))
+        wanted.setdefault(handle.key.address, {}).update(dict.fromkeys(handle.record.used))
     return {address: list(names) for address, names in wanted.items()}
-
-
-def own_resource(key: ServiceKey) -> str:
-    """What stands for a service that names no resources: itself."""
-    return f"{key.domain}/{key.provider}/{key.name}"
 
 
 def selected(
@@ -272,22 +267,35 @@ def _groups_of(which: Constraint) -> list[str]:
 
 
 def require_whole(which: Constraint | Iterable[Handle], handles: Sequence[Handle]) -> None:
-    """A group of a robot is locked as a whole (S16).
+    """A group of a robot is locked as a whole (S16), and of a union a part of each alternative (S13).
 
     Raises:
-        IncompleteGroup: some of what the robot file says belongs to it is not there.
+        IncompleteGroup: some of what belongs to it is not there.
     """
+    if missing := absent(which, handles):
+        groups = _groups_of(which) if isinstance(which, Constraint) else []
+        raise IncompleteGroup(group=groups[0] if len(groups) == 1 else str(which), missing=missing)
+
+
+def absent(which: Constraint | Iterable[Handle], handles: Sequence[Handle]) -> list[str]:
+    """What a constraint is for and is not among these: members that the robot file names, and whole alternatives."""
     if not isinstance(which, Constraint):
-        return
-    groups = _groups_of(which)
-    there = {name for handle in handles for name in handle.record.info.uses}
-    for group in groups:
-        expected = {
-            member
-            for handle in handles
-            for whole, members in handle.record.members.items()
-            if whole == group or whole.startswith(f"{group}.")
-            for member in members
-        }
-        if missing := sorted(expected - there):
-            raise IncompleteGroup(group=group, missing=missing)
+        return []
+    groups, there = _groups_of(which), {name for handle in handles for name in handle.record.info.uses}
+    expected = {
+        member
+        for handle in handles
+        for whole, members in handle.record.members.items()
+        if any(under(whole, group) for group in groups)
+        for member in members
+    }
+    alternatives = [one for one in _alternatives(which) if not any(one.matches(handle.record) for handle in handles)]
+    return sorted(expected - there) + [str(one) for one in alternatives]
+
+
+def _alternatives(which: Constraint) -> list[Constraint]:
+    """What is asked for in place of each other; clauses that differ in what they leave out are one."""
+    asked: dict[frozenset[Term], list[frozenset[Term]]] = {}
+    for clause in which.clauses:
+        asked.setdefault(frozenset(term for term in clause if not term.negated), []).append(clause)
+    return [Constraint(tuple(clauses)) for clauses in asked.values()]

@@ -6,6 +6,7 @@ from typing import Any
 
 from trade import _many
 from trade._constraints import Constraint, where
+from trade._context import patience_s
 from trade._handle import Bound, Handle
 from trade._hints import asked_for, no_such_service, too_many_services
 from trade._member import Member
@@ -56,6 +57,7 @@ class Looking(Member):
         Raises:
             NoSuchService: it does not hold within ``wait_s`` seconds.
         """
+        wait_s = patience_s(wait_s)
         if self._parts.registry.wait_for(ready, wait_s):
             return
         apart = self._unanswered(wait_s) if len(self.addresses()) == 1 else ()
