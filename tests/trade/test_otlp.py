@@ -1,6 +1,7 @@
 """Notes of calls as OpenTelemetry's spans: ids, parents, what a collector gets; off unless a collector is named."""
 
 import itertools
+import secrets
 import sys
 import threading
 from collections.abc import Callable, Iterator
@@ -14,10 +15,11 @@ from opentelemetry.proto.collector.trace.v1.trace_service_pb2 import ExportTrace
 from opentelemetry.sdk.trace import ReadableSpan
 from opentelemetry.sdk.trace.export import SimpleSpanProcessor
 from opentelemetry.sdk.trace.export.in_memory_span_exporter import InMemorySpanExporter
+from opentelemetry.sdk.trace.sampling import Decision, TraceIdRatioBased
 from opentelemetry.trace import SpanKind, StatusCode
 
 from trade import Container, Settings, current_call, service, where
-from trade._otlp import Export
+from trade._otlp import Export, trace_id
 from trade.errors import ConfigurationError
 
 Start = Callable[..., Container]
@@ -90,7 +92,7 @@ def test_spans_have_the_first_call_as_their_trace_and_each_knows_its_parent(
     assert len(spans) == len(chain)
     first = chain[1].context.span_id
     assert chain[1].attributes["trade.call_id"] == str(first)
-    assert {span.context.trace_id for span in spans} == {first}
+    assert {span.context.trace_id for span in spans} == {trace_id(first)}
     assert chain[0].parent is None
     assert [span.parent.span_id for span in chain[1:]] == [span.context.span_id for span in chain[:-1]]
     assert len({span.context.span_id for span in spans}) == len(spans)
@@ -171,7 +173,17 @@ def test_a_collector_gets_what_is_noted_once_its_url_is_set(
     }
     assert {name: span.name for name, span in told.items()} == {"user": "rosie.leg.step", "leg": "rosie.leg.step"}
     assert told["leg"].parent_span_id == told["user"].span_id
-    assert told["leg"].trace_id == told["user"].trace_id == bytes(8) + told["leg"].span_id
+    assert told["leg"].trace_id == told["user"].trace_id
+    assert told["leg"].trace_id[:8] != bytes(8)
+
+
+@pytest.mark.parametrize("ratio", [0.1, 0.5])
+def test_samplers_that_go_by_the_trace_take_as_many_as_they_are_told(ratio: float) -> None:
+    """Ids of calls count up from a moment's chance, and are smaller than half of all that there are."""
+    first, sampler, tried = secrets.randbits(38) << 24, TraceIdRatioBased(ratio), 4000
+    taken = [sampler.should_sample(None, trace_id(first + number), "walk") for number in range(tried)]
+    share = sum(one.decision is Decision.RECORD_AND_SAMPLE for one in taken) / tried
+    assert share == pytest.approx(ratio, abs=0.05)
 
 
 def test_calls_go_on_and_containers_end_when_no_collector_is_there(

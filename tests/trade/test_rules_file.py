@@ -10,6 +10,7 @@ from trade.rules import Rule, read_rules
 
 STEP = '{ call = { name = "go" } }'
 DO = f"do = [{STEP}]"
+EVERY = "when = { every_s = 9 }"
 LEFT = 'when = { left = { name = "look" } }'
 
 
@@ -64,7 +65,9 @@ def test_a_file_is_read_as_it_says(tmp_path: Path) -> None:
         (f"{LEFT}\ndo = [{{ args = [1] }}]", r"do\[0\]: is one of call and wait_for"),
         (f'{LEFT}\ndo = [{STEP}, {{ call = "go" }}]', r"do\[1\]\.call: 'go' is no service; write call = "),
         (f'{LEFT}\ndo = [{{ call = {{ name = "go" }}, args = [["$servce"]] }}]', r"'\$servce' stands for nothing"),
-        ('when = { every_s = 9 }\ndo = [{ call = "$service" }]', "is of rules with joined, left or changed"),
+        ('when = { every_s = 9 }\ndo = [{ call = "$service" }]', "is of rules with joined, left, changed or if"),
+        (f'{EVERY}\n{DO}\nif = {{ service = {{ name = "a" }}, args = ["$service"] }}', "this one has every_s"),
+        (f'{EVERY}\n{DO}\nif = {{ service = {{ container = "$container" }} }}', "this one has every_s"),
         (f'{LEFT}\n{DO}\nif = {{ above = 3 }}', r"rule\.r\.if: service is missing; write service = "),
         (f'{LEFT}\n{DO}\nif = {{ service = {{ name = "a" }}, above = 3, is = 4 }}', "is goes with neither"),
         (f'{LEFT}\ndo = [{{ call = {{ name = "go" }}, deadline_s = 0 }}]', r"do\[0\]\.deadline_s: must be a number"),

@@ -31,7 +31,7 @@ class Planner:
     def busy(self) -> float:
         return self.load
 
-    @service
+    @service(achieves=["plan(?goal)"])
     def plan(self, goal: str) -> str:
         return goal
 
@@ -150,25 +150,25 @@ def test_a_lamp_that_is_missing_is_made(
     shine(0.5)
 
 
-def test_work_is_spread_once_there_is_too_much_of_it(
+def test_who_has_too_much_to_do_goes_on_elsewhere_and_whoever_looks_finds_one(
     start_container: StartContainer, only: Only, here: Container
 ) -> None:
-    mind, spare, planner = start_container("mind"), start_container("spare"), Planner()
+    mind, planner = start_container("mind"), Planner()
+    start_container("worker-1", instantiable=[f"{__name__}:Planner"])
     mind.register(planner, "mind.planner")
-    spare.register(Camera(), "rosie.eyes")
-    stand_by(spare, Planner(), "mind.planner")
-    name = spare.system.withdrawn()[0].provider
-    assert name == "Planner-2"
-    plans = where(name="plan", group="mind.planner")
-    wait_until(lambda: len(here.services(plans)) == 1)
+    for constraint in (where(name="migrate", container="mind"), where(name="clock", container="worker-1")):
+        here.find(constraint, wait_s=30)
+    wait_until(lambda: here.services(where(name="plan")))
     rules = only("balance", every_s="0.02")
     wait_until(lambda: any(info.fired for info in here.notifications()))
     assert rules.rule_firings() == []
     planner.load = 0.9
-    assert first(rules).ok
-    wait_until(lambda: len(here.services(plans)) == 2)
-    outcomes = here.call_all(plans, "tea")
-    assert [outcome.result for outcome in outcomes] == ["tea", "tea"]
+    firing = first(rules)
+    assert (firing.ok, firing.service) == (True, "mind.planner.busy")
+    wait_until(lambda: [one.container for one in here.services(where(name="plan"))] == ["worker-1"])
+    for looking in (where(name="plan"), where(name="plan", group="mind.planner"), where(achieves="plan(?goal)")):
+        assert here.find(looking)("tea") == "tea"
+    assert here.call(where(name="busy")) == 0.9
 
 
 def test_all_of_them_together_do_not_run_in_circles_when_a_camera_is_replaced(

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
+from hashlib import blake2b
 from typing import TYPE_CHECKING, Final
 
 from trade._keys import Address
@@ -24,7 +25,7 @@ _NS: Final = 1_000_000_000
 class Export:
     """Turns notes into spans of OpenTelemetry and hands them on; never waits for a collector.
 
-    A trace has the id of the call that began it, a served call its own id as span id.
+    The id of a trace is made of that of the call that began it, a served call has its own id as span id.
 
     Args:
         processor: of OpenTelemetry's SDK; closed with this.
@@ -45,7 +46,7 @@ class Export:
         from opentelemetry.trace import SpanContext, SpanKind, Status, StatusCode, TraceFlags  # noqa: PLC0415
 
         def named(span_id: int, *, remote: bool) -> SpanContext:
-            return SpanContext(span.ids[-1], span_id, remote, TraceFlags(TraceFlags.SAMPLED))
+            return SpanContext(trace_id(span.ids[-1]), span_id, remote, TraceFlags(TraceFlags.SAMPLED))
 
         asked, failed = span.side == "asked", span.outcome != "ok"
         kind = SpanKind.CLIENT if asked else SpanKind.SERVER if span.remote else SpanKind.INTERNAL
@@ -76,6 +77,11 @@ class Export:
     def close(self) -> None:
         """Send what waits, for a few seconds at most."""
         self._processor.shutdown()
+
+
+def trace_id(call_id: int) -> int:
+    """The trace of an outermost call, the same in every container: all 128 bits look random, as samplers expect."""
+    return int.from_bytes(blake2b(call_id.to_bytes(8, "big"), digest_size=16).digest(), "big")
 
 
 def span_ids(span: Span) -> tuple[int, int]:

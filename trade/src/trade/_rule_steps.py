@@ -134,12 +134,15 @@ def _call(handle: Handle, args: list[Any] | dict[str, Any], about: Handle | None
     return handle(**given) if isinstance(given, dict) else handle(*given)
 
 
-def holds(home: Home, condition: Condition | None, about: Handle | None) -> bool:
-    """Whether a rule's condition holds now. Raises what finding and asking the service does."""
+def holds(home: Home, condition: Condition | None, about: Handle | None) -> tuple[bool, Handle | None]:
+    """Whether a rule's condition holds now, and which service the steps are about: if the occasion has none, the asked.
+
+    Raises what finding and asking the service does.
+    """
     if condition is None:
-        return True
+        return True, about
     handle = home.find(condition.service.constraint(about), wait_s=0)
     if handle.effect != "read":
         problem = f"{handle.label} does not only read, so it is no condition"
         raise ConfigurationError(where=str(condition), problem=problem)
-    return condition.holds(_call(handle, condition.args, about))
+    return condition.holds(_call(handle, condition.args, about)), handle if about is None else about

@@ -119,7 +119,7 @@ class _Standing:
         now = time.monotonic_ns()
         if now < self._resting.get(about.label, 0):
             self._skipped += 1
-        elif self._holds(about):
+        elif self._holds(about)[0]:
             self._fire(about, self._way_to(about.label, now))
 
     def _altered(self, about: Handle) -> None:
@@ -140,22 +140,23 @@ class _Standing:
     def _tick(self) -> None:
         if time.monotonic_ns() < self._resting.get("", 0):
             return
-        if not self._holds(None):
+        held, about = self._holds(None)
+        if not held:
             self._not_so()
             return
         if self.rule.when.every_s is None or self.rule.if_ is not None:  # time alone has no cause
             self._way = self._way or self._way_to("", self._not_so_ns)
-        self._fire(None, self._way or (Mark(self.name),))
+        self._fire(about, self._way or (Mark(self.name),))
 
     def _not_so(self) -> None:
         self._not_so_ns, self._way = time.monotonic_ns(), ()
 
-    def _holds(self, about: Handle | None) -> bool:
+    def _holds(self, about: Handle | None) -> tuple[bool, Handle | None]:
         try:
             return holds(self._engine.container, self.rule.if_, about)
         except Exception as error:  # noqa: BLE001 - a condition that cannot be asked does not hold, and is told of
             self._fail(f"{type(error).__name__}: {error}")
-            return False
+            return False, about
 
     def _way_to(self, label: str, since_ns: int) -> Way:
         return self._engine.causes.way_to(Mark(self.name, label), since_ns)
@@ -349,13 +350,14 @@ def _rehearsed(container: Container, name: str, rule: Rule) -> Rehearsal:
         now = []
     if rule.if_ is not None:
         try:
-            held = holds(container, rule.if_, about)
+            held, about = holds(container, rule.if_, about)
             now.append("the condition holds" if held else "the condition does not hold")
         except Exception as error:  # noqa: BLE001 - told in its place
             held = False
             now.append(f"the condition cannot be asked: {type(error).__name__}: {error}")
         fires = fires and held
-    steps = () if rule.when.of_services and about is None else done(container, rule.do, about, dry_run=True)
+    unknown = about is None and (rule.when.of_services or rule.if_ is not None)
+    steps = () if unknown else done(container, rule.do, about, dry_run=True)
     return Rehearsal(
         rule=name,
         occasion=str(rule.when),

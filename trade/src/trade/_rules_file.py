@@ -18,7 +18,7 @@ from trade._wire import Scalar
 from trade.errors import ConfigurationError
 
 SERVICE: Final = "$service"
-"""Stands for the service that joined, left or changed."""
+"""Stands for the service that joined, left or changed; if the occasion is about none, for the one that ``if`` asks."""
 CONTAINER: Final = "$container"
 """Stands for the name of its container."""
 
@@ -145,7 +145,7 @@ class Step(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """A call of the only service that matches, or waiting until there is one."""
 
     call: Selection | str | None = None
-    """``$service``: the one that the occasion is about."""
+    """``$service``: the one that the rule is about."""
     args: list[Any] | dict[str, Any] = []
     """In order, or by name."""
     deadline_s: float = 10.0
@@ -238,7 +238,7 @@ class _Check:
         if len(said) != 1:
             self._wrong("when", f"says {' and '.join(said) or 'nothing'}; it is exactly one: {_EXAMPLES['when']}")
         if rule.when.selection is not None:
-            self._selection(rule.when.selection, f"when.{said[0]}", filled=False)
+            self._selection(rule.when.selection, f"when.{said[0]}", known=None)
         self._number("when.every_s", rule.when.every_s, SHORTEST_S, LONGEST_S)
         self._number("cooldown_s", rule.cooldown_s, 0.0, LONGEST_S)
         if rule.when.missing is not None and rule.cooldown_s <= 0:
@@ -251,8 +251,8 @@ class _Check:
             self._step(step, f"do[{number}]")
 
     def _condition(self, condition: Condition) -> None:
-        self._selection(condition.service, "if.service")
-        self._filled(condition.args, "if.args")
+        self._selection(condition.service, "if.service", known=self._rule.when.of_services)
+        self._filled(condition.args, "if.args", known=self._rule.when.of_services)
         self._number("if.above", condition.above, -math.inf, math.inf)
         self._number("if.below", condition.below, -math.inf, math.inf)
         if condition.is_ is not UNSET and (condition.above is not None or condition.below is not None):
@@ -274,25 +274,27 @@ class _Check:
         self._number(f"{at}.deadline_s", step.deadline_s, SHORTEST_S, LONGEST_DEADLINE_S)
         self._number(f"{at}.s", step.s, 0.0, LONGEST_DEADLINE_S)
 
-    def _selection(self, selection: Selection, at: str, *, filled: bool = True) -> None:
+    def _selection(self, selection: Selection, at: str, *, known: bool | None = True) -> None:
         if selection == Selection():
             self._wrong(at, f"says nothing; there is {', '.join(Selection.__struct_fields__)}")
         if selection.container == CONTAINER:
-            if not filled:
+            if known is None:
                 self._wrong(at, f"{CONTAINER} is known only once it has happened")
-            self._filled(CONTAINER, at)
+            self._filled(CONTAINER, at, known=bool(known))
         try:
             selection.constraint()
         except ConfigurationError as bad:
             self._wrong(at, bad.problem)
 
-    def _filled(self, value: Any, at: str) -> None:
-        """What stands for something does so."""
+    def _filled(self, value: Any, at: str, *, known: bool = True) -> None:
+        """What stands for something does so; ``known``: once there is a condition, too."""
+        about = self._rule.when.of_services or (known and self._rule.if_ is not None)
         for text in _texts(value):
             if text.startswith("$") and text not in (SERVICE, CONTAINER):
                 self._wrong(at, f"{text!r} stands for nothing; there is {SERVICE} and {CONTAINER}")
-            if text in (SERVICE, CONTAINER) and not self._rule.when.of_services:
-                self._wrong(at, f"{text} is of rules with joined, left or changed; this one has {self._rule.when.kind}")
+            if text in (SERVICE, CONTAINER) and not about:
+                problem = f"{text} is of rules with joined, left, changed or if; this one has {self._rule.when.kind}"
+                self._wrong(at, problem)
 
     def _number(self, key: str, value: float | None, least: float, most: float) -> None:
         if value is not None and not (math.isfinite(value) and least <= value <= most):
