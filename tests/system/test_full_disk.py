@@ -34,7 +34,7 @@ def disk(system: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterat
 
 def kept(disk: SmallDisk, system: str) -> list[str]:
     """What is kept of e-stops."""
-    return sorted(path.name for path in (disk.folder / "state_dir" / system / "estop").glob("*"))
+    return sorted(path.name for path in (disk.folder / "state_dir" / system / "estop").rglob("*.json"))
 
 
 def test_S09_an_estop_stops_all_and_says_that_it_is_not_written_down(

@@ -150,6 +150,40 @@ def test_what_cannot_be_written_waits_until_it_can_and_that_is_said_once(
     assert "is written again" in caplog.text
 
 
+def test_a_writer_closed_as_its_file_can_be_written_again_writes_what_waits_and_ends(
+    write: Write,
+    path: Path,
+    eventually: Eventually,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    monkeypatch.setattr(writing, "_AGAIN_S", 600)
+    path.parent.write_bytes(b"")  # in the place of its folder
+    writer = write()
+    writer.tell(event())
+    assert eventually(lambda: "cannot be written" in caplog.text)
+    path.parent.unlink()
+    writer.close()
+    assert not writer.running
+    assert [row.what for row in rows(path)] == ["began", "rosie.step", "ended"]
+
+
+def test_a_writer_closed_while_another_process_holds_its_file_ends(
+    write: Write, path: Path, eventually: Eventually
+) -> None:
+    writer = write()
+    assert eventually(lambda: writer.written == 1)
+    holder = sqlite3.connect(path, isolation_level=None)
+    try:
+        holder.execute("BEGIN IMMEDIATE")
+        writer.tell(event())
+        writer.close()
+        assert not writer.running
+    finally:
+        holder.close()
+    assert [row.what for row in rows(path)] == ["began"]
+
+
 def test_a_disk_that_is_full_indeed_loses_what_does_not_fit_and_breaks_nothing(path: Path) -> None:
     program = f"""
 import resource, logging

@@ -27,6 +27,7 @@ from trade.errors import (
     LockedByOther,
     LockLost,
     NotInstantiable,
+    NotLocked,
     SessionEnded,
     Stopped,
     TradeError,
@@ -48,6 +49,7 @@ _REFUSALS: Final = (
     LockedByOther,
     LockLost,
     NotInstantiable,
+    NotLocked,
     SessionEnded,
     Stopped,
 )

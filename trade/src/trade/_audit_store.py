@@ -18,7 +18,8 @@ from trade._audit_chain import DROPPED, NOTHING, AuditRow, Head, Link, checkpoin
 SUFFIX: Final = ".sqlite"
 BROKEN: Final = ".broken-"
 """Stands in the name of a file that was moved aside."""
-_BUSY_S: Final = 2.0
+_BUSY_S: Final = 0.5
+"""How long one step waits for who else holds the file; a closing writer takes four such steps at most."""
 _DAY_NS: Final = 86_400_000_000_000
 _COLUMNS: Final = AuditRow.__struct_fields__
 _SCHEMA: Final = (

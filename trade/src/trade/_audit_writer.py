@@ -92,6 +92,11 @@ class AuditWriter:
         """Events that are not written yet."""
         return len(self._waiting)
 
+    @property
+    def running(self) -> bool:
+        """It still writes, or tries to."""
+        return self._thread.is_alive()
+
     def tell(self, event: Event) -> None:
         """Take an event, on any thread; without waiting for anything."""
         if len(self._waiting) >= _MOST:
@@ -119,7 +124,7 @@ class AuditWriter:
         self._part()
 
     def _write_all(self, *, last: bool) -> None:
-        while self._waiting or self._rows or self._lost or self._to_drop:
+        while self._waiting or self._rows or self._lost or (self._to_drop and not last):
             self._gather()
             if self._write() and (last or self._drop()):
                 continue
@@ -232,6 +237,8 @@ class AuditWriter:
         self._some.set()
         if self._thread is not threading.current_thread():
             self._thread.join(_PARTING_S)
+            if self.running:
+                _logger.error("audit: %s is still held up after %g s; what waits may be lost", self._path, _PARTING_S)
 
 
 def _row_of(event: Event, boot: str) -> AuditRow:
