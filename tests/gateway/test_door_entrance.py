@@ -6,6 +6,8 @@ import ssl
 import stat
 import struct
 from collections.abc import Iterator
+from contextlib import suppress
+from http.client import HTTPException
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -17,7 +19,7 @@ from jointed import Robot
 from trade.errors import ConfigurationError
 from trade.testing import memory_system
 from trade_gateway.door import Door, Tokens, add_token
-from waiting import PATIENCE_S
+from waiting import PATIENCE_S, wait_until
 
 
 @pytest.fixture
@@ -27,6 +29,35 @@ def door(tmp_path: Path) -> Iterator[Opened]:
 
 
 # --- under which name, by which page
+
+
+def test_strangers_take_a_bounded_number_of_descriptors(door: Opened) -> None:
+    place, strangers = urlsplit(door.door.url), list[socket.socket]()
+    try:
+        for _ in range(700):
+            strangers.append(socket.create_connection((place.hostname, place.port), timeout=20))
+        wait_until(lambda: _is_closed(strangers[-1]), "further ones are closed")
+        assert not _is_closed(strangers[0])  # it has its time to ask for something
+    finally:
+        for one in strangers:
+            one.close()
+    wait_until(lambda: _lets_in(door), "it answers again")
+
+
+def _is_closed(stranger: socket.socket) -> bool:
+    stranger.settimeout(0)
+    try:
+        return stranger.recv(1) == b""
+    except BlockingIOError:
+        return False
+    except OSError:
+        return True
+
+
+def _lets_in(door: Opened) -> bool:
+    with suppress(OSError, HTTPException):
+        return door.client().ask("GET", "/me").status == 200
+    return False
 
 
 def test_under_another_name_the_door_does_not_answer(door: Opened) -> None:

@@ -1,5 +1,6 @@
 """The door over HTTP: calls, sessions, locks and stops of clients who speak nothing else (S03, S05, S07)."""
 
+import json
 import os
 import re
 import subprocess
@@ -9,6 +10,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from http.client import HTTPConnection
 from pathlib import Path
+from typing import Any
 
 import pytest
 from typer.testing import CliRunner
@@ -21,7 +23,7 @@ from trade.errors import Stopped
 from trade.testing import memory_system
 from trade_gateway.cli import app
 from trade_gateway.door import add_token
-from waiting import wait_until
+from waiting import PATIENCE_S, wait_until
 
 
 class Lamp:
@@ -54,6 +56,32 @@ def door(tmp_path: Path) -> Iterator[Opened]:
         for joint in robot.joints.values():
             joint.hold.set()
             joint.stopped.set()
+
+
+@pytest.mark.parametrize("depth", [90, 200, 500, 900, 2000, 100_000])
+@pytest.mark.parametrize("over", ["http", "websocket"])
+def test_arguments_that_are_nested_too_deep_are_refused_by_name_and_no_fault_of_the_door(
+    door: Opened, caplog: pytest.LogCaptureFixture, depth: int, over: str
+) -> None:
+    class Lathe:
+        @service
+        def take(self, shape: Any) -> None: ...
+
+    door.robot.me.register(Lathe(), "lathe")
+    anna, shape = door.client(), "[" * depth + "]" * depth
+    if over == "http":
+        answer = anna.ask("POST", "/call/lathe/take", f'{{"args": [{shape}]}}'.encode())
+        status, body = answer.status, answer.body
+    else:
+        with anna.socket() as page:
+            page.send(f'{{"do": "call", "id": 1, "group": "lathe", "name": "take", "args": [{shape}]}}')
+            told = json.loads(page.recv(PATIENCE_S))
+        body = told.get("problem", told)
+        status = body.get("status", 200)
+    assert status == (200 if depth < 100 else 400), body
+    if depth > 100:
+        assert body["title"] in ("InvalidArgument", "BadMessage")
+    assert "Traceback" not in caplog.text
 
 
 def test_services_are_listed_and_called_by_place_and_by_name(door: Opened) -> None:

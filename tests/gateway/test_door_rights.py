@@ -50,6 +50,15 @@ def test_what_a_client_may_not_know_of_it_does_not_see(door: Opened) -> None:
         assert heard(page)["service"]["group"] == "robot.a.again"
 
 
+def test_who_has_no_role_reads_nothing_of_the_system(door: Opened) -> None:
+    bert, stranger = door.client("bert"), door.client("carl")
+    for path in ("/containers", "/loads", "/sight", "/estops"):
+        assert bert.ask("GET", path).status == 200
+        refused = stranger.ask("GET", path)
+        assert (refused.status, refused.title) == (403, "AccessDenied"), path
+    assert stranger.ask("POST", "/estop", {"reason": "smoke"}).status == 200  # to stop needs no role (S07)
+
+
 def test_locks_resuming_and_clearing_are_the_clients_rights_too(door: Opened) -> None:
     anna, bert, chief = (door.client(name).opened(lease_s=60) for name in ("anna", "bert", "chief"))
     assert bert.ask("POST", "/locks", {"group": "robot.a"}).title == "AccessDenied"

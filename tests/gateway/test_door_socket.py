@@ -144,6 +144,52 @@ def test_what_cannot_be_read_is_answered_and_ends_nothing(door: Opened) -> None:
         assert ask(page, **go_on())["result"] is None
 
 
+class Slow:
+    """Its stop takes until it is let go."""
+
+    def __init__(self) -> None:
+        self.let_go = self.stopped = self.hold = threading.Event()
+        self.inside = self.most = self.stops = 0
+
+    @service
+    def go(self) -> None: ...
+
+    @service(effect="stop")
+    def stop(self) -> None:
+        self.stops += 1
+        self.inside += 1
+        self.most = max(self.most, self.inside)
+        self.let_go.wait(30)
+        self.inside -= 1
+
+
+def test_S07_further_stops_of_one_page_share_the_next_one_and_all_are_answered(door: Opened) -> None:
+    slow, many = Slow(), 400
+    door.robot.joints["slow"] = slow  # type: ignore[assignment]
+    door.robot.system.container("slow").register(slow, "robot.slow")
+    door.robot.system.settle()
+    before = threading.active_count()
+    with door.client().socket() as page:
+        for number in range(many):
+            say(page, do="call", id=number, group="robot.slow", name="stop")
+        say(page, do="call", id="seen", group="robot.a", name="where_is_it")
+        told = [heard(page)]
+        while told[-1]["id"] != "seen":
+            told.append(heard(page))
+        refused = [one["id"] for one in told if "problem" in one]
+        assert len(refused) > 100  # beyond those whose answer may be waited for; they are carried out all the same
+        assert threading.active_count() - before < 40
+        begun = slow.stops
+        assert begun <= 4
+        slow.let_go.set()
+        told += [heard(page) for _ in range(many + 1 - len(told))]
+        assert {one["id"] for one in told} == {*range(many), "seen"}
+        assert {one["problem"]["title"] for one in told if "problem" in one} == {"TooMany"}
+        assert slow.stops == begun + 1  # begun after the last of them had come
+        assert slow.most <= 4
+        assert ask(page, do="call", id="again", group="robot.slow", name="stop") == {"id": "again", "result": None}
+
+
 def test_S05_what_a_page_moves_stops_when_it_closes_and_nothing_else_does(door: Opened) -> None:
     with door.client("bert").socket() as other:
         ask(other, **go_on("b"))

@@ -73,6 +73,11 @@ class Client:
             self._stops += stops
             return self._stops
 
+    @property
+    def stops(self) -> int:
+        """How many were asked for so far."""
+        return self._stops
+
     def overtaken(self, admitted: int) -> bool:
         """Whether a stop was asked for after that number was given: what had not begun by then must not (S08)."""
         return self._stops != admitted

@@ -25,6 +25,7 @@ from trade.errors import (
     AccessDenied,
     Cancelled,
     ConfigurationError,
+    InvalidArgument,
     LockLost,
     NoSuchService,
     TooManyServices,
@@ -130,7 +131,13 @@ class Deeds:
         return run
 
     def _begin(self, client: Client, handle: Handle, body: messages.CallBody, admitted: int) -> Run:
-        given: Any = messages.numbers(body.args)
+        try:
+            given: Any = messages.numbers(body.args)
+        except RecursionError:
+            problem = f"is nested more than {messages.MOST_DEEP} deep"
+            raise InvalidArgument(
+                service=handle.label, argument="args", problem=problem, signature=handle.signature
+            ) from None
         args: tuple[Any, ...] = tuple(given) if isinstance(body.args, list) else ()
         kwargs: dict[str, Any] = given if isinstance(body.args, dict) else {}
         begin = partial(self._container.begin, handle, args, kwargs, body.deadline_s)
@@ -227,7 +234,7 @@ class Deeds:
         except TradeError:
             lock.release()
             raise
-        return messages.LockTaken(client.keep(lock, handles), lock.resources)
+        return messages.LockTaken(client.keep(lock, handles), lock.resources, lock.missing)
 
     def _lockable(self, client: Client, wanted: Constraint) -> list[Handle]:
         """What a lock takes. Raises AccessDenied: the client may not lock all of it."""
@@ -311,9 +318,10 @@ class Deeds:
         if not sight.complete:
             raise sight.nobody(self._container.settings.system, "so nobody can tell whether an e-stop is open")
 
-    def estops(self) -> list[messages.EstopView]:
-        """Those that are open."""
-        return [messages.EstopView(one.id, one.by, one.reason, one.at) for one in self._container.estops()]
+    def estops(self, who: str) -> list[messages.EstopView]:
+        """Those that are open. Raises AccessDenied: an identity may do nothing here but stop."""
+        self.judge.require_some(who, "estops")
+        return [messages.EstopView(one.id, one.by, one.reason, one.at, one.told_by) for one in self._container.estops()]
 
     # --- listening
 

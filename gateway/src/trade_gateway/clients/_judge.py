@@ -77,6 +77,13 @@ class Judge:
                 raise AccessDenied(who=who, verb=verb, what=handle.label, rule=rule)
             self._access.require(who, verb, handle.key.domain, handle.label)
 
+    def require_some(self, who: str, what: str) -> None:
+        """Raises AccessDenied: it may not even see anything, as who has no role; so it reads nothing of the system."""
+        policy = self._access.policy
+        if policy is not None and not policy.groups_of(who, _TO_SEE):
+            rule = "it has no right over any group, and reads nothing of the system; a stop needs none"
+            raise AccessDenied(who=who, verb="read", what=what, rule=rule)
+
     def require_system(self, who: str, verb: str, what: str) -> None:
         """Raises AccessDenied: it may not ``administer`` or ``read`` the system itself."""
         self._access.require(who, verb, _OWN, what)

@@ -13,6 +13,8 @@ MOST_DEADLINE_S: Final = 86_400.0
 SESSION_LEASE_S: Final = 2.0
 LEAST_INTEGER: Final = -(2**63)
 MOST_INTEGER: Final = 2**64 - 1
+MOST_DEEP: Final = 100
+"""How deep arguments may be nested."""
 _MOST_EXACT: Final = 2**53
 
 Deadline = Annotated[float, Meta(gt=0, le=MOST_DEADLINE_S)]
@@ -229,6 +231,8 @@ class LockTaken(Struct, frozen=True):
     lock: str
     """What releases it."""
     resources: tuple[str, ...]
+    missing: tuple[str, ...] = ()
+    """What belongs to the group and was not there; only with ``partial``."""
 
 
 class SessionOpened(Struct, frozen=True):
@@ -244,6 +248,8 @@ class EstopView(Struct, frozen=True):
     by: str
     reason: str
     at: float
+    told_by: str = ""
+    """Who told of it, if that is not its giver: that one may have made it up."""
 
 
 class Stopped(Struct, frozen=True):
@@ -311,13 +317,18 @@ def plain(value: Any) -> Any:
     raise TypeError(f"a {type(value).__qualname__} has no form in JSON")
 
 
-def numbers(value: Any) -> Any:
-    """JSON has one kind of number: 2.0 is an integer where one is asked for, and what no integer holds is a float."""
+def numbers(value: Any, deep: int = 0) -> Any:
+    """JSON has one kind of number: 2.0 is an integer where one is asked for, and what no integer holds is a float.
+
+    Raises RecursionError: it is nested more than ``MOST_DEEP`` deep.
+    """
+    if deep > MOST_DEEP:
+        raise RecursionError
     match value:
         case dict():
-            return {key: numbers(inner) for key, inner in cast("dict[str, Any]", value).items()}
+            return {key: numbers(inner, deep + 1) for key, inner in cast("dict[str, Any]", value).items()}
         case list():
-            return [numbers(inner) for inner in cast("list[Any]", value)]
+            return [numbers(inner, deep + 1) for inner in cast("list[Any]", value)]
         case float() if value.is_integer() and abs(value) < _MOST_EXACT:
             return int(value)
         case int() if not LEAST_INTEGER <= value <= MOST_INTEGER and abs(value) < sys.float_info.max:

@@ -74,7 +74,12 @@ class Overview:
         return CallReader(self._container, reads=reads)
 
     async def sight(self, who: str) -> Sight:
-        """Whom the door has found, and where nobody; looked at once for all who ask within two seconds."""
+        """Whom the door has found, and where nobody; looked at once for all who ask within two seconds.
+
+        Raises:
+            AccessDenied: an identity may do nothing here but stop; likewise for containers and loads.
+        """
+        self._judge.require_some(who, "sight")
         return await self._counted(who, self._look)
 
     def _look(self) -> Sight:
@@ -84,12 +89,14 @@ class Overview:
                 self._looked_at = time.monotonic()
             return self._sight
 
-    def containers(self) -> list[messages.ContainerView]:
+    def containers(self, who: str) -> list[messages.ContainerView]:
         """Those of the system."""
+        self._judge.require_some(who, "containers")
         return [messages.ContainerView(one.name, one.identity, one.host) for one in self._container.containers()]
 
     async def loads(self, who: str) -> list[LoadInfo]:
         """How busy they are; takes a second."""
+        self._judge.require_some(who, "loads")
         return await self._counted(who, loads, self._container)
 
     async def notifications(self, who: str) -> list[NotificationInfo]:

@@ -112,8 +112,7 @@ class Http:
         return _answer({"containers": await self._deeds.overview.set_tracing(who, on=body.on)})
 
     async def containers(self, request: Request) -> Response:
-        self._who(request)
-        return _answer(self._deeds.overview.containers())
+        return _answer(self._deeds.overview.containers(self._who(request)))
 
     async def sight(self, request: Request) -> Response:
         return _answer(await self._deeds.overview.sight(self._who(request)))
@@ -182,8 +181,7 @@ class Http:
             return _answer({"resumed": await self._deeds.resume(client, body)})
 
     async def estops(self, request: Request) -> Response:
-        self._who(request)
-        return _answer(self._deeds.estops())
+        return _answer(self._deeds.estops(self._who(request)))
 
     async def estop(self, request: Request) -> Response:
         who = self._entry.who(request.scope)

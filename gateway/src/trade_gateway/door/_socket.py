@@ -1,8 +1,8 @@
 """The door over a WebSocket: one client, one session, for as long as the connection lasts."""
 
 import asyncio
-from collections import deque
-from collections.abc import Callable
+from collections import defaultdict, deque
+from collections.abc import Awaitable, Callable
 from contextlib import nullcontext, suppress
 from typing import Any, Final
 
@@ -21,6 +21,10 @@ from trade_gateway.door._problems import BadMessage, problem_of
 
 MOST_UNDER_WAY: Final = 64
 """Calls, streams and watches of one connection; stops do not count."""
+_MOST_STOPS: Final = 4
+"""Of one service, or e-stops, of one connection, that are under way at once; further ones share the next."""
+_MOST_ANSWERS: Final = 256
+"""To stops of one connection, that are waited for."""
 _MOST_WAITING: Final = 256
 """Events that wait for a slow client; the oldest goes first."""
 _SENT_WITHIN_S: Final = 2.0
@@ -66,12 +70,49 @@ class _Ongoing:
         self.asked: Final = asked
         self.handle: Final = handle
         """Of what to call or stream."""
-        self.admitted: Final = admitted
+        self.admitted = admitted
         """At which of the client's stops."""
         self.scope = anyio.CancelScope()
         self.run: Run | None = None
         self.unwanted = False
         """Whether a call was cancelled, if only before it had begun."""
+
+
+class _Line:
+    """Stops of one kind: a few at once, and one that is shared by all who come meanwhile."""
+
+    def __init__(self) -> None:
+        self._places = anyio.Semaphore(_MOST_STOPS)
+        self._next: asyncio.Future[Any] | None = None
+        """What those get who come before it has begun."""
+
+    @property
+    def idle(self) -> bool:
+        """Whether none is under way."""
+        return self._next is None and self._places.value == _MOST_STOPS
+
+    @property
+    def shared(self) -> bool:
+        """Whether one is about to begin that counts for whoever comes now, too."""
+        return self._next is not None
+
+    async def take(self, do: Callable[[], Awaitable[Any]]) -> Any:
+        """Do it, or share it: it begins after this was called in any case."""
+        if self._next is not None:
+            return await asyncio.shield(self._next)
+        shared = self._next = asyncio.get_running_loop().create_future()
+        shared.add_done_callback(lambda told: told.cancelled() or told.exception())  # perhaps nobody shares it
+        try:
+            async with self._places:
+                self._next = None
+                shared.set_result(await do())
+        except Exception as error:  # noqa: BLE001 - whatever comes of it is for all of them
+            shared.set_exception(error)
+        finally:
+            if not shared.done():
+                self._next = None
+                shared.cancel()
+        return shared.result()
 
 
 class Conversation:
@@ -83,6 +124,8 @@ class Conversation:
         self._deeds = deeds
         self._tasks = anyio.create_task_group()
         self._ongoing: dict[messages.Id, _Ongoing] = {}
+        self._stops: defaultdict[object, _Line] = defaultdict(_Line)
+        """By the service that stops."""
         self._speaking = anyio.Lock()
         self._beginning = anyio.Lock()
         """Calls begin in the order in which they were asked for: of two set-points the later one counts."""
@@ -98,6 +141,7 @@ class Conversation:
             self._tasks.start_soon(self._carry)
             while (message := await self._websocket.receive())["type"] != "websocket.disconnect":
                 self._hear(message.get("text") or "")
+                await asyncio.sleep(0)  # what it has begun goes on before the next one, however many wait
             await self._end()
 
     async def _end(self) -> None:
@@ -159,19 +203,25 @@ class Conversation:
         """Raises BadMessage, TooMany, NoSuchService, TooManyServices: it cannot be begun."""
         if asked.id in self._ongoing:
             raise BadMessage(problem=f"what has id {asked.id!r} has not ended yet; take another id")
-        handle, stops = None, isinstance(asked, messages.Estop | messages.Cancel)
+        handle = None
         if isinstance(asked, messages.Call | messages.Stream):
             handle = self._deeds.find(self._client.identity, asked.group, asked.name, asked.container)
-            stops = handle.effect == "stop"
-        if len(self._ongoing) >= MOST_UNDER_WAY and not stops:
+        stop = _stopping(asked, handle)
+        if len(self._ongoing) >= MOST_UNDER_WAY and stop is None:
             raise TooMany(what="calls, streams and watches of this connection", limit=MOST_UNDER_WAY)
-        return _Ongoing(asked, handle, 0 if handle is None else self._client.admit(handle))
+        admitted = 0 if handle is None else self._client.admit(handle)
+        if len(self._ongoing) >= _MOST_ANSWERS and stop in self._stops and self._stops[stop].shared:
+            raise TooMany(
+                what="stops of this connection that wait for their answer; they are carried out", limit=_MOST_ANSWERS
+            )
+        return _Ongoing(asked, handle, admitted)
 
     async def _do(self, ongoing: _Ongoing) -> None:
         result, name = None, ongoing.asked.id
         try:
             with ongoing.scope:
-                result = await self._done(ongoing)
+                stop = _stopping(ongoing.asked, ongoing.handle)
+                result = await (self._done(ongoing) if stop is None else self._stop(stop, ongoing))
             answer = {"id": name, "result": result}
         except Exception as error:  # noqa: BLE001 - whatever a provider raises is for the client
             self._deeds.note_refused(error)
@@ -203,6 +253,20 @@ class Conversation:
                 return {"cancelled": await self._cancel(asked.which)}
 
     # --- doing
+
+    async def _stop(self, which: object, ongoing: _Ongoing) -> Any:
+        """It counts for all that was asked for before it begins."""
+
+        async def stop() -> Any:
+            ongoing.admitted = self._client.stops
+            return await self._done(ongoing)
+
+        line = self._stops[which]
+        try:
+            return await line.take(stop)
+        finally:
+            if line.idle:
+                self._stops.pop(which, None)
 
     async def _call(self, asked: messages.Call, handle: Handle, ongoing: _Ongoing) -> Any:
         async with nullcontext() if handle.effect == "stop" else self._beginning:
@@ -281,6 +345,17 @@ class Conversation:
 
     def _lock_lost(self, lock: str, error: LockLost) -> None:
         self._post({"event": "lock_lost", "lock": lock, "problem": problem_of(error)})
+
+
+def _stopping(asked: messages.Asked, handle: Handle | None) -> object:
+    """Which stop is asked for; None: something else."""
+    match asked:
+        case messages.Estop():
+            return "estop"
+        case messages.Cancel():
+            return "cancel", asked.which
+        case _:
+            return handle.key if handle is not None and handle.effect == "stop" else None
 
 
 def _text(message: dict[str, Any]) -> str:
