@@ -37,6 +37,9 @@ _BODIES: Final = (
 )
 _COMPONENTS: Final = "#/components/schemas/"
 _FORMATS: Final = {"datetime": "date-time", "date": "date", "time": "time", "UUID": "uuid"}
+_TAG: Final = "door"
+_VALUES: Final = ("const", "default", "enum", "examples")
+"""What these have is no schema."""
 _SESSION: Final = {
     "name": "Trade-Session",
     "in": "header",
@@ -52,12 +55,14 @@ def document(handles: Sequence[Handle]) -> Schema:
         handles: the services to describe, each under ``/call/GROUP/NAME``.
     """
     _, components = msgspec.json.schema_components(_BODIES, ref_template=_COMPONENTS + "{name}")
-    schemas: Schema = {**components, "Problem": {**components["Problem"], "additionalProperties": True}}
+    schemas: Schema = _led(components, "")
+    schemas["Problem"]["additionalProperties"] = True
+    call = schemas.pop("CallBody")
     paths: Schema = {}
     for handle in handles:
         path = f"/call/{handle.key.domain}/{handle.name}"
         if path not in paths:
-            paths[path] = {"post": _call(handle, schemas)}
+            paths[path] = {"post": _call(handle, call, schemas)}
     return {
         "openapi": _OPENAPI,
         "info": {"title": "TRADE", "version": version("trade-gateway"), "description": __doc__},
@@ -70,17 +75,13 @@ def document(handles: Sequence[Handle]) -> Schema:
     }
 
 
-def _call(handle: Handle, schemas: Schema) -> Schema:
+def _call(handle: Handle, call: Schema, schemas: Schema) -> Schema:
     record, described = handle.record, handle.schema
     name = f"{handle.key.domain}.{handle.name}"
     arguments = _placed(described["arguments"], name, schemas)
     named = {**arguments, "additionalProperties": False}
-    kinds: list[Any] = [named]
-    if not any(one.required and one.keyword_only for one in record.info.parameters):
-        kinds.append(_by_place([one for one in record.info.parameters if not one.keyword_only], arguments))
     needs_some = any(one.required for one in record.info.parameters)
-    properties = {**schemas["CallBody"]["properties"], "args": {"anyOf": kinds}}
-    body = {**schemas["CallBody"], "properties": properties, "required": ["args"] if needs_some else []}
+    body = {**call, "properties": {**call["properties"], "args": named}, "required": ["args"] if needs_some else []}
     result = {
         "type": "object",
         "properties": {"result": _placed(described["result"], name, schemas)},
@@ -98,17 +99,6 @@ def _call(handle: Handle, schemas: Schema) -> Schema:
     }
 
 
-def _by_place(parameters: Sequence[Any], arguments: Schema) -> Schema:
-    if not parameters:
-        return {"type": "array", "maxItems": 0}
-    return {
-        "type": "array",
-        "prefixItems": [arguments["properties"][one.name] for one in parameters],
-        "items": False,
-        "minItems": sum(one.required for one in parameters),
-    }
-
-
 def _placed(schema: Mapping[str, Any], name: str, schemas: Schema) -> Schema:
     """A service's own schema, with what it refers to among the document's under the service's name."""
     own = schema.get("$defs", {})
@@ -118,14 +108,25 @@ def _placed(schema: Mapping[str, Any], name: str, schemas: Schema) -> Schema:
 
 
 def _led(part: Any, name: str) -> Any:
-    """References into the document, formats where there are some, and what an integer holds."""
+    """References into the document, formats where there are some, and what an integer holds.
+
+    Titles go, as generators of clients take them for names, which have to be different. So does ``items: false``, which
+    few of them read: the greatest length says the same.
+    """
     if isinstance(part, list):
         return [_led(one, name) for one in cast("list[Any]", part)]
     if not isinstance(part, dict):
         return part
-    led = {key: _led(value, name) for key, value in cast("Schema", part).items()}
-    if isinstance(ref := led.get("$ref"), str):
+    led = {
+        key: value if key in _VALUES else _led(value, name)
+        for key, value in cast("Schema", part).items()
+        if not (key == "title" and isinstance(value, str))
+    }
+    if name and isinstance(ref := led.get("$ref"), str):
         led["$ref"] = f"{_COMPONENTS}{name}.{ref.rpartition('/')[2]}"
+    if led.get("items") is False:
+        del led["items"]
+        led.setdefault("maxItems", len(led.get("prefixItems", ())))
     if (form := _FORMATS.get(str(led.get("x-trade-kind")))) is not None:
         led.setdefault("format", form)
     if led.get("type") == "integer":
@@ -148,32 +149,53 @@ def _fixed() -> Schema:
     resumed = {"type": "object", "properties": {"resumed": names}, "required": ["resumed"]}
     opened = {"type": "object", "properties": {"name": {"type": "string"}, "lease_s": {"type": "number"}}}
     return {
-        "/openapi.json": {"get": _operation("This document.", {"type": "object"})},
-        "/services": {"get": _operation("Services.", _list("ServiceView"), parameters=query)},
-        "/me": {"get": _operation("As whom the client is known, and its rights over the system.", _ref("Me"))},
-        "/containers": {"get": _operation("Containers.", _list("ContainerView"))},
-        "/sight": {"get": _operation("Whom the door has found, and where nobody.", _ref("Sight"))},
-        "/loads": {"get": _operation("How busy they are, over the second that this takes.", _list("LoadInfo"))},
-        "/notifications": {"get": _operation("Notifications that stand.", _list("NotificationInfo"))},
-        "/hooks": {"get": _operation("Hooks that are attached.", _list("HookInfo"))},
+        "/openapi.json": {"get": _operation("document", "This document.", {"type": "object"})},
+        "/services": {"get": _operation("services", "Services.", _list("ServiceView"), parameters=query)},
+        "/me": {"get": _operation("me", "As whom the client is known, and its rights over the system.", _ref("Me"))},
+        "/containers": {"get": _operation("containers", "Containers.", _list("ContainerView"))},
+        "/sight": {"get": _operation("sight", "Whom the door has found, and where nobody.", _ref("Sight"))},
+        "/loads": {
+            "get": _operation("loads", "How busy they are, over the second that this takes.", _list("LoadInfo"))
+        },
+        "/notifications": {"get": _operation("notifications", "Notifications that stand.", _list("NotificationInfo"))},
+        "/hooks": {"get": _operation("hooks", "Hooks that are attached.", _list("HookInfo"))},
         "/session": {
-            "post": _operation("Open a session.", _ref("SessionOpened"), body="SessionBody", status="201"),
-            "get": _operation("Renew a session, as any request in it does.", opened, parameters=[held]),
-            "delete": _operation("End a session: what it moves stops.", None, parameters=[held], status="204"),
+            "post": _operation(
+                "open_session", "Open a session.", _ref("SessionOpened"), body="SessionBody", status="201"
+            ),
+            "get": _operation(
+                "renew_session", "Renew a session, as any request in it does.", opened, parameters=[held]
+            ),
+            "delete": _operation(
+                "end_session", "End a session: what it moves stops.", None, parameters=[held], status="204"
+            ),
         },
         "/locks": {
-            "get": _operation("Locks.", _list("LockView")),
+            "get": _operation("locks", "Locks.", _list("LockView")),
             "post": _operation(
-                "Take a lock.", _ref("LockTaken"), body="LockBody", needed=True, parameters=[held], status="201"
+                "take_lock",
+                "Take a lock.",
+                _ref("LockTaken"),
+                body="LockBody",
+                needed=True,
+                parameters=[held],
+                status="201",
             ),
         },
         "/locks/request": {
-            "post": _operation("Ask their owners to give locks back.", asked, body="RequestBody", needed=True)
+            "post": _operation(
+                "request_locks", "Ask their owners to give locks back.", asked, body="RequestBody", needed=True
+            )
         },
-        "/locks/break": {"post": _operation("Take locks away.", _list("LockView"), body="RequestBody", needed=True)},
-        "/locks/{lock}": {"delete": _operation("Release a lock.", None, parameters=[lock, held], status="204")},
+        "/locks/break": {
+            "post": _operation("break_locks", "Take locks away.", _list("LockView"), body="RequestBody", needed=True)
+        },
+        "/locks/{lock}": {
+            "delete": _operation("release_lock", "Release a lock.", None, parameters=[lock, held], status="204")
+        },
         "/resume": {
             "post": _operation(
+                "resume",
                 "Let move again what somebody else stopped.",
                 resumed,
                 body="GroupBody",
@@ -181,13 +203,16 @@ def _fixed() -> Schema:
                 parameters=[_SESSION],
             )
         },
-        "/estops": {"get": _operation("Open e-stops.", _list("EstopView"))},
-        "/estop": {"post": _operation("Stop everything. Not safety-rated.", _ref("Stopped"), body="EstopBody")},
-        "/estop/clear": {"post": _operation("Clear e-stops.", _ref("Stopped"), body="ClearBody")},
+        "/estops": {"get": _operation("estops", "Open e-stops.", _list("EstopView"))},
+        "/estop": {
+            "post": _operation("estop", "Stop everything. Not safety-rated.", _ref("Stopped"), body="EstopBody")
+        },
+        "/estop/clear": {"post": _operation("clear_estops", "Clear e-stops.", _ref("Stopped"), body="ClearBody")},
     }
 
 
 def _operation(
+    name: str,
     summary: str,
     answer: Schema | None,
     *,
@@ -197,7 +222,8 @@ def _operation(
     status: str = "200",
 ) -> Schema:
     asked = {"requestBody": _json(_ref(body), required=needed)} if body else {}
-    return {"summary": summary, "parameters": list(parameters), **asked, "responses": _responses(answer, status)}
+    said = {"operationId": name, "summary": summary, "tags": [_TAG]}
+    return {**said, "parameters": list(parameters), **asked, "responses": _responses(answer, status)}
 
 
 def _responses(answer: Schema | None, status: str = "200") -> Schema:
