@@ -3,15 +3,20 @@
 import json
 import os
 import sys
+from contextlib import closing
 from typing import Any
 
 import anyio
 import psutil
+import pytest
 from anyio.to_thread import run_sync
 from mcp import ClientSession, StdioServerParameters
 from mcp.client.stdio import stdio_client
 
-from system.conftest import ROSIES_HEAD, Bench
+from system.conftest import ROOT, ROSIES_HEAD, Bench
+from trade import service, where
+from trade.testing import memory_system
+from trade_gateway.agents import Twin
 from waiting import wait_until
 
 FAR = [1.0, 0.0]
@@ -55,6 +60,63 @@ def test_what_is_tried_on_the_twin_moves_nothing_and_is_what_the_robot_does_then
     anyio.run(main)
     assert round(bench.rests("neck.pan")[-1], 1) == 0.4
     assert not [one for one in psutil.Process().children(recursive=True) if "--name twin" in " ".join(one.cmdline())]
+
+
+def test_a_dry_run_begins_where_a_robot_is_whose_joints_are_not_at_zero(bench: Bench) -> None:
+    there, goal = [0.6, -0.3], [0.5, -0.2]
+
+    async def main() -> None:
+        async with (
+            stdio_client(_program("--twin", str(ROSIES_HEAD))) as (hears, says),
+            ClientSession(hears, says) as session,
+        ):
+            await session.initialize()
+            taken = await _used(session, "lock", group="rosie.head", purpose="to look")
+            await _used(session, "call", group="rosie.head", name="move_to", args=[there])
+            await _used(session, "unlock", lock=taken["lock"])
+            tried = await _used(session, "dry_run", group="rosie.head", name="move_to", args=[goal])
+            assert tried["ok"], tried
+            assert tried["began_where_the_robot_is"]
+            assert [round(one["position_rad"], 1) for one in tried["before"]] == there
+            assert [round(one["position_rad"], 1) for one in tried["after"]] == goal
+            joint = await _used(session, "dry_run", group="rosie.neck.pan", name="state")
+            assert round(joint["before"]["position_rad"], 1) == there[0]
+
+    anyio.run(main)
+    assert round(bench.rests("neck.pan")[-1], 1) == there[0]
+
+
+class Part:
+    """A part of a robot that is where the test says."""
+
+    @service(effect="read")
+    def state(self) -> None: ...
+
+
+PLACES = {
+    "head": ("rosie.neck.pan", {"position_rad": 0.6}),
+    "legs": ("rosie.legs", [{"position_rad": 0.05 * number} for number in (1, 2, 3, 4, 5, 6)]),
+    "arm": ("ada.right", {"positions_rad": [0.4, -1.5, 1.0, -1.2, -1.5, 0.2]}),
+    "hand": ("rosie.left.hand", {"width_m": 0.03}),
+}
+
+
+@pytest.mark.parametrize("part", PLACES)
+def test_the_twin_is_brought_to_where_a_part_of_each_kind_is(system: str, part: str) -> None:
+    group, there = PLACES[part]
+    with memory_system() as memory, closing(Twin(ROOT / "examples" / f"{part}.toml")) as twin:
+        robot = memory.container("robot")
+        robot.register(Part(), group)
+        tried = twin.call(robot.find(where(name="state", group=group)), [], 10.0, there)
+    assert tried.began_where_the_robot_is, tried
+    for real, tells in zip(_several(there), _several(tried.before), strict=True):
+        assert {name: tells[name] for name in real} == {
+            name: pytest.approx(value, abs=0.02 if "rad" in name else 0.001) for name, value in real.items()
+        }
+
+
+def _several(state: Any) -> list[dict[str, Any]]:
+    return state if isinstance(state, list) else [state]
 
 
 def test_S03_the_client_of_an_agent_dies_and_what_the_agent_moves_stops(bench: Bench) -> None:

@@ -235,3 +235,34 @@ def test_each_use_of_a_tool_is_on_the_record_also_a_refused_one(
         ("agent's tool call", "rosie.head.turn", "NeedsLock", "agent"),
     ]
     assert "0.123" not in str(told)
+
+
+@pytest.mark.parametrize("sentence", ["stop", "Halt!", "E-stop because of smoke", "stop everything because I say so"])
+def test_a_question_opens_no_e_stop_and_its_refusal_names_the_tools_that_do(
+    robot: Robot, agent: Container, sentence: str
+) -> None:
+    async def asks(client: Client) -> None:
+        refusal = await client.refused("ask", sentence=sentence)
+        assert "`estop`" in refusal
+        assert "`stop`" in refusal
+        assert robot.container.estops() == []
+        assert not robot.head.stopped.is_set()
+        assert not robot.legs.stopped.is_set()
+        await client("estop", reason="smoke")
+        assert [one.reason for one in robot.container.estops()] == ["agent: smoke"]
+
+    run(asks, agent)
+
+
+def test_tools_announced_as_reading_have_no_effect_and_those_that_stop_are_announced_as_acting(
+    agent: Container,
+) -> None:
+    async def lists(client: Client) -> None:
+        tools = {tool.name: tool for tool in (await client._session.list_tools()).tools}
+        for name in ("stop", "estop"):
+            hints = tools[name].annotations
+            assert hints is not None
+            assert (hints.readOnlyHint, hints.destructiveHint) == (False, True)
+        assert "`estop`" in (tools["ask"].description or "")
+
+    run(lists, agent)

@@ -89,6 +89,35 @@ def test_nobody_approves_for_himself_or_without_the_right(
     assert robot.legs.angle == 0.0
 
 
+def test_without_a_policy_an_agents_name_does_not_approve_its_own_call_and_another_does(
+    memory: MemorySystem, robot: Robot, agent: Container
+) -> None:
+    again, person = memory.container("again", identity="agent"), memory.container("person", identity="ann")
+    memory.settle()
+    said: list[str] = []
+
+    def tries() -> None:
+        with pytest.raises(AccessDenied) as denied:
+            _decide(again, "approve")
+        said.append(str(denied.value))
+
+    async def asks(client: Client) -> None:
+        await client("lock", group="rosie.legs")
+        async with anyio.create_task_group() as tasks:
+
+            async def decides() -> None:
+                await run_sync(tries)
+                assert robot.legs.angle == 0.0
+                await run_sync(_decide, person, "approve")
+
+            tasks.start_soon(decides)
+            assert await client("call", group="rosie.legs", name="turn", args=[0.5]) == {"result": 0.5}
+
+    run(asks, agent, ask_first=("rosie.legs",))
+    assert "another identity" in said[0]
+    assert robot.legs.angle == 0.5
+
+
 class Joint:
     """A joint of the head, in a group of its own."""
 

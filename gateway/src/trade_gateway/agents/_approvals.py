@@ -109,8 +109,10 @@ class Approvals:
         if call is None or call.session.startswith(f"{self._container.address}"):
             rule = "the agent's own process cannot approve what it asks for"
             raise AccessDenied(who=agent, verb="administer", what=waiting.request.service, rule=rule)
-        if self._container.access.policy is not None and call.caller == agent:
-            rule = "nobody approves what he asks for himself"
+        if call.caller == agent:
+            rule = (
+                "an identity cannot approve its own call, with or without a policy; approve it under another identity"
+            )
             raise AccessDenied(who=agent, verb="administer", what=waiting.request.service, rule=rule)
         self._container.access.require(call.caller, "administer", waiting.group, waiting.request.service)
 

@@ -117,8 +117,9 @@ class Tools:
         try:
             try:
                 asked = msgspec.convert(messages.numbers(given), tool.asked)
-            except (msgspec.ValidationError, ValueError) as bad:
-                raise NotThatWay(problem=f"the arguments of {name} are wrong: {bad}") from None
+            except (msgspec.ValidationError, ValueError, RecursionError) as bad:
+                problem = f"nested more than {messages.MOST_DEEP} deep" if isinstance(bad, RecursionError) else bad
+                raise NotThatWay(problem=f"the arguments of {name} are wrong: {problem}") from None
             about = _about(asked)
             result = await tool.do(self, asked, progress)
         except Exception as error:
@@ -151,7 +152,10 @@ class Tools:
         )
 
     async def ask(self, asked: Sentence, _: Progress) -> Any:
-        """A question about the system in plain English: what runs where, who holds what, what failed, what is new."""
+        """A question about the system in plain English: what runs where, who holds what, what failed, what is new.
+
+        It does nothing: the tools `stop` and `estop` stop.
+        """
         return await self._deeds.apart(partial(self._talk.say, asked.sentence, orders=False))
 
     async def locks(self, _asked: Nothing, _: Progress) -> Any:

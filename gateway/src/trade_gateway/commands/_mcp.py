@@ -41,6 +41,8 @@ def mcp(
     with Container(choice.settings(name)) as container:
         if container.access.policy is None and not ask_first:
             complain("there is no policy: this agent may call everything it has locked; see docs/agents.md")
+        if container.access.policy is None and ask_first:
+            complain(f"there is no policy: approve under another identity than {container.address.identity}")
         approvals = room.Approvals(container, ask_first or ())
 
         def leave() -> None:

@@ -41,6 +41,8 @@ class Question(NamedTuple):
     fields: tuple[str, ...]
     """What its answer can say."""
     ask: Callable[[Container, Memory, Mapping[str, str]], Answer]
+    is_order: bool = False
+    """Whether it does something."""
 
 
 def _services(container: Container, _: Memory, gaps: Mapping[str, str]) -> Answer:
@@ -104,7 +106,9 @@ def _locks(container: Container, _: Memory, gaps: Mapping[str, str]) -> Answer:
 def _unwell(container: Container, _: Memory, gaps: Mapping[str, str]) -> Answer:
     bad = {(handle.groups or (handle.label,))[0]: handle.health for handle in _matching(container, gaps)}
     bad = {group: health for group, health in bad.items() if health != HEALTHY}
-    stopped = [f"an e-stop is open, by {one.by}{f': {one.reason}' if one.reason else ''}" for one in container.estops()]
+    stopped = [
+        f"an e-stop is open, by {one.giver}{f': {one.reason}' if one.reason else ''}" for one in container.estops()
+    ]
     said = [*stopped, *(f"{group}: {health}" for group, health in sorted(bad.items()))]
     return Answer(len(said), {"count": len(said), "problems": "; ".join(said)}, said)
 
@@ -151,9 +155,9 @@ QUESTIONS: Final[Mapping[str, Question]] = {
     "unwell": Question(_WHICH, ("count", "problems"), _unwell),
     "news": Question((), ("count", "news"), _news),
     "load": Question(("container",), ("count", "loads", "busiest"), _load),
-    "estop": Question(("reason",), ("count", "report", "id"), _estop),
+    "estop": Question(("reason",), ("count", "report", "id"), _estop, is_order=True),
 }
-"""By the name that a lexicon gives it. The last one is an order: it stops everything."""
+"""By the name that a lexicon gives it."""
 
 
 def _others(container: Container) -> list[Handle]:

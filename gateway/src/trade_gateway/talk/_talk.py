@@ -54,9 +54,8 @@ class Talk:
             TradeError: what the call led to.
         """
         phrase, gaps = self._lexicon.hear(sentence)
-        if phrase.call and not orders:
-            problem = f"that is an order, to call {phrase.call}; here are only questions"
-            raise NotUnderstood(where=repr(sentence), problem=problem)
+        if not orders:
+            _require_question(sentence, phrase)
         if phrase.call:
             return self._call(phrase, gaps)
         try:
@@ -78,6 +77,18 @@ class Talk:
             result = service(*(_filled(value, gaps) for value in phrase.args))
         said = msgspec.json.encode(result).decode()
         return Reply(phrase.say.format(**{**gaps, "result": said}), phrase.call, result)
+
+
+def _require_question(sentence: str, phrase: Phrase) -> None:
+    if phrase.call:
+        problem = f"this is an order, to call {phrase.call}. Only questions are answered here. Call the service itself"
+        raise NotUnderstood(where=repr(sentence), problem=problem)
+    if QUESTIONS[phrase.ask].is_order:
+        problem = (
+            "this is an order, and only questions are answered here. Nothing was stopped. "
+            f"Call `{phrase.ask}` to stop the whole system, or `stop` to stop a group"
+        )
+        raise NotUnderstood(where=repr(sentence), problem=problem)
 
 
 def _filled(value: Any, gaps: Mapping[str, str]) -> Any:
