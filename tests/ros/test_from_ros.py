@@ -1,6 +1,7 @@
 """What ROS has, as providers of ours: with its types, and with stops that reach it."""
 
 import threading
+import time
 from typing import Any
 
 import pytest
@@ -107,6 +108,18 @@ def test_what_does_not_answer_in_time_is_stopped_as_it_may_move(stand: Stand) ->
     assert stand.container.locks() == []
 
 
+def test_what_does_not_answer_is_told_before_the_deadline_of_the_call(stand: Stand) -> None:
+    """By default the bridge waits as long as a call lasts."""
+    lab = Lab(stand)
+    lab.waits = True
+    stand.up(DOOR)
+    person = stand.memory.container("person")
+    stand.memory.settle()
+    with pytest.raises(RosUnreachable, match="no answer within"):
+        person.find(where(group="lab", name="door")).with_(deadline_s=1.5)(True)
+    assert lab.stopped.is_set()
+
+
 def test_what_ros_refuses_does_not_count_as_moving(stand: Stand) -> None:
     stand.node("/lab").serve("/lab/door", "std_srvs/srv/SetBool", lambda request, who, _at: {"success": 1 / 0})
     stand.up(DOOR)
@@ -205,11 +218,22 @@ class RosArm:
         self.goals: list[Any] = []
         self.goes, self.canceled = threading.Event(), threading.Event()
         self.holds = False
+        self.falls_silent = self.dies = False
+        """What was told of its joints ends, at once or with the next motion."""
         self.result: dict[str, Any] = {}
+        self.at = (0.0, 0.0)
         self._states = self.graph.advertise("/joint_states", "sensor_msgs/msg/JointState")
         self.graph.act("/arm/follow", ACTION, self._do)
+        threading.Thread(target=self._publish, name="ros-arm", daemon=True).start()
+
+    def _publish(self) -> None:
+        while not self.graph.closed:
+            threading.Event().wait(0.2)
+            if not self.falls_silent:
+                self.tell(*self.at)
 
     def tell(self, *angles: float) -> None:
+        self.at = angles
         self._states.send({"name": ["b", "a"], "position": list(reversed(angles)), "velocity": [0.0, 0.1]})
 
     def _do(self, goal: Goal) -> Outcome:
@@ -221,7 +245,8 @@ class RosArm:
             return Outcome(Ended.CANCELED, {}, "canceled")
         if self.result:
             return Outcome(Ended.ABORTED, self.result, "")
-        self.tell(*goal.message["trajectory"]["points"][-1]["positions"])
+        self.at = tuple(goal.message["trajectory"]["points"][-1]["positions"])
+        self.falls_silent = self.falls_silent or self.dies
         return Outcome(Ended.SUCCEEDED, {})
 
 
@@ -265,6 +290,21 @@ def test_a_trajectory_of_ours_is_followed_in_ros(stand: Stand, arm: RosArm) -> N
     points = [{"time_from_start_s": t, "positions_rad": [t, -t]} for t in (0.0, 1.0)]
     found(stand, "lab.arm", "follow")({"joints": ["lab.arm.b", "lab.arm.a"], "points": points})
     assert [point["positions"] for point in arm.goals[0]["points"]] == [[0.0, 0.0], [-1.0, 1.0]]
+
+
+@pytest.mark.parametrize("how", ["move_to", "follow"])
+def test_a_motion_in_ros_is_answered_with_where_the_joints_are_at_its_end(stand: Stand, arm: RosArm, how: str) -> None:
+    points = [{"time_from_start_s": 1.0, "positions_rad": [0.4, -0.4]}]
+    args = {"move_to": [0.4, -0.4], "follow": {"joints": ["lab.arm.a", "lab.arm.b"], "points": points}}
+    assert found(stand, "lab.arm", how)(args[how]) == [0.4, -0.4]
+
+
+def test_a_motion_in_ros_after_which_nothing_is_heard_is_an_error_that_says_so(stand: Stand, arm: RosArm) -> None:
+    arm.dies = True
+    began = time.monotonic()
+    with pytest.raises(RosUnreachable, match=r"has ended, but for .* nothing was heard of a, b"):
+        found(stand, "lab.arm", "move_to").with_(deadline_s=2.0)([0.4, -0.4])
+    assert time.monotonic() - began < PATIENCE_S
 
 
 def test_what_ros_aborts_is_a_fault(stand: Stand, arm: RosArm) -> None:

@@ -261,10 +261,9 @@ def parameters_from_ros(entry: FromParameters, graph: Graph) -> Offered:
 
 
 def _left_s(longest_s: float) -> float:
-    """What the running call has left, at most so much; never nothing, as its end is the caller's to see."""
+    """What the running call has left for it, at most so much, and never nothing."""
     call = current_call()
-    left_s = None if call is None else call.remaining_s
-    return longest_s if left_s is None else max(0.01, min(longest_s, left_s))
+    return longest_s if call is None else max(0.01, call.patience_s(longest_s))
 
 
 def _nothing() -> None:

@@ -22,7 +22,6 @@ __all__ = ["RosJoint", "RosJoints", "joints_from_ros"]
 _JOINT_STATE: Final = "sensor_msgs/msg/JointState"
 _STOPPED_WITHIN_S: Final = 1.8
 """Within what the end of a session allows (S05)."""
-_MARGIN_S: Final = 0.1
 _LONGEST_S: Final = 3600.0
 _PEAK: Final = 1.5
 """How much quicker than its mean a cubic curve from rest to rest is at its quickest."""
@@ -54,6 +53,8 @@ class RosJoints:
         self.resources: Final = tuple(Resource(name) for name in self._names)
         self._heard: dict[str, tuple[float, float | None, float | None, float]] = {}
         self._began = time.monotonic()
+        self._news = threading.Condition()
+        """Something was heard."""
         self._guard = threading.Condition()
         self._active: Pursuit | None = None
         self._sending = 0
@@ -66,6 +67,8 @@ class RosJoints:
         for number, name in enumerate(message["name"][: len(message["position"])]):
             values = [_nth(message[field], number) for field in ("velocity", "effort")]
             self._heard[name] = (message["position"][number], values[0], values[1], now)
+        with self._news:
+            self._news.notify_all()
 
     @service(effect="read")
     def joints(self) -> list[str]:
@@ -89,11 +92,12 @@ class RosJoints:
 
     @service(cancel="stop")
     def move_to(self, positions_rad: list[Position], speed_rad_s: float | None = None) -> list[float]:
-        """Move all joints to angles, so that they arrive together; the angles heard at the end.
+        """Move all joints to angles, so that they arrive together; the angles heard after the end.
 
         Raises:
             InvalidArgument: not as many as there are joints, or no speed.
-            RosUnreachable: nobody knows where they are, or nobody serves the action.
+            RosUnreachable: nobody knows where they are, or nobody serves the action, or they have arrived, and nothing
+                was heard of them since.
             RosRefused: it was rejected.
             DeviceFault: it was aborted, or nobody heard whether it has ended.
             MotionStopped: it was stopped, or its call's deadline came first.
@@ -113,7 +117,7 @@ class RosJoints:
 
     @service(cancel="stop")
     def follow(self, trajectory: Trajectory) -> list[float]:
-        """Go through angles at given times; the angles heard at the end. Limits are kept by ROS. Raises like move_to.
+        """Go through angles at given times; the angles heard after it. Limits are kept by ROS. Raises like move_to.
 
         Args:
             trajectory: of all joints, in any order.
@@ -172,7 +176,23 @@ class RosJoints:
             pursuit = self._sent(goal, permitted)
             outcome = self._ended(pursuit)
         self._check(outcome)
+        self._await_news(time.monotonic())
         return [one.position_rad for one in self.state()]
+
+    def _await_news(self, ended_at: float) -> None:
+        """What was heard before the end is where they were on their way. Raises RosUnreachable: nothing was heard."""
+        call, longest_s = current_call(), self._entry.stale_after_s
+        wait_s = longest_s if call is None else call.patience_s(longest_s)
+        with self._news:
+            if self._news.wait_for(lambda: not self._unheard(ended_at), wait_s):
+                return
+        silent = ", ".join(self._unheard(ended_at))
+        problem = f"the motion has ended, but for {wait_s:.3g} s nothing was heard of {silent}, so nobody knows where"
+        raise RosUnreachable(what=self._entry.topic, problem=problem)
+
+    def _unheard(self, since: float) -> list[str]:
+        """Joints of which nothing was heard since then."""
+        return [name for name in self._entry.joints if name not in self._heard or self._heard[name][3] <= since]
 
     def _sent(self, goal: Message, permitted: Permit) -> Pursuit:
         """Nobody waits for it who stops: a stop that comes meanwhile cancels it as soon as it has arrived."""
@@ -208,9 +228,8 @@ class RosJoints:
         call, device = current_call(), self._entry.groups[0]
         if call is not None:
             call.on_cancel(pursuit.cancel)
-        left_s = None if call is None else call.remaining_s
         try:
-            outcome = pursuit.wait(_LONGEST_S if left_s is None else max(0.0, left_s - _MARGIN_S))
+            outcome = pursuit.wait(_LONGEST_S if call is None else call.patience_s(_LONGEST_S))
         except RosRefused:
             self._rest(pursuit)
             raise
