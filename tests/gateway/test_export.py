@@ -136,12 +136,40 @@ def test_a_lock_over_two_containers_is_one_episode(tmp_path: Path) -> None:
     assert json.loads(done.stdout)["tasks"] == ["look"]
 
 
-def test_a_lock_in_which_joints_moved_unmeasured_is_left_out_and_told(tmp_path: Path) -> None:
+def test_a_gap_costs_its_own_time_and_not_the_recording(tmp_path: Path) -> None:
+    file = recording(tmp_path / "walk.mcap", without=range(100, 140))
+    done = export(file, tmp_path / "set", "--fps", "50", "--json")
+    assert done.exit_code == 0, done.output
+    assert json.loads(done.stdout)["tasks"] == ["walk", "walk"]
+    said = " ".join(done.stderr.split())
+    assert "walk is cut: rosie.neck.pan moved and was not measured from 2.0 to 2.8 s" in said
+    assert "left out" not in said
+    first, second = rows(tmp_path / "set", "meta/episodes")
+    assert (first["length"] / 50, second["length"] / 50) == (pytest.approx(2.0, abs=0.1), pytest.approx(7.2, abs=0.1))
+    data = rows(tmp_path / "set")
+    assert max(row["observation.state"][0] for row in data if row["episode_index"] == 0) < angle(0, 2.0)
+    assert min(row["observation.state"][0] for row in data if row["episode_index"] == 1) >= angle(0, 2.8)
+
+
+def test_a_gap_of_one_joint_among_others_cuts_all(tmp_path: Path) -> None:
+    moments = [number / 50 for number in range(501)]
+    arm = [joints("rosie.left.arm", ARM, at_s) for at_s in moments if not 4.0 < at_s < 5.0]
+    with RecordingFile(tmp_path / "walk.mcap", {}) as recorded:
+        for message in sorted([*arm, *(joints("rosie.head", HEAD, at_s) for at_s in moments)], key=lambda one: one[2]):
+            recorded.write(message)
+    done = export(tmp_path / "walk.mcap", tmp_path / "set", "--fps", "50", "--json")
+    assert done.exit_code == 0, done.output
+    lengths = [one["length"] / 50 for one in rows(tmp_path / "set", "meta/episodes")]
+    assert lengths == pytest.approx([4.0, 5.0], abs=0.1)
+
+
+def test_a_lock_in_which_joints_moved_unmeasured_is_cut_and_told(tmp_path: Path) -> None:
     said = [locks(1.0, ("a", HEAD[0], 1.0)), locks(3.0, ("b", HEAD[0], 3.0)), locks(7.0)]
     file = recording(tmp_path / "a.mcap", *said, without=range(75, 115))
     done = export(file, tmp_path / "set", "--episodes", "locks", "--task", "look", "--json")
-    assert json.loads(done.stdout)["tasks"] == ["look"]
-    assert "look is left out: rosie.neck.pan was not measured from 0.5 to 1.3 s" in " ".join(done.stderr.split())
+    assert json.loads(done.stdout)["tasks"] == ["look", "look", "look"]
+    said = " ".join(done.stderr.split())
+    assert "look is cut: rosie.neck.pan moved and was not measured from 0.5 to 1.3 s" in said
 
 
 def test_the_tables_are_laid_out_as_version_3_says(tmp_path: Path) -> None:

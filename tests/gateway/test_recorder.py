@@ -3,6 +3,7 @@
 import json
 import sys
 import threading
+import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -166,6 +167,20 @@ def test_the_stamp_of_joints_is_when_they_were_measured(record: Record) -> None:
     message = next(one for one in seen.messages if one.channel.topic == "/rosie.head/joints")
     assert json.loads(message.data)["stamp_s"] == [pytest.approx(message.stamp_ns / 1e9)]
     assert message.arrived_ns - message.stamp_ns >= 500_000_000
+
+
+def test_what_arrived_later_is_later_in_the_file_also_when_the_clock_is_put_back(
+    record: Record, robot: Container, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    right_ns = time.time_ns
+    first = record(lambda sink: {"/rosie.head/joints", "/locks"} <= {*sink.by_topic}).messages[-1]
+    monkeypatch.setattr(time, "time_ns", lambda: right_ns() - 3600 * 10**9)
+    with robot.lock(where(group="rosie.neck.pan")):
+        seen = record(lambda sink: any(lock["locks"] for lock in sink.by_topic["/locks"]))
+        times = [one.arrived_ns for one in seen.messages]
+        assert times == sorted(times)
+        assert times[-1] > first.arrived_ns
+        assert len(set(times)) > len(times) / 2
 
 
 def _move(container: Container, *args: object) -> None:

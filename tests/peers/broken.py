@@ -22,6 +22,7 @@ from trade import (
 )
 from trade._announcing import Announcer
 from trade._deadman import Deadman
+from trade._dispatch import Dispatcher
 
 
 def _put(where: Any, name: str, instead: Any) -> Callable[[], None]:
@@ -127,7 +128,10 @@ BREAK: dict[str, Callable[[], None]] = {
     "runs-twice": _put(_ongoing.Once, "begin", _as_if_new),
     "forgets-the-latest": _put(_ongoing.Once, "end", _end_in_64_bits),
     "ignores-locks": _put(_resources.Resource, "check_lock", lambda self, tokens, caller, session="": None),
-    "ignores-sessions": _put(Deadman, "session_ended", lambda self, session: None),
+    "ignores-sessions": _all_of(
+        _put(Deadman, "session_ended", lambda self, session: None),
+        _put(Dispatcher, "session_ended", lambda self, session: None),
+    ),
     "ignores-stops": _put(_local_service.LocalService, "run", _run_but_stops),
     "stops-late": _put(_local_service.LocalService, "run", _run_stops_late),
     "stops-in-line": _put(_local_service.LocalService, "run", _run_in_line),

@@ -62,7 +62,7 @@ def failed(outcomes: Sequence[dict[str, Any]]) -> dict[str, str]:
 
 @pytest.mark.timeout(600)
 def test_a_container_of_this_project_passes_every_check() -> None:
-    ended = conformance("--peer", start(), "--json")
+    ended = conformance("--peer", start(), "--motion", "--json")
     outcomes = told(ended)
     assert failed(outcomes) == {}
     assert [one["check"] for one in outcomes] == [one.name for one in CHECKS]
@@ -73,13 +73,57 @@ def test_a_container_of_this_project_passes_every_check() -> None:
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("broken", NOTICED_BY)
 def test_who_breaks_a_rule_fails_its_check(broken: str) -> None:
-    ended = conformance("--peer", start(broken), "--only", "presence", "--only", NOTICED_BY[broken], "--json")
+    only = ("--only", "presence", "--only", NOTICED_BY[broken])
+    ended = conformance("--peer", start(broken), "--motion", *only, "--json")
     assert list(failed(told(ended))) == [NOTICED_BY[broken]], ended.stdout
     assert ended.returncode == 1
 
 
 def test_every_way_to_break_a_rule_is_tried() -> None:
     assert set(runpy.run_path(str(PEER.with_name("broken.py")))["BREAK"]) == set(NOTICED_BY)
+
+
+NOTING = """
+import sys, typing
+sys.path[:0] = [{here!r}]
+import peer
+from trade import service
+
+class Noting(peer.Arm):
+    @service
+    def turn(self, angle_rad: float) -> float:
+        open({note!r}, "w").close()
+        return super().turn(angle_rad)
+
+class Armless:
+    @service(effect="read")
+    def echo(self, value: typing.Any) -> typing.Any:
+        return value
+
+peer.Arm = {arm}
+peer.main()
+"""
+
+
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize("arm", ["Noting", "Armless"])
+def test_without_motion_the_arm_is_never_turned_and_need_not_be_there(arm: str, tmp_path: Path) -> None:
+    program, note = tmp_path / "noting.py", tmp_path / "turned"
+    program.write_text(NOTING.format(here=str(PEER.parent), note=str(note), arm=arm), encoding="utf-8")
+    ended = conformance("--peer", f"{sys.executable} {program}", "--json")
+    outcomes = told(ended)
+    assert failed(outcomes) == {}
+    assert {one["check"] for one in outcomes if one["outcome"] == "ok"} == {one.name for one in CHECKS if one.still}
+    why = {one["why"] for one in outcomes if one["outcome"] == "left out"}
+    assert why == {"it is of motion; --motion turns the arm"}
+    assert ended.returncode == 0
+    assert not note.exists()
+
+
+def test_a_check_of_motion_by_its_name_needs_the_option() -> None:
+    refused = conformance("--peer", start(), "--only", "stops")
+    assert refused.returncode == 2
+    assert "add --motion" in " ".join(refused.stderr.split())
 
 
 @pytest.mark.parametrize("signs", ["one sign of life", "none"])
@@ -91,7 +135,7 @@ def test_a_shell_that_starts_it_leaves_nothing_behind(signs: str, tmp_path: Path
     script = tmp_path / "begin.sh"
     script.write_text(f"exec 9> {inherited}\necho began >&9\nsleep 1000 &\n({begin}) &\nwait $!\n", encoding="utf-8")
     try:
-        ended = conformance("--peer", f"sh {script}", "--only", "presence", "--only", "restarts", "--json")
+        ended = conformance("--peer", f"sh {script}", "--motion", "--only", "presence", "--only", "restarts", "--json")
         began = os.read(reader, 1000)
         heard, _, _ = select.select([reader], [], [], 30.0)
         assert (heard, os.read(reader, 1)) == ([reader], b"")

@@ -81,7 +81,7 @@ def _relay(stage: Stage, who: Voice, name: str, resources: list[str], args: list
     return who.call(stage.peer.place("relay"), "relay", _handle(stage, name), resources, args, **how)
 
 
-@check("calls", "Expiry")
+@check("calls", "Expiry", still=True)
 def calls(stage: Stage) -> None:
     """It calls a service of ours, with the right arguments, an expiry no later than its own, and for whom it does."""
     with stage.voice() as anna, _lathe(stage) as lathe:
@@ -102,7 +102,7 @@ def calls(stage: Stage) -> None:
         )
 
 
-@check("calls-no-longer", "Expiry")
+@check("calls-no-longer", "Expiry", still=True)
 def calls_no_longer(stage: Stage) -> None:
     """What it calls expires no later than the call that led to it, however early or late that is."""
     with stage.voice() as anna, _lathe(stage) as lathe:
@@ -114,7 +114,7 @@ def calls_no_longer(stage: Stage) -> None:
         require(late is not None and late > _SHORT_S, f"of all the time there is, {late} s are left to what it called")
 
 
-@check("passes-errors", "Messages")
+@check("passes-errors", "Messages", still=True)
 def passes_errors(stage: Stage) -> None:
     """An error of a service it calls comes to its own caller."""
     with stage.voice() as anna, _lathe(stage):
@@ -122,7 +122,7 @@ def passes_errors(stage: Stage) -> None:
         require("jammed" in str(found), f"the error of our service came as {found!r}")
 
 
-@check("locks-ours", "S11")
+@check("locks-ours", "S11", still=True)
 def locks_ours(stage: Stage) -> None:
     """It takes a lock on what we offer, calls under it, and gives it back."""
     with stage.voice() as anna, _lathe(stage) as lathe:
@@ -132,7 +132,7 @@ def locks_ours(stage: Stage) -> None:
         eventually(lambda: lathe.resources[0].live == 0, "it did not give the lock back")
 
 
-@check("renews", "S12")
+@check("renews", "S12", still=True)
 def renews(stage: Stage) -> None:
     """A lock of ours is renewed for as long as it is used."""
     with stage.voice() as anna, _lathe(stage) as lathe:
@@ -146,7 +146,7 @@ def renews(stage: Stage) -> None:
         eventually(lambda: lathe.resources[0].live == 0, "it did not give the lock back")
 
 
-@check("is-refused", "S11")
+@check("is-refused", "S11", still=True)
 def is_refused(stage: Stage) -> None:
     """While somebody else has the lock it is refused, and says so to its caller."""
     with stage.voice() as anna, _lathe(stage) as lathe:

@@ -20,6 +20,8 @@ ARM: Final = {
     "relay": ("actuate", ("service", "resources", "args")),
 }
 """What the container under test offers: effect and parameters."""
+MOVES: Final = ("turn", "angle", "turns", "halt")
+"""Of these, what has to do with motion."""
 OWN: Final = {
     "clock": "read",
     "acquire": "actuate",
@@ -34,7 +36,7 @@ _TALLY_S: Final = 20.0
 """A little more than a container may be silent about how far it is."""
 
 
-@check("presence", "Presence and registry")
+@check("presence", "Presence and registry", still=True)
 def presence(stage: Stage) -> None:
     """One sign of life stands on alive/<identity>/<container>/<epoch>, as the environment names them."""
     boots = stage.boots() if stage.peer else []
@@ -42,7 +44,7 @@ def presence(stage: Stage) -> None:
     require(is_chunk(boots[0].epoch), f"its epoch {boots[0].epoch!r} is no plain chunk")
 
 
-@check("offers", "Presence and registry")
+@check("offers", "Presence and registry", still=True)
 def offers(stage: Stage) -> None:
     """Asked what it offers, it tells its entries on their own keys, and the tally last."""
     offer = stage.peer.offer()
@@ -57,19 +59,21 @@ def offers(stage: Stage) -> None:
     require(len(set(revisions)) == len(revisions), "two entries have the same revision")
 
 
-@check("describes", "Messages")
+@check("describes", "Messages", still=True)
 def describes(stage: Stage) -> None:
     """The services of group peer and the functions of its own provider are described as agreed."""
-    places = {name: stage.peer.place(name) for name in ARM}
+    wanted = {name: told for name, told in ARM.items() if stage.motion or name not in MOVES}
+    places = {name: stage.peer.place(name) for name in wanted}
     offer = stage.peer.offer()
     arm = {name: _services(offer, place)[name] for name, place in places.items()}
-    for name, (effect, parameters) in ARM.items():
+    for name, (effect, parameters) in wanted.items():
         found = arm[name]
         require(found.effect == effect, f"{name} has the effect {found.effect!r}, not {effect!r}")
         named = tuple(parameter.name for parameter in found.parameters)
         require(named == parameters, f"{name} has the parameters {named}, not {parameters}")
-    require(arm["turn"].uses, "turn names no resource that it uses")
-    require(set(arm["turn"].uses) == set(arm["halt"].uses), "halt does not stop what turn uses")
+    if stage.motion:
+        require(arm["turn"].uses, "turn names no resource that it uses")
+        require(set(arm["turn"].uses) == set(arm["halt"].uses), "halt does not stop what turn uses")
     require(arm["relay"].uses == (), "relay uses no resource")
     own = _services(offer, SYSTEM)
     for name, effect in OWN.items():
@@ -77,7 +81,7 @@ def describes(stage: Stage) -> None:
         require(own[name].effect == effect, f"trade.{name} has the effect {own[name].effect!r}, not {effect!r}")
 
 
-@check("tells-late", "Presence and registry")
+@check("tells-late", "Presence and registry", still=True)
 def tells_late(stage: Stage) -> None:
     """Every sixteen seconds at least it says how far it is."""
     with stage.listening(tally_key(stage.peer.address)) as heard:
@@ -86,7 +90,7 @@ def tells_late(stage: Stage) -> None:
     require(tallies[-1].revision == stage.peer.offer().tally, "its tally is not that of its answer")
 
 
-@check("found", "Presence and registry")
+@check("found", "Presence and registry", still=True)
 def found(stage: Stage) -> None:
     """A container of this project finds its services and calls them."""
     from trade import where  # noqa: PLC0415 - the public way, here only
@@ -97,10 +101,11 @@ def found(stage: Stage) -> None:
     require(handle("through the front door") == "through the front door", "echo answered something else")
 
 
-@check("survives-rubbish", "Messages")
+@check("survives-rubbish", "Messages", still=True)
 def survives_rubbish(stage: Stage) -> None:
     """What is no message is dropped and kills nothing, on whatever key it comes."""
-    peer, place = stage.peer, "/".join(stage.peer.arm)
+    peer, echo = stage.peer, stage.peer.place("echo")
+    place = "/".join(echo)
     rubbish = [b"", b"\xc1", b"\xff" * 40, b"\x91" * 5000, b"\xdf\xff\xff\xff\xff", b"\xdd\xff\xff\xff\xff\x01"]
     rubbish += [b"\x80", b"\x90", b"\x99\x01\x01", b"\xc7\xff\x01" + b"\x00" * 8, b"\xa3\xff\xfe\xfd", b"\x01"]
     keys = [f"call/anna/{peer.address}/{place}", f"stop/anna/{peer.address}/{place}", "estop/anna"]
@@ -110,7 +115,7 @@ def survives_rubbish(stage: Stage) -> None:
         for key in keys:
             for payload in rubbish:
                 anna.put(key, payload)
-        require(anna.result(peer.arm, "echo", 1, expires_ns=NEVER) == 1, "after rubbish echo answers wrongly")
+        require(anna.result(echo, "echo", 1, expires_ns=NEVER) == 1, "after rubbish echo answers wrongly")
     require(peer.alive, f"rubbish killed it: {stage.last_words()}")
 
 
@@ -127,7 +132,7 @@ def restarts(stage: Stage) -> None:
         require(not anna.answers(lost) and not anna.answers(read), "a call to an earlier epoch was answered")
 
 
-@check("leaves", "Presence and registry")
+@check("leaves", "Presence and registry", still=True)
 def leaves(stage: Stage) -> None:
     """On SIGTERM it ends by itself, and its sign of life falls."""
     peer = stage.peer

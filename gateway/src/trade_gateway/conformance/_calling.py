@@ -15,7 +15,7 @@ from trade_gateway.conformance._voice import DEADLINE_S, NEVER, SYSTEM, error_of
 _LATEST_NS: Final = 2**63 - 1
 
 
-@check("answers", "Messages")
+@check("answers", "Messages", still=True)
 def answers(stage: Stage) -> None:
     """echo answers with what it was given, of every kind, by place and by name."""
     values: list[Any] = [None, True, -1, 2**63 - 1, -(2**63), 0.25, "häß", b"\x00\xff", [1, [2]], {"a": {"b": []}}]
@@ -23,7 +23,7 @@ def answers(stage: Stage) -> None:
         for value in [*values, "x" * 70_000]:
             for how in ({}, {"by_name": {"value": value}}):
                 args = () if how else (value,)
-                said = anna.result(stage.peer.arm, "echo", *args, expires_ns=NEVER, **how)
+                said = anna.result(stage.peer.place("echo"), "echo", *args, expires_ns=NEVER, **how)
                 require(said == value and type(said) is type(value), f"echo({value!r}) answered {said!r}"[:200])
 
 

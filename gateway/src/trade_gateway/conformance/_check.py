@@ -15,15 +15,17 @@ class Check(Struct, frozen=True):
     rule: str
     """Of the safety rules (docs/safety.md), or the section of the wire protocol's page."""
     does: Callable[[Stage], None]
+    still: bool = False
+    """Whether it asks nothing of what moves; the others turn the arm, or fail where there is none."""
     needs: str = ""
     """A function of the container's own provider, without which the check is left out."""
 
 
-def check(name: str, rule: str, *, needs: str = "") -> Callable[[Callable[[Stage], None]], Check]:
+def check(name: str, rule: str, *, still: bool = False, needs: str = "") -> Callable[[Callable[[Stage], None]], Check]:
     """Make a check of a function; what it asks is the first line of its docstring."""
 
     def make(does: Callable[[Stage], None]) -> Check:
         what = (does.__doc__ or "").strip().splitlines()[0].rstrip(".")
-        return Check(name, what, rule, does, needs)
+        return Check(name, what, rule, does, still, needs)
 
     return make

@@ -31,20 +31,26 @@ class Outcome(Struct, frozen=True):
     took_s: float = 0.0
 
 
-def run(command: str, checks: Sequence[Check], told: Callable[[Outcome], None]) -> list[Outcome]:
+def run(
+    command: str, checks: Sequence[Check], told: Callable[[Outcome], None], *, motion: bool = False
+) -> list[Outcome]:
     """Start the container under test and run the checks on it.
 
     Args:
         command: starts it; words as in a shell, without one.
         checks: which.
         told: called with each outcome when it is known.
+        motion: whether its arm may be turned; else checks that do so are left out, and no call of ``turn`` is sent.
 
     Raises:
         ConfigurationError: there is no such program.
     """
     outcomes: list[Outcome] = []
     logging.getLogger("trade").setLevel(logging.CRITICAL)  # what our own container drops here is meant to be dropped
-    with tempfile.TemporaryDirectory(prefix="trade-conformance-") as folder, Stage(command, Path(folder)) as stage:
+    with (
+        tempfile.TemporaryDirectory(prefix="trade-conformance-") as folder,
+        Stage(command, Path(folder), motion=motion) as stage,
+    ):
         for outcome in _each(stage, checks):
             outcomes.append(outcome)
             told(outcome)
@@ -61,6 +67,8 @@ def _each(stage: Stage, checks: Sequence[Check]) -> Iterator[Outcome]:
 
 
 def _judge(stage: Stage, one: Check) -> tuple[str, str]:
+    if not (one.still or stage.motion):
+        return LEFT_OUT, "it is of motion; --motion turns the arm"
     try:
         if one.needs and not stage.peer.says(one.needs):
             return LEFT_OUT, f"its own provider has no {one.needs}"

@@ -39,7 +39,7 @@ _LAST_LINES: Final = 12
 class Stage:
     """Everything a check needs. A context manager: nothing of it is left behind."""
 
-    def __init__(self, command: str, folder: Path) -> None:
+    def __init__(self, command: str, folder: Path, *, motion: bool) -> None:
         try:
             self._command = shlex.split(command)
         except ValueError as bad:
@@ -51,6 +51,8 @@ class Stage:
                 where="--peer", problem=f"cannot be started: there is no program {self._command[0]!r}"
             )
         self._folder = folder
+        self.motion: Final = motion
+        """Whether the arm may be turned."""
         self._system = f"conformance-{secrets.token_hex(4)}"
         self._credentials = ("conformance", secrets.token_hex(16))
         self._ending = contextlib.ExitStack()
@@ -216,7 +218,7 @@ class Stage:
 
     def voice(self, identity: str = "anna", *, client: str = "1") -> Voice:
         """Somebody who speaks to it; to be closed."""
-        return Voice(self._transport, identity, self.peer.address, client=client)
+        return Voice(self._transport, identity, self.peer.address, client=client, motion=self.motion)
 
     # --- its arm
 

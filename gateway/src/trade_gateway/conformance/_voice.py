@@ -24,7 +24,7 @@ from trade._wire import (
     decode_reply,
     encode_message,
 )
-from trade_gateway.conformance._judging import PATIENCE_S, NotHeld, eventually
+from trade_gateway.conformance._judging import PATIENCE_S, NotHeld, eventually, require
 
 Place = tuple[str, str]
 """Domain and provider."""
@@ -37,8 +37,11 @@ NEVER: Final = object()
 class Voice:
     """Somebody of an identity of its own, whose session is seen by its sign of life until it is closed."""
 
-    def __init__(self, transport: Transport, identity: str, callee: Address, *, client: str = "1") -> None:
+    def __init__(
+        self, transport: Transport, identity: str, callee: Address, *, client: str = "1", motion: bool = False
+    ) -> None:
         self._transport = transport
+        self._motion = motion
         self.callee: Final = callee
         self.identity: Final = identity
         epoch = secrets.token_hex(6)
@@ -79,6 +82,7 @@ class Voice:
         key: str = "",
     ) -> int:
         """Send a call and return its id. Unless said otherwise it expires in good time, by the callee's clock."""
+        require(self._motion or service != "turn", "a check that asks for motion ran without --motion")
         asked = self.new_id() if call_id is None else call_id
         if expires_ns is None and not stop:
             expires_ns = self.expiry_ns()

@@ -8,7 +8,7 @@ import msgspec
 
 from trade.errors import ConfigurationError
 from trade_gateway.recording._channels import LOCKS, JointStates, Lock, Locks
-from trade_gateway.recording._motion import motion_of
+from trade_gateway.recording._motion import gaps, motion_of
 from trade_gateway.recording._reader import Entry
 from trade_gateway.recording._sources import within
 
@@ -77,7 +77,7 @@ def episodes(
     states: Mapping[str, Sequence[JointStates]],
     spans: Sequence[Span],
     fps: int,
-    left_out: Callable[[Span, str], None],
+    tell: Callable[[Span, str], None],
 ) -> Iterator[Episode]:
     """What was measured in each span, straight lines between the measurements.
 
@@ -85,22 +85,49 @@ def episodes(
         states: what was measured, by group; the joints of all of them are in each frame, in this order.
         spans: the parts to take.
         fps: frames a second.
-        left_out: told of a span that is no episode, and why: joints were not measured in it, or not all through.
+        tell: told of a span that is cut where a joint moved unmeasured, or left out as joints were hardly measured in
+            it, and why.
     """
     for span in spans:
         try:
-            found = _episode(states, span, fps)
+            parts = list(_parts(_within(states, span), span, tell))
         except ConfigurationError as problem:
-            left_out(span, problem.problem)
-        else:
-            yield found
+            tell(span, f"is left out: {problem.problem}")
+            continue
+        for part in parts:
+            try:
+                found = _episode(_within(states, part), part, fps)
+            except ConfigurationError as problem:
+                what = "is left out" if part == span else "is left out in part"
+                tell(span, f"{what}: {problem.problem}")
+            else:
+                yield found
+
+
+def _within(states: Mapping[str, Sequence[JointStates]], span: Span) -> dict[str, list[JointStates]]:
+    return {
+        group: [one for one in measured if span.from_s <= min(one.stamp_s) <= span.until_s]
+        for group, measured in states.items()
+    }
+
+
+def _parts(
+    states: Mapping[str, Sequence[JointStates]], span: Span, tell: Callable[[Span, str], None]
+) -> Iterator[Span]:
+    """A span without the times in which a joint moved unmeasured."""
+    began_s = min((min(one.stamp_s) for measured in states.values() for one in measured), default=0.0)
+    from_s = span.from_s
+    for gap in sorted(gap for group, measured in states.items() for gap in gaps(group, measured)):
+        at = f"from {gap.from_s - began_s:.1f} to {gap.until_s - began_s:.1f} s"
+        tell(span, f"is cut: {gap.joint} moved and was not measured {at}")
+        if gap.from_s > from_s:
+            yield span._replace(from_s=from_s, until_s=gap.from_s)
+        from_s = max(from_s, gap.until_s)
+    yield span._replace(from_s=from_s)
 
 
 def _episode(states: Mapping[str, Sequence[JointStates]], span: Span, fps: int) -> Episode:
-    motions = [
-        motion_of(group, [one for one in measured if span.from_s <= min(one.stamp_s) <= span.until_s])
-        for group, measured in states.items()
-    ]
+    motions = [motion_of(group, measured) for group, measured in states.items()]
     tracks = [(motion.began_s, track) for motion in motions for track in motion.tracks]
     from_s = max(began_s + track.times_s[0] for began_s, track in tracks)
     until_s = min(began_s + track.times_s[-1] for began_s, track in tracks)

@@ -60,7 +60,7 @@ def export(
     spans = locked(entries(file), joints) if cut is Cut.LOCKS else [Span(file.stem)]
     if task is not None:
         spans = [span._replace(task=task) for span in spans]
-    made = list(episodes(states, spans, fps, lambda span, why: complain(f"{span.task} is left out: {why}")))
+    made = list(episodes(states, spans, fps, lambda span, what: complain(f"{span.task} {what}")))
     if not made:
         raise ConfigurationError(where=str(file), problem=f"has no episode of {', '.join(groups)}")
     _lerobot.write(folder, ", ".join(groups), joints, fps, made, file.name)

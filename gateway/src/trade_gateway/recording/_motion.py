@@ -2,7 +2,7 @@
 
 import math
 from bisect import bisect_left
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -14,7 +14,19 @@ from trade_drivers import JointLimits, Tolerances, Trajectory, TrajectoryPoint, 
 from trade_gateway.recording._channels import JointStates, group_of
 from trade_gateway.recording._reader import entries
 
-__all__ = ["Deviation", "Motion", "Track", "deviation", "fitted", "motion_of", "motions", "moving", "trajectory"]
+__all__ = [
+    "Deviation",
+    "Gap",
+    "Motion",
+    "Track",
+    "deviation",
+    "fitted",
+    "gaps",
+    "motion_of",
+    "motions",
+    "moving",
+    "trajectory",
+]
 
 _decode: Final = msgspec.json.Decoder(JointStates).decode
 _STEP_S: Final = 0.05
@@ -84,6 +96,14 @@ class Motion(NamedTuple):
         return [track.around(0.0)[0] for track in self.tracks]
 
 
+class Gap(NamedTuple):
+    """When a joint moved and was not measured, in seconds since the epoch."""
+
+    from_s: float
+    until_s: float
+    joint: str
+
+
 class Deviation(NamedTuple):
     """How far joints were from a recorded motion, in rad."""
 
@@ -113,6 +133,31 @@ def motion_of(group: str, states: Iterable[JointStates]) -> Motion:
     Raises:
         ConfigurationError: its joints are not the same all through, or are missing while they moved.
     """
+    joints, measured = _measured(group, states)
+    if not measured or any(len(track) < 3 for track in measured):
+        raise ConfigurationError(where="recording", problem=f"{group} was measured less than three times")
+    began = max(track[0][0] for track in measured)
+    tracks: list[Track] = []
+    for joint, track in zip(joints, measured, strict=True):
+        for gap in _gaps(joint, track):
+            at = f"from {gap.from_s - began:.1f} to {gap.until_s - began:.1f} s"
+            problem = f"{joint} was not measured {at}, while it moved"
+            raise ConfigurationError(where="recording", problem=problem)
+        tracks.append(Track([at - began for at, _ in track], [position for _, position in track]))
+    return Motion(group, joints, tracks, began)
+
+
+def gaps(group: str, states: Iterable[JointStates]) -> list[Gap]:
+    """When joints of a group moved and were not measured.
+
+    Raises:
+        ConfigurationError: its joints are not the same all through.
+    """
+    return [gap for joint, track in zip(*_measured(group, states), strict=True) for gap in _gaps(joint, track)]
+
+
+def _measured(group: str, states: Iterable[JointStates]) -> tuple[list[str], list[list[tuple[float, float]]]]:
+    """The joints, and when each of them was measured where."""
     joints: list[str] = []
     measured: list[list[tuple[float, float]]] = []
     for each in states:
@@ -124,21 +169,13 @@ def motion_of(group: str, states: Iterable[JointStates]) -> Motion:
         for track, at_s, position in zip(measured, each.stamp_s, each.position_rad, strict=True):
             if not track or at_s > track[-1][0] + _SAME_S:
                 track.append((at_s, position))
-    if not measured or any(len(track) < 3 for track in measured):
-        raise ConfigurationError(where="recording", problem=f"{group} was measured less than three times")
-    began = max(track[0][0] for track in measured)
-    tracks: list[Track] = []
-    for joint, track in zip(joints, measured, strict=True):
-        _whole(joint, track, began)
-        tracks.append(Track([at - began for at, _ in track], [position for _, position in track]))
-    return Motion(group, joints, tracks, began)
+    return joints, measured
 
 
-def _whole(joint: str, track: Sequence[tuple[float, float]], began: float) -> None:
+def _gaps(joint: str, track: Sequence[tuple[float, float]]) -> Iterator[Gap]:
     for (before_s, before), (after_s, after) in pairwise(track):
         if after_s - before_s > _GAP_S and abs(after - before) > _STILL_RAD:
-            problem = f"{joint} was not measured from {before_s - began:.1f} to {after_s - began:.1f} s, while it moved"
-            raise ConfigurationError(where="recording", problem=problem)
+            yield Gap(before_s, after_s, joint)
 
 
 def moving(motion: Motion) -> Motion:

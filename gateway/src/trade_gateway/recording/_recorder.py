@@ -5,6 +5,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from importlib.metadata import version
+from itertools import chain
 from typing import Final, Protocol
 
 from trade import Container
@@ -42,6 +43,8 @@ class Recorder:
         self._sources = Sources(container, wanted, self._wake)
         self._watch = Watch(container, list(wanted.groups), self._wake)
         self.messages = 0
+        self._ahead_ns = 0
+        """The clock on the wall ahead of the one that always runs, at most so far."""
 
     @property
     def dropped(self) -> int:
@@ -95,8 +98,14 @@ class Recorder:
             self.messages += 1
 
     def _new(self) -> Iterator[Message]:
-        yield from self._sources.take()
-        yield from self._watch.take()
+        for message in chain(self._sources.take(), self._watch.take()):
+            yield message._replace(arrived_ns=self._now_ns())
+
+    def _now_ns(self) -> int:
+        """Since the epoch; it follows the clock on the wall forwards, and goes on evenly where that is put back."""
+        running_ns = time.monotonic_ns()
+        self._ahead_ns = max(self._ahead_ns, time.time_ns() - running_ns)
+        return running_ns + self._ahead_ns
 
     def close(self) -> None:
         """Listen to nothing more. Idempotent."""

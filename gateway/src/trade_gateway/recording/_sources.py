@@ -100,7 +100,7 @@ class Sources:
                 yield handle, wanted.services_hz, _answer
 
     def take(self) -> Iterator[Message]:
-        """What has come since the last time."""
+        """What has come since the last time, without its time of arrival."""
         refused, self._refused = self._refused, []
         yield from refused
         for source in list(self._open.values()):
@@ -125,16 +125,15 @@ class Sources:
             if source.read is not _image and source.read is not _answer:
                 for joint, fault in _faults(sample.value):
                     yield from self._noted(joint, "joint", fault)
-            yield source.read(handle, sample)._replace(arrived_ns=time.time_ns())
+            yield source.read(handle, sample)
 
     def _noted(self, about: str, kind: FaultKind, text: str, what: str = "") -> Iterator[Message]:
         """A change of what is wrong, by ``what`` rather than by the whole text, which may have times in it."""
         now, before = what or text, self._wrong.get((about, kind))
         self._wrong[about, kind] = now
         if now != (before or ""):
-            now_ns = time.time_ns()
             fault = Fault(about=about, kind=kind, text=text, new=before is not None)
-            yield Message(FAULTS, now_ns, now_ns, encoded(fault))
+            yield Message(FAULTS, 0, time.time_ns(), encoded(fault))
 
     def _arm(self, handle: Handle, sample: Sample) -> Message:
         names = self._arms.get(handle)

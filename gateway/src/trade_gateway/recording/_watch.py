@@ -57,7 +57,7 @@ class Watch:
         self._thread.start()
 
     def take(self) -> Iterator[Message]:
-        """What was seen since the last time."""
+        """What was seen since the last time, without its time of arrival."""
         with contextlib.suppress(queue.Empty):
             while True:
                 yield self._seen.get_nowait()
@@ -79,7 +79,7 @@ class Watch:
         self._wake.set()
 
     def _put(self, channel: Channel, stamp_s: float, value: object) -> None:
-        self._seen.put(Message(channel, time.time_ns(), int(stamp_s * 1e9), encoded(value)))
+        self._seen.put(Message(channel, 0, int(stamp_s * 1e9), encoded(value)))
 
     def _look_at_calls(self) -> None:
         for span in self._calls.read():
@@ -109,7 +109,7 @@ class Watch:
             if health != self._health.get(group, _HEALTHY):
                 self._told(group, "health", "" if health == _HEALTHY else health)
         self._health = now
-        estops = {estop.id: f"{estop.reason} (by {estop.by})" for estop in self._container.estops()}
+        estops = {estop.id: f"{estop.reason} (by {estop.giver})" for estop in self._container.estops()}
         for known in self._estops.keys() - estops.keys():
             self._told(f"e-stop {known}", "e-stop", "")
         for known in estops.keys() - self._estops.keys():
