@@ -1,4 +1,4 @@
-"""Drivers that are broken on purpose, each in one way; as a plugin of pytest (``-p mutants``) tests are run on one.
+"""The product broken on purpose, each in one way; as a plugin of pytest (``-p mutants``) tests are run on one.
 
 ``MUTANT`` in the environment says which. Broken locks have a place of their own: `chaos._mutants`.
 """
@@ -76,6 +76,59 @@ def _watchdog_off(patch: Patch) -> None:
     patch(DynamixelExchange, "__init__", unwatched)
 
 
+def _discovery_stays_on(patch: Patch) -> None:
+    """Who looks for containers once looks for ever."""
+    from trade._reach import Reach
+
+    switch = Reach.set_discovery
+    patch(Reach, "set_discovery", lambda self, on: switch(self, on or self.discovers))
+
+
+def _uses_uncounted(patch: Patch) -> None:
+    """Calls under a lock are not counted."""
+    from trade._resources import Resource
+
+    check = Resource.check_lock
+
+    def uncounted(self: Any, *args: Any) -> None:
+        before = self.uses, self.used_at
+        check(self, *args)
+        self.uses, self.used_at = before
+
+    patch(Resource, "check_lock", uncounted)
+
+
+def _no_priority(patch: Patch) -> None:
+    """Whoever locks waits like everybody else, whatever priority it was given."""
+    from trade._locking import Locking
+
+    lock = Locking.lock
+    patch(Locking, "lock", lambda self, which, **terms: lock(self, which, **{**terms, "priority": 0}))
+
+
+def _busiest(patch: Patch) -> None:
+    """What is moved goes where there is most to do."""
+    from trade import _departing
+
+    busyness = _departing.busyness
+    patch(_departing, "busyness", lambda load: tuple(-each for each in busyness(load)))
+
+
+def _twin_unplaced(patch: Patch) -> None:
+    """The twin stays where it came up, and says that it is where the robot is."""
+    from trade_gateway.agents import Twin
+
+    patch(Twin, "_place", lambda self, *_: True)
+
+
+def _no_stop_line(patch: Patch) -> None:
+    """Nobody listens on the stop line."""
+    from trade.stop_line import _service
+
+    patch(_service, "host_door", lambda _: None)
+    patch(_service, "_network_doors", lambda *_: [])
+
+
 HOW: Final[dict[str, Callable[[Patch], None]]] = {
     "nothing-stops": _nothing_stops,
     "anybody-may": _anybody_may,
@@ -83,6 +136,12 @@ HOW: Final[dict[str, Callable[[Patch], None]]] = {
     "no-dedupe": _no_dedupe,
     "stop-loses": _stop_loses,
     "watchdog-off": _watchdog_off,
+    "discovery-stays-on": _discovery_stays_on,
+    "uses-uncounted": _uses_uncounted,
+    "no-priority": _no_priority,
+    "busiest": _busiest,
+    "twin-unplaced": _twin_unplaced,
+    "no-stop-line": _no_stop_line,
 }
 
 

@@ -3,6 +3,7 @@
 import threading
 
 import pytest
+from msgspec import structs
 
 from migrants import Scene
 from trade import Called, _departing, service, where
@@ -150,12 +151,22 @@ def test_a_call_that_runs_ends_first(scene: Scene) -> None:
 # --- the least busy
 
 
-def test_of_several_that_fit_it_goes_to_the_least_busy(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    busy = {"new-1": 80.0, "new-2": 10.0, "new-3": 40.0}
-    for name in busy:
-        scene.memory.container(name, instantiable=["migrants_there:*"])
+@pytest.mark.parametrize(
+    "busy",
+    [
+        [(80.0, 5.0, 0.0), (10.0, 90.0, 7.0), (40.0, 1.0, 3.0)],  # by the CPU of their hosts
+        [(30.0, 5.0, 8.0), (30.0, 90.0, 2.0), (30.0, 1.0, 4.0)],  # by calls, where that is the same
+        [(None, 50.0, 0.0), (None, 20.0, 7.0), (None, 30.0, 3.0)],  # by their own CPU, where hosts do not tell
+    ],
+)
+def test_of_several_that_fit_it_goes_to_the_least_busy(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch, busy: list[tuple[float | None, float, float]]
+) -> None:
+    for number, (host, own, calls) in enumerate(busy, 1):
+        meter = scene.memory.container(f"new-{number}", instantiable=["migrants_there:*"]).meter
+        told = structs.replace(meter.read(), host_cpu_percent=host, cpu_percent=own, calls_per_s=calls)
+        monkeypatch.setattr(meter, "read", lambda told=told: told)
     scene.memory.settle()
-    monkeypatch.setattr(_departing, "busyness", lambda load: (busy[load.container], 0.0))
     [count, _] = scene.asker.migrate(scene.counter()[0], to="new-?")
     assert count.container == "new-2"
 
