@@ -25,7 +25,7 @@ from tests.holds import Log
 
 from system import wall_clock
 from system.networks import Member, Networks, ip
-from system.siege_records import CAN_BUS, Fault
+from system.siege_records import CAN_BUS, Alarm, Fault, Rescue
 from system.sites import DOOR, SYSTEM, Site
 from trade_gateway.door import add_token
 from trade_hil_sim import BusOff, SimProcess
@@ -43,6 +43,13 @@ _HALL: Final = "127.0.0.1:7480"
 """Where pages come in, on their own host."""
 _DISK_BYTES: Final = 4 << 20
 _JUMPS_S: Final = (-36_000.0, -5.0, 5.0, 36_000.0)
+_STRANGERS: Final = 200
+"""So many come in a second, and so many stay."""
+_LEFT_S: Final = 20.0
+"""When they have left, the transport ends ten of what they left a second; nobody is linked anew before."""
+_RESCUE_S: Final = 10.0
+_ESTOPS: Final = 200
+"""Of one flood."""
 _LONG_S: Final = 60.0
 """Of a siege: one in which there is time to come to rest between troubles."""
 _WHO: Final = [
@@ -61,9 +68,13 @@ read = ["*"]
 call = ["rosie", "dora"]
 lock = ["rosie", "dora"]
 
+[roles.warden]
+administer = ["*"]
+
 [identities]
 rosie = ["driver"]
 dora = ["driver"]
+warden = ["warden"]
 {"".join(f'{who} = ["operator"]' + chr(10) for who in _WHO)}"""
 _JOINT: Final = """
 [joint."{name}"]
@@ -240,6 +251,7 @@ class Stand:
         door = ["-m", "trade_gateway", "door", "--name", "hall", "--listen", _HALL, "--tokens", str(tokens), "--json"]
         self._hall = Kept(self.site, "right", "hall", f"tls/{_WIRE}", door)
         self.clients = {slot: self._client(slot) for slot in range(len(_KINDS))}
+        self._eve, self._warden = self._alarmist("eve"), self._alarmist("warden")
 
     def _client(self, slot: int) -> tuple[str, Member]:
         self._turns[slot] += 1
@@ -258,6 +270,12 @@ class Stand:
         }
         member.tell(json.dumps(told))
         return name, member
+
+    def _alarmist(self, name: str) -> Member:
+        """One without any role, or one that may clear e-stops."""
+        member = self.site.launched("right2", name, script=_HERE / "alarmist.py", policy=self._policy)
+        member.tell(json.dumps({"connect": DOOR["public"]}))
+        return member
 
     def restart(self, slot: int) -> None:
         """Another client in its place, which locks and moves."""
@@ -413,14 +431,90 @@ class Stand:
         self._disk.fill()
         return self._noted("disk", "all", self._disk.free)
 
+    def strangers(self) -> Callable[[], None]:
+        """They fill the gateway's ports, or a driver's; somebody without a link has to stop something."""
+        robot = self._dice.choice([*self.drivers])
+        whom = self._dice.choice(["door", robot])
+        host, per_s = ("right2" if whom == "door" else "left"), str(_STRANGERS)
+        crowd = subprocess.Popen(
+            [*self._on(host), str(_HERE / "stranger_flood.py"), self._ports(whom), per_s, per_s, "-", "-"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+        )
+
+        def leave() -> None:
+            crowd.kill()
+            threading.Event().wait(_LEFT_S)
+
+        back = self._noted("strangers", whom, leave)
+        self._rest(2.0)
+        self._log.note(self._rescue(whom, robot))
+
+        def end() -> None:
+            back()
+            crowd.communicate()
+
+        return end
+
+    def estops(self) -> Callable[[], None]:
+        """An identity without any role floods the system with e-stops; in the end all are cleared."""
+        began = time.monotonic()
+        back = self._noted("estops", "all", self._clear)
+        confirmed = self._eve.ask("flood", str(_ESTOPS))
+        latched = time.monotonic()
+
+        def end() -> None:
+            for robot in {who.partition("/")[0] for who in confirmed} & {*self.drivers}:
+                self._log.note(Alarm(t=latched, robot=robot, since=began, until=time.monotonic()))
+            back()
+
+        return end
+
+    def _clear(self) -> list[str]:
+        return self._warden.ask("clear")
+
+    def _on(self, host: str) -> list[str]:
+        return ["ip", "netns", "exec", self.site.networks.host(host), sys.executable]
+
+    def _ports(self, whom: str) -> str:
+        if whom == "door":
+            host, port = DOOR["public"].removeprefix("tls/").split(":")
+            return f"{host}:{port},{host}:{int(port) + 1000}"
+        there = (self.site.folder / "runtime" / whom / SYSTEM).glob("tls_*")  # nobody, if it has just been killed
+        return ",".join(":".join(path.name.split("_")[1:]) for path in there) or "127.0.0.1:1"
+
+    def _rescue(self, whom: str, robot: str) -> Rescue:
+        """A program of the robot's own user, on its host; or one on the public network."""
+        identity = robot if whom == robot else "anna"
+        settings = {
+            "TRADE_SYSTEM": SYSTEM,
+            "TRADE_TLS": str(self.site.papers.of(identity)),
+            "TRADE_POLICY": str(self._policy),
+            "TRADE_RUNTIME_DIR": str(self.site.folder / "runtime" / identity),
+        }
+        began = time.monotonic()
+        words = [str(_HERE / "rescuer.py"), robot, str(_RESCUE_S), *([] if whom == robot else [DOOR["public"]])]
+        said = subprocess.run(
+            [*self._on("left" if whom == robot else "right"), *words],
+            env={**os.environ, **settings},
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=60,
+        )
+        told = json.loads(said.stdout) if said.returncode == 0 else {"through": False, "said": said.stderr}
+        return Rescue(t=began, whom=whom, until=time.monotonic(), through=told["through"], said=told["said"])
+
     # --- after it
 
     def quiet(self) -> None:
-        """Everybody locks nothing any more."""
+        """Everybody locks nothing any more, and no e-stop is open."""
         for _, member in self.clients.values():
             member.tell("quiet")
         for _, member in self.clients.values():
             member.heard()
+        still_open = self._clear()
+        assert not still_open, still_open
 
     def wrong(self) -> dict[str, list[str]]:
         """By client, what does not work although there is no trouble any more."""
@@ -465,6 +559,8 @@ TROUBLES: Final[Mapping[str, Callable[[Stand], Callable[[], None]]]] = {
     "policy": Stand.policy,
     "clock": Stand.clock,
     "disk": Stand.disk,
+    "strangers": Stand.strangers,
+    "estops": Stand.estops,
 }
 """Each begins, and returns what ends it."""
 

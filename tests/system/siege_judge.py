@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from tests.holds import Owned, Verdict, asks_without_end, by_kind, owned, two_owners
 
-from system.siege_records import CAN_BUS, Answer, AnyRecord, Fault, Order, whole
+from system.siege_records import CAN_BUS, Alarm, Answer, AnyRecord, Fault, Order, Rescue, whole
 from trade_hil_sim import Entry
 
 STOPS_S = 6.0
@@ -19,6 +19,11 @@ FULL_SPEED = 100
 """What is written with so much and more (of 0.229 rpm) is a stop: nobody orders more than 84."""
 _ANSWERED_S = 3.0
 """So long after its deadline a call may end, beside the time that its process did not have."""
+_IN_THE_WAY = frozenset(
+    ("kill driver", "freeze driver", "unplug", "bus off", "kill gateway", "freeze gateway", "cut", "one way", "disk")
+)
+"""Troubles in which a stop cannot get through, or cannot be confirmed."""
+_BACK_S = 15.0
 _FAR_COUNTS = 100
 """What a stop may take to come to rest, and more; what goes farther was ordered."""
 _FREE = ":free"
@@ -72,6 +77,8 @@ def judge(records: Iterable[AnyRecord], logs: Mapping[str, Iterable[Entry]]) -> 
     verdict.counts["motion turned"] = sum(motion.turned for of in motions.values() for motion in of)
     surely = owned(known)
     killed = {fault.whom for fault in known[Fault] if fault.what == "kill client"}
+    verdict.counts.update("rescue got through" for rescue in known[Rescue] if rescue.through)
+    verdict.violations += _not_rescued(known) + _not_latched(known, motions)
     verdict.violations += two_owners(surely) + asks_without_end(known, killed) + _unanswered(known, killed)
     for resource, of in sorted(motions.items()):
         orders = sorted((order for order in known[Order] if order.resource == resource), key=lambda order: order.t)
@@ -176,6 +183,38 @@ def _unanswered(known: dict[type, list[Any]], killed: set[str]) -> list[str]:
         if late_s > _ANSWERED_S and _who(order.number) not in killed:
             found.append(f"{order.number} ordered at {order.t:.3f}, answered {late_s:.1f} s after its deadline")
     return found
+
+
+def _not_rescued(known: dict[type, list[Any]]) -> list[str]:
+    """Stops that did not get through although strangers at the ports were the only trouble."""
+    found: list[str] = []
+    for rescue in known[Rescue]:
+        others = (fault for fault in known[Fault] if fault.what in _IN_THE_WAY)
+        if not rescue.through and not any(_overlaps(rescue, fault) for fault in others):
+            found.append(f"no stop got through to {rescue.whom} at {rescue.t:.3f}: {rescue.said}")
+    return found
+
+
+def _not_latched(known: dict[type, list[Any]], motions: Mapping[str, Sequence[Motion]]) -> list[str]:
+    """Motions that began although their robot had confirmed an e-stop that nobody had begun to clear.
+
+    A driver that starts while its disk is full finds no notes of what is open.
+    """
+    found: list[str] = []
+    for alarm in known[Alarm]:
+        if any(fault.what == "disk" and fault.t < alarm.until and fault.until > alarm.since for fault in known[Fault]):
+            continue
+        for resource, of in motions.items():
+            for motion in of if resource.startswith(f"{alarm.robot}.") else ():
+                if alarm.t < motion.t < alarm.until and motion.far > _FAR_COUNTS:
+                    found.append(f"{resource} goes to {motion.counts} at {motion.t:.3f} while an e-stop is open")
+    return found
+
+
+def _overlaps(rescue: Rescue, fault: Fault) -> bool:
+    """What was killed comes back, and what is back finds the others, within some time."""
+    until = fault.t if fault.what.startswith("kill") else fault.until
+    return fault.t < rescue.until and until + _BACK_S > rescue.t
 
 
 def _frozen_s(faults: Sequence[Fault], order: Order) -> float:

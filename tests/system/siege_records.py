@@ -35,6 +35,25 @@ class Fault(Record):
     until: float
 
 
+class Rescue(Record):
+    """Somebody without a link stopped a group while strangers were at the ports, or could not."""
+
+    whom: str
+    """Who was asked: ``door``, or a robot."""
+    until: float
+    through: bool
+    said: str
+
+
+class Alarm(Record):
+    """A robot confirmed an e-stop before ``t``, and nobody began to clear it before ``until``."""
+
+    robot: str
+    since: float
+    """When the first e-stop was given."""
+    until: float
+
+
 def of_robot(hold: str, robot: str) -> str:
     """A hold as far as it is of one robot."""
     return f"{hold}@{robot}"
@@ -45,4 +64,4 @@ def whole(hold: str) -> str:
     return hold.partition("@")[0]
 
 
-AnyRecord = Ask | Held | Seen | Done | Order | Answer | Fault
+AnyRecord = Ask | Held | Seen | Done | Order | Answer | Fault | Rescue | Alarm

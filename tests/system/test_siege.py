@@ -17,7 +17,7 @@ from system.networks import Networks
 from system.siege import TROUBLES, Stand, stand
 from system.siege_judge import judge, motions_of
 from system.siege_minimised import fewest
-from system.siege_records import Answer, AnyRecord, Fault, Order
+from system.siege_records import Alarm, Answer, AnyRecord, Fault, Order, Rescue
 from trade_hil_sim import Entry
 
 SECONDS = 60 * float(os.environ.get("SIEGE_MINUTES", "0.4"))
@@ -254,6 +254,44 @@ def test_motions_of_a_drive_are_read_from_what_it_did_and_was_told() -> None:
     [one, two] = motions_of(late)["leg.hip"]
     assert one == (1.01, 2500, 2048, 2.1, True, False)
     assert two == (2.1, 2848, 2358, 3, False, True)
+
+
+@pytest.mark.parametrize(
+    ("faults", "found"),
+    [
+        ([], 1),
+        ([Fault(t=9, what="strangers", whom="door", until=20)], 1),
+        ([Fault(t=9, what="cut", whom="net1", until=10.5)], 0),
+        ([Fault(t=11, what="freeze driver", whom="dora", until=20)], 0),
+        ([Fault(t=1, what="kill driver", whom="dora", until=1e12)], 0),
+        ([Fault(t=-20, what="kill driver", whom="dora", until=1e12)], 1),
+    ],
+)
+def test_a_stop_that_does_not_get_through_is_found_unless_something_is_in_its_way(
+    faults: list[Fault], found: int
+) -> None:
+    missed = Rescue(t=10, whom="dora", until=12, through=False, said="nobody answers")
+    assert len(judge([missed, *faults], {}).violations) == found
+    assert judge([structs.replace(missed, through=True), *faults], {}).violations == []
+
+
+@pytest.mark.parametrize(
+    ("begins", "faults", "found"),
+    [
+        (3.0, [], 1),
+        (3.0, [Fault(t=2, what="kill driver", whom="rosie", until=1e12)], 1),
+        (3.0, [Fault(t=1.5, what="disk", whom="all", until=2.5)], 0),
+        (1.9, [], 0),
+        (4.1, [], 0),
+    ],
+)
+def test_a_motion_that_begins_while_an_estop_is_open_is_found(begins: float, faults: list[Fault], found: int) -> None:
+    alarm = Alarm(t=2, robot="rosie", since=1, until=4)
+    order = structs.replace(ORDER, t=begins - 0.1)
+    entries = {"rosie": [begun(begins, 2500), rest(begins + 1)]}
+    verdict = judge([*HOLD, order, ANSWER, Done(t=9, hold="a:1", how="given back"), alarm, *faults], entries)
+    assert [each for each in verdict.violations if "e-stop" in each] == verdict.violations
+    assert len(verdict.violations) == found
 
 
 @pytest.mark.parametrize("guilty", [{"cut"}, {"cut", "unplug"}, {"kill client", "delay", "disk"}])
