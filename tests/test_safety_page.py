@@ -12,10 +12,10 @@ ROWS = [[cell.strip() for cell in line.strip("|").split("|")] for line in TABLE.
 REQUIRED = {"S01", "S06", "S08", "S11", "S18"}
 RIGS = {
     "Dynamixel": "Rig",
-    "CAN": "Leg",
+    "CAN": "(?:Leg|CanRig)",
     "Modbus": "HandRig",
     "Feetech": "TailRig",
-    "ODrive and Damiao": "MotorRig",
+    "ODrive and Damiao": "(?:MotorRig|CanRig)",
     "UR": "ArmRig",
 }
 """What a test of the wire is done with: the parameters of a test say which wire it is about."""
