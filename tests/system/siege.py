@@ -299,10 +299,14 @@ class Stand:
         done, until, bag = Counter[str](), time.monotonic() + seconds, list[str]()
         while time.monotonic() < until or min(done[kind] for kind in kinds) < fewest:
             undo: list[Callable[[], None]] = []
+            now = set[str]()
             for _ in range(self._dice.choice(at_once)):
                 if not bag:
                     bag = self._dice.sample(kinds, len(kinds))
                 kind = bag.pop()
+                if kind in now:  # a gateway that is killed twice would be started twice
+                    continue
+                now.add(kind)
                 done[kind] += 1
                 undo.append(TROUBLES[kind](self))
                 self._rest(0.3)

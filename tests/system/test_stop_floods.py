@@ -2,6 +2,7 @@
 
 import json
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -158,6 +159,30 @@ anna = ["operator"]
         check(came(networks.host("right"), environment, DOOR["public"]), "rosie.neck.halt")
         assert len(arm.ask("estops")) == 1
         assert descriptors(site.gateway.pid) - before < MOST_DESCRIPTORS
+    finally:
+        site.close()
+
+
+def test_a_gateway_starts_while_strangers_are_at_its_port(
+    networks: Networks, tmp_path: Path, flood: Callable[..., Flood], came: Callable[..., dict[str, Any]]
+) -> None:
+    policy = 'gateways = ["door"]\n[roles.driver]\nregister = ["rosie"]\n[identities]\narm = ["driver"]\n'
+    site = Site(networks, tmp_path, policy, private='["rosie"]')
+    try:
+        arm = site.member("left", "arm")
+        arm.ask("register_joint", "rosie.neck")
+        host, port = DOOR["public"].removeprefix("tls/").split(":")
+        flood(networks.host("right2"), f"{host}:{port},{host}:{int(port) + 1000}")
+        site.end(signal.SIGKILL)
+        site.begin()
+        assert site.ready["ready"] is True, site.complaints()
+        environment = {
+            "TRADE_TLS": str(site.papers.of("anna")),
+            "TRADE_RUNTIME_DIR": str(tmp_path / "right"),
+            "TRADE_SYSTEM": "lab-0",
+            "TRADE_POLICY": str(site.policy),
+        }
+        check(came(networks.host("right"), environment, DOOR["public"]), "rosie.neck.halt")
     finally:
         site.close()
 

@@ -140,12 +140,19 @@ def _networks(bridge: Sequence[str]) -> list[list[str]]:
 
 
 def _check_bridged(bridge: Sequence[str], links: Links) -> None:
-    """Raises ConfigurationError: nobody can come in by one of the interfaces."""
+    """Raises ConfigurationError: nobody can come in by one of the interfaces.
+
+    An endpoint that does not answer itself may be flooded by strangers. That must not keep a bridge from starting.
+    """
     if not bridge or any(own.everywhere for own in links.listen):
         return
-    heard = [name for own in links.listen for name in links.interfaces(str(own))]
+    heard = {str(own): links.interfaces(str(own)) for own in links.listen}
+    silent = [endpoint for endpoint, names in heard.items() if not names]
+    if silent:
+        _logger.warning("%s cannot be reached from here: its interface is not checked", ", ".join(silent))
+        return
     for name in bridge:
-        if name not in heard:
+        if not any(name in names for names in heard.values()):
             problem = (
                 f"nothing listens on it, only on {', '.join(map(str, links.listen))}; let TRADE_LISTEN name an address "
                 f"of {name}, too (in a gateway file: listen), or {links.listen[0].protocol}/0.0.0.0:PORT"
