@@ -354,6 +354,8 @@ class Model(RuleBasedStateMachine):
         """It leaves so many questions unanswered."""
         name = self._named(data, self._up())
         for _ in range(times):
+            if name not in self._up():  # it is being ended: nothing of it is due at any time
+                break
             if not self.kept[name].asking:
                 self._advance(max(self.now, self.kept[name].until))
                 self.it_agrees()
@@ -413,6 +415,7 @@ class Model(RuleBasedStateMachine):
         self._advance(self.now + duration_s)
 
     def _advance(self, until: float) -> None:
+        assert until < math.inf
         self.now = until
         self._settle()
         self.real._post(lambda: None)

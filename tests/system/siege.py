@@ -50,6 +50,8 @@ _LEFT_S: Final = 20.0
 _RESCUE_S: Final = 10.0
 _ESTOPS: Final = 200
 """Of one flood."""
+_CLEARED_S: Final = 10.0
+_CLEARED_AGAIN_S: Final = 2.0
 _LONG_S: Final = 60.0
 """Of a siege: one in which there is time to come to rest between troubles."""
 _WHO: Final = [
@@ -314,6 +316,7 @@ class Stand:
             for back in reversed(undo):
                 back()
             self._rest(rest_s)
+            self._clear(_CLEARED_AGAIN_S)  # who was away when the others cleared keeps it open
 
     def _rest(self, most_s: float) -> None:
         threading.Event().wait(self._dice.random() * most_s)
@@ -463,7 +466,7 @@ class Stand:
     def estops(self) -> Callable[[], None]:
         """An identity without any role floods the system with e-stops; in the end all are cleared."""
         began = time.monotonic()
-        back = self._noted("estops", "all", self._clear)
+        back = self._noted("estops", "all", lambda: self._clear(_CLEARED_S))
         confirmed = self._eve.ask("flood", str(_ESTOPS))
         latched = time.monotonic()
 
@@ -474,8 +477,8 @@ class Stand:
 
         return end
 
-    def _clear(self) -> list[str]:
-        return self._warden.ask("clear")
+    def _clear(self, limit_s: float) -> list[str]:
+        return self._warden.ask("clear", str(limit_s))
 
     def _on(self, host: str) -> list[str]:
         return ["ip", "netns", "exec", self.site.networks.host(host), sys.executable]
@@ -517,7 +520,7 @@ class Stand:
             member.tell("quiet")
         for _, member in self.clients.values():
             member.heard()
-        still_open = self._clear()
+        still_open = self._clear(_CLEARED_S)
         assert not still_open, still_open
 
     def wrong(self) -> dict[str, list[str]]:
