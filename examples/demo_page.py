@@ -8,7 +8,7 @@ from urllib.parse import urlsplit
 
 from demo_stage import Stage
 
-from trade_gateway.door import add_token
+from trade_gateway.http import add_token
 
 _CHUNK = 65536
 

@@ -19,7 +19,7 @@ from typing import Any
 from demo_actor import PATIENCE_S, Actor, DemoFailed
 
 from trade_drivers import Bus, Driver, load, load_driver
-from trade_gateway._pki import Authority
+from trade_gateway.pki._authority import Authority
 
 HERE = Path(__file__).parent
 ROBOT = HERE / "rosie.toml"

@@ -13,9 +13,9 @@ from mcp.shared.memory import create_client_server_memory_streams
 from mcp.types import CancelledNotification, CancelledNotificationParams, ClientNotification
 
 from trade import Container, Resource, service
-from trade_gateway.agents import Approvals
-from trade_gateway.agents._server import converse
-from trade_gateway.talk import read_lexicon
+from trade_gateway.language import read_lexicon
+from trade_gateway.mcp import Approvals
+from trade_gateway.mcp._server import converse
 
 POLICY = """
 [roles.behaviour]

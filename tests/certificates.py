@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from datetime import timedelta
 from pathlib import Path
 
-from trade_gateway._pki import Authority
+from trade_gateway.pki._authority import Authority
 
 
 @dataclass

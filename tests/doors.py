@@ -15,7 +15,7 @@ from websockets.sync.client import ClientConnection, connect
 from jointed import Joint, Robot
 from trade import Container, service
 from trade.testing import memory_system
-from trade_gateway.door import Door, Tokens, add_token
+from trade_gateway.http import Door, Tokens, add_token
 from waiting import PATIENCE_S
 
 POLICY = """

@@ -5,9 +5,18 @@ from typing import Any
 import msgspec
 
 from trade import Container, Handle, where
-from trade._keys import Address, alive_key, calls_to, registry_key, reply_key
-from trade._schemas import schema_message
-from trade._wire import PROTOCOL, Call, ProviderInfo, Reply, ServiceInfo, Status, decode_call, encode_message
+from trade._protocol.keys import Address, alive_key, calls_to, registry_key, reply_key
+from trade._protocol.messages import (
+    PROTOCOL,
+    Call,
+    ProviderInfo,
+    Reply,
+    ServiceInfo,
+    Status,
+    decode_call,
+    encode_message,
+)
+from trade._protocol.schema import schema_message
 
 FUTURE = 99
 """A version of the protocol that nobody speaks."""

@@ -3,10 +3,10 @@
 import concurrent.futures
 from collections.abc import Callable, Iterable, Sequence
 
-from trade._locks import LockTable
-from trade._resources import Holder, Permit, Resource, admit
-from trade._terms import Granted, Terms
-from trade._wire import Token
+from trade._protocol.messages import Token
+from trade._resources.lock_request import Granted, Terms
+from trade._resources.lock_table import LockTable
+from trade._resources.resource import Holder, Permit, Resource, admit
 from waiting import wait_until
 
 EPOCH = "epoch"

@@ -18,8 +18,8 @@ _IMPATIENCE_S: Final = 6.0
 
 def _nothing_stops(patch: Patch) -> None:
     """Who is gone, and what he has lost, is of no concern."""
-    from trade._deadman import Deadman
-    from trade._resources import Permit
+    from trade._estop.deadman import Deadman
+    from trade._resources.resource import Permit
 
     patch(Deadman, "stop", lambda self, resources, reason, done: [done(resource, "") for resource in resources])
     patch(Permit, "gate", lambda self: None)
@@ -27,7 +27,7 @@ def _nothing_stops(patch: Patch) -> None:
 
 def _anybody_may(patch: Patch) -> None:
     """No lock is looked at."""
-    from trade._resources import Permit, Resource
+    from trade._resources.resource import Permit, Resource
 
     patch(Resource, "check", lambda self, *_: None)
     patch(Permit, "gate", lambda self: None)
@@ -35,8 +35,8 @@ def _anybody_may(patch: Patch) -> None:
 
 def _never_late(patch: Patch) -> None:
     """Calls and commands run however late they come."""
-    from trade._local_service import LocalService
-    from trade_drivers import _work
+    from trade._services.local_service import LocalService
+    from trade_drivers.bus import _jobs as _work
     from trade_drivers.joints import _jobs
 
     patch(LocalService, "too_late", lambda self, _: False)
@@ -50,7 +50,7 @@ def _never_late(patch: Patch) -> None:
 
 def _no_dedupe(patch: Patch) -> None:
     """A call that comes again runs again."""
-    from trade._ongoing import Once
+    from trade._context.active_calls import Once
 
     patch(Once, "begin", lambda self, call, ongoing: ongoing)
     patch(Once, "find", lambda self, caller, call: None)
@@ -58,14 +58,14 @@ def _no_dedupe(patch: Patch) -> None:
 
 def _stop_loses(patch: Patch) -> None:
     """What was asked for before a stop is done after it."""
-    from trade._resources import Resource
+    from trade._resources.resource import Resource
 
     patch(Resource, "stop", lambda self, *_, **__: None)
 
 
 def _watchdog_off(patch: Patch) -> None:
     """Servos are not told to look after themselves."""
-    from trade_drivers.dynamixel._exchange import DynamixelExchange
+    from trade_drivers.vendors.dynamixel._cycle import DynamixelExchange
 
     begin = DynamixelExchange.__init__
 
@@ -78,7 +78,7 @@ def _watchdog_off(patch: Patch) -> None:
 
 def _discovery_stays_on(patch: Patch) -> None:
     """Who looks for containers once looks for ever."""
-    from trade._reach import Reach
+    from trade._discovery.dialer import Reach
 
     switch = Reach.set_discovery
     patch(Reach, "set_discovery", lambda self, on: switch(self, on or self.discovers))
@@ -86,7 +86,7 @@ def _discovery_stays_on(patch: Patch) -> None:
 
 def _uses_uncounted(patch: Patch) -> None:
     """Calls under a lock are not counted."""
-    from trade._resources import Resource
+    from trade._resources.resource import Resource
 
     check = Resource.check_lock
 
@@ -100,7 +100,7 @@ def _uses_uncounted(patch: Patch) -> None:
 
 def _no_priority(patch: Patch) -> None:
     """Whoever locks waits like everybody else, whatever priority it was given."""
-    from trade._locking import Locking
+    from trade._locks.api import Locking
 
     lock = Locking.lock
     patch(Locking, "lock", lambda self, which, **terms: lock(self, which, **{**terms, "priority": 0}))
@@ -108,7 +108,7 @@ def _no_priority(patch: Patch) -> None:
 
 def _busiest(patch: Patch) -> None:
     """What is moved goes where there is most to do."""
-    from trade import _departing
+    from trade._migration import source as _departing
 
     busyness = _departing.busyness
     patch(_departing, "busyness", lambda load: tuple(-each for each in busyness(load)))
@@ -116,17 +116,17 @@ def _busiest(patch: Patch) -> None:
 
 def _twin_unplaced(patch: Patch) -> None:
     """The twin stays where it came up, and says that it is where the robot is."""
-    from trade_gateway.agents import Twin
+    from trade_gateway.mcp import Twin
 
     patch(Twin, "_place", lambda self, *_: True)
 
 
 def _no_stop_line(patch: Patch) -> None:
     """Nobody listens on the stop line."""
-    from trade.stop_line import _service
+    from trade._stop_line import service
 
-    patch(_service, "host_door", lambda _: None)
-    patch(_service, "_network_doors", lambda *_: [])
+    patch(service, "host_door", lambda _: None)
+    patch(service, "_network_doors", lambda *_: [])
 
 
 HOW: Final[dict[str, Callable[[Patch], None]]] = {

@@ -18,7 +18,7 @@ from pages.blocks import blocks
 from trade import errors
 from trade_gateway.cli import build
 from trade_hil_sim import AnswerFault, Command, SimProcess, events
-from trade_hil_sim._faults import kinds_of
+from trade_hil_sim.faults._faults import kinds_of
 
 if sys.version_info >= (3, 11):
     import tomllib

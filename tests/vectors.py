@@ -10,11 +10,8 @@ from typing import Any, Final
 import msgspec
 from msgspec import Raw, msgpack
 
-from trade._keys import Address, ServiceKey
-from trade._resources import Holder
-from trade._sample import StreamSample
-from trade._terms import Granted, LockInfo, Terms
-from trade._wire import (
+from trade._protocol.keys import Address, ServiceKey
+from trade._protocol.messages import (
     PROTOCOL,
     Behalf,
     Call,
@@ -31,6 +28,9 @@ from trade._wire import (
     Tally,
     Token,
 )
+from trade._protocol.samples import StreamSample
+from trade._resources.lock_request import Granted, LockInfo, Terms
+from trade._resources.resource import Holder
 
 FILE: Final = Path(__file__).parents[1] / "docs" / "wire-vectors.json"
 AT: Final = 1767225600.5

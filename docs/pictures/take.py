@@ -21,7 +21,7 @@ from rich.console import Console
 
 import trade
 from trade import where
-from trade_gateway.door import add_token
+from trade_gateway.http import add_token
 
 HERE = Path(__file__).parent
 ROSIE = HERE.parents[1] / "examples" / "rosie.toml"

@@ -115,9 +115,9 @@ def bare_session(
     bridge: Sequence[Sequence[str]] = (),
 ):
     """A session of zenoh's with the settings of ours, and no container around it."""
-    from trade._links import open_session
-    from trade._tls import Certificate
-    from trade._zenoh import configuration
+    from trade._security.certificates import Certificate
+    from trade._transport.zenoh import configuration
+    from trade._transport.zenoh_links import open_session
     from trade.policies import acl, read_policy
 
     return open_session(

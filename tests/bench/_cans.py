@@ -19,12 +19,12 @@ from tests.bench._report import keep_point, print_target
 
 from trade.errors import DeviceError, TradeError
 from trade_drivers import Motor, Tolerances, Trajectory, TrajectoryPoint
-from trade_drivers.can import frame_bits
-from trade_drivers.cia402 import _table as table
-from trade_drivers.cia402 import open_exchange
-from trade_drivers.cia402._motor import AttachedDrives
+from trade_drivers.bus.can import frame_bits
 from trade_drivers.joints import BusThread
 from trade_drivers.robotfile import CanBus, parse
+from trade_drivers.vendors.cia402 import _table as table
+from trade_drivers.vendors.cia402 import open_exchange
+from trade_drivers.vendors.cia402._motor import AttachedDrives
 from trade_hil_sim import SimProcess
 
 _COUNT = 6

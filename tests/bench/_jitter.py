@@ -28,7 +28,7 @@ from tests.bench._record import Histogram
 from tests.bench._report import keep_point, print_skipped
 
 from trade_drivers import load_driver
-from trade_drivers._driver import Driver
+from trade_drivers.plugins._driver import Driver
 from trade_hil_sim import Entry, SimProcess, SimulationError, read_log
 
 EDGES_US: Final = (*(step * 10.0**decade for decade in range(1, 5) for step in (1, 2, 5)), 1e5)

@@ -11,11 +11,11 @@ from collections.abc import Mapping
 from msgspec import structs
 
 from trade import Container
-from trade._announcing import Announcer
-from trade._keys import ALIVE, ESTOPS, REGISTRY, Address, calls_to, registry_key
-from trade._memory import MemoryTransport, Network
-from trade._transport import ChannelClosed, Message
-from trade._wire import ProviderInfo, decode_provider
+from trade._discovery.announcer import Announcer
+from trade._protocol.keys import ALIVE, ESTOPS, REGISTRY, Address, calls_to, registry_key
+from trade._protocol.messages import ProviderInfo, decode_provider
+from trade._transport.base import ChannelClosed, Message
+from trade._transport.memory import MemoryTransport, Network
 
 Offer = Mapping[tuple[str, str], ProviderInfo]
 """Providers by domain and name."""

@@ -18,7 +18,7 @@ from tests.bench._report import begin_part, this_run
 from tests.bench.test_page import a_run
 
 from trade_drivers import AttachedRobot, attach, load_driver
-from trade_drivers._driver import Driver
+from trade_drivers.plugins._driver import Driver
 from trade_drivers.robotfile import parse
 from trade_hil_sim import SimProcess
 

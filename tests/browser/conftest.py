@@ -14,7 +14,7 @@ from playwright.sync_api import Browser, Page, expect, sync_playwright
 from doors import Client
 from system.conftest import Bench, Program, bench, benches, run
 from trade import Settings
-from trade_gateway.door import add_token
+from trade_gateway.http import add_token
 from waiting import PATIENCE_S, wait_until
 
 __all__ = ["bench", "benches", "run"]

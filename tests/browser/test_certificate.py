@@ -7,7 +7,7 @@ from playwright.sync_api import expect, sync_playwright
 from browser.conftest import PATIENCE_MS, chromium
 from certificates import Papers
 from trade.testing import memory_system
-from trade_gateway.door import Door, Tokens
+from trade_gateway.http import Door, Tokens
 
 
 def test_a_certificate_of_the_systems_authority_takes_the_place_of_a_token(tmp_path: Path) -> None:

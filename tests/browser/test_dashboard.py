@@ -10,7 +10,7 @@ from playwright.sync_api import expect
 
 from browser.conftest import PAN, Browsers, Doorway, View, renderers
 from system.conftest import Bench
-from trade._endpoints import free_endpoint
+from trade._transport.endpoints import free_endpoint
 from trade_hil_sim import events
 from waiting import wait_until
 

@@ -15,12 +15,12 @@ from typing import Any
 from tests.holds import Ask, Done, Held, Log, Seen, now
 
 from trade import Container, Handle, Settings, where
-from trade._claims import Claim
-from trade._context import holding
-from trade._keys import Address
-from trade._transport import ChannelClosed
-from trade._wire import Token
-from trade._zenoh import ZenohTransport
+from trade._context.call_context import holding
+from trade._locks.claims import Claim
+from trade._protocol.keys import Address
+from trade._protocol.messages import Token
+from trade._transport.base import ChannelClosed
+from trade._transport.zenoh import ZenohTransport
 from trade.errors import TradeError
 
 LEASE_S = 0.5

@@ -14,7 +14,7 @@ from tests.chaos._records import Beat, Byte, Command, End, Grant, Renewed
 from tests.holds import Log, now
 
 from trade import Container, Resource, Settings, current_call, permit, service
-from trade._locks import LockTable
+from trade._resources.lock_table import LockTable
 
 _BYTES = 6
 _BYTE_S = 0.005

@@ -8,9 +8,9 @@ import os
 from collections.abc import Callable
 from typing import Any
 
-from trade._locks import LockTable
-from trade._resources import Permit, Resource
-from trade._wire import Token
+from trade._protocol.messages import Token
+from trade._resources.lock_table import LockTable
+from trade._resources.resource import Permit, Resource
 from trade.errors import LockLost
 
 

@@ -12,7 +12,7 @@ from system.conftest import networks_of_ones_own
 from system.member import PROVIDERS
 from system.networks import Member, ip
 from trade import Container, Settings, service, where
-from trade._endpoints import free_endpoint
+from trade._transport.endpoints import free_endpoint
 
 __all__ = ["Loopback", "Wifi"]
 

@@ -5,16 +5,16 @@ from typing import Any
 
 import pytest
 
-from trade._deadman import Deadman
-from trade_drivers._bus_thread import BusThread
-from trade_drivers.damiao._exchange import DamiaoExchange
-from trade_drivers.dynamixel import _table as dynamixel
-from trade_drivers.feetech import _table as feetech
+from trade._estop.deadman import Deadman
+from trade_drivers.bus._thread import BusThread
 from trade_drivers.joints import Axis, Course, Exchange
 from trade_drivers.joints._jobs import Enable
 from trade_drivers.joints._motion import Motion
 from trade_drivers.joints._setpoint import SetPoint
-from trade_drivers.servos import told
+from trade_drivers.joints.serial import told
+from trade_drivers.vendors.damiao._cycle import DamiaoExchange
+from trade_drivers.vendors.dynamixel import _table as dynamixel
+from trade_drivers.vendors.feetech import _table as feetech
 
 
 def a_driver_that_leaves_relaxes(patch: pytest.MonkeyPatch) -> None:
@@ -39,11 +39,11 @@ def enabling_starts_no_servo_anew(patch: pytest.MonkeyPatch) -> None:
         yield
         return axis.health
 
-    patch.setattr("trade_drivers.dynamixel._jobs._restarted", as_it_is)
+    patch.setattr("trade_drivers.vendors.dynamixel._jobs._restarted", as_it_is)
 
 
 def enabling_resets_no_fault_of_a_drive(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr("trade_drivers.cia402._jobs._reset", lambda *_: iter(()))
+    patch.setattr("trade_drivers.vendors.cia402._jobs._reset", lambda *_: iter(()))
 
 
 def the_end_of_a_session_stops_nothing(patch: pytest.MonkeyPatch) -> None:
@@ -63,11 +63,11 @@ def _torque_alone(address: int) -> Callable[..., Iterator[None]]:
 
 
 def enabling_a_dynamixel_writes_torque_alone(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr("trade_drivers.dynamixel._jobs.enabling", _torque_alone(dynamixel.TORQUE_ENABLE.address))
+    patch.setattr("trade_drivers.vendors.dynamixel._jobs.enabling", _torque_alone(dynamixel.TORQUE_ENABLE.address))
 
 
 def enabling_a_feetech_writes_torque_alone(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr("trade_drivers.feetech._jobs.enabling", _torque_alone(feetech.TORQUE.address))
+    patch.setattr("trade_drivers.vendors.feetech._jobs.enabling", _torque_alone(feetech.TORQUE.address))
 
 
 def a_course_begins_at_zero(patch: pytest.MonkeyPatch) -> None:

@@ -3,13 +3,13 @@
 import pytest
 
 from complaints.hosts import Wifi
-from trade._crew import Crew
-from trade._policies import Decision, Policy
-from trade._transport import ChannelClosed
+from trade._security.policy import Decision, Policy
+from trade._threads.channel_workers import Crew
+from trade._transport.base import ChannelClosed
 
 
 def the_devices_zero_is_taken_as_it_is(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr("trade_drivers.servos._homing.zero_moved", lambda *_: "")
+    patch.setattr("trade_drivers.joints.serial._homing.zero_moved", lambda *_: "")
 
 
 def one_thread_serves_all_calls(patch: pytest.MonkeyPatch) -> None:
@@ -41,4 +41,4 @@ def a_check_has_rules_of_its_own(patch: pytest.MonkeyPatch) -> None:
     def decision(policy: Policy, who: str, verb: str, what: str) -> Decision:
         return Policy(policy.roles.values(), policy.identities).decide(who, verb, what)  # revoked or not
 
-    patch.setattr("trade_gateway.commands._policy._decision", decision)
+    patch.setattr("trade_gateway.cli.rights._policy._decision", decision)

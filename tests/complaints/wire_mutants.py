@@ -10,18 +10,18 @@ from dynamixel_sdk import PacketHandler, PortHandler
 
 from complaints.bodies import Body
 from trade.errors import DeviceError
-from trade_drivers.cia402 import _sdo as sdo
-from trade_drivers.cia402 import _table as table
-from trade_drivers.cia402._axis import DriveAxis
-from trade_drivers.cia402._net import Net
-from trade_drivers.cia402._table import Entry
-from trade_drivers.damiao._axis import DamiaoAxis
-from trade_drivers.damiao._frames import Feedback
-from trade_drivers.dynamixel import _table as dynamixel
-from trade_drivers.dynamixel._sdk import Wire as DynamixelWire
-from trade_drivers.feetech._wire import Wire as FeetechWire
 from trade_drivers.joints import BusMotor, Gate
-from trade_drivers.servos import Answer, ServoExchange
+from trade_drivers.joints.serial import Answer, ServoExchange
+from trade_drivers.vendors.cia402 import _sdo as sdo
+from trade_drivers.vendors.cia402 import _table as table
+from trade_drivers.vendors.cia402._axis import DriveAxis
+from trade_drivers.vendors.cia402._net import Net
+from trade_drivers.vendors.cia402._table import Entry
+from trade_drivers.vendors.damiao._axis import DamiaoAxis
+from trade_drivers.vendors.damiao._frames import Feedback
+from trade_drivers.vendors.dynamixel import _table as dynamixel
+from trade_drivers.vendors.dynamixel._sdk import Wire as DynamixelWire
+from trade_drivers.vendors.feetech._wire import Wire as FeetechWire
 
 
 def a_read_that_fails_ends_the_loop(patch: pytest.MonkeyPatch) -> None:
@@ -52,11 +52,11 @@ def a_motors_frame_is_unpacked_unseen(patch: pytest.MonkeyPatch) -> None:
 
 
 def nobody_compares_the_model(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr("trade_drivers.feetech._attach.check_model", lambda *_: None)
+    patch.setattr("trade_drivers.vendors.feetech._inspect.check_model", lambda *_: None)
 
 
 def nobody_compares_the_serial_number(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr("trade_drivers.cia402._attach._check_fingerprint", lambda *_: iter(()))
+    patch.setattr("trade_drivers.vendors.cia402._inspect._check_fingerprint", lambda *_: iter(()))
 
 
 def the_bare_dynamixel_sdk_takes_whoever_obeys(patch: pytest.MonkeyPatch) -> None:

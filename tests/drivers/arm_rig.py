@@ -93,6 +93,6 @@ def children(role: str) -> list[int]:
     found: list[int] = []
     for child in psutil.Process().children():
         with suppress(psutil.NoSuchProcess):  # it has just ended
-            if f"trade_drivers.ur._{role}_child" in child.cmdline():
+            if f"trade_drivers.vendors.ur._{role}_child" in child.cmdline():
                 found.append(child.pid)
     return found

@@ -11,7 +11,7 @@ import pytest
 
 from drivers.gate import Gate
 from robots import HEAD
-from trade._context import CallContext, running
+from trade._context.call_context import CallContext, running
 from trade.errors import DeviceSilent
 from trade_drivers import AttachedRobot, Robot, attach, parse
 from trade_hil_sim import DynamixelBus, Entry, Servo, events, motion_writes, writes

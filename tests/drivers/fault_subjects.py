@@ -19,7 +19,7 @@ from drivers.motor_rig import KINDS, ROOT
 from drivers.tail_rig import TailRig, goal_of
 from trade.errors import DeviceError, DeviceFault
 from trade_drivers import Arm, Motor
-from trade_drivers.ur._dashboard import ask
+from trade_drivers.vendors.ur._dashboard import ask
 from trade_hil_sim import Entry, events, instructions, motion_writes, writes
 from waiting import PATIENCE_S, wait_until
 

@@ -14,7 +14,7 @@ import trade_hil_sim as sim
 from drivers.conftest import Outcome, Rig
 from trade.errors import ConfigurationError
 from trade_drivers import Driver, drivers, load
-from trade_drivers import _driver as driver_module
+from trade_drivers.plugins import _driver as driver_module
 from trade_hil_sim import DynamixelBus, Servo
 
 
@@ -208,7 +208,7 @@ def test_a_missing_vendor_library_is_named_with_the_command_that_installs_it(
             raise ModuleNotFoundError("No module named 'dynamixel_sdk'")
         return real(name, *args, **kwargs)
 
-    monkeypatch.delitem(sys.modules, "trade_drivers.dynamixel._sdk", raising=False)
+    monkeypatch.delitem(sys.modules, "trade_drivers.vendors.dynamixel._sdk", raising=False)
     monkeypatch.setattr(builtins, "__import__", without)
     assert "needs dynamixel-sdk" in (text := refused(head))
     assert 'pip install "trade-drivers[dynamixel]"' in text

@@ -12,11 +12,11 @@ import can
 import pytest
 
 from trade.errors import ConfigurationError
-from trade_drivers.can import CanPort, ErrorState, Frame, LoadMeter, error_state, frame_bits, split_port
-from trade_drivers.cia402 import _machine as machine
-from trade_drivers.cia402 import _table as table
-from trade_drivers.cia402._machine import State, command_towards_enabled, state_of
+from trade_drivers.bus.can import CanPort, ErrorState, Frame, LoadMeter, error_state, frame_bits, split_port
 from trade_drivers.joints import PortLost
+from trade_drivers.vendors.cia402 import _machine as machine
+from trade_drivers.vendors.cia402 import _table as table
+from trade_drivers.vendors.cia402._machine import State, command_towards_enabled, state_of
 from trade_hil_sim import BusOff, CanBus, Replug, Unplug, frames
 
 _numbers = itertools.count()

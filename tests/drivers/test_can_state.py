@@ -10,8 +10,8 @@ import pytest
 from drivers.legs import HIP, Leg, leg, rig
 from trade import Container, where
 from trade_drivers import CanBusState, CanMonitor
-from trade_drivers.can import CanPort, ErrorState, frame_bits
-from trade_drivers.can._netlink import Link, look_at, parse_link
+from trade_drivers.bus.can import CanPort, ErrorState, frame_bits
+from trade_drivers.bus.can._netlink import Link, look_at, parse_link
 from trade_drivers.joints import PortLost
 from trade_hil_sim import BadCrc, BusOff, Heal, Replug, Unplug
 from waiting import wait_until

@@ -133,8 +133,8 @@ def test_a_missing_library_is_named_with_its_remedy(leg: Leg, monkeypatch: pytes
             raise ImportError(f"No module named {name!r}")
         return real(name, *rest)
 
-    for module in [name for name in sys.modules if name.startswith(("trade_drivers.cia402._", "canopen"))]:
-        if module != "trade_drivers.cia402._driver":
+    for module in [name for name in sys.modules if name.startswith(("trade_drivers.vendors.cia402._", "canopen"))]:
+        if module != "trade_drivers.vendors.cia402._driver":
             monkeypatch.delitem(sys.modules, module)
     monkeypatch.setattr(builtins, "__import__", without_canopen)
     assert 'pip install "trade-drivers[cia402]"' in refused(leg)

@@ -5,7 +5,7 @@ from typing import Any
 from drivers.conftest import written_now
 from drivers.legs import HIP, KNEE, Leg, leg, rig, stop_by_nmt
 from trade_drivers import scan
-from trade_drivers.cia402 import Cia402Driver
+from trade_drivers.vendors.cia402 import Cia402Driver
 from trade_hil_sim import Absent
 
 __all__ = ["leg", "rig"]

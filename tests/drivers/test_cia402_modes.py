@@ -24,11 +24,11 @@ from drivers.legs import (
 from drivers.test_cia402_motor import through
 from trade.errors import DeviceFault, MotionStopped
 from trade_drivers import JointGroup, Tolerances
-from trade_drivers._plan import Course
-from trade_drivers.cia402 import _table as table
-from trade_drivers.cia402._motor import Drive
-from trade_drivers.cia402._stream import Following, Turning, interpolation_period
 from trade_drivers.joints import Sample
+from trade_drivers.motion._plan import Course
+from trade_drivers.vendors.cia402 import _table as table
+from trade_drivers.vendors.cia402._motor import Drive
+from trade_drivers.vendors.cia402._stream import Following, Turning, interpolation_period
 from trade_hil_sim import Entry, Mute
 from trade_hil_sim.cia402 import Cia402Bus
 from waiting import PATIENCE_S, wait_until

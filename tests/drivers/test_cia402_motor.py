@@ -9,7 +9,7 @@ from drivers.conftest import Outcome, written_now
 from drivers.legs import COUNTS_PER_RAD, GO, HALT, HIP, HOMING, KNEE, PROFILE_POSITION, Leg, leg, only, rig
 from trade.errors import ConfigurationError, DeviceFault, InvalidArgument, LimitExceeded, MotionStopped
 from trade_drivers import JointGroup, Tolerances, Trajectory, TrajectoryPoint
-from trade_drivers.cia402._motor import Drive
+from trade_drivers.vendors.cia402._motor import Drive
 from waiting import wait_until
 
 __all__ = ["leg", "rig"]

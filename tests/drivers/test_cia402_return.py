@@ -17,8 +17,8 @@ from drivers.conftest import Outcome, sleep_past, written_now
 from drivers.legs import HIP, KNEE, LEG, Leg, fault_of, leg, rig, stop_by_nmt
 from trade.errors import DeviceFault, DeviceSilent, TradeError
 from trade_drivers import AttachedRobot, Motor, attach, parse
-from trade_drivers.cia402 import _table as table
-from trade_drivers.cia402._axis import Stage
+from trade_drivers.vendors.cia402 import _table as table
+from trade_drivers.vendors.cia402._axis import Stage
 from trade_hil_sim import Absent, BrownOut, Entry, Heal, Late, Mute, SimProcess, events, frames
 from waiting import wait_until
 

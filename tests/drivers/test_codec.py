@@ -12,12 +12,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import trade_drivers
-from trade_drivers.dynamixel import _table as table
-from trade_drivers.dynamixel._axis import CYCLIC, GRAIN, SLOW, DynamixelAxis
-from trade_drivers.dynamixel._frames import Corrupt, crc16, take_status, unstuffed
 from trade_drivers.joints._axis import Scale
 from trade_drivers.joints._profile import Leg, together
 from trade_drivers.robotfile import Joint
+from trade_drivers.vendors.dynamixel import _table as table
+from trade_drivers.vendors.dynamixel._axis import CYCLIC, GRAIN, SLOW, DynamixelAxis
+from trade_drivers.vendors.dynamixel._frames import Corrupt, crc16, take_status, unstuffed
 from trade_hil_sim.dynamixel import status
 
 
@@ -192,5 +192,5 @@ def test_the_public_names_are_there() -> None:
 
 
 def test_no_vendor_library_is_imported_before_a_bus_is_attached() -> None:
-    code = "import sys, trade_drivers, trade_drivers.dynamixel; print({'serial', 'dynamixel_sdk'} & set(sys.modules))"
+    code = "import sys, trade_drivers, trade_drivers.vendors.dynamixel; print({'serial', 'dynamixel_sdk'} & set(sys.modules))"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "set()\n"

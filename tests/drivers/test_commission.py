@@ -9,9 +9,9 @@ import pytest
 
 from trade.errors import ConfigurationError
 from trade_drivers import Commissioner, Found, scan
-from trade_drivers.dynamixel import DynamixelDriver
-from trade_drivers.feetech import FeetechDriver
-from trade_drivers.robotiq import RobotiqDriver
+from trade_drivers.vendors.dynamixel import DynamixelDriver
+from trade_drivers.vendors.feetech import FeetechDriver
+from trade_drivers.vendors.robotiq import RobotiqDriver
 from trade_hil_sim import DynamixelBus, Gripper, Mute, RobotiqBus, Servo, WrongModel, motion_writes, writes
 from trade_hil_sim.feetech import FeetechBus
 from trade_hil_sim.feetech import Servo as FeetechServo

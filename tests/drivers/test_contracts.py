@@ -19,7 +19,7 @@ from trade_drivers import AttachedRobot, JointGroup, Motor, Robot, attach, parse
 from trade_drivers.robotfile import Bus
 from trade_drivers.testing import JointGroupContract, MotorContract
 from trade_hil_sim import ByteLog, SimProcess, events
-from trade_hil_sim._robot import buses_of
+from trade_hil_sim.robot._robot import buses_of
 
 FILES = {
     "head": HEAD,

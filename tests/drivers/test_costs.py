@@ -23,7 +23,7 @@ from drivers.legs import Leg
 from drivers.motor_rig import DamiaoRig, OdriveRig
 from drivers.tail_rig import TailRig
 from trade_drivers import AttachedRobot
-from trade_drivers._driver import Driver, drivers
+from trade_drivers.plugins._driver import Driver, drivers
 from trade_hil_sim import Entry
 from waiting import wait_until
 

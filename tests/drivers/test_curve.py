@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trade_drivers._curve import Curve, Way, there_together
+from trade_drivers.motion._spline import Curve, Way, there_together
 
 ANGLES = st.floats(-3, 3)
 STEPS = st.floats(0.05, 2)

@@ -5,7 +5,7 @@ import pytest
 from drivers.conftest import Outcome, Rig
 from trade.errors import ConfigurationError
 from trade_drivers import scan
-from trade_drivers.dynamixel import DynamixelDriver
+from trade_drivers.vendors.dynamixel import DynamixelDriver
 from trade_hil_sim import MODELS, Jam, Servo, WrongModel, instructions
 from waiting import wait_until
 

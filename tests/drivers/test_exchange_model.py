@@ -13,8 +13,8 @@ from hypothesis.stateful import RuleBasedStateMachine, precondition, rule
 
 from trade import Resource
 from trade.errors import BusGone, DeviceFault, DeviceSilent, TradeError
-from trade_drivers._exchange import HALT_NS, BusExchange, StopTicket, _drained
-from trade_drivers._work import Device, Steps, Work
+from trade_drivers.bus._cycle import HALT_NS, BusExchange, StopTicket, _drained
+from trade_drivers.bus._jobs import Device, Steps, Work
 from waiting import PATIENCE_S
 
 MS = 1_000_000

@@ -13,8 +13,8 @@ from drivers.conftest import Outcome, Rig, goal_counts, written_now
 from trade import permit
 from trade.errors import BusGone, DeviceFault, DeviceSilent
 from trade_drivers import AttachedRobot, MotorState
-from trade_drivers.dynamixel import open_exchange
 from trade_drivers.joints._jobs import Enable, Relax
+from trade_drivers.vendors.dynamixel import open_exchange
 from waiting import wait_until
 
 COUNT_RAD = 6.283185 / 4096

@@ -10,12 +10,12 @@ import pytest
 import rustypot
 from hypothesis import strategies as st
 
-from trade_drivers.feetech import _table as table
-from trade_drivers.feetech._axis import CYCLIC, SLOW, FeetechAxis
-from trade_drivers.feetech._frames import Corrupt, Status, packet, take_status
-from trade_drivers.feetech._jobs import GOAL_BLOCK, goal_block
 from trade_drivers.joints import Goal, Sample
 from trade_drivers.robotfile import Joint
+from trade_drivers.vendors.feetech import _table as table
+from trade_drivers.vendors.feetech._axis import CYCLIC, SLOW, FeetechAxis
+from trade_drivers.vendors.feetech._frames import Corrupt, Status, packet, take_status
+from trade_drivers.vendors.feetech._jobs import GOAL_BLOCK, goal_block
 from trade_hil_sim.feetech import STS3215, PacketReader, encode, status
 
 REGISTERS = {name: value for name, value in vars(table).items() if isinstance(value, table.Register)}
@@ -185,5 +185,5 @@ def test_a_joint_that_is_not_heard_on_its_way_is_not_told_to_hold_beyond_where_i
 
 
 def test_importing_the_driver_needs_no_serial_library() -> None:
-    code = "import sys, trade_drivers, trade_drivers.feetech; print({'serial'} & set(sys.modules))"
+    code = "import sys, trade_drivers, trade_drivers.vendors.feetech; print({'serial'} & set(sys.modules))"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "set()\n"

@@ -9,7 +9,7 @@ import pytest
 import trade_hil_sim
 from drivers.conftest import Outcome, Rig, call, goal_counts, written_now
 from trade import where
-from trade._context import CallContext, running
+from trade._context.call_context import CallContext, running
 from trade.errors import InvalidArgument, LimitExceeded, MotionStopped, ToleranceExceeded, TradeError
 from trade.testing import memory_system
 from trade_drivers import AttachedRobot, FollowProgress, JointGroup, Tolerances, Trajectory, TrajectoryPoint

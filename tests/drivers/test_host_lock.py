@@ -10,14 +10,14 @@ from itertools import count
 import pytest
 
 from trade.errors import ConfigurationError
-from trade_drivers._host_lock import HostLock, Taken
-from trade_drivers._serial import SerialLine
-from trade_drivers.can import CanPort
+from trade_drivers.bus._host_lock import HostLock, Taken
+from trade_drivers.bus._serial_port import SerialLine
+from trade_drivers.bus.can import CanPort
 
 _numbers = count()
 _HOLDER = """
 import sys
-from trade_drivers._host_lock import HostLock
+from trade_drivers.bus._host_lock import HostLock
 lock = HostLock(sys.argv[1], "robot.toml: bus.legs")
 lock.take()
 print("held", flush=True)

@@ -11,8 +11,8 @@ from drivers.conftest import written_now
 from drivers.motor_rig import KINDS, ROOT, TIP, MotorRig, motor_rig, wag
 from trade.errors import ConfigurationError, DeviceFault
 from trade_drivers import load
-from trade_drivers.odrive import _frames as frames
-from trade_drivers.odrive._frames import Command, Control, Input, State, frame_id
+from trade_drivers.vendors.odrive import _frames as frames
+from trade_drivers.vendors.odrive._frames import Command, Control, Input, State, frame_id
 from trade_hil_sim import Absent, WrongModel
 from waiting import wait_until
 

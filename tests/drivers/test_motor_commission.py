@@ -13,10 +13,10 @@ import pytest
 from drivers.motor_rig import ROOT, TIP, MotorRig, motor_rig, wag
 from trade.errors import ConfigurationError, WrongDevice
 from trade_drivers import Commissioner, Found, scan
-from trade_drivers.can import Talk
-from trade_drivers.cia402 import Cia402Driver
-from trade_drivers.damiao import DamiaoDriver
-from trade_drivers.odrive import OdriveDriver
+from trade_drivers.bus.can import Talk
+from trade_drivers.vendors.cia402 import Cia402Driver
+from trade_drivers.vendors.damiao import DamiaoDriver
+from trade_drivers.vendors.odrive import OdriveDriver
 from trade_hil_sim import WrongModel, frames
 from trade_hil_sim.can import CanBus
 from trade_hil_sim.cia402 import Drive

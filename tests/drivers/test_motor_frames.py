@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trade_drivers.damiao import _frames as damiao
-from trade_drivers.odrive import _frames as odrive
-from trade_drivers.odrive._frames import Command, Control, Input, State, frame_id
+from trade_drivers.vendors.damiao import _frames as damiao
+from trade_drivers.vendors.odrive import _frames as odrive
+from trade_drivers.vendors.odrive._frames import Command, Control, Input, State, frame_id
 from trade_hil_sim.damiao import MODELS, Ranges, decode_mit, encode_feedback
 from trade_hil_sim.damiao import Register as SimRegister
 from trade_hil_sim.damiao import Status as SimStatus

@@ -10,9 +10,9 @@ from drivers.legs import HIP, PATIENT, Leg
 from drivers.motor_rig import KINDS, ROOT
 from trade.errors import ConfigurationError
 from trade_drivers import Commissioner, Motor, scan
-from trade_drivers.cia402 import Cia402Driver
-from trade_drivers.damiao import DamiaoDriver
-from trade_drivers.odrive import OdriveDriver
+from trade_drivers.vendors.cia402 import Cia402Driver
+from trade_drivers.vendors.damiao import DamiaoDriver
+from trade_drivers.vendors.odrive import OdriveDriver
 
 RIGS: dict[str, type[Leg]] = {"cia402": Leg, **KINDS}
 COMMISSIONERS: dict[str, Callable[[], Commissioner]] = {

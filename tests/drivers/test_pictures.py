@@ -4,8 +4,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trade_drivers.snapshot._http import Answer, Place, parse_answer, place_of
-from trade_drivers.snapshot._picture import Picture, picture
+from trade_drivers.vendors.snapshot._http import Answer, Place, parse_answer, place_of
+from trade_drivers.vendors.snapshot._picture import Picture, picture
 from trade_hil_sim.scene import png
 
 APP0 = b"\xff\xe0\x00\x10JFIF\0\1\1\0\0\1\0\1\0\0"

@@ -16,7 +16,7 @@ from trade.errors import ConfigurationError, DeviceSilent
 from trade_drivers import AttachedRobot, Sensor, attach, drivers, load
 from trade_drivers.testing import SensorContract
 from trade_hil_sim import ByteLog, Heal, Late, Mute, Replug, SimProcess, SimulationError, Supply, Truncate, Unplug
-from trade_hil_sim._robot import buses_of, read_robot
+from trade_hil_sim.robot._robot import buses_of, read_robot
 from waiting import wait_until
 
 PLUGIN = Path(__file__).parents[2] / "examples" / "plugin"

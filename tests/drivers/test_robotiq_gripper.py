@@ -10,8 +10,8 @@ from drivers.gripper_rig import HandRig, made_rig
 from robots import HAND, HEAD
 from trade.errors import ConfigurationError, DeviceFault, MotionStopped
 from trade_drivers import Gripper, SerialBus, attach, parse
-from trade_drivers.robotiq import _table as table
 from trade_drivers.testing import GripperContract
+from trade_drivers.vendors.robotiq import _table as table
 from trade_hil_sim import Absent, DynamixelBus, Put
 from trade_hil_sim.robotiq import _table as simulated
 from waiting import wait_until

@@ -248,9 +248,9 @@ def test_S07_a_stop_waits_for_one_exchange_at_most_although_a_joint_is_silent(he
 
 
 def test_S07_no_exchange_waits_longer_than_a_stop_may() -> None:
-    from trade_drivers import _serial
+    from trade_drivers.bus import _serial_port
 
-    assert _serial.LONGEST_WAIT_S < 0.050
+    assert _serial_port.LONGEST_WAIT_S < 0.050
 
 
 def test_S08_a_command_admitted_before_a_stop_is_dropped_after_it(head: Rig, gate: Gate) -> None:

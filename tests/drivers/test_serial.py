@@ -9,10 +9,10 @@ from typing import NoReturn
 import pytest
 
 from trade.errors import ConfigurationError, DeadlineExceeded
-from trade_drivers._serial import LONGEST_WAIT_S, SerialLine, SerialWire
-from trade_drivers._work import PortLost
-from trade_drivers.dynamixel._sdk import Wire as ServoWire
-from trade_drivers.robotiq._modbus import Wire as GripperWire
+from trade_drivers.bus._jobs import PortLost
+from trade_drivers.bus._serial_port import LONGEST_WAIT_S, SerialLine, SerialWire
+from trade_drivers.vendors.dynamixel._sdk import Wire as ServoWire
+from trade_drivers.vendors.robotiq._modbus import Wire as GripperWire
 
 WIRES = pytest.mark.parametrize("kind", [ServoWire, GripperWire], ids=["dynamixel", "robotiq"])
 

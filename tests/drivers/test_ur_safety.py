@@ -207,7 +207,7 @@ def test_S07_a_stop_and_the_state_are_answered_at_once_while_a_lost_controller_i
 def test_S07_a_driver_is_closed_while_a_silent_controller_is_looked_for(
     rig: ArmRig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("trade_drivers.ur._link._FIRST_S", 3600.0)
+    monkeypatch.setattr("trade_drivers.vendors.ur._link._FIRST_S", 3600.0)
     rig.sim.do(Absent())
     wait_until(lambda: _is_gone(rig.arm), "it is noticed")
     wait_until(_freezes_who_looks, "there is a process that looks for it")

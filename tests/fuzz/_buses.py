@@ -10,25 +10,25 @@ from pymodbus.framer import FramerRTU
 from tests.fuzz._target import Target
 
 from trade.errors import DeviceError
-from trade_drivers.can._netlink import parse_link
-from trade_drivers.cia402 import _sdo as sdo
-from trade_drivers.cia402._axis import DriveAxis
-from trade_drivers.damiao._axis import DamiaoAxis
-from trade_drivers.dynamixel import _frames as dynamixel
-from trade_drivers.feetech import _frames as feetech
-from trade_drivers.odrive._axis import OdriveAxis
+from trade_drivers.bus.can._netlink import parse_link
 from trade_drivers.robotfile import parse
-from trade_drivers.robotiq._modbus import _QuietClient as ModbusClient
-from trade_drivers.snapshot._picture import picture
-from trade_drivers.ur import _dashboard as dashboard
+from trade_drivers.vendors.cia402 import _sdo as sdo
+from trade_drivers.vendors.cia402._axis import DriveAxis
+from trade_drivers.vendors.damiao._axis import DamiaoAxis
+from trade_drivers.vendors.dynamixel import _frames as dynamixel
+from trade_drivers.vendors.feetech import _frames as feetech
+from trade_drivers.vendors.odrive._axis import OdriveAxis
+from trade_drivers.vendors.robotiq._modbus import _QuietClient as ModbusClient
+from trade_drivers.vendors.snapshot._picture import picture
+from trade_drivers.vendors.ur import _dashboard as dashboard
 from trade_hil_sim import SimulationError, UrBus
-from trade_hil_sim import _control as control
 from trade_hil_sim.can._device import Device
 from trade_hil_sim.can._frame import Frame
 from trade_hil_sim.can._interface import LAYOUT
 from trade_hil_sim.can._interface import _frame as frame_of
 from trade_hil_sim.can._text import Reader, frame_text, parse_send
 from trade_hil_sim.cia402 import Drive
+from trade_hil_sim.control import _server as control
 from trade_hil_sim.damiao import Motor
 from trade_hil_sim.dynamixel import DynamixelBus
 from trade_hil_sim.dynamixel import _protocol as dynamixel_sim

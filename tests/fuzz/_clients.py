@@ -5,8 +5,8 @@ from typing import Any, Final
 import msgspec
 from tests.fuzz._target import Target
 
-from trade_gateway.agents._tools import TOOLS
-from trade_gateway.clients import _messages as messages
+from trade_gateway.clients import _schemas as messages
+from trade_gateway.mcp._tools import TOOLS
 
 _BODIES: Final = [
     messages.CallBody,

@@ -8,18 +8,12 @@ from msgspec import Meta, Raw, Struct
 from tests.fuzz._target import Target
 
 from trade import Constraint, Handle, Secret, service
-from trade._endpoints import Endpoint
-from trade._estop_messages import decode_estop_confirmed, decode_estop_order, decode_open_estops
-from trade._failures import pack_error, unpack_error
-from trade._handle_codec import handle_codec
-from trade._inherited import InheritedLock
-from trade._keys import Address, ServiceKey
-from trade._predicates import achieves_all, parse_predicates
-from trade._sample import decode_sample
-from trade._service import marked_methods
-from trade._signature import Signature
-from trade._watch import _place as place_of
-from trade._wire import (
+from trade._calls.handle_codec import handle_codec
+from trade._discovery.listener import _place as place_of
+from trade._locks.inherited import InheritedLock
+from trade._protocol.estop_messages import decode_estop_confirmed, decode_estop_order, decode_open_estops
+from trade._protocol.keys import Address, ServiceKey
+from trade._protocol.messages import (
     UNREADABLE,
     ErrorInfo,
     Malformed,
@@ -31,6 +25,12 @@ from trade._wire import (
     decode_tally,
     encode_message,
 )
+from trade._protocol.remote_errors import pack_error, unpack_error
+from trade._protocol.samples import decode_sample
+from trade._registry.predicates import achieves_all, parse_predicates
+from trade._services.decorator import marked_methods
+from trade._services.signature import Signature
+from trade._transport.endpoints import Endpoint
 from trade.errors import ConfigurationError, InvalidArgument, TradeError
 
 ME: Final = Address("anna", "kitchen", "e1")

@@ -9,22 +9,22 @@ from typing import Any, Final
 
 from tests.fuzz._target import Target
 
-from trade._estop_store import _read as read_open_estop
-from trade._policy_file import read_policy
-from trade._rules_file import read_rules
+from trade._estop.store import _read as read_open_estop
+from trade._security.policy_file import read_policy
 from trade.errors import ConfigurationError
+from trade.rules._file import read_rules
 from trade_drivers.robotfile import parse as parse_robot
-from trade_gateway._gateway_file import read_gateway_file
-from trade_gateway._pki import Authority
-from trade_gateway._system_file import read_system_file
-from trade_gateway.commands._archive import read_archive
-from trade_gateway.commands._audit import _noted as read_notes
-from trade_gateway.commands._audit import _verified as verified
-from trade_gateway.commands._named import named_files
-from trade_gateway.door._tokens import Tokens
+from trade_gateway.cli.operation._archive import read_archive
+from trade_gateway.cli.operation._file_closure import named_files
+from trade_gateway.cli.watching._audit import _noted as read_notes
+from trade_gateway.cli.watching._audit import _verified as verified
+from trade_gateway.config._gateway import read_gateway_file
+from trade_gateway.config._system import read_system_file
+from trade_gateway.http._tokens import Tokens
+from trade_gateway.language import read_lexicon
+from trade_gateway.language._previous_answer import _read as read_memory
+from trade_gateway.pki._authority import Authority
 from trade_gateway.ros._file import read_ros_file
-from trade_gateway.talk import read_lexicon
-from trade_gateway.talk._memory import _read as read_memory
 
 _FOLDER: Final = tempfile.TemporaryDirectory(prefix="trade-fuzz-")
 

@@ -23,17 +23,17 @@ from tests.fuzz._ros import _TYPES as TYPES
 from tests.fuzz.targets import TARGETS
 
 from trade import where
-from trade._audit_chain import AuditRow
-from trade._audit_store import AuditStore
-from trade._failures import pack_error
-from trade._sample import StreamSample
-from trade._wire import EMPTY, PROTOCOL, Estop, encode_message
+from trade._audit.hash_chain import AuditRow
+from trade._audit.store import AuditStore
+from trade._protocol.messages import EMPTY, PROTOCOL, Estop, encode_message
+from trade._protocol.remote_errors import pack_error
+from trade._protocol.samples import StreamSample
 from trade.errors import LimitExceeded, LockedByOther
-from trade_drivers.dynamixel._frames import crc16 as dynamixel_crc
-from trade_drivers.feetech._frames import packet as feetech_packet
-from trade_gateway.agents._tools import TOOLS
-from trade_gateway.commands._archive import _MANIFEST as MANIFEST
-from trade_gateway.commands._archive import Entry, Manifest
+from trade_drivers.vendors.dynamixel._frames import crc16 as dynamixel_crc
+from trade_drivers.vendors.feetech._frames import packet as feetech_packet
+from trade_gateway.cli.operation._archive import _MANIFEST as MANIFEST
+from trade_gateway.cli.operation._archive import Entry, Manifest
+from trade_gateway.mcp._tools import TOOLS
 from trade_gateway.ros.ros2._attachment import Attachment
 from trade_hil_sim.dynamixel import encode as dynamixel_packet
 from trade_hil_sim.robotiq._protocol import frame as modbus_frame

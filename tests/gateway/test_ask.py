@@ -11,7 +11,7 @@ from trade import Container, service, where
 from trade.errors import ConfigurationError, InvalidArgument
 from trade.testing import MemorySystem, memory_system
 from trade_gateway.cli import app
-from trade_gateway.talk import Memory, NotUnderstood, Talk, read_lexicon
+from trade_gateway.language import Memory, NotUnderstood, Talk, read_lexicon
 
 
 class Eyes:

@@ -6,7 +6,7 @@ import subprocess
 import sys
 import threading
 
-from trade_gateway._asked import Asked
+from trade_gateway.process._signal_event import Asked
 from waiting import PATIENCE_S, wait_until
 
 

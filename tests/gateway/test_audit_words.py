@@ -11,11 +11,11 @@ import pytest
 from msgspec import structs
 from typer.testing import CliRunner
 
-from trade._audit_chain import AuditRow
-from trade._audit_store import AuditStore, Keep
+from trade._audit.hash_chain import AuditRow
+from trade._audit.store import AuditStore, Keep
 from trade.errors import ConfigurationError
 from trade_gateway.cli import app
-from trade_gateway.commands._output import UsageError
+from trade_gateway.cli._output import UsageError
 
 
 def trade(*words: str | Path) -> Any:

@@ -19,8 +19,8 @@ from certificates import Papers
 from trade.errors import ConfigurationError
 from trade.policies import read_policy
 from trade_gateway.cli import app
-from trade_gateway.commands._archive import Manifest, read_archive, unpack
-from trade_gateway.supervisor._alone import alone, lock_of
+from trade_gateway.cli.operation._archive import Manifest, read_archive, unpack
+from trade_gateway.supervisor._single_instance import alone, lock_of
 
 ROOT = Path(__file__).parents[2]
 FILE = """

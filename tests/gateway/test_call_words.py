@@ -4,8 +4,8 @@ import json
 
 import pytest
 
-from trade_gateway.commands._call import parse_arguments
-from trade_gateway.commands._output import Output, UsageError
+from trade_gateway.cli._output import Output, UsageError
+from trade_gateway.cli.services._call import parse_arguments
 
 
 def test_words_are_json_by_place_or_by_name() -> None:

@@ -10,16 +10,16 @@ import pytest
 from typer.testing import CliRunner
 
 from robots import HAND, HEAD, TAIL
-from trade._endpoints import free_endpoint
+from trade._transport.endpoints import free_endpoint
 from trade_drivers import CanBus, Found, parse
-from trade_drivers.can import ErrorState, Link
-from trade_gateway._pki import Authority
+from trade_drivers.bus.can import ErrorState, Link
 from trade_gateway.cli import app
-from trade_gateway.commands import _doctor_host as host
-from trade_gateway.commands import _doctor_robot as robots
-from trade_gateway.commands._doctor import _of_robot
-from trade_gateway.commands._doctor_host import Finding
-from trade_gateway.commands._first_file import first_file
+from trade_gateway.cli.hardware import _doctor_host as host
+from trade_gateway.cli.hardware import _doctor_robot as robots
+from trade_gateway.cli.hardware._doctor import _of_robot
+from trade_gateway.cli.hardware._doctor_host import Finding
+from trade_gateway.cli.hardware._robot_file_template import first_file
+from trade_gateway.pki._authority import Authority
 from trade_hil_sim import DynamixelBus, Mute, writes
 
 
@@ -68,7 +68,9 @@ def test_a_library_that_is_missing_is_named_with_what_installs_it(
     monkeypatch: pytest.MonkeyPatch, needed: bool, level: str
 ) -> None:
     assert only(host.libraries(["dynamixel"], needed=needed)).level == "ok"
-    monkeypatch.setattr("trade_drivers._driver.find_spec", lambda name: None if name == "dynamixel_sdk" else object())
+    monkeypatch.setattr(
+        "trade_drivers.plugins._driver.find_spec", lambda name: None if name == "dynamixel_sdk" else object()
+    )
     found = only(host.libraries(["dynamixel"], needed=needed))
     assert (found.level, found.text) == (level, "needs dynamixel_sdk")
     assert found.fix == 'pip install "trade-drivers[dynamixel]"'
@@ -192,7 +194,7 @@ def test_another_device_than_the_file_says_is_an_error(robot_file: Path) -> None
 
 def test_a_line_in_use_is_left_alone(robot_file: Path) -> None:
     with simulated(robot_file) as sim:
-        from trade_drivers.dynamixel import DynamixelDriver
+        from trade_drivers.vendors.dynamixel import DynamixelDriver
 
         bench = DynamixelDriver.commissioner().open(str(sim.port), 1_000_000)
         try:

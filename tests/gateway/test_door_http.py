@@ -22,7 +22,7 @@ from trade import Handle, Sight, service, where
 from trade.errors import Stopped
 from trade.testing import memory_system
 from trade_gateway.cli import app
-from trade_gateway.door import add_token
+from trade_gateway.http import add_token
 from waiting import PATIENCE_S, wait_until
 
 

@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 
 from doors import POLICY, Client, Opened, ask, govern, governed, heard, say
-from trade._audit import Event
-from trade._audit_chain import AuditRow
-from trade._audit_store import AuditStore
+from trade._audit.events import Event
+from trade._audit.hash_chain import AuditRow
+from trade._audit.store import AuditStore
 from trade.errors import ConfigurationError
-from trade_gateway.clients._records import newest
+from trade_gateway.clients._audit_reader import newest
 from waiting import wait_until
 
 

@@ -10,11 +10,11 @@ import pytest
 
 from trade_drivers import load
 from trade_drivers.robotfile import Drill
-from trade_gateway.commands._drill import _chosen
-from trade_gateway.commands._output import UsageError
-from trade_gateway.drill import SCENES, Played, Report, Scene, Stop, Target, _play, as_data, page, play, targets_of
-from trade_gateway.drill._actors import DrillFailed
+from trade_gateway.cli._output import UsageError
+from trade_gateway.cli.hardware._drill import _chosen
+from trade_gateway.drill import SCENES, Played, Report, Scene, Stop, Target, _runner, as_data, page, play, targets_of
 from trade_gateway.drill._judge import Judge
+from trade_gateway.drill._processes import DrillFailed
 from trade_gateway.drill._scenes import ALLOWANCE_S, limit_s
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -268,7 +268,7 @@ def test_a_joint_is_judged_by_when_it_rested_for_good(
     verdict: str,
 ) -> None:
     for name, seconds in (("_ON_ITS_WAY_S", 0.01), ("_QUIET_S", 0.05), ("_REST_S", 2.0)):
-        monkeypatch.setattr(_play, name, seconds)
+        monkeypatch.setattr(_runner, name, seconds)
     targets, _ = targets_of(load(EXAMPLES / "head.toml"))
     stand = ScriptedStand(tmp_path / "log.jsonl", script, after_mending)
     played = play(stand, BY_NAME["unplug"], targets, Drill(unplug=0.5))
@@ -277,7 +277,7 @@ def test_a_joint_is_judged_by_when_it_rested_for_good(
 
 def test_a_joint_that_rested_before_the_deed_has_shown_nothing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     for name, seconds in (("_ON_ITS_WAY_S", 0.01), ("_QUIET_S", 0.05)):
-        monkeypatch.setattr(_play, name, seconds)
+        monkeypatch.setattr(_runner, name, seconds)
     targets, _ = targets_of(load(EXAMPLES / "head.toml"))
     stand = ScriptedStand(tmp_path / "log.jsonl", [(-0.001, False)], [])
     played = play(stand, BY_NAME["unplug"], targets, Drill())

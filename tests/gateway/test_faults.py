@@ -7,9 +7,9 @@ from unittest.mock import create_autospec
 import pytest
 
 from trade_drivers import FaultLog, Gripper, Motor
-from trade_drivers.faults._lookout import Found
-from trade_gateway.commands._faults import FaultWatch
-from trade_gateway.commands._output import Output
+from trade_drivers.faults._detector import Found
+from trade_gateway.cli._output import Output
+from trade_gateway.cli.robots._fault_reporter import FaultWatch
 
 OVERLOAD = Found("overload", "rosie.pan: overload", "remove the cause")
 BLOCKED = Found("is it blocked?", "rosie.pan: is it blocked?", "remove the cause")

@@ -9,13 +9,13 @@ from pathlib import Path
 
 import pytest
 
-from trade_gateway._fence import Term, uptime_s
-from trade_gateway.supervisor._alone import alone, is_free
+from trade_gateway.process._kill_timer import Term, uptime_s
+from trade_gateway.supervisor._single_instance import alone, is_free
 from waiting import PATIENCE_S, wait_until
 
 STAYS = """
 import os, signal, sys, threading
-from trade_gateway._lifeline import end_with_stdin
+from trade_gateway.process._parent_watch import end_with_stdin
 signal.signal(signal.SIGTERM, lambda *_: os.write(1, b"told to leave\\n"))  # print may be at work
 end_with_stdin(leased=True)
 print("up", flush=True)

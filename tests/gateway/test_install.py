@@ -15,10 +15,10 @@ from robots import HEAD
 from trade.errors import ConfigurationError
 from trade_drivers import load
 from trade_gateway.cli import app
-from trade_gateway.commands import _install
-from trade_gateway.commands._install import _closed_to
-from trade_gateway.commands._output import UsageError
-from trade_gateway.commands._unit import UDEV_RULES, Needs, needs_of, unit_text
+from trade_gateway.cli._output import UsageError
+from trade_gateway.cli.operation import _install
+from trade_gateway.cli.operation._install import _closed_to
+from trade_gateway.cli.operation._systemd_unit import UDEV_RULES, Needs, needs_of, unit_text
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 FILE = """

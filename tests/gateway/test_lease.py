@@ -8,7 +8,7 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
-from trade_gateway._fence import Term
+from trade_gateway.process._kill_timer import Term
 from trade_gateway.supervisor._lease import Arbiter, Holder, Lease, waits_s
 
 LEASE_S = 10.0

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from trade_gateway.supervisor._life import Do, Life, State
+from trade_gateway.supervisor._state_machine import Do, Life, State
 from trade_gateway.supervisor._tables import Supervised
 
 

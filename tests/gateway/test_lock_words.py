@@ -17,8 +17,8 @@ from trade.errors import (
     TooManyServices,
 )
 from trade_gateway.cli import app
-from trade_gateway.commands._lock import _wanted
-from trade_gateway.commands._output import REMEDIES, UsageError, say_error
+from trade_gateway.cli._output import REMEDIES, UsageError, say_error
+from trade_gateway.cli.motion._lock import _wanted
 
 
 @pytest.mark.parametrize("command", ["lock", "locks", "unlock", "resume", "estop"])

@@ -16,10 +16,11 @@ from typer.testing import CliRunner, Result
 
 from trade.errors import ConfigurationError, TradeError
 from trade.policies import read_policy
-from trade_gateway import _files, _pki
-from trade_gateway._pki import Authority, Issued, NameRevoked, NameTaken, NoAuthority
 from trade_gateway.cli import build
-from trade_gateway.commands._pki_commands import app
+from trade_gateway.cli.rights._pki import app
+from trade_gateway.pki import _authority
+from trade_gateway.pki._authority import Authority, Issued, NameRevoked, NameTaken, NoAuthority
+from trade_gateway.process import _atomic_file
 
 
 @pytest.fixture
@@ -85,13 +86,13 @@ def test_whoever_reads_a_certificate_while_it_is_replaced_gets_a_whole_one(
     authority: Authority, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = authority.issue("arm").folder / "cert.pem"
-    before, seen, claim = path.read_bytes(), [], _files.claim
+    before, seen, claim = path.read_bytes(), [], _atomic_file.claim
 
     def watched(fresh: Path, text: bytes) -> None:
         claim(fresh, text)
         seen.append(path.read_bytes())
 
-    monkeypatch.setattr(_files, "claim", watched)
+    monkeypatch.setattr(_atomic_file, "claim", watched)
     authority.issue("arm")
     assert seen and set(seen) == {before}
     assert path.read_bytes() != before
@@ -176,14 +177,14 @@ def test_of_two_that_revoke_at_the_same_time_neither_is_forgotten(
 ) -> None:
     for name in ("arm", "leg"):
         authority.issue(name)
-    replace, others = _pki.replace, iter([lambda: Authority(authority.folder).revoke("leg")])
+    replace, others = _authority.replace, iter([lambda: Authority(authority.folder).revoke("leg")])
 
     def late(path: Path, text: bytes, mode: int) -> None:
         for other in others:  # comes in between, and is done before the first one writes
             other()
         replace(path, text, mode)
 
-    monkeypatch.setattr(_pki, "replace", late)
+    monkeypatch.setattr(_authority, "replace", late)
     authority.revoke("arm")
     assert read_policy(a_policy_with(authority.folder / "revoked.toml")).revoked == {"arm", "leg"}
     assert authority.revoked() == {"arm", "leg"}
@@ -276,7 +277,7 @@ def test_an_authority_that_cannot_be_used_says_why(authority: Authority, tmp_pat
 
 
 def test_an_expired_authority_issues_nothing(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_pki, "_AUTHORITY_LASTS", timedelta(0))
+    monkeypatch.setattr(_authority, "_AUTHORITY_LASTS", timedelta(0))
     authority = Authority.create(folder)
     with pytest.raises(NoAuthority, match=r"has expired .*begin a new one"):
         authority.issue("arm")

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from trade.errors import ConfigurationError
 from trade_gateway.cli import app
-from trade_gateway.commands._output import UsageError
+from trade_gateway.cli._output import UsageError
 
 POLICY = """
 revoked = ["thief"]

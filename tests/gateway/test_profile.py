@@ -7,8 +7,8 @@ import pytest
 
 from trade import Span
 from trade.errors import ConfigurationError
-from trade_gateway.commands._profile import statistics
-from trade_gateway.commands._sequences import deviations, learn, read, sequences, write
+from trade_gateway.cli.watching._call_model import deviations, learn, read, sequences, write
+from trade_gateway.cli.watching._profile import statistics
 
 
 def span(call_id: int, service: str, **others: Any) -> Span:

@@ -19,8 +19,8 @@ from typer.testing import CliRunner
 from disks import FullDisk
 from trade import Container, Resource, Secret, service, where
 from trade_gateway.cli import app
-from trade_gateway.commands._output import UsageError
-from trade_gateway.recording import _under_way
+from trade_gateway.cli._output import UsageError
+from trade_gateway.recording import _progress
 from trade_gateway.recording._channels import Message
 from trade_gateway.recording._file import RecordingFile
 from trade_gateway.recording._recorder import Recorder
@@ -311,7 +311,7 @@ def test_the_command_says_what_it_records_how_far_it_is_and_what_there_is(tmp_pa
 
 @pytest.mark.usefixtures("head")
 def test_a_full_disk_is_said_and_the_exit_code_tells(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_under_way, "RecordingFile", partial(RecordingFile, opened=lambda path: FullDisk(path, 15_000)))
+    monkeypatch.setattr(_progress, "RecordingFile", partial(RecordingFile, opened=lambda path: FullDisk(path, 15_000)))
     file = tmp_path / "a.mcap"
     code, _, errors = _lines(str(file), "--seconds", str(PATIENCE_S), "--camera-hz", "100")
     assert code == 1

@@ -12,7 +12,6 @@ from msgspec import json as as_json
 
 from disks import FullDisk
 from trade.errors import ConfigurationError
-from trade_gateway.recording._at_fault import HOLD_OFF_S, SavedAtFault
 from trade_gateway.recording._channels import (
     FAULTS,
     LOCKS,
@@ -30,9 +29,10 @@ from trade_gateway.recording._channels import (
     picture,
     service_channel,
 )
+from trade_gateway.recording._fault_trigger import HOLD_OFF_S, SavedAtFault
 from trade_gateway.recording._file import RecordingFile
 from trade_gateway.recording._reader import entries
-from trade_gateway.recording._ring import Ring
+from trade_gateway.recording._ring_buffer import Ring
 from trade_gateway.recording._sources import within
 
 S = 1_000_000_000

@@ -13,9 +13,9 @@ from typer.testing import CliRunner, Result
 from trade.errors import ConfigurationError
 from trade_drivers import Found, parse
 from trade_gateway.cli import app
-from trade_gateway.commands._first_file import first_file
-from trade_gateway.commands._output import UsageError
-from trade_gateway.commands._scan import _numbers
+from trade_gateway.cli._output import UsageError
+from trade_gateway.cli.hardware._robot_file_template import first_file
+from trade_gateway.cli.hardware._scan import _numbers
 from trade_hil_sim import Arm, DynamixelBus, Servo, UrBus
 from trade_hil_sim.damiao import DamiaoBus, Motor
 from trade_hil_sim.odrive import Axis, OdriveBus

@@ -8,9 +8,9 @@ from typer.testing import CliRunner
 
 from certificates import Papers
 from trade.errors import ConfigurationError
-from trade_gateway._parts import line_of
-from trade_gateway._system_file import read_system_file
 from trade_gateway.cli import app
+from trade_gateway.config._system import read_system_file
+from trade_gateway.config._tables import line_of
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 HEAD = '[system]\nname = "home"\n\n'

@@ -7,8 +7,8 @@ from typer.testing import CliRunner
 
 from robots import HAND, TAIL
 from trade_gateway.cli import app
-from trade_gateway.commands._output import UsageError
-from trade_gateway.commands._up import ports_told
+from trade_gateway.cli._output import UsageError
+from trade_gateway.cli.robots._up import ports_told
 
 
 def test_a_port_of_the_command_line_may_have_any_sign_in_it() -> None:

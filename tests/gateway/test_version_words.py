@@ -3,10 +3,10 @@
 import pytest
 
 from trade import ContainerInfo, EstopReport
-from trade._wire import PROTOCOL
-from trade_gateway.commands._estop import _say
-from trade_gateway.commands._list import _containers_table
-from trade_gateway.commands._output import Output
+from trade._protocol.messages import PROTOCOL
+from trade_gateway.cli._output import Output
+from trade_gateway.cli.motion._estop import _say
+from trade_gateway.cli.services._services import _containers_table
 
 OTHER = PROTOCOL + 1
 REPORT = EstopReport(

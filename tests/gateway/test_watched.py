@@ -5,10 +5,11 @@ from collections.abc import Iterator
 
 import pytest
 
-from trade import Resource, _locking, service, where
+from trade import Resource, service, where
+from trade._locks import api
 from trade.testing import MemorySystem, memory_system
-from trade_gateway.commands import _watch
-from trade_gateway.commands._watch import Watched
+from trade_gateway.cli.watching import _watch
+from trade_gateway.cli.watching._watch import Watched
 
 
 class Arm:
@@ -34,7 +35,7 @@ def test_who_does_not_answer_has_not_given_its_locks_back(
     robot, planner, looker = (system.container(name) for name in ("robot", "planner", "looker"))
     robot.register(Arm(), "rosie.arm")
     system.settle()
-    monkeypatch.setattr(_locking, "_ANSWER_S", 0.2)
+    monkeypatch.setattr(api, "_ANSWER_S", 0.2)
     monkeypatch.setattr(_watch, "_ASKED_EVERY_S", 0.0)
     seen = Watched(looker, where(group="rosie"))
 

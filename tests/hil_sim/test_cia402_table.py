@@ -2,7 +2,7 @@
 
 import pytest
 
-from trade_drivers.cia402 import _table as theirs
+from trade_drivers.vendors.cia402 import _table as theirs
 from trade_hil_sim.cia402 import OBJECTS
 
 OURS = {(entry.index, entry.sub): entry for entry in OBJECTS}

@@ -12,9 +12,9 @@ from typing import Any, Final
 import pytest
 
 from trade_hil_sim import Command, DynamixelBus, Late, Servo, SimControl, SimulationError
-from trade_hil_sim._control import ControlServer
-from trade_hil_sim._faults import kinds_of
-from trade_hil_sim._strikes import Strikes
+from trade_hil_sim.control._server import ControlServer
+from trade_hil_sim.faults._faults import kinds_of
+from trade_hil_sim.faults._methods import Strikes
 
 KINDS: Final = kinds_of(Command)
 FIELDS: Final[dict[str, Any]] = {

@@ -6,8 +6,8 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from trade_hil_sim import SimulationError
-from trade_hil_sim._errands import Errands
-from trade_hil_sim._ready import ready
+from trade_hil_sim.robot._mailbox import Errands
+from trade_hil_sim.robot._polling import ready
 from waiting import PATIENCE_S
 
 

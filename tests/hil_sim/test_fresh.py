@@ -5,10 +5,10 @@ from pathlib import Path
 import pytest
 
 from trade_hil_sim import Absent, SimulationError
-from trade_hil_sim._fresh import fresh_bus
 from trade_hil_sim.cia402 import Cia402Bus, Drive
 from trade_hil_sim.dynamixel import DynamixelBus
 from trade_hil_sim.feetech import FeetechBus
+from trade_hil_sim.robot._factory_devices import fresh_bus
 from trade_hil_sim.robotiq import RobotiqBus
 
 

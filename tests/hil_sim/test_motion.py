@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trade_hil_sim._motion import Course, at_rest, to_position, to_speed
+from trade_hil_sim.mechanics._profile import Course, at_rest, to_position, to_speed
 
 POSITIONS = st.floats(-1e6, 1e6)
 SPEEDS = st.floats(-5000, 5000)

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from trade_hil_sim import DynamixelBus, SimulationError
-from trade_hil_sim._robot import buses_of, find_simulator, read_robot
+from trade_hil_sim.robot._robot import buses_of, find_simulator, read_robot
 
 
 def test_each_joint_is_a_servo_standing_at_the_joints_zero(robot_file: Path, tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from hil_sim.conftest import FakeClock
 from robots import HAND
 from trade_drivers.robotfile import parse
 from trade_hil_sim import Gripper, RobotiqBus, SimulationError
-from trade_hil_sim._robot import buses_of, find_simulator
+from trade_hil_sim.robot._robot import buses_of, find_simulator
 from trade_hil_sim.robotiq import frame
 from waiting import wait_until
 

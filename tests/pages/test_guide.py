@@ -14,7 +14,7 @@ from pages.blocks import DOCS, of, said, sections
 from pages.conftest import Play, Said
 from system.conftest import Program
 from trade import Handle, Settings, service, where
-from trade._endpoints import free_endpoint
+from trade._transport.endpoints import free_endpoint
 from trade.errors import Cancelled, CannotStart, DeviceFault, InvalidArgument
 from waiting import wait_until
 

@@ -11,9 +11,9 @@ import pytest
 from msgspec import Struct, structs
 
 from pages.blocks import DOCS
-from trade._credentials import user_secret
-from trade._rendezvous import runtime_folder
-from trade._wire import ProviderInfo, ServiceInfo, decode_provider
+from trade._discovery.host_folder import runtime_folder
+from trade._protocol.messages import ProviderInfo, ServiceInfo, decode_provider
+from trade._transport.credentials import user_secret
 
 PAGE = (DOCS / "wire-protocol.md").read_text(encoding="utf-8")
 PROVIDER = {"revision": 1, "groups": ["a"], "kind": "Arm", "host": "rosie", "pid": 1}

@@ -6,9 +6,9 @@ import pytest
 
 from ros.robots import Stand
 from trade.errors import ConfigurationError
+from trade_gateway.ros._connect import join, planned
+from trade_gateway.ros._conversion import ros_path
 from trade_gateway.ros._file import read_ros_file
-from trade_gateway.ros._joining import join, planned
-from trade_gateway.ros._words import ros_path
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "ros.toml"
 HEAD = "[ros]\nversion = 2\n"

@@ -11,8 +11,8 @@ from ros.memory_graph import MemoryGraph, MemoryRos
 from ros.robots import PATIENCE_S, Stand
 from trade import where
 from trade.errors import DeviceFault, ToleranceExceeded
+from trade_gateway.ros._conversion import ros_stamp
 from trade_gateway.ros._graph import Ended, Outcome
-from trade_gateway.ros._words import ros_stamp
 from waiting import wait_until
 
 ACTION = "control_msgs/action/FollowJointTrajectory"

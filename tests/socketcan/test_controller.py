@@ -8,8 +8,8 @@ from drivers.legs import Leg, leg
 from socketcan.interfaces import down, up
 from socketcan.slcan_adapter import SlcanAdapter
 from trade.errors import ConfigurationError
-from trade_drivers.can import CanPort, ErrorState
-from trade_drivers.can._netlink import look_at
+from trade_drivers.bus.can import CanPort, ErrorState
+from trade_drivers.bus.can._netlink import look_at
 from trade_drivers.joints import PortLost
 from trade_hil_sim import SimulationError
 from trade_hil_sim.can import CanBus

@@ -9,7 +9,7 @@ from drivers.legs import HIP, Leg, fault_of, leg
 from socketcan.interfaces import down, ip, up
 from trade.errors import BusGone
 from trade_drivers import AttachedRobot
-from trade_drivers.can import CanPort
+from trade_drivers.bus.can import CanPort
 from trade_drivers.joints import PortLost
 from trade_hil_sim import Replug
 from waiting import PATIENCE_S, wait_until

@@ -8,7 +8,7 @@ from typing import Any, Final
 from msgspec import Raw
 
 from system.sites import DOOR, Site
-from trade._wire import PROTOCOL, Call, encode_message
+from trade._protocol.messages import PROTOCOL, Call, encode_message
 from waiting import wait_until
 
 POLICY: Final = """

@@ -14,10 +14,10 @@ from typing import Any
 
 import zenoh
 
-from trade._endpoints import free_endpoint
-from trade._links import open_session
-from trade._tls import Certificate
-from trade._zenoh import configuration
+from trade._security.certificates import Certificate
+from trade._transport.endpoints import free_endpoint
+from trade._transport.zenoh import configuration
+from trade._transport.zenoh_links import open_session
 
 _PATIENCE_S = 20.0
 

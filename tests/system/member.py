@@ -13,8 +13,8 @@ from typing import Any
 import zenoh
 
 from trade import Called, Container, Handle, Lock, Resource, Run, Settings, Stream, current_call, service, where
-from trade._links import _others
-from trade._sample import stream_key
+from trade._protocol.samples import stream_key
+from trade._transport.zenoh_links import _others
 
 PROVIDERS = 5
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from types import CodeType, ModuleType
 from typing import Final
 
-_MODULE: Final = "trade._wire"
+_MODULE: Final = "trade._protocol.messages"
 _AS_IT_IS: Final = "PROTOCOL: Final = 1\n"
 
 

@@ -27,7 +27,7 @@ from system import wall_clock
 from system.networks import Member, Networks, ip
 from system.siege_records import CAN_BUS, Alarm, Fault, Rescue
 from system.sites import DOOR, SYSTEM, Site
-from trade_gateway.door import add_token
+from trade_gateway.http import add_token
 from trade_hil_sim import BusOff, SimProcess
 
 _HERE: Final = Path(__file__).parent

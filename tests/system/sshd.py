@@ -8,7 +8,7 @@ import subprocess
 from collections.abc import Mapping
 from pathlib import Path
 
-from trade._endpoints import Endpoint, free_endpoint
+from trade._transport.endpoints import Endpoint, free_endpoint
 from waiting import wait_until
 
 _PLACES = os.pathsep.join((os.environ.get("PATH", os.defpath), "/usr/local/sbin", "/usr/sbin", "/sbin"))

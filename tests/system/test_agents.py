@@ -16,7 +16,7 @@ from mcp.client.stdio import stdio_client
 from system.conftest import ROOT, ROSIES_HEAD, Bench
 from trade import service, where
 from trade.testing import memory_system
-from trade_gateway.agents import Twin
+from trade_gateway.mcp import Twin
 from waiting import wait_until
 
 FAR = [1.0, 0.0]

@@ -19,8 +19,7 @@ from system import rights
 from system.attack import ARM, POLICY, Attack, numbers
 from system.conftest import ROOT, networks_of_ones_own
 from system.sites import DOOR, Site
-from trade._access import FUNCTIONS
-from trade._wire import (
+from trade._protocol.messages import (
     EMPTY,
     PROTOCOL,
     Behalf,
@@ -32,6 +31,7 @@ from trade._wire import (
     Token,
     encode_message,
 )
+from trade._security.authorizer import FUNCTIONS
 from waiting import wait_until
 
 pytestmark = pytest.mark.timeout(300)

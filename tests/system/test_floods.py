@@ -9,8 +9,9 @@ from typing import Any
 import pytest
 
 from certificates import Papers
-from trade import Container, Settings, _crew, service, where
-from trade._endpoints import free_endpoint
+from trade import Container, Settings, service, where
+from trade._threads import channel_workers
+from trade._transport.endpoints import free_endpoint
 from trade.errors import Busy
 
 POLICY = """
@@ -69,7 +70,7 @@ def lab(tmp_path: Path, system: str) -> Iterator[Lab]:
 def test_who_has_all_threads_of_its_own_busy_leaves_those_of_others_alone(
     lab: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(_crew, "MOST_THREADS", 2)
+    monkeypatch.setattr(channel_workers, "MOST_THREADS", 2)
     room = Room()
     lab.robot.register(room, "lab")
     mallory, planner = lab.join("mallory"), lab.join("planner")

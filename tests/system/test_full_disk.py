@@ -11,11 +11,11 @@ from disks import SmallDisk, small_disk
 from system.conftest import Rosie
 from trade import Container, where
 from trade.errors import ConfigurationError, MotionStopped, Stopped
-from trade_gateway._pki import Authority
-from trade_gateway.commands._calibrate import _write
-from trade_gateway.commands._output import Output
-from trade_gateway.commands._sequences import Model, read, write
-from trade_gateway.door import add_token
+from trade_gateway.cli._output import Output
+from trade_gateway.cli.hardware._calibrate import _write
+from trade_gateway.cli.watching._call_model import Model, read, write
+from trade_gateway.http import add_token
+from trade_gateway.pki._authority import Authority
 from trade_hil_sim import events, read_log
 from waiting import wait_until
 

@@ -13,7 +13,7 @@ import pytest
 import trade
 from system.conftest import ROSIES_HEAD, Program, Rosie
 from trade import Container, where
-from trade._endpoints import free_endpoint
+from trade._transport.endpoints import free_endpoint
 from trade.errors import LockedByOther, Stopped
 from waiting import PATIENCE_S, wait_until
 

@@ -14,7 +14,8 @@ import pytest
 
 import trade
 from system.sshd import Sshd
-from trade import _starting, where
+from trade import where
+from trade._remote import ssh
 from trade.errors import CannotStart, ConfigurationError
 from waiting import wait_until
 
@@ -110,8 +111,8 @@ def test_where_no_sshd_listens_it_is_refused(sshd: Sshd) -> None:
 
 
 def test_a_host_that_says_nothing_is_given_up(sshd: Sshd, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked = [word.replace(f"ConnectTimeout={_starting.CONNECT_S}", "ConnectTimeout=1") for word in _starting._ASKED]
-    monkeypatch.setattr(_starting, "_ASKED", tuple(asked))
+    asked = [word.replace(f"ConnectTimeout={ssh.CONNECT_S}", "ConnectTimeout=1") for word in ssh._ASKED]
+    monkeypatch.setattr(ssh, "_ASKED", tuple(asked))
     with socket.create_server(("127.0.0.1", 0)) as mute:
         sshd.write_config(port=mute.getsockname()[1])
         assert refused(sshd).reason == "timeout"
@@ -149,8 +150,8 @@ def test_what_is_no_host_never_reaches_ssh(system: str, host: str, monkeypatch: 
 
 def test_words_reach_the_far_shell_as_they_are() -> None:
     hostile = "a b; $(reboot) 'x'"
-    words = [*_starting._assigned({"TRADE_CONNECT": hostile}), "trade", "--allow", hostile]
-    assert shlex.split(_starting.ssh_words("robot", None, words)[-1]) == words
+    words = [*ssh._assigned({"TRADE_CONNECT": hostile}), "trade", "--allow", hostile]
+    assert shlex.split(ssh.ssh_words("robot", None, words)[-1]) == words
     assert words[:2] == ["env", f"TRADE_CONNECT={hostile}"]
     with pytest.raises(ConfigurationError, match="is no name of a variable"):
-        _starting._assigned({"A;B": "1"})
+        ssh._assigned({"A;B": "1"})

@@ -18,8 +18,8 @@ from doors import Client
 from system.conftest import ROSIES_HEAD, Program, at_ports
 from trade import Container, where
 from trade.errors import ConfigurationError
-from trade_gateway._gateway_file import read_gateway_file
-from trade_gateway.door import add_token
+from trade_gateway.config._gateway import read_gateway_file
+from trade_gateway.http import add_token
 from trade_gateway.supervisor import ChildInfo, News, Supervisor
 from trade_hil_sim import SimProcess, events, writes
 from waiting import wait_until

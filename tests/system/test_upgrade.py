@@ -19,7 +19,7 @@ from system.siege import Driver
 from system.siege_judge import judge
 from system.siege_records import Answer, AnyRecord, Fault
 from system.sites import DOOR, SYSTEM, Site
-from trade._wire import PROTOCOL
+from trade._protocol.messages import PROTOCOL
 from waiting import wait_until
 
 NOW, NEXT = PROTOCOL, PROTOCOL + 1

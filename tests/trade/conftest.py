@@ -21,11 +21,11 @@ from listening import Battery, Two
 from migrants import Scene, migration_scene
 from ruled import Desk, Engine
 from trade import Container, Handle, service, where
-from trade._credentials import user_secret
-from trade._endpoints import free_endpoint
-from trade._keys import ALIVE, alive_key
-from trade._rendezvous import Rendezvous
-from trade._zenoh import ZenohTransport, configuration
+from trade._discovery.host_folder import Rendezvous
+from trade._protocol.keys import ALIVE, alive_key
+from trade._transport.credentials import user_secret
+from trade._transport.endpoints import free_endpoint
+from trade._transport.zenoh import ZenohTransport, configuration
 from trade.testing import MemorySystem, memory_system
 
 hypothesis.settings.register_profile("deterministic", deadline=None, derandomize=True, max_examples=60)

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from trade._absence import Absences
+from trade._discovery.grace_period import Absences
 
 
 @pytest.fixture

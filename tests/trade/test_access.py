@@ -9,15 +9,15 @@ import pytest
 
 from guarded_neck import Neck, find, memory, policy, rewritten
 from trade import Container, Estop, Handle, Settings, service, where
-from trade._access import FUNCTIONS, Access
-from trade._context import CallContext, running
-from trade._estop_services import EstopServices
-from trade._hints import no_such_service
-from trade._keys import Address, alive_key, estop_key
-from trade._memory import MemoryTransport
-from trade._own_services import OwnServices
-from trade._service import marked_methods
-from trade._wire import PROTOCOL, Behalf, EstopOrder, encode_message
+from trade._container.builtin_services import OwnServices
+from trade._context.call_context import CallContext, running
+from trade._estop.services import EstopServices
+from trade._protocol.keys import Address, alive_key, estop_key
+from trade._protocol.messages import PROTOCOL, Behalf, EstopOrder, encode_message
+from trade._registry.suggestions import no_such_service
+from trade._security.authorizer import FUNCTIONS, Access
+from trade._services.decorator import marked_methods
+from trade._transport.memory import MemoryTransport
 from trade.errors import AccessDenied, ConfigurationError, LockedByOther, LockLost, NoSuchService, Stopped
 from trade.testing import MemorySystem
 

@@ -18,11 +18,11 @@ import pytest
 import zenoh
 
 from trade import Container, Settings, service, where
-from trade._acl import acl, crossings
-from trade._endpoints import free_endpoint
-from trade._policies import Policy, Role
-from trade._policy_file import read_policy
-from trade._zenoh import ZenohTransport, configuration
+from trade._security.policy import Policy, Role
+from trade._security.policy_file import read_policy
+from trade._security.zenoh_acl import acl, crossings
+from trade._transport.endpoints import free_endpoint
+from trade._transport.zenoh import ZenohTransport, configuration
 
 POLICY: Final = """
 revoked = ["thief"]

@@ -10,8 +10,16 @@ from msgspec import Raw, Struct
 
 import trade
 from trade import Container, current_call, service
-from trade._keys import call_key, reply_key
-from trade._wire import EMPTY_ARGUMENTS, PROTOCOL, Call, CancelArguments, Status, decode_reply, encode_message
+from trade._protocol.keys import call_key, reply_key
+from trade._protocol.messages import (
+    EMPTY_ARGUMENTS,
+    PROTOCOL,
+    Call,
+    CancelArguments,
+    Status,
+    decode_reply,
+    encode_message,
+)
 from trade.errors import Cancelled, NotSerialisable
 from waiting import wait_until
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 import trade
 from trade import Container, Handle, service, where
-from trade._wire import Malformed, ProviderInfo, decode_provider, encode_message
+from trade._protocol.messages import Malformed, ProviderInfo, decode_provider, encode_message
 from trade.errors import ConfigurationError
 
 Eventually = Callable[[Callable[[], bool]], bool]

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from trade import Container, Resource, Secret, Settings, service, where
-from trade._audit_store import reading
-from trade._local_service import LocalService
+from trade._audit.store import reading
+from trade._services.local_service import LocalService
 from trade.auditing import AuditRow, verify
 from trade.errors import AccessDenied, ConfigurationError, InvalidArgument, LockedByOther, LockLost, Stopped
 

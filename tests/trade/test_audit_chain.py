@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 from msgspec import structs
 
-from trade._audit_chain import NOTHING, AuditRow, Head, Link, Verdict, row_hash, verify
-from trade._audit_store import AuditStore, Keep, reading
+from trade._audit.hash_chain import NOTHING, AuditRow, Head, Link, Verdict, row_hash, verify
+from trade._audit.store import AuditStore, Keep, reading
 
 DAY_NS = 86_400_000_000_000
 

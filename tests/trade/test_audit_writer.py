@@ -11,11 +11,11 @@ from pathlib import Path
 
 import pytest
 
-import trade._audit_writer as writing
-from trade._audit import Event
-from trade._audit_chain import AuditRow, Verdict, verify
-from trade._audit_store import AuditStore, Keep, moved_aside_in, reading
-from trade._audit_writer import AuditWriter
+import trade._audit.writer as writing
+from trade._audit.events import Event
+from trade._audit.hash_chain import AuditRow, Verdict, verify
+from trade._audit.store import AuditStore, Keep, moved_aside_in, reading
+from trade._audit.writer import AuditWriter
 
 Eventually = Callable[[Callable[[], bool]], bool]
 KEEP = Keep(90, 1_000_000)
@@ -188,9 +188,9 @@ def test_a_disk_that_is_full_indeed_loses_what_does_not_fit_and_breaks_nothing(p
     program = f"""
 import resource, logging
 logging.basicConfig()
-import trade._audit_writer as writing
-from trade._audit import Event
-from trade._audit_store import Keep
+import trade._audit.writer as writing
+from trade._audit.events import Event
+from trade._audit.store import Keep
 from pathlib import Path
 writing._AGAIN_S = 0.01
 writer = writing.AuditWriter(Path({str(path)!r}), "boot", "", Keep(90, 10**6))
@@ -345,10 +345,10 @@ def test_killed_at_any_step_it_leaves_a_record_that_verifies(path: Path) -> None
     """The writer is ended by the kernel before and after each thing that it asks of the database."""
     program = f"""
 import os, signal, sqlite3, sys
-import trade._audit_writer as writing
-from trade._audit_chain import verify
-from trade._audit_store import AuditStore, Keep, reading
-from trade._audit import Event
+import trade._audit.writer as writing
+from trade._audit.hash_chain import verify
+from trade._audit.store import AuditStore, Keep, reading
+from trade._audit.events import Event
 from pathlib import Path
 path = Path({str(path)!r})
 left = 0
@@ -407,9 +407,9 @@ print(steps, verdict.head.seq)
 
 def test_its_process_killed_under_load_leaves_a_record_that_verifies_and_can_be_added_to(path: Path) -> None:
     program = f"""
-import trade._audit_writer as writing
-from trade._audit_store import Keep
-from trade._audit import Event
+import trade._audit.writer as writing
+from trade._audit.store import Keep
+from trade._audit.events import Event
 from pathlib import Path
 writing._GATHER_S = 0.001
 writer = writing.AuditWriter(Path({str(path)!r}), "boot", "", Keep(90, 10**6))

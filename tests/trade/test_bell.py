@@ -5,7 +5,7 @@ import time
 
 import pytest
 
-from trade._bell import Bell
+from trade._threads.condition import Bell
 
 
 def test_it_wakes_everybody_who_waits() -> None:

@@ -8,11 +8,11 @@ from collections.abc import Callable, Iterator
 import msgspec
 import pytest
 
-from trade._calls import Caller
-from trade._keys import Address
-from trade._peer import Peer
-from trade._transport import Answer, Channel, ChannelClosed, Message, Publisher, Questions, Transport
-from trade._wire import EMPTY, EMPTY_ARGUMENTS, PROTOCOL, Reply, Status, decode_call, encode_message
+from trade._calls.caller import Caller
+from trade._calls.peer import Peer
+from trade._protocol.keys import Address
+from trade._protocol.messages import EMPTY, EMPTY_ARGUMENTS, PROTOCOL, Reply, Status, decode_call, encode_message
+from trade._transport.base import Answer, Channel, ChannelClosed, Message, Publisher, Questions, Transport
 
 OWN = Address("me", "here", "e0")
 OTHER = Address("arm", "driver", "e1")

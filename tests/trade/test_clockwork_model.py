@@ -9,7 +9,7 @@ import pytest
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from trade._clockwork import MOST_THREADS, Clockwork, Due
+from trade._threads.scheduler import MOST_THREADS, Clockwork, Due
 from waiting import PATIENCE_S, wait_until
 
 HOUR_NS = 3_600_000_000_000

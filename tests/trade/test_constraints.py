@@ -12,11 +12,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from trade import Constraint, Container, Handle, service, where
-from trade._codec import Codec
-from trade._constraints import Term
-from trade._service import ServiceMark
-from trade._signature import Signature
-from trade._wire import ServiceInfo
+from trade._protocol.codec import Codec
+from trade._protocol.messages import ServiceInfo
+from trade._registry.constraints import Term
+from trade._services.decorator import ServiceMark
+from trade._services.signature import Signature
 from trade.errors import ConfigurationError
 
 _PLAIN = ServiceInfo(name="move", signature="move()")

@@ -13,15 +13,15 @@ from typing import Any, cast
 import pytest
 from msgspec import structs
 
-import trade._signature as signatures
+import trade._services.signature as signatures
 from trade import Container, Handle, Settings, service, where
-from trade._arguments import encode_call
-from trade._keys import TALLY, Address
-from trade._registry import Registry
-from trade._rendezvous import Rendezvous, free_endpoint
-from trade._transport import Publisher
-from trade._wire import PROTOCOL, Call, ProviderInfo, ServiceInfo, decode_provider, encode_message
-from trade._zenoh import ZenohTransport, configuration
+from trade._discovery.host_folder import Rendezvous, free_endpoint
+from trade._protocol.keys import TALLY, Address
+from trade._protocol.messages import PROTOCOL, Call, ProviderInfo, ServiceInfo, decode_provider, encode_message
+from trade._registry.registry import Registry
+from trade._services.arguments import encode_call
+from trade._transport.base import Publisher
+from trade._transport.zenoh import ZenohTransport, configuration
 from trade.errors import InvalidArgument
 
 CALLS = 20

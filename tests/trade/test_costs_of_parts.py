@@ -32,9 +32,9 @@ import pytest
 from tests.trade.test_costs import blocks, functions_run, traced
 
 from trade import Called, Container, Handle, Settings, service, where
-from trade._audit_chain import AuditRow
-from trade._audit_store import AuditStore
-from trade._memory import MemoryTransport, Passage
+from trade._audit.hash_chain import AuditRow
+from trade._audit.store import AuditStore
+from trade._transport.memory import MemoryTransport, Passage
 from trade.sharing import Border
 from trade.testing import Kind, MemorySystem, memory_system
 from waiting import wait_until

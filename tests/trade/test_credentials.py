@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 
 from trade import Container, Settings, service, where
-from trade._credentials import user_secret
-from trade._endpoints import free_endpoint
-from trade._zenoh import ZenohTransport
+from trade._transport.credentials import user_secret
+from trade._transport.endpoints import free_endpoint
+from trade._transport.zenoh import ZenohTransport
 from trade.errors import CannotConnect, ConfigurationError, NoSuchService
 
 ALICE = ("alice", "pass:word")

@@ -7,8 +7,8 @@ from statistics import median
 
 import pytest
 
-from trade._crew import MOST_THREADS, Crew
-from trade._transport import Channel, ChannelClosed, Message
+from trade._threads.channel_workers import MOST_THREADS, Crew
+from trade._transport.base import Channel, ChannelClosed, Message
 
 CALL = Message("call/a/b", b"")
 

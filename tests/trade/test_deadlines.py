@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 
 from trade import Container, Handle, current_call, service, where
-from trade._keys import call_key, reply_key
-from trade._peer import Peer
-from trade._waits import Pending
-from trade._wire import EMPTY_ARGUMENTS, PROTOCOL, Call, Reply, Status, decode_reply, encode_message
+from trade._calls.peer import Peer
+from trade._calls.reply_slot import Pending
+from trade._protocol.keys import call_key, reply_key
+from trade._protocol.messages import EMPTY_ARGUMENTS, PROTOCOL, Call, Reply, Status, decode_reply, encode_message
 from trade.errors import DeadlineExceeded, OutcomeUnknown
 
 COUNTING = """

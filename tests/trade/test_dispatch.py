@@ -6,10 +6,12 @@ from typing import Any
 
 import pytest
 
-from trade import Container, Handle, _crew, _dispatch, current_call, service, where
-from trade._keys import reply_key
-from trade._memory import MemoryTransport
-from trade._transport import Channel, Message
+from trade import Container, Handle, current_call, service, where
+from trade._protocol.keys import reply_key
+from trade._services import dispatcher
+from trade._threads import channel_workers
+from trade._transport.base import Channel, Message
+from trade._transport.memory import MemoryTransport
 from trade.errors import Busy, Cancelled, OutcomeUnknown, RemoteError
 from trade.testing import memory_system
 from waiting import wait_until
@@ -61,7 +63,7 @@ def test_services_run_side_by_side(here: Container, there: Container, crowd: Cro
 def test_at_the_cap_a_call_is_refused_and_stops_still_get_through(
     here: Container, there: Container, crowd: Crowd, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(_crew, "MOST_THREADS", 8)
+    monkeypatch.setattr(channel_workers, "MOST_THREADS", 8)
     there.register(crowd, "robot")
     enter, stop = found(here, "enter"), found(here, "stop")
     assert stop() == 1
@@ -82,7 +84,7 @@ def test_at_the_cap_a_call_is_refused_and_stops_still_get_through(
 def test_a_container_at_its_cap_still_drains(
     here: Container, there: Container, crowd: Crowd, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(_crew, "MOST_THREADS", 2)
+    monkeypatch.setattr(channel_workers, "MOST_THREADS", 2)
     there.register(crowd, "robot")
     enter = found(here, "enter")
     run = enter.start()
@@ -265,7 +267,7 @@ def test_a_service_may_register_others_and_look_up(here: Container, there: Conta
 def test_only_so_many_reply_keys_are_kept_and_evicted_ones_work_again(
     here: Container, there: Container, monkeypatch: pytest.MonkeyPatch, crowd: Crowd
 ) -> None:
-    monkeypatch.setattr(_dispatch, "_MOST_REPLY_KEYS", 2)
+    monkeypatch.setattr(dispatcher, "_MOST_REPLY_KEYS", 2)
     there.register(crowd, "robot")
     enter = found(here, "enter")
     threads = [threading.Thread(target=enter) for _ in range(6)]  # each borrows a reply key of its own

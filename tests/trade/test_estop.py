@@ -11,14 +11,14 @@ from pathlib import Path
 import pytest
 
 from trade import Container, Estop, EstopReport, Resource, current_call, service, where
-from trade._audit import Event
-from trade._crew import MOST_THREADS
-from trade._estop_ledger import MOST_OF_ONE
-from trade._estop_messages import decode_estop_confirmed, decode_estop_order
-from trade._estop_work import SHARED_S
-from trade._keys import Address, alive_key, registry_key
-from trade._memory import MemoryTransport, Passage
-from trade._wire import PROTOCOL, EstopOrder, ProviderInfo, ServiceInfo, encode_message
+from trade._audit.events import Event
+from trade._estop.ledger import MOST_OF_ONE
+from trade._estop.worker import SHARED_S
+from trade._protocol.estop_messages import decode_estop_confirmed, decode_estop_order
+from trade._protocol.keys import Address, alive_key, registry_key
+from trade._protocol.messages import PROTOCOL, EstopOrder, ProviderInfo, ServiceInfo, encode_message
+from trade._threads.channel_workers import MOST_THREADS
+from trade._transport.memory import MemoryTransport, Passage
 from trade.errors import Busy, ConfigurationError, MotionStopped, NoSuchEstop, Stopped
 from trade.testing import Kind, MemorySystem, memory_system
 

@@ -9,9 +9,9 @@ import psutil
 import pytest
 
 from trade import Container, Estop, where
-from trade._estop_ledger import MOST_OF_ONE
-from trade._keys import estop_key
-from trade._wire import PROTOCOL, EstopOrder, encode_message
+from trade._estop.ledger import MOST_OF_ONE
+from trade._protocol.keys import estop_key
+from trade._protocol.messages import PROTOCOL, EstopOrder, encode_message
 from trade.errors import Stopped, TradeError
 
 Eventually = Callable[[Callable[[], bool]], bool]

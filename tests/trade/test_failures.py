@@ -11,8 +11,8 @@ import msgspec
 import pytest
 
 from trade import Container, Secret, errors, service, where
-from trade._failures import RemoteTraceback, pack_error, unpack_error
-from trade._wire import ErrorInfo
+from trade._protocol.messages import ErrorInfo
+from trade._protocol.remote_errors import RemoteTraceback, pack_error, unpack_error
 from trade.errors import CallerError, DeadlineExceeded, InvalidResult, LimitExceeded, RemoteError, TradeError
 
 CONCRETE = [

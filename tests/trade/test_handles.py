@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from trade import Container, Handle, current_call, service, where
-from trade._keys import ServiceKey
+from trade._protocol.keys import ServiceKey
 from trade.errors import ConfigurationError, ServiceGone
 
 

@@ -6,8 +6,9 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from trade import Called, Container, _hands, service, where
-from trade._hands import Hands
+from trade import Called, Container, service, where
+from trade._threads import thread_pool
+from trade._threads.thread_pool import Hands
 
 NUMBER: contextvars.ContextVar[int] = contextvars.ContextVar("NUMBER", default=0)
 Eventually = Callable[[Callable[[], bool]], bool]
@@ -94,7 +95,7 @@ def test_what_fails_is_logged_and_harms_nothing(
 def test_who_waits_too_long_ends_and_others_come(
     monkeypatch: pytest.MonkeyPatch, hands: Hands, eventually: Eventually
 ) -> None:
-    monkeypatch.setattr(_hands, "_PATIENCE_S", 0.01)
+    monkeypatch.setattr(thread_pool, "_PATIENCE_S", 0.01)
     for _ in range(20):
         done_by(hands)
         assert eventually(lambda: not any(thread.name == "work" for thread in threading.enumerate()))
@@ -103,7 +104,7 @@ def test_who_waits_too_long_ends_and_others_come(
 
 def test_work_that_comes_as_one_gives_up_waiting_is_done(monkeypatch: pytest.MonkeyPatch, hands: Hands) -> None:
     """It has been taken from those that wait, and is not told yet, when its patience ends."""
-    monkeypatch.setattr(_hands, "_PATIENCE_S", 0.001)
+    monkeypatch.setattr(thread_pool, "_PATIENCE_S", 0.001)
     for _ in range(300):
         done_by(hands)
 

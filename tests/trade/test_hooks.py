@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 
 from trade import Called, Container, Handle, Secret, current_call, errors, service, where
-from trade._context import CallContext
-from trade._hooking import Hook
-from trade._local_service import LocalService
+from trade._container.hooking import Hook
+from trade._context.call_context import CallContext
+from trade._services.local_service import LocalService
 from trade.errors import AccessDenied, ConfigurationError, NoSuchHook
 from waiting import wait_until
 

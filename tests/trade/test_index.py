@@ -7,11 +7,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from trade import Constraint, where
-from trade._constraints import Term
-from trade._index import Index
-from trade._keys import Address, ServiceKey
-from trade._registry import Record, Registry
-from trade._wire import HEALTHY, ProviderInfo, ServiceInfo
+from trade._protocol.keys import Address, ServiceKey
+from trade._protocol.messages import HEALTHY, ProviderInfo, ServiceInfo
+from trade._registry.constraints import Term
+from trade._registry.index import Index
+from trade._registry.registry import Record, Registry
 
 
 def record(number: int, **told: Any) -> Record:

@@ -9,9 +9,9 @@ import psutil
 import pytest
 
 from trade import Container, Handle, service, where
-from trade import _load as module
-from trade._crew import Crew
-from trade._load import Load
+from trade._telemetry import load as module
+from trade._telemetry.load import Load
+from trade._threads.channel_workers import Crew
 from waiting import wait_until
 
 

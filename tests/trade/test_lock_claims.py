@@ -85,8 +85,8 @@ def command(request: pytest.FixtureRequest, robot: Robot) -> Any:
         return relay(handle)
 
     def inherited(lock: Any, handle: Handle) -> object:
-        from trade._context import handed_down
-        from trade._inherited import VARIABLE, InheritedLock
+        from trade._context.call_context import handed_down
+        from trade._locks.inherited import VARIABLE, InheritedLock
 
         passed = InheritedLock(lock.environment()[VARIABLE], robot.other.address)
         theirs = robot.other.find(where(name=handle.name, container=handle.container), wait_s=20)

@@ -7,8 +7,8 @@ import pytest
 
 from jointed import WHOLE, Joint, Robot
 from trade import Handle, where
-from trade._keys import Address
-from trade._resources import Latch
+from trade._protocol.keys import Address
+from trade._resources.resource import Latch
 from trade.errors import (
     ConfigurationError,
     LockedByOther,

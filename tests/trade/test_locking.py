@@ -11,9 +11,10 @@ from typing import Any
 import pytest
 
 from jointed import WHOLE, Joint, Robot
-from trade import Container, Handle, _locking, permit, service, where
-from trade._keys import ServiceKey
-from trade._terms import Terms
+from trade import Container, Handle, permit, service, where
+from trade._locks import api
+from trade._protocol.keys import ServiceKey
+from trade._resources.lock_request import Terms
 from trade.errors import (
     ConfigurationError,
     IncompleteGroup,
@@ -56,7 +57,7 @@ def test_whose_locks_are_not_known_is_told(
     asleep = threading.Event()
     with robot.me.lock(WHOLE):
         monkeypatch.setattr(robot.system.container("a")._parts.locks, "infos", lambda: asleep.wait(60) and [])
-        monkeypatch.setattr(_locking, "_ANSWER_S", 0.2)
+        monkeypatch.setattr(api, "_ANSWER_S", 0.2)
         assert [info.resources for info in robot.other.locks()] == [("b",)]
         asleep.set()
     assert "which locks there are in tester/a is not known" in caplog.text
@@ -154,7 +155,7 @@ def test_a_cancelled_async_with_leaves_nothing_locked(robot: Robot) -> None:
 
 
 def test_the_locks_around_a_task_are_forgotten_even_if_giving_back_is_cancelled(robot: Robot) -> None:
-    from trade._context import holding
+    from trade._context.call_context import holding
 
     async def main() -> None:
         lock = robot.me.lock(WHOLE)

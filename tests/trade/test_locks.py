@@ -8,10 +8,10 @@ from collections.abc import Iterator
 import pytest
 
 from lock_table import EPOCH, Table
-from trade._locks import LockTable
-from trade._resources import Holder, Permit, Resource
-from trade._terms import Granted, Terms
-from trade._wire import Token
+from trade._protocol.messages import Token
+from trade._resources.lock_request import Granted, Terms
+from trade._resources.lock_table import LockTable
+from trade._resources.resource import Holder, Permit, Resource
 from trade.errors import LockedByOther, LockLost, MotionStopped, NotStopped, ServiceGone, Stopped
 from waiting import wait_until
 

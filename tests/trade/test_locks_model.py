@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
 from lock_table import COUPLED, NAMES, Table
-from trade._resources import Permit
-from trade._terms import Granted
-from trade._wire import Token
+from trade._protocol.messages import Token
+from trade._resources.lock_request import Granted
+from trade._resources.resource import Permit
 from trade.errors import LockedByOther, LockLost, MotionStopped, NotStopped
 from waiting import wait_until
 

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from trade import Container, LogReader, current_call, service, where
-from trade._logbook import Logbook
+from trade._telemetry.log_buffer import Logbook
 
 _log = logging.getLogger("trade")
 

@@ -9,8 +9,8 @@ import pytest
 
 from lamps import Lamp, Pair, found, labels
 from trade import Container, where
-from trade._memory import Passage
-from trade._transport import ChannelClosed
+from trade._transport.base import ChannelClosed
+from trade._transport.memory import Passage
 from trade.errors import ContainerLost, NoSuchService, ServiceGone, TradeError
 from trade.testing import MemorySystem, memory_system
 

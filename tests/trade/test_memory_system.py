@@ -13,10 +13,10 @@ import pytest
 
 from lamps import Lamp, Pair, found, labels
 from trade import Container, errors, where
-from trade._announcing import Announcer
-from trade._keys import Address
-from trade._memory import MemoryTransport, Passage
-from trade._wire import ProviderInfo, ServiceInfo
+from trade._discovery.announcer import Announcer
+from trade._protocol.keys import Address
+from trade._protocol.messages import ProviderInfo, ServiceInfo
+from trade._transport.memory import MemoryTransport, Passage
 from trade.errors import ContainerLost, ServiceGone
 from trade.testing import Kind, MemorySystem, memory_system
 
@@ -331,7 +331,7 @@ def held(container: Container) -> Iterator[None]:
 def test_a_container_that_says_nothing_of_itself_is_asked_again_less_and_less_often(
     monkeypatch: pytest.MonkeyPatch, eventually: Eventually
 ) -> None:
-    monkeypatch.setattr("trade._asking._FIRST_PAUSE_S", 0.001)
+    monkeypatch.setattr("trade._discovery.resync._FIRST_PAUSE_S", 0.001)
     with memory_system() as system:
         a = system.container("a")
         ghost = MemoryTransport(system.network, "ghost")
@@ -367,8 +367,8 @@ def test_who_asks_in_vain_still_takes_signs_of_life(lamp: Lamp, eventually: Even
 
 
 def test_nobody_waits_behind_who_has_failed_to_answer(monkeypatch: pytest.MonkeyPatch, eventually: Eventually) -> None:
-    monkeypatch.setattr("trade._asking._ANSWER_S", 0.02)
-    monkeypatch.setattr("trade._asking._SLOW_ANSWER_S", 3600.0)
+    monkeypatch.setattr("trade._discovery.resync._ANSWER_S", 0.02)
+    monkeypatch.setattr("trade._discovery.resync._SLOW_ANSWER_S", 3600.0)
     with memory_system() as system:
         a, silent, other = (
             system.container("a"),

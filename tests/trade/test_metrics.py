@@ -13,7 +13,7 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from trade import Container, Measure, Resource, Settings, service, where
-from trade._local_service import LocalService
+from trade._services.local_service import LocalService
 from trade.errors import AccessDenied, ConfigurationError, InvalidArgument
 from waiting import wait_until
 

@@ -6,7 +6,8 @@ import pytest
 from msgspec import structs
 
 from migrants import Scene
-from trade import Called, _departing, service, where
+from trade import Called, service, where
+from trade._migration import source as _departing
 from trade.errors import ConfigurationError, LockedByOther, NoSuchService, ServiceGone, TooManyServices
 from waiting import wait_until
 

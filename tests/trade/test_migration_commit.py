@@ -6,7 +6,8 @@ import threading
 import pytest
 
 from migrants import Scene
-from trade import Handle, _departing, where
+from trade import Handle, where
+from trade._migration import source as _departing
 from trade.errors import CannotMigrate, LockedByOther, MigrationUnknown, ServiceGone
 from waiting import wait_until
 
@@ -99,7 +100,7 @@ def test_who_dies_before_it_offers_it_leaves_it_to_somebody_who_decides(scene: S
 def test_who_dies_before_it_is_offered_there_takes_it_along_and_what_was_prepared_ends(
     scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("trade._arriving.TICKET_S", 0.2)
+    monkeypatch.setattr("trade._migration.target.TICKET_S", 0.2)
     count, _ = scene.counter()
     in_between(scene, lambda: scene.memory.kill("old"))
     run = scene.asker.find(where(name="migrate", container="old")).start(count, "new")

@@ -8,8 +8,9 @@ from typing import Any
 import pytest
 
 from migrants import MODULE, Scene, imported
-from trade import Container, Handle, _arriving, _freezing, _state, where
-from trade._making import path_of
+from trade import Container, Handle, where
+from trade._migration import quiesce, state, target
+from trade._migration.factory import path_of
 from trade.errors import (
     AccessDenied,
     Busy,
@@ -98,7 +99,7 @@ def test_nothing_migrates_during_an_e_stop(scene: Scene) -> None:
 
 
 def test_a_call_that_does_not_end_keeps_it(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_freezing, "CALLS_S", 0.05)
+    monkeypatch.setattr(quiesce, "CALLS_S", 0.05)
     count, shown = scene.counter()
     inside, leave = threading.Event(), threading.Event()
     scene.module.before["count"] = lambda: (inside.set(), leave.wait(30))
@@ -112,7 +113,7 @@ def test_a_call_that_does_not_end_keeps_it(scene: Scene, monkeypatch: pytest.Mon
 
 
 def test_a_provider_does_not_move_itself_away_under_its_own_call(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_freezing, "CALLS_S", 0.05)
+    monkeypatch.setattr(quiesce, "CALLS_S", 0.05)
     count, _ = scene.counter()
     here = scene.old.handle(count.key)
     scene.module.before["count"] = lambda: scene.old.migrate(here, to="new")
@@ -186,7 +187,7 @@ def test_S18_what_is_commanded_while_state_is_restored_is_refused(scene: Scene) 
 
 
 def test_S18_who_is_given_up_may_not_command_later_either(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_state, "BUDGET_S", 0.05)
+    monkeypatch.setattr(state, "BUDGET_S", 0.05)
     leave, outcomes = threading.Event(), list[Exception]()
 
     def linger(wheel: Any, _state: object) -> None:
@@ -277,7 +278,7 @@ def test_a_constructor_that_fails_there_changes_nothing(scene: Scene) -> None:
 
 def test_a_full_container_says_so(scene: Scene) -> None:
     count, shown = scene.counter()
-    tickets = [prepare(scene).ticket for _ in range(_arriving.MOST)]
+    tickets = [prepare(scene).ticket for _ in range(target.MOST)]
     with pytest.raises(Busy):
         scene.asker.migrate(count, to="new")
     for ticket in tickets:
@@ -308,7 +309,7 @@ def test_what_a_provider_raises_is_told_and_changes_nothing(scene: Scene, method
 def test_a_provider_that_takes_too_long_with_its_state_stays(
     scene: Scene, method: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(_state, "BUDGET_S", 0.05)
+    monkeypatch.setattr(state, "BUDGET_S", 0.05)
     count, _ = scene.counter()
     leave = threading.Event()
     scene.module.before[method] = lambda: leave.wait(30)
@@ -379,13 +380,13 @@ def ask(scene: Scene, name: str) -> Handle:
 
 def prepare(scene: Scene) -> Any:
     kind = scene.module.Counter
-    print_of = _arriving.fingerprint(kind, (), scene.old._parts.codec)
-    luggage = _arriving.Luggage(class_path=path_of(kind), fingerprint=print_of, groups=("hall",))
+    print_of = target.fingerprint(kind, (), scene.old._parts.codec)
+    luggage = target.Luggage(class_path=path_of(kind), fingerprint=print_of, groups=("hall",))
     return ask(scene, "prepare_arrival")(luggage)
 
 
 def test_what_nobody_fetches_is_closed_by_itself(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_arriving, "TICKET_S", 0.05)
+    monkeypatch.setattr(target, "TICKET_S", 0.05)
     ticket = prepare(scene).ticket
     wait_until(lambda: scene.module.events == ["made 1", "close 0"])
     with pytest.raises(CannotMigrate, match="not there any more"):

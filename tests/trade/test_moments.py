@@ -5,8 +5,8 @@ import time
 
 import pytest
 
-from trade._moments import clock, day_and_clock
-from trade._occasions import Terms
+from trade._notifications.triggers import Terms
+from trade._timestamps import clock, day_and_clock
 from trade.errors import ConfigurationError, LockedByOther
 
 NO_MOMENTS = [1e300, -1e300, math.inf, -math.inf, math.nan]

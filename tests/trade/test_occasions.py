@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from trade import Container, Handle, service, where
-from trade import _notifications as notifications
+from trade._notifications import notification as notifications
 from trade.errors import ConfigurationError, DeviceSilent, NoSuchNotification
 from waiting import wait_until
 

@@ -8,10 +8,11 @@ import msgspec
 import pytest
 from msgspec import structs
 
-from trade import Container, Handle, _ongoing, service, where
-from trade._keys import Address, call_key, reply_key
-from trade._ongoing import Once, Ongoing
-from trade._wire import EMPTY, EMPTY_ARGUMENTS, PROTOCOL, Call, Reply, Status, decode_reply, encode_message
+from trade import Container, Handle, service, where
+from trade._context import active_calls
+from trade._context.active_calls import Once, Ongoing
+from trade._protocol.keys import Address, call_key, reply_key
+from trade._protocol.messages import EMPTY, EMPTY_ARGUMENTS, PROTOCOL, Call, Reply, Status, decode_reply, encode_message
 
 SECOND_NS = 10**9
 LATER = 2**62
@@ -158,7 +159,7 @@ def test_answers_go_some_seconds_after_their_deadline(monkeypatch: pytest.Monkey
 
 
 def test_a_call_under_way_is_never_forgotten_and_too_old_ones_never_run_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_ongoing, "MOST_CALLS", 1024)
+    monkeypatch.setattr(active_calls, "MOST_CALLS", 1024)
     once = Once()
     running = begun(once, call(0))
     for i in range(1, 3000):
@@ -173,7 +174,7 @@ def test_a_call_under_way_is_never_forgotten_and_too_old_ones_never_run_again(mo
 
 
 def test_large_answers_are_let_go_first_but_not_that_they_were_given(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_ongoing, "MOST_BYTES", 10_000)
+    monkeypatch.setattr(active_calls, "MOST_BYTES", 10_000)
     once = Once()
     for i in range(20):
         end(once, call(i, expires_ns=LATER), b"x" * 1000)

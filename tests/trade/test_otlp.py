@@ -19,7 +19,7 @@ from opentelemetry.sdk.trace.sampling import Decision, TraceIdRatioBased
 from opentelemetry.trace import SpanKind, StatusCode
 
 from trade import Container, Settings, current_call, service, where
-from trade._otlp import Export, trace_id
+from trade._telemetry.otlp import Export, trace_id
 from trade.errors import ConfigurationError
 
 Start = Callable[..., Container]
@@ -189,7 +189,7 @@ def test_samplers_that_go_by_the_trace_take_as_many_as_they_are_told(ratio: floa
 def test_calls_go_on_and_containers_end_when_no_collector_is_there(
     system: str, collector: Collector, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("trade._otlp._TIMEOUT_S", 0.2)
+    monkeypatch.setattr("trade._telemetry.otlp._TIMEOUT_S", 0.2)
     collector.close()
     with _three(collector.url, monkeypatch) as user:
         assert user.find(where(name="step"), wait_s=30)(0.5) == 0.5

@@ -3,7 +3,7 @@
 from msgspec import structs
 
 from trade import Container, Resource, service, where
-from trade._wire import NO_SCHEMA, ProviderInfo
+from trade._protocol.messages import NO_SCHEMA, ProviderInfo
 from trade.testing import memory_system
 from waiting import wait_until
 

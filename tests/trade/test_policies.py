@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trade._policies import VERBS, Policy, Role
-from trade._policy_file import read_policy
+from trade._security.policy import VERBS, Policy, Role
+from trade._security.policy_file import read_policy
 from trade.errors import ConfigurationError
 
 POLICY = """

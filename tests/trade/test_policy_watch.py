@@ -7,7 +7,7 @@ import pytest
 
 from guarded_neck import POLICY, Neck, find, memory, policy, rewritten
 from trade import Container, Settings
-from trade._memory import MemoryTransport
+from trade._transport.memory import MemoryTransport
 from trade.errors import AccessDenied
 from trade.testing import MemorySystem
 from waiting import wait_until
@@ -51,7 +51,7 @@ def test_a_list_that_could_not_be_read_is_read_once_it_can_be(
     watching: Container, policy: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Whoever copies it as another user and gives the right to read it afterwards changes nothing else of it."""
-    monkeypatch.setattr("trade._policy_watch._AGAIN_NS", 10**15)
+    monkeypatch.setattr("trade._container.policy_reload._AGAIN_NS", 10**15)
     listed, may = tmp_path / "revoked.toml", Path.read_text
     listed.write_text("revoked = []")
     rewritten(policy, 'revoked = ["thief"]', 'revoked_file = "revoked.toml"')
@@ -74,7 +74,7 @@ def test_a_list_that_could_not_be_read_is_read_once_it_can_be(
 def test_files_that_were_refused_are_tried_again_as_they_are(
     watching: Container, policy: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("trade._policy_watch._AGAIN_NS", 10**9)
+    monkeypatch.setattr("trade._container.policy_reload._AGAIN_NS", 10**9)
     may, down = Path.read_text, [False]
 
     def passing(path: Path, **options: str) -> str:

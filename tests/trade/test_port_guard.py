@@ -10,8 +10,8 @@ import pytest
 
 from certificates import Papers
 from trade import Container, Settings
-from trade._endpoints import Endpoint, free_endpoint
-from trade._port_guard import MOST_STRANGERS, PortGuard
+from trade._transport.endpoints import Endpoint, free_endpoint
+from trade._transport.port_guard import MOST_STRANGERS, PortGuard
 from waiting import wait_until
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="there are such filters on Linux only")

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from trade import service
-from trade._predicates import Predicate, achieves_all, parse_achieved, parse_predicates, read_achieved
+from trade._registry.predicates import Predicate, achieves_all, parse_achieved, parse_predicates, read_achieved
 from trade.errors import ConfigurationError
 
 FITS = [

@@ -106,12 +106,12 @@ def test_closing_frees_blocked_callers(here: Container, there: Container, gate: 
 
 
 def test_a_container_that_cannot_start_leaves_nothing(system: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    from trade import _parts
+    from trade._container import assembly
 
     def fail(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(_parts, "Watch", fail)
+    monkeypatch.setattr(assembly, "Watch", fail)
     with pytest.raises(KeyboardInterrupt):
         Container(Settings.read(container="interrupted"))
     monkeypatch.undo()

@@ -149,7 +149,7 @@ def test_settings_come_from_arguments_then_the_environment_then_defaults() -> No
 
 
 def test_a_container_may_be_reached_at_a_chosen_endpoint(system: str) -> None:
-    from trade._endpoints import free_endpoint
+    from trade._transport.endpoints import free_endpoint
 
     class Echo:
         @service(effect="read")
@@ -181,8 +181,8 @@ def test_an_endpoint_that_is_taken_is_refused_and_leaves_nothing(here: Container
 def test_when_a_free_port_is_taken_in_between_another_one_is_tried(
     here: Container, system: str, monkeypatch: pytest.MonkeyPatch, listen: list[str]
 ) -> None:
-    from trade import _joining
-    from trade._endpoints import Endpoint, free_endpoint
+    from trade._container import connect
+    from trade._transport.endpoints import Endpoint, free_endpoint
 
     taken = next(
         connection.laddr.port
@@ -190,13 +190,13 @@ def test_when_a_free_port_is_taken_in_between_another_one_is_tried(
         if connection.status == psutil.CONN_LISTEN
     )
     endpoints = map(Endpoint.read, [f"tcp/127.0.0.1:{taken}", f"tcp/127.0.0.1:{taken}", free_endpoint()])
-    monkeypatch.setattr(_joining, "with_free_port", lambda _: next(endpoints))
+    monkeypatch.setattr(connect, "with_free_port", lambda _: next(endpoints))
     with Container(Settings.read(container="second", listen=listen)) as second:
         assert {info.name for info in second.containers()} == {"here", "second"}
 
 
 def test_a_container_reached_at_its_endpoint_is_reached_again_after_its_restart(system: str) -> None:
-    from trade._endpoints import free_endpoint
+    from trade._transport.endpoints import free_endpoint
 
     endpoint = free_endpoint()
     with Container(Settings.read(container="client", connect=[endpoint])) as client:

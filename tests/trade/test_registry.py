@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trade._constraints import where
-from trade._keys import Address, ServiceKey
-from trade._registry import Change, Registry
-from trade._wire import ProviderInfo, ServiceInfo
+from trade._protocol.keys import Address, ServiceKey
+from trade._protocol.messages import ProviderInfo, ServiceInfo
+from trade._registry.constraints import where
+from trade._registry.registry import Change, Registry
 
 OWN = Address("me", "here", "e0")
 OTHER = Address("arm", "driver", "e1")
@@ -174,7 +174,7 @@ def test_an_answer_from_before_the_sign_of_life_fell_is_none(registry: Registry)
 
 
 def test_only_so_many_providers_of_one_container_count(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("trade._registry._MOST_PROVIDERS", 10)
+    monkeypatch.setattr("trade._registry.registry._MOST_PROVIDERS", 10)
     registry.appear(OTHER)
     for number in range(1, 100):
         registry.put(OTHER, "rosie", f"p{number}", info(number))

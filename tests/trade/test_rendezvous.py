@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from trade import Container, where
-from trade._endpoints import free_endpoint
-from trade._rendezvous import Rendezvous
+from trade._discovery.host_folder import Rendezvous
+from trade._transport.endpoints import free_endpoint
 from trade.errors import ConfigurationError
 
 

@@ -15,10 +15,10 @@ import msgspec
 import pytest
 
 from trade import Container, where
-from trade._invoke import result_decoder
-from trade._records import type_from_schema
-from trade._schemas import schema_message
-from trade._wire import ServiceInfo
+from trade._calls.target import result_decoder
+from trade._protocol.messages import ServiceInfo
+from trade._protocol.schema import schema_message
+from trade._protocol.schema_types import type_from_schema
 
 PROGRAM = """
 import datetime, enum

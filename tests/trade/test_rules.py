@@ -10,9 +10,9 @@ import pytest
 
 from ruled import NOTE, SOON_S, TELL, Desk, Engine, Lamp
 from trade import Container, service, where
-from trade import _rules as rules_module
 from trade.errors import AccessDenied, ConfigurationError
 from trade.rules import Rules, read_rules, rehearse
+from trade.rules import _engine as rules_module
 from waiting import wait_until
 
 

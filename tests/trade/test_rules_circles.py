@@ -7,10 +7,10 @@ import pytest
 
 from ruled import SOON_S, TELL, Desk, Engine, Lamp
 from trade import Container, service, where
-from trade import _rule_causes as causes
-from trade import _rules as rules_module
-from trade._rule_causes import Causes, Mark, turns
 from trade.rules import Firing
+from trade.rules import _engine as rules_module
+from trade.rules import _loop_detector as causes
+from trade.rules._loop_detector import Causes, Mark, turns
 from waiting import wait_until
 
 

@@ -6,9 +6,10 @@ from typing import Any
 
 import pytest
 
-from trade import Container, Handle, _endpoints, service, where
-from trade._endpoints import free_endpoint
-from trade._wire import decode_reply
+from trade import Container, Handle, service, where
+from trade._protocol.messages import decode_reply
+from trade._transport import endpoints
+from trade._transport.endpoints import free_endpoint
 from trade.errors import ConfigurationError
 
 
@@ -107,7 +108,7 @@ def test_a_name_is_resolved_when_it_is_dialled(start_container: Any, monkeypatch
         asked.append(host)
         return real("127.0.0.1" if host == "localhost" else host, port, **more)
 
-    monkeypatch.setattr(_endpoints.socket, "getaddrinfo", lookup)
+    monkeypatch.setattr(endpoints.socket, "getaddrinfo", lookup)
     port = endpoint.rsplit(":", 1)[1]
     client.system.connect(f"tcp/localhost:{port}")
     assert asked[0] == "localhost"

@@ -6,7 +6,7 @@ import pytest
 from msgspec import Meta
 
 from trade import Handle, Secret, service
-from trade._secret import MASK
+from trade._services.secret import MASK
 from trade.errors import InvalidArgument
 
 WORD = "correct horse battery"

@@ -6,9 +6,10 @@ from typing import Any
 
 import pytest
 
-from trade import Container, Handle, _process, service, where
+from trade import Container, Handle, service, where
+from trade._stop_line.listener import Listener
+from trade._threads import fork_guard
 from trade.errors import Busy, Cancelled, ConfigurationError, DeadlineExceeded
-from trade.stop_line._listener import Listener
 
 
 class Bench:
@@ -69,7 +70,7 @@ def test_serial_calls_run_one_at_a_time_in_order_of_arrival(offer: Any, bench: B
 
 def work_serial(work: Handle) -> Any:
     """The queue behind a handle, wherever its provider lives."""
-    [home] = [one for one in _process.live if one.address == work.key.address]
+    [home] = [one for one in fork_guard.live if one.address == work.key.address]
     service = home._parts.providers.lookup(f"{work.key.domain}/{work.key.provider}", work.name)
     assert service is not None
     return service.serial
@@ -155,9 +156,9 @@ def test_async_services_are_serial_too(offer: Any, bench: Bench) -> None:
 def test_only_so_many_wait(
     here: Container, there: Container, bench: Bench, monkeypatch: pytest.MonkeyPatch, eventually: Any
 ) -> None:
-    from trade import _serial
+    from trade._services import serial_queue
 
-    monkeypatch.setattr(_serial, "MOST_WAITING", 2)
+    monkeypatch.setattr(serial_queue, "MOST_WAITING", 2)
     there.register(bench, "robot")
     work = here.find(where(name="work"), wait_s=20)
     runs = [work.start(i) for i in range(4)]

@@ -9,8 +9,8 @@ from msgspec import Struct
 
 from jointed import Joint
 from trade import Container, Handle, Settings, progress, service, where
-from trade._memory import MemoryTransport
-from trade._session import foreign
+from trade._context.sessions import foreign
+from trade._transport.memory import MemoryTransport
 from trade.errors import (
     Cancelled,
     ConfigurationError,

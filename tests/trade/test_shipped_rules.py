@@ -5,11 +5,12 @@ from pathlib import Path
 
 import pytest
 
-from trade import Container, _departing, service, where
-from trade import _rules as rules_module
-from trade._endpoints import free_endpoint
+from trade import Container, service, where
+from trade._migration import source as _departing
+from trade._transport.endpoints import free_endpoint
 from trade.errors import NoSuchService
 from trade.rules import Firing, Rules, read_rules, rehearse
+from trade.rules import _engine as rules_module
 from waiting import wait_until
 
 EXAMPLES = Path(__file__).parents[2] / "examples"

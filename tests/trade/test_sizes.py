@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from trade import Container, service, where
-from trade._wire import MOST_BYTES
+from trade._protocol.messages import MOST_BYTES
 from trade.errors import TooLarge
 
 MIB = 1 << 20

@@ -11,15 +11,15 @@ from pathlib import Path
 import pytest
 
 from trade import Container, Settings, service
-from trade._audit import Event
-from trade._estop_line import EstopReport, all_of
-from trade._rendezvous import runtime_folder
-from trade._wire import Malformed
-from trade.stop_line import StopLines, StopReport
-from trade.stop_line._group_stop import together
-from trade.stop_line._listener import MOST_STRANGERS
-from trade.stop_line._messages import MOST_BYTES, StopAnswer, StopRequest, encoded, read_answer, read_request
-from trade.stop_line._places import line_port, places
+from trade._audit.events import Event
+from trade._discovery.host_folder import runtime_folder
+from trade._estop.broadcast import EstopReport, all_of
+from trade._protocol.messages import Malformed
+from trade._stop_line import StopLines, StopReport
+from trade._stop_line.group_stop import together
+from trade._stop_line.listener import MOST_STRANGERS
+from trade._stop_line.messages import MOST_BYTES, StopAnswer, StopRequest, encoded, read_answer, read_request
+from trade._stop_line.places import line_port, places
 from waiting import wait_until
 
 StartContainer = Callable[..., Container]

@@ -10,9 +10,9 @@ import pytest
 
 from listening import FAST_HZ, PATIENCE_S, Battery, Display, Two
 from trade import Container, where
-from trade._memory import MemoryTransport
-from trade._sample import stream_key
-from trade._streams import Source, Wish
+from trade._protocol.samples import stream_key
+from trade._streams.source import Source, Wish
+from trade._transport.memory import MemoryTransport
 from trade.errors import AccessDenied, ConfigurationError, ServiceGone, SessionEnded, SourceLost
 from trade.testing import MemorySystem
 

@@ -8,10 +8,10 @@ import pytest
 
 from listening import FAST_HZ, PATIENCE_S, Battery, Two, is_sample, numbers, some
 from trade import Handle, Stream, where
-from trade._pace import Pace
-from trade._sample import STEPS_HZ, StreamSample, stream_key
-from trade._streams import Source, Wish
-from trade._wire import EMPTY, PROTOCOL
+from trade._protocol.messages import EMPTY, PROTOCOL
+from trade._protocol.samples import STEPS_HZ, StreamSample, stream_key
+from trade._streams.pace import Pace
+from trade._streams.source import Source, Wish
 from trade.errors import ConfigurationError
 from trade.testing import MemorySystem
 

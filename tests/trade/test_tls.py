@@ -19,10 +19,11 @@ from cryptography.hazmat.primitives import serialization
 from cryptography.x509.oid import ExtendedKeyUsageOID
 
 from certificates import Papers
-from trade import Container, Settings, _ending, service, where
-from trade._endpoints import free_endpoint
-from trade._tls import Certificate
-from trade._zenoh import ZenohTransport, configuration
+from trade import Container, Settings, service, where
+from trade._security import certificate_expiry
+from trade._security.certificates import Certificate
+from trade._transport.endpoints import free_endpoint
+from trade._transport.zenoh import ZenohTransport, configuration
 from trade.errors import AccessDenied, CannotConnect, ConfigurationError, ContainerLost, NoSuchService
 from waiting import wait_until
 
@@ -226,7 +227,7 @@ def test_who_sits_where_its_certificate_is_not_for_is_not_linked(
     """Else any container of the system could take another one's address."""
     own, endpoint = papers.of("planner"), tls_endpoint()
     if not honest:
-        monkeypatch.setattr("trade_gateway._pki._HERE", ("arm.example", "10.9.9.9"))
+        monkeypatch.setattr("trade_gateway.pki._authority._HERE", ("arm.example", "10.9.9.9"))
     open_bare(papers.of("arm"), listen=[endpoint])
     planner = start_container("planner", tls=own, connect=[endpoint])
     is_linked(planner, "arm", honest)
@@ -266,7 +267,7 @@ def test_a_container_that_runs_is_told_in_time_to_start_again_before_its_certifi
     start_container: Any, papers: Papers, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As it listens with the one it was started with, a renewed one in its folder does not help."""
-    monkeypatch.setattr(_ending, "_TOLD", (timedelta(hours=22), timedelta(hours=21)))
+    monkeypatch.setattr(certificate_expiry, "_TOLD", (timedelta(hours=22), timedelta(hours=21)))
     with caplog.at_level(logging.WARNING, "trade"):
         for name, hours in (("arm", 22), ("leg", 23)):
             start_container(name, tls=papers.of(name, lasts=timedelta(hours=hours, seconds=2)))
@@ -279,10 +280,10 @@ def test_a_container_that_runs_is_told_in_time_to_start_again_before_its_certifi
 def test_the_end_of_a_certificate_is_told_twice(
     papers: Papers, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(_ending, "_TOLD", (timedelta(hours=22), timedelta(hours=21)))
+    monkeypatch.setattr(certificate_expiry, "_TOLD", (timedelta(hours=22), timedelta(hours=21)))
     until = datetime.now(timezone.utc) + timedelta(hours=21, seconds=1)
     with caplog.at_level(logging.WARNING, "trade"):
-        ending = _ending.Ending(Certificate(papers.of("arm"), "arm", frozenset(), until))
+        ending = certificate_expiry.Ending(Certificate(papers.of("arm"), "arm", frozenset(), until))
         assert said_of_the_end(caplog, "arm") == 1
         wait_until(lambda: said_of_the_end(caplog, "arm") == 2, "once more")
         ending.close()
@@ -428,7 +429,7 @@ def test_certificates_that_are_of_no_use_are_refused(
     papers: Papers, monkeypatch: pytest.MonkeyPatch, made_with: dict[str, Any], said: str
 ) -> None:
     for name, value in made_with.items():
-        monkeypatch.setattr(f"trade_gateway._pki.{name}", value)
+        monkeypatch.setattr(f"trade_gateway.pki._authority.{name}", value)
     with pytest.raises(ConfigurationError, match=said):
         read(tls=papers.of("arm"))
 

@@ -10,9 +10,9 @@ from typing import Any
 
 import pytest
 
-import trade._spans as noted
+import trade._telemetry.spans as noted
 from trade import Called, Container, Handle, Resource, Secret, Trace, current_call, service, where
-from trade._local_service import LocalService
+from trade._services.local_service import LocalService
 from trade.errors import AccessDenied, NoSuchCall
 from trade.testing import MemorySystem, memory_system
 

@@ -9,9 +9,9 @@ import zenoh
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trade._memory import Clock, Kind, MemoryTransport, Network, Passage
-from trade._memory._keys import meet
-from trade._transport import Channel, ChannelClosed, Message
+from trade._transport.base import Channel, ChannelClosed, Message
+from trade._transport.memory import Clock, Kind, MemoryTransport, Network, Passage
+from trade._transport.memory.keys import meet
 from trade.testing import LossConformance, Severable, TransportConformance
 
 

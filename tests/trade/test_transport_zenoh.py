@@ -9,9 +9,9 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from trade._rendezvous import free_endpoint
-from trade._transport import Channel, ChannelClosed, Presence, Questions
-from trade._zenoh import _CHANNEL_CAPACITY, ZenohTransport, configuration
+from trade._discovery.host_folder import free_endpoint
+from trade._transport.base import Channel, ChannelClosed, Presence, Questions
+from trade._transport.zenoh import _CHANNEL_CAPACITY, ZenohTransport, configuration
 from trade.testing import LossConformance, Severable, TransportConformance
 
 

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from msgspec import Meta, Struct
 
 from trade import Container, Handle, service, where
-from trade._schemas import fits, schema_message
-from trade._wire import NO_SCHEMA, Parameter, ServiceInfo
+from trade._protocol.messages import NO_SCHEMA, Parameter, ServiceInfo
+from trade._protocol.schema import fits, schema_message
 
 
 class Point(Struct):
@@ -191,7 +191,7 @@ def test_foreign_schemas_break_nothing(schema: dict[str, Any], more: Any) -> Non
         parameters=(Parameter("a"),),
     )
     decoded = msgspec.msgpack.decode(msgspec.msgpack.encode(info), type=ServiceInfo)
-    from trade._constraints import _returns, _takes, types_text
+    from trade._registry.constraints import _returns, _takes, types_text
 
     for kind in (int, Point, list[Tree], Tree, Any):
         assert _returns(decoded, types_text([kind])) in (True, False)

@@ -10,10 +10,19 @@ import pytest
 from msgspec import msgpack
 
 from trade import Container, service, where
-from trade._keys import ALIVE, ESTOPS, Address, alive_key, estop_confirmed_key, estop_key, registry_key, tally_key
-from trade._memory import MemoryTransport
-from trade._transport import ChannelClosed
-from trade._wire import PROTOCOL, encode_message
+from trade._protocol.keys import (
+    ALIVE,
+    ESTOPS,
+    Address,
+    alive_key,
+    estop_confirmed_key,
+    estop_key,
+    registry_key,
+    tally_key,
+)
+from trade._protocol.messages import PROTOCOL, encode_message
+from trade._transport.base import ChannelClosed
+from trade._transport.memory import MemoryTransport
 from trade.errors import NoSuchService, Stopped
 from trade.testing import MemorySystem, memory_system
 

@@ -6,9 +6,9 @@ from typing import Any
 import pytest
 
 from trade import Container, Handle, service, where
-from trade._announcing import Announcer
-from trade._keys import Address
-from trade._wire import ProviderInfo, ServiceInfo
+from trade._discovery.announcer import Announcer
+from trade._protocol.keys import Address
+from trade._protocol.messages import ProviderInfo, ServiceInfo
 
 HOST = Address("somebody", "host", "e1")
 

@@ -11,10 +11,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from forged import FORGED, FUTURE, PROVIDER, TEXT, FakeCallee
-from trade import Container, Secret, _wire, service, where
-from trade._announcing import Announcer
-from trade._keys import Address, alive_key, as_chunk, call_key, calls_to, is_chunk, registry_key, reply_key, tally_key
-from trade._wire import (
+from trade import Container, Secret, service, where
+from trade._discovery.announcer import Announcer
+from trade._protocol import messages
+from trade._protocol.keys import (
+    Address,
+    alive_key,
+    as_chunk,
+    call_key,
+    calls_to,
+    is_chunk,
+    registry_key,
+    reply_key,
+    tally_key,
+)
+from trade._protocol.messages import (
     EMPTY,
     EMPTY_ARGUMENTS,
     PROTOCOL,
@@ -101,7 +112,7 @@ def test_hostile_nesting_and_lengths_are_malformed(decode: Any, data: bytes) -> 
 
 @pytest.mark.parametrize("decode", _DECODERS, ids=lambda decode: decode.__name__)
 def test_what_is_larger_than_any_message_is_not_decoded(decode: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_wire, "_MOST_MESSAGE_BYTES", 1000)
+    monkeypatch.setattr(messages, "_MOST_MESSAGE_BYTES", 1000)
     with pytest.raises(Malformed, match="1001 bytes are more than any message may have"):
         decode(bytes(1001))
 
@@ -453,7 +464,7 @@ def test_a_flood_of_entries_ends_at_a_limit_and_disturbs_nobody(
     monkeypatch: pytest.MonkeyPatch,
     eventually: Any,
 ) -> None:
-    monkeypatch.setattr("trade._registry._MOST_PROVIDERS", 100)
+    monkeypatch.setattr("trade._registry.registry._MOST_PROVIDERS", 100)
     raw, _ = announcer
     _sign = raw.appear(alive_key(FORGED))
     assert eventually(lambda: FORGED in here._parts.registry._containers)

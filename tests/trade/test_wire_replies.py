@@ -8,16 +8,10 @@ import pytest
 
 from forged import FUTURE, FakeCallee
 from trade import Container
-from trade._handle_codec import handle_codec
-from trade._invoke import result_decoder
-from trade._schemas import schema_message
-from trade._wire import (
-    PROTOCOL,
-    Reply,
-    ServiceInfo,
-    Status,
-    encode_message,
-)
+from trade._calls.handle_codec import handle_codec
+from trade._calls.target import result_decoder
+from trade._protocol.messages import PROTOCOL, Reply, ServiceInfo, Status, encode_message
+from trade._protocol.schema import schema_message
 from trade.errors import InvalidResult, RemoteError
 
 # --- replies from somewhere strange

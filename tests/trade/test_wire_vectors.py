@@ -6,17 +6,17 @@ from typing import Any
 import msgspec
 import pytest
 
-from trade import _estop_messages, _wire
-from trade._sample import decode_sample
+from trade._protocol import estop_messages, messages
+from trade._protocol.samples import decode_sample
 from vectors import DROPPED, FILE, MESSAGES, kind_of, text
 
 READERS: dict[str, Callable[[bytes], Any]] = {
-    "Call": _wire.decode_call,
-    "Reply": _wire.decode_reply,
-    "Tally": _wire.decode_tally,
-    "ProviderInfo": _wire.decode_provider,
-    "EstopOrder": lambda data: _estop_messages.decode_estop_order(data, "anna"),
-    "EstopConfirmed": _estop_messages.decode_estop_confirmed,
+    "Call": messages.decode_call,
+    "Reply": messages.decode_reply,
+    "Tally": messages.decode_tally,
+    "ProviderInfo": messages.decode_provider,
+    "EstopOrder": lambda data: estop_messages.decode_estop_order(data, "anna"),
+    "EstopConfirmed": estop_messages.decode_estop_confirmed,
     "StreamSample": decode_sample,
 }
 
@@ -41,5 +41,5 @@ def test_a_message_is_read_and_written_as_it_was(name: str) -> None:
 @pytest.mark.parametrize("name", DROPPED)
 def test_what_is_no_message_is_dropped(name: str) -> None:
     kind, data = DROPPED[name]
-    with pytest.raises(_wire.Malformed):
+    with pytest.raises(messages.Malformed):
         READERS[kind](data)

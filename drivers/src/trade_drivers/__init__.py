@@ -1,21 +1,22 @@
 """Motors, grippers, arms, cameras and sensors as TRADE services: interfaces in SI units, robot file, drivers."""
 
-from trade_drivers._arm import Arm, ArmLimits, ArmState
+from trade._protocol.schema_types import publish
 from trade_drivers._attach import AttachedRobot, attach
-from trade_drivers._can_monitor import CanBusState, CanMonitor
-from trade_drivers._commission import Bench, Commissioner, Found, scan
-from trade_drivers._driver import AnyDriver, AttachedBus, Driver, SenseDriver, drivers, load_driver
-from trade_drivers._interfaces import Gripper, GripperLimits, GripperState, JointGroup, Motor, MotorState
-from trade_drivers._load import load
-from trade_drivers._plan import FollowProgress, JointLimits, Plan, Tolerances
-from trade_drivers._polled import Measured, PolledSensor
-from trade_drivers._refusals import check, refusals
-from trade_drivers._senses import UNITS, Camera, CameraInfo, Image, Reading, Sensor, SensorInfo
-from trade_drivers._trajectory import Trajectory, TrajectoryPoint, planned
-from trade_drivers._without import without
-from trade_drivers._work import WireError
+from trade_drivers.bus._jobs import WireError
+from trade_drivers.bus.can._monitor import CanBusState, CanMonitor
+from trade_drivers.commissioning._commissioner import Bench, Commissioner, Found, scan
 from trade_drivers.faults import Fault, FaultInfo, FaultLog, FaultSample, Trouble
+from trade_drivers.interfaces._arm import Arm, ArmLimits, ArmState
+from trade_drivers.interfaces._motion import Gripper, GripperLimits, GripperState, JointGroup, Motor, MotorState
+from trade_drivers.interfaces._polled_sensor import Measured, PolledSensor
+from trade_drivers.interfaces._sensing import UNITS, Camera, CameraInfo, Image, Reading, Sensor, SensorInfo
+from trade_drivers.interfaces._trajectory import Trajectory, TrajectoryPoint, planned
+from trade_drivers.motion._plan import FollowProgress, JointLimits, Plan, Tolerances
+from trade_drivers.plugins._driver import AnyDriver, AttachedBus, Driver, SenseDriver, drivers, load_driver
+from trade_drivers.plugins._validate import check, refusals
 from trade_drivers.robotfile import Bus, CanBus, Coupled, Group, Joint, Robot, SerialBus, UrBus, parse
+from trade_drivers.robotfile._load import load
+from trade_drivers.robotfile._subset import without
 
 __all__ = [
     "UNITS",
@@ -77,3 +78,8 @@ __all__ = [
     "scan",
     "without",
 ]
+
+publish(
+    __name__, ArmLimits, ArmState, CameraInfo, CanBusState, Fault, FaultInfo, FaultSample, GripperLimits, GripperState
+)
+publish(__name__, Image, JointLimits, MotorState, Reading, SensorInfo)

@@ -4,9 +4,9 @@
 one's own process. `read_log`, `motion_writes` and their kin say what a bus has seen.
 """
 
-from ._client import SimControl
-from ._errors import SimulationError
-from ._faults import (
+from trade_hil_sim.control._client import SimControl
+from trade_hil_sim.control._process import SimProcess, remove_leftovers
+from trade_hil_sim.faults._faults import (
     Absent,
     AnswerFault,
     BadCrc,
@@ -35,11 +35,12 @@ from ._faults import (
     Unplug,
     WrongModel,
 )
-from ._judge import events, frames, instructions, motion_writes, read_log, received, sent, writes
-from ._line import Peer, SerialLine
-from ._log import ByteLog, Entry
-from ._process import SimProcess, remove_leftovers
-from ._state import ArmTruth, BusState, DeviceState, GripperTruth
+from trade_hil_sim.log._byte_log import ByteLog, Entry
+from trade_hil_sim.log._queries import events, frames, instructions, motion_writes, read_log, received, sent, writes
+from trade_hil_sim.mechanics._truth import ArmTruth, BusState, DeviceState, GripperTruth
+from trade_hil_sim.robot._errors import SimulationError
+from trade_hil_sim.serial._line import Peer, SerialLine
+
 from .can import CanBus, Frame
 from .dynamixel import MODELS, XL430_W250, XM430_W350, DynamixelBus, Servo
 from .robotiq import Gripper, RobotiqBus

@@ -14,15 +14,15 @@ from types import FrameType
 
 import msgspec
 
-from ._client import SimControl
-from ._control import ControlServer, State
-from ._errors import SimulationError
-from ._fresh import fresh_bus
-from ._log import ByteLog
-from ._process import Ready
-from ._ready import ready
-from ._robot import buses_of, read_robot
-from ._words import command_of, listing
+from trade_hil_sim.control._client import SimControl
+from trade_hil_sim.control._command_line import command_of, listing
+from trade_hil_sim.control._process import Ready
+from trade_hil_sim.control._server import ControlServer, State
+from trade_hil_sim.log._byte_log import ByteLog
+from trade_hil_sim.robot._errors import SimulationError
+from trade_hil_sim.robot._factory_devices import fresh_bus
+from trade_hil_sim.robot._polling import ready
+from trade_hil_sim.robot._robot import buses_of, read_robot
 
 EPILOG = f"""\
 When all ports can be opened, one line of JSON appears on standard output:

@@ -13,9 +13,9 @@ from mcp import McpError
 
 from agent_rig import Client, Robot, connected, run
 from trade import Container, where
-from trade._audit import Audit
+from trade._audit.events import Audit
 from trade.testing import MemorySystem
-from trade_gateway.agents._tools import TOOLS
+from trade_gateway.mcp._tools import TOOLS
 from waiting import wait_until
 
 

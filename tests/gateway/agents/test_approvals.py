@@ -11,7 +11,7 @@ from agent_rig import POLICY, Client, Part, Robot, run
 from trade import Container, service, where
 from trade.errors import AccessDenied, ConfigurationError, TradeError
 from trade.testing import MemorySystem
-from trade_gateway.agents import Approvals
+from trade_gateway.mcp import Approvals
 from waiting import wait_until
 
 

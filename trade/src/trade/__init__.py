@@ -12,38 +12,40 @@ from typing import Any
 from msgspec import Meta
 
 from trade import errors
-from trade._constraints import Constraint, where
-from trade._container import Container
-from trade._context import CallContext, current_call, progress
-from trade._estop_line import EstopReport
-from trade._estopping import LIMIT_S
-from trade._handle import Bound, Handle
-from trade._hooking import Hook
-from trade._hooks import Called, HookInfo
-from trade._load import LoadInfo
-from trade._lock import Lock, OnLost, OnRequest
-from trade._locking import LEASE_S, RESUME_WAIT_S
-from trade._logbook import LogLine
-from trade._many import Outcome
-from trade._measures import Measure
-from trade._notifications import Notification, NotificationInfo
-from trade._notifying import POLL_S
-from trade._occasions import What
-from trade._resources import Permit, Resource, permit
-from trade._run import Run
-from trade._sample import Sample
-from trade._secret import Secret
-from trade._service import service
-from trade._session import Session
+from trade._calls.batch import Outcome
+from trade._calls.handle import Bound, Handle
+from trade._calls.run import Run
+from trade._container.container import Container
+from trade._container.hooking import Hook
+from trade._container.notifying import POLL_S
+from trade._container.reachability import Sight
+from trade._container.system import ContainerInfo, System, WithdrawnInfo
+from trade._container.tracing import LogReader, Trace
+from trade._context.call_context import CallContext, current_call, progress
+from trade._context.sessions import Session
+from trade._counters import Measure
+from trade._estop.broadcast import EstopReport
+from trade._estop.controller import LIMIT_S
+from trade._hooks.hook import Called, HookInfo
+from trade._locks.api import LEASE_S, RESUME_WAIT_S
+from trade._locks.lock import Lock, OnLost, OnRequest
+from trade._migration.target import Prepared
+from trade._notifications.notification import Notification, NotificationInfo
+from trade._notifications.triggers import What
+from trade._protocol.messages import HEALTHY, Estop, Scalar, Token
+from trade._protocol.samples import Sample
+from trade._protocol.schema_types import publish
+from trade._registry.constraints import Constraint, where
+from trade._resources.lock_request import Granted, LockInfo
+from trade._resources.resource import Holder, Permit, Resource, permit
+from trade._services.decorator import service
+from trade._services.secret import Secret
 from trade._settings import Settings
-from trade._sight import Sight
-from trade._spans import Span
-from trade._stream import If, Stream
-from trade._system import ContainerInfo, System
-from trade._terms import LockInfo
-from trade._tracing import LogReader, Trace
-from trade._wire import HEALTHY, Estop, Scalar
-from trade.stop_line import StopReport
+from trade._stop_line import StopReport
+from trade._streams.stream import If, Stream
+from trade._telemetry.load import LoadInfo
+from trade._telemetry.log_buffer import LogLine
+from trade._telemetry.spans import Span
 
 __all__ = [
     "Bound",
@@ -492,3 +494,8 @@ def estop_clear(ids: Sequence[str], *, limit_s: float = LIMIT_S) -> EstopReport:
 for _name in __all__:  # `help(trade.lock)` says all that there is to say
     if f"see `Container.{_name}`" in (_said := getattr(globals()[_name], "__doc__", None) or "").replace("See", "see"):
         globals()[_name].__doc__ = getattr(Container, _name).__doc__
+
+publish(
+    __name__, ContainerInfo, Estop, EstopReport, Handle, HookInfo, LoadInfo, LockInfo, LogLine, NotificationInfo, Span
+)
+publish(__name__, Granted, Holder, Prepared, Token, WithdrawnInfo)

@@ -13,11 +13,11 @@ from types import MappingProxyType
 from typing import Final
 from urllib.parse import SplitResult, urlsplit
 
-from trade._endpoints import Endpoint, dialled_from_here
-from trade._keys import as_chunk, is_chunk
-from trade._policies import EVERYTHING
-from trade._sample import STEPS_HZ
-from trade._tls import Certificate
+from trade._protocol.keys import as_chunk, is_chunk
+from trade._protocol.samples import STEPS_HZ
+from trade._security.certificates import Certificate
+from trade._security.policy import EVERYTHING
+from trade._transport.endpoints import Endpoint, dialled_from_here
 from trade.errors import ConfigurationError
 
 __all__ = ["Settings"]

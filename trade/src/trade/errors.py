@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Final
 
-from trade._moments import clock
+from trade._timestamps import clock
 
 __all__ = [
     "AccessDenied",

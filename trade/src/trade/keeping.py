@@ -1,5 +1,5 @@
 """Files in which something outlives its process, for whoever keeps such."""
 
-from trade._database import Database
+from trade._storage.database import Database
 
 __all__ = ["Database"]

@@ -1,5 +1,5 @@
 """For those that listen for strangers: a bound on how many of them there are at once."""
 
-from trade._bounded_listener import BoundedListener
+from trade._transport.bounded_listener import BoundedListener
 
 __all__ = ["BoundedListener"]

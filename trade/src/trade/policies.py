@@ -3,10 +3,10 @@
 Containers read their own: see `trade.Settings.policy` and `trade.Container.load_policy`.
 """
 
-from trade._access import decide_call
-from trade._acl import Crossing, acl, crossings
-from trade._policies import EVERYTHING, VERBS, Decision, Policy, Role
-from trade._policy_file import read_policy
+from trade._security.authorizer import decide_call
+from trade._security.policy import EVERYTHING, VERBS, Decision, Policy, Role
+from trade._security.policy_file import read_policy
+from trade._security.zenoh_acl import Crossing, acl, crossings
 
 __all__ = [
     "EVERYTHING",

@@ -1,5 +1,5 @@
 """Programs started on other hosts through ``ssh``, for whoever brings up a whole system: ``trade system up``."""
 
-from trade._starting import LONGEST_S, Started, end_there, launch, missing_there
+from trade._remote.ssh import LONGEST_S, Started, end_there, launch, missing_there
 
 __all__ = ["LONGEST_S", "Started", "end_there", "launch", "missing_there"]

@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any, Final, TypeVar, get_type_hints
 
 from trade import current_call
-from trade._service import effect_of
+from trade._services.decorator import effect_of
 from trade.errors import ConfigurationError, DeadlineExceeded, DeviceError, InvalidArgument
-from trade_drivers.clibrary._passing import Passing, is_never_negative, plan
+from trade_drivers.clibrary._marshalling import Passing, is_never_negative, plan
 
 __all__ = ["CFunctionFailed", "CLibrary"]
 

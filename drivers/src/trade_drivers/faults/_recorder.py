@@ -8,12 +8,12 @@ from collections.abc import Collection, Mapping
 from typing import Any, Final
 
 from trade.errors import DeviceFault
-from trade_drivers._arm import Arm, ArmState
-from trade_drivers._interfaces import Gripper, Motor
-from trade_drivers._senses import Sensor
+from trade_drivers.faults._detector import Found, Trouble, found_in
 from trade_drivers.faults._log import FaultLog
-from trade_drivers.faults._lookout import Found, Trouble, found_in
 from trade_drivers.faults._record import Moment, when
+from trade_drivers.interfaces._arm import Arm, ArmState
+from trade_drivers.interfaces._motion import Gripper, Motor
+from trade_drivers.interfaces._sensing import Sensor
 
 __all__ = ["FaultRecorder"]
 

@@ -10,7 +10,7 @@ from msgspec import Struct
 
 from trade import Resource
 from trade.errors import DeviceFault, DeviceSilent, LimitExceeded
-from trade_drivers._interfaces import MotorState
+from trade_drivers.interfaces._motion import MotorState
 from trade_drivers.robotfile import Joint
 
 if TYPE_CHECKING:

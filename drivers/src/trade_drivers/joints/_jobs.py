@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING
 
 from trade import Permit
 from trade.errors import TradeError
-from trade_drivers._work import Steps, Work, check_admitted
+from trade_drivers.bus._jobs import Steps, Work, check_admitted
 from trade_drivers.joints._axis import Axis
 
 if TYPE_CHECKING:
-    from trade_drivers.joints._exchange import Exchange
+    from trade_drivers.joints._cycle import Exchange
 
 __all__ = ["Command", "Enable", "Halt", "Job", "Leave", "Manner", "Relax", "Steps"]
 

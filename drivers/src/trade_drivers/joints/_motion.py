@@ -7,13 +7,13 @@ from msgspec import Struct
 
 from trade import Permit
 from trade.errors import MotionStopped, TradeError
-from trade_drivers._work import Steps
+from trade_drivers.bus._jobs import Steps
 from trade_drivers.joints._axis import Axis, Goal
 from trade_drivers.joints._jobs import Command
 from trade_drivers.joints._profile import Leg, together
 
 if TYPE_CHECKING:
-    from trade_drivers.joints._exchange import Exchange
+    from trade_drivers.joints._cycle import Exchange
 
 __all__ = ["Motion", "Move"]
 

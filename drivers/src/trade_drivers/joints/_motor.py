@@ -4,19 +4,19 @@ from collections.abc import Sequence
 
 from trade import Measure, Resource, permit
 from trade.errors import DeviceError, DeviceSilent, LimitExceeded
-from trade_drivers._asked import expiry, span
-from trade_drivers._bus_thread import BusThread
-from trade_drivers._checks import finite, one_each, valid, within
-from trade_drivers._driver import AttachedBus
-from trade_drivers._interfaces import JointGroup, JointLimits, Motor, MotorState
-from trade_drivers._plan import Plan
+from trade_drivers.bus._deadlines import expiry, span
+from trade_drivers.bus._thread import BusThread
+from trade_drivers.bus._validation import finite, one_each, valid, within
 from trade_drivers.faults import Tell
+from trade_drivers.interfaces._motion import JointGroup, JointLimits, Motor, MotorState
 from trade_drivers.joints._axis import Axis
-from trade_drivers.joints._exchange import Exchange
-from trade_drivers.joints._follow import Follow
+from trade_drivers.joints._cycle import Exchange
 from trade_drivers.joints._jobs import Command, Enable, Halt, Manner, Relax
 from trade_drivers.joints._motion import Move
 from trade_drivers.joints._setpoint import SetPoint
+from trade_drivers.joints._trajectory_run import Follow
+from trade_drivers.motion._plan import Plan
+from trade_drivers.plugins._driver import AttachedBus
 
 __all__ = ["AttachedJoints", "BusGroup", "BusMotor"]
 

@@ -10,7 +10,7 @@ from trade_drivers.joints._jobs import Manner
 from trade_drivers.joints._motion import Motion
 
 if TYPE_CHECKING:
-    from trade_drivers.joints._exchange import Exchange
+    from trade_drivers.joints._cycle import Exchange
 
 __all__ = ["SetPoint"]
 

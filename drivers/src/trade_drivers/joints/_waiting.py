@@ -3,11 +3,11 @@
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Final
 
-from trade_drivers._work import Steps
+from trade_drivers.bus._jobs import Steps
 from trade_drivers.joints._axis import Axis
 
 if TYPE_CHECKING:
-    from trade_drivers.joints._exchange import Exchange
+    from trade_drivers.joints._cycle import Exchange
 
 __all__ = ["next_measurement", "until"]
 

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from typing import Final
 
 from trade.errors import InvalidArgument, LimitExceeded, MotionStopped, ToleranceExceeded
-from trade_drivers._arm import Arm
-from trade_drivers._trajectory import Trajectory, TrajectoryPoint
+from trade_drivers.interfaces._arm import Arm
+from trade_drivers.interfaces._trajectory import Trajectory, TrajectoryPoint
 from trade_drivers.testing._asking import NEAR_RAD, REACH_RAD, SPEED_RAD_S, Caller, refused, until
 
 __all__ = ["ArmContract"]

@@ -11,8 +11,8 @@ from typing import Any, Final, Generic, TypeVar
 from trade import where
 from trade.errors import TradeError
 from trade.testing import memory_system
-from trade_drivers._interfaces import MotorState
-from trade_drivers._plan import JointLimits
+from trade_drivers.interfaces._motion import MotorState
+from trade_drivers.motion._plan import JointLimits
 
 __all__ = ["NEAR_RAD", "REACH_RAD", "SPEED_RAD_S", "Caller", "ahead", "at_once", "refused", "streamed", "until"]
 

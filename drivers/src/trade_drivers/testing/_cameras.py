@@ -4,7 +4,7 @@
 
 from typing import Final
 
-from trade_drivers._senses import Camera
+from trade_drivers.interfaces._sensing import Camera
 from trade_drivers.testing._asking import at_once, streamed
 
 __all__ = ["CameraContract"]

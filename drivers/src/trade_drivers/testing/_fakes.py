@@ -7,9 +7,9 @@ from typing import Final
 
 from trade import Resource, permit
 from trade.errors import ToleranceExceeded
-from trade_drivers._checks import one_each, valid, within
-from trade_drivers._interfaces import JointGroup, MotorState, Position, Speed, Valid
-from trade_drivers._plan import JointLimits, Plan
+from trade_drivers.bus._validation import one_each, valid, within
+from trade_drivers.interfaces._motion import JointGroup, MotorState, Position, Speed, Valid
+from trade_drivers.motion._plan import JointLimits, Plan
 
 __all__ = ["FakeJointGroup"]
 

@@ -5,7 +5,7 @@
 import math
 
 from trade.errors import InvalidArgument, LimitExceeded, MotionStopped
-from trade_drivers._interfaces import Gripper
+from trade_drivers.interfaces._motion import Gripper
 from trade_drivers.testing._asking import Caller, refused, until
 
 __all__ = ["GripperContract"]

@@ -9,9 +9,9 @@ from collections.abc import Callable, Sequence
 from trade import where
 from trade.errors import InvalidArgument, LimitExceeded, LockedByOther, MotionStopped, ToleranceExceeded
 from trade.testing import memory_system
-from trade_drivers._interfaces import JointGroup
-from trade_drivers._plan import Tolerances
-from trade_drivers._trajectory import Trajectory, TrajectoryPoint
+from trade_drivers.interfaces._motion import JointGroup
+from trade_drivers.interfaces._trajectory import Trajectory, TrajectoryPoint
+from trade_drivers.motion._plan import Tolerances
 from trade_drivers.testing._asking import NEAR_RAD, REACH_RAD, SPEED_RAD_S, Caller, ahead, refused, until
 
 __all__ = ["JointGroupContract"]

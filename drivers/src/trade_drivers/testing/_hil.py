@@ -12,12 +12,12 @@ import pytest
 import trade
 from trade import where
 from trade.errors import ConfigurationError, TradeError
-from trade_drivers._arm import Arm
 from trade_drivers._attach import AttachedRobot, attach
-from trade_drivers._interfaces import Gripper, JointGroup, Motor
-from trade_drivers._load import load
-from trade_drivers._senses import Camera, Sensor
+from trade_drivers.interfaces._arm import Arm
+from trade_drivers.interfaces._motion import Gripper, JointGroup, Motor
+from trade_drivers.interfaces._sensing import Camera, Sensor
 from trade_drivers.robotfile import Robot
+from trade_drivers.robotfile._load import load
 from trade_drivers.testing._asking import REACH_RAD, SPEED_RAD_S
 
 __all__ = ["main"]

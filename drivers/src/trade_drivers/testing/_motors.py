@@ -7,7 +7,7 @@ import math
 from trade import where
 from trade.errors import InvalidArgument, LimitExceeded, LockedByOther, MotionStopped
 from trade.testing import memory_system
-from trade_drivers._interfaces import Motor
+from trade_drivers.interfaces._motion import Motor
 from trade_drivers.testing._asking import NEAR_RAD, REACH_RAD, SPEED_RAD_S, Caller, ahead, refused, until
 
 __all__ = ["MotorContract"]

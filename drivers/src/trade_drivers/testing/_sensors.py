@@ -4,7 +4,7 @@
 
 import math
 
-from trade_drivers._senses import UNITS, Reading, Sensor, SensorInfo
+from trade_drivers.interfaces._sensing import UNITS, Reading, Sensor, SensorInfo
 from trade_drivers.testing._asking import at_once, streamed, until
 
 __all__ = ["SensorContract"]

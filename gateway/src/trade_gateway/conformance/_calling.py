@@ -6,11 +6,11 @@ import threading
 from typing import Any, Final
 
 from trade import errors
-from trade._wire import CANCEL, Status
+from trade._protocol.messages import CANCEL, Status
+from trade_gateway.conformance._assertions import eventually, require
 from trade_gateway.conformance._check import check
-from trade_gateway.conformance._judging import eventually, require
-from trade_gateway.conformance._stage import Stage
-from trade_gateway.conformance._voice import DEADLINE_S, NEVER, SYSTEM, error_of
+from trade_gateway.conformance._environment import Stage
+from trade_gateway.conformance._raw_client import DEADLINE_S, NEVER, SYSTEM, error_of
 
 _LATEST_NS: Final = 2**63 - 1
 

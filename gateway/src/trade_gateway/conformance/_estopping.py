@@ -6,14 +6,14 @@ from collections.abc import Callable
 from typing import Any
 
 from trade import errors, where
-from trade._estop_messages import decode_estop_confirmed
-from trade._keys import estop_confirmed_key, estop_key
-from trade._wire import PROTOCOL, Estop, EstopConfirmed, EstopOrder, Malformed, encode_message
+from trade._protocol.estop_messages import decode_estop_confirmed
+from trade._protocol.keys import estop_confirmed_key, estop_key
+from trade._protocol.messages import PROTOCOL, Estop, EstopConfirmed, EstopOrder, Malformed, encode_message
+from trade_gateway.conformance._assertions import PATIENCE_S, eventually, require
 from trade_gateway.conformance._check import check
-from trade_gateway.conformance._judging import PATIENCE_S, eventually, require
+from trade_gateway.conformance._environment import Stage
 from trade_gateway.conformance._peer import GROUP
-from trade_gateway.conformance._stage import Stage
-from trade_gateway.conformance._voice import NEVER, SYSTEM, Voice, error_of
+from trade_gateway.conformance._raw_client import NEVER, SYSTEM, Voice, error_of
 
 _ALL_TOLD_S = 3.0
 _WATCHED_S = 0.5

@@ -6,13 +6,13 @@ import time
 import msgspec
 
 from trade import errors, where
-from trade._terms import LockInfo
-from trade._wire import Status, Token
+from trade._protocol.messages import Status, Token
+from trade._resources.lock_request import LockInfo
+from trade_gateway.conformance._assertions import PATIENCE_S, NotHeld, eventually, require
 from trade_gateway.conformance._check import check
-from trade_gateway.conformance._judging import PATIENCE_S, NotHeld, eventually, require
+from trade_gateway.conformance._environment import Stage
 from trade_gateway.conformance._peer import GROUP
-from trade_gateway.conformance._stage import Stage
-from trade_gateway.conformance._voice import SYSTEM, Voice, body_of, error_of
+from trade_gateway.conformance._raw_client import SYSTEM, Voice, body_of, error_of
 
 _ARM = ["peer.arm"]
 _LEASE_S = 1.0

@@ -1,11 +1,11 @@
 """Checks of motion: it stops when it is told to, and with whoever set it going."""
 
 from trade import errors
-from trade._wire import Status
+from trade._protocol.messages import Status
+from trade_gateway.conformance._assertions import require
 from trade_gateway.conformance._check import check
-from trade_gateway.conformance._judging import require
-from trade_gateway.conformance._stage import Stage
-from trade_gateway.conformance._voice import NEVER, SYSTEM, Voice, body_of, error_of
+from trade_gateway.conformance._environment import Stage
+from trade_gateway.conformance._raw_client import NEVER, SYSTEM, Voice, body_of, error_of
 
 
 @check("turns", "Writing a container in another language")

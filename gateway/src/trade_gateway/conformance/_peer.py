@@ -11,11 +11,11 @@ from typing import Final
 
 from msgspec import Struct
 
-from trade._keys import Address, registry_key
-from trade._transport import Answer
-from trade._wire import Malformed, ProviderInfo, decode_provider, decode_tally
-from trade_gateway.conformance._judging import NotHeld, eventually, require
-from trade_gateway.conformance._voice import SYSTEM, Place
+from trade._protocol.keys import Address, registry_key
+from trade._protocol.messages import Malformed, ProviderInfo, decode_provider, decode_tally
+from trade._transport.base import Answer
+from trade_gateway.conformance._assertions import NotHeld, eventually, require
+from trade_gateway.conformance._raw_client import SYSTEM, Place
 
 GROUP: Final = "peer"
 _OFFERED_S: Final = 5.0

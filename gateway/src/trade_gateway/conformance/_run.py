@@ -10,9 +10,9 @@ from typing import Final
 from msgspec import Struct
 
 from trade.errors import TradeError
+from trade_gateway.conformance._assertions import NotHeld
 from trade_gateway.conformance._check import Check
-from trade_gateway.conformance._judging import NotHeld
-from trade_gateway.conformance._stage import Stage
+from trade_gateway.conformance._environment import Stage
 
 OK: Final = "ok"
 FAILED: Final = "failed"

@@ -2,18 +2,18 @@
 
 from typing import Final
 
-from trade_gateway.conformance import _asking, _being_there, _calling, _estopping, _locking, _moving
+from trade_gateway.conformance import _callbacks, _calling, _estopping, _locking, _moving, _presence
 from trade_gateway.conformance._check import Check
 
 CHECKS: Final[tuple[Check, ...]] = (
-    _being_there.presence,
-    _being_there.offers,
-    _being_there.describes,
-    _being_there.tells_late,
-    _being_there.found,
-    _being_there.survives_rubbish,
-    _being_there.restarts,
-    _being_there.leaves,
+    _presence.presence,
+    _presence.offers,
+    _presence.describes,
+    _presence.tells_late,
+    _presence.found,
+    _presence.survives_rubbish,
+    _presence.restarts,
+    _presence.leaves,
     _calling.answers,
     _calling.refuses_arguments,
     _calling.knows_not,
@@ -45,13 +45,13 @@ CHECKS: Final[tuple[Check, ...]] = (
     _locking.lost_stops,
     _locking.stop_needs_no_lock,
     _locking.stop_beside_waiting,
-    _asking.calls,
-    _asking.calls_no_longer,
-    _asking.passes_errors,
-    _asking.locks_ours,
-    _asking.renews,
-    _asking.is_refused,
-    _asking.streams,
+    _callbacks.calls,
+    _callbacks.calls_no_longer,
+    _callbacks.passes_errors,
+    _callbacks.locks_ours,
+    _callbacks.renews,
+    _callbacks.is_refused,
+    _callbacks.streams,
     _estopping.estop,
     _estopping.estop_reported,
     _estopping.estop_forged,

@@ -1,10 +1,10 @@
 """``trade drill``: while a simulated twin of a robot moves, what it hangs on is taken away, and the time is taken."""
 
 from trade_gateway.drill._page import page
-from trade_gateway.drill._play import play
 from trade_gateway.drill._record import Played, Report, Stop, as_data
+from trade_gateway.drill._runner import play
 from trade_gateway.drill._scenes import SCENES, Scene
-from trade_gateway.drill._stand import standing
 from trade_gateway.drill._targets import Target, targets_of
+from trade_gateway.drill._testbed import standing
 
 __all__ = ["SCENES", "Played", "Report", "Scene", "Stop", "Target", "as_data", "page", "play", "standing", "targets_of"]

@@ -9,10 +9,10 @@ from itertools import chain
 from typing import Final, Protocol
 
 from trade import Container
-from trade_gateway._asked import Asked
+from trade_gateway.process._signal_event import Asked
 from trade_gateway.recording._channels import Message
+from trade_gateway.recording._poller import Watch
 from trade_gateway.recording._sources import Sources, Wanted
-from trade_gateway.recording._watch import Watch
 
 __all__ = ["Recorder", "Sink", "about"]
 

@@ -12,7 +12,6 @@ from msgspec import Struct
 from trade import Container, service
 from trade.errors import TradeError
 from trade_gateway.ros._file import RosFile
-from trade_gateway.ros._following import Following, Mapping
 from trade_gateway.ros._from_ros import (
     Offered,
     parameters_from_ros,
@@ -22,8 +21,9 @@ from trade_gateway.ros._from_ros import (
 )
 from trade_gateway.ros._from_ros_joints import joints_from_ros
 from trade_gateway.ros._graph import Graph
+from trade_gateway.ros._mapping_sync import Following, Mapping
 from trade_gateway.ros._nodes import Nodes
-from trade_gateway.ros._offering import Records
+from trade_gateway.ros._providers import Records
 from trade_gateway.ros._to_ros_commands import CommandsToRos
 from trade_gateway.ros._to_ros_services import LocksToRos, ServicesToRos
 from trade_gateway.ros._to_ros_streams import JointStatesToRos, StreamsToRos, Topics

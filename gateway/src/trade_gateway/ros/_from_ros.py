@@ -9,7 +9,7 @@ from trade import Container, Resource, current_call, permit
 from trade.errors import MotionStopped
 from trade_gateway.ros._file import FromParameters, FromPublish, FromService, FromTopic
 from trade_gateway.ros._graph import Graph, RosRefused, RosUnreachable
-from trade_gateway.ros._offering import Method, Records, plain, provider
+from trade_gateway.ros._providers import Method, Records, plain, provider
 from trade_gateway.ros._types import Message
 
 __all__ = ["Offered", "parameters_from_ros", "publisher_from_ros", "service_from_ros", "topic_from_ros"]

@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 from trade.errors import InvalidArgument, ToleranceExceeded
+from trade_gateway.ros._conversion import failure, ros_stamp, seconds
 from trade_gateway.ros._joints import JointNames
 from trade_gateway.ros._types import Message
-from trade_gateway.ros._words import failure, ros_stamp, seconds
 
 __all__ = [
     "ACTION",

@@ -13,7 +13,7 @@ from trade import Container, Handle, Run
 from trade.errors import Cancelled
 from trade_gateway.clients._clients import Client
 from trade_gateway.ros._graph import Graph, RosUnreachable
-from trade_gateway.ros._locking import Grips
+from trade_gateway.ros._lock_guard import Grips
 
 __all__ = ["UNKNOWN", "Guest", "Nodes"]
 

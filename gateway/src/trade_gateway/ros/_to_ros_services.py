@@ -6,12 +6,12 @@ from typing import Final, NamedTuple
 from trade import Constraint, Container, Handle, Lock, where
 from trade.errors import ConfigurationError
 from trade_gateway.clients._clients import Client
+from trade_gateway.ros._conversion import Asked, Told, ros_path
 from trade_gateway.ros._file import LockService, ServiceEntry
-from trade_gateway.ros._following import Place, named_services
 from trade_gateway.ros._graph import Answer, Closes, Graph, RosRefused
+from trade_gateway.ros._mapping_sync import Place, named_services
 from trade_gateway.ros._nodes import UNKNOWN, Nodes
 from trade_gateway.ros._types import Message
-from trade_gateway.ros._words import Asked, Told, ros_path
 
 __all__ = ["LocksToRos", "ServicesToRos"]
 

@@ -6,12 +6,12 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Final
 
 from trade import Constraint, Container, Handle, Sample, Stream, where
+from trade_gateway.ros._conversion import Told, failure, ros_stamp
 from trade_gateway.ros._file import JointStates, StreamEntry
-from trade_gateway.ros._following import Place, named_services
 from trade_gateway.ros._graph import Closes, Graph, Publisher
 from trade_gateway.ros._joints import LIMBS, JointNames, joints_of, limbs, measured
+from trade_gateway.ros._mapping_sync import Place, named_services
 from trade_gateway.ros._types import Message
-from trade_gateway.ros._words import Told, failure, ros_stamp
 
 __all__ = ["JointStatesToRos", "StreamsToRos", "Topics"]
 

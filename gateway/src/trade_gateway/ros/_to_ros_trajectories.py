@@ -11,8 +11,8 @@ import msgspec
 
 from trade import Constraint, Container, Handle, Run, where
 from trade.errors import SessionEnded
+from trade_gateway.ros._conversion import ros_stamp
 from trade_gateway.ros._file import TrajectoryEntry
-from trade_gateway.ros._following import Place
 from trade_gateway.ros._goals import (
     ACTION,
     INVALID_GOAL,
@@ -27,8 +27,8 @@ from trade_gateway.ros._goals import (
 )
 from trade_gateway.ros._graph import Closes, Ended, Goal, Graph, Outcome
 from trade_gateway.ros._joints import LIMBS, JointNames, beside, joints_of, limbs, measured
+from trade_gateway.ros._mapping_sync import Place
 from trade_gateway.ros._nodes import Nodes
-from trade_gateway.ros._words import ros_stamp
 
 __all__ = ["TrajectoriesToRos"]
 

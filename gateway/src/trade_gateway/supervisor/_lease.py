@@ -10,7 +10,7 @@ from typing import Final
 
 from msgspec import Struct
 
-from trade_gateway._fence import Term
+from trade_gateway.process._kill_timer import Term
 
 __all__ = ["Arbiter", "Holder", "Lease", "waits_s"]
 

@@ -17,15 +17,15 @@ from msgspec import structs
 from trade import Container, Handle, Run
 from trade.errors import Busy, ConfigurationError, ServiceGone, TradeError
 from trade.starting import Started
-from trade_gateway._fence import Term
-from trade_gateway.supervisor._alone import lock_of
+from trade_gateway.process._kill_timer import Term
+from trade_gateway.supervisor._child import ChildInfo, News, Unit
 from trade_gateway.supervisor._furnish import Furnished, furnish, save
-from trade_gateway.supervisor._leasing import Asking, Leased, StandIn
-from trade_gateway.supervisor._life import GRACE_S, SAVE_S, Do, State
+from trade_gateway.supervisor._lease_protocol import Asking, Leased, StandIn
 from trade_gateway.supervisor._process import Process, rss_mb
+from trade_gateway.supervisor._single_instance import lock_of
+from trade_gateway.supervisor._state_machine import GRACE_S, SAVE_S, Do, State
 from trade_gateway.supervisor._store import StateStore
 from trade_gateway.supervisor._tables import Child
-from trade_gateway.supervisor._unit import ChildInfo, News, Unit
 
 __all__ = ["Supervisor"]
 

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Final, Literal, NamedTuple
 
 from msgspec import Meta
 
-from trade_gateway._parts import Around, Entry, Part, Tables, converted
+from trade_gateway.config._tables import Around, Entry, Part, Tables, converted
 
 __all__ = ["Child", "Supervised", "read_children"]
 

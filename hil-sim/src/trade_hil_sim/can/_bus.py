@@ -10,11 +10,11 @@ from typing import Final, TypeVar
 
 import msgspec
 
-from trade_hil_sim import _faults as faults
-from trade_hil_sim._errands import Errands
-from trade_hil_sim._errors import SimulationError
-from trade_hil_sim._log import ByteLog, Entry
-from trade_hil_sim._state import BusState
+from trade_hil_sim.faults import _faults as faults
+from trade_hil_sim.log._byte_log import ByteLog, Entry
+from trade_hil_sim.mechanics._truth import BusState
+from trade_hil_sim.robot._errors import SimulationError
+from trade_hil_sim.robot._mailbox import Errands
 
 from ._adapter import Adapter, Client
 from ._device import Device

@@ -3,9 +3,9 @@
 from collections.abc import Callable
 from typing import Protocol
 
-from trade_hil_sim import _faults as faults
-from trade_hil_sim._log import Entry
-from trade_hil_sim._state import DeviceState
+from trade_hil_sim.faults import _faults as faults
+from trade_hil_sim.log._byte_log import Entry
+from trade_hil_sim.mechanics._truth import DeviceState
 
 from ._frame import Frame
 

@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterable
 from contextlib import suppress
 from typing import Final
 
-from trade_hil_sim._errors import SimulationError
-from trade_hil_sim._ready import ready
+from trade_hil_sim.robot._errors import SimulationError
+from trade_hil_sim.robot._polling import ready
 
 from ._adapter import Tenant
 from ._frame import Frame

@@ -9,8 +9,8 @@ from errno import ENETDOWN
 from pathlib import Path
 from typing import Final
 
-from trade_hil_sim._errors import SimulationError
-from trade_hil_sim._ready import ready
+from trade_hil_sim.robot._errors import SimulationError
+from trade_hil_sim.robot._polling import ready
 
 from ._adapter import Tenant
 from ._frame import Frame

@@ -3,8 +3,8 @@
 from math import tau
 from typing import TYPE_CHECKING
 
-from trade_hil_sim._errors import SimulationError
 from trade_hil_sim.can import JointBus
+from trade_hil_sim.robot._errors import SimulationError
 
 from ._drive import Drive
 from ._names import canopen_label

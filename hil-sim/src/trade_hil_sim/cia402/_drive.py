@@ -5,12 +5,12 @@ from dataclasses import replace
 from math import inf, tau
 from typing import Final
 
-from trade_hil_sim import _faults as faults
-from trade_hil_sim._errors import SimulationError
-from trade_hil_sim._log import Entry
-from trade_hil_sim._shaft import Shaft
-from trade_hil_sim._state import DeviceState
 from trade_hil_sim.can import Frame
+from trade_hil_sim.faults import _faults as faults
+from trade_hil_sim.log._byte_log import Entry
+from trade_hil_sim.mechanics._shaft import Shaft
+from trade_hil_sim.mechanics._truth import DeviceState
+from trade_hil_sim.robot._errors import SimulationError
 
 from ._machine import Machine
 from ._modes import MOTION, Mode, Modes

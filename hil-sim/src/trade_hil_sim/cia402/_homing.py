@@ -4,7 +4,7 @@ from collections.abc import Callable
 from math import ceil, floor, inf
 from typing import Final
 
-from trade_hil_sim._shaft import Shaft
+from trade_hil_sim.mechanics._shaft import Shaft
 
 from ._store import Store
 

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from math import inf
 from typing import Final
 
-from trade_hil_sim._shaft import Shaft
+from trade_hil_sim.mechanics._shaft import Shaft
 
 from ._modes import Modes
 from ._states import Command, State, command, next_state

@@ -5,7 +5,7 @@ from enum import IntEnum
 from math import inf
 from typing import Final
 
-from trade_hil_sim._shaft import STILL, Shaft
+from trade_hil_sim.mechanics._shaft import STILL, Shaft
 
 from ._homing import Homing
 from ._store import Store

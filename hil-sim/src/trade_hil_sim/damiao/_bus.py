@@ -2,8 +2,8 @@
 
 from typing import TYPE_CHECKING
 
-from trade_hil_sim._errors import SimulationError
 from trade_hil_sim.can import JointBus
+from trade_hil_sim.robot._errors import SimulationError
 
 from ._motor import Motor
 from ._names import damiao_label

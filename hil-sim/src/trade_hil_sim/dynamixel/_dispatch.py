@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final, TypeVar
 
-from trade_hil_sim._device_line import interleaved
+from trade_hil_sim.serial._device_bus import interleaved
 
 from ._memory import Refusal
 from ._protocol import BROADCAST, ErrorCode, Instruction, JoinedStatus, Packet, status

@@ -8,7 +8,7 @@ from enum import IntEnum
 from math import inf
 from typing import Final
 
-from trade_hil_sim._motion import Course, at_rest, to_position, to_speed
+from trade_hil_sim.mechanics._profile import Course, at_rest, to_position, to_speed
 
 from ._memory import ControlTable
 from ._table import ACCELERATION_COUNTS_S2, CENTRE, COUNTS_PER_TURN, RAD_PER_COUNT, VELOCITY_COUNTS_S

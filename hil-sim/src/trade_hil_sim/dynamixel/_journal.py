@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from trade_hil_sim._log import ByteLog, Entry
+from trade_hil_sim.log._byte_log import ByteLog, Entry
 
 from ._protocol import BROADCAST, Instruction, Packet
 from ._requests import Writing, readings, writings

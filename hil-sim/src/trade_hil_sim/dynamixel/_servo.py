@@ -7,7 +7,7 @@ leaves a choice, the one that is harder on a driver was taken; docs/simulators.m
 from collections.abc import Callable, Iterator
 from typing import Final
 
-from trade_hil_sim._state import DeviceState
+from trade_hil_sim.mechanics._truth import DeviceState
 
 from ._drive import Drive, Mode
 from ._memory import ControlTable, Refusal

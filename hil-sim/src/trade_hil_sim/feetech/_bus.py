@@ -5,10 +5,10 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from trade_hil_sim import _faults as faults
-from trade_hil_sim._device_line import DeviceLine, interleaved
-from trade_hil_sim._errors import SimulationError
-from trade_hil_sim._log import ByteLog, Entry
+from trade_hil_sim.faults import _faults as faults
+from trade_hil_sim.log._byte_log import ByteLog, Entry
+from trade_hil_sim.robot._errors import SimulationError
+from trade_hil_sim.serial._device_bus import DeviceLine, interleaved
 
 from ._protocol import BROADCAST, Instruction, Packet, PacketReader, Writing, readings, status, writings
 from ._servo import MOTION, Servo

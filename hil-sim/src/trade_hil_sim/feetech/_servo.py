@@ -6,7 +6,7 @@ Where the sources leave a choice, the one that is harder on a driver was taken; 
 from collections.abc import Callable, Iterator
 from typing import Final
 
-from trade_hil_sim._state import DeviceState
+from trade_hil_sim.mechanics._truth import DeviceState
 
 from ._memory import Memory
 from ._shaft import Shaft

@@ -6,7 +6,7 @@ clock when they are read.
 
 from typing import Final
 
-from trade_hil_sim._motion import Course, at_rest, to_position, to_speed
+from trade_hil_sim.mechanics._profile import Course, at_rest, to_position, to_speed
 
 from ._memory import Memory
 from ._table import ACCELERATION_STEPS_S2, CENTRE, COUNTS_PER_TURN, RAD_PER_COUNT

@@ -5,11 +5,11 @@ from collections.abc import Callable
 from math import inf, isfinite, tau
 from typing import Final
 
-from trade_hil_sim import _faults as faults
-from trade_hil_sim._errors import SimulationError
-from trade_hil_sim._log import Entry
-from trade_hil_sim._state import DeviceState
 from trade_hil_sim.can import Frame
+from trade_hil_sim.faults import _faults as faults
+from trade_hil_sim.log._byte_log import Entry
+from trade_hil_sim.mechanics._truth import DeviceState
+from trade_hil_sim.robot._errors import SimulationError
 
 from ._motor import Motor
 from ._table import ANSWERS, ORDERS, Command, Errors, Result, State

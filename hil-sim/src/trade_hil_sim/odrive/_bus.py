@@ -3,8 +3,8 @@
 from math import tau
 from typing import TYPE_CHECKING, Final
 
-from trade_hil_sim._errors import SimulationError
 from trade_hil_sim.can import JointBus
+from trade_hil_sim.robot._errors import SimulationError
 
 from ._axis import Axis
 from ._names import odrive_label

@@ -3,7 +3,7 @@
 from math import copysign, inf
 from typing import Final
 
-from trade_hil_sim._shaft import Shaft
+from trade_hil_sim.mechanics._shaft import Shaft
 
 from ._table import Command, Control, Input
 

@@ -9,7 +9,7 @@ from enum import IntEnum
 from math import inf
 from typing import Final
 
-from trade_hil_sim._state import GripperTruth
+from trade_hil_sim.mechanics._truth import GripperTruth
 
 from . import _table as table
 

@@ -9,11 +9,11 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from trade_hil_sim import _faults as faults
-from trade_hil_sim._errors import SimulationError
-from trade_hil_sim._log import ByteLog, Entry
-from trade_hil_sim._ready import ready
-from trade_hil_sim._state import BusState
+from trade_hil_sim.faults import _faults as faults
+from trade_hil_sim.log._byte_log import ByteLog, Entry
+from trade_hil_sim.mechanics._truth import BusState
+from trade_hil_sim.robot._errors import SimulationError
+from trade_hil_sim.robot._polling import ready
 
 from ._drawing import draw
 from ._png import png

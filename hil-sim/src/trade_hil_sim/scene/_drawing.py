@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from math import ceil, cos, sin, sqrt
 from typing import Final, NamedTuple
 
-from trade_hil_sim._state import BusState, GripperTruth
+from trade_hil_sim.mechanics._truth import BusState, GripperTruth
 
 __all__ = ["BACKGROUND", "LIMB", "OBJECT", "Colour", "Field", "draw", "fields"]
 

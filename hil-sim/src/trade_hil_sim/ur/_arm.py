@@ -6,8 +6,8 @@ from typing import Final
 
 import msgspec
 
-from trade_hil_sim._errors import SimulationError
-from trade_hil_sim._log import Entry
+from trade_hil_sim.log._byte_log import Entry
+from trade_hil_sim.robot._errors import SimulationError
 
 from ._kinematics import flange, joints_for, pose_between, pose_of, way_of
 from ._motions import Braking, Free, Held, Motion, Servo, Speed, Way

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Final, TypeVar
 
 import msgspec
 
-from trade_hil_sim import _faults as faults
-from trade_hil_sim._errands import Errands
-from trade_hil_sim._errors import SimulationError
-from trade_hil_sim._log import ByteLog, Entry
-from trade_hil_sim._ready import ready
-from trade_hil_sim._state import ArmTruth, BusState
+from trade_hil_sim.faults import _faults as faults
+from trade_hil_sim.log._byte_log import ByteLog, Entry
+from trade_hil_sim.mechanics._truth import ArmTruth, BusState
+from trade_hil_sim.robot._errors import SimulationError
+from trade_hil_sim.robot._mailbox import Errands
+from trade_hil_sim.robot._polling import ready
 
 from ._arm import HOME, Arm
 from ._client import MOST_HELD, Client

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from math import copysign, sqrt
 from typing import Final
 
-from trade_hil_sim._motion import to_position
+from trade_hil_sim.mechanics._profile import to_position
 
 __all__ = ["MAX_SPEED_RAD_S", "Braking", "Free", "Held", "Motion", "Servo", "Speed", "Way"]
 

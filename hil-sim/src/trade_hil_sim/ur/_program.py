@@ -10,7 +10,7 @@ from typing import Final
 
 import msgspec
 
-from trade_hil_sim._log import Entry
+from trade_hil_sim.log._byte_log import Entry
 
 from ._arm import Arm
 from ._motions import Way

@@ -3,7 +3,7 @@
 Nothing here needs a test framework; the suites are plain classes with ``test_`` methods, run in a subclass by pytest.
 """
 
-from trade._memory import Clock, Kind, Network, Passage
+from trade._transport.memory import Clock, Kind, Network, Passage
 from trade.testing._losses import LossConformance, Severable
 from trade.testing._system import MemorySystem, memory_system
 from trade.testing._transports import TransportConformance

@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from typing import NamedTuple
 
-from trade._transport import Message, Transport
+from trade._transport.base import Message, Transport
 from trade.testing._ear import PATIENCE_S, Ear, Teller, meet
 
 __all__ = ["LossConformance", "Severable"]

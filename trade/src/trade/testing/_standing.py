@@ -8,7 +8,7 @@ from collections.abc import Callable, Generator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 
-from trade._transport import ChannelClosed, Message, Transport
+from trade._transport.base import ChannelClosed, Message, Transport
 from trade.testing._ear import PATIENCE_S, Ear, Teller, meet
 
 

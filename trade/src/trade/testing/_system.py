@@ -8,10 +8,10 @@ from collections.abc import Callable, Generator, Sequence
 from pathlib import Path
 from typing import Final
 
-from trade._container import Container
-from trade._memory import Clock, Kind, MemoryTransport, Network, Passage
-from trade._memory._node import Node
+from trade._container.container import Container
 from trade._settings import Settings
+from trade._transport.memory import Clock, Kind, MemoryTransport, Network, Passage
+from trade._transport.memory.node import Node
 
 __all__ = ["MemorySystem", "memory_system"]
 

@@ -9,7 +9,7 @@ import sys
 import threading
 from collections.abc import Callable, Generator
 
-from trade._transport import Channel, ChannelClosed, Message, Transport
+from trade._transport.base import Channel, ChannelClosed, Message, Transport
 from trade.testing._ear import Ear, listen, meet
 from trade.testing._standing import StandingConformance
 

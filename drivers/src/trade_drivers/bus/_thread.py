@@ -1,0 +1,221 @@
+"""The thread that owns a bus: cycles at its rate, falls silent when its process is sick, reopens its port."""
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any, Final, Generic, Protocol, TypeVar
+
+from trade import Measure
+from trade.errors import BusGone, TradeError
+from trade_drivers.bus._cycle import BusExchange
+from trade_drivers.bus._jobs import Device, PortLost, PortOpening
+from trade_drivers.faults import Lookout, Tell
+from trade_drivers.robotfile import Bus
+
+__all__ = ["BusThread", "Port"]
+
+_log = logging.getLogger("trade")
+_REOPEN_FIRST_S: Final = 0.1
+_REOPEN_MOST_S: Final = 1.0
+
+
+class Port(Protocol):
+    """What the wire is reached through."""
+
+    path: str
+    """For messages."""
+
+    def open(self) -> None:
+        """Begin to use it; raises ``PortLost`` while it is not there, ``PortOpening`` if that is only a matter of time.
+
+        While it is waited for, services are answered: it must not block for long.
+        """
+        ...
+
+    def close(self) -> None:
+        """Let go of it; more than once is fine."""
+        ...
+
+
+_Exchange_co = TypeVar("_Exchange_co", bound=BusExchange[Any], covariant=True)
+
+
+class BusThread(Generic[_Exchange_co]):
+    """One owner thread of one bus. Services hand it work and read what it measured; nobody else touches the port."""
+
+    def __init__(self, exchange: _Exchange_co, wire: Port, bus: Bus, healthy: Callable[[], bool], name: str) -> None:
+        self._exchange = exchange
+        self._wire = wire
+        self._bus = bus
+        self._healthy = healthy
+        self._sick = False
+        self._lost_at = 0.0
+        self._lost_why = ""
+        self._reopen_at = 0.0
+        self._reopen_s = _REOPEN_FIRST_S
+        self._leaving = False
+        self.unseen: list[str] = []
+        """The devices that were not seen at rest when they were left."""
+        self._lookout: Lookout | None = None
+        self.cycles = 0
+        """Since it started."""
+        self.late = 0
+        """Of those, how many ended so late that the next one began after its time by a whole period."""
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+
+    @property
+    def exchange(self) -> _Exchange_co:
+        """What it does on the wire."""
+        return self._exchange
+
+    def start(self) -> None:
+        """Begin to cycle; the port must be open."""
+        self._thread.start()
+
+    def watched(self, tell: Tell) -> None:
+        """Have ``tell`` told, on the bus thread, what is wrong with devices, now and whenever that changes."""
+        self._lookout = Lookout(self._exchange, tell)
+
+    def alive(self) -> bool:
+        """Whether the thread still runs."""
+        return self._thread.is_alive()
+
+    def measures(self, bus: str) -> list[Measure]:
+        """How it fares; ``bus`` is its name with the robot's before it."""
+        of, missed = {"bus": bus}, self.exchange.missed_answers
+        return [
+            Measure("bus_cycles", "Cycles of a bus.", self.cycles, of, "counter"),
+            Measure("bus_late_cycles", "Cycles that ended too late by a period or more.", self.late, of, "counter"),
+            Measure("bus_missed_answers", "Exchanges not answered in time.", missed, of, "counter"),
+            Measure("bus_up", "1: its port is open; 0: gone, and looked for.", float(not self._lost_at), of),
+        ]
+
+    def close(self) -> None:
+        """Stop everything, hold or relax as the robot file says, let go of the port. More than once is fine.
+
+        Raises:
+            TradeError: not everything could be left as the robot file says; the port is closed all the same.
+        """
+        if self._leaving:
+            return
+        try:
+            if self.alive():
+                self.exchange.leave(self.alive, relax=self._bus.leave == "relax")
+        finally:
+            self.unseen = self.exchange.unseen()
+            self._leaving = True
+            self.exchange.wake.set()
+            self._thread.join()
+
+    # --- the thread
+
+    def _run(self) -> None:
+        problem, failed = "the thread of its bus has ended", False
+        try:
+            next_at = time.monotonic()
+            while not self._leaving:
+                self._beat()
+                self._look()
+                next_at = self._rest(next_at + 1 / self._bus.rate_hz)
+            self._look()
+        except Exception as defect:  # noqa: BLE001 - whatever it is: the bus falls silent, and the watchdogs stop the motors
+            problem, failed = f"the thread of its bus failed: {defect!r}", True
+            _log.exception("bus %s: its thread failed; its devices stop by their watchdogs", self._bus.name)
+        finally:
+            self.exchange.refusing = lambda device: device.faulty(problem)
+            self._wire.close()
+            self.exchange.fail_all(self.exchange.refusing)
+            if failed:
+                self._look()
+
+    def _look(self) -> None:
+        if self._lookout is not None:
+            try:
+                self._lookout.look()
+            except Exception:  # noqa: BLE001 - who looks on ends no motion
+                self._lookout = None
+                _log.exception("bus %s: faults of its devices are not noticed any more", self._bus.name)
+
+    def _rest(self, next_at: float) -> float:
+        """Wait for the next cycle; stops do not wait."""
+        exchange = self.exchange
+        while (left_s := next_at - time.monotonic()) > 0:
+            if self._lost_at:
+                exchange.wake.wait(left_s)
+                exchange.wake.clear()
+            else:
+                self._guarded(partial(exchange.idle, left_s))
+            if self._leaving:
+                break
+        now = time.monotonic()
+        if now - next_at < 1 / self._bus.rate_hz:  # a little late, the next one is not
+            return next_at
+        self.late += 1
+        return now
+
+    def _beat(self) -> None:
+        if self._lost_at:
+            self._reopen()
+        elif self._is_healthy():
+            self.cycles += 1
+            self._guarded(self.exchange.cycle)
+
+    def _guarded(self, act: Callable[[], None]) -> None:
+        try:
+            act()
+        except PortLost as lost:
+            _log.warning("bus %s: port %s is gone: %s", self._bus.name, self._wire.path, lost)
+            self._lost_at, self._lost_why = time.monotonic(), str(lost)
+            self._reopen_s = _REOPEN_FIRST_S
+            self._reopen_at = self._lost_at + self._reopen_s
+            self.exchange.refusing = self._gone
+            self.exchange.forget_measurements()
+            self.exchange.fail_all(self._gone)
+            self._wire.close()
+
+    def _gone(self, device: Device) -> TradeError:
+        waited_s = time.monotonic() - self._lost_at
+        return BusGone(device=device.name, bus=self._wire.path, waited_s=waited_s, reason=self._lost_why)
+
+    def _reopen(self) -> None:
+        self.exchange.fail_all(self._gone)
+        if time.monotonic() < self._reopen_at:
+            return
+        try:
+            self._wire.open()
+        except PortOpening:
+            self._reopen_at = time.monotonic() + _REOPEN_FIRST_S
+            return
+        except (PortLost, TradeError) as still:
+            self._lost_why = str(still)
+            self._reopen_s = min(_REOPEN_MOST_S, 2 * self._reopen_s)
+            self._reopen_at = time.monotonic() + self._reopen_s
+            return
+        _log.info("bus %s: port %s is back", self._bus.name, self._wire.path)
+        self.exchange.fail_all(self._gone)
+        self._lost_at = 0.0
+        self.exchange.refusing = None
+
+    def _is_healthy(self) -> bool:
+        """A sick process moves nothing: everything is told to hold once, then silence lets the watchdogs judge."""
+        try:
+            healthy = self._healthy()
+        except Exception:  # noqa: BLE001 - a check that fails is a check that says no
+            _log.exception("bus %s: the health check failed", self._bus.name)
+            healthy = False
+        if healthy == (not self._sick):
+            return healthy
+        self._sick = not healthy
+        if self._sick:
+            _log.error("bus %s: this process is not healthy; holding, then silent", self._bus.name)
+            self._guarded(lambda: self.exchange.halt_all("its driver's process is not healthy"))
+            self.exchange.refusing = self._unhealthy
+            self.exchange.fail_all(self._unhealthy)
+        else:
+            self.exchange.refusing = None
+        return healthy
+
+    def _unhealthy(self, device: Device) -> TradeError:
+        return device.faulty("its driver's process is not healthy")

@@ -1,0 +1,24 @@
+"""CAN buses through python-can: one port, used by one thread; its load, its errors, its loss."""
+
+from trade_drivers.bus.can._bus_load import LoadMeter, frame_bits
+from trade_drivers.bus.can._errors import ErrorState, error_state
+from trade_drivers.bus.can._listeners import Listeners
+from trade_drivers.bus.can._netlink import Link, look_at
+from trade_drivers.bus.can._port import CanPort, Frame, split_port
+from trade_drivers.bus.can._scan import CanBench
+from trade_drivers.bus.can._sniffer import Talk
+
+__all__ = [
+    "CanBench",
+    "CanPort",
+    "ErrorState",
+    "Frame",
+    "Link",
+    "Listeners",
+    "LoadMeter",
+    "Talk",
+    "error_state",
+    "frame_bits",
+    "look_at",
+    "split_port",
+]

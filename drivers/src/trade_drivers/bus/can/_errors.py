@@ -1,0 +1,57 @@
+"""What an error frame says of the bus: pure, no I/O.
+
+Source: Linux ``include/uapi/linux/can/error.h``: the class is in the identifier, the controller's state in data[1].
+"""
+
+from enum import IntEnum
+from typing import Final
+
+from trade_drivers.bus.can._monitor import ErrorWord
+
+__all__ = ["ErrorState", "error_state"]
+
+_CONTROLLER: Final = 0x004
+_BUS_OFF: Final = 0x040
+_RESTARTED: Final = 0x100
+_WARNING: Final = 0x0C
+_PASSIVE: Final = 0x30
+_ACTIVE: Final = 0x40
+
+
+class ErrorState(IntEnum):
+    """How the controller of this end of the bus is doing; the greater the worse."""
+
+    ACTIVE = 0
+    """All is well."""
+    WARNING = 1
+    PASSIVE = 2
+    """It may no longer signal errors to others."""
+    BUS_OFF = 3
+    """It has switched itself off the bus."""
+
+    @property
+    def word(self) -> ErrorWord:
+        """Its name in ISO 11898-1."""
+        return _WORDS[self]
+
+
+_WORDS: Final[dict[ErrorState, ErrorWord]] = {
+    ErrorState.ACTIVE: "error-active",
+    ErrorState.WARNING: "error-warning",
+    ErrorState.PASSIVE: "error-passive",
+    ErrorState.BUS_OFF: "bus-off",
+}
+
+
+def error_state(frame_id: int, data: bytes) -> ErrorState | None:
+    """What an error frame changes the state to; None if it says nothing of it."""
+    if frame_id & _BUS_OFF:
+        return ErrorState.BUS_OFF
+    if frame_id & _RESTARTED:
+        return ErrorState.ACTIVE
+    if not frame_id & _CONTROLLER or len(data) < 2:
+        return None
+    for bits, state in ((_PASSIVE, ErrorState.PASSIVE), (_WARNING, ErrorState.WARNING), (_ACTIVE, ErrorState.ACTIVE)):
+        if data[1] & bits:
+            return state
+    return None

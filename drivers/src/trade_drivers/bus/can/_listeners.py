@@ -1,0 +1,55 @@
+"""Who is told of which frames of a bus; everything belongs to the thread that owns the port."""
+
+import time
+from collections.abc import Callable
+from typing import Final
+
+from trade_drivers.bus.can._port import CanPort
+
+__all__ = ["Listeners"]
+
+_SLICE_S: Final = 0.004
+"""Longest wait for a frame before stops are looked for."""
+
+
+class Listeners:
+    """One CAN bus, and who listens to what on it."""
+
+    def __init__(self, port: CanPort, between: Callable[[], None], meanwhile: Callable[[], None]) -> None:
+        self.port = port
+        self._between = between
+        """Called between frames: it may send, but not wait."""
+        self._meanwhile = meanwhile
+        """The same, but only where there is time left."""
+        self._listeners: dict[int, Callable[[bytes], None]] = {}
+        self._heard_at = 0.0
+
+    def heard_until(self, moment: float) -> bool:
+        """Whether all that had come by then (``time.monotonic()``) has been taken in."""
+        return self._heard_at > moment
+
+    def hear(self, can_id: int, listener: Callable[[bytes], None]) -> None:
+        """Have frames of an identifier given to a listener."""
+        self._listeners[can_id] = listener
+
+    def take_in(self, seconds: float, enough: Callable[[], bool] = lambda: False) -> None:
+        """Take frames in for that long, or until it is enough; 0 takes in what has come already.
+
+        Raises:
+            PortLost: the bus is gone.
+        """
+        until = time.monotonic() + seconds
+        while True:
+            self._between()
+            if enough():
+                return
+            now = time.monotonic()
+            if now < until:
+                self._meanwhile()
+            frame = self.port.receive(max(0.0, min(until - now, _SLICE_S)))
+            if frame is None:
+                self._heard_at = now
+                if now >= until:
+                    return
+            elif (listener := self._listeners.get(frame.id)) is not None:
+                listener(frame.data)

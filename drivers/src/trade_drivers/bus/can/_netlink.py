@@ -1,0 +1,81 @@
+"""What the system knows of one of its CAN interfaces: whether it is up, and how its controller is.
+
+Sources: linux/rtnetlink.h, linux/if_link.h (the request, the attributes), linux/can/netlink.h (those of a controller).
+"""
+
+import socket
+import struct
+from collections.abc import Iterator
+from typing import Final, NamedTuple
+
+from trade_drivers.bus.can._errors import ErrorState
+
+__all__ = ["Link", "look_at", "parse_link"]
+
+_HEADER: Final = struct.Struct("=IHHII")
+_LINK: Final = struct.Struct("=BxHiII")
+_ATTRIBUTE: Final = struct.Struct("=HH")
+_NEW_LINK: Final = 16
+_GET_LINK: Final = 18
+_REQUEST: Final = 1
+_UP: Final = 1
+_LINK_INFO: Final = 18
+_INFO_DATA: Final = 2
+_CAN_BIT_TIMING: Final = 1
+_BITRATE_SIZE: Final = 4
+"""The bit rate comes first in it."""
+_CAN_STATE: Final = 4
+_KIND_MASK: Final = 0x3FFF
+"""The two bits above it are flags."""
+_PATIENCE_S: Final = 1.0
+_LONGEST: Final = 65_536
+
+
+class Link(NamedTuple):
+    """An interface."""
+
+    up: bool
+    state: ErrorState | None
+    """None: it has no controller (``vcan``), or it is stopped."""
+    bitrate: int | None = None
+    """Bits per second; None: it has no controller, or none was set."""
+
+
+def look_at(channel: str) -> Link:
+    """Ask the system; raises OSError if there is no such interface."""
+    try:
+        index = socket.if_nametoindex(channel)
+    except OSError:
+        raise OSError(f"there is no interface {channel}") from None
+    body = _LINK.pack(socket.AF_UNSPEC, 0, index, 0, 0)
+    with socket.socket(socket.AF_NETLINK, socket.SOCK_RAW, socket.NETLINK_ROUTE) as system:
+        system.settimeout(_PATIENCE_S)
+        system.send(_HEADER.pack(_HEADER.size + len(body), _GET_LINK, _REQUEST, 0, 0) + body)
+        answer = system.recv(_LONGEST)
+    return parse_link(answer)
+
+
+def parse_link(answer: bytes) -> Link:
+    """What the system's answer says; raises OSError if it is a refusal."""
+    if len(answer) < _HEADER.size + _LINK.size or _HEADER.unpack_from(answer)[1] != _NEW_LINK:
+        raise OSError("the system does not tell of the interface")
+    *_, flags, _ = _LINK.unpack_from(answer, _HEADER.size)
+    data = _within(_within(answer[_HEADER.size + _LINK.size :], _LINK_INFO), _INFO_DATA)
+    number = int.from_bytes(_within(data, _CAN_STATE) or b"\xff", "little")
+    bitrate = int.from_bytes(_within(data, _CAN_BIT_TIMING)[:_BITRATE_SIZE], "little")
+    return Link(bool(flags & _UP), ErrorState(number) if number in set(ErrorState) else None, bitrate or None)
+
+
+def _within(data: bytes, kind: int) -> bytes:
+    """The attribute of that kind; empty if there is none."""
+    return next((value for found, value in _attributes(data) if found == kind), b"")
+
+
+def _attributes(data: bytes) -> Iterator[tuple[int, bytes]]:
+    place = 0
+    while place + _ATTRIBUTE.size <= len(data):
+        length, kind = _ATTRIBUTE.unpack_from(data, place)
+        if length < _ATTRIBUTE.size:
+            return
+        yield kind & _KIND_MASK, data[place + _ATTRIBUTE.size : place + length]
+        place += (length + 3) & ~3

@@ -1,0 +1,323 @@
+"""One end of a CAN bus, through python-can: frames out and in, and everything that can go wrong as ``PortLost``."""
+
+import logging
+import os
+import socket
+import time
+from collections.abc import Callable, Collection, Sequence
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import can
+
+from trade.errors import ConfigurationError
+from trade_drivers.bus._host_lock import HostLock, Taken
+from trade_drivers.bus._jobs import PortLost, losing
+from trade_drivers.bus.can._bus_load import LoadMeter, frame_bits
+from trade_drivers.bus.can._errors import ErrorState, error_state
+from trade_drivers.bus.can._monitor import CanBusState
+from trade_drivers.bus.can._netlink import look_at
+from trade_drivers.bus.can._sniffer import Talk
+from trade_drivers.bus.can._socketcand import ServerBus
+
+if TYPE_CHECKING:
+    from trade_drivers.robotfile import CanBus
+
+__all__ = ["CanPort", "Frame", "split_port"]
+
+_log = logging.getLogger("trade")
+logging.getLogger("can.interfaces.socketcand").setLevel(logging.ERROR)  # else it warns of every frame in two pieces
+_HELLO_S: Final = 1.0
+_SOCKETCAND_PORT: Final = 29536
+_HELLO: Final = b"< hi >"
+_TROUBLE: Final = (can.CanError, OSError, ValueError, IndexError)
+"""What python-can's interfaces raise: not only its own errors."""
+_FULL: Final = 0.9
+_SLICE_S: Final = 0.01
+_SLOWEST_S: Final = 0.8
+"""Every driver of this project that is not held up says something in it: the slowest cycle there may be is 0.67 s."""
+
+
+class Frame(NamedTuple):
+    """What was received."""
+
+    id: int
+    data: bytes
+
+
+def split_port(port: str, where: str) -> tuple[str, str]:
+    """Interface and channel of a text such as ``socketcan:can0``.
+
+    Raises:
+        ConfigurationError: it is no such text.
+    """
+    interface, colon, channel = port.partition(":")
+    if not (interface and colon and channel):
+        problem = f"{port!r} is no CAN bus; write INTERFACE:CHANNEL, such as socketcan:can0"
+        raise ConfigurationError(where=where, problem=problem)
+    return interface, channel
+
+
+def _nobody(_: Talk) -> Collection[int]:
+    """Whoever talks does not matter."""
+    return ()
+
+
+class CanPort:
+    """A CAN bus as one thread uses it, and no other driver of this host.
+
+    Args:
+        path: ``INTERFACE:CHANNEL``.
+        bitrate: bits a second.
+        where: the table of the robot file that describes this bus, for messages; empty: there is none.
+        listen_s: how long to listen, each time it is opened, before anything may be sent.
+        orders: identifiers among what was heard then that only another driver sends.
+    """
+
+    def __init__(
+        self,
+        path: str,
+        bitrate: int,
+        where: str = "bus",
+        listen_s: float = 0.0,
+        orders: Callable[[Talk], Collection[int]] = _nobody,
+    ) -> None:
+        self.path = path
+        self.state = ErrorState.ACTIVE
+        self.errors = 0
+        """Error frames received, ever."""
+        self.bus_offs = 0
+        """How often it went bus-off."""
+        self.talk = Talk({})
+        """What was heard when it was opened."""
+        self._where = where
+        self._listen_s, self._orders = listen_s, orders
+        self._interface, self._channel = split_port(path, where or path)
+        device = self._channel.partition("@")[0] if self._channel.startswith("/") else ""
+        self._lock = HostLock(self._known_as(), where or "a scan", device)
+        self._bitrate = bitrate
+        self._bus: can.BusABC | None = None
+        self.meter = LoadMeter(bitrate, time.monotonic_ns())
+        self._told_full = False
+
+    @classmethod
+    def of(cls, path: str, bus: "CanBus", where: str, orders: Callable[[Talk], Collection[int]]) -> "CanPort":
+        """For a driver: it listens for as long as watchdogs take.
+
+        What has torque then is fed by somebody else, or is not watched.
+        """
+        return cls(path, bus.bitrate, where, max(_SLOWEST_S, bus.watchdog_s + 0.1), orders)
+
+    def _known_as(self) -> str:
+        """What this bus is to all of this host."""
+        match self._interface:
+            case "virtual":  # each process has its own
+                return f"{self.path} of {os.getpid()}"
+            case _ if self._channel.startswith("/"):
+                return f"{self._interface}:{os.path.realpath(self._channel)}"
+            case _:
+                return self.path
+
+    def open(self) -> None:
+        """Begin to use it, after listening who talks there. Nothing is sent.
+
+        Raises:
+            PortLost: it is not there, at present.
+            ConfigurationError: another driver has it, on this host or elsewhere; python-can knows no such interface, or
+                it needs another package.
+        """
+        self.close()
+        try:
+            self._lock.take()
+            self._begin()
+            self._listen()
+        except Taken as taken:
+            problem = f"{self.path}: another driver has this bus: {taken}; stop it first"
+            raise self._wrong("channel", problem) from None
+        except BaseException:
+            self.close()
+            raise
+
+    def _begin(self) -> None:
+        options = self._options()
+        if self.state is not ErrorState.BUS_OFF:  # of that only a frame, or the system, says that it is over
+            self.state = ErrorState.ACTIVE
+        if self._interface == "socketcan":
+            self._look_over()
+        with losing(*_TROUBLE):
+            try:
+                if self._interface == "socketcand":
+                    self._bus = ServerBus(**options)
+                else:
+                    self._bus = can.Bus(interface=self._interface, **options)
+            except (can.CanInterfaceNotImplementedError, ImportError) as unknown:
+                raise self._wrong("interface", f"{self.path}: {unknown}") from None
+
+    def _listen(self) -> None:
+        heard: dict[int, list[bytes]] = {}
+        until = time.monotonic() + self._listen_s
+        while (left_s := until - time.monotonic()) > 0:
+            frame = self.receive(min(left_s, _SLICE_S))
+            if frame is not None:
+                heard.setdefault(frame.id, []).append(frame.data)
+        self.talk = Talk(heard)
+        if orders := self._orders(self.talk):
+            said = ", ".join(f"{one:03X}h" for one in sorted(orders))
+            problem = f"{self.path}: another driver commands the devices of this bus (it sends {said}); stop it first"
+            raise self._wrong("channel", problem)
+
+    def _look_over(self) -> None:
+        """What the system knows of the interface already.
+
+        Raises:
+            PortLost: it is not there, is down, or its controller is bus-off.
+        """
+        with losing(OSError):
+            link = look_at(self._channel)
+        if not link.up:
+            raise PortLost(f"it is down; `ip link set {self._channel} up`")
+        if link.state is not None:
+            self._enter(link.state)
+
+    def look(self, name: str) -> CanBusState:
+        """How it is now; from any thread."""
+        return CanBusState(
+            name=name,
+            port=self.path,
+            up=self._bus is not None,
+            state=self.state.word,
+            load=self.meter.load,
+            error_frames=self.errors,
+            bus_offs=self.bus_offs,
+        )
+
+    def _options(self) -> dict[str, Any]:
+        match self._interface:
+            case "socketcand":
+                host, port, channel = self._server()
+                _greet(host, port)
+                # without tcp_tune several small frames in a row wait 40 ms for an acknowledgement
+                return {"host": host, "port": port, "channel": channel, "tcp_tune": True}
+            case "slcan":
+                return {"channel": self._channel, "bitrate": self._bitrate, "sleep_after_open": 0}
+            case "socketcan" | "virtual":  # the system sets the one's bit rate, the other has none
+                return {"channel": self._channel}
+            case _:
+                return {"channel": self._channel, "bitrate": self._bitrate}
+
+    def _wrong(self, key: str, problem: str) -> ConfigurationError:
+        return ConfigurationError(where=f"{self._where}.{key}" if self._where else "", problem=problem)
+
+    def _server(self) -> tuple[str, int, str]:
+        server, slash, channel = self._channel.partition("/")
+        host, _, port = server.partition(":")
+        if not (host and slash and channel) or (port and not port.isdecimal()):
+            problem = f"{self._channel!r}: write HOST:PORT/CHANNEL, such as 127.0.0.1:29536/can0"
+            raise self._wrong("channel", problem)
+        return host, int(port or _SOCKETCAND_PORT), channel
+
+    def close(self) -> None:
+        """Let go of it; more than once is fine."""
+        bus, self._bus = self._bus, None
+        self.meter = LoadMeter(self._bitrate, time.monotonic_ns())
+        if bus is not None:
+            with suppress(*_TROUBLE):
+                bus.shutdown()
+        self._lock.release()
+
+    def send(self, frame_id: int, data: bytes) -> None:
+        """One frame out; never waits.
+
+        Raises:
+            PortLost: it could not be sent.
+        """
+        self.send_all([Frame(frame_id, data)])
+
+    def send_all(self, frames: Sequence[Frame]) -> None:
+        """Frames out, in this order, and in one write where the interface has that; never waits.
+
+        Raises:
+            PortLost: they could not be sent, or not all of them.
+        """
+        messages = [can.Message(arbitration_id=frame.id, data=frame.data, is_extended_id=False) for frame in frames]
+        bus = self._open_bus()
+        try:
+            if isinstance(bus, ServerBus):
+                bus.send_all(messages)
+            else:
+                for message in messages:
+                    bus.send(message, timeout=0)
+        except _TROUBLE as gone:
+            raise PortLost(str(gone)) from None
+        self._count(sum(frame_bits(len(frame.data)) for frame in frames))
+
+    def receive(self, timeout_s: float) -> Frame | None:
+        """One data frame, or None when none has come in that time (or an error frame has).
+
+        Raises:
+            PortLost: the bus is gone, or this end has switched itself off it.
+        """
+        bus = self._open_bus()
+        try:
+            message = bus.recv(timeout_s)
+        except _TROUBLE as gone:
+            raise PortLost(str(gone)) from None
+        if message is None:
+            self.meter.tick(time.monotonic_ns())
+            return None
+        if message.is_error_frame:
+            self._take_error(message.arbitration_id, bytes(message.data))
+            return None
+        if self.state is ErrorState.BUS_OFF:
+            self._enter(ErrorState.ACTIVE)  # nothing is heard in bus-off
+        self._count(frame_bits(len(message.data)))
+        if message.is_extended_id or message.is_remote_frame:
+            return None
+        return Frame(message.arbitration_id, bytes(message.data))
+
+    def _open_bus(self) -> can.BusABC:
+        if self._bus is None:
+            raise PortLost("it is not open")
+        return self._bus
+
+    def _count(self, bits: int) -> None:
+        self.meter.add(bits, time.monotonic_ns())
+        full = self.meter.load > _FULL
+        if full and not self._told_full:
+            _log.warning(
+                "%s: the bus is %.0f %% full; lower rate_hz or raise the bit rate", self.path, self.meter.load * 100
+            )
+        self._told_full = full
+
+    def _take_error(self, frame_id: int, data: bytes) -> None:
+        self.errors += 1
+        state = error_state(frame_id, data)
+        if state is not None:
+            self._enter(state)
+
+    def _enter(self, state: ErrorState) -> None:
+        """Note how its controller is; raises PortLost for bus-off."""
+        before, self.state = self.state, state
+        if state != before:
+            _log.log(logging.INFO if state < before else logging.WARNING, "%s: the bus is %s", self.path, state.word)
+        if state is ErrorState.BUS_OFF:
+            self.bus_offs += state != before
+            raise PortLost(self._bus_off())
+
+    def _bus_off(self) -> str:
+        remedy = "check bit rate, termination and cable"
+        if self._interface == "socketcan":
+            here = self._channel
+            remedy += f", then `ip link set {here} down` and `up`; with `ip link set {here} type can restart-ms 100` "
+            remedy += "it comes back by itself"
+        return f"bus-off: too many errors on the bus; {remedy}"
+
+
+def _greet(host: str, port: int) -> None:
+    """Find out with a deadline whether a server answers: python-can's own client has none."""
+    try:
+        with socket.create_connection((host, port), _HELLO_S) as probe:
+            if not probe.recv(len(_HELLO)).startswith(b"<"):
+                raise PortLost(f"{host}:{port} is no socketcand")
+    except OSError as bad:
+        raise PortLost(f"{host}:{port}: {bad}") from None

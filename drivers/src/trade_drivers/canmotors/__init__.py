@@ -1,6 +1,0 @@
-"""Motors with controllers of their own on a CAN bus, asked in every cycle: what those of all vendors have in common."""
-
-from trade_drivers.canmotors._axis import Another, MotorAxis, Unfit
-from trade_drivers.canmotors._driver import CanMotorDriver
-
-__all__ = ["Another", "CanMotorDriver", "MotorAxis", "Unfit"]

@@ -1,0 +1,1 @@
+"""Finding devices on a bus, and giving them ids and rates."""

@@ -1,5 +1,0 @@
-"""ROBOTIS Dynamixel X-series servos, protocol 2.0, in position control."""
-
-from trade_drivers.dynamixel._driver import DynamixelDriver, open_exchange
-
-__all__ = ["DynamixelDriver", "open_exchange"]

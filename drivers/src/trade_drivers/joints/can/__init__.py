@@ -1,0 +1,6 @@
+"""Motors with controllers of their own on a CAN bus, asked in every cycle: what those of all vendors have in common."""
+
+from trade_drivers.joints.can._axis import Another, MotorAxis, Unfit
+from trade_drivers.joints.can._driver import CanMotorDriver
+
+__all__ = ["Another", "CanMotorDriver", "MotorAxis", "Unfit"]

@@ -1,0 +1,56 @@
+"""Exchanges with one servo within a retry budget, one after the other: what its jobs are made of."""
+
+from collections.abc import Callable, Generator
+from typing import Final, TypeVar
+
+from trade.errors import DeadlineExceeded, DeviceSilent, OutcomeUnknown
+from trade_drivers.joints import Job, Steps
+from trade_drivers.joints.serial._answers import NoAnswer, Refused
+from trade_drivers.joints.serial._axis import Health, ServoAxis
+from trade_drivers.joints.serial._cycle import ServoExchange
+
+__all__ = ["health_of", "told", "tried"]
+
+_Result = TypeVar("_Result")
+_Health = TypeVar("_Health", bound=Health)
+_ATTEMPTS: Final = 3
+
+
+def told(bus: ServoExchange, job: Job, axis: ServoAxis[_Health], address: int, data: bytes) -> Steps:
+    """Registers written, and confirmed."""
+    yield from tried(bus, axis, lambda: bus.wire.write(axis.id, address, data, job.gate))
+
+
+def health_of(bus: ServoExchange, axis: ServoAxis[_Health]) -> Generator[None, None, _Health]:
+    """How it is, asked now."""
+
+    def look() -> _Health:
+        asked_ns = bus.clock()
+        return axis.take_health(bus.wire.read(axis.id, *axis.slow).data, asked_ns)
+
+    return (yield from tried(bus, axis, look))
+
+
+def tried(bus: ServoExchange, axis: ServoAxis[_Health], act: Callable[[], _Result]) -> Generator[None, None, _Result]:
+    """One exchange within the retry budget; a ping before each retry keeps late answers from being taken for new."""
+    asked, waited_s = False, 0.0
+    for _ in range(_ATTEMPTS):
+        try:
+            if asked:
+                bus.wire.ping(axis.id)
+                yield
+            result = act()
+        except DeadlineExceeded as late:
+            if asked:  # it went out before, and nobody heard what became of it
+                raise OutcomeUnknown(service=late.service, deadline_s=late.deadline_s) from None
+            raise
+        except NoAnswer as silent:
+            asked, waited_s = True, silent.waited_s
+            axis.doubted = True
+            yield
+        except Refused as refused:
+            raise axis.faulty(f"it refused a command: {refused}") from None
+        else:
+            yield
+            return result
+    raise DeviceSilent(device=axis.name, bus=axis.bus, waited_s=waited_s * _ATTEMPTS)

@@ -1,0 +1,104 @@
+"""Setting servos of any vendor up: what their registers are called differs, what is done with them does not."""
+
+from abc import abstractmethod
+from contextlib import suppress
+from typing import TYPE_CHECKING, ClassVar, Final
+
+from trade_drivers.commissioning._commissioner import Bench, Found
+from trade_drivers.joints.serial._answers import BadAnswer, NoAnswer, Refused
+
+if TYPE_CHECKING:
+    from trade_drivers.joints.serial._wire import ServoWire
+
+__all__ = ["ServoBench"]
+
+_LOOKS: Final = 3
+_SHARED: Final = (
+    "what answers is garbled or comes twice: two devices may share this id, or there is noise. Unplug all devices "
+    "but one, give it an id of its own, then plug in the next"
+)
+
+_UNKNOWN: Final = "this driver does not know that model; look at it with the vendor's tool"
+
+
+class ServoBench(Bench):
+    """An open line of servos."""
+
+    driver: ClassVar[str]
+    restless: ClassVar[tuple[int, int]]
+    """Address and size of what is hardly the same in two servos: two that answer alike would look like one."""
+    mute: ClassVar[str]
+    """What is wrong with a servo that tells its model and nothing else."""
+
+    def __init__(self, wire: "ServoWire", baud: int) -> None:
+        self.wire = wire
+        self._baud = baud
+
+    @abstractmethod
+    def model_of(self, number: int) -> str:
+        """What a model is called; empty if this driver does not know it."""
+
+    @abstractmethod
+    def firmware_of(self, device_id: int) -> str:
+        """The version of its program."""
+
+    @abstractmethod
+    def torque_of(self, device_id: int) -> bool:
+        """Whether its torque is on."""
+
+    def anybody(self) -> bool:
+        return True
+
+    def look(self, device_id: int) -> Found | None:
+        found = self._look(device_id)
+        for _ in range(_LOOKS - 1):
+            if found is not None and found.problem == self.mute:  # one answer that got lost says nothing of it
+                found = self._look(device_id)
+        return found
+
+    def _look(self, device_id: int) -> Found | None:
+        try:
+            number = self.wire.ping(device_id)
+        except BadAnswer:
+            return self._found(device_id, problem=_SHARED)
+        except NoAnswer:
+            self.wire.settled_at = 0.0  # an answer that comes now is not taken for that of the next id
+            return None
+        model = self.model_of(number)
+        if not model:  # its registers may mean anything
+            return self._found(device_id, f"model number {number}", problem=_UNKNOWN)
+        try:
+            shared = self.wire.answers_twice()
+            for _ in range(_LOOKS):
+                self.wire.read(device_id, *self.restless)
+                shared = shared or self.wire.answers_twice()
+            firmware, torque = self.firmware_of(device_id), self.torque_of(device_id)
+        except BadAnswer:
+            return self._found(device_id, problem=_SHARED)
+        except NoAnswer:
+            self.wire.settled_at = 0.0
+            return self._found(device_id, model, problem=self.mute)
+        except Refused as refused:
+            return self._found(device_id, model, problem=f"it refuses to be read: {refused}")
+        return self._found(device_id, model, firmware, torque, _SHARED if shared else "")
+
+    def _found(
+        self, device_id: int, model: str = "", firmware: str = "", torque: bool | None = None, problem: str = ""
+    ) -> Found:
+        return Found(
+            driver=self.driver,
+            baud=self._baud,
+            id=device_id,
+            model=model,
+            firmware=firmware,
+            torque=torque,
+            problem=problem,
+        )
+
+    def told(self, device_id: int, address: int, data: bytes) -> None:
+        """Write once; its answer may come under another id or at another rate, so nobody waits for it twice."""
+        with suppress(NoAnswer):
+            self.wire.write(device_id, address, data)
+
+    def close(self) -> None:
+        self.wire.close()

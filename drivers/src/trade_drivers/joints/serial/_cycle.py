@@ -1,0 +1,191 @@
+"""The cyclic exchange with all servos of one bus: stops, measurements, work, goals. One thread calls ``cycle()``."""
+
+import logging
+import time
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, Final, cast
+
+from trade_drivers.bus._cycle import PROBE_NS
+from trade_drivers.joints import Axis, Exchange, Motion, Steps
+from trade_drivers.joints.serial._answers import NoAnswer, Refused
+from trade_drivers.joints.serial._axis import ServoAxis
+
+if TYPE_CHECKING:
+    from trade_drivers.joints.serial._wire import ServoWire
+    from trade_drivers.robotfile import SerialBus
+
+__all__ = ["ServoExchange"]
+
+_log = logging.getLogger("trade")
+_HEALTH_NS: Final = 500_000_000
+_CLEAN_NS: Final = 1_000_000_000
+_WAIT_S: Final = 0.001
+_CHUNK_S: Final = 0.014
+"""A group is read in pieces that take no longer than this on the wire, so that a stop can come in between."""
+
+
+class ServoExchange(Exchange):
+    """What happens on one bus of servos."""
+
+    sizes: ClassVar[tuple[int, ...]]
+    """Sizes of the cyclic read: after a failure the next one is used, so that a late answer has another length."""
+    answer_overhead: ClassVar[int]
+    """Bytes that a joint adds to a cyclic exchange, beside what is read of it."""
+
+    def __init__(
+        self,
+        wire: "ServoWire",
+        bus: "SerialBus",
+        axes: Sequence[ServoAxis[Any]],
+        clock: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
+        super().__init__(bus, axes, clock)
+        self.wire = wire
+        self.servos = tuple(axes)
+        self._chunk = max(1, int(_CHUNK_S * bus.baud / 10 / (self.answer_overhead + self.sizes[0])))
+        self._attended_ns = self.lasting_clock()
+        self._size = 0
+        self._failed_ns = 0
+        wire.pause = self.pause
+
+    # --- what differs
+
+    @abstractmethod
+    def admit(self, axis: ServoAxis[Any]) -> None:
+        """Take a joint on that was looked over: found moving, it is stopped."""
+
+    def name_of(self, model_number: int) -> str:
+        """What a model is called, or its number."""
+        return str(model_number)
+
+    def look_after(self, axis: ServoAxis[Any]) -> None:
+        """Do at once what the health just read asks for. Raises ``NoAnswer``."""
+
+    # --- who missed an exchange may have restarted without torque: it is sent no goal before that was read
+
+    def can_take_goals(self, axes: Sequence[Axis]) -> bool:
+        return not any(cast("ServoAxis[Any]", axis).in_doubt for axis in axes)
+
+    def making_way(self, job: Motion) -> Steps:
+        while not self.can_take_goals(job.axes):
+            for axis in job.axes:
+                self.require_answering(axis)
+            self.idle(_WAIT_S)
+            yield
+
+    # --- from the bus thread
+
+    def cycle(self) -> None:
+        """One round: stops, gaps, measurements, work, motions, one joint's health."""
+        began_ns = self.clock()
+        self.serve_stops()
+        attended_ns, self._attended_ns = self._attended_ns, self.lasting_clock()
+        if self._attended_ns - attended_ns > self.watchdog_ns // 2:
+            self._look_after_a_gap()
+        self._read()
+        self._recover()
+        self.work(began_ns + self.period_ns // 2)
+        self.watch()
+        self._read_health()
+
+    def readmit(self, axis: ServoAxis[Any]) -> None:
+        """Look a joint over that was away, or missed an exchange: its model, its health.
+
+        Never enables, never moves; found moving and owned by nobody, it is stopped.
+
+        Raises:
+            NoAnswer: it is still away.
+        """
+        number = self.wire.ping(axis.id)
+        if number != axis.model_number:
+            found = self.name_of(number)
+            axis.fault = f"another model answers with its id: {found}, not {axis.joint.model}"
+            axis.ready = False
+            axis.sample = None  # what was measured of ours means nothing to this one: it is told nothing
+            axis.silent = True
+            return
+        self._refresh_health(axis)
+        if axis.silent:
+            _log.info("%s answers again", axis.name)
+            axis.misses = 0
+        axis.silent = axis.doubted = False
+        if axis.motion is None:
+            self.stop_found_moving(axis)
+
+    def stop_found_moving(self, axis: ServoAxis[Any]) -> None:
+        """Have a joint hold that moves and is owned by nobody."""
+        if axis.health is not None and axis.health.torque and axis.health.moving:
+            axis.take_sample(self.wire.read(axis.id, *axis.cyclic).data, self.clock())
+            self.hold([axis], self.clock())
+
+    # --- parts of a cycle
+
+    def _look_after_a_gap(self) -> None:
+        """The process was frozen: what became of the joints comes before anything else."""
+        for axis in self.servos:
+            axis.health_due_ns = 0
+            if not axis.silent and not axis.doubted and not self._try_health(axis):
+                return
+
+    def _read(self) -> None:
+        asked = [axis for axis in self.servos if not axis.silent and not axis.doubted]
+        if self._size and self.clock() - self._failed_ns > _CLEAN_NS:
+            self._size = 0
+        size = self.sizes[self._size]
+        for at in range(0, len(asked), self._chunk):
+            part = asked[at : at + self._chunk]
+            asked_ns = self.clock()  # not when it came: a frozen process would take old values for new
+            silent = {axis.id: axis for axis in part}
+            for device_id, answer in self.wire.sync_read(part[0].cyclic[0], size, list(silent)):
+                if (axis := silent.pop(device_id, None)) is not None:
+                    axis.take_sample(answer.data, asked_ns)
+                    if answer.alert and not axis.fault:
+                        axis.health_due_ns = 0
+            for axis in silent.values():
+                self.missed(axis)
+            self.serve_stops()
+
+    def missed(self, device: Axis) -> None:
+        self._failed_ns = self.clock()
+        self._size = (self._size + 1) % len(self.sizes)
+        super().missed(device)
+
+    def _recover(self) -> None:
+        """Look over those in doubt, and those silent when it is their turn; the first that fails ends the round."""
+        now_ns = self.clock()
+        for axis in self.servos:
+            due = axis.silent and now_ns >= axis.probe_at_ns
+            if not due and (axis.silent or not axis.doubted):
+                continue
+            try:
+                self.readmit(axis)
+            except NoAnswer:
+                self.missed(axis)
+                return
+            except Refused as refused:
+                axis.fault, axis.doubted = f"it refuses to be read: {refused}", False
+            if axis.silent:
+                axis.probe_at_ns = self.clock() + PROBE_NS
+
+    def _read_health(self) -> None:
+        now_ns = self.clock()
+        due = [axis for axis in self.servos if axis.health_due_ns <= now_ns and not axis.silent and not axis.doubted]
+        if due:
+            self._try_health(min(due, key=lambda axis: axis.health_due_ns))
+
+    def _try_health(self, axis: ServoAxis[Any]) -> bool:
+        try:
+            self._refresh_health(axis)
+        except NoAnswer:
+            self.missed(axis)
+            return False
+        except Refused as refused:
+            axis.fault = f"it refuses to be read: {refused}"
+        return True
+
+    def _refresh_health(self, axis: ServoAxis[Any]) -> None:
+        asked_ns = self.clock()
+        axis.take_health(self.wire.read(axis.id, *axis.slow).data, asked_ns)
+        axis.health_due_ns = asked_ns + _HEALTH_NS
+        self.look_after(axis)

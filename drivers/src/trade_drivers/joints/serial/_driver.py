@@ -1,0 +1,110 @@
+"""Bringing a bus of servos up, and handing out its motors."""
+
+import time
+from abc import abstractmethod
+from collections.abc import Callable, Collection, Mapping
+from contextlib import ExitStack
+from typing import TYPE_CHECKING, Any, ClassVar, cast
+
+from trade.errors import ConfigurationError
+from trade_drivers.commissioning._commissioner import Bench
+from trade_drivers.joints import AttachedJoints, BusThread, PortLost
+from trade_drivers.joints.serial._answers import WireError
+from trade_drivers.joints.serial._commission import ServoBench
+from trade_drivers.joints.serial._cycle import ServoExchange
+from trade_drivers.plugins._driver import AttachedBus, Driver
+from trade_drivers.robotfile import Bus, Gripper, Joint, Robot, SerialBus
+
+if TYPE_CHECKING:
+    from trade_drivers.joints.serial._axis import ServoAxis
+    from trade_drivers.joints.serial._wire import ServoWire
+
+__all__ = ["ServoDriver"]
+
+
+class ServoDriver(Driver):
+    """One vendor's servos in position control on a serial bus."""
+
+    devices = (Joint,)
+    name: ClassVar[str]
+    models: ClassVar[Mapping[str, object]]
+    """Those it knows, by the name printed on them."""
+    bauds: ClassVar[Collection[int]]
+    """Rates they can be set to."""
+
+    @abstractmethod
+    def exchange(self, robot: Robot, bus: SerialBus, port: str, joints: list[Joint]) -> ServoExchange:
+        """What the file alone can tell is checked; the port is not open yet. Raises ``ConfigurationError``."""
+
+    @abstractmethod
+    def look_over(
+        self, wire: "ServoWire", bus: SerialBus, axis: "ServoAxis[Any]", clock_ns: Callable[[], int], where: str
+    ) -> None:
+        """Check one joint's device and take its first measurements. Raises ``ConfigurationError``."""
+
+    def check(self, robot: Robot, bus: Bus) -> None:
+        serial = self._serial(robot, bus)
+        self.exchange(robot, serial, serial.port, self._known(robot, serial))
+
+    def fits(self, bench: Bench, robot: Robot, bus: Bus, device: Joint | Gripper) -> None:
+        serial, wire = self._serial(robot, bus), cast("ServoBench", bench).wire
+        [axis] = self.exchange(robot, serial, serial.port, [cast("Joint", device)]).servos
+        self.look_over(wire, serial, axis, time.monotonic_ns, robot.where)
+
+    def attach(self, robot: Robot, bus: Bus, port: str, healthy: Callable[[], bool]) -> AttachedBus:
+        with ExitStack() as undo:
+            exchange = self.open_exchange(robot, self._serial(robot, bus), port)
+            undo.callback(exchange.wire.close)
+            thread = BusThread(exchange, exchange.wire, bus, healthy, name=f"bus {robot.name}.{bus.name}")
+            thread.start()
+            undo.pop_all()
+        return AttachedJoints(thread)
+
+    def open_exchange(self, robot: Robot, bus: SerialBus, port: str) -> ServoExchange:
+        """Open the port and look every joint over, without a thread: ``cycle()`` is the caller's to call.
+
+        Raises:
+            ConfigurationError: the port cannot be had, or a device is absent, another, or set wrongly.
+        """
+        exchange = self.exchange(robot, bus, port, self._known(robot, bus))
+        where = f"{robot.where}: bus.{bus.name}.port"
+        with ExitStack() as undo:
+            undo.callback(exchange.wire.close)
+            try:
+                exchange.wire.open()
+                for axis in exchange.servos:
+                    self.look_over(exchange.wire, bus, axis, exchange.clock, robot.where)
+                for axis in exchange.servos:
+                    exchange.admit(axis)
+                exchange.cycle()
+            except PortLost as lost:
+                problem = f"{port}: {lost}; `ls -l /dev/serial/by-id` shows those that are"
+                raise ConfigurationError(where=where, problem=problem) from None
+            except WireError as bad:
+                problem = f"the bus does not work reliably: {bad}; check cable and power"
+                raise ConfigurationError(where=where, problem=problem) from bad
+            undo.pop_all()
+        return exchange
+
+    def _serial(self, robot: Robot, bus: Bus) -> SerialBus:
+        if not isinstance(bus, SerialBus):
+            problem = f"driver {self.name} needs a serial bus: port instead of interface and channel"
+            raise ConfigurationError(where=f"{robot.where}: bus.{bus.name}", problem=problem)
+        return bus
+
+    def _known(self, robot: Robot, bus: SerialBus) -> list[Joint]:
+        if bus.baud not in self.bauds:
+            problem = f"{bus.baud} is no rate of these servos; they know {', '.join(map(str, sorted(self.bauds)))}"
+            raise ConfigurationError(where=f"{robot.where}: bus.{bus.name}.baud", problem=problem)
+        joints = robot.joints_on(bus.name)
+        for joint in joints:
+            if joint.model not in self.models:
+                problem = f"{joint.model!r} is unknown to the driver {self.name}; it knows {', '.join(self.models)}"
+                raise ConfigurationError(where=f'{robot.where}: joint."{joint.name}".model', problem=problem)
+            if joint.counts_per_rev is not None or joint.gear != 1:
+                problem = "counts_per_rev and gear are for other devices: a servo's angle is that of its joint"
+                raise ConfigurationError(where=f'{robot.where}: joint."{joint.name}"', problem=problem)
+            if joint.serial_number is not None:
+                problem = "these servos tell no serial number; leave this key out"
+                raise ConfigurationError(where=f'{robot.where}: joint."{joint.name}".serial_number', problem=problem)
+        return joints

@@ -1,0 +1,1 @@
+"""Planned motion: splines, checked plans, and joint groups over several buses."""

@@ -1,0 +1,49 @@
+"""What drivers have against a robot file, before any port is opened."""
+
+from collections.abc import Iterator
+
+from trade.errors import ConfigurationError
+from trade_drivers import robotfile
+from trade_drivers.plugins._driver import Driver, SenseDriver, load_driver
+from trade_drivers.robotfile import Bus, Robot
+
+__all__ = ["check", "refusals"]
+
+
+def check(robot: Robot) -> None:
+    """Have the drivers of a robot look at its file. Nothing is opened, and nobody is asked.
+
+    Raises:
+        ConfigurationError: the first thing that one of them refuses; names file and key.
+    """
+    for _, refusal in refusals(robot):
+        raise refusal
+
+
+def refusals(robot: Robot) -> Iterator[tuple[str, ConfigurationError]]:
+    """By bus, camera and sensor: the first thing that its driver refuses of the file, if there is any."""
+    parts = (*robot.buses, *robot.cameras, *robot.sensors)
+    for part in parts:
+        try:
+            _check_bus(robot, part) if isinstance(part, Bus) else _check_sense(part)
+        except ConfigurationError as refusal:
+            yield part.name, refusal
+
+
+def _check_bus(robot: Robot, bus: robotfile.SerialBus | robotfile.CanBus | robotfile.UrBus) -> None:
+    driver = load_driver(bus.driver, f"{robot.where}: bus.{bus.name}.driver", Driver)
+    devices = (*robot.joints_on(bus.name), *robot.grippers_on(bus.name), *robot.arms_on(bus.name))
+    for device in devices:
+        if not isinstance(device, driver.devices):
+            kind, known = (
+                type(device).__name__.lower(),
+                " and ".join(f"{one.__name__.lower()}s" for one in driver.devices),
+            )
+            problem = f"bus {bus.name!r} has driver {bus.driver}, which has no {kind}s, only {known}"
+            raise ConfigurationError(where=f'{robot.where}: {kind}."{device.name}".bus', problem=problem)
+    if devices:
+        driver.check(robot, bus)
+
+
+def _check_sense(sense: robotfile.Camera | robotfile.Sensor) -> None:
+    load_driver(sense.driver, f"{sense.where}: {sense.key}.driver", SenseDriver).check(sense)

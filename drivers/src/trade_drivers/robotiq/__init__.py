@@ -1,5 +1,0 @@
-"""Robotiq 2F-85 grippers on Modbus RTU."""
-
-from trade_drivers.robotiq._driver import RobotiqDriver
-
-__all__ = ["RobotiqDriver"]

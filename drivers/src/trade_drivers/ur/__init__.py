@@ -1,6 +1,0 @@
-"""Arms of Universal Robots, through ur-rtde."""
-
-from trade_drivers.ur._driver import UrDriver
-from trade_drivers.ur._identify import identify
-
-__all__ = ["UrDriver", "identify"]

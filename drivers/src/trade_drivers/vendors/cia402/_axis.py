@@ -1,0 +1,244 @@
+"""One drive as the bus thread knows it: what its frames said last, and what speaks against moving on."""
+
+from collections.abc import Sequence
+from enum import Enum, auto
+from math import tau
+from struct import error as BadLength  # noqa: N812 - what unpacking raises for another number of bytes
+from typing import Final
+
+from trade.errors import DeviceError
+from trade_drivers.interfaces._motion import MotorState
+from trade_drivers.joints import Axis, Grain, Sample
+from trade_drivers.robotfile import Joint
+from trade_drivers.vendors.cia402 import _machine as machine
+from trade_drivers.vendors.cia402 import _table as table
+from trade_drivers.vendors.cia402._machine import State, state_of
+from trade_drivers.vendors.cia402._net import emergency_text
+from trade_drivers.vendors.cia402._stream import Following, Turning
+
+__all__ = ["DriveAxis", "Stage"]
+
+_STILL_RAD_S: Final = 0.01
+_ARRIVED_RAD: Final = 0.004
+_NEAR_RAD: Final = 0.03
+_FAULTS: Final = (State.FAULT, State.FAULT_REACTION)
+_SOME_FAULT: Final = "it reports a fault"
+_STOPPED: Final = "network management has stopped it: it answers nothing until it is taken back"
+_ACKNOWLEDGE_NS: Final = 250_000_000
+"""How long a drive may take to take a set-point."""
+
+
+def grain_of(joint: Joint, rate_hz: float) -> Grain:
+    """What counts of this joint's drive mean: positions in counts, speeds in counts a second, and so on."""
+    rad = tau / ((joint.counts_per_rev or 1.0) * joint.gear)
+    return Grain(
+        rad=rad,
+        rad_s=rad,
+        rad_s2=rad,
+        centre=0,
+        still_velocity=max(1, round(_STILL_RAD_S / rad)),
+        still_counts=max(1, round(_STILL_RAD_S / rate_hz / rad)),
+        arrived=max(2, round(_ARRIVED_RAD / rad)),
+        near=max(4, round(_NEAR_RAD / rad)),
+    )
+
+
+class Stage(Enum):
+    """How far a drive is on its way into the cycle; ``Admission`` tells what happens in each."""
+
+    AWAY = auto()
+    LOOKED_OVER = auto()
+    SET_UP = auto()
+    HERE = auto()
+
+
+class DriveAxis(Axis):
+    """One drive."""
+
+    def __init__(self, name: str, bus: str, joint: Joint, rate_hz: float, coupled: Sequence[str] = ()) -> None:
+        super().__init__(name, bus, joint, grain_of(joint, rate_hz), coupled)
+        self.identity: tuple[int, ...] = ()
+        """What it said of itself when it was attached."""
+        self.state_now: State | None = None
+        self.statusword = 0
+        self.mode = 0
+        self.modes: frozenset[int] = frozenset()
+        """Those it can be used in."""
+        self.entered = 0
+        """The mode it was enabled in; 0 if that is not known any more."""
+        self.stream: Following | Turning | None = None
+        """In a mode without a goal: what it is sent in every cycle."""
+        self.velocity = 0
+        self.controlword = 0
+        """What was commanded last."""
+        self.target = 0
+        self.asked_ns = 0
+        """When its set-point was raised; 0 once it was taken."""
+        self.beat_ns = 0
+        """When its heartbeat came last."""
+        self.awaited_ns = 0
+        """When it was last asked for a measurement; 0 once that has come."""
+        self.stage = Stage.AWAY
+        """Only in the last one it is not ``silent``."""
+        self.set_up_ns = 0
+        """When it was last looked over and set up."""
+        self.answered_ns = 0
+        """When it was asked for a measurement that came while it was left out."""
+        self.stopped = False
+        """Network management has stopped it, so its last heartbeat said: it answers nothing until it is taken back."""
+        self.recalled = False
+        """Who works on it waits until it is taken back and set up."""
+        self.to_start = False
+        """It was started, and its heartbeat says that it is not: the frame was lost, or it went back."""
+
+    # --- what it says
+
+    def take_status(self, data: bytes) -> None:
+        """Its first TPDO. Only the first after a SYNC counts: what comes later is too late to be believed."""
+        asked_ns, self.awaited_ns = self.awaited_ns, 0
+        if not asked_ns:
+            return
+        try:
+            statusword, position, torque = table.STATUS.layout.unpack(data)
+        except BadLength:
+            return
+        if self.silent:
+            self.answered_ns = asked_ns
+            return
+        self.statusword = statusword
+        self.state_now = state_of(self.statusword)
+        self.note(Sample(position, self.velocity, torque, asked_ns))
+        self._judge(asked_ns)
+
+    def take_motion(self, data: bytes) -> None:
+        """Its second TPDO."""
+        try:
+            self.velocity, self.mode, error = table.MOTION.layout.unpack(data)
+        except BadLength:
+            return
+        if error and self.state_now in _FAULTS:
+            self.latch(emergency_text(error))
+
+    def take_emergency(self, data: bytes) -> None:
+        """An EMCY, however short; code 00xx says that an error has gone, which does not undo that it was there."""
+        code = int.from_bytes(data[:2], "little")
+        if code & 0xFF00:
+            self.latch(emergency_text(code))
+
+    def take_heartbeat(self, data: bytes, now_ns: int) -> None:
+        """Its heartbeat, or that it has started anew: then what it was told before is gone."""
+        state = data[0] & 0x7F if data else table.BOOT_UP
+        self.stopped = state == table.STOPPED
+        if state == table.BOOT_UP:
+            self._lose("it has restarted; is its supply sound?", now_ns)
+        elif state == table.OPERATIONAL:
+            self.beat_ns = now_ns
+        elif self.stage is Stage.SET_UP:
+            self.to_start = True
+        elif not self.silent:
+            why = f"somebody has made it {table.NMT_STATES.get(state, hex(state))}"
+            self._lose(_STOPPED if self.stopped else why, now_ns)
+
+    def _lose(self, why: str, now_ns: int) -> None:
+        if self.ready:
+            self.latch(why)
+        self.forget(now_ns)
+
+    def forget(self, now_ns: int) -> None:
+        """Leave it out until it was looked over again, which may be at once."""
+        if not self.silent:
+            self.silent, self.silent_since_ns = True, now_ns
+        self.stage, self.probe_at_ns = Stage.AWAY, now_ns
+        self.controlword = self.asked_ns = self.awaited_ns = 0
+        self.entered, self.stream = 0, None
+
+    def be_awaited(self, now_ns: int) -> None:
+        """It was set up: it is to be heard."""
+        if self.ready:
+            self.latch("it was away")
+        self.stage, self.set_up_ns = Stage.SET_UP, now_ns
+        self.entered, self.stream = 0, None
+
+    def welcome(self, now_ns: int) -> None:
+        """It is heard."""
+        self.stage = Stage.HERE
+        self.silent, self.silent_since_ns, self.sample = False, now_ns, None
+        self.controlword = self.asked_ns = self.awaited_ns = 0
+
+    def latch(self, fault: str) -> None:
+        """Note what speaks against moving on, until it is enabled again; the first that says something is kept."""
+        if self.fault in {"", _SOME_FAULT}:
+            self.fault = fault
+        self.ready = False
+
+    def _judge(self, now_ns: int) -> None:
+        state = self.state_now
+        if state in _FAULTS:
+            self.latch(_SOME_FAULT)
+        elif self.ready and state is State.QUICK_STOP:
+            self.latch("it has made a quick stop by itself: it heard nothing for too long, or a switch told it to")
+        elif self.ready and state is not State.ENABLED:
+            self.latch("its torque went off: it lost power, or its protection switched it off")
+        elif self.ready and self.asked_ns and now_ns - self.asked_ns > _ACKNOWLEDGE_NS and not self.acknowledged:
+            self.latch("it does not take its goal (statusword bit 12)")
+        if self.ready and not self.statusword & machine.REMOTE:
+            self.latch("it does not obey the bus (statusword bit 9); is it operated from its panel?")
+
+    # --- what it is
+
+    @property
+    def unheard(self) -> str:
+        """What it has not sent since it was set up."""
+        if self.beat_ns <= self.set_up_ns:
+            return "no heartbeat (1017h)"
+        return "" if self.answered_ns > self.set_up_ns else "no TPDO1 (1800h) after a SYNC"
+
+    @property
+    def acknowledged(self) -> bool:
+        """It shows that it has taken a set-point."""
+        return bool(self.statusword & machine.ACKNOWLEDGED)
+
+    @property
+    def can_take_goal(self) -> bool:
+        """The handshake of the last set-point is over."""
+        return not self.controlword & machine.NEW_SET_POINT and not self.acknowledged
+
+    @property
+    def turning_mode(self) -> int:
+        """The mode in which it is told speeds; profile position, where their goal is the end of the range, if none."""
+        for mode in (table.CYCLIC_VELOCITY, table.PROFILE_VELOCITY_MODE):
+            if mode in self.modes:
+                return mode
+        return table.PROFILE_POSITION
+
+    def braking(self, accel: int) -> bytes:
+        """The data of the frame with its deceleration; its target velocity, if that is in there, is 0."""
+        return (
+            table.BRAKING.layout.pack(accel)
+            if self.turning_mode == table.PROFILE_POSITION
+            else table.TURNING.layout.pack(accel, 0)
+        )
+
+    @property
+    def may_hold_torque(self) -> bool:
+        return self.state_now is None or self.state_now.torque
+
+    def fresh(self, now_ns: int, stale_after_ns: int) -> Sample:
+        if self.silent:  # also if it was measured a moment ago: it is not taken on again yet
+            raise self.absence(now_ns)
+        return super().fresh(now_ns, stale_after_ns)
+
+    def absence(self, now_ns: int) -> DeviceError:
+        """The error of a drive that is left out."""
+        return self.faulty(_STOPPED) if self.stopped else self.deaf(now_ns)
+
+    def state(self, now_ns: int, stale_after_ns: int) -> MotorState:
+        sample = self.fresh(now_ns, stale_after_ns)
+        return self.measured(
+            sample,
+            now_ns,
+            load=self.scale.load(sample.effort, table.FULL_TORQUE),
+            enabled=self.state_now in {State.ENABLED, State.QUICK_STOP},
+            temperature_c=None,
+            voltage_v=None,
+        )

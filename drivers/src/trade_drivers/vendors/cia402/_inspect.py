@@ -1,0 +1,269 @@
+"""Looking a drive over and setting up its frames, before anything is commanded. Enables nothing, moves nothing."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Final
+
+from trade.errors import ConfigurationError
+from trade_drivers.bus.can import frame_bits
+from trade_drivers.joints import Steps
+from trade_drivers.vendors.cia402 import _machine as machine
+from trade_drivers.vendors.cia402 import _table as table
+from trade_drivers.vendors.cia402._axis import DriveAxis
+from trade_drivers.vendors.cia402._machine import State, state_of
+from trade_drivers.vendors.cia402._net import Answer, Net, Refused
+from trade_drivers.vendors.cia402._stream import interpolation_period
+from trade_drivers.vendors.cia402._table import Entry, Pdo
+
+if TYPE_CHECKING:
+    from trade_drivers.robotfile import CanBus
+
+__all__ = ["Another", "Unfit", "check_bus", "heartbeat_ms", "motion_every", "set_up"]
+
+_BRAKING_S: Final = 1.5
+_QUICK_STOP: Final = 3
+"""Of 6007h: a lost heartbeat is answered with a quick stop."""
+_BRAKE_AND_STAY: Final = 6
+"""Of 605Ah: brake on the quick-stop ramp, and stand under torque."""
+_BRAKE: Final = 1
+"""Of 605Dh: brake on the ramp of 6084h, and stand under torque."""
+_LARGEST: Final = 2**31 - 1
+
+
+class Unfit(Exception):
+    """A drive cannot be used as it is; what is wrong, and of which key of the joint."""
+
+    def __init__(self, problem: str, key: str = "") -> None:
+        super().__init__(problem)
+        self.key = key
+
+
+class Another(Unfit):
+    """Another drive than the one the robot file names."""
+
+    def __init__(self, key: str, expected: str, found: str) -> None:
+        super().__init__(f"its {key} is {found}, not {expected}: it is another drive", f".{key}")
+        self.expected, self.found = expected, found
+
+
+def check_bus(bus: "CanBus", axes: Sequence[DriveAxis], where: str) -> None:
+    """What the file alone can tell: numbers of nodes, counts, speeds, and whether the frames of a cycle fit into it.
+
+    Raises:
+        ConfigurationError: names the key and what would be right.
+    """
+    for axis in axes:
+        try:
+            _check_joint(axis)
+        except Unfit as bad:
+            raise ConfigurationError(where=f'{where}: joint."{axis.joint.name}"{bad.key}', problem=str(bad)) from None
+    least_hz = 3 / min(bus.watchdog_s, bus.stale_after_s)
+    if bus.rate_hz < least_hz:
+        problem = f"{bus.rate_hz:g} is too slow for watchdog_s and stale_after_s; at least {least_hz:.3g}"
+        raise ConfigurationError(where=f"{where}: bus.{bus.name}.rate_hz", problem=problem)
+    frames = frame_bits(table.STATUS.layout.size) + frame_bits(table.TURNING.layout.size)
+    slower = frame_bits(table.MOTION.layout.size) / motion_every(bus)
+    cycle_s = (frame_bits(0) + len(axes) * (frames + slower)) / bus.bitrate
+    if cycle_s * bus.rate_hz > 1:
+        need = f"{len(axes)} drives at {bus.bitrate} bit/s need {cycle_s * 1e3:.1f} ms a cycle"
+        problem = f"{need}: at most {1 / cycle_s:.0f} Hz"
+        raise ConfigurationError(where=f"{where}: bus.{bus.name}.rate_hz", problem=problem)
+
+
+def _check_joint(axis: DriveAxis) -> None:
+    joint = axis.joint
+    if joint.counts_per_rev is None:
+        raise Unfit("missing; a CiA 402 drive's angles are counts: write counts_per_rev = 4096, or as many", "")
+    if joint.homing_counts:
+        raise Unfit("is for servos; leave this key out", ".homing_counts")
+    if not 1 <= joint.id < table.OUR_NODE:
+        raise Unfit(f"{joint.id} is no node of a drive; 1 to 126 are (127 is the driver's own)", ".id")
+    if max(abs(axis.low), abs(axis.high)) > _LARGEST:
+        raise Unfit("the range does not fit into 32 bits of counts; check counts_per_rev and gear", ".max_rad")
+    for key, value, least in (
+        (".max_speed_rad_s", joint.max_speed_rad_s, axis.grain.rad_s),
+        (".max_accel_rad_s2", joint.max_accel_rad_s2, axis.grain.rad_s2),
+    ):
+        if value < least:
+            raise Unfit(f"{value:.3g} is below {least:.3g}, one count of its encoder", key)
+    braking_s = joint.max_speed_rad_s / joint.max_accel_rad_s2
+    if braking_s > _BRAKING_S:
+        problem = f"a stop from max_speed_rad_s takes {braking_s:.2g} s with it; it must take {_BRAKING_S} s at most"
+        raise Unfit(problem, ".max_accel_rad_s2")
+
+
+def motion_every(bus: "CanBus") -> int:
+    """How many SYNCs make a drive send its second TPDO."""
+    return max(1, min(240, round(bus.rate_hz / 100)))
+
+
+def set_up(net: Net, axis: DriveAxis, bus: "CanBus") -> Steps:
+    """Check who a drive is, arm its watchdog and map its frames; found moving and owned by nobody, it is stopped.
+
+    Some sixty requests, one at a time: yields while an answer is awaited.
+
+    Raises:
+        Unfit: it cannot be used.
+        NoAnswer: it does not answer.
+    """
+    yield from _check_identity(net, axis)
+    yield from _check_abilities(net, axis)
+    yield from _halt_if_moving(net, axis)
+    try:
+        yield from _arm(net, axis, bus)
+        for pdo, kind in ((table.STATUS, 1), (table.MOTION, motion_every(bus))):
+            yield from _map(net, axis.id, pdo, kind, table.NO_REMOTE)
+        for pdo in (table.COMMAND, table.PROFILE):
+            yield from _map(net, axis.id, pdo, table.AT_ONCE, 0)
+        yield from _map_streams(net, axis, bus)
+    except Refused as refused:
+        raise Unfit(f"it refuses to be set up: {refused}") from None
+    for record in table.UNUSED:
+        yield from _try_write(net, axis.id, Entry(record, "u4", 1), _disabled(record, axis.id))
+    net.command(axis.id, table.NMT_START)
+
+
+def _check_identity(net: Net, axis: DriveAxis) -> Steps:
+    kind = (yield from net.read(axis.id, table.DEVICE_TYPE)) & 0xFFFF
+    if kind != table.DRIVE_PROFILE:
+        raise Unfit(f"node {axis.id} is no CiA 402 drive: its device type (1000h) names profile {kind}")
+    identity: tuple[int, ...] = ()
+    for entry in table.IDENTITY:
+        identity += ((yield from _read(net, axis.id, entry)),)
+    if axis.identity and identity != axis.identity:
+        raise Unfit(f"another drive answers as node {axis.id}: {_named(identity)}, not {_named(axis.identity)}")
+    try:
+        name = yield from net.read_text(axis.id, table.DEVICE_NAME)
+    except Refused:
+        name = axis.joint.model  # it does not say, and need not
+    if name != axis.joint.model:
+        raise Unfit(f"is {axis.joint.model!r}, but node {axis.id} says it is {name!r} (1008h)", ".model")
+    yield from _check_fingerprint(net, axis, identity)
+    axis.identity = identity
+
+
+def _check_fingerprint(net: Net, axis: DriveAxis, identity: Sequence[int]) -> Steps:
+    """Whether it is the very drive that the robot file names, as far as it names one."""
+    joint, (_, _, _, serial_number) = axis.joint, identity
+    if joint.serial_number is not None and serial_number != joint.serial_number:
+        raise Another("serial_number", str(joint.serial_number), str(serial_number))
+    if joint.firmware is None:
+        return
+    try:
+        firmware = yield from net.read_text(axis.id, table.SOFTWARE_VERSION)
+    except Refused:
+        raise Unfit("it tells no firmware version (100Ah); leave this key out", ".firmware") from None
+    if firmware != joint.firmware:
+        raise Another("firmware", joint.firmware, firmware)
+
+
+def _named(identity: Sequence[int]) -> str:
+    vendor, product, _, serial = identity
+    return f"vendor {vendor:X}h, product {product:X}h, serial number {serial}"
+
+
+def _check_abilities(net: Net, axis: DriveAxis) -> Steps:
+    modes = yield from _read(net, axis.id, table.SUPPORTED_MODES, 1 << table.PROFILE_POSITION - 1)
+    axis.modes = frozenset(mode for mode in range(1, 33) if modes >> mode - 1 & 1)
+    if table.PROFILE_POSITION not in axis.modes:
+        raise Unfit("it has no profile position mode (6502h)")
+    low = yield from _read(net, axis.id, table.POSITION_LIMITS[0])
+    high = yield from _read(net, axis.id, table.POSITION_LIMITS[1])
+    if low < high and (axis.low < low or axis.high > high):
+        ends = sorted((axis.scale.angle_rad(low), axis.scale.angle_rad(high)))
+        joint = axis.joint
+        raise Unfit(
+            f"min_rad {joint.min_rad:.6g} to max_rad {joint.max_rad:.6g} is more than the drive's own range (607Dh), "
+            f"{ends[0]:.6g} to {ends[1]:.6g} rad; narrow the one or widen the other"
+        )
+    fastest = yield from _read(net, axis.id, table.MAX_PROFILE_VELOCITY)
+    if 0 < fastest < axis.speed_counts:
+        limit = fastest * axis.grain.rad_s
+        problem = f"{axis.joint.max_speed_rad_s:.6g} is above the drive's own limit {limit:.4g} (607Fh)"
+        raise Unfit(problem, ".max_speed_rad_s")
+
+
+def _halt_if_moving(net: Net, axis: DriveAxis) -> Steps:
+    """Nobody's motion ends; torque stays as it is."""
+    state = state_of((yield from net.read(axis.id, table.STATUSWORD)))
+    if state is not State.ENABLED or abs((yield from net.read(axis.id, table.VELOCITY))) <= axis.grain.still_velocity:
+        return
+    if (yield from net.read(axis.id, table.MODE_DISPLAY)) < table.CYCLIC_POSITION:
+        yield from net.write(axis.id, table.CONTROLWORD, machine.HOLD)
+        return
+    yield from _try_write(net, axis.id, table.QUICK_STOP_OPTION, _BRAKE_AND_STAY)
+    yield from net.write(axis.id, table.CONTROLWORD, machine.QUICK_STOP)
+
+
+def _arm(net: Net, axis: DriveAxis, bus: "CanBus") -> Steps:
+    for entry, value in (
+        (table.ABORT_CONNECTION, _QUICK_STOP),
+        (table.CONSUMER_HEARTBEAT, table.OUR_NODE << 16 | round(bus.watchdog_s * 1e3)),
+        (table.PRODUCER_HEARTBEAT, heartbeat_ms(bus)),
+    ):
+        yield from net.write(axis.id, entry, value)
+    for entry, value in ((table.QUICK_STOP_OPTION, _BRAKE_AND_STAY), (table.HALT_OPTION, _BRAKE)):
+        yield from _try_write(net, axis.id, entry, value)
+    yield from _try_write(net, axis.id, table.QUICK_STOP_DECELERATION, axis.accel_counts)
+
+
+def _map_streams(net: Net, axis: DriveAxis, bus: "CanBus") -> Steps:
+    """What its modes without a goal need. One that lacks it is used without them: they are a way, not a condition."""
+    if (yield from _read(net, axis.id, table.QUICK_STOP_OPTION)) not in table.STANDING:
+        axis.modes -= {table.PROFILE_VELOCITY_MODE, table.CYCLIC_VELOCITY, table.CYCLIC_POSITION}
+    if axis.turning_mode != table.PROFILE_POSITION:
+        try:
+            yield from _map(net, axis.id, table.TURNING, table.AT_ONCE, 0)
+        except Refused:
+            axis.modes -= {table.PROFILE_VELOCITY_MODE, table.CYCLIC_VELOCITY}
+    if axis.turning_mode == table.PROFILE_POSITION:
+        yield from _map(net, axis.id, table.BRAKING, table.AT_ONCE, 0)
+    if table.CYCLIC_POSITION in axis.modes:
+        try:
+            for entry, value in zip(table.INTERPOLATION_PERIOD, interpolation_period(bus.rate_hz), strict=True):
+                yield from net.write(axis.id, entry, value)
+            yield from _map(net, axis.id, table.FOLLOWING, table.AT_NEXT_SYNC, 0)
+        except Refused:
+            axis.modes -= {table.CYCLIC_POSITION}
+    if table.CYCLIC_POSITION not in axis.modes:
+        record = table.FOLLOWING.communication
+        yield from _try_write(net, axis.id, Entry(record, "u4", 1), _disabled(record, axis.id))
+
+
+def heartbeat_ms(bus: "CanBus") -> int:
+    """How often a drive tells that it is alive: three times as often as it has to."""
+    return max(10, round(bus.stale_after_s * 1e3 / 3))
+
+
+def _map(net: Net, node: int, pdo: Pdo, kind: int, flags: int) -> Steps:
+    """In the order that drives insist on: invalid, empty, filled, counted, valid."""
+    record, mapping, cob = pdo.communication, pdo.communication + 0x200, pdo.base + node | flags
+    yield from net.write(node, Entry(record, "u4", 1), cob | table.INVALID)
+    yield from net.write(node, Entry(record, "u1", 2), kind)
+    yield from net.write(node, Entry(mapping, "u1", 0), 0)
+    for place, word in enumerate(pdo.mapping(), 1):
+        yield from net.write(node, Entry(mapping, "u4", place), word)
+    yield from net.write(node, Entry(mapping, "u1", 0), len(pdo.entries))
+    yield from net.write(node, Entry(record, "u4", 1), cob)
+
+
+def _disabled(record: int, node: int) -> int:
+    base = {0x1403: 0x500, 0x1802: 0x380, 0x1803: 0x480}[record]
+    return table.INVALID | (base + node)
+
+
+def _read(net: Net, node: int, entry: Entry, default: int = 0) -> Answer[int]:
+    """A number that not every drive has."""
+    try:
+        return (yield from net.read(node, entry))
+    except Refused as refused:
+        if refused.code in table.NO_SUCH_OBJECT:
+            return default
+        raise Unfit(f"it refuses to be read: {refused}") from None
+
+
+def _try_write(net: Net, node: int, entry: Entry, value: int) -> Steps:
+    """A number that not every drive has, or lets be changed; its own choice does as well."""
+    try:
+        yield from net.write(node, entry, value)
+    except Refused:
+        return

@@ -1,0 +1,67 @@
+"""A motor with what only a drive can: finding its zero. And a bus of drives, with how it is itself."""
+
+from functools import partial
+from typing import TYPE_CHECKING, Annotated, cast
+
+from trade import Meta, permit, service
+from trade_drivers.bus._deadlines import span
+from trade_drivers.bus._validation import within
+from trade_drivers.bus.can._monitor import CanMonitor
+from trade_drivers.joints import AttachedJoints, BusMotor, BusThread
+from trade_drivers.vendors.cia402._axis import DriveAxis
+from trade_drivers.vendors.cia402._cycle import DriveExchange
+from trade_drivers.vendors.cia402._homing import Homing
+
+if TYPE_CHECKING:
+    from trade_drivers.bus.can import CanPort
+
+__all__ = ["AttachedDrives", "Drive"]
+
+Method = Annotated[int, Meta(ge=-128, le=37, description="homing method of CiA 402-2; 37: where it is now is its zero")]
+Slow = Annotated[float, Meta(gt=0, description="speed of the search in rad/s; by default a tenth of the joint's limit")]
+
+
+class Drive(BusMotor):
+    """One CiA 402 drive as a motor."""
+
+    @service(effect="actuate", cancel="stop")
+    def home(self, method: Method = 37, speed_rad_s: Slow | None = None) -> float:
+        """Find the zero of the joint, and return the angle measured there.
+
+        With most methods the joint moves until it meets a switch or an index, limits() or not: nobody else knows where
+        it is. Never done by itself. The next move or enable() puts the drive back into its usual mode.
+
+        Raises:
+            DeviceFault: it was not found, or the drive does not know the method.
+            LimitExceeded: faster than limits().
+            MotionStopped, DeviceSilent, DeadlineExceeded: as with move_to().
+        """
+        axis = cast("DriveAxis", self._axes[0])
+        fastest = axis.joint.max_speed_rad_s
+        speed = fastest / 10 if speed_rad_s is None else speed_rad_s
+        within(speed, axis.grain.rad_s, fastest, f"{axis.name} speed", "rad/s")
+        expires_ns, until_ns = span(self._exchange.clock)
+        with permit(self.resources) as permitted:
+            homing = Homing(
+                cast("DriveExchange", self._exchange),
+                axis,
+                method=method,
+                speed_counts=int(speed / axis.grain.rad_s),
+                service=f"{self._name}.home",
+                expires_ns=expires_ns,
+                until_ns=until_ns,
+                permit=permitted,
+            )
+            self._finish(homing)
+        return axis.scale.angle_rad(axis.fresh(self._exchange.clock(), self._exchange.stale_after_ns).position)
+
+
+class AttachedDrives(AttachedJoints):
+    """A bus of drives."""
+
+    def __init__(self, thread: BusThread[DriveExchange], port: "CanPort") -> None:
+        super().__init__(thread, Drive)
+        self._port = port
+
+    def monitor(self, name: str) -> CanMonitor:
+        return CanMonitor(partial(self._port.look, name))

@@ -1,0 +1,133 @@
+"""The nodes of one CAN bus: listeners for frames, requests to dictionaries that never hold up who makes them."""
+
+import time
+from collections import deque
+from collections.abc import Callable, Generator
+from typing import Final, TypeVar
+
+from canopen.emcy import EmcyError
+from canopen.sdo.exceptions import SdoAbortedError
+
+from trade_drivers.bus.can import CanPort, Listeners
+from trade_drivers.joints import Gate
+from trade_drivers.vendors.cia402 import _sdo as sdo
+from trade_drivers.vendors.cia402 import _table as table
+from trade_drivers.vendors.cia402._sdo import Aborted, Transfer
+from trade_drivers.vendors.cia402._table import Entry
+
+__all__ = ["Answer", "Net", "NoAnswer", "Refused", "emergency_text"]
+
+_ATTEMPTS: Final = 3
+_ANSWER_S: Final = 0.25
+"""Patience for one answer: drives take milliseconds, and nobody is held up, but a busy host takes its time."""
+_KEPT: Final = 8
+"""Frames of a server that are looked at; one of them at most is the answer."""
+
+_T = TypeVar("_T")
+Answer = Generator[None, None, _T]
+"""Yields until the answer is there, and returns what it says."""
+
+
+class NoAnswer(Exception):
+    """A drive did not answer a request in time, or not to that one."""
+
+
+class Refused(Exception):
+    """A drive answered that it would not."""
+
+    def __init__(self, entry: object, code: int, text: str) -> None:
+        super().__init__(f"{entry}: {text}")
+        self.code = code
+
+
+def emergency_text(code: int) -> str:
+    """What an error code of a drive means, in short."""
+    known = _CODES.get(code) or EmcyError(code, 0, b"", 0.0).get_desc()
+    return f"error {code:04X}h" + (f", {known.lower()}" if known else "")
+
+
+_CODES: Final = {
+    0x2310: "continuous over-current",
+    0x3210: "over-voltage",
+    0x3220: "under-voltage",
+    0x4210: "over-temperature of the device",
+    0x4310: "over-temperature of the drive",
+    0x7305: "encoder",
+    0x8120: "its CAN controller is error passive",
+    0x8130: "it has not heard this driver for too long",
+    0x8140: "it has come back from bus-off",
+    0x8210: "a PDO was too short",
+    0x8611: "following error",
+}
+
+
+class Net(Listeners):
+    """One CAN bus with its nodes."""
+
+    def __init__(self, port: CanPort, between: Callable[[], None], meanwhile: Callable[[], None]) -> None:
+        super().__init__(port, between, meanwhile)
+        self._answers: dict[int, deque[bytes]] = {}
+        """What came from the SDO server of a node."""
+
+    def command(self, node: int, word: int) -> None:
+        """Network management: start a node, and so on. Nobody confirms it."""
+        self.port.send(table.NMT, bytes((word, node)))
+
+    def read(self, node: int, entry: Entry) -> Answer[int]:
+        """A number out of a drive's dictionary.
+
+        Raises:
+            NoAnswer, Refused: what became of it.
+        """
+        data = yield from self._ask(node, entry, lambda: sdo.upload(entry.index, entry.sub))
+        if len(data) < entry.size:
+            raise NoAnswer(f"{entry} came with {len(data)} bytes")
+        return entry.decode(data)
+
+    def read_text(self, node: int, index: int) -> Answer[str]:
+        """A text out of a drive's dictionary."""
+        data = yield from self._ask(node, f"{index:04X}h", lambda: sdo.upload(index, 0))
+        return data.rstrip(b"\0 ").decode("ascii", "replace")
+
+    def write(self, node: int, entry: Entry, value: int, gate: Gate = lambda: None) -> Answer[None]:
+        """A number into a drive's dictionary, more than once if need be; the gate is asked before each attempt."""
+
+        def download() -> Transfer:
+            gate()
+            return sdo.download(entry.index, entry.sub, entry.encode(value))
+
+        yield from self._ask(node, entry, download)
+
+    def _ask(self, node: int, entry: object, begin: Callable[[], Transfer]) -> Answer[bytes]:
+        for _ in range(_ATTEMPTS):
+            try:
+                data = yield from self._transfer(node, begin())
+            except Aborted as refused:
+                raise Refused(entry, refused.code, str(SdoAbortedError(refused.code))) from None
+            if data is not None:
+                return data
+        raise NoAnswer(f"{entry}: no answer within {_ATTEMPTS * _ANSWER_S * 1e3:.0f} ms")
+
+    def _transfer(self, node: int, transfer: Transfer) -> Answer[bytes | None]:
+        """What came of it; None if an answer is missing."""
+        answers = self._answers_of(node)
+        request = next(transfer)
+        while True:
+            answers.clear()
+            self.port.send(table.SDO_REQUEST + node, request.data)
+            give_up_at = time.monotonic() + _ANSWER_S
+            while (answer := next(filter(request.is_answered_by, answers), None)) is None:
+                if self.heard_until(give_up_at):
+                    self.port.send(table.SDO_REQUEST + node, sdo.abort(request, sdo.TIMED_OUT))
+                    return None
+                yield
+            try:
+                request = transfer.send(answer)
+            except StopIteration as done:
+                return done.value
+
+    def _answers_of(self, node: int) -> deque[bytes]:
+        if node not in self._answers:
+            self._answers[node] = deque(maxlen=_KEPT)
+            self.hear(table.SDO_ANSWER + node, self._answers[node].append)
+        return self._answers[node]

@@ -1,0 +1,93 @@
+"""An open CAN bus, and what its nodes tell of themselves. Reads dictionaries; commands nothing."""
+
+from collections.abc import Iterable
+from itertools import islice
+from typing import Final
+
+from trade_drivers.bus.can import CanBench, CanPort
+from trade_drivers.commissioning._commissioner import Found
+from trade_drivers.vendors.cia402 import _table as table
+from trade_drivers.vendors.cia402._machine import state_of
+from trade_drivers.vendors.cia402._net import Answer, Net, NoAnswer, Refused
+
+__all__ = ["DriveBench"]
+
+_AT_ONCE: Final = 8
+"""Nodes asked at the same time: the queues of interfaces are short."""
+_SLICE_S: Final = 0.01
+_STOPPED: Final = "network management has stopped it, and it answers nothing; a driver that attaches takes it back"
+
+
+class DriveBench(CanBench):
+    """One CAN bus."""
+
+    driver = "cia402"
+    remedy = "its own switches, or by the vendor's tool"
+    zero = "the zero of a drive is found by its homing"
+
+    orders = staticmethod(table.orders)
+
+    def __init__(self, port: CanPort, bitrate: int) -> None:
+        super().__init__(port, bitrate)
+        self._net = Net(port, _nothing, _nothing)
+        self._known: dict[int, Found | None] = {}
+
+    def anybody(self) -> bool:
+        """Asks all nodes, some at a time, so that those that are not there cost little."""
+        left = iter(range(1, table.OUR_NODE))
+        while some := list(islice(left, _AT_ONCE)):
+            self._ask(some)
+        return any(self._known.values())
+
+    def look(self, device_id: int) -> Found | None:
+        if device_id not in self._known:
+            self._ask([device_id])
+        return self._known.pop(device_id)
+
+    def _ask(self, nodes: Iterable[int]) -> None:
+        asking = {node: self._looking(node) for node in nodes}
+        while asking:
+            for node, steps in list(asking.items()):
+                try:
+                    next(steps)
+                except StopIteration as done:
+                    self._known[node] = done.value
+                    del asking[node]
+            self._net.take_in(_SLICE_S)
+
+    def _looking(self, node: int) -> Answer[Found | None]:
+        try:
+            kind = (yield from self._net.read(node, table.DEVICE_TYPE)) & 0xFFFF
+        except NoAnswer:
+            beats = self._talk.frames.get(table.HEARTBEAT + node, ())
+            return self.found(node, problem=_STOPPED) if bytes((table.STOPPED,)) in beats[-1:] else None
+        except Refused as refused:
+            return self.found(node, problem=f"it refuses to be read: {refused}")
+        if kind != table.DRIVE_PROFILE:
+            return self.found(node, problem=f"is no CiA 402 drive: its device type (1000h) names profile {kind}")
+        try:
+            serial_number = yield from self._net.read(node, table.IDENTITY[3])
+            statusword = yield from self._net.read(node, table.STATUSWORD)
+            model = yield from self._text(node, table.DEVICE_NAME)
+            firmware = yield from self._text(node, table.SOFTWARE_VERSION)
+        except (NoAnswer, Refused) as bad:
+            return self.found(node, problem=f"it does not tell who it is: {bad}")
+        state = state_of(statusword)
+        return self.found(
+            node,
+            model,
+            firmware=firmware,
+            serial_number=serial_number or None,
+            torque=state is not None and state.torque,
+        )
+
+    def _text(self, node: int, index: int) -> Answer[str]:
+        """A text that need not be there."""
+        try:
+            return (yield from self._net.read_text(node, index))
+        except Refused:
+            return ""
+
+
+def _nothing() -> None:
+    """Nothing has to be done between frames."""

@@ -1,0 +1,73 @@
+"""Set-points for modes without a goal, one in every cycle: where to be, or how fast to turn. No I/O."""
+
+from math import copysign, sqrt
+
+from trade_drivers.joints import Course, Sample, towards
+from trade_drivers.vendors.cia402 import _table as table
+
+__all__ = ["Following", "Turning", "interpolation_period"]
+
+
+class Following(Course):
+    """Positions, each reached one period after the SYNC that makes it count: cyclic synchronous position."""
+
+    def __init__(self, node: int, position: int, *, speed: float, accel: float, period_s: float) -> None:
+        super().__init__(position, fastest=speed, accel=accel, braking=accel / 2)
+        self.can_id = table.FOLLOWING.base + node
+        self._period_s = period_s
+
+    def next(self, sample: Sample, now_ns: int) -> bytes:  # noqa: ARG002 - that is the drive's own business in this mode
+        """The data of the frame for one period more."""
+        self.step(self._period_s)
+        return table.FOLLOWING.layout.pack(self.target)
+
+    @property
+    def target(self) -> int:
+        """What the drive was sent last."""
+        return round(self.position)
+
+
+class Turning:
+    """Speeds: cyclic synchronous velocity, or profile velocity, whose own ramps are as steep.
+
+    It stands until it is given an end and a speed. It slows down before the end in time for the drive to stop within
+    the range by itself, should the driver fall silent: after ``blind_s``. While nothing new is measured it takes the
+    joint to go on as it was told.
+    """
+
+    def __init__(self, node: int, *, accel: int, period_s: float, blind_s: float) -> None:
+        self.can_id = table.TURNING.base + node
+        self.end: int | None = None
+        """Where it must not go beyond, in counts."""
+        self.fastest = 0.0
+        """In counts/s, without a sign."""
+        self._speed = 0.0
+        self._accel, self._period_s, self._blind_s = accel, period_s, blind_s
+        self._measured_ns = self._told_ns = 0
+        self._travelled = 0.0
+        """How far it must have got since it was measured, in counts."""
+
+    def next(self, sample: Sample, now_ns: int) -> bytes:
+        """The data of the frame for one period more, where that was measured last."""
+        if sample.at_ns == self._measured_ns:
+            self._travelled += self._speed * (now_ns - self._told_ns) / 1e9
+        else:
+            self._travelled = self._speed * (now_ns - sample.at_ns) / 1e9
+        self._measured_ns, self._told_ns = sample.at_ns, now_ns
+        wanted = 0.0 if self.end is None else self._allowed(self.end - sample.position - self._travelled)
+        self._speed = towards(self._speed, wanted, self._accel * self._period_s)
+        return table.TURNING.layout.pack(self._accel, round(self._speed))
+
+    def _allowed(self, left: float) -> float:
+        blind = self._accel * self._blind_s
+        return copysign(min(self.fastest, sqrt(blind * blind + 2 * self._accel * abs(left)) - blind), left)
+
+
+def interpolation_period(rate_hz: float) -> tuple[int, int]:
+    """A period as object 60C2h has it: a number below 256, and the power of ten of its unit."""
+    for exponent in (-3, -4, -5, -6):  # whole milliseconds are what every drive takes
+        count = 10.0**-exponent / rate_hz
+        if abs(count - round(count)) < 1e-3 and round(count) < 256:
+            return round(count), exponent
+    exponent = next(exponent for exponent in (-5, -4, -3, -2, -1, 0) if 10.0**-exponent / rate_hz < 255)
+    return round(10.0**-exponent / rate_hz), exponent

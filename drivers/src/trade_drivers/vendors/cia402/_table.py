@@ -1,0 +1,140 @@
+"""Objects of a drive's dictionary that this driver uses, and the frames it maps them to: data, no I/O.
+
+Sources: CiA 301 (1000h to 1FFFh, identifiers) and CiA 402-2 (6000h on).
+"""
+
+import struct
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Final, Literal
+
+from msgspec import Struct
+
+if TYPE_CHECKING:
+    from trade_drivers.bus.can import Talk
+
+__all__ = ["OUR_NODE", "Entry", "Pdo"]
+
+Kind = Literal["u1", "u2", "u4", "i1", "i2", "i4"]
+
+
+class Entry(Struct, frozen=True):
+    """One object, or one field of it."""
+
+    index: int
+    kind: Kind
+    sub: int = 0
+
+    @property
+    def size(self) -> int:
+        """Bytes on the wire."""
+        return int(self.kind[1])
+
+    def decode(self, data: bytes) -> int:
+        """The number that was read; drives may answer with more bytes than it has."""
+        return int.from_bytes(data[: self.size], "little", signed=self.kind[0] == "i")
+
+    def encode(self, value: int) -> bytes:
+        """The bytes of a number; OverflowError if they do not fit."""
+        return value.to_bytes(self.size, "little", signed=self.kind[0] == "i")
+
+    def __str__(self) -> str:
+        return f"{self.index:04X}h" + (f":{self.sub}" if self.sub else "")
+
+
+DEVICE_TYPE: Final = Entry(0x1000, "u4")
+DEVICE_NAME: Final = 0x1008
+SOFTWARE_VERSION: Final = 0x100A
+CONSUMER_HEARTBEAT: Final = Entry(0x1016, "u4", 1)
+"""Whose heartbeat it wants, ``node << 16``, and for how many milliseconds it does without."""
+PRODUCER_HEARTBEAT: Final = Entry(0x1017, "u2")
+"""In milliseconds."""
+IDENTITY: Final = tuple(Entry(0x1018, "u4", sub) for sub in (1, 2, 3, 4))
+"""Vendor, product, revision, serial number."""
+
+ABORT_CONNECTION: Final = Entry(0x6007, "i2")
+ERROR_CODE: Final = Entry(0x603F, "u2")
+CONTROLWORD: Final = Entry(0x6040, "u2")
+STATUSWORD: Final = Entry(0x6041, "u2")
+QUICK_STOP_OPTION: Final = Entry(0x605A, "i2")
+HALT_OPTION: Final = Entry(0x605D, "i2")
+MODE: Final = Entry(0x6060, "i1")
+MODE_DISPLAY: Final = Entry(0x6061, "i1")
+POSITION: Final = Entry(0x6064, "i4")
+VELOCITY: Final = Entry(0x606C, "i4")
+TORQUE: Final = Entry(0x6077, "i2")
+TARGET_POSITION: Final = Entry(0x607A, "i4")
+POSITION_LIMITS: Final = (Entry(0x607D, "i4", 1), Entry(0x607D, "i4", 2))
+MAX_PROFILE_VELOCITY: Final = Entry(0x607F, "u4")
+PROFILE_VELOCITY: Final = Entry(0x6081, "u4")
+ACCELERATION: Final = Entry(0x6083, "u4")
+DECELERATION: Final = Entry(0x6084, "u4")
+QUICK_STOP_DECELERATION: Final = Entry(0x6085, "u4")
+HOMING_METHOD: Final = Entry(0x6098, "i1")
+HOMING_SPEEDS: Final = (Entry(0x6099, "u4", 1), Entry(0x6099, "u4", 2))
+HOMING_ACCELERATION: Final = Entry(0x609A, "u4")
+INTERPOLATION_PERIOD: Final = (Entry(0x60C2, "u1", 1), Entry(0x60C2, "i1", 2))
+"""In which a cyclic position is reached: so many times ten to the power of so many seconds."""
+TARGET_VELOCITY: Final = Entry(0x60FF, "i4")
+SUPPORTED_MODES: Final = Entry(0x6502, "u4")
+"""Bit ``mode - 1`` for each."""
+
+PROFILE_POSITION: Final = 1
+PROFILE_VELOCITY_MODE: Final = 3
+HOMING: Final = 6
+CYCLIC_POSITION: Final = 8
+CYCLIC_VELOCITY: Final = 9
+STANDING: Final = (5, 6, 7)
+"""Of 605Ah: what stands under torque after a quick stop."""
+DRIVE_PROFILE: Final = 402
+FULL_TORQUE: Final = 1000
+"""Counts of the torque that mean the rated one."""
+
+OUR_NODE: Final = 127
+"""The node whose heartbeats the drives live on: this driver."""
+NMT: Final = 0x000
+SYNC: Final = 0x080
+EMERGENCY: Final = 0x080
+SDO_ANSWER, SDO_REQUEST = 0x580, 0x600
+HEARTBEAT: Final = 0x700
+NMT_START, NMT_PREOPERATIONAL = 0x01, 0x80
+BOOT_UP, STOPPED, OPERATIONAL, PREOPERATIONAL = 0x00, 0x04, 0x05, 0x7F
+NMT_STATES: Final = {BOOT_UP: "booting", STOPPED: "stopped", OPERATIONAL: "operational", PREOPERATIONAL: "pre-op"}
+
+NO_SUCH_OBJECT: Final = (0x06020000, 0x06090011)
+
+
+def orders(talk: "Talk", nodes: Iterable[int] = ()) -> set[int]:
+    """Identifiers among what was heard that only who commands drives sends: those with these nodes, or that tell."""
+    everybody = {NMT, SYNC, HEARTBEAT + OUR_NODE}
+    bases = (SDO_REQUEST, *(pdo.base for pdo in (COMMAND, PROFILE, BRAKING, FOLLOWING)))
+    return talk.frames.keys() & (everybody | {base + node for base in bases for node in {*nodes, *talk.canopen}})
+
+
+class Pdo(Struct, frozen=True):
+    """What one process data object carries, little-endian and without gaps."""
+
+    communication: int
+    """Its record of parameters; the mapping is 200h above."""
+    base: int
+    """Its identifier, less the node's number."""
+    entries: tuple[Entry, ...]
+    layout: struct.Struct
+
+    def mapping(self) -> list[int]:
+        """The words of the mapping record."""
+        return [entry.index << 16 | entry.sub << 8 | entry.size * 8 for entry in self.entries]
+
+
+STATUS: Final = Pdo(0x1800, 0x180, (STATUSWORD, POSITION, TORQUE), struct.Struct("<Hih"))
+MOTION: Final = Pdo(0x1801, 0x280, (VELOCITY, MODE_DISPLAY, ERROR_CODE), struct.Struct("<ibH"))
+COMMAND: Final = Pdo(0x1400, 0x200, (CONTROLWORD, TARGET_POSITION), struct.Struct("<Hi"))
+PROFILE: Final = Pdo(0x1401, 0x300, (PROFILE_VELOCITY, ACCELERATION), struct.Struct("<II"))
+BRAKING: Final = Pdo(0x1402, 0x400, (DECELERATION,), struct.Struct("<I"))
+TURNING: Final = Pdo(0x1402, 0x400, (DECELERATION, TARGET_VELOCITY), struct.Struct("<Ii"))
+"""In its place, where a drive has a velocity mode."""
+FOLLOWING: Final = Pdo(0x1403, 0x500, (TARGET_POSITION,), struct.Struct("<i"))
+UNUSED: Final = (0x1802, 0x1803)
+AT_NEXT_SYNC: Final = 1
+AT_ONCE: Final = 255
+INVALID: Final = 1 << 31
+NO_REMOTE: Final = 1 << 30

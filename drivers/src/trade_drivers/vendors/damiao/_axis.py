@@ -1,0 +1,144 @@
+"""One motor as the bus thread knows it: what its frames said last, where it is told to be, what speaks against it."""
+
+from collections.abc import Sequence
+from math import tau
+from struct import error as BadLength  # noqa: N812 - what unpacking raises for another number of bytes
+from typing import Final
+
+from trade_drivers.interfaces._motion import MotorState
+from trade_drivers.joints import Course, Grain
+from trade_drivers.joints.can import MotorAxis
+from trade_drivers.robotfile import Joint
+from trade_drivers.vendors.damiao import _frames as frames
+from trade_drivers.vendors.damiao._frames import MODELS, Feedback, Register, Status
+
+__all__ = ["COUNTS_PER_RAD", "DamiaoAxis"]
+
+COUNTS_PER_RAD: Final = (1 << 16) / tau
+"""Of the motor's own shaft: this driver's counts; on the wire there are radians."""
+_STILL_RAD_S: Final = 0.01
+_ARRIVED_RAD: Final = 0.004
+_NEAR_RAD: Final = 0.03
+
+
+def grain_of(joint: Joint, rate_hz: float) -> Grain:
+    """What counts mean; nothing is finer than what the frames can say."""
+    ranges = MODELS[joint.model]
+    rad = 1 / (COUNTS_PER_RAD * joint.gear)
+    position, velocity = 2 * ranges.position_rad / 0xFFFF, 2 * ranges.velocity_rad_s / 0xFFF
+    return Grain(
+        rad=rad,
+        rad_s=rad,
+        rad_s2=rad,
+        centre=0,
+        still_velocity=round(max(_STILL_RAD_S / rad, 1.5 * velocity * COUNTS_PER_RAD)),
+        still_counts=round(max(_STILL_RAD_S / rate_hz / rad, 1.5 * position * COUNTS_PER_RAD)),
+        arrived=round(max(_ARRIVED_RAD / rad, 2 * position * COUNTS_PER_RAD)),
+        near=round(max(_NEAR_RAD / rad, 4 * position * COUNTS_PER_RAD)),
+    )
+
+
+class DamiaoAxis(MotorAxis):
+    """One motor."""
+
+    def __init__(self, name: str, bus: str, joint: Joint, rate_hz: float, coupled: Sequence[str] = ()) -> None:
+        super().__init__(name, bus, joint, grain_of(joint, rate_hz), coupled)
+        self.ranges = MODELS[joint.model]
+        self.master = joint.id + frames.MASTER
+        self.status: int | None = None
+        self.heard_ns = 0
+        """When it last told how it is."""
+        self.software: int | None = None
+        """What it said when it was attached."""
+        self.asks: Register | None = None
+        """Which of its registers it was asked for."""
+        self.told: float | None = None
+        """What it said of it."""
+        self.course: Course | None = None
+        """Where it is told to be, in every cycle; None: nowhere."""
+        self.easing = 1.0
+        """With how much of its acceleration it ends a way."""
+        self.stepped_ns = 0
+        """When it was told last."""
+        self._celsius: float | None = None
+
+    # --- what it says
+
+    def take(self, data: bytes, now_ns: int) -> None:
+        """A frame with the identifier of its answers: about a register if it was asked for one, else its feedback."""
+        if self.asks is not None and (told := frames.answer(data, self.id, self.asks)) is not None:
+            self.told, self.asks = told, None
+            self.beat_ns = now_ns
+            return
+        try:
+            feedback = Feedback.decode(data, self.ranges)
+        except BadLength:
+            return
+        if feedback.nibble != self.id & 0xF:
+            return
+        self.status, self.beat_ns, self.heard_ns = feedback.status, now_ns, now_ns
+        self._celsius = feedback.temperature_c
+        self.measured_at(
+            feedback.position_rad * COUNTS_PER_RAD,
+            feedback.velocity_rad_s * COUNTS_PER_RAD,
+            feedback.torque_nm / self.ranges.torque_nm * frames.FULL,
+            now_ns,
+        )
+        self._judge()
+
+    def _judge(self) -> None:
+        if self.failed:
+            self.latch(self.complaint)
+        elif self.ready and not self.torque:
+            self.latch("its torque went off; has it restarted?")
+        else:
+            return
+        self.course = None
+
+    # --- what it is
+
+    @property
+    def failed(self) -> bool:
+        """It complains, and has let go."""
+        return self.status not in {None, Status.DISABLED, Status.ENABLED}
+
+    @property
+    def complaint(self) -> str:
+        """What it complains of."""
+        known = {status.value: status.name.lower().replace("_", " ") for status in Status}
+        return f"status {self.status:X}h: {known.get(self.status or 0, 'unknown')}"
+
+    @property
+    def torque(self) -> bool | None:
+        return None if self.status is None else self.status == Status.ENABLED
+
+    def forget(self, now_ns: int) -> None:
+        super().forget(now_ns)
+        self.asks = None
+
+    def welcome(self, now_ns: int) -> None:
+        super().welcome(now_ns)
+        self.course = None
+
+    def step(self, now_ns: int, period_s: float) -> bytes:
+        """Where it is to be next, and how fast at most; on the motor's own shaft."""
+        course = self.course
+        if course is None:
+            raise self.faulty("it is told nothing")
+        elapsed_s = min((now_ns - self.stepped_ns) / 1e9, 2 * period_s)  # held up, it goes on where it was
+        self.stepped_ns = now_ns
+        if elapsed_s > 0:
+            course.step(elapsed_s)
+        fastest = self.joint.max_speed_rad_s * self.joint.gear
+        return frames.position_velocity(course.position / COUNTS_PER_RAD, min(fastest, self.ranges.velocity_rad_s))
+
+    def state(self, now_ns: int, stale_after_ns: int) -> MotorState:
+        sample = self.fresh(now_ns, stale_after_ns)
+        return self.measured(
+            sample,
+            now_ns,
+            load=self.scale.load(sample.effort, frames.FULL),
+            enabled=self.torque is True,
+            temperature_c=self._celsius,
+            voltage_v=None,
+        )

@@ -1,0 +1,152 @@
+"""What Damiao motors are told in the cyclic exchange with all of one bus, and how.
+
+A motor tells how it is only when it is told something. So one under torque is told in every cycle where to be, a step
+further on its way, and any other is asked. It has no ramps that could be relied on: they are made here.
+"""
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Final, cast
+
+from trade.errors import TradeError
+from trade_drivers.bus.can import Frame
+from trade_drivers.joints import Axis, Course, Gate, Goal, Job, Manner, Motion, Steps, next_measurement
+from trade_drivers.joints.can._cycle import MotorExchange
+from trade_drivers.vendors.damiao import _frames as frames
+from trade_drivers.vendors.damiao import _jobs as jobs
+from trade_drivers.vendors.damiao._axis import DamiaoAxis
+from trade_drivers.vendors.damiao._inspect import look_over
+
+if TYPE_CHECKING:
+    from trade_drivers.bus.can import CanPort
+    from trade_drivers.robotfile import CanBus
+
+__all__ = ["DamiaoExchange"]
+
+_LAG: Final = 5
+"""Cycles by which a motor may be behind what it is told."""
+
+
+class DamiaoExchange(MotorExchange[DamiaoAxis]):
+    """What happens on one bus of Damiao motors."""
+
+    def __init__(
+        self, port: "CanPort", bus: "CanBus", axes: Sequence[DamiaoAxis], clock: Callable[[], int] = time.monotonic_ns
+    ) -> None:
+        super().__init__(port, bus, axes, clock)
+        self.timeout = round(bus.watchdog_s * frames.TICKS_PER_S)
+        self.deaf_ns = self.stale_after_ns
+        for axis in axes:
+            self.net.hear(axis.master, self._listener(axis))
+
+    def _listener(self, axis: DamiaoAxis) -> Callable[[bytes], None]:
+        return lambda data: axis.take(data, self.clock())
+
+    # --- what a motor is told
+
+    def _there(self, axis: DamiaoAxis) -> Frame:
+        """Where to be next."""
+        return Frame(frames.POSITION_VELOCITY + axis.id, axis.step(self.clock(), self.period_ns / 1e9))
+
+    def refresh(self, axis: DamiaoAxis) -> Frame:
+        """A question that tells it nothing."""
+        return Frame(frames.EVERYBODY, frames.refresh(axis.id))
+
+    def stand(self, axis: DamiaoAxis) -> None:
+        """From now on it is told to be where it was measured."""
+        here = axis.fresh(self.clock(), self.stale_after_ns).position
+        accel = float(axis.accel_counts)
+        axis.course = Course(here, fastest=axis.speed_counts, accel=accel, braking=accel)
+        axis.stepped_ns = self.clock()
+
+    def enable(self, axis: DamiaoAxis) -> None:
+        """Torque on, with where it is before it and after it: it must not make for where it was sent last."""
+        there = self._there(axis)
+        self.port.send_all([there, Frame(axis.id, frames.ENABLE), there])
+
+    def write_goals(self, goals: Mapping[Axis, Goal], gate: Gate) -> None:
+        for axis, goal in goals.items():
+            if (course := cast("DamiaoAxis", axis).course) is not None:
+                course.fastest, course.accel = goal.speed, goal.accel
+                course.braking = goal.accel * cast("DamiaoAxis", axis).easing
+        self._aim({axis: goal.position for axis, goal in goals.items()}, gate, Course.jump)
+
+    def write_positions(self, positions: Mapping[Axis, int], gate: Gate) -> None:
+        self._aim(positions, gate, _go_on)
+
+    def _aim(self, positions: Mapping[Axis, int], gate: Gate, aim: Callable[[Course, int], None]) -> None:
+        gate()
+        told: list[Frame] = []
+        for axis, position in positions.items():
+            motor = cast("DamiaoAxis", axis)
+            if motor.course is None:
+                raise motor.faulty("it was enabled, but has let go since")
+            aim(motor.course, position)
+            told.append(self._there(motor))
+        self.port.send_all(told)
+
+    def reached_ns(self, axes: Sequence[Axis]) -> int | None:  # noqa: ARG002 - the same for all
+        """A step on its way is made within the period that begins with it."""
+        return self.clock() + self.period_ns
+
+    def write_holds(self, positions: Mapping[Axis, int]) -> None:
+        """Brake as hard as the joint may; one held off its course stands where it is.
+
+        One under torque that this driver has not enabled lets go: what it would make of a position, nobody knows.
+        """
+        for axis, position in positions.items():
+            motor = cast("DamiaoAxis", axis)
+            if motor.course is None:
+                if motor.torque:
+                    self.port.send(motor.id, frames.DISABLE)
+                continue
+            self._brake(motor, motor.course, position)
+            self.port.send_all([self._there(motor)])
+
+    def _brake(self, axis: DamiaoAxis, course: Course, position: int) -> None:
+        if abs(course.position - position) > axis.grain.near + abs(course.speed) * _LAG * self.period_ns / 1e9:
+            accel = float(axis.accel_counts)
+            axis.course = Course(position, fastest=axis.speed_counts, accel=accel, braking=accel)
+            return
+        course.accel = course.braking = axis.accel_counts
+        rests = course.position + course.speed * abs(course.speed) / (2 * axis.accel_counts)
+        course.jump(round(max(min(axis.low, course.position), min(max(axis.high, course.position), rests))))
+
+    def making_way(self, job: Motion) -> Steps:
+        for axis in job.axes:
+            cast("DamiaoAxis", axis).easing = 0.5 if job.manner is Manner.POSITIONS else 1.0
+        yield from ()
+
+    def enabling(self, job: Job, axis: Axis) -> Steps:
+        return jobs.enabling(self, job, cast("DamiaoAxis", axis))
+
+    def relaxing(self, job: Job, axis: Axis) -> Steps:
+        return jobs.relaxing(self, job, cast("DamiaoAxis", axis))
+
+    def looking(self, axis: Axis) -> Steps:
+        self.require_answering(axis)
+        yield from next_measurement(self, axis)
+
+    def leaving(self, job: Job, axis: Axis, *, relax: bool) -> Steps:
+        return jobs.leaving(self, job, cast("DamiaoAxis", axis), relax=relax)
+
+    # --- what it is asked
+
+    def question(self, axis: DamiaoAxis) -> Frame:
+        return self.refresh(axis) if axis.course is None else self._there(axis)
+
+    def look_over(self, axis: DamiaoAxis) -> Steps:
+        return look_over(self, axis)
+
+    def watch(self) -> None:
+        """What is sent on its way step by step goes on only while its call may."""
+        super().watch()
+        for motion in dict.fromkeys(axis.motion for axis in self.axes if axis.motion is not None):
+            try:
+                motion.permit.gate()
+            except TradeError as ending:
+                self.release(motion, ending)
+
+
+def _go_on(course: Course, aim: int) -> None:
+    course.aim = aim

@@ -1,0 +1,115 @@
+"""Looking Damiao motors over before anything is commanded: what the file asks of them, and who answers."""
+
+from collections.abc import Sequence
+from math import isclose
+from typing import TYPE_CHECKING, Final
+
+from trade.errors import ConfigurationError
+from trade_drivers.bus.can import Frame, frame_bits
+from trade_drivers.joints import Steps
+from trade_drivers.joints.can import Another, Unfit
+from trade_drivers.joints.can._cycle import asked
+from trade_drivers.vendors.damiao import _frames as frames
+from trade_drivers.vendors.damiao._axis import DamiaoAxis
+from trade_drivers.vendors.damiao._frames import Register
+
+if TYPE_CHECKING:
+    from trade_drivers.robotfile import CanBus
+    from trade_drivers.vendors.damiao._cycle import DamiaoExchange
+
+__all__ = ["check_bus", "look_over", "register", "set_register"]
+
+_BRAKING_S: Final = 1.5
+_WITHIN: Final = 0.98
+"""Of what a motor can say of its position, a joint may use so much: beyond, one end cannot be told from the next."""
+
+
+def check_bus(bus: "CanBus", axes: Sequence[DamiaoAxis], where: str) -> None:
+    """What the file alone can tell: identifiers, keys, ranges, and whether the frames of a cycle fit into it.
+
+    Raises:
+        ConfigurationError: names the key and what would be right.
+    """
+    for axis in axes:
+        try:
+            _check_joint(axis)
+        except Unfit as bad:
+            raise ConfigurationError(where=f'{where}: joint."{axis.joint.name}"{bad.key}', problem=str(bad)) from None
+    key = f"{where}: bus.{bus.name}.rate_hz"
+    least_hz = 4 / min(bus.watchdog_s, bus.stale_after_s)
+    if bus.rate_hz < least_hz:
+        problem = f"{bus.rate_hz:g} is too slow for watchdog_s and stale_after_s; at least {least_hz:.3g}"
+        raise ConfigurationError(where=key, problem=problem)
+    cycle = len(axes) * 2 * frame_bits(8)
+    if cycle * bus.rate_hz > bus.bitrate:
+        problem = f"{len(axes)} motors at {bus.bitrate} bit/s: at most {bus.bitrate / cycle:.0f} Hz"
+        raise ConfigurationError(where=key, problem=problem)
+
+
+def _check_joint(axis: DamiaoAxis) -> None:
+    joint, ranges = axis.joint, axis.ranges
+    if not 1 <= joint.id < frames.MASTER:
+        raise Unfit(f"{joint.id} is none; 1 to 15 can be told apart (it answers as that and 16)", ".id")
+    if joint.counts_per_rev is not None:
+        raise Unfit("a Damiao motor tells radians, not counts; leave this key out", ".counts_per_rev")
+    if joint.homing_counts:
+        raise Unfit("is for servos; leave this key out", ".homing_counts")
+    if joint.max_speed_rad_s * joint.gear > ranges.velocity_rad_s:
+        most = ranges.velocity_rad_s / joint.gear
+        raise Unfit(
+            f"{joint.max_speed_rad_s:.4g} is above {most:.4g}, the most a {joint.model} tells", ".max_speed_rad_s"
+        )
+    for key, value in ((".min_rad", joint.min_rad), (".max_rad", joint.max_rad)):
+        if abs(axis.scale.counts(value)) * axis.grain.rad * joint.gear > _WITHIN * ranges.position_rad:
+            raise Unfit(f"{value:.4g} is farther from its zero than a {joint.model} can tell", key)
+    if joint.serial_number is not None:
+        raise Unfit("a Damiao motor tells no serial number here; leave this key out", ".serial_number")
+    braking_s = joint.max_speed_rad_s / joint.max_accel_rad_s2
+    if braking_s > _BRAKING_S:
+        problem = f"a stop from max_speed_rad_s takes {braking_s:.2g} s with it; it must take {_BRAKING_S} s at most"
+        raise Unfit(problem, ".max_accel_rad_s2")
+
+
+def look_over(bus: "DamiaoExchange", axis: DamiaoAxis) -> Steps:
+    """Check who a motor is and what its numbers mean, and arm its watchdog. Enables and moves nothing.
+
+    Raises:
+        Unfit: it cannot be used.
+        NoAnswer: it does not answer.
+    """
+    for number, meant in zip(
+        (Register.POSITION_MAX, Register.VELOCITY_MAX, Register.TORQUE_MAX), axis.ranges, strict=True
+    ):
+        yield from register(bus, axis, number)
+        if axis.told is None or not isclose(axis.told, meant, rel_tol=1e-3):
+            name = number.name.replace("_MAX", "").lower()
+            problem = (
+                f"the {name} of a {axis.joint.model} goes to {meant:g}, but motor {axis.id} is set to {axis.told:g}"
+            )
+            raise Unfit(f"{problem} (register {number:d})", ".model")
+    yield from register(bus, axis, Register.SOFTWARE)
+    if axis.software not in {None, axis.told}:
+        raise Unfit(f"another motor answers as {axis.id}: its software is {axis.told}, not {axis.software}")
+    axis.software = int(axis.told or 0)
+    if axis.joint.firmware is not None and axis.joint.firmware != str(axis.software):
+        raise Another("firmware", axis.joint.firmware, str(axis.software))
+    yield from set_register(bus, axis, Register.TIMEOUT, bus.timeout)
+    if axis.told != bus.timeout:
+        raise Unfit(f"it does not keep its time-out (register 9): {axis.told}, not {bus.timeout}")
+    axis.heard_ns = 0
+    yield from asked(bus, axis, [bus.refresh(axis)], lambda: axis.heard_ns > 0)
+
+
+def register(bus: "DamiaoExchange", axis: DamiaoAxis, number: Register) -> Steps:
+    """Ask for a register; its ``told`` is what it holds."""
+    axis.told, axis.asks = None, number
+    question = Frame(frames.EVERYBODY, frames.read(axis.id, number))
+    yield from asked(bus, axis, [question], lambda: axis.asks is None)
+
+
+def set_register(bus: "DamiaoExchange", axis: DamiaoAxis, number: Register, value: int) -> Steps:
+    """Write a register and ask for it again."""
+    axis.told, axis.asks = None, number
+    order = Frame(frames.EVERYBODY, frames.write(axis.id, number, value))
+    yield from asked(bus, axis, [order], lambda: axis.asks is None)
+    yield from register(bus, axis, number)

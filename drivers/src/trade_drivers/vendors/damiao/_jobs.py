@@ -1,0 +1,91 @@
+"""What enabling, relaxing and leaving a motor are made of: one exchange on the wire after the other."""
+
+from typing import TYPE_CHECKING, Final
+
+from trade_drivers.bus._cycle import HALT_NS
+from trade_drivers.bus._jobs import NoAnswer
+from trade_drivers.joints import Job, Steps, next_measurement, until
+from trade_drivers.vendors.damiao import _frames as frames
+from trade_drivers.vendors.damiao._axis import DamiaoAxis
+from trade_drivers.vendors.damiao._frames import Register
+from trade_drivers.vendors.damiao._inspect import register, set_register
+
+if TYPE_CHECKING:
+    from trade_drivers.vendors.damiao._cycle import DamiaoExchange
+
+__all__ = ["enabling", "leaving", "relaxing"]
+
+_WAIT_S: Final = 0.001
+
+
+def enabling(bus: "DamiaoExchange", job: Job, axis: DamiaoAxis) -> Steps:
+    """Torque on where it was measured to be, in position-velocity mode; all of it confirmed."""
+    bus.require_answering(axis)
+    yield from next_measurement(bus, axis)
+    if axis.motion is not None and not axis.fault:
+        bus.end_motion(axis, f"{axis.name} was enabled anew")
+    if axis.torque:
+        yield from until(bus, axis, lambda: axis.still > 1, "it cannot be enabled while it moves", HALT_NS)
+    if axis.failed:
+        job.gate()
+        complaint = axis.complaint
+        bus.port.send(axis.id, frames.CLEAR)
+        yield from until(bus, axis, lambda: not axis.failed, f"{complaint}; it cannot be cleared")
+    yield from _set_up(bus, job, axis)
+    yield from next_measurement(bus, axis)
+    job.gate()
+    bus.stand(axis)
+    bus.enable(axis)
+    yield from until(bus, axis, lambda: axis.torque is True, "it cannot be enabled; is its power stage supplied?")
+    axis.fault, axis.ready = "", True
+
+
+def _set_up(bus: "DamiaoExchange", job: Job, axis: DamiaoAxis) -> Steps:
+    """Its time-out and its mode, every time: both are gone when it has restarted, which it does not tell."""
+    job.gate()
+    yield from _written(bus, axis, Register.TIMEOUT, bus.timeout)
+    yield from _heard(bus, axis, register(bus, axis, Register.CONTROL_MODE))
+    if axis.told == frames.IN_POSITION_VELOCITY:
+        return
+    if axis.torque:  # it would go to where it was sent in that mode, ever so long ago
+        yield from relaxing(bus, job, axis)
+    job.gate()
+    yield from _written(bus, axis, Register.CONTROL_MODE, frames.IN_POSITION_VELOCITY)
+
+
+def relaxing(bus: "DamiaoExchange", job: Job, axis: DamiaoAxis) -> Steps:
+    """Torque off; its watchdog has nothing to watch then."""
+    axis.ready = False
+    job.gate()
+    axis.course = None
+    if axis.may_hold_torque:
+        bus.port.send(axis.id, frames.DISABLE)
+    yield from until(bus, axis, lambda: not axis.may_hold_torque, "told to relax, but its torque is still on")
+
+
+def leaving(bus: "DamiaoExchange", job: Job, axis: DamiaoAxis, *, relax: bool) -> Steps:
+    """Torque off, or left on where it was seen at rest; only then its watchdog is disarmed."""
+    if relax:
+        yield from relaxing(bus, job, axis)
+        return
+    if axis.still == 0 and axis.may_hold_torque:
+        return
+    yield from _written(bus, axis, Register.TIMEOUT, 0)
+    axis.ready, axis.course = False, None
+
+
+def _written(bus: "DamiaoExchange", axis: DamiaoAxis, number: Register, value: int) -> Steps:
+    """A register, read back; raises ``DeviceFault`` if it does not hold it."""
+    yield from _heard(bus, axis, set_register(bus, axis, number, value))
+    if axis.told != value:
+        raise axis.faulty(f"it does not keep register {number:d}: {axis.told}, not {value}")
+
+
+def _heard(bus: "DamiaoExchange", axis: DamiaoAxis, asking: Steps) -> Steps:
+    """Raises ``DeviceSilent`` if it does not answer."""
+    try:
+        for _ in asking:
+            bus.idle(_WAIT_S)
+            yield
+    except NoAnswer:
+        raise axis.deaf(bus.clock()) from None

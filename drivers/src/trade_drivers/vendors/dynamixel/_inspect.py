@@ -1,0 +1,105 @@
+"""Looking a bus over before anything may be commanded: who is there, and set how. Moves nothing and resets nothing."""
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Final, NoReturn
+
+from trade.errors import ConfigurationError
+from trade_drivers.joints.serial import (
+    NoAnswer,
+    again,
+    check_firmware,
+    check_homing,
+    check_model,
+    check_ranges,
+    check_rate,
+    first_ping,
+)
+from trade_drivers.vendors.dynamixel import _table as table
+from trade_drivers.vendors.dynamixel._axis import CYCLIC, SLOW, DynamixelAxis
+
+if TYPE_CHECKING:
+    from trade_drivers.robotfile import SerialBus
+    from trade_drivers.vendors.dynamixel._sdk import Wire
+
+__all__ = ["check_bus", "look_over"]
+
+_EEPROM: Final = (table.MODEL_NUMBER.address, table.MIN_POSITION.end)
+_OTHER_THAN_REVERSED: Final = 0xFE
+_SHADOWS: Final = 252
+_ALL_ANSWER: Final = 2
+
+
+def check_bus(bus: "SerialBus", axes: Sequence[DynamixelAxis], where: str) -> None:
+    """What the file alone can tell: speeds, and whether the bytes of a cycle fit into it.
+
+    Raises:
+        ConfigurationError: names the key and what would be right.
+    """
+    for axis in axes:
+        check_ranges(axis, where)
+    count = len(axes)
+    read = 14 + count + (8 + count * 14 if bus.fast_sync else count * (11 + CYCLIC[1]))
+    check_rate(bus, count, read + 14 + count * 5, where)
+
+
+def look_over(wire: "Wire", bus: "SerialBus", axis: DynamixelAxis, clock_ns: Callable[[], int], where: str) -> float:
+    """Check one joint's device and take its first measurements.
+
+    Returns:
+        Its return delay in seconds, which only costs speed.
+
+    Raises:
+        ConfigurationError: it is absent, another model, set wrongly, or not alone under its id.
+    """
+    key = f'{where}: joint."{axis.joint.name}"'
+    number = first_ping(wire, bus, axis, key, (7, 8))
+    check_model(axis, number, table.name_of(number, "a model this driver does not know"), key)
+    silent = "it answers a ping but no read: its status return level (68) is 0 or 1; set it to 2"
+    try:
+        asked_ns = clock_ns()
+        settings = again(wire, axis, lambda: wire.read(axis.id, *_EEPROM).data)
+        health = again(wire, axis, lambda: wire.read(axis.id, *SLOW).data)
+        sample = again(wire, axis, lambda: wire.read(axis.id, *CYCLIC).data)
+    except NoAnswer:
+        raise ConfigurationError(where=key, problem=silent) from None
+    check_firmware(axis, str(table.FIRMWARE.decode(settings)), key)
+    check_homing(axis, settings, key)
+    axis.take_health(health, asked_ns)
+    axis.take_sample(sample, asked_ns)
+    _check_settings(axis, settings, key)
+    return table.RETURN_DELAY.decode(settings) * table.RETURN_DELAY.si_per_count
+
+
+def _check_settings(axis: DynamixelAxis, settings: bytes, key: str) -> None:
+    joint, health = axis.joint, axis.health
+    mode, drive = table.OPERATING_MODE.decode(settings), table.DRIVE_MODE.decode(settings)
+    if health is not None and health.status_level != _ALL_ANSWER:
+        _wrong(key, f"its status return level (register 68) is {health.status_level}; set it to 2")
+    if mode != table.POSITION_MODE:
+        _wrong(key, f"its operating mode (register 11) is {mode}; set it to 3, position control, with torque off")
+    if drive & _OTHER_THAN_REVERSED:
+        problem = (
+            f"its drive mode (register 10) is {drive}; set it to {drive & 1}, with torque off: speeds as velocities"
+        )
+        _wrong(key, f"{problem}, torque switched on by nothing but us")
+    if (shadow := table.SHADOW_ID.decode(settings)) <= _SHADOWS:
+        _wrong(key, f"it also obeys what is sent to id {shadow} (register 12); set it to 255, with torque off")
+    low, high = table.MIN_POSITION.decode(settings), table.MAX_POSITION.decode(settings)
+    if axis.low < low or axis.high > high:
+        ends = sorted((axis.scale.angle_rad(low), axis.scale.angle_rad(high)))
+        _wrong(
+            key,
+            f"min_rad {joint.min_rad:.6g} to max_rad {joint.max_rad:.6g} is more than the device's own range "
+            f"(registers 52 and 48), {ends[0]:.6g} to {ends[1]:.6g} rad; narrow the one or widen the other",
+        )
+    fastest = table.VELOCITY_LIMIT.decode(settings)
+    if axis.speed_counts > fastest:
+        limit = fastest * table.RAD_S_PER_COUNT
+        _wrong(
+            f"{key}.max_speed_rad_s",
+            f"{joint.max_speed_rad_s:.6g} is above the device's own limit {limit:.4g} (register 44)",
+        )
+
+
+def _wrong(where: str, problem: str) -> NoReturn:
+    raise ConfigurationError(where=where, problem=problem)

@@ -1,0 +1,114 @@
+"""What enabling, relaxing and leaving a servo are made of: one exchange on the wire after the other."""
+
+from collections.abc import Generator
+from contextlib import suppress
+from typing import TYPE_CHECKING, Final, cast
+
+from trade_drivers.joints import Goal, Job, Steps
+from trade_drivers.joints.serial import NoAnswer, health_of, still_homed, told, tried
+from trade_drivers.vendors.dynamixel import _table as table
+from trade_drivers.vendors.dynamixel._axis import DynamixelAxis, DynamixelHealth
+
+if TYPE_CHECKING:
+    from trade_drivers.vendors.dynamixel._cycle import DynamixelExchange
+    from trade_drivers.vendors.dynamixel._sdk import Wire
+
+__all__ = ["enabling", "goal_block", "leaving", "relaxing"]
+
+_BOOT_NS: Final = 2_000_000_000
+"""How long a servo may take to start anew, and to be taken on again."""
+_WAIT_S: Final = 0.001
+_GOAL_BLOCK: Final = (
+    table.PROFILE_ACCELERATION.address,
+    table.GOAL_POSITION.end - table.PROFILE_ACCELERATION.address,
+)
+
+
+def goal_block(goal: Goal) -> bytes:
+    """What goes from profile acceleration to goal position."""
+    return b"".join(
+        (
+            table.PROFILE_ACCELERATION.encode(goal.accel),
+            table.PROFILE_VELOCITY.encode(goal.speed),
+            table.GOAL_POSITION.encode(goal.position),
+        )
+    )
+
+
+def relaxing(bus: "DynamixelExchange", job: Job, axis: DynamixelAxis) -> Steps:
+    """Torque off, and its watchdog disarmed."""
+    axis.ready = False  # before: its health may be read in between, and torque that is off would be a fault
+    yield from _write(bus, job, axis, table.TORQUE_ENABLE, 0)
+    yield from _write(bus, job, axis, table.BUS_WATCHDOG, 0)
+    health = yield from health_of(bus, axis)
+    if health.torque:
+        raise axis.faulty("told to relax, but its torque is still on")
+
+
+def leaving(bus: "DynamixelExchange", job: Job, axis: DynamixelAxis, *, relax: bool) -> Steps:
+    """Torque off or left on, and its watchdog disarmed where it may be."""
+    health = yield from health_of(bus, axis)
+    if relax and health.torque:
+        axis.ready = False
+        yield from _write(bus, job, axis, table.TORQUE_ENABLE, 0)
+    elif health.watchdog == table.WATCHDOG_EXPIRED or axis.still == 0:
+        return
+    if health.watchdog:
+        yield from _write(bus, job, axis, table.BUS_WATCHDOG, 0)
+    axis.ready = False
+
+
+def enabling(bus: "DynamixelExchange", job: Job, axis: DynamixelAxis) -> Steps:
+    """Torque on at the measured position, with the joint's own profile and its watchdog armed; all of it read back."""
+    bus.require_answering(axis)
+    health = yield from health_of(bus, axis)
+    if health.error and health.torque:
+        raise axis.faulty(f"{axis.fault}, and it has not let go: call relax() before enable()")
+    if health.error:
+        health = yield from _restarted(bus, job, axis)
+    if health.error:
+        raise axis.faulty()
+    yield from still_homed(bus, axis)
+    if health.watchdog:
+        yield from _write(bus, job, axis, table.BUS_WATCHDOG, 0)
+    block = yield from tried(bus, axis, lambda: _seeded(bus, job, axis))
+    armed = bus.watchdog_counts
+    yield from _write(bus, job, axis, table.BUS_WATCHDOG, armed)
+    yield from _write(bus, job, axis, table.TORQUE_ENABLE, 1)
+    axis.ready = False
+    health = yield from health_of(bus, axis)
+    kept = yield from tried(bus, axis, lambda: bus.wire.read(axis.id, *_GOAL_BLOCK).data)
+    if not health.torque or health.watchdog != armed or kept != block:
+        raise axis.faulty("it did not keep what enabling it wrote")
+    axis.fault, axis.ready = "", True
+
+
+def _seeded(bus: "DynamixelExchange", job: Job, axis: DynamixelAxis) -> bytes:
+    """Its goal is where it is; tried again, it is measured again, as it may have sagged."""
+    register = table.PRESENT_POSITION
+    answer = bus.wire.read(axis.id, register.address, register.size)
+    position = register.decode(answer.data, register.address)
+    block = goal_block(Goal(position, axis.accel_counts, axis.speed_counts))
+    bus.wire.write(axis.id, _GOAL_BLOCK[0], block, job.gate)
+    return block
+
+
+def _restarted(bus: "DynamixelExchange", job: Job, axis: DynamixelAxis) -> Generator[None, None, DynamixelHealth]:
+    """How a servo is that has shut down, once it was started anew: nothing but that, or its power, has it go on."""
+    axis.ready = False
+    began_ns = bus.clock()
+    with suppress(NoAnswer):  # whether it has heard that is seen by what it says next
+        cast("Wire", bus.wire).reboot(axis.id, job.gate)
+    while True:
+        bus.idle(_WAIT_S)
+        yield
+        now_ns, health = bus.clock(), axis.health
+        heard = None if axis.silent or axis.doubted or health is None or health.at_ns <= began_ns else health
+        if heard is not None and (not heard.error or now_ns - began_ns > _BOOT_NS):
+            return heard
+        if now_ns - began_ns > 2 * _BOOT_NS:
+            raise axis.deaf(now_ns)
+
+
+def _write(bus: "DynamixelExchange", job: Job, axis: DynamixelAxis, register: table.Register, value: int) -> Steps:
+    yield from told(bus, job, axis, register.address, register.encode(value))

@@ -1,0 +1,117 @@
+"""What Feetech servos are told in the cyclic exchange with all of one bus, and how.
+
+They have no watchdog. So a joint on its way is sent a little ahead in every cycle, and comes to rest by itself soon
+after the cycles end: that is all a driver that dies or freezes leaves behind.
+"""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, Final, cast
+
+from trade.errors import TradeError
+from trade_drivers.joints import Axis, Gate, Goal, Job, Motion, Steps
+from trade_drivers.joints.serial import ServoAxis, ServoExchange, health_of
+from trade_drivers.vendors.feetech import _jobs as jobs
+from trade_drivers.vendors.feetech import _table as table
+from trade_drivers.vendors.feetech._axis import CYCLIC, FeetechAxis
+
+if TYPE_CHECKING:
+    pass
+
+__all__ = ["FeetechExchange"]
+
+_SIZES: Final = tuple(register.end - CYCLIC[0] for register in (table.PRESENT_LOAD, table.TEMPERATURE, table.STATUS))
+
+
+class FeetechExchange(ServoExchange):
+    """What happens on one bus of servos."""
+
+    sizes = _SIZES
+    answer_overhead = 7
+
+    # --- what a servo is told
+
+    def write_goals(self, goals: Mapping[Axis, Goal], gate: Gate) -> None:
+        aims = {cast("FeetechAxis", axis): goal for axis, goal in goals.items()}
+        now_ns = self.clock()
+        self._send({axis: axis.step(aim, now_ns) for axis, aim in aims.items()}, gate)
+        for axis, aim in aims.items():
+            axis.aim = aim
+
+    def write_positions(self, positions: Mapping[Axis, int], gate: Gate) -> None:
+        goals: dict[Axis, Goal] = {}
+        for axis, position in positions.items():
+            aim = cast("FeetechAxis", axis).aim
+            accel, speed = (aim.accel, aim.speed) if aim else (axis.accel_counts, axis.speed_counts)
+            goals[axis] = Goal(position, accel, speed)
+        self.write_goals(goals, gate)
+
+    def write_holds(self, positions: Mapping[Axis, int]) -> None:
+        # it brakes at its full acceleration, however gentle the move was
+        goals = {axis: Goal(position, axis.accel_counts, axis.speed_counts) for axis, position in positions.items()}
+        self._send({cast("FeetechAxis", axis): goal for axis, goal in goals.items()})
+        for axis in positions:
+            cast("FeetechAxis", axis).aim = None
+
+    def enabling(self, job: Job, axis: Axis) -> Steps:
+        return jobs.enabling(self, job, cast("FeetechAxis", axis))
+
+    def relaxing(self, job: Job, axis: Axis) -> Steps:
+        return jobs.relaxing(self, job, cast("FeetechAxis", axis))
+
+    def looking(self, axis: Axis) -> Steps:
+        yield from health_of(self, cast("FeetechAxis", axis))
+
+    def leaving(self, job: Job, axis: Axis, *, relax: bool) -> Steps:
+        return jobs.leaving(self, job, cast("FeetechAxis", axis), relax=relax)
+
+    # --- from the bus thread
+
+    def name_of(self, model_number: int) -> str:
+        return table.name_of(model_number, str(model_number))
+
+    def admit(self, axis: ServoAxis[Any]) -> None:
+        self.stop_found_moving(axis)
+
+    def look_after(self, axis: ServoAxis[Any]) -> None:
+        """Cut off by its own protection, it is switched off: else it would go on by itself once the cause is gone."""
+        servo = cast("FeetechAxis", axis)
+        if servo.health is not None and servo.health.torque and servo.health.error & servo.unload:
+            self.wire.write(servo.id, table.TORQUE.address, table.TORQUE.encode(0))
+            servo.take_health(self.wire.read(servo.id, *servo.slow).data, self.clock())
+
+    def watch(self) -> None:
+        super().watch()
+        self._lead_on()
+
+    def _lead_on(self) -> None:
+        """Send joints on that are on their way, as far ahead of where they were measured as they may be."""
+        steps: dict[FeetechAxis, Goal] = {}
+        now_ns = self.clock()
+        for motion in dict.fromkeys(axis.motion for axis in self.axes if axis.motion is not None):
+            try:
+                if due := _due(motion, now_ns):
+                    motion.permit.gate()
+                    steps.update(due)
+            except TradeError as ending:
+                self.release(motion, ending)
+        if steps:
+            self._send(steps)
+
+    def _send(self, goals: Mapping[FeetechAxis, Goal], gate: Gate | None = None) -> None:
+        data = {axis.id: jobs.goal_block(goal) for axis, goal in goals.items()}
+        self.wire.sync_write(jobs.GOAL_BLOCK[0], data, gate)
+        sent_ns = self.clock()
+        for axis, goal in goals.items():
+            axis.sent, axis.sent_ns = goal.position, sent_ns
+
+
+def _due(motion: Motion, now_ns: int) -> dict[FeetechAxis, Goal]:
+    """Where its joints are to be sent now, if that is not where they were sent last."""
+    due: dict[FeetechAxis, Goal] = {}
+    for axis in motion.axes:
+        servo = cast("FeetechAxis", axis)
+        if servo.aim is None or servo.in_doubt:
+            continue
+        if (step := servo.step(servo.aim, now_ns)).position != servo.sent:
+            due[servo] = step
+    return due

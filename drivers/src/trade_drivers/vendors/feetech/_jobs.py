@@ -1,0 +1,82 @@
+"""What enabling, relaxing and leaving a servo are made of: one exchange on the wire after the other."""
+
+from typing import TYPE_CHECKING, Final
+
+from trade_drivers.joints import Goal, Job, Steps
+from trade_drivers.joints.serial import health_of, still_homed, told, tried
+from trade_drivers.vendors.feetech import _table as table
+from trade_drivers.vendors.feetech._axis import FeetechAxis
+
+if TYPE_CHECKING:
+    from trade_drivers.vendors.feetech._cycle import FeetechExchange
+
+__all__ = ["GOAL_BLOCK", "enabling", "goal_block", "leaving", "relaxing"]
+
+GOAL_BLOCK: Final = (table.ACCELERATION.address, table.GOAL_SPEED.end - table.ACCELERATION.address)
+"""Address and size of what is written to send a joint somewhere: never a goal without its speed."""
+
+
+def goal_block(goal: Goal) -> bytes:
+    """What goes from acceleration to goal speed."""
+    return b"".join(
+        (
+            table.ACCELERATION.encode(goal.accel),
+            table.GOAL_POSITION.encode(goal.position),
+            table.GOAL_TIME.encode(0),
+            table.GOAL_SPEED.encode(goal.speed * table.STEPS_PER_SPEED),
+        )
+    )
+
+
+def relaxing(bus: "FeetechExchange", job: Job, axis: FeetechAxis) -> Steps:
+    """Torque off."""
+    axis.ready = False  # before: its health may be read in between, and torque that is off would be a fault
+    yield from _write(bus, job, axis, table.TORQUE, 0)
+    health = yield from health_of(bus, axis)
+    if health.torque:
+        raise axis.faulty("told to relax, but its torque is still on")
+
+
+def leaving(bus: "FeetechExchange", job: Job, axis: FeetechAxis, *, relax: bool) -> Steps:
+    """Torque off or left on: there is no watchdog to be disarmed."""
+    axis.ready = False
+    if relax:
+        yield from relaxing(bus, job, axis)
+
+
+def enabling(bus: "FeetechExchange", job: Job, axis: FeetechAxis) -> Steps:
+    """Torque on at the measured position, with the joint's own acceleration and speed; all of it read back."""
+    bus.require_answering(axis)
+    health = yield from health_of(bus, axis)
+    if health.error and health.torque:  # off and on again is what ends an overload
+        axis.ready = False
+        yield from _write(bus, job, axis, table.TORQUE, 0)
+        health = yield from health_of(bus, axis)
+    if health.error:
+        raise axis.faulty()
+    yield from still_homed(bus, axis)
+    if not health.locked:
+        yield from _write(bus, job, axis, table.LOCK, 1)
+        health = yield from health_of(bus, axis)
+    block = yield from tried(bus, axis, lambda: _seeded(bus, job, axis))
+    yield from _write(bus, job, axis, table.TORQUE, table.TORQUE_ON)
+    axis.ready = False
+    health = yield from health_of(bus, axis)
+    kept = yield from tried(bus, axis, lambda: bus.wire.read(axis.id, *GOAL_BLOCK).data)
+    if not health.torque or kept != block:
+        raise axis.faulty("it did not keep what enabling it wrote")
+    axis.fault, axis.ready = "", True
+
+
+def _seeded(bus: "FeetechExchange", job: Job, axis: FeetechAxis) -> bytes:
+    """Its goal is where it is. It may switch torque on: tried again, it is measured again, as it may have sagged."""
+    asked_ns = bus.clock()
+    health = axis.take_health(bus.wire.read(axis.id, *axis.slow).data, asked_ns)
+    block = goal_block(Goal(health.position, axis.accel_counts, axis.speed_counts))
+    axis.aim, axis.sent = None, health.position
+    bus.wire.write(axis.id, GOAL_BLOCK[0], block, job.gate)
+    return block
+
+
+def _write(bus: "FeetechExchange", job: Job, axis: FeetechAxis, register: table.Register, value: int) -> Steps:
+    yield from told(bus, job, axis, register.address, register.encode(value))

@@ -1,0 +1,88 @@
+"""The only place of this folder that needs pyserial: packets of STS servos over a serial line."""
+
+from collections.abc import Container, Iterator, Mapping, Sequence
+
+from trade_drivers.joints import Gate, PortLost
+from trade_drivers.joints.serial import Answer, BadAnswer, NoAnswer
+from trade_drivers.joints.serial._wire import BROADCAST, ServoWire
+from trade_drivers.vendors.feetech._frames import OVERHEAD, Corrupt, Instruction, Status, packet, take_status
+from trade_drivers.vendors.feetech._table import BAUD_CODES, MODEL_NUMBER
+
+__all__ = ["Wire"]
+
+
+class Wire(ServoWire):
+    """One serial port and the packets on it."""
+
+    def __init__(self, path: str, baud: int, where: str = "bus") -> None:
+        super().__init__(path, baud, where)
+        self._baud = baud
+        self._sent = b""
+
+    def open(self) -> None:
+        if self._baud not in BAUD_CODES:
+            problem = f"{self._baud} is no rate of these servos; they know {', '.join(map(str, sorted(BAUD_CODES)))}"
+            raise self._wrong("baud", problem)
+        super().open()
+
+    def ping(self, device_id: int) -> int:
+        # the protocol's own ping tells no model, and its answer is as long as that to a write
+        return MODEL_NUMBER.decode(
+            self.read(device_id, MODEL_NUMBER.address, MODEL_NUMBER.size).data, MODEL_NUMBER.address
+        )
+
+    def read(self, device_id: int, address: int, size: int) -> Answer:
+        return self._ask(device_id, Instruction.READ, bytes((address, size)), size)
+
+    def write(self, device_id: int, address: int, data: bytes, gate: Gate | None = None) -> None:
+        self._ask(device_id, Instruction.WRITE, bytes((address,)) + data, 0, gate)
+
+    def sync_write(self, address: int, data: Mapping[int, bytes], gate: Gate | None = None) -> None:
+        size = len(next(iter(data.values())))
+        values = b"".join(bytes((device_id,)) + value for device_id, value in data.items())
+        with self._use(gate):
+            self._send(packet(BROADCAST, Instruction.SYNC_WRITE, bytes((address, size)) + values))
+
+    def sync_read(self, address: int, size: int, ids: Sequence[int]) -> Iterator[tuple[int, Answer]]:
+        self._settle()
+        heard: set[int] = set()
+        with self._use():
+            self._line.flush()
+            self._send(packet(BROADCAST, Instruction.SYNC_READ, bytes((address, size, *ids))))
+            self._line.expect(len(ids) * (OVERHEAD + size))
+            for _ in ids:
+                try:
+                    status = self._next(ids, size)
+                except Corrupt:
+                    continue
+                if status is None:
+                    break
+                heard.add(status.device_id)
+                yield status.device_id, Answer(status.data, bool(status.status))
+        if len(heard) < len(ids):
+            self._unsettle()
+
+    def _ask(self, device_id: int, instruction: int, parameters: bytes, size: int, gate: Gate | None = None) -> Answer:
+        """One question to one device, and its answer with so many bytes of data."""
+        with self._exchange(device_id, gate):
+            self._line.flush()
+            self._send(packet(device_id, instruction, parameters))
+            self._line.expect(OVERHEAD + size)
+            try:
+                status = self._next((device_id,), size)
+            except Corrupt:
+                raise BadAnswer(device_id, 0.0) from None
+            if status is None:
+                raise (BadAnswer if self._line.received else NoAnswer)(device_id, 0.0)
+        return Answer(status.data, bool(status.status))
+
+    def _next(self, ids: Container[int], size: int) -> Status | None:
+        """The next answer that belongs to the question; None if none comes in time."""
+        while (status := take_status(self._line.received, ids, size, self._sent)) is None and self._line.more():
+            pass
+        return status
+
+    def _send(self, data: bytes) -> None:
+        self._sent = data
+        if self._line.write(data) != len(data):
+            raise PortLost("the packet could not be written as a whole")

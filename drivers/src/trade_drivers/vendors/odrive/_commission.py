@@ -1,0 +1,23 @@
+"""Which ODrives are on a CAN bus: heard by what they say by themselves."""
+
+from typing import TYPE_CHECKING
+
+from trade_drivers.joints.can._commission import CanMotorCommissioner
+from trade_drivers.vendors.odrive._frames import NODES
+
+if TYPE_CHECKING:
+    from trade_drivers.bus.can import CanBench
+
+__all__ = ["OdriveCommissioner"]
+
+
+class OdriveCommissioner(CanMotorCommissioner):
+    """ODrives; one that has no node number yet is shown with the number 63."""
+
+    driver = "odrive"
+    ids = range(NODES + 1)
+
+    def bench(self) -> "type[CanBench]":
+        from trade_drivers.vendors.odrive._scan import OdriveBench  # noqa: PLC0415 - python-can is optional
+
+        return OdriveBench

@@ -1,0 +1,125 @@
+"""What ODrives are told in the cyclic exchange with all of one bus, and how."""
+
+import logging
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Final, cast
+
+from trade_drivers.bus._cycle import HALT_NS
+from trade_drivers.bus.can import Frame
+from trade_drivers.joints import Axis, Gate, Goal, Job, Steps, next_measurement
+from trade_drivers.joints.can._cycle import MotorExchange
+from trade_drivers.vendors.odrive import _frames as frames
+from trade_drivers.vendors.odrive import _jobs as jobs
+from trade_drivers.vendors.odrive._axis import COUNTS_PER_TURN, OdriveAxis
+from trade_drivers.vendors.odrive._frames import Command, frame_id
+from trade_drivers.vendors.odrive._inspect import look_over
+
+if TYPE_CHECKING:
+    from trade_drivers.bus.can import CanPort
+    from trade_drivers.robotfile import CanBus
+
+__all__ = ["OdriveExchange"]
+
+_log = logging.getLogger("trade")
+_HEALTH: Final = (Command.ERRORS, Command.CURRENTS, Command.TEMPERATURES, Command.SUPPLY)
+_BEATS_MISSED_NS: Final = 500_000_000
+"""Five heartbeats, as an ODrive sends them if nobody has changed that."""
+
+
+class OdriveExchange(MotorExchange[OdriveAxis]):
+    """What happens on one bus of ODrives.
+
+    The questions in every cycle are what feeds an axis' watchdog.
+    """
+
+    deaf_ns = _BEATS_MISSED_NS
+
+    def __init__(
+        self, port: "CanPort", bus: "CanBus", axes: Sequence[OdriveAxis], clock: Callable[[], int] = time.monotonic_ns
+    ) -> None:
+        super().__init__(port, bus, axes, clock)
+        self.rival = False
+        """Somebody else commands these axes."""
+        for axis in axes:
+            for command, listener in axis.listeners(clock).items():
+                self.net.hear(frame_id(axis.id, command), listener)
+            self._listen_for_rivals(axis)
+
+    def _listen_for_rivals(self, axis: OdriveAxis) -> None:
+        """Whoever commands or asks an axis feeds its watchdog, too, and it would not notice that this driver dies."""
+        for command in frames.ORDERS:
+            self.net.hear(frame_id(axis.id, command), self._hear_rival)
+        take = axis.listeners(self.clock)[Command.ESTIMATES]
+        self.net.hear(frame_id(axis.id, Command.ESTIMATES), lambda data: take(data) if data else self._hear_rival(data))
+
+    def _hear_rival(self, _: bytes) -> None:
+        if not self.rival:
+            _log.error("%s: another driver commands the axes of this bus, too", self.port.path)
+        self.rival = True
+
+    # --- what an axis is told
+
+    def tell(self, axis: OdriveAxis, command: Command, data: bytes) -> None:
+        """One frame to it; whether it obeys, only its heartbeat says."""
+        self.port.send(frame_id(axis.id, command), data)
+
+    def limit(self, axis: OdriveAxis, speed: int, accel: int) -> None:
+        """How fast it goes to the positions it is sent to from now on; moves nothing."""
+        self.tell(axis, Command.SET_TRAJECTORY_SPEED, frames.set_trajectory_speed(speed / COUNTS_PER_TURN))
+        self.tell(axis, Command.SET_TRAJECTORY_ACCEL, frames.set_trajectory_accel(accel / COUNTS_PER_TURN))
+
+    def send_to(self, axis: OdriveAxis, position: int) -> None:
+        """Have it go there, and stand."""
+        self.tell(axis, Command.SET_POSITION, frames.set_position(position / COUNTS_PER_TURN))
+
+    def write_goals(self, goals: Mapping[Axis, Goal], gate: Gate) -> None:
+        """Limits first, which move nothing; then the gate, and all joints start in one go."""
+        for axis, goal in goals.items():
+            self.limit(cast("OdriveAxis", axis), goal.speed, goal.accel)
+        self.write_positions({axis: goal.position for axis, goal in goals.items()}, gate)
+
+    def write_positions(self, positions: Mapping[Axis, int], gate: Gate) -> None:
+        told = [
+            Frame(frame_id(axis.id, Command.SET_POSITION), frames.set_position(position / COUNTS_PER_TURN))
+            for axis, position in positions.items()
+        ]
+        gate()
+        self.port.send_all(told)
+
+    def write_holds(self, positions: Mapping[Axis, int]) -> None:
+        """A trajectory to where it is, as steep as the joint may; one that has no torque yet is not told."""
+        for axis, position in positions.items():
+            drive = cast("OdriveAxis", axis)
+            if drive.armed and not drive.hushed:
+                self.limit(drive, axis.speed_counts, axis.accel_counts)
+                self.send_to(drive, position)
+
+    def enabling(self, job: Job, axis: Axis) -> Steps:
+        return jobs.enabling(self, job, cast("OdriveAxis", axis))
+
+    def relaxing(self, job: Job, axis: Axis) -> Steps:
+        return jobs.relaxing(self, job, cast("OdriveAxis", axis))
+
+    def looking(self, axis: Axis) -> Steps:
+        self.require_answering(axis)
+        yield from next_measurement(self, axis)
+
+    def leaving(self, job: Job, axis: Axis, *, relax: bool) -> Steps:  # noqa: ARG002 - it can only relax
+        return jobs.relaxing(self, job, cast("OdriveAxis", axis))
+
+    # --- what it is asked
+
+    def question(self, axis: OdriveAxis) -> Frame:
+        return Frame(frame_id(axis.id, Command.ESTIMATES), b"")
+
+    def look_over(self, axis: OdriveAxis) -> Steps:
+        return look_over(self, axis, first=axis.identity is None)
+
+    def look_after(self, axis: OdriveAxis) -> None:
+        """Ask for its errors, current, temperatures and supply by turns; one that does not obey a stop is cut off."""
+        axis.asked_after = (axis.asked_after + 1) % len(_HEALTH)
+        self.tell(axis, _HEALTH[axis.asked_after], b"")
+        if axis.halting_since_ns and self.clock() - axis.halting_since_ns > HALT_NS and axis.armed:
+            _log.error("%s: told to stop, but it is still moving; emergency stop", axis.name)
+            self.tell(axis, Command.ESTOP, b"")

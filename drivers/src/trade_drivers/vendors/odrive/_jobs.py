@@ -1,0 +1,125 @@
+"""What enabling, relaxing and leaving an axis are made of: one exchange on the wire after the other."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Final, cast
+
+from trade.errors import TradeError
+from trade_drivers.bus._cycle import HALT_NS
+from trade_drivers.joints import Job, Steps, next_measurement, until
+from trade_drivers.vendors.odrive import _frames as frames
+from trade_drivers.vendors.odrive._axis import OdriveAxis
+from trade_drivers.vendors.odrive._frames import Command, Control, Errors, Input, State
+
+if TYPE_CHECKING:
+    from trade_drivers.vendors.odrive._cycle import OdriveExchange
+
+__all__ = ["enabling", "relaxing"]
+
+_SLACK_NS: Final = 250_000_000
+"""How much later than its watchdog's time it may tell that it has let go: a heartbeat, and a busy host."""
+_AT_REST: Final = 2
+_WAIT_S: Final = 0.001
+
+
+def enabling(bus: "OdriveExchange", job: Job, axis: OdriveAxis) -> Steps:
+    """Torque on where it was measured to be, its watchdog tried once; each change of state confirmed by its heartbeat.
+
+    An axis under torque already must be at rest: it goes on holding.
+    """
+    bus.require_answering(axis)
+    yield from next_measurement(bus, axis)
+    if axis.motion is not None and not axis.fault:
+        bus.end_motion(axis, f"{axis.name} was enabled anew")
+    if axis.errors:
+        yield from _clear(bus, job, axis)
+    if not axis.armed and not axis.proven:
+        others = [cast("OdriveAxis", other) for other in job.axes if other is not axis]
+        idle = [other for other in others if not (other.proven or other.torque or other.errors or other.silent)]
+        yield from _try_watchdogs(bus, job, [axis, *idle])
+        yield from next_measurement(bus, axis)
+    if axis.torque:
+        yield from until(bus, axis, lambda: axis.still >= _AT_REST, "it cannot be enabled while it moves", HALT_NS)
+    here = axis.fresh(bus.clock(), bus.stale_after_ns).position
+    job.gate()
+    bus.limit(axis, axis.speed_counts, axis.accel_counts)
+    bus.tell(axis, Command.SET_MODE, frames.set_mode(Control.POSITION, Input.TRAJECTORY))
+    bus.send_to(axis, here)
+    if not axis.armed:
+        yield from _arm(bus, job, axis)
+    axis.fault, axis.ready = "", True
+
+
+def _arm(bus: "OdriveExchange", job: Job, axis: OdriveAxis) -> Steps:
+    job.gate()
+    bus.tell(axis, Command.SET_STATE, frames.set_state(State.CLOSED_LOOP))
+    since_ns = bus.clock()
+    yield from until(bus, axis, lambda: axis.armed or _told_since(axis, since_ns), "it does not answer")
+    if not axis.armed:
+        raise axis.faulty(f"it cannot be enabled: {axis.refusal}")
+
+
+def _told_since(axis: OdriveAxis, since_ns: int) -> bool:
+    """It has said, well after it was told to arm, that it has not."""
+    return axis.beat_ns - since_ns > _SLACK_NS // 2
+
+
+def _clear(bus: "OdriveExchange", job: Job, axis: OdriveAxis) -> Steps:
+    """Clear its errors. Nothing else happens: that it can be armed again is another matter."""
+    job.gate()
+    bus.tell(axis, Command.CLEAR_ERRORS, b"\0")
+    since_ns = bus.clock()
+    stays = f"error: {axis.errors.text}; it cannot be cleared"
+    yield from until(bus, axis, lambda: axis.health_ns > since_ns and not axis.errors, stays)
+    axis.disarmed_by = Errors(0)
+
+
+def _try_watchdogs(bus: "OdriveExchange", job: Job, axes: Sequence[OdriveAxis]) -> Steps:
+    """Arm them without any torque, say nothing, and see them let go: nothing else tells whether watchdogs are on."""
+    job.gate()
+    for axis in axes:
+        axis.hushed = True
+    try:
+        for axis in axes:
+            bus.tell(axis, Command.SET_MODE, frames.set_mode(Control.TORQUE, Input.PASSTHROUGH))
+            bus.tell(axis, Command.SET_TORQUE, frames.set_torque(0.0))
+            bus.tell(axis, Command.SET_STATE, frames.set_state(State.CLOSED_LOOP))
+        give_up_ns = bus.clock() + bus.watchdog_ns + _SLACK_NS
+        for axis in axes:
+            yield from _see_it_let_go(bus, job, axis, give_up_ns)
+    except TradeError:
+        for axis in axes:
+            bus.tell(axis, Command.SET_STATE, frames.set_state(State.IDLE))
+        raise
+    finally:
+        for axis in axes:
+            axis.hushed = False
+    for axis in axes:
+        yield from _clear(bus, job, axis)
+        axis.proven = True
+
+
+def _see_it_let_go(bus: "OdriveExchange", job: Job, axis: OdriveAxis, give_up_ns: int) -> Steps:
+    while not axis.errors:
+        job.gate()
+        bus.require_answering(axis)
+        if axis.beat_ns > give_up_ns:
+            if not axis.armed:
+                raise axis.faulty(f"it cannot be enabled: {axis.refusal}")
+            most_s = bus.watchdog_ns / 1e9
+            raise axis.faulty(
+                f"its watchdog does not let go within {most_s:g} s; set axis0.config.enable_watchdog and "
+                f"watchdog_timeout = {most_s:g}, or watchdog_s to what it is"
+            )
+        bus.idle(_WAIT_S)
+        yield
+    if not axis.errors & Errors.WATCHDOG:
+        raise axis.faulty(f"it cannot be enabled: {axis.refusal}")
+
+
+def relaxing(bus: "OdriveExchange", job: Job, axis: OdriveAxis) -> Steps:
+    """Torque off; its watchdog has nothing to watch then."""
+    axis.ready = False
+    if axis.may_hold_torque:
+        job.gate()
+        bus.tell(axis, Command.SET_STATE, frames.set_state(State.IDLE))
+    yield from until(bus, axis, lambda: not axis.may_hold_torque, "told to relax, but its torque is still on")

@@ -1,0 +1,186 @@
+"""The cyclic exchange with all grippers of one bus: stops, measurements, work. One thread calls ``cycle()``."""
+
+import logging
+import time
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
+from typing import TYPE_CHECKING, Final
+
+from trade.errors import MotionStopped, TradeError
+from trade_drivers.bus._cycle import HALT_NS, BusExchange, StopTicket
+from trade_drivers.bus._jobs import Device, Gate
+from trade_drivers.vendors.robotiq._gripper_state import Hand
+from trade_drivers.vendors.robotiq._jobs import Motion
+from trade_drivers.vendors.robotiq._wire import NoAnswer, Refused
+
+if TYPE_CHECKING:
+    from trade_drivers.robotfile import SerialBus
+    from trade_drivers.vendors.robotiq._modbus import Wire
+
+__all__ = ["Exchange"]
+
+_log = logging.getLogger("trade")
+_TAKEN_NS: Final = 15_000_000
+"""So long after a write the status may still be that of before: the device takes it over 200 times a second."""
+
+
+class Exchange(BusExchange[Hand]):
+    """What happens on one bus of grippers. ``stop`` is for any thread, too."""
+
+    def __init__(
+        self, wire: "Wire", bus: "SerialBus", hands: Sequence[Hand], clock: Callable[[], int] = time.monotonic_ns
+    ) -> None:
+        super().__init__(bus, hands, clock)
+        self.wire = wire
+        self.hands = tuple(hands)
+        wire.pause = self.pause
+
+    # --- from any thread
+
+    def stop(self, hands: Sequence[Hand], reason: str = "", *, grip: bool = False) -> StopTicket[Hand]:
+        """Void what was admitted for these grippers, and have them stand before anything else happens on the bus.
+
+        With ``grip``, those at rest are left as they are, pressing on what they hold.
+        """
+        reason = reason or self.why(hands)
+        return self.order_stop(hands, reason, lambda: self._halt(hands, reason, grip=grip))
+
+    def leave(self, alive: Callable[[], bool], *, relax: bool) -> None:  # noqa: ARG002 - no robot file here says so
+        """Stop what moves; what is held stays held."""
+        self.stop(self.hands, "its driver is leaving", grip=True).wait(alive)
+
+    # --- from the bus thread
+
+    def cycle(self) -> None:
+        began_ns = self.clock()
+        for hand in self.hands:
+            self.serve_stops()
+            self._measure(hand)
+        self.work(began_ns + self.period_ns // 2)
+        self._watch()
+
+    def halt_all(self, reason: str) -> None:
+        """End every motion; what is held stays held."""
+        self._halt(self.hands, reason, grip=True)
+
+    def end_motion(self, hand: Hand, reason: str) -> None:
+        """End the motion of a gripper that is about to be reset."""
+        if hand.motion is not None:
+            self._forget(hand.motion, MotionStopped(device=hand.name, reason=reason))
+
+    def take_over(self, motion: Motion) -> None:
+        """A motion's bytes are about to leave: the one it replaces has ended."""
+        hand = motion.hand
+        if hand.motion not in {None, motion}:
+            self.end_motion(hand, "another move took over")
+        hand.motion, hand.still, hand.halting_since_ns = motion, 0, 0
+        hand.tell_moving()
+
+    def release(self, motion: Motion, error: TradeError | None) -> None:
+        """A motion has ended: well, or with an error and its fingers stopped."""
+        try:
+            if error is not None and motion.hand.motion is motion:
+                self._stand(motion.hand)
+        finally:
+            self._forget(motion, error)
+
+    def fail_motion(self, device: Hand, error_of: Callable[[Device], TradeError]) -> None:
+        if device.motion is not None:
+            self._forget(device.motion, error_of(device))
+
+    def forget_measurements(self) -> None:
+        super().forget_measurements()
+        for hand in self.hands:
+            hand.halting_since_ns = 0
+
+    def admit(self, hand: Hand) -> None:
+        """Take a gripper on that was looked over, or is back: found moving and owned by nobody, it is stopped."""
+        if hand.sample is not None and hand.sample.under_way and hand.motion is None:
+            self._stand(hand)
+
+    # --- exchanges
+
+    def read(self, hand: Hand) -> None:
+        """Measure; raises ``NoAnswer``."""
+        asked_ns = self.clock()  # not when it came: a frozen process would take old values for new
+        self._exchanged(hand, lambda: hand.take(self.wire.read(hand.id), asked_ns))
+
+    def write(self, hand: Hand, values: Sequence[int], gate: Gate | None = None, *, wait: bool = True) -> None:
+        """Write, and measure in the same exchange; raises ``NoAnswer``."""
+        asked_ns = self.clock()
+        self._exchanged(hand, lambda: hand.take(self.wire.write(hand.id, values, gate, wait=wait), asked_ns))
+
+    def probe(self, hand: Hand) -> None:
+        """Whether it answers, and nothing late is on its way; raises ``NoAnswer``."""
+        self._exchanged(hand, lambda: self.wire.probe(hand.id))
+        hand.doubted = False
+
+    def _exchanged(self, hand: Hand, act: Callable[[], object]) -> None:
+        try:
+            act()
+        except NoAnswer:
+            self.missed(hand)
+            raise
+
+    # --- parts of a cycle
+
+    def _measure(self, hand: Hand) -> None:
+        if hand.silent and self.clock() < hand.probe_at_ns:
+            return
+        with suppress(NoAnswer):
+            try:
+                if hand.doubted or hand.silent:
+                    self.probe(hand)
+                self.read(hand)
+            except Refused as refused:
+                hand.fault = f"it is no 2F-85: {refused}"
+                return
+            if hand.silent:
+                _log.info("%s answers again", hand.name)
+                hand.silent = False
+                self.admit(hand)
+
+    def _watch(self) -> None:
+        now_ns = self.clock()
+        for hand in self.hands:
+            if hand.motion is not None:
+                hand.motion.watch(now_ns)
+            if hand.halting_since_ns:
+                self._watch_halt(hand, now_ns)
+            hand.tell_moving()
+        self.answer_stops(now_ns)
+
+    def _watch_halt(self, hand: Hand, now_ns: int) -> None:
+        if hand.standing(now_ns, self.stale_after_ns):
+            hand.halting_since_ns = 0
+            return
+        sample = hand.sample
+        told = sample is not None and (sample.activating or (sample.going and sample.activated))
+        seen = sample is not None and sample.at_ns > hand.held_ns + _TAKEN_NS
+        if told and seen and now_ns - hand.halting_since_ns <= HALT_NS:
+            self._stand(hand)  # the stop was not heard
+
+    def _halt(self, hands: Iterable[Hand], reason: str, *, grip: bool) -> None:
+        for hand in hands:
+            now_ns = self.clock()
+            quiet = hand.at_rest if grip else hand.standing
+            try:
+                if not quiet(now_ns, self.stale_after_ns):
+                    self._stand(hand)
+            finally:
+                self.end_motion(hand, reason)
+
+    def _stand(self, hand: Hand) -> None:
+        """Write the stop, and watch until it is at rest; whether it was heard is seen later."""
+        values = hand.halt_registers()
+        now_ns = self.clock()
+        hand.still, hand.held_ns = 0, now_ns
+        hand.halting_since_ns = hand.halting_since_ns or now_ns
+        with suppress(NoAnswer, Refused):
+            self.write(hand, values, wait=False)
+
+    def _forget(self, motion: Motion, error: TradeError | None) -> None:
+        if motion.hand.motion is motion:
+            motion.hand.motion = None
+            motion.hand.tell_moving()
+        motion.finish(error)

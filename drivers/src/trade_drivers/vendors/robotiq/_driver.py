@@ -1,0 +1,197 @@
+"""Bringing a bus with grippers up, and handing them out."""
+
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from typing import TYPE_CHECKING, Final, NoReturn
+
+from trade import Measure
+from trade.errors import ConfigurationError
+from trade_drivers import robotfile
+from trade_drivers.bus._jobs import PortLost
+from trade_drivers.bus._thread import BusThread
+from trade_drivers.faults import Tell
+from trade_drivers.interfaces._motion import Gripper, JointGroup, Motor
+from trade_drivers.plugins._driver import AttachedBus, Driver
+from trade_drivers.robotfile import Bus, Robot, SerialBus
+from trade_drivers.vendors.robotiq import _table as table
+from trade_drivers.vendors.robotiq._commission import RobotiqCommissioner
+from trade_drivers.vendors.robotiq._cycle import Exchange
+from trade_drivers.vendors.robotiq._gripper import RobotiqGripper
+from trade_drivers.vendors.robotiq._gripper_state import Hand
+from trade_drivers.vendors.robotiq._wire import NoAnswer, Refused, WireError
+
+if TYPE_CHECKING:
+    from trade_drivers.vendors.robotiq._modbus import Wire
+
+__all__ = ["RobotiqDriver", "open_exchange"]
+
+_ATTEMPTS: Final = 3
+_BITS_A_READ: Final = (8 + 11) * 10 + 35
+"""Request, answer, and the gap of three and a half characters before it."""
+
+_MEANINGLESS: Final = {
+    "watchdog_s": "a 2F-85 has no watchdog: left alone, it ends the move it was told; leave this key out",
+    "fast_sync": "a 2F-85 has no joined answers: each is read by itself; leave this key out",
+}
+"""Keys of a serial bus that no gripper keeps, and why."""
+
+
+class AttachedGrippers(AttachedBus):
+    """A bus with its grippers, and the thread that owns it."""
+
+    def __init__(self, thread: BusThread[Exchange]) -> None:
+        self._thread = thread
+        self._hands = {hand.gripper.name: hand for hand in thread.exchange.hands}
+
+    def motor(self, joint: str) -> Motor:
+        raise ConfigurationError(where=f'joint."{joint}"', problem="driver robotiq has no joints, only grippers")
+
+    def group(self, name: str, joints: Sequence[str]) -> JointGroup:
+        raise ConfigurationError(where=name, problem=f"driver robotiq has no joints such as {', '.join(joints)}")
+
+    def gripper(self, name: str) -> Gripper:
+        return RobotiqGripper(self._thread, self._hands[name])
+
+    def measures(self, bus: str) -> list[Measure]:
+        return self._thread.measures(bus)
+
+    def watched(self, tell: Tell) -> bool:
+        self._thread.watched(tell)
+        return True
+
+    def unseen(self) -> list[str]:
+        return self._thread.unseen
+
+    def close(self) -> None:
+        self._thread.close()
+
+
+class RobotiqDriver(Driver):
+    """2F-85 grippers on a serial bus, through pymodbus."""
+
+    modules = ("pymodbus", "serial")
+    devices = (robotfile.Gripper,)
+    without_watchdog = "no watchdog: without its driver it ends the stroke it was told"
+    commissioner = RobotiqCommissioner
+
+    def check(self, robot: Robot, bus: Bus) -> None:
+        serial = _serial(robot, bus)
+        _check(robot, serial)
+        wire_at(serial.port, serial.baud, f"{robot.where}: bus.{bus.name}")
+
+    def attach(self, robot: Robot, bus: Bus, port: str, healthy: Callable[[], bool]) -> AttachedBus:
+        with ExitStack() as undo:
+            exchange = open_exchange(robot, _serial(robot, bus), port)
+            undo.callback(exchange.wire.close)
+            thread = BusThread(exchange, exchange.wire, bus, healthy, name=f"bus {robot.name}.{bus.name}")
+            thread.start()
+            undo.pop_all()
+        return AttachedGrippers(thread)
+
+
+def _serial(robot: Robot, bus: Bus) -> SerialBus:
+    if not isinstance(bus, SerialBus):
+        _wrong(f"{robot.where}: bus.{bus.name}", "driver robotiq needs a serial bus: a port, no channel")
+    return bus
+
+
+def open_exchange(robot: Robot, bus: SerialBus, port: str) -> Exchange:
+    """Open the port and look every gripper over, without a thread: ``cycle()`` is the caller's to call.
+
+    Raises:
+        ConfigurationError: the port cannot be had, or a gripper is absent, another device, or set wrongly.
+    """
+    _check(robot, bus)
+    hands = [Hand(f"{robot.name}.{gripper.name}", port, gripper) for gripper in robot.grippers_on(bus.name)]
+    where = f"{robot.where}: bus.{bus.name}"
+    wire = wire_at(port, bus.baud, where)
+    try:
+        wire.open()
+        exchange = Exchange(wire, bus, hands)
+        for hand in hands:
+            _look_over(exchange, hand, bus, robot.where)
+        for hand in hands:
+            exchange.admit(hand)
+        exchange.cycle()
+    except PortLost as lost:
+        wire.close()
+        problem = f"{port}: {lost}; `ls -l /dev/serial/by-id` shows those that are"
+        raise ConfigurationError(where=f"{where}.port", problem=problem) from None
+    except WireError as bad:
+        wire.close()
+        problem = f"the bus does not work reliably: {bad}; check cable and power"
+        raise ConfigurationError(where=f"{where}.port", problem=problem) from bad
+    except BaseException:
+        wire.close()
+        raise
+    return exchange
+
+
+def _check(robot: Robot, bus: SerialBus) -> None:
+    """What the file alone can tell: models, limits, and whether the bytes of a cycle fit into it."""
+    where, grippers = f"{robot.where}: bus.{bus.name}", robot.grippers_on(bus.name)
+    for gripper in grippers:
+        key = f'{robot.where}: gripper."{gripper.name}"'
+        model = table.BY_MODEL_NAME.get(gripper.model)
+        if model is None:
+            known = ", ".join(table.BY_MODEL_NAME)
+            _wrong(f"{key}.model", f"{gripper.model!r} is unknown to the driver robotiq; it knows {known}")
+        for name, value, (low, high) in (
+            ("max_width_m", gripper.max_width_m, (0.0, model.stroke_m)),
+            ("max_speed_m_s", gripper.max_speed_m_s, model.speeds_m_s),
+            ("max_force_n", gripper.max_force_n, model.forces_n),
+        ):
+            if not low <= value <= high:
+                _wrong(f"{key}.{name}", f"{value:g} is outside of what a {model.name} can: {low:g} to {high:g}")
+    for key, problem in _MEANINGLESS.items():
+        if key in robot.given.get(bus.name, ()):
+            _wrong(f"{where}.{key}", problem)
+    if bus.baud not in table.BAUDS:
+        known = ", ".join(map(str, table.BAUDS))
+        _wrong(
+            f"{where}.baud", f"{bus.baud} is no rate of a 2F-85; it knows {known}, and leaves the factory with 115200"
+        )
+    if bus.leave != "hold":
+        problem = '"relax" is nothing a 2F-85 can: its fingers stand without power, too; use "hold"'
+        _wrong(f"{where}.leave", problem)
+    cycle_s = len(grippers) * _BITS_A_READ / bus.baud
+    if cycle_s * bus.rate_hz > 1:
+        problem = f"{len(grippers)} grippers at {bus.baud} baud need {cycle_s * 1e3:.1f} ms a cycle"
+        _wrong(f"{where}.rate_hz", f"{problem}: at most {1 / cycle_s:.0f} Hz")
+
+
+def _look_over(exchange: Exchange, hand: Hand, bus: SerialBus, where: str) -> None:
+    """Take a gripper's first measurements; nothing is written."""
+    key = f'{where}: gripper."{hand.gripper.name}"'
+    for _ in range(_ATTEMPTS):
+        try:
+            exchange.probe(hand)
+            exchange.read(hand)
+            exchange.read(hand)  # whether it moves shows in two
+        except NoAnswer:
+            continue
+        except Refused as refused:
+            _wrong(key, f"what answers on bus {bus.name!r} is no 2F-85: {refused}")
+        if hand.sample is not None and not hand.sample.plausible:
+            _wrong(key, f"what answers to id {hand.id} on bus {bus.name!r} is no 2F-85: its status makes no sense")
+        hand.silent = False
+        return
+    _wrong(
+        key,
+        f"no gripper answers to id {hand.id} on bus {bus.name!r} ({exchange.wire.path}, {bus.baud} baud); check its "
+        "power and cable, its id and its baud rate with the vendor's tool",
+    )
+
+
+def wire_at(port: str, baud: int, where: str) -> "Wire":
+    """A line, not open yet. Raises ``ConfigurationError`` without the vendor library."""
+    try:
+        from trade_drivers.vendors.robotiq._modbus import Wire  # noqa: PLC0415 - the vendor library is optional
+    except ImportError as missing:
+        problem = f'needs pymodbus ({missing}); pip install "trade-drivers[robotiq]"'
+        raise ConfigurationError(where="driver robotiq", problem=problem) from None
+    return Wire(port, baud, where)
+
+
+def _wrong(where: str, problem: str) -> NoReturn:
+    raise ConfigurationError(where=where, problem=problem)

@@ -1,0 +1,169 @@
+"""One gripper as the bus thread knows it: what was read last, how it is, what is under way."""
+
+import time
+from typing import TYPE_CHECKING, Final, Literal
+
+from trade import Resource
+from trade.errors import DeviceFault, DeviceSilent
+from trade_drivers.interfaces._motion import GripperState
+from trade_drivers.robotfile import Gripper
+from trade_drivers.vendors.robotiq import _table as table
+from trade_drivers.vendors.robotiq._table import Contact, Status
+
+if TYPE_CHECKING:
+    from trade_drivers.vendors.robotiq._jobs import Motion
+
+__all__ = ["Hand"]
+
+_HELD: Final[dict[int, Literal["outside", "inside"]]] = {Contact.CLOSING: "outside", Contact.OPENING: "inside"}
+_HELD_COUNTS: Final = 1
+_REMEDY: Final = "remove the cause, then call activate(): it moves the fingers all the way, and what they hold falls"
+_NOT_ACTIVATED: Final = "it is not activated"
+
+
+class Hand:
+    """The state of one gripper. The bus thread writes it; other threads read whole values."""
+
+    def __init__(self, name: str, bus: str, gripper: Gripper) -> None:
+        self.name = name
+        self.resource = Resource(name)
+        """What locks and stops attach to."""
+        self.bus = bus
+        """The port, for messages."""
+        self.gripper = gripper
+        self.id = gripper.id
+        self.model = table.BY_MODEL_NAME[gripper.model]
+        self.sample: Status | None = None
+        self.force_counts = 0
+        """The force it was last told."""
+        self.fault = ""
+        """Why it refuses to move, reported by the gripper or found by this driver: kept until somebody clears it."""
+        self.motion: Motion | None = None
+        self.halting_since_ns = 0
+        """When it was told to stop; 0 once it was seen at rest."""
+        self.held_ns = 0
+        """When it was last told to."""
+        self.still = 0
+        """Measurements in a row in which it did not move."""
+        self.misses = 0
+        self.doubted = False
+        """It missed an exchange and has not answered a probe since: what it sends may be the answer of before."""
+        self.silent = False
+        """It used up its retries: it is left out and asked now and then whether it is back."""
+        self.probe_at_ns = 0
+        self.silent_since_ns = 0
+        self._holding: Literal["", "outside", "inside"] = ""
+        self._held_at = 0
+        self._speed_m_s = 0.0
+
+    def take(self, registers: list[int], at_ns: int) -> Status:
+        """Note a measurement that was asked for at this time."""
+        before, now = self.sample, Status.decode(registers, at_ns)
+        unmoved = before is not None and before.position == now.position
+        self.still = self.still + 1 if unmoved and not now.under_way else 0
+        if before is not None and at_ns > before.at_ns:
+            counts_s = (now.position - before.position) / ((at_ns - before.at_ns) / 1e9)
+            self._speed_m_s = -counts_s * self.model.m_per_count
+        self._note_contact(now)
+        self.sample = now
+        self.fault = table.fault_text(now.fault) or self.fault
+        self.misses = 0
+        return now
+
+    def _note_contact(self, now: Status) -> None:
+        if now.going and now.activated:
+            self._holding = _HELD.get(now.contact, "")
+            self._held_at = now.position
+        elif not now.activated or abs(now.position - self._held_at) > _HELD_COUNTS:
+            self._holding = ""
+
+    def at_rest(self, now_ns: int, stale_after_ns: int) -> bool:
+        """Seen at rest, now, with nothing of ours under way; it may be pressing on something."""
+        known = self.sample is not None and not self.doubted and not self.silent
+        return known and self.motion is None and self.still > 0 and self.age_ns(now_ns) <= stale_after_ns
+
+    def standing(self, now_ns: int, stale_after_ns: int) -> bool:
+        """At rest, and not told to go anywhere either."""
+        told = self.sample is not None and self.sample.going and self.sample.activated
+        return self.at_rest(now_ns, stale_after_ns) and not told
+
+    def halt_registers(self) -> tuple[int, int, int]:
+        """What stops it.
+
+        Without its activation it stands, whatever state it is in. It keeps it where that is sure to be there: to write
+        it to a gripper that has lost it would move the fingers.
+        """
+        sample = self.sample
+        if sample is None or self.doubted or self.silent or not sample.activated:
+            return table.RESET
+        return table.command(sample.echo, 0, self.force_counts, go=False)
+
+    def tell_moving(self) -> None:
+        """Let the resource know whether it moves: as last measured or commanded."""
+        under_way = self.motion is not None or self.halting_since_ns > 0
+        if under_way or not (self.silent or self.doubted):
+            self.resource.moving = under_way or self.still == 0
+
+    def age_ns(self, now_ns: int) -> int:
+        """Age of the newest measurement, or the time it has been silent if there is none."""
+        return now_ns - (self.sample.at_ns if self.sample else self.silent_since_ns)
+
+    def fresh(self, now_ns: int, stale_after_ns: int) -> Status:
+        """The newest measurement.
+
+        Raises:
+            DeviceSilent: it is too old, or there is none.
+        """
+        if self.sample is None or self.silent or self.age_ns(now_ns) > stale_after_ns:
+            raise self.deaf(now_ns)
+        return self.sample
+
+    def check_usable(self, now_ns: int, stale_after_ns: int) -> Status:
+        """The newest measurement, if the fingers may be commanded.
+
+        Raises:
+            DeviceSilent: it does not answer.
+            DeviceFault: it has a fault, or is not activated.
+        """
+        sample = self.fresh(now_ns, stale_after_ns)
+        if self.fault:
+            raise self.faulty()
+        if not sample.activated:
+            raise self.inactive()
+        return sample
+
+    def inactive(self, fault: str = _NOT_ACTIVATED) -> DeviceFault:
+        """The error of a gripper without activation."""
+        remedy = "call activate(): it moves the fingers all the way, and what they hold falls"
+        return DeviceFault(device=self.name, bus=self.bus, fault=fault, remedy=remedy)
+
+    def deaf(self, now_ns: int) -> DeviceSilent:
+        """The error of a gripper that does not answer."""
+        return DeviceSilent(device=self.name, bus=self.bus, waited_s=self.age_ns(now_ns) / 1e9)
+
+    def faulty(self, fault: str = "") -> DeviceFault:
+        """The error of a gripper with a fault; by default the one it has."""
+        return DeviceFault(device=self.name, bus=self.bus, fault=fault or self.fault, remedy=_REMEDY)
+
+    def state(self, now_ns: int, stale_after_ns: int) -> GripperState:
+        """What was last measured.
+
+        Raises:
+            DeviceSilent: it is too old.
+        """
+        sample = self.fresh(now_ns, stale_after_ns)
+        age_s = (now_ns - sample.at_ns) / 1e9
+        low, high = self.model.forces_n
+        return GripperState(
+            name=self.name,
+            width_m=self.model.width_m(sample.position),
+            speed_m_s=self._speed_m_s,
+            force_n=low + (high - low) * self.force_counts / 255,
+            current_a=sample.current * table.AMPERE_PER_COUNT,
+            holding=self._holding,
+            activated=sample.activated,
+            moving=self.motion is not None or self.still == 0,
+            fault=self.fault,
+            measured_at=time.monotonic() - age_s,
+            age_s=age_s,
+        )

@@ -1,0 +1,261 @@
+"""What services ask of the bus thread: activation, moves, stops, and the clearing of faults."""
+
+from collections.abc import Callable, Generator, Sequence
+from typing import TYPE_CHECKING, Final
+
+from trade import Permit
+from trade.errors import DeadlineExceeded, DeviceSilent, MotionStopped, OutcomeUnknown, TradeError
+from trade_drivers.bus._jobs import Gate, Steps, Work, check_admitted
+from trade_drivers.vendors.robotiq import _table as table
+from trade_drivers.vendors.robotiq._gripper_state import Hand
+from trade_drivers.vendors.robotiq._table import Contact, Status
+from trade_drivers.vendors.robotiq._wire import NoAnswer, Refused
+
+if TYPE_CHECKING:
+    from trade_drivers.vendors.robotiq._cycle import Exchange
+
+__all__ = ["Activate", "ClearFault", "Command", "Motion", "Move"]
+
+_ATTEMPTS: Final = 3
+_RESET_NS: Final = 1_000_000_000
+_TAKEN_NS: Final = 500_000_000
+_STUCK_S: Final = 0.5
+_ACTIVATION_S: Final = 10.0
+_NEAR_COUNTS: Final = 8
+_MOST_PER_CYCLE_S: Final = 0.1
+
+
+class Command(Work[Hand]):
+    """What needs leave: it carries an expiry, and the permit under which its call was admitted."""
+
+    def __init__(self, exchange: "Exchange", hand: Hand, *, service: str, expires_ns: int, permit: Permit) -> None:
+        super().__init__([hand])
+        self.exchange = exchange
+        self.hand = hand
+        self.service = service
+        self._expires_ns = expires_ns
+        self._permit = permit
+        self._admitted_ns = exchange.clock()
+
+    def gate(self) -> None:
+        """The last look before its bytes go out.
+
+        Raises:
+            DeadlineExceeded: it is late, and late is never.
+            MotionStopped, LockLost, LockedByOther: a stop, or another owner, came after it was admitted.
+        """
+        now_ns = self.exchange.clock()
+        check_admitted(
+            self.service, self._permit, admitted_ns=self._admitted_ns, expires_ns=self._expires_ns, now_ns=now_ns
+        )
+
+    def tell(self, values: Sequence[int], *, out: Gate | None = None) -> Steps:
+        """Write the command registers, within the retry budget.
+
+        Args:
+            values: the three of them.
+            out: called when the first bytes are about to leave.
+        """
+
+        def gate() -> None:
+            self.gate()
+            if out is not None:
+                out()
+
+        yield from _try(self, lambda: self.exchange.write(self.hand, values, gate))
+
+    def look(self) -> Generator[None, None, Status]:
+        """Read how the gripper is, now."""
+        yield from _try(self, lambda: self.exchange.read(self.hand))
+        return self.hand.fresh(self.exchange.clock(), self.exchange.stale_after_ns)
+
+    def resetting(self) -> Steps:
+        """Take the activation away, and its faults with it; nothing moves."""
+        exchange, hand = self.exchange, self.hand
+        self.gate()
+        exchange.end_motion(hand, f"{self.service} was called")
+        yield from self.tell(table.RESET)
+        until_ns = exchange.clock() + _RESET_NS
+        while not (status := (yield from self.look())).reset or table.fault_text(status.fault):
+            if exchange.clock() > until_ns:
+                raise hand.faulty(hand.fault or "it was reset, but keeps its activation")
+        hand.fault = ""
+
+
+class ClearFault(Command):
+    """Reset the device: nothing moves."""
+
+    def steps(self) -> Steps:
+        _require_answering(self)
+        yield from self.resetting()
+
+
+class Motion(Command):
+    """What sets the fingers moving, and is watched until something ends it."""
+
+    def __init__(
+        self,
+        exchange: "Exchange",
+        hand: Hand,
+        *,
+        service: str,
+        expires_ns: int,
+        until_ns: int | None,
+        permit: Permit,
+    ) -> None:
+        super().__init__(exchange, hand, service=service, expires_ns=expires_ns, permit=permit)
+        self._until_ns = until_ns
+        self._began_ns = self._watched_ns = 0
+        self._position = -1
+        self._waiting_s = 0.0
+        self._patience_s = 0.0
+
+    def launching(self, values: Sequence[int], patience_s: float) -> Steps:
+        """Write what sets the fingers moving; from the first byte on somebody looks after them."""
+        try:
+            yield from self.tell(values, out=lambda: self.exchange.take_over(self))
+        except TradeError as problem:
+            self.exchange.release(self, problem)
+            raise
+        self.note("wrote goal")
+        self._patience_s = patience_s
+        self._began_ns = self._watched_ns = self.exchange.clock()
+
+    def done_stepping(self) -> None:
+        """Launched; now it is watched. (It has ended already if anything was refused.)"""
+
+    def watch(self, now_ns: int) -> None:
+        """Look at the newest measurement; end it if it is over or must not go on."""
+        if not self._began_ns:
+            return
+        ending = self._trouble(now_ns)
+        sample = self.hand.sample
+        if ending is None and sample is not None and sample.at_ns > self._began_ns:
+            if self.arrived(sample):
+                self.exchange.release(self, None)
+                return
+            ending = self.stuck(sample, now_ns)
+        if ending is not None:
+            self.exchange.release(self, ending)
+
+    def arrived(self, sample: Status) -> bool:
+        """Whether it is over."""
+        raise NotImplementedError
+
+    def stuck(self, sample: Status, now_ns: int) -> TradeError | None:
+        """What keeps it from coming to an end."""
+        elapsed_s = min((now_ns - self._watched_ns) / 1e9, _MOST_PER_CYCLE_S)
+        self._watched_ns = now_ns
+        self._waiting_s = self._waiting_s + elapsed_s if sample.position == self._position else 0.0
+        self._position = sample.position
+        self._patience_s -= elapsed_s
+        if self._patience_s > 0 and self._waiting_s <= _STUCK_S:
+            return None
+        self.hand.fault = "it says that it moves, but its fingers stand: its position sensor may be broken"
+        return self.hand.faulty()
+
+    def _trouble(self, now_ns: int) -> TradeError | None:
+        hand = self.hand
+        if hand.silent or hand.age_ns(now_ns) > self.exchange.stale_after_ns:
+            return hand.deaf(now_ns)
+        if hand.fault:
+            return hand.faulty()
+        if self._until_ns is not None and now_ns >= self._until_ns:
+            return MotionStopped(device=hand.name, reason="the deadline of its call came; give it a longer one")
+        return None
+
+
+class Activate(Motion):
+    """The fingers find their stops."""
+
+    def steps(self) -> Steps:
+        _require_answering(self)
+        status = yield from self.look()
+        if status.activated and not self.hand.fault:
+            self.finish()
+            return
+        yield from self.resetting()
+        yield from self.launching(table.ACTIVATE, _ACTIVATION_S)
+
+    def arrived(self, sample: Status) -> bool:
+        return sample.activated and self.hand.still > 0
+
+    def stuck(self, sample: Status, now_ns: int) -> TradeError | None:
+        if sample.reset and now_ns - self._began_ns > _TAKEN_NS:
+            return self.hand.inactive("it did not begin its activation, or lost its power in the middle of it")
+        problem = super().stuck(sample, now_ns)
+        if problem is not None:
+            self.hand.fault = "its activation does not end: something may be in the way of its fingers"
+            return self.hand.faulty()
+        return None
+
+
+class Move(Motion):
+    """The fingers go to a width, or until they meet something."""
+
+    def __init__(
+        self,
+        exchange: "Exchange",
+        hand: Hand,
+        registers: tuple[int, int, int],
+        *,
+        service: str,
+        expires_ns: int,
+        until_ns: int | None,
+        permit: Permit,
+    ) -> None:
+        super().__init__(exchange, hand, service=service, expires_ns=expires_ns, until_ns=until_ns, permit=permit)
+        self._registers = registers
+        self._goal = registers[1]
+
+    def steps(self) -> Steps:
+        hand, exchange = self.hand, self.exchange
+        hand.check_usable(exchange.clock(), exchange.stale_after_ns)
+        slowest_m_s, _ = hand.model.speeds_m_s
+        yield from self.launching(self._registers, 1.0 + 2 * hand.model.stroke_m / slowest_m_s)
+        hand.force_counts = self._registers[2] & 0xFF
+
+    def arrived(self, sample: Status) -> bool:
+        taken = sample.going and sample.echo == self._goal and sample.activated
+        return taken and sample.contact != Contact.MOVING and self.hand.still > 0 and not self._elsewhere(sample)
+
+    def _elsewhere(self, sample: Status) -> bool:
+        """It says that it is where it should be, and it is not."""
+        short = abs(sample.position - self.hand.model.expected(self._goal))
+        return sample.contact == Contact.ARRIVED and short > _NEAR_COUNTS
+
+    def stuck(self, sample: Status, now_ns: int) -> TradeError | None:
+        if not sample.activated:
+            return self.hand.inactive("it has lost its activation; did its power fail?")
+        if (sample.echo != self._goal or not sample.going) and now_ns - self._began_ns > _TAKEN_NS:
+            return self.hand.faulty("it does not take a command")
+        return super().stuck(sample, now_ns)
+
+
+def _require_answering(job: Command) -> None:
+    if job.hand.silent:
+        raise job.hand.deaf(job.exchange.clock())
+
+
+def _try(job: Command, act: Callable[[], None]) -> Steps:
+    """One exchange within the retry budget; a probe before each retry keeps late answers from being taken for new."""
+    waited_s = 0.0
+    for attempt in range(_ATTEMPTS):
+        try:
+            if attempt:
+                job.exchange.probe(job.hand)
+                yield
+            act()
+        except DeadlineExceeded as late:
+            if attempt:  # it went out before, and nobody heard what became of it
+                raise OutcomeUnknown(service=late.service, deadline_s=late.deadline_s) from None
+            raise
+        except NoAnswer as silent:
+            waited_s += silent.waited_s
+            yield
+        except Refused as refused:
+            raise job.hand.faulty(f"it is no 2F-85: {refused}") from None
+        else:
+            yield
+            return
+    raise DeviceSilent(device=job.hand.name, bus=job.hand.bus, waited_s=waited_s)

@@ -1,0 +1,6 @@
+"""Arms of Universal Robots, through ur-rtde."""
+
+from trade_drivers.vendors.ur._driver import UrDriver
+from trade_drivers.vendors.ur._identify import identify
+
+__all__ = ["UrDriver", "identify"]

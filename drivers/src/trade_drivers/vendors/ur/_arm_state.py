@@ -1,0 +1,172 @@
+"""One arm as the bus thread knows it: what was measured last, how it is, what is under way."""
+
+import time
+from typing import TYPE_CHECKING, Final
+
+from trade import Resource
+from trade.errors import DeviceFault, DeviceSilent
+from trade_drivers.interfaces._arm import ArmState, Safety
+from trade_drivers.robotfile import Arm
+from trade_drivers.vendors.ur._messages import Sample
+
+if TYPE_CHECKING:
+    from trade_drivers.vendors.ur._jobs import Motion
+
+__all__ = ["JOINTS", "Limb"]
+
+JOINTS: Final = ("base", "shoulder", "elbow", "wrist_1", "wrist_2", "wrist_3")
+IDLE: Final = 5
+"""``robot_mode`` of an arm that is powered, with its brakes on."""
+RUNNING: Final = 7
+"""``robot_mode`` of an arm whose brakes are off."""
+_POWERED: Final = 1
+"""Bits of ``robot_status``."""
+_PROGRAM: Final = 2
+_PROTECTIVE_STOP: Final = 3
+_SAFETY: Final[dict[int, Safety]] = {
+    1: "normal",
+    2: "reduced",
+    _PROTECTIVE_STOP: "protective stop",
+    4: "recovery",
+    5: "safeguard stop",
+    6: "emergency stop",
+    7: "emergency stop",
+}
+_STILL_RAD_S: Final = 0.005
+_STILL: Final = 3
+"""Measurements in a row without motion: it is at rest."""
+
+
+class Limb:
+    """The state of one arm. The bus thread writes it; other threads read whole values."""
+
+    def __init__(self, name: str, host: str, arm: Arm) -> None:
+        self.name = name
+        self.resource = Resource(name)
+        """What locks and stops attach to."""
+        self.bus = host
+        self.arm = arm
+        self.joints = [f"{name}.{joint}" for joint in JOINTS]
+        self.sample: Sample | None = None
+        self.motion: Motion | None = None
+        self.halting_since_ns = 0
+        """When it was told to stop; 0 once it was seen at rest."""
+        self.still = 0
+        """Measurements in a row in which it did not move."""
+        self.misses = 0
+        self.doubted = False
+        self.silent = False
+        self.silent_since_ns = 0
+        self.probe_at_ns = 0
+
+    def take(self, sample: Sample) -> None:
+        """Note a measurement."""
+        self.still = self.still + 1 if max(abs(speed) for speed in sample.speeds) < _STILL_RAD_S else 0
+        self.sample, self.silent = sample, False
+
+    def tell_moving(self) -> None:
+        """Let the resource know whether it moves: as last measured or commanded."""
+        self.resource.moving = self.motion is not None or self.halting_since_ns > 0 or self.still == 0
+
+    def ended_since(self, since_ns: int) -> bool:
+        """A measurement made later shows that no program runs on the controller."""
+        sample = self.sample
+        return sample is not None and sample.at_ns > since_ns and not sample.robot_status & _PROGRAM
+
+    def at_rest(self, now_ns: int, stale_after_ns: int) -> bool:
+        """Seen at rest, now, with nothing of ours under way."""
+        return self.motion is None and self.still >= _STILL and self.age_ns(now_ns) <= stale_after_ns
+
+    def age_ns(self, now_ns: int) -> int:
+        """Age of the newest measurement, or the time it has been silent if there is none."""
+        return now_ns - (self.sample.at_ns if self.sample else self.silent_since_ns)
+
+    def fresh(self, now_ns: int, stale_after_ns: int) -> Sample:
+        """The newest measurement.
+
+        Raises:
+            DeviceSilent: it is too old, or there is none.
+        """
+        if self.sample is None or self.silent or self.age_ns(now_ns) > stale_after_ns:
+            raise self.deaf(now_ns)
+        return self.sample
+
+    def check_usable(self, now_ns: int, stale_after_ns: int) -> Sample:
+        """The newest measurement, if the arm may be commanded.
+
+        Raises:
+            DeviceSilent: its controller sends nothing new.
+            DeviceFault: it is stopped, without power, or on its brakes.
+        """
+        sample = self.fresh(now_ns, stale_after_ns)
+        if self.fault:
+            raise self.faulty()
+        return sample
+
+    @property
+    def safety(self) -> Safety:
+        """What its safety system says."""
+        return "fault" if self.sample is None else _SAFETY.get(self.sample.safety_mode, "fault")
+
+    @property
+    def enabled(self) -> bool:
+        """Its brakes are off."""
+        return self.sample is not None and self.sample.robot_mode == RUNNING
+
+    @property
+    def powered(self) -> bool:
+        """It has power."""
+        return self.sample is not None and bool(self.sample.robot_status & _POWERED)
+
+    @property
+    def fault(self) -> str:
+        """Why it cannot be moved; empty if it can."""
+        if self.safety not in {"normal", "reduced"}:
+            return f"its safety system says: {self.safety}"
+        if not self.powered:
+            return "its power is off"
+        return "" if self.enabled else "its brakes are on"
+
+    @property
+    def remedy(self) -> str:
+        """What to do about it."""
+        if self.safety == "protective stop":
+            return "remove the cause, then call unlock_protective_stop()"
+        if self.safety not in {"normal", "reduced"}:
+            return "remove the cause and release it at the controller"
+        if not self.powered:
+            return "call power_on() and release_brakes()"
+        return "try again, or look at the controller's log" if self.enabled else "call release_brakes()"
+
+    def deaf(self, now_ns: int) -> DeviceSilent:
+        """The error of a controller that sends nothing new."""
+        return DeviceSilent(device=self.name, bus=self.bus, waited_s=self.age_ns(now_ns) / 1e9)
+
+    def faulty(self, fault: str = "") -> DeviceFault:
+        """The error of an arm that does not do what it was told; by default for the reason it has."""
+        return DeviceFault(device=self.name, bus=self.bus, fault=fault or self.fault, remedy=self.remedy)
+
+    def state(self, now_ns: int, stale_after_ns: int, *, freedrive: bool) -> ArmState:
+        """What was last measured.
+
+        Raises:
+            DeviceSilent: it is too old.
+        """
+        sample = self.fresh(now_ns, stale_after_ns)
+        age_s = (now_ns - sample.at_ns) / 1e9
+        return ArmState(
+            name=self.name,
+            positions_rad=sample.positions,
+            velocities_rad_s=sample.speeds,
+            pose=sample.pose,
+            powered=self.powered,
+            enabled=self.enabled,
+            moving=self.motion is not None or self.still == 0,
+            freedrive=freedrive,
+            safety=self.safety,
+            speed_scaling=sample.speed_fraction,
+            fault=self.fault,
+            remedy=self.remedy if self.fault else "",
+            measured_at=time.monotonic() - age_s,
+            age_s=age_s,
+        )

@@ -1,0 +1,165 @@
+"""Bringing a controller's arm up, and handing it out."""
+
+import time
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from typing import Final, NoReturn
+
+from msgspec import structs
+
+from trade import Measure
+from trade.errors import ConfigurationError
+from trade_drivers import robotfile
+from trade_drivers.bus._host_lock import HostLock, Taken
+from trade_drivers.bus._jobs import PortLost
+from trade_drivers.bus._thread import BusThread
+from trade_drivers.faults import Tell
+from trade_drivers.interfaces._arm import Arm
+from trade_drivers.interfaces._motion import JointGroup, Motor
+from trade_drivers.plugins._driver import AttachedBus, Driver
+from trade_drivers.robotfile import Bus, Robot, UrBus
+from trade_drivers.vendors.ur._arm_state import Limb
+from trade_drivers.vendors.ur._cycle import Exchange
+from trade_drivers.vendors.ur._dashboard import DashboardError, ask, commanded
+from trade_drivers.vendors.ur._link import Link
+from trade_drivers.vendors.ur._ur_arm import UrArm
+
+__all__ = ["UrDriver"]
+
+_CYCLES_HZ: Final = {
+    "UR3": 125.0,
+    "UR5": 125.0,
+    "UR10": 125.0,
+    "UR3e": 500.0,
+    "UR5e": 500.0,
+    "UR10e": 500.0,
+    "UR16e": 500.0,
+}
+"""Models of the CB3 and of the e-Series, and how many cycles a second their controllers have."""
+_ASK_S: Final = 1.0
+_LET_GO_S: Final = 2.0
+_AGAIN_S: Final = 0.1
+
+
+class AttachedController(AttachedBus):
+    """A controller with its arm, and the thread that owns it."""
+
+    def __init__(self, thread: BusThread[Exchange], link: Link, lock: HostLock) -> None:
+        self._thread, self._link, self._lock = thread, link, lock
+
+    def motor(self, joint: str) -> Motor:
+        raise ConfigurationError(where=f'joint."{joint}"', problem="driver ur has no joints, only an arm: [arm.NAME]")
+
+    def group(self, name: str, joints: Sequence[str]) -> JointGroup:
+        raise ConfigurationError(where=name, problem=f"driver ur has no joints such as {', '.join(joints)}")
+
+    def arm(self, name: str) -> Arm:  # noqa: ARG002 - there is one
+        return UrArm(self._thread, self._thread.exchange.limb)
+
+    def measures(self, bus: str) -> list[Measure]:
+        return self._thread.measures(bus)
+
+    def watched(self, tell: Tell) -> bool:
+        self._thread.watched(tell)
+        return True
+
+    def unseen(self) -> list[str]:
+        return self._thread.unseen
+
+    def close(self) -> None:
+        try:
+            self._thread.close()
+        finally:
+            self._link.wait_closed()
+            self._lock.release()
+
+
+class UrDriver(Driver):
+    """Arms of Universal Robots, through ur-rtde."""
+
+    modules = ("rtde_control", "rtde_receive", "rtde_io")
+
+    devices = (robotfile.Arm,)
+
+    def check(self, robot: Robot, bus: Bus) -> None:
+        self._limb_of(robot, bus, bus.name)
+
+    def _limb_of(self, robot: Robot, bus: Bus, port: str) -> tuple[Limb, UrBus]:
+        """What the file alone can tell is checked."""
+        if not isinstance(bus, UrBus):
+            _wrong(f"{robot.where}: bus.{bus.name}", 'driver ur needs a controller: host = "192.168.0.10"')
+        if missing := self.missing():
+            problem = (
+                f'needs ur-rtde ({missing[0]} is missing); pip install "trade-drivers[ur]", or on platforms without'
+            )
+            _wrong("driver ur", f"{problem} its wheel (all but Linux x86_64 with Python 3.10-3.12) build ur-rtde 1.6.5")
+        limb = _limb(robot, bus, port)
+        return limb, structs.replace(bus, rate_hz=bus.rate_hz or _CYCLES_HZ[limb.arm.model])
+
+    def attach(self, robot: Robot, bus: Bus, port: str, healthy: Callable[[], bool]) -> AttachedBus:
+        where = f"{robot.where}: bus.{bus.name}"
+        limb, bus = self._limb_of(robot, bus, port)
+        link, lock = Link(port), HostLock(f"ur:{port}", where)
+        with ExitStack() as undo:
+            try:
+                lock.take()
+            except Taken as taken:
+                _wrong(f"{where}.host", f"{port}: another driver of this host has it: {taken}; stop it first")
+            undo.callback(lock.release)
+            undo.callback(link.wait_closed)
+            undo.callback(link.close)
+            try:
+                link.wait_open()
+                _refuse_company(port, where)
+                _look_over(limb, f"{robot.where}: arm.{limb.arm.name}")
+            except (PortLost, DashboardError) as problem:
+                _wrong(f"{where}.host", f"{problem}; is it switched on, and is this its address?")
+            exchange = Exchange(link, bus, limb)
+            exchange.listen()
+            _stop_if_moving(exchange)
+            thread = BusThread(exchange, link, bus, healthy, name=f"bus {robot.name}.{bus.name}")
+            thread.start()
+            undo.pop_all()
+        return AttachedController(thread, link, lock)
+
+
+def _limb(robot: Robot, bus: UrBus, port: str) -> Limb:
+    arms = robot.arms_on(bus.name)
+    if len(arms) != 1 or robot.joints_on(bus.name) or robot.grippers_on(bus.name):
+        _wrong(f"{robot.where}: bus.{bus.name}", "a controller has one arm, and nothing else: [arm.NAME]")
+    [arm] = arms
+    if arm.model not in _CYCLES_HZ:
+        problem = f"{arm.model!r} is unknown to the driver ur; it knows {', '.join(_CYCLES_HZ)}"
+        _wrong(f"{robot.where}: arm.{arm.name}.model", problem)
+    if bus.rate_hz > _CYCLES_HZ[arm.model]:
+        problem = f"{bus.rate_hz:g} is more than the {_CYCLES_HZ[arm.model]:g} cycles a second of a {arm.model}"
+        _wrong(f"{robot.where}: bus.{bus.name}.rate_hz", problem)
+    if bus.leave != "hold":
+        _wrong(f"{robot.where}: bus.{bus.name}.leave", '"relax" is nothing an arm can: it would fall; use "hold"')
+    return Limb(f"{robot.name}.{arm.name}", port, arm)
+
+
+def _refuse_company(port: str, where: str) -> None:
+    """One that another program has control of is left alone. A process that was killed keeps that for a moment."""
+    until = time.monotonic() + _LET_GO_S
+    while commanded(port, _ASK_S):
+        if time.monotonic() > until:
+            _wrong(f"{where}.host", f"{port}: another program has control of this arm; stop it first")
+        time.sleep(_AGAIN_S)
+
+
+def _look_over(limb: Limb, where: str) -> None:
+    """See that it is the arm of the robot file; nothing is commanded."""
+    answer = ask(limb.bus, "get robot model", _ASK_S)
+    if answer.rstrip("e").upper() != limb.arm.model.rstrip("e").upper():
+        _wrong(f"{where}.model", f"the controller at {limb.bus} has a {answer}, not a {limb.arm.model}")
+
+
+def _stop_if_moving(exchange: Exchange) -> None:
+    """Found moving and owned by nobody, it is stopped (S18)."""
+    if exchange.limb.still == 0:
+        ask(exchange.limb.bus, "stop", _ASK_S)
+
+
+def _wrong(where: str, problem: str) -> NoReturn:
+    raise ConfigurationError(where=where, problem=problem)

@@ -1,0 +1,37 @@
+"""Asking a controller which arm hangs on it. Nothing but questions."""
+
+import re
+from typing import Final
+
+from trade.errors import ConfigurationError
+from trade_drivers.commissioning._commissioner import Found
+from trade_drivers.vendors.ur._dashboard import DashboardError, ask
+
+__all__ = ["identify"]
+
+_ASK_S: Final = 2.0
+_VERSION: Final = re.compile(r"(\d+)\.\d+(?:\.\d+)*")
+_E_SERIES: Final = 5
+"""Their software begins with it; that of the CB3 with 3."""
+
+
+def identify(host: str) -> Found:
+    """The arm behind a controller: its model, the version of its software, its serial number.
+
+    Raises:
+        ConfigurationError: nobody is there, or it is no controller.
+    """
+    try:
+        model = ask(host, "get robot model", _ASK_S)
+        version = _VERSION.search(ask(host, "PolyscopeVersion", _ASK_S))
+        serial_number = ask(host, "get serial number", _ASK_S)
+    except DashboardError as bad:
+        raise ConfigurationError(where=host, problem=f"no controller of an arm answers: {bad}") from None
+    e_series = version is not None and int(version[1]) >= _E_SERIES
+    return Found(
+        driver="ur",
+        kind="arm",
+        model=f"{model.rstrip('e')}e" if e_series else model,
+        firmware=version[0] if version else "",
+        serial_number=int(serial_number) if serial_number.isdecimal() else None,
+    )

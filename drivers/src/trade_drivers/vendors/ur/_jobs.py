@@ -1,0 +1,378 @@
+"""What services ask of the bus thread: moves, set-points, freedrive, the speed slider."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Final
+
+from trade import Permit
+from trade.errors import DeadlineExceeded, InvalidArgument, LimitExceeded, MotionStopped, ToleranceExceeded, TradeError
+from trade_drivers.bus._jobs import Steps, Work, check_admitted
+from trade_drivers.motion._plan import Plan
+from trade_drivers.vendors.ur._arm_state import Limb
+from trade_drivers.vendors.ur._line_path import poses_on
+from trade_drivers.vendors.ur._messages import Free, MoveJoints, MoveLine, Sample, Solve
+from trade_drivers.vendors.ur._setpoint_filter import Chase
+
+if TYPE_CHECKING:
+    from trade_drivers.vendors.ur._cycle import Exchange
+
+__all__ = ["Command", "EndFreedrive", "Follow", "Freedrive", "LineMove", "Motion", "Move", "Scaling", "SetPoint"]
+
+_NEAR: Final = 0.01
+"""rad or m: closer to its goal, a move has arrived."""
+_OUTSIDE_RAD: Final = 0.02
+"""So far outside its range a joint may be measured, where nothing was told to leave it."""
+_STUCK_NS: Final = 1_000_000_000
+"""A move that is under way changes what is measured in that time."""
+_FOREVER_NS: Final = 2**63
+_HELD_UP_NS: Final = 200_000_000
+
+
+class Command(Work[Limb]):
+    """What needs leave: it carries an expiry, and the permit under which its call was admitted."""
+
+    def __init__(self, exchange: "Exchange", *, service: str, expires_ns: int, permit: Permit) -> None:
+        super().__init__([exchange.limb])
+        self.exchange = exchange
+        self.limb = exchange.limb
+        self.service = service
+        self.expires_ns = expires_ns
+        self._permit = permit
+        self._admitted_ns = exchange.clock()
+
+    def gate(self) -> None:
+        """The last look before its bytes go out.
+
+        Raises:
+            DeadlineExceeded: it is late, and late is never.
+            MotionStopped, LockLost, LockedByOther: a stop, or another owner, came after it was admitted.
+        """
+        now_ns = self.exchange.clock()
+        check_admitted(
+            self.service, self._permit, admitted_ns=self._admitted_ns, expires_ns=self.expires_ns, now_ns=now_ns
+        )
+
+    def expired(self) -> DeadlineExceeded:
+        """The error of a command that came too late to be carried out."""
+        return DeadlineExceeded(service=self.service, deadline_s=(self.expires_ns - self._admitted_ns) / 1e9)
+
+    def usable(self) -> Sample:
+        """The newest measurement of an arm that may be commanded; raises as ``Limb.check_usable``."""
+        return self.limb.check_usable(self.exchange.clock(), self.exchange.stale_after_ns)
+
+
+class Scaling(Command):
+    """Set the speed slider."""
+
+    def __init__(self, exchange: "Exchange", fraction: float, *, service: str, expires_ns: int, permit: Permit) -> None:
+        super().__init__(exchange, service=service, expires_ns=expires_ns, permit=permit)
+        self._fraction = fraction
+
+    def steps(self) -> Steps:
+        self.limb.fresh(self.exchange.clock(), self.exchange.stale_after_ns)
+        yield from self.exchange.scaling(self, self._fraction, self.expires_ns)
+
+
+class EndFreedrive(Command):
+    """The arm holds itself again."""
+
+    def steps(self) -> Steps:
+        if isinstance(self.limb.motion, Freedrive):
+            self.gate()
+            yield from self.exchange.making_way()
+
+
+class Motion(Command):
+    """What sets the arm moving, and is watched until something ends it."""
+
+    streams = False
+    """It is a stream of set-points, which has to be ended also when it ends well."""
+    attended_ns = 0
+    """When it was last looked after, by the lasting clock."""
+
+    def watch(self, now_ns: int) -> None:
+        """Look at the newest measurement; end it if it is over or must not go on."""
+        raise NotImplementedError
+
+    def trouble(self, now_ns: int, until_ns: int | None) -> TradeError | None:
+        """Why it may not go on: a driver that was held up, silence, a fault, or the end of its call."""
+        attended_ns, self.attended_ns = self.attended_ns, self.exchange.lasting_clock()
+        if held_up := self.exchange.held_up(attended_ns):
+            return self.limb.faulty(f"{self.limb.fault}; {held_up}" if self.limb.fault else held_up)
+        try:
+            self.usable()
+        except TradeError as problem:
+            return problem
+        if until_ns is not None and now_ns >= until_ns:
+            return MotionStopped(device=self.limb.name, reason="the deadline of its call came; give it a longer one")
+        return None
+
+    def astray(self, sample: Sample) -> LimitExceeded | None:
+        """A joint is outside its range and goes on outwards. (From outside it may come back.)"""
+        arm = self.limb.arm
+        spans = zip(self.limb.joints, sample.positions, sample.speeds, arm.min_rad, arm.max_rad, strict=True)
+        for name, angle, speed, low, high in spans:
+            if (angle > high + _OUTSIDE_RAD and speed > 0) or (angle < low - _OUTSIDE_RAD and speed < 0):
+                return LimitExceeded(what=f"{name}, measured", value=angle, lower=low, upper=high, unit="rad")
+        return None
+
+    def done_stepping(self) -> None:
+        """Launched; now it is watched. (It has ended already if anything was refused.)"""
+
+    def beginning(self) -> Steps:
+        """Have control, and the arm at rest."""
+        self.usable()
+        self.gate()
+        yield from self.exchange.taking_control(self)
+        yield from self.exchange.making_way()
+        self.usable()
+
+
+class Freedrive(Motion):
+    """It can be moved by hand, until somebody ends it; whoever asked is let go at once."""
+
+    def steps(self) -> Steps:
+        yield from self.beginning()
+        self.exchange.take_over(self)
+        try:
+            yield from self.exchange.carrying_out(self, lambda number: Free(number=number, expires_ns=self.expires_ns))
+        except TradeError as problem:
+            self.exchange.release(self, problem)
+            raise
+        self.expires_ns = _FOREVER_NS
+        self.finish()
+
+    def watch(self, now_ns: int) -> None:  # noqa: ARG002 - the gate looks at the clock itself
+        try:
+            self.gate()
+            self.usable()
+        except TradeError as ending:
+            self.exchange.release(self, ending)
+
+
+class Move(Motion):
+    """A move with an end, in joint space."""
+
+    def __init__(
+        self,
+        exchange: "Exchange",
+        goal: Sequence[float],
+        speed: float,
+        *,
+        service: str,
+        expires_ns: int,
+        until_ns: int | None,
+        permit: Permit,
+    ) -> None:
+        super().__init__(exchange, service=service, expires_ns=expires_ns, permit=permit)
+        self.goal = list(goal)
+        self.speed = speed
+        self._until_ns = until_ns
+        self._pulses = -1
+        """How many words there were of its process when it began."""
+        self._place: list[float] = []
+        self._moved_ns = 0
+
+    def order(self, number: int) -> MoveJoints | MoveLine:
+        """What is sent."""
+        accel = self.limb.arm.max_accel_rad_s2
+        return MoveJoints(number=number, expires_ns=self.expires_ns, positions=self.goal, speed=self.speed, accel=accel)
+
+    def off(self, sample: Sample) -> float:
+        """How far it is from its goal."""
+        return max(abs(a - b) for a, b in zip(sample.positions, self.goal, strict=True))
+
+    def steps(self) -> Steps:
+        yield from self.beginning()
+        self.exchange.take_over(self)
+        try:
+            yield from self.exchange.carrying_out(self, self.order)
+        except TradeError as problem:
+            self.exchange.release(self, problem)
+            raise
+        self.note("began its move")
+        self.attended_ns = self.exchange.lasting_clock()
+        control = self.exchange.link.control
+        self._pulses = 0 if control is None else control.pulses
+
+    def watch(self, now_ns: int) -> None:
+        control, sample = self.exchange.link.control, self.limb.sample
+        if self._pulses < 0 or control is None or sample is None:
+            return
+        ending = self.trouble(now_ns, self._until_ns) or self.astray(sample) or self._stuck(sample)
+        over = ending is None and control.pulses > self._pulses + 1 and not control.running and self.limb.still > 2
+        if over and self.off(sample) > _NEAR:
+            ending = self.limb.faulty("its move ended before it was there")
+        if over or ending is not None:
+            self.exchange.release(self, ending)
+
+    def _stuck(self, sample: Sample) -> TradeError | None:
+        """What is measured does not change at all: it is blocked, held up, or what is told is old."""
+        if sample.positions != self._place or not self._moved_ns:
+            self._place, self._moved_ns = sample.positions, sample.at_ns
+        return self.limb.faulty("it makes no progress") if sample.at_ns - self._moved_ns > _STUCK_NS else None
+
+
+class LineMove(Move):
+    """A move with an end, of the tool in a line."""
+
+    def order(self, number: int) -> MoveLine:
+        accel = self.limb.arm.max_accel_m_s2
+        return MoveLine(number=number, expires_ns=self.expires_ns, pose=self.goal, speed=self.speed, accel=accel)
+
+    def off(self, sample: Sample) -> float:
+        return max(abs(a - b) for a, b in zip(sample.pose[:3], self.goal[:3], strict=True))
+
+    def beginning(self) -> Steps:
+        yield from super().beginning()
+        sample = self.usable()
+        near, poses = sample.positions, poses_on(sample.pose, self.goal)
+        for pose in poses:
+            done = yield from self.exchange.carrying_out(
+                self,
+                lambda number, pose=pose, near=near: Solve(
+                    number=number, expires_ns=self.expires_ns, pose=pose, near=near
+                ),
+            )
+            if not done.angles:
+                problem = f"the line leads out of reach: there are no joint angles for {pose}"
+                raise InvalidArgument(service=self.service, argument="pose", problem=problem)
+            self._check_range(near, done.angles)
+            near = done.angles
+
+    def _check_range(self, before: Sequence[float], angles: Sequence[float]) -> None:
+        arm = self.limb.arm
+        spans = zip(self.limb.joints, before, angles, arm.min_rad, arm.max_rad, strict=True)
+        for name, was, angle, low, high in spans:
+            if (angle > high and angle > was) or (angle < low and angle < was):
+                raise LimitExceeded(what=f"{name} on the line", value=angle, lower=low, upper=high, unit="rad")
+
+
+class SetPoint(Motion):
+    """Angles that hold for a short while only; not renewed in time, the arm stops.
+
+    Each renewal is a set-point of its own, admitted anew, that takes over from the one before, and goes on from where
+    the stream has got to.
+    """
+
+    streams = True
+
+    def __init__(
+        self,
+        exchange: "Exchange",
+        goal: Sequence[float],
+        *,
+        service: str,
+        expires_ns: int,
+        valid_ns: int,
+        permit: Permit,
+    ) -> None:
+        super().__init__(exchange, service=service, expires_ns=expires_ns, permit=permit)
+        self._goal = list(goal)
+        self._until_ns = exchange.clock() + valid_ns
+        self._valid_ns = valid_ns
+        self._chase: Chase | None = None
+        self._sent_ns = 0
+
+    def steps(self) -> Steps:
+        before = self.limb.motion
+        if isinstance(before, SetPoint) and before._chase is not None and self.exchange.taken:
+            self.usable()
+            self._chase, self._sent_ns = before._chase, before._sent_ns
+        else:
+            yield from self.beginning()
+            arm = self.limb.arm
+            self._chase = Chase(self.usable().positions, arm.max_speed_rad_s, arm.max_accel_rad_s2)
+            self._sent_ns = self.exchange.clock() - self.exchange.period_ns
+            self._until_ns = self.exchange.clock() + self._valid_ns  # control had to be taken first
+        self.gate()
+        self.exchange.take_over(self)
+        self.expires_ns = self._until_ns  # on its way, it lasts as long as it was said to
+        self._send(self.exchange.clock())
+        self.finish()
+
+    def watch(self, now_ns: int) -> None:
+        """What would keep it from being sent ends it, too: its time, a stop, a lock, a fault, silence."""
+        try:
+            self._send(now_ns)
+        except TradeError as ending:
+            self.exchange.release(self, ending)
+
+    def _send(self, now_ns: int) -> None:
+        self.gate()
+        if (ending := self.trouble(now_ns, None) or self.astray(self.usable())) is not None:
+            raise ending
+        if self._chase is not None and now_ns - self._sent_ns >= self.exchange.period_ns // 2:
+            dt = min(now_ns - self._sent_ns, 5 * self.exchange.period_ns) / 1e9
+            self._sent_ns = now_ns
+            self.exchange.stream(self._chase.step(self._goal, dt))
+
+
+class Follow(Motion):
+    """A trajectory: in every cycle what is due goes out, and every joint is compared with where it should be."""
+
+    streams = True
+
+    def __init__(
+        self,
+        exchange: "Exchange",
+        plan: Plan,
+        *,
+        service: str,
+        expires_ns: int,
+        until_ns: int | None,
+        permit: Permit,
+    ) -> None:
+        super().__init__(exchange, service=service, expires_ns=expires_ns, permit=permit)
+        self._plan = plan
+        self._until_ns = until_ns
+        self._told_ns = 0
+
+    def steps(self) -> Steps:
+        yield from self.beginning()
+        self._compare(self.usable(), "start", self._plan.tolerances.start_rad)
+        self.gate()
+        self.exchange.take_over(self)
+        self.expires_ns = _FOREVER_NS  # it began in time: how long it may take is another matter
+        self._told_ns = self.exchange.clock()
+        self._plan.course.ready(self._told_ns)
+
+    def watch(self, now_ns: int) -> None:
+        if not self._told_ns:
+            return
+        try:
+            self.gate()
+            self._go_on(now_ns)
+        except TradeError as ending:
+            self._plan.course.fail(ending)
+            self.exchange.release(self, ending)
+
+    def _go_on(self, now_ns: int) -> None:
+        if (ending := self.trouble(now_ns, self._until_ns)) is not None:
+            raise ending
+        if now_ns - self._told_ns > _HELD_UP_NS:
+            raise MotionStopped(device=self.limb.name, reason="its bus was held up: nothing told it where to go")
+        course, tolerances, sample = self._plan.course, self._plan.tolerances, self.usable()
+        if course.failed is not None:
+            raise MotionStopped(device=self.limb.name, reason=f"its group could not go on: {course.failed}")
+        if (astray := self.astray(sample)) is not None:
+            raise astray
+        self._compare(sample, "path", tolerances.path_rad)
+        late_s = course.elapsed_s(now_ns) - course.duration_s
+        if late_s >= 0 and self.limb.still > 2:
+            self._compare(sample, "goal", tolerances.goal_rad)
+            self.exchange.release(self, None)
+            return
+        if late_s > tolerances.goal_time_s:
+            raise self.limb.faulty("it does not come to rest at the end of its trajectory")
+        self.exchange.stream([track.curve.at(course.elapsed_s(now_ns))[0] for track in self._plan.tracks])
+        self._told_ns = now_ns
+
+    def _compare(self, sample: Sample, what: str, tolerance_rad: float) -> None:
+        elapsed_s = self._plan.course.elapsed_s(sample.at_ns)
+        for name, angle, track in zip(self.limb.joints, sample.positions, self._plan.tracks, strict=True):
+            error = angle - track.curve.at(elapsed_s)[0]
+            self._plan.course.note(track.limits.name, error)
+            if abs(error) > tolerance_rad:
+                raise ToleranceExceeded(
+                    device=name, bus=self.limb.bus, what=what, error_rad=error, tolerance_rad=tolerance_rad
+                )

@@ -1,0 +1,102 @@
+"""The child process that reads: it sends every new measurement, and sets the speed slider.
+
+The library tells old values as if they were new, and its constructor waits for ever for a server that is silent. So a
+value is as old as the controller's own time stamp says, the ports are probed first, and nobody waits for this process.
+"""
+
+import os
+import signal
+import socket
+import sys
+import time
+from contextlib import suppress
+from typing import Any, Final
+
+from trade_drivers.vendors.ur._clock_offset import Age
+from trade_drivers.vendors.ur._dashboard import DashboardError, probe
+from trade_drivers.vendors.ur._messages import Channel, Done, Failed, Gone, Hello, Order, Sample, Scale
+
+RATE_HZ: Final = 125.0
+_PROBE_S: Final = 1.0
+_PROBED_S: Final = 5.0
+"""The alarm while three ports are probed one after the other."""
+_STUCK_S: Final = 3.0
+_FIELDS: Final = [
+    *("timestamp", "actual_q", "actual_qd", "actual_TCP_pose", "robot_mode", "safety_mode"),
+    *("robot_status_bits", "safety_status_bits", "runtime_state", "target_speed_fraction"),
+]
+
+
+class Child:
+    """Reads until the connection, or whoever started it, is gone."""
+
+    def __init__(self, host: str, channel: "Channel[Order]") -> None:
+        import rtde_io  # noqa: PLC0415  # pyright: ignore[reportMissingTypeStubs]
+        import rtde_receive  # noqa: PLC0415  # pyright: ignore[reportMissingTypeStubs]
+
+        self._io_library: Any = rtde_io
+        library: Any = rtde_receive
+        self._robot = library.RTDEReceiveInterface(host, RATE_HZ, _FIELDS)
+        self._io: Any = None
+        self._host = host
+        self._channel = channel
+        self._clock = 0.0
+        self._age = Age()
+
+    def run(self) -> None:
+        """A measurement whenever there is a new one; orders in between."""
+        self._channel.send(Hello())
+        while self._robot.isConnected():
+            signal.setitimer(signal.ITIMER_REAL, _STUCK_S)
+            self._measure()
+            order = self._channel.receive(1 / (2 * RATE_HZ))
+            if isinstance(order, Scale):
+                late = time.monotonic_ns() >= order.expires_ns
+                self._channel.send(Done(order.number, "" if late else self._scale(order), late))
+
+    def _measure(self) -> None:
+        robot = self._robot
+        at_ns = time.monotonic_ns()  # before it is read: what comes between makes it older, not younger
+        clock = robot.getTimestamp()
+        if clock == self._clock:
+            return
+        self._clock = clock
+        self._channel.send(
+            Sample(
+                self._age.measured_ns(at_ns, int(clock * 1e9)),
+                robot.getActualQ(),
+                robot.getActualQd(),
+                robot.getActualTCPPose(),
+                robot.getRobotMode(),
+                robot.getSafetyMode(),
+                robot.getRobotStatus(),
+                robot.getTargetSpeedFraction(),
+            )
+        )
+
+    def _scale(self, order: Scale) -> str:
+        try:
+            self._io = self._io or self._io_library.RTDEIOInterface(self._host)
+        except RuntimeError as problem:
+            return str(problem)
+        return "" if self._io.setSpeedSlider(order.fraction) else "the controller refused"
+
+
+def main() -> None:
+    """Serve the socket whose number is the first argument, for the controller at the second."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGALRM, signal.SIG_DFL)
+    host, channel = sys.argv[2], Channel[Order](socket.socket(fileno=int(sys.argv[1])), Order)
+    with suppress(Gone):
+        try:
+            signal.setitimer(signal.ITIMER_REAL, _PROBED_S)
+            probe(host, _PROBE_S)
+            signal.setitimer(signal.ITIMER_REAL, _STUCK_S)
+            Child(host, channel).run()
+        except (DashboardError, RuntimeError) as problem:
+            channel.send(Failed(str(problem)))
+    os._exit(0)
+
+
+if __name__ == "__main__":
+    main()

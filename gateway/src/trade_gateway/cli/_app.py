@@ -1,0 +1,181 @@
+"""The command ``trade``: bring a robot up, look at a system, call its services."""
+
+import os
+import sys
+from collections.abc import Sequence
+from importlib import import_module
+from typing import Annotated, Final
+
+import typer
+
+from trade.errors import TradeError
+from trade_gateway.cli._output import UsageError, say_error
+from trade_gateway.cli._system_choice import SystemChoice
+from trade_gateway.process._parent_watch import end_with_stdin
+
+__all__ = ["build", "main"]
+
+_SERVICES: Final = "Services"
+_MOTION: Final = "Locks and stops"
+_ROBOTS: Final = "Robots, containers and networks"
+_OPERATION: Final = "Keeping it up"
+_HARDWARE: Final = "Setting hardware up"
+_WATCHING: Final = "Watching and rules"
+_RECORDINGS: Final = "Recordings and live views"
+_RIGHTS: Final = "Identities and rights"
+
+_COMMANDS: Final = {
+    "up": (_ROBOTS, "cli.robots._up:up"),
+    "gateway": (_ROBOTS, "cli.robots._gateway:gateway"),
+    "container": (_ROBOTS, "cli.robots._container:container"),
+    "start": (_ROBOTS, "cli.robots._start:start"),
+    "migrate": (_ROBOTS, "cli.robots._migrate:migrate"),
+    "door": (_ROBOTS, "cli.robots._door:app"),
+    "system": (_ROBOTS, "cli.robots._system:app"),
+    "install": (_OPERATION, "cli.operation._install:install"),
+    "backup": (_OPERATION, "cli.operation._backup:backup"),
+    "restore": (_OPERATION, "cli.operation._backup:restore"),
+    "scan": (_HARDWARE, "cli.hardware._scan:scan"),
+    "set-id": (_HARDWARE, "cli.hardware._scan:set_id"),
+    "set-baud": (_HARDWARE, "cli.hardware._scan:set_baud"),
+    "calibrate": (_HARDWARE, "cli.hardware._calibrate:calibrate"),
+    "doctor": (_HARDWARE, "cli.hardware._doctor:doctor"),
+    "drill": (_HARDWARE, "cli.hardware._drill:drill"),
+    "conformance": (_OPERATION, "conformance._command:conformance"),
+    "services": (_SERVICES, "cli.services._services:services"),
+    "containers": (_SERVICES, "cli.services._services:containers"),
+    "call": (_SERVICES, "cli.services._call:call"),
+    "stream": (_SERVICES, "cli.services._stream:stream"),
+    "ask": (_SERVICES, "cli.services._ask:ask"),
+    "mcp": (_SERVICES, "cli.services._mcp:mcp"),
+    "ros": (_ROBOTS, "cli.robots._ros:ros"),
+    "lock": (_MOTION, "cli.motion._lock:lock"),
+    "locks": (_MOTION, "cli.motion._locks:locks"),
+    "unlock": (_MOTION, "cli.motion._locks:unlock"),
+    "resume": (_MOTION, "cli.motion._locks:resume"),
+    "stop": (_MOTION, "cli.motion._stop:stop"),
+    "estop": (_MOTION, "cli.motion._estop:estop"),
+    "watch": (_WATCHING, "cli.watching._watch:watch"),
+    "top": (_WATCHING, "cli.watching._top:top"),
+    "notifications": (_WATCHING, "cli.watching._notifications:notifications"),
+    "hooks": (_WATCHING, "cli.watching._notifications:hooks"),
+    "record": (_RECORDINGS, "recording._record:record"),
+    "foxglove": (_RECORDINGS, "recording._foxglove:foxglove"),
+    "replay": (_RECORDINGS, "recording._replay:replay"),
+    "export": (_RECORDINGS, "recording._export:export"),
+    "tracing": (_WATCHING, "cli.watching._trace:tracing"),
+    "trace": (_WATCHING, "cli.watching._trace:trace"),
+    "logs": (_WATCHING, "cli.watching._logs:logs"),
+    "faults": (_WATCHING, "cli.watching._faults:app"),
+    "audit": (_WATCHING, "cli.watching._audit:app"),
+    "profile": (_WATCHING, "cli.watching._profile:profile"),
+    "rules": (_WATCHING, "cli.watching._rules:app"),
+    "pki": (_RIGHTS, "cli.rights._pki:app"),
+    "policy": (_RIGHTS, "cli.rights._policy:app"),
+    "approvals": (_RIGHTS, "cli.rights._approvals:app"),
+}
+"""By name: where help shows it, and the function or the group of commands that does it."""
+_COMPLETED: Final = ("COMP_WORDS", "_TYPER_COMPLETE_ARGS")
+"""Where shells say what is to be completed."""
+_WITH_VALUE: Final = ("--system", "--connect")
+"""Options of every command that take another word."""
+
+
+def build(only: str | None = None) -> typer.Typer:
+    """The command line.
+
+    Args:
+        only: the one command that will be asked for: what the others need is not imported. None: all of them.
+    """
+    made = typer.Typer(
+        name="trade",
+        no_args_is_help=True,
+        rich_markup_mode="rich",
+        help="Robots as services: bring one up, see what it offers, call it.",
+        epilog="Without hardware: trade up examples/rosie.toml --sim, then in another terminal: trade services",
+        context_settings={"help_option_names": ["-h", "--help"]},
+    )
+    made.callback()(options)
+    for name, (panel, where) in _COMMANDS.items():
+        if only is not None and name != only:
+            continue
+        module, _, attribute = where.partition(":")
+        room = import_module(f"trade_gateway.{module}")
+        does = getattr(room, attribute)
+        if isinstance(does, typer.Typer):
+            made.add_typer(does, name=name, rich_help_panel=panel)
+        else:
+            made.command(name, rich_help_panel=panel, **getattr(room, "COMMAND", {}))(does)
+    return made
+
+
+def __getattr__(name: str) -> typer.Typer:
+    if name != "app":
+        raise AttributeError(name)
+    return build()
+
+
+def _asked_for(words: Sequence[str]) -> str | None:
+    """The command among the words of a command line; None if it is to be found out, or help is wanted about all."""
+    left = iter(words)
+    for word in left:
+        if word in _WITH_VALUE:
+            next(left, None)
+        elif not word.startswith("-"):
+            return word if word in _COMMANDS else None
+    return None
+
+
+def _words() -> Sequence[str]:
+    """Of the command line, or of the one that a shell completes."""
+    if "_TRADE_COMPLETE" in os.environ:
+        line = next((os.environ[name] for name in _COMPLETED if name in os.environ), "")
+        return line.split()[1:]
+    return sys.argv[1:]
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version  # noqa: PLC0415 - only for this option
+
+        typer.echo(f"trade {version('trade-gateway')}")
+        raise typer.Exit
+
+
+def options(
+    context: typer.Context,
+    system: Annotated[
+        str | None, typer.Option(help="System id; containers of other systems are invisible. \\[env: TRADE_SYSTEM]")
+    ] = None,
+    connect: Annotated[
+        list[str] | None,
+        typer.Option(help="Endpoint of a container, such as tcp/127.0.0.1:7450; repeatable. \\[env: TRADE_CONNECT]"),
+    ] = None,
+    with_stdin: Annotated[
+        bool, typer.Option("--with-stdin", hidden=True, help="End when standard input does.")
+    ] = False,
+    leased: Annotated[
+        bool, typer.Option("--leased", hidden=True, help="With it: stay only as long as standard input says.")
+    ] = False,
+    version: Annotated[  # noqa: ARG001 - answered by its callback
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version.")
+    ] = False,
+) -> None:
+    """Options of every command."""
+    if with_stdin:
+        end_with_stdin(leased=leased)
+    context.obj = SystemChoice(system, connect)
+
+
+def main() -> None:
+    """Run the command line; errors of ours are one line on stderr and exit code 1, or 2 if its words are wrong."""
+    try:
+        build(_asked_for(_words()))()
+    except UsageError as error:
+        say_error(error)
+        sys.exit(2)
+    except TradeError as error:
+        say_error(error)
+        sys.exit(1)
+    except KeyboardInterrupt:
+        sys.exit(130)

@@ -1,0 +1,319 @@
+"""``trade calibrate ROBOT.toml JOINT``: zero and range of a joint, measured while somebody moves it by hand."""
+
+import difflib
+import os
+import select
+import stat
+import sys
+import time
+from collections.abc import Callable, Generator, Mapping
+from contextlib import contextmanager
+from math import pi
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Final, TypeVar, cast
+
+import typer
+from msgspec import Struct
+from rich.markup import escape
+
+from trade.errors import ConfigurationError, WrongDevice
+from trade_drivers import Bench, Driver, Joint, Robot, SerialBus, WireError, load, load_driver, parse
+from trade_gateway.cli._output import Output, UsageError
+from trade_gateway.process._atomic_file import replace
+
+if TYPE_CHECKING:
+    import tomlkit
+
+__all__ = ["Sweep", "calibrate", "homed", "measured", "with_values"]
+
+_MARGIN_RAD: Final = 0.02
+"""How far inside of what was reached the range ends: the last bit is the stop giving way."""
+_LEAST_RAD: Final = 0.1
+_APART_S: Final = 0.3
+_STILL_RAD: Final = 0.01
+"""What is held still has moved by no more since it was looked at before: a hand trembles."""
+_LONGEST_S: Final = 600.0
+"""How long somebody may take between two prompts."""
+_DIGITS: Final = 4
+_PATIENCE_S: Final = 2.0
+"""So long a device that does not answer is asked again: what was shown by hand before is not lost by a loose plug."""
+_AGAIN_S: Final = 0.02
+
+_Number = TypeVar("_Number", int, float)
+
+
+def calibrate(
+    robot_file: Annotated[Path, typer.Argument(metavar="ROBOT.toml", help="The robot file.")],
+    joint: Annotated[str, typer.Argument(help="The joint, as the file names it: neck.pan.")],
+    zero_here: Annotated[bool, typer.Option("--zero-here", help="Its zero is where it stands still now.")] = False,
+    range_from_motion: Annotated[
+        float | None,
+        typer.Option(metavar="SECONDS", min=1.0, max=_LONGEST_S, help="Its range is where it is moved meanwhile."),
+    ] = None,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask before the file is written.")] = False,
+) -> None:
+    """Measure zero and range of a joint while you move it by hand, and write them into the robot file.
+
+    Its torque must be off, and stays off: nothing is written to the device. Comments of the file stay as they are.
+
+    For example: trade calibrate rosie.toml neck.pan
+    """
+    out = Output(as_json=False)
+    robot = load(robot_file)
+    text = robot_file.read_text(encoding="utf-8")
+    record, bus = _joint(robot, joint)
+    with _slack(bus, record) as bench:
+        sweep = Sweep(bench, record.id, _place(bus, record))
+        values = _measure(out, record, sweep, zero_here=zero_here, seconds=range_from_motion)
+        values |= homed(record, sweep.homing_counts(), zero_measured="offset_rad" in values)
+    changed = with_values(text, joint, values)
+    parse(changed, str(robot_file))
+    _write(out, robot_file, text, changed, yes=yes)
+
+
+class Ends(Struct, frozen=True):
+    """Where a device was moved to, in its own sense."""
+
+    low: float
+    high: float
+    last: float
+
+
+class Sweep:
+    """Readings of one device while it is moved by hand.
+
+    Args:
+        bench: its line.
+        device_id: its id there.
+        where: which joint that is and on which port, for messages.
+        patience_s: how long it is asked again if it does not answer.
+    """
+
+    def __init__(self, bench: Bench, device_id: int, where: str, patience_s: float = _PATIENCE_S) -> None:
+        self._bench, self._id, self._where, self._patience_s = bench, device_id, where, patience_s
+
+    def until(self, done: Callable[[], bool], longest_s: float) -> Ends:
+        """Read until something holds.
+
+        Raises:
+            ConfigurationError: it jumped over the end of its encoder, or nothing happened in time.
+        """
+        low = high = last = self.read()
+        until = time.monotonic() + longest_s
+        while not done():
+            if time.monotonic() > until:
+                problem = f"nobody went on for {longest_s:g} s; nothing was written"
+                raise ConfigurationError(where=self._where, problem=problem)
+            now = self.read()
+            if abs(now - last) > pi or abs(now) > pi:
+                problem = "it turns past the end of its encoder: mount its horn so that it cannot, then try again"
+                raise ConfigurationError(where=self._where, problem=problem)
+            low, high, last = min(low, now), max(high, now), now
+        return Ends(low, high, last)
+
+    def still(self) -> float:
+        """Where it stands, seen twice.
+
+        Raises:
+            ConfigurationError: it moves.
+        """
+        before = self.read()
+        time.sleep(_APART_S)
+        now = self.read()
+        if abs(now - before) > _STILL_RAD:
+            problem = f"it moves (by {abs(now - before):.3f} rad in {_APART_S:g} s); hold it still, then try again"
+            raise ConfigurationError(where=self._where, problem=problem)
+        return now
+
+    def read(self) -> float:
+        """Where it stands, from its own centre, in rad."""
+        return self._told(self._bench.angle_rad)
+
+    def homing_counts(self) -> int:
+        """By how much it shifts its zero itself."""
+        return self._told(self._bench.homing_counts)
+
+    def _told(self, ask: Callable[[int], _Number]) -> _Number:
+        until = time.monotonic() + self._patience_s
+        while True:
+            try:
+                return ask(self._id)
+            except WireError as bad:
+                trouble = str(bad).removeprefix(f"id {self._id} ")
+            if time.monotonic() > until:
+                problem = f"{trouble}, asked for {self._patience_s:g} s; check its cable. Nothing was written"
+                raise ConfigurationError(where=self._where, problem=problem)
+            time.sleep(_AGAIN_S)
+
+
+def measured(joint: Joint, zero: float | None, ends: Ends | None) -> dict[str, float]:
+    """The values of a joint's keys that change.
+
+    Args:
+        joint: what the file says of it.
+        zero: the device's angle at the joint's zero; None leaves it as it is.
+        ends: where the device was moved to; None leaves the range as it is.
+
+    Raises:
+        ConfigurationError: it was not moved far enough to be a range.
+    """
+    sign = -1 if joint.reversed else 1
+    offset = joint.offset_rad if zero is None else -sign * zero
+    values = {} if zero is None else {"offset_rad": offset}
+    if ends is not None:
+        if ends.high - ends.low < _LEAST_RAD:
+            problem = f"was moved by {ends.high - ends.low:.3f} rad only; move it from one end to the other"
+            raise ConfigurationError(where=joint.name, problem=problem)
+        low, high = sorted((offset + sign * ends.low, offset + sign * ends.high))
+        values |= {"min_rad": low + _MARGIN_RAD, "max_rad": high - _MARGIN_RAD}
+    return {key: round(value, _DIGITS) + 0.0 for key, value in values.items()}
+
+
+def homed(joint: Joint, found: int, *, zero_measured: bool) -> dict[str, float]:
+    """The key that changes if the servo's own homing offset is not what the file says.
+
+    Raises:
+        WrongDevice: its zero has moved, and was not measured.
+    """
+    if found == joint.homing_counts:
+        return {}
+    if not zero_measured:
+        where, expected = f'joint."{joint.name}"', str(joint.homing_counts)
+        raise WrongDevice(where=where, key="homing_counts", expected=expected, found=str(found))
+    return {"homing_counts": found}
+
+
+def with_values(text: str, joint: str, values: Mapping[str, float]) -> str:
+    """The text of a robot file with other values for some keys of a joint; everything else stays as it is."""
+    import tomlkit  # noqa: PLC0415 - takes its time, and other commands do without
+
+    for key in values:
+        text = _with_key(text, joint, key)
+    document = tomlkit.parse(text)
+    table = _table(document, joint)
+    for key, value in values.items():
+        table[key] = value
+    return tomlkit.dumps(document)  # pyright: ignore[reportUnknownMemberType]
+
+
+def _with_key(text: str, joint: str, key: str) -> str:
+    """The text with a line for a key that a joint has not got, above its ``min_rad``."""
+    import tomlkit  # noqa: PLC0415 - takes its time, and other commands do without
+
+    document = tomlkit.parse(text)
+    table = _table(document, joint)
+    if key in table:
+        return text
+    lowest, mark = table["min_rad"], "the joint that is calibrated"
+    table["min_rad"] = mark
+    lines = tomlkit.dumps(document).splitlines(keepends=True)  # pyright: ignore[reportUnknownMemberType]
+    at = next(number for number, line in enumerate(lines) if mark in line)
+    lines[at] = lines[at].replace(f'"{mark}"', repr(lowest))
+    indent = lines[at][: len(lines[at]) - len(lines[at].lstrip())]
+    more = "".join([*lines[:at], f"{indent}{key} = 0.0\n", *lines[at:]])
+    if key not in _table(tomlkit.parse(more), joint):
+        raise ConfigurationError(where=f'joint."{joint}"', problem=f"write {key} = 0.0 into its table, then try again")
+    return more
+
+
+def _table(document: "tomlkit.TOMLDocument", joint: str) -> dict[str, object]:
+    return cast("dict[str, dict[str, object]]", document["joint"])[joint]
+
+
+def _joint(robot: Robot, name: str) -> tuple[Joint, SerialBus]:
+    """A joint whose servo can be turned by hand, and its bus."""
+    joint = next((one for one in robot.joints if one.name == name), None)
+    if any(one.name == name for one in robot.grippers):
+        activate = f"`trade call {robot.name}.{name}.activate`, once it is up"
+        raise UsageError(where=robot.where, problem=f"a gripper is not calibrated; activate it: {activate}")
+    if joint is None:
+        there = ", ".join(one.name for one in robot.joints) or "none"
+        raise UsageError(where=robot.where, problem=f"there is no joint {name!r}; there is {there}")
+    bus = next(one for one in robot.buses if one.name == joint.bus)
+    if not isinstance(bus, SerialBus):
+        problem = "is no servo on a serial line: its zero is found by its own homing"
+        raise ConfigurationError(where=f'{robot.where}: joint."{name}"', problem=problem)
+    return joint, bus
+
+
+def _place(bus: SerialBus, joint: Joint) -> str:
+    return f"{joint.name} (id {joint.id} on {bus.port})"
+
+
+@contextmanager
+def _slack(bus: SerialBus, joint: Joint) -> Generator[Bench, None, None]:
+    """The line of a joint whose torque is off."""
+    commissioner = load_driver(bus.driver, f"bus.{bus.name}.driver", Driver).commissioner
+    if commissioner is None:
+        raise ConfigurationError(where=joint.name, problem=f"driver {bus.driver} has nothing to calibrate by hand")
+    with commissioner().at(bus.port, bus.baud) as bench:
+        found = bench.alone(joint.id, _place(bus, joint))
+        if found.model != joint.model:
+            raise WrongDevice(where=f'joint."{joint.name}"', key="model", expected=joint.model, found=found.model)
+        yield bench
+
+
+def _measure(
+    out: Output,
+    joint: Joint,
+    sweep: Sweep,
+    *,
+    zero_here: bool,
+    seconds: float | None,
+    enter: Callable[[], bool] | None = None,
+) -> dict[str, float]:
+    """What changes, by the ways that were asked for; by prompts if none was."""
+    name, asked = escape(joint.name), enter or _enter_pressed
+    zero, ends = sweep.still() if zero_here else None, None
+    if seconds is not None:
+        out.say(f"Move [bold]{name}[/] slowly from one end to the other and back, for {seconds:g} s")
+        until = time.monotonic() + seconds
+        ends = sweep.until(lambda: time.monotonic() > until, seconds + 1)
+    elif not zero_here:
+        out.say(f"Move [bold]{name}[/] to its zero by hand, hold it there, and press Enter")
+        zero = sweep.until(asked, _LONGEST_S).last
+        out.say(f"Now move [bold]{name}[/] slowly from one end to the other, and press Enter")
+        ends = sweep.until(asked, _LONGEST_S)
+    if zero is not None and ends is None:
+        out.say("its range keeps its numbers, counted from the new zero")
+    return measured(joint, zero, ends)
+
+
+def _enter_pressed() -> bool:
+    """Whether a line has come since; never waits for one.
+
+    Raises:
+        UsageError: nobody is there to press anything.
+    """
+    fd = sys.stdin.fileno()
+    while select.select([fd], [], [], 0)[0]:
+        match os.read(fd, 1):
+            case b"":
+                problem = "nobody is there to press Enter; --zero-here and --range-from-motion ask nobody"
+                raise UsageError(where="trade calibrate", problem=problem)
+            case b"\n":
+                return True
+            case _:
+                pass
+    return False
+
+
+def _write(out: Output, path: Path, before: str, after: str, *, yes: bool) -> None:
+    """Show what changes, ask, and replace the file as a whole."""
+    if before == after:
+        out.say("it is so already; nothing is written")
+        return
+    name = str(path)
+    for line in difflib.unified_diff(before.splitlines(), after.splitlines(), name, name, n=1, lineterm=""):
+        out.say(escape(line))
+    if not yes and not typer.confirm(f"Write this into {name}?"):
+        out.say("nothing was written")
+        raise typer.Exit(1)
+    target = path.resolve()
+    if target.read_text(encoding="utf-8") != before:
+        raise ConfigurationError(where=name, problem="was changed by somebody else meanwhile; nothing was written")
+    try:
+        replace(target, after.encode(), stat.S_IMODE(target.stat().st_mode))
+    except OSError as bad:
+        raise ConfigurationError(where=name, problem=f"cannot be written: {bad}; it is as it was") from None
+    out.say(f"[bold]{escape(name)}[/] is written")

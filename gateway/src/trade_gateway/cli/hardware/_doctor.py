@@ -1,0 +1,135 @@
+"""``trade doctor [ROBOT.toml]``: what is wrong with this host and this robot, each finding with its fix."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from msgspec.structs import replace
+from rich.markup import escape
+
+from trade._toml import read_toml_text
+from trade.errors import ConfigurationError, TradeError
+from trade_drivers import SerialBus, drivers, load, refusals
+from trade_gateway.cli._output import Output
+from trade_gateway.cli._system_choice import choice_of, visitor
+from trade_gateway.cli.hardware import _doctor_host as host
+from trade_gateway.cli.hardware import _doctor_robot as robots
+from trade_gateway.cli.hardware._doctor_host import Finding
+from trade_gateway.cli.hardware._scan import serial_ports
+from trade_gateway.cli.services._services import Json
+
+_COLOURS = {"ok": "green", "warning": "yellow", "error": "red"}
+
+
+def doctor(
+    context: typer.Context,
+    robot_file: Annotated[
+        Path | None,
+        typer.Argument(metavar="[ROBOT.toml]", help="A robot file, to look at its lines and devices, too."),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Look for what keeps a robot from working, and say what helps. Nothing is changed; the exit code is 1 on errors.
+
+    Of the host: rights and latency of serial ports, libraries, clock, certificates, who is in sight. With a robot file:
+    what its drivers refuse of it, its ports and CAN interfaces, whether its devices answer and are set up as it says,
+    and which have no watchdog. Lines that a driver holds are left alone.
+
+    For example: trade doctor rosie.toml
+    """
+    out = Output(as_json=as_json)
+    found: list[Finding] = []
+    for one in (*_of_host(context, robot_file), *(() if robot_file is None else _of_robot(robot_file))):
+        found.append(one)
+        if not as_json:
+            _tell(out, one)
+    if as_json:
+        out.data(found)
+    errors = sum(one.level == "error" for one in found)
+    warnings = sum(one.level == "warning" for one in found)
+    out.say(f"{errors} errors, {warnings} warnings")
+    if errors:
+        raise typer.Exit(1)
+
+
+def _of_host(context: typer.Context, robot_file: Path | None) -> Iterator[Finding]:
+    yield from host.ports(serial_ports(), _lines_of(robot_file))
+    yield from host.latencies()
+    if robot_file is None:
+        yield from host.libraries(sorted(drivers()), needed=False)
+    yield from host.clock()
+    yield from host.waits()
+    try:
+        settings = choice_of(context).settings()
+    except TradeError as bad:
+        yield Finding(level="error", about="settings", text=str(bad), fix=_fix_of(bad))
+        return
+    if settings.tls is not None:
+        yield from host.certificate(settings.tls)
+    yield from host.multicast()
+    try:
+        with visitor(context) as member:
+            yield from host.in_sight(member, settings.system)
+    except TradeError as bad:
+        yield Finding(
+            level="error", about=f"system {settings.system}", text=str(bad), fix="the message says what helps"
+        )
+
+
+def _fix_of(bad: TradeError) -> str:
+    """Papers are not left out: without TRADE_TLS a system that has them lets nobody in."""
+    papers = isinstance(bad, ConfigurationError) and bad.where.endswith(".pem")
+    return "the message says what helps" if papers else "correct that variable, or leave it out"
+
+
+def _lines_of(path: Path | None) -> list[str]:
+    """The serial ports that a robot file names; none if it cannot be read, which is told later."""
+    try:
+        return [bus.port for bus in load(path).buses if isinstance(bus, SerialBus)] if path is not None else []
+    except TradeError:
+        return []
+
+
+def _of_robot(path: Path) -> Iterator[Finding]:
+    try:
+        robot = load(path)
+    except TradeError as bad:
+        yield _no_robot(path) or Finding(
+            level="error",
+            about=str(path),
+            text=str(bad).removeprefix(f"{path}: "),
+            fix="correct the file; the message says where",
+        )
+        return
+    known = {bus.driver for bus in robot.buses} & drivers().keys()
+    yield from host.libraries(sorted(known), needed=True)
+    wrong = dict(refusals(robot))
+    yield from robots.refused(robot, wrong)
+    sound = replace(robot, buses=[bus for bus in robot.buses if bus.name not in wrong])
+    yield from robots.unwatched(sound)
+    yield from robots.unmeasured(robot, path)
+    yield from robots.interfaces(sound)
+    yield from robots.devices(sound)
+    yield from robots.controllers(sound)
+
+
+def _no_robot(path: Path) -> Finding | None:
+    """That it is a file of another kind; None: it is none that is known."""
+    try:
+        system = read_toml_text(path.read_text(encoding="utf-8")).get("system")
+    except (OSError, ValueError):
+        return None
+    if system is None:
+        return None
+    kind, check = (
+        ("gateway", "trade gateway {} --check") if isinstance(system, str) else ("system", "trade system up {} --check")
+    )
+    text = f"is a {kind} file; trade doctor looks at robot files, such as those that it names"
+    return Finding(level="error", about=str(path), text=text, fix=check.format(path))
+
+
+def _tell(out: Output, one: Finding) -> None:
+    out.say(f"[{_COLOURS[one.level]}]{one.level:7}[/]  {escape(one.about)}: {escape(one.text)}")
+    if one.fix:
+        out.say(f"         fix: {escape(one.fix)}")

@@ -1,0 +1,197 @@
+"""What ``trade doctor`` looks at of a robot: its lines, its devices, and what stops them when all else fails."""
+
+import socket
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from trade.errors import ConfigurationError
+from trade_drivers import (
+    Bench,
+    CanBus,
+    Commissioner,
+    Driver,
+    Found,
+    Joint,
+    Robot,
+    SerialBus,
+    UrBus,
+    WireError,
+    load_driver,
+)
+from trade_drivers.bus._jobs import TAKEN
+from trade_drivers.robotfile import Gripper
+from trade_gateway.cli.hardware._doctor_host import Finding
+from trade_gateway.cli.hardware._robot_file_template import UNMEASURED_RAD
+
+if TYPE_CHECKING:
+    from trade_drivers.bus.can import Link
+
+__all__ = ["controllers", "devices", "interfaces", "judged", "refused", "unmeasured", "unwatched"]
+
+_LOOKS: Final = 10
+"""How often a device is asked: a bad line shows in some of them."""
+_DASHBOARD: Final = 29999
+_PATIENCE_S: Final = 3.0
+_BAD_LINE: Final = (
+    "check the cable, its length and its ends: a long line needs its termination (120 ohm) at both ends and nowhere "
+    "else, a common ground, and one baud rate"
+)
+
+
+def unwatched(robot: Robot) -> Iterator[Finding]:
+    """Devices that nothing in themselves stops when their driver is gone."""
+    for bus in robot.buses:
+        without = load_driver(bus.driver, bus.name, Driver).without_watchdog
+        named = [device.name for device in (*robot.joints_on(bus.name), *robot.grippers_on(bus.name))]
+        if without and named:
+            fix = "give the robot an emergency stop that cuts their power; docs/safety.md, S06"
+            yield Finding(level="warning", about=", ".join(named), text=without, fix=fix)
+
+
+def unmeasured(robot: Robot, path: Path) -> Iterator[Finding]:
+    """Joints whose zero and range nobody has measured: they are as a scan writes them."""
+    lines = {bus.name for bus in robot.buses if isinstance(bus, SerialBus)}
+    for joint in robot.joints:
+        if (joint.offset_rad, joint.min_rad, joint.max_rad) == (0.0, -UNMEASURED_RAD, UNMEASURED_RAD):
+            fix = (
+                f"trade calibrate {path} {joint.name}"
+                if joint.bus in lines
+                else "measure it, and write it into the file"
+            )
+            text = "its zero and range are those that `trade scan` wrote, and nobody's"
+            yield Finding(level="warning", about=joint.name, text=text, fix=fix)
+
+
+def interfaces(robot: Robot) -> Iterator[Finding]:
+    """CAN interfaces of the operating system: there, up, at the rate of the file, and well."""
+    for bus in robot.buses:
+        if not isinstance(bus, CanBus) or bus.interface != "socketcan":
+            continue
+        from trade_drivers.bus.can import look_at  # noqa: PLC0415 - python-can is optional
+
+        try:
+            yield judged(bus, look_at(bus.channel))
+        except OSError as bad:
+            fix = "is its adapter plugged in, and its module loaded? `ip link show type can` shows those there are"
+            yield Finding(level="error", about=bus.channel, text=str(bad), fix=fix)
+
+
+def judged(bus: CanBus, link: "Link") -> Finding:
+    """What is to be said of a CAN interface."""
+    about = bus.channel
+    up = f"sudo ip link set {about} up type can bitrate {bus.bitrate} restart-ms 100"
+    if not link.up:
+        return Finding(level="error", about=about, text="is down", fix=up)
+    if link.bitrate is not None and link.bitrate != bus.bitrate:
+        text = f"runs at {link.bitrate} bit/s, and the robot file says {bus.bitrate}"
+        return Finding(level="error", about=about, text=text, fix=f"sudo ip link set {about} down; {up}")
+    if link.state:
+        text = f"its controller meets errors ({link.state.name.lower().replace('_', '-')})"
+        fix = (
+            "nobody may be listening, or the ends are wrong: exactly two terminations of 120 ohm (60 ohm between CAN_H "
+            f"and CAN_L without power), one bit rate for all, power for the drives. Then: sudo ip link set {about} "
+            f"down; {up}"
+        )
+        return Finding(level="error", about=about, text=text, fix=fix)
+    return Finding(level="ok", about=about, text="is up" + (f" at {link.bitrate} bit/s" if link.bitrate else ""))
+
+
+def refused(robot: Robot, refusals: Mapping[str, ConfigurationError]) -> Iterator[Finding]:
+    """What drivers refuse of the file, before any device is asked."""
+    buses = {bus.name for bus in robot.buses}
+    for part, refusal in refusals.items():
+        about, then = (
+            (f"bus {part}", "; its line was not looked at, so look again then") if part in buses else (part, "")
+        )
+        yield Finding(level="error", about=about, text=str(refusal), fix=f"correct the file{then}")
+
+
+def devices(robot: Robot) -> Iterator[Finding]:
+    """Whether the devices on serial lines answer, reliably, and are those of the file. Nothing is written to them."""
+    for bus in robot.buses:
+        driver = load_driver(bus.driver, bus.name, Driver)
+        if not isinstance(bus, SerialBus) or driver.commissioner is None:
+            continue
+        if not Path(bus.port).exists():
+            fix = "plug its adapter in; `trade scan` lists the ports there are, /dev/serial/by-id has lasting names"
+            yield Finding(level="error", about=f"bus {bus.name}", text=f"there is no {bus.port}", fix=fix)
+            continue
+        try:
+            yield from _on_line(robot, bus, driver, driver.commissioner())
+        except ConfigurationError as bad:
+            yield _unseen(robot, bus, bad)
+
+
+def _unseen(robot: Robot, bus: SerialBus, bad: ConfigurationError) -> Finding:
+    """A line that could not be had."""
+    about = f"bus {bus.name}"
+    if TAKEN in bad.problem:
+        fix = "end what uses it and look again; while a robot is up, `trade up` tells of its devices"
+        return Finding(level="warning", about=about, text=f"was not looked at: {bad}", fix=fix)
+    text = f"was not looked at: {robot.where}: bus.{bus.name}.port: {bad.problem}"
+    return Finding(
+        level="error", about=about, text=text, fix="have port name the line of these devices, and look again"
+    )
+
+
+def _on_line(robot: Robot, bus: SerialBus, driver: Driver, commissioner: Commissioner) -> Iterator[Finding]:
+    with commissioner.at(bus.port, bus.baud) as bench:
+        for device in (*robot.joints_on(bus.name), *robot.grippers_on(bus.name)):
+            found = _of_device(bench, device, bus)
+            yield found if found.level != "ok" else _unfit(driver, bench, robot, bus, device, found.about) or found
+
+
+def _unfit(
+    driver: Driver, bench: Bench, robot: Robot, bus: SerialBus, device: Joint | Gripper, about: str
+) -> Finding | None:
+    """What `trade up` would refuse of a device that answers; None if nothing."""
+    try:
+        driver.fits(bench, robot, bus, device)
+    except ConfigurationError as bad:
+        return Finding(level="error", about=about, text=str(bad), fix="set the device up so, or correct the file")
+    except WireError as bad:
+        return Finding(level="error", about=about, text=f"answers, but not always: {bad}", fix=_BAD_LINE)
+    return None
+
+
+def _of_device(bench: Bench, device: Joint | Gripper, bus: SerialBus) -> Finding:
+    about = f"{device.name} (id {device.id} on bus {bus.name})"
+    looks = [bench.look(device.id) for _ in range(_LOOKS)]
+    good = [found for found in looks if found is not None and not found.problem]
+    if not any(looks):
+        fix = f"check its power and cable; `trade scan --port {bus.port}` shows under which id and rate it answers"
+        return Finding(level="error", about=about, text=f"does not answer at {bus.baud} baud", fix=fix)
+    if not good:
+        problem = Counter(found.problem for found in looks if found is not None).most_common(1)[0][0]
+        return Finding(level="error", about=about, text="cannot be used", fix=problem)
+    if len(good) < _LOOKS:
+        text = f"answered {len(good)} of {_LOOKS} questions as it should"
+        return Finding(level="error", about=about, text=text, fix=_BAD_LINE)
+    return _identity(about, device, good[0])
+
+
+def _identity(about: str, device: Joint | Gripper, found: Found) -> Finding:
+    firmware = device.firmware if isinstance(device, Joint) else None
+    for key, expected, said in (("model", device.model, found.model), ("firmware", firmware, found.firmware)):
+        if expected is not None and expected != said:
+            text = f"its {key} is {said}, and the robot file says {expected}"
+            fix = f"attach the device that is meant, or correct {key} and calibrate it"
+            return Finding(level="error", about=about, text=text, fix=fix)
+    said = f"{found.model}, firmware {found.firmware}," if found.firmware else found.model
+    return Finding(level="ok", about=about, text=f"{said} answers")
+
+
+def controllers(robot: Robot) -> Iterator[Finding]:
+    """Whether the controllers of arms are to be reached."""
+    for bus in robot.buses:
+        if not isinstance(bus, UrBus):
+            continue
+        try:
+            socket.create_connection((bus.host, _DASHBOARD), _PATIENCE_S).close()
+        except OSError as bad:
+            fix = "is it switched on, and in this network? On its screen: Settings, System, Network"
+            yield Finding(level="error", about=bus.host, text=f"does not let itself be reached: {bad}", fix=fix)
+        else:
+            yield Finding(level="ok", about=bus.host, text="is to be reached")

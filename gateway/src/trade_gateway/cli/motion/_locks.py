@@ -1,0 +1,109 @@
+"""``trade locks``, ``unlock`` and ``resume``: who has what for himself, taking it away, letting it move again."""
+
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+
+from trade import Constraint, Container, LockInfo
+from trade._timestamps import clock
+from trade_gateway.cli._output import Output
+from trade_gateway.cli._system_choice import visitor_among_others
+from trade_gateway.cli.services._services import Json, asked_for
+
+Group = Annotated[str, typer.Argument(help="A group and what is beneath it: rosie.head.")]
+
+
+def locks(context: typer.Context, as_json: Json = False) -> None:
+    """List what is locked: by whom, what for, since when, how much of the lease is left, who waits.
+
+    What could not be stopped is of nobody, and nobody gets it before somebody resumes it.
+
+    For example: trade locks --json
+    """
+    out = Output(as_json=as_json)
+    with visitor_among_others(context) as container:
+        found = container.locks()
+    if as_json:
+        out.data([_plain(info) for info in found])
+    elif not found:
+        out.say("nothing is locked")
+    else:
+        columns = ("RESOURCES", "OWNER", "PURPOSE", "SINCE", "LEASE LEFT", "CONTAINER", "WAITING")
+        out.table(columns, [_row(info) for info in found])
+
+
+def _owner(info: LockInfo) -> str:
+    return info.holder.owner
+
+
+def _plain(info: LockInfo) -> dict[str, object]:
+    return {
+        "resources": info.resources,
+        "owner": _owner(info),
+        "purpose": info.holder.purpose,
+        "since": info.holder.since,
+        "lease_left_s": info.left_s,
+        "container": info.container,
+        "uses": info.uses,
+        "waiting": info.waiting,
+    }
+
+
+def _row(info: LockInfo) -> tuple[str, ...]:
+    return (
+        ", ".join(info.resources),
+        _owner(info),
+        info.holder.purpose,
+        clock(info.holder.since),
+        f"{info.left_s:.1f} s" if info.token.number else "",  # what nobody gets has no lease
+        info.container,
+        ", ".join(info.waiting),
+    )
+
+
+def unlock(
+    context: typer.Context,
+    group: Group,
+    reason: Annotated[str, typer.Option("--break", metavar="REASON", help="Why; the owner is told.")],
+) -> None:
+    """Take locks away from their owners; what moves under them is stopped.
+
+    For example: trade unlock rosie.head --break "its program hangs"
+    """
+    out = Output(as_json=False)
+    with visitor_among_others(context) as container:
+        broken = container.break_lock(_there(container, group), reason)
+    for info in broken:
+        out.say(f"taken from {escape(_owner(info))}: {escape(', '.join(info.resources))}")
+    if not broken:
+        out.say(f"nothing of {escape(group)} was locked")
+
+
+def _there(container: Container, group: str) -> Constraint:
+    """The services of a group. Raises NoSuchService, with what there is that looks like it."""
+    constraint = asked_for(f"group {group!r}", group=group, name=None)
+    container.await_services(constraint, lambda: bool(container.services(constraint)), 0.0)
+    return constraint
+
+
+def resume(context: typer.Context, group: Group) -> None:
+    """Let a group move again after a stop by somebody else. It moves nothing itself.
+
+    The exit code is 1 while an e-stop is open: nothing moves before that is cleared.
+
+    For example: trade resume rosie.head
+    """
+    out = Output(as_json=False)
+    with visitor_among_others(context) as container:
+        resumed = container.resume(asked_for(f"group {group!r}", group=group, name=None))
+        still = container.estops()
+    for estop in still:
+        why = f": {escape(estop.reason)}" if estop.reason else ""
+        out.say(f"[bold red]e-stop {estop.id} is open{why}; nothing moves before it is cleared[/]")
+    if still:
+        if resumed:
+            out.say(f"resumed, for when it is: {escape(', '.join(resumed))}")
+        out.say(f"when it is safe: [bold]trade estop --clear {' '.join(estop.id for estop in still)}[/]")
+        raise typer.Exit(1)
+    out.say(f"may move again: {escape(', '.join(resumed))}" if resumed else f"nothing of {escape(group)} was held")

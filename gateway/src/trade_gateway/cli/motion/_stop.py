@@ -1,0 +1,52 @@
+"""``trade stop``: stop all that moves in a group."""
+
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+
+from trade import StopReport
+from trade._stop_line import StopLines
+from trade_gateway.cli._output import Output
+from trade_gateway.cli._system_choice import choice_of, visitor
+from trade_gateway.cli.services._services import Json
+
+
+def stop(
+    context: typer.Context,
+    group: Annotated[str, typer.Argument(metavar="GROUP", help="Such as rosie.left; all beneath it, too.")],
+    reason: Annotated[str, typer.Option(help="Why, for the record.")] = "",
+    limit: Annotated[float, typer.Option(min=0.1, max=60.0, help="Seconds to try.")] = 3.0,
+    as_json: Json = False,
+) -> None:
+    """Stop all that moves in a group: every stop service there is, at once. It needs no lock.
+
+    It asks on the stop line first, which works while the ports of the middleware are busy.
+    The exit code is not 0 if something could not be stopped, or if there was nothing to stop.
+    This is software: it is not safety-rated and replaces no switch that cuts the power.
+
+    For example: trade stop rosie.head, and later trade resume rosie.head
+    """
+    out = Output(as_json=as_json)
+    settings = choice_of(context).settings()
+    asked = StopLines(settings).stop(group, reason, limit)
+    report = asked.wait()
+    if not report.complete:  # whoever is not on a stop line may be linked
+        with visitor(context) as container:
+            report = container.stop(group, reason, limit_s=limit)
+    if as_json:
+        out.data(report)
+    else:
+        _say(out, report, settings.system)
+    if not report.complete:
+        raise typer.Exit(1)
+
+
+def _say(out: Output, report: StopReport, system: str) -> None:
+    for name in report.stopped:
+        out.say(f"stopped: {escape(name)}")
+    for name, problem in report.failed.items():
+        out.say(f"[bold red]FAILED: {escape(name)}: {escape(problem)}[/]")
+    if not (report.stopped or report.failed):
+        group = escape(report.group)
+        out.say(f"[bold red]nothing was found[/] in group {group} of system {escape(system)} that can be stopped")

@@ -1,0 +1,1 @@
+"""Commands that install a system, back it up and restore it."""

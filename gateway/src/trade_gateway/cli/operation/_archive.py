@@ -1,0 +1,283 @@
+"""A backup as a file: written in one step, found whole before anything of it counts, put back file by file.
+
+It is a compressed tar archive. ``manifest.json`` comes first; then the files, ``config/...`` beside the gateway file
+and ``state/...`` in the folder for state.
+"""
+
+import grp
+import gzip
+import hashlib
+import io
+import itertools
+import os
+import pwd
+import shutil
+import tarfile
+import zlib
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path, PurePosixPath
+from typing import IO, Annotated, Final, NamedTuple
+
+import msgspec
+from msgspec import Meta, Struct
+
+from trade.errors import ConfigurationError
+from trade_gateway.process._atomic_file import fresh_beside
+
+__all__ = ["CONFIG", "SQLITE_BESIDE", "STATE", "Entry", "Manifest", "Source", "read_archive", "unpack", "write_archive"]
+
+CONFIG: Final = "config"
+STATE: Final = "state"
+SQLITE_BESIDE: Final = ("-wal", "-shm", "-journal")
+"""The ends of the names of what belongs to a database; with another one's it would be damaged."""
+_MANIFEST: Final = "manifest.json"
+_LONGEST_MANIFEST: Final = 16 * 1024 * 1024
+_PIECE: Final = 1024 * 1024
+_FOLDER_MODES: Final = {CONFIG: 0o755, STATE: 0o700}
+
+
+class Entry(Struct, frozen=True):
+    """One file."""
+
+    path: str
+    """In the archive: ``config/policy.toml``."""
+    size: int
+    sha256: str
+    mode: Annotated[int, Meta(ge=0, le=0o777)]
+    owner: str
+    group: str
+    database: bool = False
+    """Whether it is one of SQLite."""
+
+    @property
+    def part(self) -> str:
+        """``config`` or ``state``."""
+        return self.path.partition("/")[0]
+
+    def below(self, folder: Path) -> Path:
+        """Where it belongs, if that is the folder of its part."""
+        return folder / self.path.partition("/")[2]
+
+
+class Manifest(Struct, frozen=True):
+    """What a backup says of itself."""
+
+    format: Annotated[int, Meta(ge=1, le=1)]
+    version: str
+    """Of TRADE."""
+    host: str
+    made_at: str
+    file: str
+    """The gateway file, as its entry has it."""
+    files: list[Entry]
+
+
+class Source(NamedTuple):
+    """A file to be backed up."""
+
+    path: str
+    """In the archive."""
+    content: Path
+    """What is to be kept."""
+    status: os.stat_result
+    """Of the file itself: its owner and mode are kept, too."""
+    database: bool = False
+
+
+def write_archive(out: Path, sources: Sequence[Source], about: Manifest) -> Manifest:
+    """Write a backup that only this user can read, in one step; returns its manifest.
+
+    Args:
+        out: the file; another one of that name is replaced.
+        sources: its files, which nobody changes meanwhile.
+        about: its manifest, but for the files.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    manifest = msgspec.structs.replace(about, files=[_entry(source) for source in sources])
+    text = msgspec.json.format(msgspec.json.encode(manifest))
+    fresh = fresh_beside(out)
+    try:
+        with os.fdopen(os.open(fresh, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
+            with tarfile.open(fileobj=file, mode="w:gz") as archive:
+                archive.addfile(_member(_MANIFEST, len(text), 0o600), io.BytesIO(text))
+                for source, entry in zip(sources, manifest.files, strict=True):
+                    with source.content.open("rb") as content:
+                        archive.addfile(_member(entry.path, entry.size, entry.mode), content)
+            file.flush()
+            os.fsync(file.fileno())
+        fresh.replace(out)
+    finally:
+        fresh.unlink(missing_ok=True)
+    return manifest
+
+
+def read_archive(path: Path) -> Manifest:
+    """Look through a whole backup.
+
+    Raises:
+        ConfigurationError: it is damaged or incomplete, or would put something where it does not belong.
+    """
+    with _opened(path) as (archive, manifest):
+        names = {entry.path for entry in manifest.files}
+        if len(names) != len(manifest.files) or manifest.file not in names:
+            raise _refused(path, "its manifest contradicts itself")
+        for wrong in (entry.path for entry in manifest.files if not _stays_inside(entry.path)):
+            raise _refused(path, f"{wrong!r} leads out of its folder")
+        for member, entry in _files(path, archive, manifest):
+            _copy(path, archive, member, entry, lambda _: None)
+    return manifest
+
+
+def unpack(
+    path: Path,
+    manifest: Manifest,
+    folders: Mapping[str, Path],
+    before: Callable[[Path, Path], None] = lambda _there, _fresh: None,
+) -> list[str]:
+    """Put the files of a backup in place, each in one step; returns owners that this host does not know.
+
+    Args:
+        path: of the backup.
+        manifest: its own, as `read_archive` found it.
+        folders: where to, by part.
+        before: told of each file that is there, and of the one that is about to take its place.
+
+    Raises:
+        ConfigurationError: it has been changed since it was read.
+        OSError: a file cannot be written.
+    """
+    unknown = set[str]()
+    with _opened(path) as (archive, again):
+        if again != manifest:
+            raise _refused(path, "it was changed a moment ago")
+        for member, entry in _files(path, archive, manifest):
+            target = entry.below(folders[entry.part])
+            _make_folder(target.parent, entry, unknown)
+            fresh = fresh_beside(target)
+            try:
+                with os.fdopen(os.open(fresh, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
+                    _copy(path, archive, member, entry, file.write)
+                    file.flush()
+                    os.fsync(file.fileno())
+                if target.is_file():
+                    before(target, fresh)
+                _give(fresh, entry, unknown)
+                fresh.chmod(entry.mode)
+                for end in SQLITE_BESIDE if entry.database else ():
+                    target.with_name(target.name + end).unlink(missing_ok=True)
+                fresh.replace(target)
+            finally:
+                fresh.unlink(missing_ok=True)
+    return sorted(unknown)
+
+
+def _make_folder(folder: Path, entry: Entry, unknown: set[str]) -> None:
+    if not folder.exists():
+        _make_folder(folder.parent, entry, unknown)
+        folder.mkdir(_FOLDER_MODES[entry.part])
+        _give(folder, entry, unknown)
+
+
+def _give(path: Path, entry: Entry, unknown: set[str]) -> None:
+    """To its owner, which root alone can do."""
+    if os.geteuid() == 0:
+        try:
+            shutil.chown(path, entry.owner, entry.group)
+        except LookupError:
+            unknown.add(f"{entry.owner}:{entry.group}")
+
+
+def _entry(source: Source) -> Entry:
+    status, seen = source.status, hashlib.sha256()
+    with source.content.open("rb") as content:
+        size = sum(len(piece) for piece in _pieces(content, seen.update))
+    return Entry(
+        path=source.path,
+        size=size,
+        sha256=seen.hexdigest(),
+        mode=status.st_mode & 0o777,
+        owner=_name(lambda: pwd.getpwuid(status.st_uid).pw_name, status.st_uid),
+        group=_name(lambda: grp.getgrgid(status.st_gid).gr_name, status.st_gid),
+        database=source.database,
+    )
+
+
+def _name(look_up: Callable[[], str], number: int) -> str:
+    try:
+        return look_up()
+    except KeyError:
+        return str(number)
+
+
+def _member(path: str, size: int, mode: int) -> tarfile.TarInfo:
+    member = tarfile.TarInfo(path)
+    member.size, member.mode = size, mode
+    return member
+
+
+@contextmanager
+def _opened(path: Path) -> "Generator[tuple[tarfile.TarFile, Manifest]]":
+    """The archive behind its manifest. What comes up inside of it as damaged is refused as such."""
+    try:
+        with tarfile.open(path, "r:gz") as archive:
+            first = archive.next()
+            if first is None or first.name != _MANIFEST or not first.isreg() or first.size > _LONGEST_MANIFEST:
+                raise _refused(path, "it does not begin with a manifest")
+            text = archive.extractfile(first)
+            assert text is not None  # noqa: S101 - a regular file
+            yield archive, msgspec.json.decode(text.read(), type=Manifest)
+    except FileNotFoundError:
+        raise ConfigurationError(where=str(path), problem="there is no such file") from None
+    except (
+        tarfile.TarError,
+        gzip.BadGzipFile,
+        zlib.error,
+        EOFError,
+        msgspec.DecodeError,
+        UnicodeDecodeError,
+    ) as damaged:
+        raise _refused(path, str(damaged)) from None
+
+
+def _files(path: Path, archive: tarfile.TarFile, manifest: Manifest) -> Iterator[tuple[tarfile.TarInfo, Entry]]:
+    """What is behind the manifest. Raises ConfigurationError: it is not what that names."""
+    missing = {entry.path: entry for entry in manifest.files}
+    for member in itertools.islice(archive, 1, None):
+        entry = missing.pop(member.name, None)
+        if entry is None:
+            raise _refused(path, f"its manifest does not name {member.name!r}, or only once")
+        yield member, entry
+    if missing:
+        raise _refused(path, f"it lacks {', '.join(missing)}")
+
+
+def _copy(
+    path: Path, archive: tarfile.TarFile, member: tarfile.TarInfo, entry: Entry, to: Callable[[bytes], object]
+) -> None:
+    """Read a file of the archive. Raises ConfigurationError: it is not what the manifest says."""
+    if not member.isreg() or member.size != entry.size:
+        raise _refused(path, f"{entry.path} is no file of {entry.size} bytes")
+    content, seen = archive.extractfile(member), hashlib.sha256()
+    assert content is not None  # noqa: S101 - a regular file
+    for piece in _pieces(content, seen.update):
+        to(piece)
+    if seen.hexdigest() != entry.sha256:
+        raise _refused(path, f"{entry.path} is not what was backed up")
+
+
+def _pieces(content: IO[bytes], see: Callable[[bytes], object]) -> Generator[bytes]:
+    while piece := content.read(_PIECE):
+        see(piece)
+        yield piece
+
+
+def _stays_inside(path: str) -> bool:
+    parts = PurePosixPath(path).parts
+    return len(parts) > 1 and parts[0] in (CONFIG, STATE) and ".." not in parts and "/".join(parts) == path
+
+
+def _refused(path: Path, why: str) -> ConfigurationError:
+    return ConfigurationError(where=str(path), problem=f"is no backup, or a damaged one: {why}; take another one")

@@ -1,0 +1,1 @@
+"""Commands for identities and rights."""

@@ -1,0 +1,201 @@
+"""``trade pki``: give containers and gateways identities that they can prove, and take them back."""
+
+import shlex
+from datetime import datetime, timedelta, timezone
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final
+
+import typer
+from rich.markup import escape
+
+from trade_gateway.cli._output import Output, UsageError
+from trade_gateway.cli.services._services import Json
+
+if TYPE_CHECKING:
+    from trade_gateway.pki._authority import Authority, Issued
+
+_PURPOSES: Final = ("container", "gateway")
+_LONGEST_HOURS: Final = 366 * 24.0
+_DEFAULT: Final = Path("pki")
+
+app = typer.Typer(
+    no_args_is_help=True,
+    help="Give containers identities that they prove by certificates, and take them back.",
+)
+
+Name = Annotated[str, typer.Argument(help="The identity: letters, digits, _ - and .")]
+Folder = Annotated[Path, typer.Option("--ca", help="The folder of the authority.")]
+
+
+@app.command()
+def init(folder: Annotated[Path, typer.Argument(metavar="[DIR]", help="A folder for it.")] = _DEFAULT) -> None:
+    """Begin an authority: whoever has its ca.key can be anybody in the system.
+
+    For example: trade pki init pki, and then trade pki issue arm
+    """
+    from trade_gateway.pki._authority import Authority  # noqa: PLC0415 - loads what the other commands do not need
+
+    made = Authority.create(folder)
+    Output(as_json=False).say(
+        f"{escape(str(made.folder))} has an authority. Keep ca.key secret and off the robots, and a copy of it "
+        "in a safe place.\n"
+        f"Next: [bold]trade pki issue NAME --ca {escape(_quoted(folder))}[/]"
+    )
+
+
+@app.command()
+def issue(
+    name: Name,
+    purpose: Annotated[
+        str | None, typer.Option("--for", help="container or gateway; a name is given for one of them for ever.")
+    ] = None,
+    host: Annotated[list[str] | None, typer.Option(help="Name it may be dialled by; repeatable.")] = None,
+    address: Annotated[list[str] | None, typer.Option(help="Address it may be dialled by; repeatable.")] = None,
+    hours: Annotated[
+        float | None,
+        typer.Option(
+            min=0.1,
+            max=_LONGEST_HOURS,
+            help="How long; a week if not said. A link cannot be revoked before, so not for long.",
+        ),
+    ] = None,
+    force: Annotated[
+        bool, typer.Option("--force", help="A new key as well, and only the hosts and addresses given now.")
+    ] = False,
+    folder: Folder = _DEFAULT,
+    as_json: Json = False,
+) -> None:
+    """Give a container or gateway its certificate, or the next one before it expires.
+
+    The next one has the same key and hosts, and replaces the last in one step. A running container dials with the new
+    one at once; it listens with the old one until it is started again.
+
+    For example: trade pki issue arm --address 192.168.1.5
+    """
+    if purpose not in (None, *_PURPOSES):
+        raise UsageError(where=f"--for {purpose}", problem=f"there is {' and '.join(_PURPOSES)}")
+    authority = _authority(folder)
+    renewed = not force and any(one.name == name and one.until for one in authority.issued())
+    given = authority.issue(
+        name,
+        purpose="gateway" if purpose == "gateway" else "container" if purpose else None,
+        hosts=host or (),
+        addresses=address or (),
+        lasts=timedelta(hours=hours) if hours else None,
+        new_key=force,
+    )
+    out = Output(as_json=as_json)
+    if as_json:
+        out.data(_plain(given))
+        return
+    advice = _to_renew if renewed else _for_gateway if given.purpose == "gateway" else _for_container
+    out.say(escape("\n".join((f"{given.name}, a {given.purpose}, until {_moment(given.until)}", *advice(given)))))
+
+
+def _to_renew(given: "Issued") -> list[str]:
+    return [
+        "Its key and ca.pem are the same, so copy only this one, over the old one on its host:",
+        f"  {given.folder / 'cert.pem'}",
+        f"It may be dialled by {', '.join(given.hosts)}" if given.hosts else "Nobody beyond its host can dial it.",
+    ]
+
+
+def _for_gateway(given: "Issued") -> list[str]:
+    endpoints = _endpoints(given)
+    return [
+        *_where(given),
+        "Name the folder in its gateway file, and each address in the table of its network:",
+        f'  tls = "{given.folder}"',
+        *(f'  listen = ["{endpoint}"]' for endpoint in endpoints),
+        *([] if endpoints else [f"  (it has no address yet: trade pki issue {given.name} --address ADDRESS)"]),
+        f'  trade gateway GATEWAY.toml          # the policy it names needs gateways = ["{given.name}"]',
+    ]
+
+
+def _for_container(given: "Issued") -> list[str]:
+    endpoints = ",".join(_endpoints(given))
+    return [
+        *_where(given),
+        "Start it with them, wherever you take them, and with the policy of the system:",
+        f"  export TRADE_SYSTEM=SYSTEM TRADE_TLS={_quoted(given.folder)} TRADE_POLICY=POLICY.toml",
+        *([f"  export TRADE_LISTEN={endpoints}          # where others dial it"] if endpoints else []),
+        "  export TRADE_CONNECT=tls/ADDRESS:7450          # whom it dials: a gateway, or a robot"
+        + (", if any" if endpoints else "; nobody beyond its host can dial it"),
+        "  trade services          # or trade up ROBOT.toml, or a program of yours",
+    ]
+
+
+def _where(given: "Issued") -> list[str]:
+    return ["ca.pem, cert.pem and key.pem (secret) are in", f"  {given.folder}"]
+
+
+def _endpoints(given: "Issued") -> list[str]:
+    """Where it may listen; IPv6 does not go with certificates."""
+    return [f"tls/{host}:7450" for host in given.hosts if ":" not in host]
+
+
+@app.command()
+def revoke(name: Name, folder: Folder = _DEFAULT) -> None:
+    """Take an identity back for good: it is not issued again, and policies refuse it.
+
+    For example: trade pki revoke arm
+    """
+    taken = _authority(folder).revoke(name)
+    Output(as_json=False).say(
+        f"{name} is revoked and not issued again. Links know no revocation: its certificate links until "
+        f"{_moment(taken.until)}. Refused before that it is by the policies that have the list:\n"
+        f"  {escape(str(taken.folder.parents[1] / 'revoked.toml'))}\n"
+        "Copy it to every host, to where its policy says (revoked_file): what runs there reads it within seconds, and "
+        "says so in its log."
+    )
+
+
+@app.command("list")
+def list_(folder: Folder = _DEFAULT, as_json: Json = False) -> None:
+    """List the identities: what for, until when, whether revoked.
+
+    For example: trade pki list --json
+    """
+    out = Output(as_json=as_json)
+    found = _authority(folder).issued()
+    if as_json:
+        out.data([_plain(one) for one in found])
+    elif not found:
+        out.say("nobody has an identity yet; [bold]trade pki issue NAME[/] gives one")
+    else:
+        rows = [(one.name, one.purpose, _moment(one.until), _state(one), ", ".join(one.hosts)) for one in found]
+        out.table(("NAME", "FOR", "UNTIL", "STATE", "HOSTS"), rows)
+
+
+def _authority(folder: Path) -> "Authority":
+    from trade_gateway.pki._authority import Authority  # noqa: PLC0415 - loads what the other commands do not need
+
+    return Authority(folder)
+
+
+def _plain(given: "Issued") -> dict[str, Any]:
+    return {
+        "name": given.name,
+        "for": given.purpose,
+        "until": given.until,
+        "hosts": given.hosts,
+        "state": _state(given),
+        "revoked": given.revoked,
+        "folder": str(given.folder),
+    }
+
+
+def _state(given: "Issued") -> str:
+    if given.revoked:
+        return "revoked"
+    if given.until is None:
+        return "files gone"
+    return "valid" if given.until > datetime.now(timezone.utc) else "expired"
+
+
+def _moment(when: datetime | None) -> str:
+    return f"{when:%Y-%m-%d %H:%M} UTC" if when else "a time not known here"
+
+
+def _quoted(folder: Path) -> str:
+    return shlex.quote(str(folder))

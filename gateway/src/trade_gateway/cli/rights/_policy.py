@@ -1,0 +1,77 @@
+"""``trade policy``: who may do what, by a policy file; nothing is started and nobody is asked."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+
+from trade.policies import VERBS, Decision, Policy, decide_call, read_policy
+from trade_gateway.cli._output import Output, UsageError
+from trade_gateway.cli.services._services import Json
+
+app = typer.Typer(no_args_is_help=True, help="Who may do what, by the access policy.")
+
+File = Annotated[Path | None, typer.Option("--policy", envvar="TRADE_POLICY", help="The policy file.")]
+
+
+@app.command("check")
+def check(
+    who: Annotated[str, typer.Argument(help="An identity.")],
+    verb: Annotated[str, typer.Argument(help=f"What it wants to do: {', '.join(VERBS)}.")],
+    what: Annotated[str, typer.Argument(help="A group or a service in it: rosie.neck.move_to; _ for no group.")],
+    policy: File = None,
+    as_json: Json = False,
+) -> None:
+    """Say whether somebody may do something, and by which rule. Exit code 0: allowed; 1: denied.
+
+    A stop service needs no rule, only an identity that is not revoked.
+
+    For example: trade policy check planner call rosie.neck.move_to
+    """
+    if verb not in VERBS:
+        raise UsageError(where=verb, problem=f"is nothing one may do; there is {', '.join(VERBS)}")
+    decision = _decision(_read(policy), who, verb, what)
+    out = Output(as_json=as_json)
+    if as_json:
+        out.data(decision._asdict())
+    out.say(f"{'[green]allowed[/]' if decision.allowed else '[bold red]denied[/]'}: {escape(decision.rule)}")
+    if not decision.allowed:
+        raise typer.Exit(1)
+
+
+def _decision(policy: Policy, who: str, verb: str, what: str) -> Decision:
+    group, _, function = what.partition(".")
+    if group == "trade" and function and verb in {"call", "read"}:
+        return decide_call(policy, who, group, function, "actuate")[1]
+    return policy.decide(who, verb, what)
+
+
+@app.command("show")
+def show(policy: File = None, as_json: Json = False) -> None:
+    """List the identities of a policy, their roles, and the groups in which they may do what.
+
+    For example: trade policy show --policy policy.toml
+    """
+    read, out = _read(policy), Output(as_json=as_json)
+    if as_json:
+        identities = {name: {"roles": read.roles_of(name), **_groups(read, name)} for name in read.identities}
+        out.data({"identities": identities, "revoked": sorted(read.revoked)})
+        return
+    rows = [
+        (name, ", ".join(read.roles_of(name)), *(", ".join(groups) for groups in _groups(read, name).values()))
+        for name in read.identities
+    ]
+    out.table(("IDENTITY", "ROLES", *(verb.upper() for verb in VERBS)), rows)
+    if read.revoked:
+        out.say(f"revoked: {escape(', '.join(sorted(read.revoked)))}")
+
+
+def _groups(policy: Policy, who: str) -> dict[str, list[str]]:
+    return {verb: policy.groups_of(who, (verb,)) for verb in VERBS}
+
+
+def _read(path: Path | None) -> Policy:
+    if path is None:
+        raise UsageError(where="trade policy", problem="say which: --policy FILE, or TRADE_POLICY in the environment")
+    return read_policy(path)

@@ -1,0 +1,1 @@
+"""Commands that bring up robots, containers and networks."""

@@ -1,0 +1,53 @@
+"""``trade container``: a process with nothing in it, for others to put providers into."""
+
+from dataclasses import replace
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+
+from trade import Container
+from trade_gateway.cli._output import Output
+from trade_gateway.cli._system_choice import choice_of
+from trade_gateway.cli.robots._detached import Detach, detach_now, ready
+from trade_gateway.cli.robots._up import leaving, refuse_twice, settle
+from trade_gateway.cli.services._services import Json
+
+_LOOK_EVERY_S = 0.2
+
+
+def container(
+    context: typer.Context,
+    name: Annotated[str | None, typer.Option(help="Its name. \\[env: TRADE_CONTAINER]")] = None,
+    allow: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Classes that may be made in it: mypkg.vision:Camera, mypkg.*; repeatable. \\[env: TRADE_INSTANTIABLE]"
+        ),
+    ] = None,
+    detach: Detach = False,
+    as_json: Json = False,
+) -> None:
+    """Keep an empty container up until Ctrl-C, SIGTERM or its function terminate_container.
+
+    For example: trade container --name eyes --allow "mypkg.vision:*"
+    """
+    out, settings = Output(as_json=as_json), choice_of(context).settings(name)
+    if detach:
+        detach_now(out, settings)
+        return
+    if allow:
+        settings = replace(settings, instantiable=tuple(allow))
+    with leaving() as asked_to_leave, Container(settings) as running:
+        running.terminating.close = asked_to_leave.set
+        refuse_twice(running, "trade container")
+        settle()
+        if as_json:
+            out.data({**ready(running), "instantiable": settings.instantiable})
+        out.say(
+            f"[bold green]{running.name} is up[/]; it may make {escape(', '.join(settings.instantiable)) or 'nothing'}"
+        )
+        out.say("Ctrl-C leaves")
+        while not asked_to_leave.wait(_LOOK_EVERY_S):
+            pass
+        out.say("leaving")

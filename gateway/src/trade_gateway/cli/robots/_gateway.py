@@ -1,0 +1,284 @@
+"""``trade gateway GATEWAY.toml``: join networks, and let across what the file and its policy allow."""
+
+import queue
+import signal
+import tempfile
+from collections.abc import Callable, Generator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import Annotated, Final
+
+import typer
+from rich.markup import escape
+
+from trade import Container, Settings
+from trade.errors import ConfigurationError, TradeError
+from trade.policies import EVERYTHING
+from trade_gateway.cli._addresses import forwarding
+from trade_gateway.cli._output import Output, complain
+from trade_gateway.cli._sd_notify import Notifier
+from trade_gateway.cli.robots._detached import Detach, detach_now, ready
+from trade_gateway.cli.robots._up import leaving, settle
+from trade_gateway.cli.services._services import Json
+from trade_gateway.config._changes import Named, digest, named_by
+from trade_gateway.config._gateway import Plan, read_gateway_file
+from trade_gateway.federation._guests import Guests, opened
+from trade_gateway.process._signal_event import Asked
+from trade_gateway.supervisor import ChildServices, News, Supervisor
+
+_LOOK_EVERY_S: Final = 1.0
+
+
+def gateway(
+    file: Annotated[Path, typer.Argument(metavar="GATEWAY.toml", help="The gateway file.")],
+    check: Annotated[bool, typer.Option("--check", help="Only say whether the file is right.")] = False,
+    detach: Detach = False,
+    as_json: Json = False,
+) -> None:
+    """Carry calls between networks that have no way to each other, as far as the file and its policy allow.
+
+    It may be a guest in other systems, too, and share some groups with them. Containers of its host that the file names
+    it starts, and starts again when they crash or hang; they end with it.
+
+    The file is read again when it changes, when its policy, its revoked names or its certificate do, and on SIGHUP.
+    What is wrong with it is said, and the gateway goes on as before.
+
+    For example: trade gateway /etc/trade/gateway.toml --check
+    """
+    out, notifier = Output(as_json=as_json), Notifier()
+    plan = read_gateway_file(file)
+    plan.check_here(file)
+    _warn_of_forwarding(plan)
+    if check:
+        if unnamed := plan.unnamed:
+            raise ConfigurationError(where=str(plan.settings.policy), problem=unnamed)
+        out.say(f"{file} is right")
+        _say_what_crosses(out, plan)
+        _say_children(out, plan)
+        return
+    if detach:
+        detach_now(out, plan.settings)
+        return
+    with leaving() as asked_to_leave, hangups() as hangup, notifier:
+        seen = digest(file)
+        running = Gateway(plan, named_by(file, plan), asked_to_leave.set)
+        try:
+            settle()
+            _say_ready(out, running, plan)
+            if unnamed := plan.unnamed:
+                complain(f"{plan.settings.policy}: {unnamed}")
+            notifier.ready(_status(running))
+            while not asked_to_leave.wait(_LOOK_EVERY_S):
+                if running.healthy:
+                    notifier.alive()
+                _say_news(out, running.news)
+                now = digest(file)
+                if now != seen or hangup.is_set():
+                    seen, anew = now, hangup.is_set()
+                    hangup.clear()
+                    notifier.reloading()
+                    good = running.reload(file, out, anew=anew)
+                    notifier.ready(_status(running) if good else f"{file} is wrong; going on as before")
+        finally:
+            notifier.leaving()
+            out.say("leaving")
+            running.close()
+            _say_news(out, running.news)
+
+
+class Gateway:
+    """The container that joins the networks, its guests in other systems, its children, as the file says now."""
+
+    def __init__(self, plan: Plan, named: Named, leave: Callable[[], None]) -> None:
+        self._plan = plan
+        self._leave = leave
+        """What ends the gateway when its container is terminated."""
+        self._named = named
+        """What the files said that it names."""
+        self._guests = Guests()
+        self._container = Container(plan.settings)
+        self._container.terminating.close = leave
+        self._running: Settings | None = plan.settings
+        """What the container that is open was started with."""
+        self._supervisor: Supervisor | None = None
+        self.news: queue.SimpleQueue[News] = queue.SimpleQueue()
+        """What becomes of the children."""
+        try:
+            self._guests.apply(self._container, plan)
+            self._look_after(plan)
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def container(self) -> Container:
+        """The one that runs now."""
+        return self._container
+
+    @property
+    def healthy(self) -> bool:
+        """Whether it can take a call now, and its children are looked after."""
+        return self._container.healthy() and (self._supervisor is None or self._supervisor.alive)
+
+    def reload(self, file: Path, out: Output, *, anew: bool = True) -> bool:
+        """Go by the file as it is now; returns whether that could be done. If not, all stays as it was.
+
+        Args:
+            file: the gateway file.
+            out: where to tell of it.
+            anew: open everything anew, even where the file says nothing else.
+        """
+        try:
+            plan = read_gateway_file(file)
+            plan.check_here(file)
+            named = named_by(file, plan)
+        except TradeError as wrong:
+            complain(f"{file} was changed and is wrong; going on as before: {wrong}")
+            return False
+        changed = named.since(self._named)
+        anew = anew or named.digests != self._named.digests
+        try:
+            self._go_by(plan, anew=anew)
+        except TradeError as refused:
+            self._go_by(self._plan, anew=False)
+            complain(f"{file} was changed and cannot be used; going on as before: {refused}")
+            return False
+        self._plan, self._named = plan, named
+        self._container.note_change("gateway file read", f"{file}: {changed}" if changed else str(file))
+        self._look_after(plan)
+        out.say(escape(f"read {file} again{': ' if changed else ''}{changed}"))
+        if out.as_json:
+            out.data({"reloaded": str(file), "changed": changed})
+        return True
+
+    def _go_by(self, plan: Plan, *, anew: bool) -> None:
+        if anew or plan.settings != self._running:
+            self._running = None
+            self._leave_networks()
+            self._container = opened(plan.settings)
+            self._container.terminating.close = self._leave
+            self._offer()
+            self._running = plan.settings
+        self._guests.apply(self._container, plan)
+
+    def _look_after(self, plan: Plan) -> None:
+        """The children are as the file says; those of which it says nothing new go on."""
+        if self._supervisor is None and plan.children:
+            state = plan.settings.state_dir or Path(tempfile.gettempdir())
+            self._supervisor = Supervisor(lambda: self._container, self.news.put, state / plan.settings.system)
+            self._offer()
+        if self._supervisor is not None:
+            self._supervisor.go_by(plan.children)
+
+    def _offer(self) -> None:
+        if self._supervisor is not None:
+            self._container.register_functions(ChildServices(self._supervisor), "supervisor")
+
+    def _leave_networks(self) -> None:
+        self._guests.close()
+        self._container.close()
+
+    def close(self) -> None:
+        """End the children, then leave all networks and systems. Idempotent."""
+        if self._supervisor is not None:
+            self._supervisor.close()
+        self._leave_networks()
+
+
+@contextmanager
+def hangups() -> Generator[Asked]:
+    """What SIGHUP asks for."""
+    event = Asked()
+
+    def heard(_number: int, _frame: FrameType | None) -> None:
+        event.set()
+
+    number = getattr(signal, "SIGHUP", None)
+    before = None if number is None else signal.signal(number, heard)
+    try:
+        yield event
+    finally:
+        if number is not None:
+            signal.signal(number, before)
+
+
+def _warn_of_forwarding(plan: Plan) -> None:
+    """The host's kernel would carry what the gateway does not."""
+    interfaces = [network.interface for network in plan.file.network.values()]
+    if len(plan.file.network) + len(plan.file.share) > 1 and (on := forwarding(interfaces)):
+        complain(
+            f"this host passes packets on between its networks ({', '.join(on)}), so who has a route through it can "
+            "dial containers beyond the gateway, and no `export` counts there; sudo sysctl -w net.ipv4.ip_forward=0 "
+            "net.ipv6.conf.all.forwarding=0, or have a firewall drop what is forwarded between them"
+        )
+
+
+def _status(running: Gateway) -> str:
+    settings = running.container.settings
+    return f"{settings.container} is up in system {settings.system}, as {settings.identity}"
+
+
+def _say_news(out: Output, told: "queue.SimpleQueue[News]") -> None:
+    while not told.empty():
+        news = told.get()
+        if out.as_json:
+            out.data(news)
+        elif news.bad:
+            complain(news.text)
+        else:
+            out.say(escape(news.text))
+
+
+def _say_ready(out: Output, running: Gateway, plan: Plan) -> None:
+    settings = plan.settings
+    if out.as_json:
+        networks = {name: None if settings.exports is None else settings.exports[name] for name in settings.bridge}
+        out.data(
+            {
+                **ready(running.container),
+                "identity": settings.identity,
+                "listen": settings.listen,
+                "networks": networks,
+                "shares": {name: _share(plan, name) for name in plan.shares},
+                "children": [child.name for child in plan.children],
+            }
+        )
+        return
+    out.say(f"[bold green]{running.container.name} is up[/] in system {settings.system}, as {settings.identity}")
+    _say_what_crosses(out, plan)
+    _say_children(out, plan)
+    out.say("Ctrl-C leaves; the file is read again when it changes")
+
+
+def _share(plan: Plan, name: str) -> dict[str, object]:
+    share, settings = plan.file.share[name], plan.shares[name]
+    return {
+        "system": settings.system,
+        "identity": settings.identity,
+        "listen": settings.listen,
+        "export": share.export,
+        "import": share.import_,
+    }
+
+
+def _say_what_crosses(out: Output, plan: Plan) -> None:
+    settings = plan.settings
+    for name in settings.bridge:
+        groups = (EVERYTHING,) if settings.exports is None else settings.exports[name]
+        out.say(f"  {name}: others see {_listed(groups)} of it")
+        for group, hz in settings.stream_hz.get(name, {}).items():
+            out.say(f"    and at most {hz:g} samples a second of each stream of {_listed([group])}")
+    for name, share in plan.file.share.items():
+        guest = plan.shares[name]
+        out.say(f"  system {guest.system}, as {guest.identity}: it sees {_listed(share.export)} of {settings.system}")
+        out.say(f"  and {settings.system} sees {_listed(share.import_)} of {guest.system}")
+
+
+def _say_children(out: Output, plan: Plan) -> None:
+    for child in plan.children:
+        out.say(f"  it keeps {escape(child.name)} up: {child.part.entry.kind}")
+
+
+def _listed(groups: Sequence[str]) -> str:
+    return ", ".join(groups).replace(EVERYTHING, "everything") or "nothing"

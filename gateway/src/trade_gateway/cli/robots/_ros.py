@@ -1,0 +1,105 @@
+"""``trade ros``: a bridge between a system and ROS, 1 or 2, by what a file says."""
+
+from pathlib import Path
+from typing import Annotated, Any, Final
+
+import typer
+from rich.markup import escape
+
+from trade import Container
+from trade.errors import ConfigurationError
+from trade_gateway.cli._output import Output, complain
+from trade_gateway.cli._sd_notify import Notifier
+from trade_gateway.cli._system_choice import SystemChoice
+from trade_gateway.cli.robots._detached import Detach, detach_now, ready
+from trade_gateway.cli.robots._up import leaving, refuse_twice, settle
+from trade_gateway.cli.services._services import Json
+
+_LOOK_EVERY_S: Final = 0.5
+_UP_WITHIN_S: Final = 30.0
+
+
+def ros(
+    context: typer.Context,
+    file: Annotated[Path, typer.Argument(metavar="FILE.toml", help="What is mapped; see docs/ros.md.")],
+    check: Annotated[bool, typer.Option("--check", help="Only say whether the file is right, and what it maps.")] = (
+        False
+    ),
+    name: Annotated[str, typer.Option(help="Name of its container.")] = "ros",
+    detach: Detach = False,
+    as_json: Json = False,
+) -> None:
+    """Have ROS, 1 or 2, see and call what a file names, and the other way round; until Ctrl-C or SIGTERM.
+
+    Each node of ROS is a client of its own: what it moves stops when it dies, and its locks fall.
+
+    For example: trade ros examples/ros.toml --check
+    """
+    room, out = _room(), Output(as_json=as_json)
+    read = room.read_ros_file(file)
+    if check:
+        _say_checked(out, file, room.planned(read, file))
+        return
+    room.planned(read, file)  # what is wrong with its types is said before anything is joined
+    choice: SystemChoice = context.obj
+
+    def say(line: str) -> None:
+        out.say(escape(line))
+
+    if detach:
+        detach_now(out, choice.settings(name))
+        return
+    with (
+        Notifier() as notifier,
+        leaving() as asked_to_leave,
+        Container(choice.settings(name)) as container,
+    ):
+        container.terminating.close = asked_to_leave.set
+        refuse_twice(container, "trade ros")
+        if container.access.policy is None:
+            complain("there is no policy: every node of that ROS may call what the file maps; see docs/ros.md")
+        graph = room.join(read, file)
+        try:
+            bridge = room.Bridge(container, graph, read, say)
+            try:
+                bridge.settled(_UP_WITHIN_S)
+                settle()
+                _say_ready(out, container, read.ros.node)
+                notifier.ready(f"ROS {read.ros.version} is bridged by container {container.name}")
+                while not asked_to_leave.wait(_LOOK_EVERY_S):
+                    if container.healthy():
+                        notifier.alive()
+                notifier.leaving()
+                out.say("leaving")
+            finally:
+                bridge.close()
+        finally:
+            graph.close()
+
+
+def _say_checked(out: Output, file: Path, planned: list[str]) -> None:
+    if out.as_json:
+        out.data({"file": str(file), "maps": planned})
+        return
+    for line in planned:
+        out.say(escape(line))
+    out.say(f"{escape(str(file))} is right")
+
+
+def _say_ready(out: Output, container: Container, node: str) -> None:
+    if out.as_json:
+        out.data({**ready(container), "node": node})
+        return
+    out.say(
+        f"[bold green]bridged[/]: {escape(node)} in ROS, {escape(container.name)} in system "
+        f"{escape(container.settings.system)}; Ctrl-C ends it"
+    )
+
+
+def _room() -> Any:
+    try:
+        from trade_gateway import ros as room  # noqa: PLC0415 - loads what the other commands do not need
+    except ImportError as missing:
+        problem = f"needs {missing.name}; pip install 'trade-gateway[ros]'"
+        raise ConfigurationError(where="trade ros", problem=problem) from None
+    return room

@@ -1,0 +1,45 @@
+"""``trade start HOST NAME``: an empty container on another host."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+
+from trade_gateway.cli._output import Output
+from trade_gateway.cli._system_choice import visitor
+from trade_gateway.cli.services._services import Json
+
+
+def start(
+    context: typer.Context,
+    host: Annotated[str, typer.Argument(metavar="HOST", help="As for ssh: HOST or USER@HOST.")],
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the container.")],
+    allow: Annotated[list[str] | None, typer.Option(help="Classes that may be made in it; repeatable.")] = None,
+    dial: Annotated[list[str] | None, typer.Option(help="Endpoint it dials, as seen from there; repeatable.")] = None,
+    command: Annotated[str, typer.Option(help="Path of trade there.")] = "trade",
+    ssh_config: Annotated[Path | None, typer.Option(help="Instead of ~/.ssh/config.")] = None,
+    wait: Annotated[float, typer.Option(min=0.0, max=600.0, help="Seconds until it must be seen here.")] = 10.0,
+    as_json: Json = False,
+) -> None:
+    """Start an empty container on another host, through ssh; it stays up when this command ends.
+
+    Only hosts whose key is known are talked to, and nothing is asked: set up ssh before.
+
+    For example: trade start robot.example eyes --allow "mypkg.vision:*"
+    """
+    out = Output(as_json=as_json)
+    with visitor(context) as container:
+        started = container.system.start_container(
+            host,
+            name,
+            allow=allow or (),
+            connect=dial or (),
+            command=(command,),
+            ssh_config=ssh_config,
+            wait_s=wait,
+        )
+    if as_json:
+        out.data(started)
+    out.say(f"[bold green]{escape(started.name)} is up[/] on {escape(started.host)}, process {started.pid}")
+    out.say(f"to end it: [bold]trade call trade.terminate_container '\"done\"' --container {escape(started.name)}[/]")

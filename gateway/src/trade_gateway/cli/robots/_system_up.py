@@ -1,0 +1,225 @@
+"""Bringing the containers of a system file up, looking at them, taking them down."""
+
+import contextlib
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from msgspec import Struct
+
+from trade import Container, ContainerInfo, Handle, where
+from trade.errors import CannotStart, ConfigurationError, NoSuchService, TooManyServices, TradeError
+from trade.starting import LONGEST_S, Started, end_there, launch, missing_there
+from trade_gateway.cli.robots._detached import detached
+from trade_gateway.config._system import SystemPlan
+from trade_gateway.config._tables import Part
+from trade_gateway.process._signal_event import Asked
+from trade_gateway.supervisor._objects import GROUP, lacking, make
+
+_LEFT_S: Final = 20.0
+"""How long a container may take to leave once it was told to: a robot is brought to rest before."""
+_LOOK_EVERY_S: Final = 0.05
+
+
+class Told(Struct, frozen=True, kw_only=True):
+    """What became of one container."""
+
+    container: str
+    host: str
+    """As the file has it."""
+    state: str
+    """``started``, ``was up``, ``up``, ``down``, ``ended``, ``was down``, or what is missing in it."""
+    pid: int = 0
+    took_s: float = 0.0
+    services: int = 0
+
+
+Tell = Callable[[Told], None]
+
+
+class _Began(NamedTuple):
+    part: Part
+    started: Started
+
+
+class Bringing:
+    """The containers of one file, seen from a container of the command's own.
+
+    Args:
+        plan: the file, checked.
+        member: in the system of the file.
+        ssh_config: instead of the user's own.
+        wait_s: how long a container may take to be seen once it is up, and an object to be made.
+        tell: told of each container.
+    """
+
+    def __init__(
+        self, plan: SystemPlan, member: Container, *, ssh_config: Path | None, wait_s: float, tell: Tell
+    ) -> None:
+        self._plan = plan
+        self._member = member
+        self._ssh_config = ssh_config
+        self._wait_s = wait_s
+        self._tell = tell
+
+    def up(self, *, keep: bool, interrupted: threading.Event | Asked) -> None:
+        """Start what is not up, in order; leave what is. What fails has what this began taken down again.
+
+        Args:
+            keep: leave what was begun as it is.
+            interrupted: ends it likewise, once the container that is being started is up and known by its process.
+
+        Raises:
+            KeyboardInterrupt: it was interrupted.
+            CannotStart, ConfigurationError: with the reason; before anything is started if a host is out of reach.
+            TradeError: an object could not be made.
+        """
+        check_hosts(self._plan, [part for part in self._plan.parts if self._seen(part) is None], self._ssh_config)
+        began: list[_Began] = []
+        try:
+            for part in self._plan.parts:
+                self._bring(part, began)
+                if interrupted.is_set():
+                    raise KeyboardInterrupt
+        except BaseException:
+            if not keep:
+                self._undo(began)
+            raise
+
+    def _bring(self, part: Part, began: list[_Began]) -> None:
+        at, info = time.monotonic(), self._seen(part)
+        was_up = info is not None
+        if info is None:
+            began.append(_Began(part, self._start(part)))
+            info = self._await(began[-1])
+        made = [make(self._own(part, "instantiate"), one, wait_s=self._wait_s) for one in lacking(self._member, part)]
+        state = "was up" if was_up and not made else "started"
+        took_s = time.monotonic() - at
+        self._tell(Told(container=part.name, host=part.entry.host, state=state, pid=info.pid, took_s=took_s))
+
+    def _start(self, part: Part) -> Started:
+        entry = part.entry
+        if entry.is_local:
+            settings = replace(self._plan.settings, container=part.name)
+            return detached(part.words, settings, {**os.environ, **part.environment})
+        return launch(
+            entry.host,
+            part.name,
+            part.words,
+            command=(entry.command,),
+            environment=part.environment,
+            ssh_config=self._ssh_config,
+        )
+
+    def _await(self, began: _Began) -> ContainerInfo:
+        part, started = began
+        with contextlib.suppress(NoSuchService, TooManyServices):  # which one it is the epoch tells
+            self._member.find(where(name="clock", group=GROUP, container=part.name), wait_s=self._wait_s)
+        info = next((one for one in self._member.containers() if one.epoch == started.epoch), None)
+        if info is None:
+            said = f"it is up there as process {started.pid}, and not seen here within {self._wait_s:g} s"
+            remedy = f"tell it whom to dial ({self._plan.at(part.name, 'connect')}), and give it the certificate"
+            raise CannotStart(host=part.entry.host, container=part.name, reason="not seen", said=said, remedy=remedy)
+        return info
+
+    def _own(self, part: Part, name: str) -> Handle:
+        return self._member.find(where(name=name, group=GROUP, container=part.name), wait_s=self._wait_s)
+
+    def _seen(self, part: Part) -> ContainerInfo | None:
+        """The container of that name. Raises ConfigurationError if there are two."""
+        found = [info for info in self._member.containers() if info.name == part.name]
+        if len(found) > 1:
+            problem = f"there are {len(found)} of that name: {', '.join(f'{one.pid} on {one.host}' for one in found)}"
+            raise ConfigurationError(where=self._plan.at(part.name), problem=problem)
+        return found[0] if found else None
+
+    def _undo(self, began: Sequence[_Began]) -> None:
+        """Take down what was begun, last first; what does not go is told, and left."""
+        for part, started in reversed(began):
+            try:
+                if any(info.epoch == started.epoch for info in self._member.containers()):
+                    self._end(part, only_at_rest=True)
+                else:
+                    self._end_unseen(part, started)
+            except TradeError as left:
+                self._tell(Told(container=part.name, host=part.entry.host, state=f"left up: {left}", pid=started.pid))
+
+    def _end_unseen(self, part: Part, started: Started) -> None:
+        if part.entry.is_local:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(started.pid, signal.SIGTERM)
+        else:
+            end_there(part.entry.host, part.name, started.pid, self._ssh_config)
+        self._tell(Told(container=part.name, host=part.entry.host, state="ended", pid=started.pid))
+
+    def down(self, *, only_at_rest: bool) -> None:
+        """End the containers, those first that were started last; stops at the first that does not go.
+
+        Raises:
+            InUse: something of it is locked or moves, and it was to end ``only_at_rest``.
+            TradeError: it could not be told to.
+        """
+        for part in reversed(self._plan.parts):
+            if self._seen(part) is None:
+                self._tell(Told(container=part.name, host=part.entry.host, state="was down"))
+            else:
+                self._end(part, only_at_rest=only_at_rest)
+
+    def _end(self, part: Part, *, only_at_rest: bool) -> None:
+        at, info = time.monotonic(), self._seen(part)
+        terminate = self._own(part, "terminate_container").with_(deadline_s=_LEFT_S)
+        problems = terminate("trade system down", only_at_rest)
+        until, pause = at + _LEFT_S, threading.Event()
+        while info is not None and any(one.epoch == info.epoch for one in self._member.containers()):
+            if time.monotonic() > until:
+                problem = f"was told to end and is still there after {_LEFT_S:g} s; see trade logs"
+                raise ConfigurationError(where=self._plan.at(part.name), problem=problem)
+            pause.wait(_LOOK_EVERY_S)
+        state = f"ended, but: {'; '.join(problems)}" if problems else "ended"
+        took_s = time.monotonic() - at
+        self._tell(Told(container=part.name, host=part.entry.host, state=state, took_s=took_s))
+
+    def status(self) -> Iterator[Told]:
+        """How each container of the file fares, in order."""
+        for part in self._plan.parts:
+            info, host = self._seen(part), part.entry.host
+            if info is None:
+                yield Told(container=part.name, host=host, state="down")
+                continue
+            lacks = ", ".join(one.class_ for one in lacking(self._member, part))
+            state = f"lacks {lacks}" if lacks else "up"
+            yield Told(container=part.name, host=host, state=state, pid=info.pid, services=info.services)
+
+
+def check_hosts(plan: SystemPlan, parts: Sequence[Part], ssh_config: Path | None) -> None:
+    """Ask all other hosts at once whether they are there, and have ``trade`` and the files that are named.
+
+    Raises:
+        CannotStart: one is out of reach, or has no ``trade``.
+        ConfigurationError: a file is missing there; names the line.
+    """
+    asked = [part for part in parts if not part.entry.is_local]
+    wrong: dict[str, TradeError] = {}
+
+    def ask(part: Part) -> None:
+        try:
+            missing = missing_there(part.entry.host, part.name, (part.entry.command,), part.files, ssh_config)
+            if missing:
+                problem = f"{part.entry.host} has no {', '.join(missing)} that can be read"
+                raise ConfigurationError(where=plan.at(part.name, part.entry.kind), problem=problem)
+        except TradeError as error:
+            wrong[part.name] = error
+
+    askers = [threading.Thread(target=ask, args=(part,), name=f"trade-ask-{part.name}") for part in asked]
+    for asker in askers:
+        asker.start()
+    for asker in askers:
+        asker.join(LONGEST_S + 1)  # ssh is ended before
+    for part in asked:
+        if part.name in wrong:
+            raise wrong[part.name]

@@ -1,0 +1,212 @@
+"""``trade up ROBOT.toml``: attach a robot's devices and offer them as services until told to leave."""
+
+import gc
+import logging
+import signal
+from collections.abc import Generator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import Annotated, Any
+
+import typer
+from rich.markup import escape
+
+from trade import Container
+from trade.errors import ConfigurationError
+from trade_drivers import AttachedRobot, attach, load, without
+from trade_drivers import check as drivers_check
+from trade_drivers.robotfile import Robot
+from trade_gateway.cli._output import Output, UsageError, complain
+from trade_gateway.cli._sd_notify import Notifier
+from trade_gateway.cli._system_choice import choice_of
+from trade_gateway.cli.robots._detached import Detach, detach_now, ready
+from trade_gateway.cli.robots._fault_reporter import FaultWatch
+from trade_gateway.cli.services._services import Json
+from trade_gateway.process._signal_event import Asked
+
+_LOOK_EVERY_S = 0.5
+
+
+def up(
+    context: typer.Context,
+    robot_file: Annotated[Path, typer.Argument(metavar="ROBOT.toml", help="The robot file.")],
+    sim: Annotated[bool, typer.Option("--sim", help="Simulate the devices: the same bytes, no hardware.")] = False,
+    sim_log: Annotated[Path | None, typer.Option(help="With --sim: where to write the log of all bytes.")] = None,
+    port: Annotated[
+        list[str] | None,
+        typer.Option(metavar="PART=PORT", help="A port instead of the file's, such as neck=/dev/ttyUSB1; repeatable."),
+    ] = None,
+    leave_out: Annotated[
+        list[str] | None,
+        typer.Option("--without", metavar="PART", help="A bus, camera or sensor to leave out; again for another."),
+    ] = None,
+    name: Annotated[str | None, typer.Option(help="Name of the container; by default the robot's.")] = None,
+    check: Annotated[bool, typer.Option("--check", help="Only say whether its drivers take the file.")] = False,
+    detach: Detach = False,
+    as_json: Json = False,
+) -> None:
+    """Bring a robot up and keep it up; Ctrl-C or SIGTERM leaves it as its file says (hold or relax).
+
+    Attaching moves nothing and resets nothing. A line tells when a joint has a fault, and when it has none any more.
+
+    For example: trade up examples/rosie.toml --sim
+    """
+    if sim_log is not None and not sim:
+        raise UsageError(where="--sim-log", problem="is the log of the simulator; it needs --sim")
+    if sim and port:
+        raise UsageError(where="--port", problem="names hardware, and --sim simulates it; leave one of them out")
+    out = Output(as_json=as_json)
+    robot, left_out = without(load(robot_file), leave_out or [])
+    told = ports_told(port or [])
+    if check:
+        drivers_check(robot)
+        out.say(f"{robot_file} is right")
+        return
+    if detach:
+        detach_now(out, choice_of(context).settings(name or robot.name))
+        return
+    with Notifier() as notifier, ExitStack() as stack:
+        asked_to_leave = stack.enter_context(leaving())
+        simulation = stack.enter_context(_simulation(robot, sim_log)) if sim else None
+        ports: dict[str, str] = simulation.ports if simulation else told
+        container = stack.enter_context(Container(choice_of(context).settings(name or robot.name)))
+        container.terminating.close = asked_to_leave.set
+        refuse_twice(container, "trade up")
+        if left_out:
+            out.say(f"[bold]{robot.name}[/]: left out: {', '.join(left_out)}")
+        _say_attaching(out, robot, ports)
+        state_dir = container.settings.state_dir
+        attached = attach(
+            robot,
+            register=container.register,
+            deregister=container.deregister,
+            set_health=container.set_health,
+            ports=ports,
+            healthy=container.healthy,
+            state_dir=state_dir and state_dir / container.settings.system,
+        )
+        logging.getLogger("trade.silences").setLevel(logging.ERROR)  # FaultWatch tells of them, once and with the time
+        stack.callback(_say_left, attached)
+        stack.enter_context(attached)
+        container.measured_by(attached.measures)
+        settle()
+        _say_ready(out, robot, container, simulation)
+        faults = FaultWatch(attached.faults, attached.providers)
+        faults.begin(out)
+        stack.callback(notifier.leaving)
+        notifier.ready(f"{robot.name} is up in container {container.name}")
+        while not asked_to_leave.wait(_LOOK_EVERY_S):
+            faults.tell(out)
+            if container.healthy():
+                notifier.alive()
+            if simulation is not None and not simulation.running:
+                raise ConfigurationError(where="simulation", problem="its process ended; start again")
+        out.say("leaving")
+
+
+def ports_told(words: Sequence[str]) -> dict[str, str]:
+    """By part of the robot: the port that the command line names instead of the file's.
+
+    Raises:
+        UsageError: a word is no PART=PORT, or names a part a second time.
+    """
+    ports: dict[str, str] = {}
+    for word in words:
+        part, _, port = word.partition("=")
+        if not (part and port):
+            raise UsageError(where=f"--port {word}", problem="is no PART=PORT; write neck=/dev/ttyUSB1")
+        if part in ports:
+            raise UsageError(where=f"--port {word}", problem=f"{part} has {ports[part]} already")
+        ports[part] = port
+    return ports
+
+
+@contextmanager
+def leaving() -> Generator[Asked]:
+    """What Ctrl-C and SIGTERM ask for, so that devices are always left in order."""
+    event = Asked()
+
+    def leave(_number: int, _frame: FrameType | None) -> None:
+        event.set()
+
+    before = {number: signal.signal(number, leave) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield event
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def settle() -> None:
+    """To be called once all stands: from now on garbage collections leave out what is there already.
+
+    A full one looks through all of it, which takes 50 ms in the process of a robot, and every thread waits meanwhile.
+    """
+    gc.collect()
+    gc.freeze()
+
+
+def _simulation(robot: Robot, log: Path | None) -> Any:
+    try:
+        from trade_hil_sim import SimProcess, SimulationError, remove_leftovers  # noqa: PLC0415 - only needed without hardware
+    except ImportError:
+        raise ConfigurationError(where="--sim", problem="needs trade-hil-sim; pip install trade-hil-sim") from None
+    remove_leftovers()
+    try:
+        parts = [part.name for part in (*robot.buses, *robot.cameras, *robot.sensors)]
+        return SimProcess(robot.where, buses=parts, log=log, logged=log is not None)
+    except SimulationError as problem:
+        raise ConfigurationError(where=robot.where, problem=str(problem)) from None
+
+
+def refuse_twice(container: Container, command: str) -> None:
+    """Two containers of one name that stay up would make every look-up ambiguous."""
+    for other in container.containers():
+        if other.name == container.name and other.epoch != container.address.epoch:
+            problem = f"{other.name!r} is up already (process {other.pid} on {other.host}); stop it, or choose a --name"
+            raise ConfigurationError(where=command, problem=problem)
+
+
+def _say_left(attached: AttachedRobot) -> None:
+    if unseen := attached.unseen():
+        complain(f"left without being seen at rest: {', '.join(unseen)}")
+
+
+def _say_attaching(out: Output, robot: Robot, ports: dict[str, str]) -> None:
+    for bus in robot.buses:
+        devices = (*robot.joints_on(bus.name), *robot.grippers_on(bus.name))
+        named = ", ".join(
+            [
+                *(f"{device.name} ({device.model}, id {device.id})" for device in devices),
+                *(f"{arm.name} ({arm.model})" for arm in robot.arms_on(bus.name)),
+            ]
+        )
+        told = named or f'no device; one that is on it says bus = "{bus.name}"'
+        out.say(f"[bold]{robot.name}[/]: attaching bus {bus.name} on {ports.get(bus.name, bus.port)}: {told}")
+    for sense in (*robot.cameras, *robot.sensors):
+        place = f" on {ports[sense.name]}" if sense.name in ports else ""
+        out.say(f"[bold]{robot.name}[/]: attaching {type(sense).__name__.lower()} {sense.name} ({sense.driver}){place}")
+
+
+def _say_ready(out: Output, robot: Robot, container: Container, simulation: Any) -> None:
+    mine = [handle for handle in container.services() if handle.local and "trade" not in handle.groups]
+    if out.as_json:
+        extra = {"control": str(simulation.control_path)} if simulation else {}
+        open_ones = [estop.id for estop in container.estops()]
+        told = {**ready(container), "robot": robot.name, "estops": open_ones, **extra}
+        out.data({**told, "services": [handle.label for handle in mine]})
+        return
+    out.say(f"[bold green]{robot.name} is up[/]: {len(mine)} services in container {container.name}")
+    example = next((handle.label for handle in mine if handle.name in {"state", "read"}), None)
+    if example:
+        out.say(f"in another terminal: [bold]trade services --group {robot.name}[/] or [bold]trade call {example}[/]")
+    if simulation:
+        out.say(
+            f"to strike the simulator with faults: trade-hil-sim --do {simulation.control_path} FAULT (--help has them)"
+        )
+    out.say("Ctrl-C leaves")
+    for estop in container.estops():
+        why = f": {escape(estop.reason)}" if estop.reason else ""
+        out.say(f"[bold red]e-stop {estop.id} is open{why}; nothing moves before it is cleared[/]")
+        out.say(f"when it is safe: [bold]trade estop --clear {estop.id}[/]")

@@ -1,0 +1,1 @@
+"""Commands that call services and ask about them."""

@@ -1,0 +1,142 @@
+"""``trade call GROUP.NAME ARGUMENT...``: call one service and print its result."""
+
+import re
+import shlex
+import signal
+from collections.abc import Generator
+from contextlib import contextmanager
+from types import FrameType
+from typing import Annotated, Any, Final
+
+import msgspec
+import typer
+
+from trade import Container, Handle
+from trade.errors import TooManyServices, TradeError
+from trade_gateway.cli._output import Output, UsageError, say_error
+from trade_gateway.cli._system_choice import visitor
+from trade_gateway.cli.services._services import Json, asked_for
+
+_NO_NUMBER = re.compile(r"(?<![\w\"])(nan|inf|infinity)(?![\w\"])", re.IGNORECASE)
+_WORD = re.compile(r"[^\W\d][\w ./-]*")
+COMMAND: Final = {"context_settings": {"ignore_unknown_options": True}}
+"""A negative number is no option."""
+_NAMED = re.compile(r"([A-Za-z_]\w*)=(.*)", re.DOTALL)
+
+
+def call(
+    context: typer.Context,
+    service: Annotated[str, typer.Argument(help="Group and name: rosie.head.move_to.")],
+    arguments: Annotated[
+        list[str] | None,
+        typer.Argument(help="Each argument as JSON, by place ('[0.3, -0.2]') or by name (speed_rad_s=0.5)."),
+    ] = None,
+    deadline: Annotated[float, typer.Option(min=0.001, help="Seconds until the call is given up.")] = 10.0,
+    wait: Annotated[float, typer.Option(min=0.0, help="Seconds to wait for the service to appear.")] = 2.0,
+    container: Annotated[str | None, typer.Option(help="Only the service of this container.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Call a service and print its result; Ctrl-C cancels a motion under way.
+
+    What is printed for people is rounded to six places; --json has all digits.
+
+    For example: trade call rosie.head.move_to '[0.3, -0.2]' speed_rad_s=0.5
+    """
+    args, kwargs = parse_arguments(arguments or [])
+    with visitor(context) as visiting:
+        handle = find(visiting, service, container, wait).with_(deadline_s=deadline)
+        result = run_to_end(handle, *args, **kwargs)
+    Output(as_json=as_json).data(result)
+
+
+def run_to_end(handle: Handle, *args: Any, **kwargs: Any) -> Any:
+    """Call a service; Ctrl-C and its kin end what it began, and raise KeyboardInterrupt."""
+    with _interruptible():
+        run = handle.start(*args, **kwargs)
+        try:
+            return run.result()
+        except KeyboardInterrupt:
+            _cancel(handle)
+            raise
+
+
+@contextmanager
+def _interruptible() -> Generator[None]:
+    """A terminal that closes, ``kill`` and ``timeout`` end a call as Ctrl-C does: what it moves is stopped."""
+
+    def interrupt(_number: int, _frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    numbers = [signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else [])]
+    before = {number: signal.signal(number, interrupt) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _cancel(handle: Handle) -> None:
+    """Ctrl-C: end what was begun, and say if that failed."""
+    try:
+        handle.cancel_service()()
+    except TradeError as error:
+        say_error(error)
+
+
+def find(visiting: Container, service: str, container: str | None, wait_s: float) -> Handle:
+    """The service of a group and name; one of exactly this group goes before those beneath it.
+
+    Raises:
+        UsageError: the text names no service.
+    """
+    group, _, name = service.rpartition(".")
+    constraint = asked_for(f"service {service!r}", name=name or service, group=group or None, container=container)
+    try:
+        return visiting.find(constraint, wait_s=wait_s)
+    except TooManyServices:
+        exact = [handle for handle in visiting.services(constraint) if group in handle.groups]
+        if len(exact) == 1:
+            return exact[0]
+        raise
+
+
+def parse_arguments(texts: list[str]) -> tuple[list[Any], dict[str, Any]]:
+    """Arguments of a call from the words of a command line.
+
+    Raises:
+        UsageError: a word is not JSON.
+    """
+    args: list[Any] = []
+    kwargs: dict[str, Any] = {}
+    for place, text in enumerate(texts):
+        named = _NAMED.fullmatch(text)
+        try:
+            if named is None:
+                args.append(msgspec.json.decode(text))
+            else:
+                kwargs[named.group(1)] = msgspec.json.decode(named.group(2))
+        except msgspec.DecodeError as bad:
+            problem = f"is not JSON ({bad}); {_remedy(named.group(2) if named else text, texts[place + 1 :])}"
+            raise UsageError(where=f"argument {text!r}", problem=problem) from None
+    return args, kwargs
+
+
+def _remedy(value: str, rest: list[str]) -> str:
+    """What was probably meant by a word that is not JSON, given those that follow it."""
+    if _NO_NUMBER.search(value):
+        return "JSON has no NaN and no infinity, and what moves takes neither"
+    for count in range(1, len(rest) + 1 if value[:1] in ("[", "{", '"') else 0):
+        if _is_json(whole := " ".join([value, *rest[:count]])):
+            return f"forgot quotes? The shell splits at spaces: {shlex.quote(whole)}"
+    if _WORD.fullmatch(value):
+        return f"forgot quotes? A text is written {shlex.quote(msgspec.json.encode(value).decode())}"
+    return """write numbers as 0.3, lists as '[0.3, -0.2]', texts as '"left"'; forgot quotes?"""
+
+
+def _is_json(text: str) -> bool:
+    try:
+        msgspec.json.decode(text)
+    except msgspec.DecodeError:
+        return False
+    return True

@@ -1,0 +1,164 @@
+"""``trade services`` and ``trade containers``: what there is."""
+
+from collections.abc import Sequence
+from textwrap import indent
+from typing import Annotated, Any, Final
+
+import typer
+from rich.markup import escape
+
+from trade import Constraint, Container, ContainerInfo, Handle, LoadInfo, where
+from trade._protocol.messages import PROTOCOL
+from trade.errors import ConfigurationError
+from trade_gateway.cli._load_table import loads, loads_table
+from trade_gateway.cli._output import Output, UsageError
+from trade_gateway.cli._system_choice import visitor_among_others
+
+HEALTHY: Final = "healthy"
+_STARTS: Final = "; [bold]trade up examples/rosie.toml --sim[/] starts one"
+Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+
+
+def services(
+    context: typer.Context,
+    group: Annotated[str | None, typer.Option(help="Only this group and what is beneath it: rosie.head.")] = None,
+    name: Annotated[str | None, typer.Option(help="Only this name; * and ? stand for anything.")] = None,
+    everything: Annotated[bool, typer.Option("--all", help="Also the middleware's own services.")] = False,
+    doc: Annotated[bool, typer.Option("--doc", help="Show what each service does.")] = False,
+    as_json: Json = False,
+) -> None:
+    """List services: group and name, arguments, where they run.
+
+    For example: trade services --group rosie.head --doc
+    """
+    constraint = asked_for(f"--group {group}" if group else "services", group=group, name=name)
+    if not everything and group is None:
+        constraint = constraint & ~where(group="trade")
+    out = Output(as_json=as_json)
+    with visitor_among_others(context) as container:
+        found = container.services(constraint)
+        if as_json:
+            out.data([describe(handle) for handle in found])
+        elif not found:
+            out.say(_nothing(container, constraint))
+        elif doc:
+            for handle in found:
+                doc_text = indent(handle.doc or "(undocumented)", "  ")
+                out.say(f"[bold]{escape(handle.label)}[/]  {escape(handle.signature)}\n{escape(doc_text)}\n")
+        else:
+            out.table(*_table(found))
+
+
+def asked_for(what: str, *, name: str | None, group: str | None, container: str | None = None) -> Constraint:
+    """The constraint that words of the command line ask for.
+
+    Raises:
+        UsageError: they make none.
+    """
+    try:
+        return where(name=name, group=group, container=container)
+    except ConfigurationError as bad:
+        raise UsageError(where=what, problem=bad.problem) from None
+
+
+def _nothing(container: Container, constraint: Constraint) -> str:
+    """What there is instead of what was asked for."""
+    others = container.services(~where(group="trade"))
+    groups = sorted({group for handle in others for group in handle.groups})
+    if groups:
+        return f"no services match {escape(str(constraint))}; there is {', '.join(groups)}"
+    return f"nothing is up in system {escape(container.settings.system)}{_starts(container)}"
+
+
+def _alone(container: Container) -> str:
+    return f"no other container is up in this system{_starts(container)}"
+
+
+def _starts(container: Container) -> str:
+    """Who tries it out is told how to begin; who has set up a system of his own is not."""
+    settings = container.settings
+    return "" if settings.connect or settings.tls is not None else _STARTS
+
+
+def describe(handle: Handle) -> dict[str, Any]:
+    """Everything a handle tells, as plain data."""
+    return {
+        "service": handle.label,
+        "name": handle.name,
+        "groups": handle.groups,
+        "signature": handle.signature,
+        "effect": handle.effect,
+        "verb": handle.verb,
+        "roles": handle.roles,
+        "resources": handle.resources,
+        "doc": handle.doc,
+        "container": handle.container,
+        "host": handle.host,
+        "health": handle.health,
+        "schema": handle.schema,
+    }
+
+
+def _table(found: Sequence[Handle]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    """Where one is not well, there is a column for it."""
+    columns: dict[str, list[str]] = {"SERVICE": [handle.label for handle in found]}
+    if any(handle.health != HEALTHY for handle in found):
+        columns["HEALTH"] = [handle.health for handle in found]
+    columns["CALLED AS"] = [handle.signature for handle in found]
+    columns["EFFECT"] = [handle.effect for handle in found]
+    columns["CONTAINER"] = [handle.container for handle in found]
+    columns["HOST"] = [handle.host for handle in found]
+    return tuple(columns), list(zip(*columns.values(), strict=True))
+
+
+def containers(
+    context: typer.Context,
+    load: Annotated[bool, typer.Option("--load", help="How busy each is, over one second.")] = False,
+    as_json: Json = False,
+) -> None:
+    """List the containers of the system.
+
+    For example: trade containers --load
+    """
+    out = Output(as_json=as_json)
+    with visitor_among_others(context) as container:
+        if load:
+            _say_loads(out, container, loads(container))
+            return
+        found = [info for info in container.containers() if info.epoch != container.address.epoch]
+        if as_json:
+            out.data(found)
+        elif not found:
+            out.say(_alone(container))
+        else:
+            out.table(*_containers_table(found))
+
+
+def _containers_table(found: Sequence[ContainerInfo]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    """Where one speaks another version of the protocol, or has not answered yet, there is a column for it."""
+    columns: dict[str, list[str]] = {
+        "CONTAINER": [info.name for info in found],
+        "IDENTITY": [info.identity for info in found],
+    }
+    if any(info.protocol != PROTOCOL for info in found):
+        columns["PROTOCOL"] = [_version(info) for info in found]
+    columns["HOST"] = [info.host or "?" for info in found]
+    columns["PID"] = [str(info.pid or "?") for info in found]
+    columns["SERVICES"] = [str(info.services) if info.protocol == PROTOCOL else "?" for info in found]
+    columns["EPOCH"] = [info.epoch for info in found]
+    return tuple(columns), list(zip(*columns.values(), strict=True))
+
+
+def _version(info: ContainerInfo) -> str:
+    if info.protocol in (0, PROTOCOL):
+        return str(info.protocol or "?")
+    return f"{info.protocol} (here {PROTOCOL})"
+
+
+def _say_loads(out: Output, container: Container, found: Sequence[LoadInfo]) -> None:
+    if out.as_json:
+        out.data(found)
+    elif not found:
+        out.say(_alone(container))
+    else:
+        out.table(*loads_table(found))

@@ -1,0 +1,1 @@
+"""Commands that watch a system: events, calls, logs, faults, audit, rules."""

@@ -1,0 +1,162 @@
+"""``trade faults``: what is or was wrong with devices, what they measured then, and that somebody has seen it."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Annotated, Final
+
+import typer
+from rich.markup import escape
+
+from trade import Container, where
+from trade._timestamps import day_and_clock
+from trade.errors import TradeError
+from trade_gateway.cli._default_command import FirstByDefault
+from trade_gateway.cli._output import Output, UsageError, as_commands, complain
+from trade_gateway.cli._system_choice import visitor_among_others
+from trade_gateway.cli.services._services import Json, asked_for
+
+if TYPE_CHECKING:
+    from trade import Handle
+    from trade_drivers import Fault, FaultInfo, FaultSample
+
+_WAIT_S: Final = 5.0
+_SHOWN: Final = 20
+"""Samples; with ``--json`` all of them."""
+
+Id = Annotated[str, typer.Argument(metavar="ID", help="As trade faults tells it: rosie-3f2a.")]
+
+app = typer.Typer(
+    cls=FirstByDefault,
+    help="What is or was wrong with devices. Without one of the commands: list.",
+)
+
+
+@app.command("list")
+def list_faults(
+    context: typer.Context,
+    robot: Annotated[str | None, typer.Argument(metavar="ROBOT", help="Only of this robot.")] = None,
+    open_only: Annotated[bool, typer.Option("--open", help="Only what is wrong now.")] = False,
+    as_json: Json = False,
+) -> None:
+    """List the faults of devices, those that began last first.
+
+    For example: trade faults rosie --open
+    """
+    out, silent = Output(as_json=as_json), False
+    found: list[FaultInfo] = []
+    with visitor_among_others(context) as container:
+        for handle in _logs(container, robot):
+            try:
+                found += handle(open_only=open_only)
+            except TradeError as error:
+                silent = True
+                complain(f"{handle.label}: {error}")
+    found.sort(key=lambda info: -info.last_at)
+    if as_json:
+        out.data(found)
+    elif not found:
+        out.say("nothing is wrong" if open_only else "no faults are known")
+    else:
+        columns = ("ID", "DEVICE", "FAULT", "STATE", "COUNT", "FIRST", "LAST", "SEEN BY")
+        out.table(columns, [_row(info) for info in found])
+    if silent:
+        raise typer.Exit(1)
+
+
+@app.command()
+def show(
+    context: typer.Context,
+    fault_id: Id,
+    first: Annotated[bool, typer.Option("--first", help="What was measured the first time, not the latest.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Show one fault, and what its device measured before it began.
+
+    For example: trade faults show rosie-3f2a
+    """
+    out = Output(as_json=as_json)
+    with visitor_among_others(context) as container:
+        fault: Fault = _service(container, fault_id, "fault")(fault_id)
+    if as_json:
+        out.data(fault)
+        return
+    remedy = as_commands(fault.device, fault.remedy)
+    out.say(f"[bold]{escape(fault.text)}[/]" + (f"; {escape(remedy)}" if remedy else ""))
+    out.say(f"{_state(fault)}; began {_times(fault)}, was there for {fault.lasted_s:.1f} s in all")
+    if fault.acknowledged_at is not None:
+        out.say(f"seen by {escape(fault.acknowledged_by)} at {day_and_clock(fault.acknowledged_at)}")
+    for note in fault.evidence:
+        out.say(f"evidence: {escape(note)}")
+    samples = fault.first if first else fault.latest
+    if samples:
+        out.table(*_samples_table(samples[-_SHOWN:]))
+    else:
+        out.say("nothing was measured before it")
+
+
+@app.command()
+def ack(context: typer.Context, fault_id: Id, as_json: Json = False) -> None:
+    """Say that you have seen a fault. It clears nothing in the device and moves nothing.
+
+    For example: trade faults ack rosie-3f2a
+    """
+    out = Output(as_json=as_json)
+    with visitor_among_others(context) as container:
+        seen: FaultInfo = _service(container, fault_id, "acknowledge")(fault_id)
+    if as_json:
+        out.data(seen)
+    else:
+        out.say(f"{escape(seen.device)}: {escape(_said(seen))}: seen by {escape(seen.acknowledged_by)}; {_state(seen)}")
+
+
+def _logs(container: Container, robot: str | None) -> "Sequence[Handle]":
+    wanted = asked_for(f"robot {robot!r}", name="faults", group=None if robot is None else f"{robot}.faults")
+    found = container.services(wanted & where(kind="FaultLog"))
+    if not found and robot is not None:
+        found = [container.find(wanted, wait_s=_WAIT_S)]
+    return found
+
+
+def _service(container: Container, fault_id: str, name: str) -> "Handle":
+    robot = fault_id.rpartition("-")[0]
+    if not robot:
+        raise UsageError(where=fault_id, problem="is no id of a fault; `trade faults` lists them: rosie-3f2a")
+    return container.find(asked_for(f"id {fault_id!r}", name=name, group=f"{robot}.faults"), wait_s=_WAIT_S)
+
+
+def _said(info: "FaultInfo") -> str:
+    """`FaultInfo.said`, of what came from a driver: here it has the fields alone."""
+    begin = f"{info.device}: "
+    return info.text.removeprefix(begin) if info.text.startswith(begin) else info.kind
+
+
+def _row(info: "FaultInfo") -> tuple[str, ...]:
+    return (
+        info.id,
+        info.device,
+        _said(info),
+        _state(info),
+        str(info.count),
+        day_and_clock(info.first_at),
+        day_and_clock(info.last_at),
+        info.acknowledged_by,
+    )
+
+
+def _state(info: "FaultInfo") -> str:
+    return "open" if info.gone_at is None else "gone"
+
+
+def _times(info: "FaultInfo") -> str:
+    if info.count == 1:
+        return f"once, {day_and_clock(info.first_at)}"
+    return f"{info.count} times, first {day_and_clock(info.first_at)}, last {day_and_clock(info.last_at)}"
+
+
+def _samples_table(samples: "Sequence[FaultSample]") -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    names = tuple(dict.fromkeys(name for sample in samples for name in sample.values))
+    rows = [(f"{sample.s:+.2f}", *(_number(sample.values.get(name)) for name in names)) for sample in samples]
+    return ("S", *names), rows
+
+
+def _number(value: float | None) -> str:
+    return "" if value is None else f"{value:.4g}"

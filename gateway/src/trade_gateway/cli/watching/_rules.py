@@ -1,0 +1,193 @@
+"""``trade rules``: have a system configure itself by a rules file, try one out, see what stands."""
+
+import queue
+from pathlib import Path
+from typing import Annotated, Final
+
+import typer
+from rich.markup import escape
+
+from trade import Container, where
+from trade._timestamps import clock
+from trade.errors import TradeError
+from trade.rules import GROUP, Did, Firing, Rehearsal, RuleInfo, Rules, read_rules, rehearse
+from trade_gateway.cli._output import Output, complain
+from trade_gateway.cli._system_choice import choice_of, visitor_among_others
+from trade_gateway.cli.robots._detached import Detach, detach_now, ready
+from trade_gateway.cli.robots._gateway import hangups
+from trade_gateway.cli.robots._up import leaving, refuse_twice
+from trade_gateway.cli.services._services import Json
+
+_LOOK_EVERY_S: Final = 0.5
+
+app = typer.Typer(no_args_is_help=True, help="Rules by which the system configures itself.")
+
+File = Annotated[Path, typer.Argument(metavar="RULES.toml", help="The rules file.")]
+
+
+@app.command("run")
+def run(
+    context: typer.Context,
+    file: File,
+    audit: Annotated[Path | None, typer.Option(help="A file that gets a line of JSON for every firing.")] = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Say on each occasion what would be called, and call nothing.")
+    ] = False,
+    name: Annotated[str, typer.Option(help="Name of the container; its identity's rights are those of the rules.")] = (
+        "rules"
+    ),
+    detach: Detach = False,
+    as_json: Json = False,
+) -> None:
+    """Run the rules of a file until told to leave; a line tells of every firing.
+
+    The file is read again when it changes, and on SIGHUP. What is wrong with it is said, and the rules go on as before.
+
+    For example: trade rules run examples/rules.toml --audit rules.jsonl
+    """
+    out, told, settings = Output(as_json=as_json), queue.SimpleQueue[Firing](), choice_of(context).settings(name)
+    if detach:
+        detach_now(out, settings)
+        return
+    with (
+        leaving() as asked_to_leave,
+        hangups() as hangup,
+        Container(settings) as container,
+        Rules(container, file, audit=audit, dry_run=dry_run, tell=told.put) as rules,
+    ):
+        container.terminating.close = asked_to_leave.set
+        refuse_twice(container, "trade rules run")
+        seen = _contents(file)
+        _say_ready(out, container, rules)
+        while not asked_to_leave.wait(_LOOK_EVERY_S):
+            _say_firings(out, told)
+            now = _contents(file)
+            if now != seen or hangup.is_set():
+                seen = now
+                hangup.clear()
+                _reload(out, rules, file)
+    _say_firings(out, told)
+    out.say("leaving")
+
+
+def _contents(file: Path) -> bytes | None:
+    try:
+        return file.read_bytes()
+    except OSError:  # what is wrong with it is said by who reads it
+        return None
+
+
+def _say_ready(out: Output, container: Container, rules: Rules) -> None:
+    names = [info.name for info in rules.rules()]
+    if out.as_json:
+        out.data({**ready(container), "rules": names})
+    out.say(f"[bold green]{container.name} is up[/] as {escape(container.address.identity)}: {', '.join(names)}")
+    out.say("Ctrl-C leaves; the file is read again when it changes")
+
+
+def _say_firings(out: Output, told: "queue.SimpleQueue[Firing]") -> None:
+    while not told.empty():
+        firing = told.get()
+        if out.as_json:
+            out.data(firing)
+            continue
+        at = clock(firing.at)
+        about = f" ({firing.service})" if firing.service else ""
+        out.say(f"{at} [bold]{firing.rule}[/]: {escape(f'{firing.occasion}{about}')}")
+        for did in firing.steps:
+            _say_step(out, did)
+        if firing.stopped:
+            out.say(f"  [bold red]stopped until the file is read again: {escape(firing.stopped)}[/]")
+
+
+def _say_step(out: Output, did: Did) -> None:
+    to = f": {did.service} in {did.container}" if did.service else ""
+    end = f"[bold red]{escape(did.error)}[/]" if did.error else escape(did.result)
+    out.say(f"  {escape(f'{did.step}{to}')}: {end}")
+
+
+def _reload(out: Output, rules: Rules, file: Path) -> None:
+    try:
+        rules.load(file)
+    except TradeError as wrong:
+        complain(f"{file} was changed and is wrong; going on as before: {wrong}")
+        return
+    out.say(f"read {escape(str(file))} again")
+    if out.as_json:
+        out.data({"reloaded": str(file)})
+
+
+@app.command("test")
+def test(context: typer.Context, file: File, as_json: Json = False) -> None:
+    """Check a file, and say of each rule when it fires, whether it would now, and what it would call.
+
+    Conditions are asked; nothing else is called. Rights are those of who runs this.
+
+    For example: trade rules test examples/rules.toml
+    """
+    out, rules = Output(as_json=as_json), read_rules(file)
+    with visitor_among_others(context) as container:
+        told = rehearse(container, rules)
+    if as_json:
+        out.data(told)
+    for rehearsal in told:
+        _say_rehearsal(out, rehearsal)
+
+
+def _say_rehearsal(out: Output, told: Rehearsal) -> None:
+    fires = "[bold]would fire now[/]" if told.fires else "would not fire now"
+    occasion = f"{told.occasion}, {told.condition}" if told.condition else told.occasion
+    now = f" ({told.now})" if told.now else ""
+    out.say(f"[bold]{told.rule}[/]: {escape(occasion)}: {fires}{escape(now)}")
+    for did in told.steps:
+        _say_step(out, did)
+
+
+@app.command("list")
+def list_(context: typer.Context, as_json: Json = False) -> None:
+    """List the rules that stand anywhere in the system, and how they fare.
+
+    For example: trade rules list --json
+    """
+    out = Output(as_json=as_json)
+    with visitor_among_others(context) as container:
+        outcomes = container.call_all(where(name="rules", group=GROUP, kind="Rules"))
+    found: list[RuleInfo] = []
+    for outcome in outcomes:
+        if outcome.ok:
+            found += outcome.result
+        else:
+            complain(f"{outcome.handle.container} did not tell: {outcome.error}")
+    if as_json:
+        out.data(found)
+    elif not found:
+        out.say("no rules stand; [bold]trade rules run examples/rules.toml[/] starts some")
+    else:
+        columns = (
+            "RULE",
+            "OCCASION",
+            "CONDITION",
+            "STATE",
+            "FIRED",
+            "FAILED",
+            "SKIPPED",
+            "CONTAINER",
+            "WHY",
+            "LAST ERROR",
+        )
+        out.table(columns, [_row(info) for info in found])
+
+
+def _row(info: RuleInfo) -> tuple[str, ...]:
+    return (
+        info.name,
+        info.occasion,
+        info.condition,
+        f"{info.state}, dry run" if info.dry_run else info.state,
+        str(info.fired),
+        str(info.failed),
+        str(info.skipped),
+        info.container,
+        info.why,
+        info.last_error,
+    )

@@ -1,0 +1,155 @@
+"""``trade top``: how busy a system is now, what is locked in it and what is not well, again and again."""
+
+import shutil
+import sys
+import threading
+import time
+from collections.abc import Callable, Generator, Sequence
+from contextlib import contextmanager
+from typing import Annotated, Final
+
+import typer
+from msgspec import Struct
+from rich.console import Console, Group
+from rich.live import Live
+from rich.text import Text
+
+from trade import Container, Handle, LoadInfo, where
+from trade._protocol.messages import HEALTHY
+from trade._timestamps import clock
+from trade_gateway.cli._load_table import loads_table
+from trade_gateway.cli._output import Output, table_lines
+from trade_gateway.cli._system_choice import visitor
+from trade_gateway.cli.services._services import Json
+
+_ANSWERS_WITHIN_S: Final = 1.0
+
+
+class Unwell(Struct, frozen=True):
+    """A provider that is not well."""
+
+    group: str
+    container: str
+    health: str
+
+
+class Locked(Struct, frozen=True):
+    """What somebody has for himself."""
+
+    resources: tuple[str, ...]
+    owner: str
+    purpose: str
+    since: float
+    waiting: tuple[str, ...]
+
+
+class Shown(Struct, frozen=True):
+    """A system at one moment; with ``--json`` a line."""
+
+    at: float
+    system: str
+    services: int
+    containers: Sequence[LoadInfo]
+    """The busiest first."""
+    silent: Sequence[str]
+    """Containers that did not tell within a second."""
+    unwell: Sequence[Unwell]
+    locks: Sequence[Locked]
+    estops: Sequence[str]
+    """Those that are open: who gave it, and why."""
+
+
+def top(
+    context: typer.Context,
+    every: Annotated[float, typer.Option(min=1.0, max=3600.0, help="Seconds between two looks.")] = 2.0,
+    count: Annotated[int | None, typer.Option(min=1, help="End after so many looks; else with Ctrl-C.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Show how busy each container is, what is locked, what is not well, again and again.
+
+    Rates are means since the look before. In a pipe one look follows the other; with --json each is an object.
+
+    For example: trade top --every 5
+    """
+    out, looks = Output(as_json=as_json), 0
+    with visitor(context) as container, _screen(out) as show:
+        _ask(container)  # rates are told from here on
+        while count is None or looks < count:
+            threading.Event().wait(every)
+            show(look(container))
+            looks += 1
+
+
+def look(container: Container) -> Shown:
+    """How the system is now, as this container sees it."""
+    told, silent = _ask(container)
+    services = container.services(~where(group="trade") & ~where.local)
+    return Shown(
+        at=time.time(),
+        system=container.settings.system,
+        services=len(services),
+        containers=sorted(told, key=lambda info: -info.cpu_percent),
+        silent=silent,
+        unwell=_unwell(services),
+        locks=[
+            Locked(info.resources, info.holder.owner, info.holder.purpose, info.holder.since, tuple(info.waiting))
+            for info in container.locks()
+        ],
+        estops=[f"{known.giver}: {known.reason}" if known.reason else known.giver for known in container.estops()],
+    )
+
+
+def _ask(container: Container) -> tuple[list[LoadInfo], list[str]]:
+    asked = container.services(where(name="load", group="trade") & ~where.local)
+    outcomes = container.call_all([handle.with_(deadline_s=_ANSWERS_WITHIN_S).bind() for handle in asked])
+    silent = [outcome.handle.container for outcome in outcomes if not outcome.ok]
+    return [outcome.result for outcome in outcomes if outcome.ok], sorted(silent)
+
+
+def _unwell(services: Sequence[Handle]) -> list[Unwell]:
+    found = {
+        Unwell(handle.groups[0] if handle.groups else handle.label, handle.container, handle.health)
+        for handle in services
+        if handle.health != HEALTHY
+    }
+    return sorted(found, key=lambda one: one.group)
+
+
+@contextmanager
+def _screen(out: Output) -> Generator[Callable[[Shown], None]]:
+    if out.as_json or not sys.stdout.isatty():
+        yield out.data if out.as_json else lambda shown: out.say("\n".join(_lines(shown, None)) + "\n")
+        return
+    with Live(console=Console(highlight=False), screen=True, auto_refresh=False) as live:
+
+        def show(shown: Shown) -> None:
+            width, height = shutil.get_terminal_size()
+            lines = [Text(line, no_wrap=True) for line in _lines(shown, width)[: height - 1]]
+            lines[0].stylize("bold red" if shown.estops else "bold")
+            live.update(Group(*lines), refresh=True)
+
+        yield show
+
+
+def _lines(shown: Shown, width: int | None) -> list[str]:
+    """The whole screen."""
+    counts = [f"{len(shown.containers) + len(shown.silent)} containers", f"{shown.services} services"]
+    counts += [f"{len(items)} {word}" for items, word in ((shown.unwell, "not well"), (shown.locks, "locked")) if items]
+    lines = [
+        f"{shown.system}  {clock(shown.at)}  {', '.join(counts)}",
+        *(f"E-STOP OPEN, by {one}" for one in shown.estops),
+        "",
+    ]
+    columns, rows = loads_table(shown.containers)
+    rows += [(name, "no answer", *[""] * (len(columns) - 2)) for name in shown.silent]
+    lines += table_lines(columns, rows, width)
+    if shown.unwell:
+        found = [(one.group, one.container, one.health) for one in shown.unwell]
+        lines += ["", *table_lines(("NOT WELL", "CONTAINER", "WHY"), found, width)]
+    if shown.locks:
+        held = [
+            (", ".join(one.resources), one.owner, one.purpose, f"{shown.at - one.since:.0f} s", ", ".join(one.waiting))
+            for one in shown.locks
+        ]
+        lines += ["", *table_lines(("LOCKED", "OWNER", "PURPOSE", "FOR", "WAITING"), held, width)]
+    return lines

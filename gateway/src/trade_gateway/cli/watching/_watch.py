@@ -1,0 +1,180 @@
+"""``trade watch``: what becomes of a system: who comes, goes, is not well, locks, stops everything."""
+
+import queue
+import threading
+import time
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
+from functools import partial
+from typing import Annotated, Final, Literal, NamedTuple, TypeVar
+
+import typer
+from msgspec import Struct
+from rich.markup import escape
+
+from trade import Constraint, Container, Estop, Handle, LockInfo, where
+from trade._protocol.messages import HEALTHY
+from trade._timestamps import clock
+from trade.errors import TradeError
+from trade_gateway.cli._output import Output
+from trade_gateway.cli._system_choice import visitor
+from trade_gateway.cli.services._services import Json, asked_for
+
+_EVERY_S: Final = 0.3
+"""What happens to many services of a container within that is one line."""
+_ASKED_EVERY_S: Final = 1.0
+"""How often every container is asked for its locks."""
+_NAMED: Final = 3
+_COLOURS: Final = {"is well": "green", "is not well": "bold red", "e-stop": "bold red", "cleared": "green"}
+
+_Key = TypeVar("_Key")
+_Value = TypeVar("_Value")
+What = Literal["came", "went", "changed", "is well", "is not well", "locked", "released", "e-stop", "cleared"]
+
+
+class Happening(Struct, frozen=True):
+    """Something that has become otherwise; with ``--json`` a line."""
+
+    at: float
+    """``time.time()`` here."""
+    what: What
+    about: str
+    """A service, resources, or an e-stop's id."""
+    container: str = ""
+    text: str = ""
+    """What is wrong, who has locked it and what for, who gave the e-stop and why."""
+
+
+class _Kind(NamedTuple):
+    """Happenings of one kind make one line."""
+
+    what: What
+    container: str
+    text: str
+
+
+def watch(
+    context: typer.Context,
+    group: Annotated[str | None, typer.Option(help="Only this group and what is beneath it: rosie.head.")] = None,
+    everything: Annotated[bool, typer.Option("--all", help="Also the middleware's own services.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Tell what happens until Ctrl-C: services come, go, are not well; locks; e-stops.
+
+    Locks and e-stops are looked at every second: one that is shorter may go unseen. With --json each line is an object.
+
+    For example: trade watch --group rosie
+    """
+    meant = asked_for(f"--group {group}" if group else "watch", group=group, name=None)
+    if not everything and group is None:
+        meant = meant & ~where(group="trade")
+    out = Output(as_json=as_json)
+    with visitor(context) as container:
+        seen = Watched(container, meant)
+        out.say(f"watching {seen.services} services in system {escape(container.settings.system)}; Ctrl-C ends")
+        pause = threading.Event()
+        while True:
+            _say(out, list(seen.news()))
+            pause.wait(_EVERY_S)
+
+
+class Watched:
+    """What has been seen of a system so far."""
+
+    def __init__(self, container: Container, meant: Constraint) -> None:
+        self._container = container
+        self._told: queue.SimpleQueue[tuple[What, Handle]] = queue.SimpleQueue()
+        here = meant & ~where.local
+        container.joined(here, partial(self._tell, "came"))
+        container.left(here, partial(self._tell, "went"))
+        container.changed(here, partial(self._tell, "changed"))
+        known = container.services(here)
+        self.services: Final = len(known)
+        """How many there were at the beginning."""
+        self._health = {handle.key: handle.health for handle in known if handle.health != HEALTHY}
+        self._meant = meant
+        self._locks: dict[tuple[str, str], LockInfo] = {}
+        self._estops: dict[str, Estop] = {}
+        self._asked_at = -_ASKED_EVERY_S
+
+    def _tell(self, what: What, handle: Handle) -> None:
+        self._told.put((what, handle))
+
+    def news(self) -> Iterator[Happening]:
+        """What has happened since it was asked last. What stands locked or stopped at first is news, too."""
+        now = time.time()
+        with suppress(queue.Empty):
+            while True:
+                yield self._of_service(now, *self._told.get_nowait())
+        if time.monotonic() - self._asked_at >= _ASKED_EVERY_S:
+            self._asked_at = time.monotonic()
+            with suppress(TradeError):  # somebody leaves, or may not tell: the next second will show
+                yield from self._of_locks(now)
+            yield from self._of_estops(now)
+
+    def _of_service(self, at: float, what: What, handle: Handle) -> Happening:
+        before = self._health.pop(handle.key, HEALTHY)
+        if what == "went":
+            return Happening(at, what, handle.label, handle.container)
+        health = handle.health
+        if health != HEALTHY:
+            self._health[handle.key] = health
+        if health == before:
+            return Happening(at, what, handle.label, handle.container)
+        well = health == HEALTHY
+        return Happening(
+            at, "is well" if well else "is not well", handle.label, handle.container, "" if well else health
+        )
+
+    def _of_locks(self, at: float) -> Iterator[Happening]:
+        uses = {use for handle in self._container.services(self._meant) for use in handle.resources}
+        known = self._container.locking.known()
+        found = {(", ".join(info.resources), info.holder.owner): info for info in known.locks}
+        found = {key: info for key, info in found.items() if not uses.isdisjoint(info.resources)}
+        found |= {key: info for key, info in self._locks.items() if known.still(info.container)}
+        for info in _new(self._locks, found):
+            yield _of_lock(at, "released", info)
+        for info in _new(found, self._locks):
+            yield _of_lock(at, "locked", info)
+        self._locks = found
+
+    def _of_estops(self, at: float) -> Iterator[Happening]:
+        found = {known.id: known for known in self._container.estops()}
+        for known in _new(self._estops, found):
+            yield _of_estop(at, "cleared", known)
+        for known in _new(found, self._estops):
+            yield _of_estop(at, "e-stop", known)
+        self._estops = found
+
+
+def _of_lock(at: float, what: What, info: LockInfo) -> Happening:
+    purpose = f" ({info.holder.purpose})" if info.holder.purpose else ""
+    return Happening(at, what, ", ".join(info.resources), info.container, info.holder.owner + purpose)
+
+
+def _of_estop(at: float, what: What, known: Estop) -> Happening:
+    return Happening(at, what, known.id, "", f"{known.giver}: {known.reason}" if known.reason else known.giver)
+
+
+def _say(out: Output, news: Iterable[Happening]) -> None:
+    kinds: dict[_Kind, list[Happening]] = {}
+    for one in news:
+        if out.as_json:
+            out.data(one)
+        kinds.setdefault(_Kind(one.what, one.container, one.text), []).append(one)
+    for kind, alike in kinds.items():
+        colour = _COLOURS.get(kind.what, "bold")
+        about = escape(_some([one.about for one in alike]))
+        said = f": {escape(kind.text)}" if kind.text else ""
+        out.say(f"{clock(alike[0].at, ms=True)} {escape(kind.container):12} [{colour}]{kind.what:11}[/] {about}{said}")
+
+
+def _some(names: list[str]) -> str:
+    shown = names if len(names) <= _NAMED + 1 else names[:_NAMED]
+    more = f" and {len(names) - len(shown)} more" if len(names) > len(shown) else ""
+    return ", ".join(shown) + more
+
+
+def _new(now: Mapping[_Key, _Value], before: Mapping[_Key, object]) -> list[_Value]:
+    """What was not there before."""
+    return [value for key, value in now.items() if key not in before]

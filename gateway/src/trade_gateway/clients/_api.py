@@ -1,0 +1,384 @@
+"""What clients have done, whichever way they ask: judged in their name, made in their session, in threads."""
+
+import logging
+from collections.abc import Awaitable, Callable, Sequence
+from functools import partial
+from math import inf
+from typing import Any, Final, TypeVar
+
+import anyio
+from anyio.to_thread import run_sync
+
+from trade import (
+    Constraint,
+    Container,
+    EstopReport,
+    Handle,
+    Lock,
+    Notification,
+    Run,
+    Sight,
+    where,
+)
+from trade import Stream as Samples
+from trade.errors import (
+    AccessDenied,
+    Cancelled,
+    ConfigurationError,
+    InvalidArgument,
+    LockLost,
+    NoSuchService,
+    TooManyServices,
+    TradeError,
+)
+from trade_gateway.clients import _schemas as messages
+from trade_gateway.clients._authorizer import Judge
+from trade_gateway.clients._clients import Client, Clients, places
+from trade_gateway.clients._quota import MOST, Quota
+from trade_gateway.clients._system_info import Overview
+
+_logger = logging.getLogger("trade")
+
+T = TypeVar("T")
+
+_THREADS: Final = MOST + 16
+"""As many as there may be calls, locks and questions under way, and some for sessions that come and go."""
+_HEARD_S: Final = 1.0
+"""How long to wait for everybody to be heard."""
+_NO_GROUP: Final = "_"
+_NOT_TOLD: Final = "nobody with something to stop is known to have been told; use the switch that cuts the power"
+
+Gone = Callable[[], Awaitable[object]]
+"""Returns when whoever asked is there no more."""
+
+
+class Deeds:
+    """The door's side of its system."""
+
+    def __init__(self, container: Container) -> None:
+        self._container = container
+        self.judge: Final = Judge(container)
+        self.clients: Final = Clients(container)
+        self._threads = anyio.CapacityLimiter(_THREADS)
+        self._stop_threads = anyio.CapacityLimiter(inf)
+        self._quota = Quota()
+        self.overview: Final = Overview(container, self.judge, self.counted)
+
+    async def apart(self, do: Callable[..., T], *args: Any, stops: bool = False) -> T:
+        """Do in a thread what may wait for others; what stops waits for no thread."""
+        return await run_sync(partial(do, *args), limiter=self._stop_threads if stops else self._threads)
+
+    async def counted(self, who: str, do: Callable[..., T], *args: Any) -> T:
+        """Likewise, as one of what may be under way. Raises TooMany."""
+        ended = self._quota.take(who)
+        try:
+            return await self.apart(do, *args)
+        finally:
+            ended()
+
+    # --- looking
+
+    def seen(self, who: str, group: str | None = None, name: str | None = None) -> list[Handle]:
+        """The services that an identity may know of; what names no group or service matches none."""
+        try:
+            found = self._container.services(_wanted(group, name))
+        except ConfigurationError:  # no name of a group
+            return []
+        return [handle for handle in found if self.judge.sees(who, handle)]
+
+    def find(self, who: str, group: str, name: str, container: str = "") -> Handle:
+        """The service of a group and name; one of exactly this group goes before those beneath it.
+
+        Raises:
+            NoSuchService, TooManyServices: none, or several, that the client may know of.
+        """
+        inside = self.seen(who, None if group == _NO_GROUP else group)
+        found = [one for one in inside if one.name == name and container in ("", one.container)]
+        exact = [one for one in found if one.key.domain == group or group in one.groups]
+        found = exact or (found if group != _NO_GROUP else [])
+        if not found:
+            raise NoSuchService(constraint=f"{group}.{name}", groups=_groups(self.seen(who)))
+        if len(found) > 1:
+            matches = [f"{one.label} in {one.container}" for one in found]
+            raise TooManyServices(constraint=f"{group}.{name}", matches=matches, differ=("group", "container"))
+        return found[0]
+
+    # --- calling
+
+    async def begin(self, client: Client, handle: Handle, body: messages.CallBody, admitted: int) -> Run:
+        """Make a call without waiting for its end.
+
+        Args:
+            client: whose call it is.
+            handle: of what.
+            body: its arguments.
+            admitted: what `Client.admit` said when it was asked for.
+
+        Raises:
+            TradeError: it is not allowed, or could not begin; Cancelled: the client has asked for a stop since.
+        """
+        self.judge.require_call(client.identity, handle)
+        stops = handle.effect == "stop"
+        counted = None if stops else self._quota.take(client.identity)
+        try:
+            run = await self.apart(self._begin, client, handle, body, admitted, stops=stops)
+        except BaseException:
+            if counted is not None:
+                counted()
+            raise
+        if counted is not None:
+            run.when_done(lambda _: counted())
+        return run
+
+    def _begin(self, client: Client, handle: Handle, body: messages.CallBody, admitted: int) -> Run:
+        try:
+            given: Any = messages.numbers(body.args)
+        except RecursionError:
+            problem = f"is nested more than {messages.MOST_DEEP} deep"
+            raise InvalidArgument(
+                service=handle.label, argument="args", problem=problem, signature=handle.signature
+            ) from None
+        args: tuple[Any, ...] = tuple(given) if isinstance(body.args, list) else ()
+        kwargs: dict[str, Any] = given if isinstance(body.args, dict) else {}
+        begin = partial(self._container.begin, handle, args, kwargs, body.deadline_s)
+        with client.speaking():
+            if handle.effect == "stop":
+                client.stopping(admitted, handle, begin)
+            elif handle.effect == "actuate" and client.overtaken(admitted):
+                raise Cancelled(service=handle.label)
+            run = begin()
+            if handle.effect == "actuate":
+                client.stop_again(admitted)
+        client.note(run)
+        return run
+
+    async def end(self, client: Client, run: Run) -> None:
+        """End a call early, in its client's name."""
+        try:
+            await self.apart(client.cancel, run, stops=True)
+        except TradeError as error:  # the call itself says how it ended
+            _logger.info("a call of %s could not be cancelled: %s", client.identity, error)
+
+    async def call(self, client: Client, handle: Handle, body: messages.CallBody, gone: Gone, *, alone: bool) -> Run:
+        """Make a call and wait for its end; it is ended early when whoever asked is gone.
+
+        Args:
+            client: whose call it is.
+            handle: of what.
+            body: its arguments.
+            gone: tells that nobody waits any more.
+            alone: the client is there for this call only, and ends with it.
+
+        Returns:
+            The call, which has ended, well or not.
+
+        Raises:
+            TradeError: it could not begin.
+            Cancelled: nobody waits any more.
+        """
+        run = await self.begin(client, handle, body, client.admit(handle))
+
+        async def watch() -> None:
+            await gone()
+            if alone:
+                await self.apart(client.close, stops=True)
+            else:
+                await self.end(client, run)
+            tasks.cancel_scope.cancel()
+
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(watch)
+            await run.settled()
+            tasks.cancel_scope.cancel()
+        if not run.done():
+            raise Cancelled(service=handle.label)
+        return run
+
+    # --- locks and stops
+
+    async def lock(
+        self, client: Client, body: messages.LockBody, on_lost: Callable[[str, LockLost], object]
+    ) -> messages.LockTaken:
+        """Take a lock for a client.
+
+        Raises:
+            TradeError: see `trade.Container.lock`; and TooMany. What is not there is not waited for.
+        """
+        client.locking()
+        return await self.counted(client.identity, self._lock, client, body, on_lost)
+
+    def _lock(
+        self, client: Client, body: messages.LockBody, on_lost: Callable[[str, LockLost], object]
+    ) -> messages.LockTaken:
+        wanted = where(group=body.group)
+        if not self._container.services(wanted):
+            raise NoSuchService(constraint=body.group, groups=_groups(self.seen(client.identity)))
+        handles = self._lockable(client, wanted)
+        taken: list[Lock] = []
+
+        def lost(error: LockLost) -> None:
+            on_lost(client.name_of(taken[0]), error)
+
+        with client.session.use():
+            lock = self._container.lock(
+                wanted,
+                purpose=body.purpose or f"of {client.identity}",
+                wait_s=body.wait_s,
+                partial=body.partial,
+                on_lost=lost,
+            )
+            taken.append(lock)
+            lock.acquire()
+        try:
+            self._lockable(client, wanted)  # with what came meanwhile
+        except TradeError:
+            lock.release()
+            raise
+        return messages.LockTaken(client.keep(lock, handles), lock.resources, lock.missing)
+
+    def _lockable(self, client: Client, wanted: Constraint) -> list[Handle]:
+        """What a lock takes. Raises AccessDenied: the client may not lock all of it."""
+        handles = [one for one in self._container.services(wanted) if one.effect == "actuate"]
+        self.judge.require(client.identity, "lock", handles)
+        return handles
+
+    async def locks(self, who: str) -> list[messages.LockView]:
+        """The locks on what an identity may know of."""
+        known = {name for _, name in places(self.seen(who))}
+        found = await self.counted(who, self._container.locks)
+        return [messages.lock_view(info) for info in found if not known.isdisjoint(info.resources)]
+
+    async def request_release(self, who: str, body: messages.RequestBody) -> list[str]:
+        """Ask the owners of locks to give them back; who was asked. Raises NoSuchService."""
+        handles, reason = self._using(who, body.resources), f"{who}: {body.reason}" if body.reason else f"by {who}"
+        return await self.counted(who, self._container.request_release, handles, reason)
+
+    async def break_locks(self, who: str, body: messages.RequestBody) -> list[messages.LockView]:
+        """Take locks away from their owners; what moves under them stops. Raises AccessDenied, NoSuchService."""
+        handles, reason = self._using(who, body.resources), f"{who}: {body.reason}" if body.reason else f"by {who}"
+        self.judge.require(who, "administer", handles)
+        broken = await self.counted(who, self._container.break_lock, handles, reason)
+        return [messages.lock_view(info) for info in broken]
+
+    def _using(self, who: str, resources: Sequence[str]) -> list[Handle]:
+        """What uses these and nothing else. Raises NoSuchService: an identity knows of no such service."""
+        wanted = set(resources)
+        actuating = [one for one in self.seen(who) if one.effect == "actuate"]
+        found = [one for one in actuating if wanted.issuperset(name for _, name in places([one]))]
+        if not found:
+            raise NoSuchService(constraint=", ".join(resources), groups=_groups(self.seen(who)))
+        return found
+
+    async def resume(self, client: Client, body: messages.GroupBody) -> list[str]:
+        """Let services move again; without a lock of its own that is for who administers them. Raises AccessDenied."""
+        handles = [one for one in self.seen(client.identity, body.group) if one.effect == "actuate"]
+        if not handles:
+            raise NoSuchService(constraint=body.group, groups=_groups(self.seen(client.identity)))
+        others = [one for one in handles if not client.has_locked(one)]
+        self.judge.require(client.identity, "administer", others)
+
+        def resume() -> list[str]:
+            with client.speaking():
+                return self._container.resume(handles)
+
+        return await self.counted(client.identity, resume)
+
+    async def estop(self, who: str, body: messages.EstopBody) -> messages.Stopped:
+        """Stop everything in the system.
+
+        Raises:
+            NobodyFound: nobody is known to have been told; it is open here, and who comes into sight is told then.
+        """
+        reason = f"{who}: {body.reason}" if body.reason else f"by {who}"
+        report = await self.apart(self._container.estop, reason, stops=True)
+        sight = await self.apart(partial(self._container.sight, limit_s=0), stops=True)  # not before: it waits
+        if not (report.confirmed or report.missing or report.failed):
+            raise sight.nobody(self._container.settings.system, f"e-stop {report.id}: {_NOT_TOLD}")
+        return _stopped(report, sight)
+
+    async def clear(self, who: str, body: messages.ClearBody) -> messages.Stopped:
+        """Clear e-stops. Raises AccessDenied, NoSuchEstop; NobodyFound: none is known, and not everybody was heard."""
+        ids = body.ids or [one.id for one in self._container.estops()]
+        self.judge.require_system(who, "administer", f"e-stop {', '.join(ids)}")
+        if not ids:
+            await self.counted(who, self._require_all_heard)
+            return messages.Stopped("", True, (), (), {})
+        report = await self.counted(who, self._container.estop_clear, ids)
+        self._container.note_asked("e-stop clearing", ", ".join(ids), kind="stop", who=who)
+        return _stopped(report)
+
+    def note_refused(self, error: BaseException) -> None:
+        """Have in the record what the policy lets a client not do; what it lets this container not do is there."""
+        if isinstance(error, AccessDenied) and error.who != self._container.address.identity:
+            why, outcome = str(error), type(error).__name__
+            self._container.note_asked(error.what, kind="refused", who=error.who, outcome=outcome, why=why)
+
+    def _require_all_heard(self) -> None:
+        sight = self._container.sight(limit_s=_HEARD_S)
+        if not sight.complete:
+            raise sight.nobody(self._container.settings.system, "so nobody can tell whether an e-stop is open")
+
+    def estops(self, who: str) -> list[messages.EstopView]:
+        """Those that are open. Raises AccessDenied: an identity may do nothing here but stop."""
+        self.judge.require_some(who, "estops")
+        return [messages.EstopView(one.id, one.by, one.reason, one.at, one.told_by) for one in self._container.estops()]
+
+    # --- listening
+
+    async def stream(self, client: Client, handle: Handle, asked: messages.Stream) -> Samples:
+        """Samples of a service, until the client is gone. Raises like `trade.Container.stream`."""
+        self.judge.require_call(client.identity, handle)
+
+        def listen() -> Samples:
+            with client.session.use():
+                return self._container.stream(handle, hz=asked.hz, on_change=asked.on_change)
+
+        return await self.counted(client.identity, listen)
+
+    def view(self, who: str, handle: Handle) -> messages.ServiceView:
+        """A service, as an identity is told of it."""
+        return messages.service_view(handle, allowed=self.judge.may_call(who, handle))
+
+    def watch(self, client: Client, asked: messages.Watch, tell: Callable[[str, Handle], object]) -> list[Notification]:
+        """Have services that come, go or change told of, those that the client may know of, until it is gone."""
+
+        wanted, here = _wanted(asked.group, asked.name), self._container
+        with client.session.use():
+            kinds = {
+                "joined": partial(here.joined, existing=asked.existing),
+                "left": here.left,
+                "changed": here.changed,
+            }
+            return [
+                kinds[one](wanted, _Told(client, one, self.judge, tell).hear) for one in dict.fromkeys(asked.occasions)
+            ]
+
+
+class _Told:
+    """Tells a client of services, of those that it may know of."""
+
+    def __init__(self, client: Client, occasion: str, judge: Judge, tell: Callable[[str, Handle], object]) -> None:
+        self._client = client
+        self._occasion = occasion
+        self._judge = judge
+        self._tell = tell
+        self.told_as = f"tell {client.identity} (a client of the door)"
+        """In lists of notifications."""
+
+    def hear(self, handle: Handle) -> None:
+        if self._judge.sees(self._client.identity, handle):
+            self._tell(self._occasion, handle)
+
+
+def _wanted(group: str | None, name: str | None) -> Constraint:
+    return where(group=group or None, name=name or None)
+
+
+def _groups(handles: Sequence[Handle]) -> list[str]:
+    return sorted({group for handle in handles for group in handle.groups})
+
+
+def _stopped(report: EstopReport, sight: Sight | None = None) -> messages.Stopped:
+    apart = sight.apart if sight is not None else {}
+    complete = report.complete and not apart
+    return messages.Stopped(report.id, complete, report.confirmed, report.missing, report.failed, apart)

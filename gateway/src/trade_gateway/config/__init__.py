@@ -1,0 +1,1 @@
+"""Configuration files: gateway files, system files, and their tables."""

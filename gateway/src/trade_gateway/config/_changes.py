@@ -1,0 +1,82 @@
+"""What a gateway file names, and in what that has become different since it was read."""
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final, NamedTuple, cast
+
+from trade._container.policy_reload import different
+from trade._security.certificates import Certificate
+from trade._security.policy import Policy
+from trade._security.policy_file import policy_files
+from trade._toml import read_toml_text
+from trade.errors import ConfigurationError
+from trade.policies import read_policy
+from trade_gateway.config._gateway import Plan
+
+__all__ = ["Named", "digest", "named_by"]
+
+_CERTIFICATE: Final = "cert.pem"
+
+
+def digest(path: Path) -> str:
+    """Changes when the file does, or anything that it names."""
+    return _digest([path, *_beside(path)])
+
+
+class Named(NamedTuple):
+    """What a gateway file names, as it is at one moment."""
+
+    digests: Mapping[Path, str]
+    """Of policies, lists of revoked names and certificates: what changes with each."""
+    policy: Policy | None
+    """Its own."""
+
+    def since(self, before: "Named") -> str:
+        """What has become different, in words; empty: nothing."""
+        changed = [path for path, seen in self.digests.items() if before.digests.get(path) != seen]
+        told = [_certified(path) for path in changed if path.name == _CERTIFICATE]
+        told += [f"{path.name} is another one" for path in changed if path.name != _CERTIFICATE]
+        if changed and self.policy is not None and before.policy is not None:
+            told += different(before.policy, self.policy)
+        return ", ".join(told)
+
+
+def named_by(path: Path, plan: Plan) -> Named:
+    """What a gateway file names, now. Raises ConfigurationError: its policy is wrong by now."""
+    policy = plan.settings.policy
+    return Named({file: _digest([file]) for file in _beside(path)}, None if policy is None else read_policy(policy))
+
+
+def _certified(path: Path) -> str:
+    try:
+        made = Certificate.read(path.parent)
+    except ConfigurationError as wrong:
+        return str(wrong)
+    return f"new certificate of {made.identity} until {made.until:%Y-%m-%d %H:%M} UTC"
+
+
+def _digest(files: Sequence[Path]) -> str:
+    seen = hashlib.sha256()
+    for file in files:
+        try:
+            seen.update(file.read_bytes())
+        except OSError as gone:
+            seen.update(str(gone.errno).encode())
+    return seen.hexdigest()
+
+
+def _beside(path: Path) -> list[Path]:
+    try:
+        raw = read_toml_text(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):  # what is wrong with it is said by who reads it
+        return []
+    shares = raw.get("share")
+    parts = [raw, *(cast("Mapping[str, Any]", shares).values() if isinstance(shares, dict) else ())]
+    tables = [cast("Mapping[str, Any]", part) for part in parts if isinstance(part, dict)]
+    return [file for table in tables for file in _named_by(table, path)]
+
+
+def _named_by(part: Mapping[str, Any], path: Path) -> list[Path]:
+    papers = [path.parent / str(part["tls"]) / _CERTIFICATE] if part.get("tls") else []
+    return [*papers, *(policy_files(path.parent / str(part["policy"])) if part.get("policy") else ())]

@@ -1,0 +1,400 @@
+"""The gateway file: which networks are joined, what crosses, who may do what, what is kept up. Checked as a whole."""
+
+import os
+import re
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Final, NamedTuple, cast
+
+import msgspec
+from msgspec import Meta, Struct
+
+from trade import Settings
+from trade._security.certificates import Certificate
+from trade._toml import read_toml_text
+from trade._transport.endpoints import Endpoint, loopback_interface
+from trade.errors import ConfigurationError
+from trade.policies import EVERYTHING, read_policy
+from trade_gateway.cli._addresses import addresses
+from trade_gateway.config._tables import Around
+from trade_gateway.supervisor import Child, read_children
+
+__all__ = ["GatewayFile", "Network", "Plan", "Share", "read_gateway_file"]
+
+_GROUP: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_-]*(\.[A-Za-z0-9_-]+)*")
+_UNKNOWN_LOOPBACK: Final = re.compile(r"/127\.(?!0\.0\.1:)")
+"""The transport knows the interface of a link by the interface's own addresses; it would apply no rule."""
+_AT: Final = re.compile(r" - at `\$\.?([^`]*)`$")
+_MISSING: Final = re.compile(r"missing required field `([^`]*)`")
+_UNKNOWN: Final = re.compile(r"contains unknown field `([^`]*)`")
+_EXAMPLES: Final = {
+    "system": 'system = "lab"',
+    "network": '[network.private] and interface = "eth0"',
+    "interface": 'interface = "eth0" (`ip link` shows those there are)',
+    "listen": 'listen = ["tls/192.168.1.1:7450"]',
+}
+
+_Text = Annotated[str, Meta(min_length=1)]
+
+
+class Network(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """One network that the gateway has a foot in."""
+
+    interface: _Text
+    """Of this host, such as ``eth0``."""
+    listen: list[_Text] = []
+    """Endpoints on it; none is fine if the gateway only dials out by it."""
+    export: list[str] | None = None
+    """Groups whose services on this network the others see and call; an empty list: none; left out: all."""
+    stream_hz: float | dict[str, float] = {}
+    """How many samples a second of each stream of these the others hear at most: of all, or by group."""
+
+    @property
+    def limits(self) -> Mapping[str, float]:
+        """By group."""
+        if isinstance(self.stream_hz, dict):
+            return self.stream_hz
+        return dict.fromkeys(_or_all(self.export), self.stream_hz)
+
+
+class Share(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, rename={"import_": "import"}):
+    """Another system, in which the gateway is a guest: what of ours it offers there, and the other way round."""
+
+    system: _Text
+    """Its system id."""
+    tls: str = ""
+    """The folder with the guest's certificate, of that system's authority."""
+    policy: str = ""
+    """That system's policy: who of it may see and call what is offered there."""
+    connect: list[_Text] = []
+    """Endpoints in it to dial."""
+    listen: list[_Text] = []
+    """Endpoints where its containers may dial the guest."""
+    export: list[str] = []
+    """Groups of ours that they see and call."""
+    import_: list[str] = []
+    """Groups of theirs that ours see and call."""
+    credentials: str = ""
+    """Laboratories only, instead of ``tls``: ``user:password``."""
+
+    def settings(self, where: Path, name: str, audit: Path | None, *, insecure_lan: bool) -> Settings:
+        """What the guest is started with. Raises ConfigurationError."""
+        if self.policy:
+            read_policy(where.parent / self.policy)
+        return Settings.read(
+            system=self.system,
+            container=name,
+            audit=audit,
+            listen=self.listen,
+            connect=self.connect,
+            credentials=_pair(self.credentials),
+            tls=where.parent / self.tls if self.tls else None,
+            insecure_lan=insecure_lan,
+            bridge=[],
+            policy=where.parent / self.policy if self.policy else None,
+            environment=_without_system(),
+        )
+
+
+class GatewayFile(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A gateway file, read; paths in it are beside it."""
+
+    system: _Text
+    """The system id."""
+    name: _Text = "gateway"
+    """Of its container."""
+    tls: str = ""
+    """The folder that `trade pki issue --for gateway` made."""
+    policy: str = ""
+    """The access policy."""
+    metrics: str = ""
+    """Where Prometheus finds its metrics: ``127.0.0.1:9464``."""
+    audit: str = ""
+    """The folder for the record of what happens in it, and in its guests in other systems."""
+    connect: list[_Text] = []
+    """Other gateways that it dials."""
+    network: dict[str, Network] = {}
+    """By a name for people; at least one, unless the gateway only shares or looks after containers."""
+    share: dict[str, Share] = {}
+    """Other systems, by a name for people."""
+    container: dict[str, dict[str, Any]] = {}
+    """Containers of this host that it keeps up, by name."""
+    credentials: str = ""
+    """Laboratories only, instead of ``tls``: ``user:password``."""
+    insecure_lan: bool = False
+    """Laboratories only: neither certificates nor encryption nor a policy."""
+
+    @property
+    def alone(self) -> bool:
+        """Whether it joins no networks of its system: it only shares."""
+        return bool(self.share) and len(self.network) < 2 and not self.connect
+
+    def settings(self, where: Path) -> Settings:
+        """What its container is started with.
+
+        Raises:
+            ConfigurationError: certificates, policy and endpoints do not fit together.
+        """
+        beside = where.parent
+        if self.policy:
+            policy = read_policy(beside / self.policy)  # wrong is wrong before anything is closed for it
+            self._check_papers(where, policy.gateways)
+        networks = [] if self.alone else list(self.network.values())
+        limited = any(network.export is not None or network.limits for network in networks)
+        exports = {network.interface: tuple(_or_all(network.export)) for network in networks}
+        return Settings.read(
+            system=self.system,
+            container=self.name,
+            listen=[endpoint for network in self.network.values() for endpoint in network.listen],
+            connect=self.connect,
+            credentials=_pair(self.credentials),
+            tls=beside / self.tls if self.tls else None,
+            insecure_lan=self.insecure_lan,
+            bridge=[network.interface for network in networks],
+            exports=exports if limited else None,
+            stream_hz={network.interface: network.limits for network in networks},
+            policy=beside / self.policy if self.policy else None,
+            audit=self.audit_folder(where),
+            metrics=self.metrics,
+            environment=_without_system(),
+        )
+
+    def _check_papers(self, where: Path, gateways: Collection[str]) -> None:
+        """Raises ConfigurationError: they are a container's, and for none of the addresses."""
+        if not (self.tls and gateways):
+            return
+        papers = Certificate.read((where.parent / self.tls).absolute())
+        hosts = [Endpoint.read(one).host for network in self.network.values() for one in network.listen]
+        if papers.identity not in gateways and hosts and not papers.hosts.intersection(hosts):
+            problem = (
+                f"{papers.folder} has the papers of {papers.identity!r}, which the policy does not call a gateway "
+                f"({', '.join(gateways)}) and which are not for {hosts[0]}; a gateway's are needed here: trade pki "
+                f"issue NAME --for gateway --address {hosts[0]}"
+            )
+            raise ConfigurationError(where=f"{where}: tls", problem=problem)
+
+    def audit_folder(self, where: Path) -> Path | None:
+        """Beside the file."""
+        return where.parent / self.audit if self.audit else None
+
+
+def _pair(credentials: str) -> tuple[str, str] | None:
+    user, _, password = credentials.partition(":")
+    return (user, password) if credentials else None
+
+
+def _or_all(groups: Sequence[str] | None) -> Sequence[str]:
+    return (EVERYTHING,) if groups is None else groups
+
+
+def _without_system() -> dict[str, str]:
+    """The file says it all, and not whatever shell the gateway is started from; but for what concerns this host."""
+    kept = ("TRADE_AUDIT_READS", "TRADE_AUDIT_KEEP_DAYS", "TRADE_AUDIT_KEEP_ROWS")
+    return {
+        name: value
+        for name, value in os.environ.items()
+        if not name.startswith("TRADE_") or name.endswith("_DIR") or name in kept
+    }
+
+
+_KINDS: Final[Mapping[str, type[Struct]]] = {"network": Network, "share": Share}
+
+
+class Plan(NamedTuple):
+    """A gateway file with all that it names, checked."""
+
+    file: GatewayFile
+    settings: Settings
+    shares: Mapping[str, Settings]
+    """What the guests in other systems are started with, by the name of the share."""
+    children: Sequence[Child]
+    """The containers that it looks after, in the order in which they are started."""
+
+    @property
+    def unnamed(self) -> str:
+        """What is wrong with a policy that does not name the gateway; empty: nothing.
+
+        Raises:
+            ConfigurationError: the policy is wrong by now.
+        """
+        carries = self.settings.bridge and self.settings.tls is not None
+        if not carries or self.settings.policy is None:
+            return ""
+        name = self.settings.identity
+        named = read_policy(self.settings.policy).gateways
+        if name in named:
+            return ""
+        said = ", ".join(f'"{one}"' for one in (*named, name))
+        return (
+            f"does not name the gateway {name!r}, so nobody believes it whom it speaks for; write gateways = [{said}]"
+        )
+
+    def check_here(self, where: Path) -> None:
+        """That each network listens at addresses of its own interface, as far as this host has them.
+
+        Who dials is taken to be of the network whose interface has the address, so that with two of them swapped the
+        one would see what is of the other.
+
+        Raises:
+            ConfigurationError: an address is of another interface of this host.
+        """
+        here, known = loopback_interface(), addresses()
+        interfaces = [network.interface for network in self.file.network.values()]
+        for name, network in self.file.network.items():
+            own = {network.interface}
+            if network.interface == interfaces[0] and here not in interfaces:
+                own.add(here)  # containers of the gateway's host belong to the first network
+            for endpoint in network.listen:
+                if others := _others_at(endpoint, own, known):
+                    problem = (
+                        f"{endpoint} is an address of {', '.join(others)} on this host, and interface is "
+                        f"{network.interface}: who dials there would count as of another network, and see what that "
+                        f"does not export; write an address of {network.interface} "
+                        f"({_listed(known.get(network.interface, ()))}), or the interface that has this one"
+                    )
+                    raise ConfigurationError(where=f"{where}: network.{name}.listen", problem=problem)
+
+
+def _others_at(endpoint: str, own: set[str], known: Mapping[str, frozenset[str]]) -> list[str]:
+    """The interfaces of this host that have an address of an endpoint, if none of its own has."""
+    place = Endpoint.read(endpoint)
+    if place.everywhere:
+        return []
+    for one in place.resolved():
+        address = Endpoint.read(one).host.strip("[]").partition("%")[0]
+        having = sorted(name for name, has in known.items() if address in has)
+        if having and not own.intersection(having):
+            return having
+    return []
+
+
+def _listed(known: Iterable[str]) -> str:
+    return ", ".join(sorted(known)) or "this host has none of it"
+
+
+def read_gateway_file(path: Path) -> Plan:
+    """Read and check a gateway file, the policy and the certificate that it names.
+
+    Raises:
+        ConfigurationError: names the file, the key and what would be right.
+    """
+    where = str(path)
+    try:
+        text = path.read_text(encoding="utf-8")
+        raw = read_toml_text(text)
+    except FileNotFoundError:
+        raise ConfigurationError(where=where, problem="there is no such file") from None
+    except OSError as bad:
+        raise ConfigurationError(where=where, problem=f"cannot be read: {bad.strerror}") from None
+    except ValueError as bad:  # no TOML, or no UTF-8
+        raise ConfigurationError(where=where, problem=f"not valid TOML: {bad}") from None
+    try:
+        file = msgspec.convert(raw, GatewayFile)
+    except msgspec.ValidationError as bad:
+        raise _explained(str(bad), raw, where) from None
+    _check(file, where)
+    shares = {
+        name: share.settings(path, file.name, file.audit_folder(path), insecure_lan=file.insecure_lan)
+        for name, share in file.share.items()
+    }
+    laboratory = _of_children(file)
+    around = Around(
+        system=file.system,
+        policy=file.policy,
+        audit=file.audit,
+        environment=laboratory,
+        inherited=_without_system(),
+    )
+    children = read_children(path, text, around, file.container, certified=bool(file.tls))
+    return Plan(file, file.settings(path), shares, children)
+
+
+def _of_children(file: GatewayFile) -> dict[str, str]:
+    """Variables by which containers of this host are let into the system as the gateway is."""
+    laboratory = {"TRADE_CREDENTIALS": file.credentials, "TRADE_INSECURE_LAN": "1" if file.insecure_lan else ""}
+    return {name: value for name, value in laboratory.items() if value}
+
+
+def _check(file: GatewayFile, where: str) -> None:
+    if not (file.network or file.share or file.container):
+        raise ConfigurationError(where=f"{where}: network", problem=f"missing; write {_EXAMPLES['network']}")
+    _check_networks(file, where)
+    if file.network or file.share or file.connect:
+        _check_proof(file, file, f"{where}: ", "NAME --for gateway")
+    for name, share in file.share.items():
+        at = f"{where}: share.{name}."
+        if share.system in (file.system, *(one.system for known, one in file.share.items() if known != name)):
+            problem = f"{share.system!r} is this system or that of another share; name another one, once"
+            raise ConfigurationError(where=f"{at}system", problem=problem)
+        _check_groups(share.export, f"{at}export")
+        _check_groups(share.import_, f"{at}import")
+        _check_proof(file, share, at, f"NAME, by the authority of {share.system}")
+        if not share.policy and not file.insecure_lan:
+            problem = f"missing; name the policy of {share.system}: without one all of it might call what is shared"
+            raise ConfigurationError(where=f"{at}policy", problem=problem)
+
+
+def _check_networks(file: GatewayFile, where: str) -> None:
+    owners: dict[str, str] = {}
+    for name, network in file.network.items():
+        if other := owners.get(network.interface):
+            problem = f"{network.interface} is the interface of network {other!r} already"
+            raise ConfigurationError(where=f"{where}: network.{name}.interface", problem=problem)
+        owners[network.interface] = name
+        for endpoint in network.listen:
+            if _UNKNOWN_LOOPBACK.search(endpoint):
+                problem = f"{endpoint}: lo is known by 127.0.0.1 alone, and nothing would cross; write that one"
+                raise ConfigurationError(where=f"{where}: network.{name}.listen", problem=problem)
+        _check_groups(network.export or (), f"{where}: network.{name}.export")
+        given = {"export": network.export is not None, "stream_hz": network.stream_hz != {}}
+        for key in [key for key, is_given in given.items() if is_given and file.alone]:
+            problem = "there is no other network of this system; leave it out: what other systems see is in [share...]"
+            raise ConfigurationError(where=f"{where}: network.{name}.{key}", problem=problem)
+
+
+def _check_groups(groups: Sequence[str], where: str) -> None:
+    for group in groups:
+        if group != EVERYTHING and not _GROUP.fullmatch(group):
+            problem = f'{group!r} is no group; write "rosie.head" (it and all beneath it), or "*" for all'
+            raise ConfigurationError(where=where, problem=problem)
+
+
+def _check_proof(file: GatewayFile, part: GatewayFile | Share, where: str, words: str) -> None:
+    if part.credentials and not (file.insecure_lan and all(part.credentials.partition(":"))):
+        problem = 'is for laboratories: "user:password", and insecure_lan = true; else use tls'
+        raise ConfigurationError(where=f"{where}credentials", problem=problem)
+    if not part.tls and not part.credentials:
+        problem = f"missing; name the folder with its certificate: trade pki issue {words}"
+        raise ConfigurationError(where=f"{where}tls", problem=problem)
+
+
+def _explained(said: str, raw: Mapping[str, Any], where: str) -> ConfigurationError:
+    at = _AT.search(said)
+    path = at.group(1) if at else ""
+    prefix = _named(path, raw)
+    if missing := _MISSING.search(said):
+        key = missing.group(1)
+        return ConfigurationError(where=f"{where}: {prefix}{key}", problem=f"missing; write {_EXAMPLES.get(key, key)}")
+    if unknown := _UNKNOWN.search(said):
+        kind = _KINDS.get(prefix.partition(".")[0], GatewayFile)
+        problem = f"unknown key; there is {', '.join(kind.__struct_encode_fields__)}"
+        return ConfigurationError(where=f"{where}: {prefix}{unknown.group(1)}", problem=problem)
+    return ConfigurationError(where=f"{where}: {prefix.rstrip('.')}", problem=said[: at.start()] if at else said)
+
+
+def _fits(part: object, kind: type[Struct] | None) -> bool:
+    try:
+        msgspec.convert(part, kind or dict[str, Any])
+    except msgspec.ValidationError:
+        return False
+    return True
+
+
+def _named(path: str, raw: Mapping[str, Any]) -> str:
+    """The place of a value, with its network's or share's own name where the check only says that it is one of them."""
+    if "[...]" in path:
+        table = path.partition("[")[0]
+        named = cast("Mapping[str, object]", raw.get(table, {}))
+        wrong = next((name for name, part in named.items() if not _fits(part, _KINDS.get(table))), "")
+        path = path.replace("[...]", f".{wrong}" if wrong else "", 1)
+    return f"{path}." if path else ""

@@ -1,0 +1,114 @@
+"""The system file: which containers make up a system, on which hosts, in which order. Checked as a whole."""
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Final, NamedTuple, cast
+
+from msgspec import Meta, Struct
+
+from trade import Settings
+from trade.errors import ConfigurationError
+from trade.policies import read_policy
+from trade_gateway.config._gateway import read_gateway_file
+from trade_gateway.config._tables import Around, Entry, Part, Tables, at, converted, line_of, read_toml
+
+__all__ = ["SystemPlan", "read_system_file"]
+
+_TELLS_ITSELF: Final = ("tls", "policy", "audit", "metrics", "connect", "listen")
+"""What a gateway file says, and the system file does not."""
+
+_Text = Annotated[str, Meta(min_length=1)]
+
+
+class _System(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    name: _Text
+    """The system id."""
+    tls: str = ""
+    """Of `trade system` itself, and of containers of this host that name none."""
+    policy: str = ""
+    audit: str = ""
+    """Of containers of this host that name none."""
+    connect: list[_Text] = []
+
+
+class SystemPlan(NamedTuple):
+    """A system file with all that it names on this host, checked."""
+
+    path: Path
+    settings: Settings
+    """Of who brings it up."""
+    parts: Sequence[Part]
+    """In the order in which they are started."""
+    text: str
+
+    def at(self, name: str, key: str = "") -> str:
+        """Where the file speaks of a container, for errors."""
+        return at(self.path, self.text, ("container", name), key)
+
+
+def read_system_file(path: Path) -> SystemPlan:
+    """Read and check a system file, and the files of this host that it names. Nothing is started and nobody is asked.
+
+    Raises:
+        ConfigurationError: names the file, the line, the key and what would be right.
+    """
+    text, raw = read_toml(path)
+    for key in raw:
+        if key not in ("system", "container"):
+            problem = "unknown; there is [system] and [container.NAME]"
+            raise ConfigurationError(where=f"{path}:{line_of(text, (key,), key)}: {key}", problem=problem)
+    if not isinstance(raw.get("system"), dict):
+        raise ConfigurationError(where=f"{path}:1: system", problem='missing; write [system] and name = "lab"')
+    system = converted(raw["system"], _System, path, text, ("system",))
+    tables = raw.get("container")
+    if not isinstance(tables, dict) or not tables:
+        raise ConfigurationError(where=f"{path}:1: container", problem="missing; write [container.NAME]")
+    entries = {
+        name: converted(table, Entry, path, text, ("container", name))
+        for name, table in cast("dict[str, object]", tables).items()
+    }
+    around = Around(
+        system=system.name, tls=system.tls, policy=system.policy, audit=system.audit, connect=system.connect
+    )
+    reading = _WithGateways(path, text, around, entries)
+    settings = _own_settings(reading, text)
+    return SystemPlan(path, settings, reading.parts(), text)
+
+
+def _own_settings(reading: Tables, text: str) -> Settings:
+    """Of who brings the system up."""
+    system = reading.around
+    environment = {**os.environ, **reading.environment(system.tls, system.policy)}
+    try:
+        if system.policy:
+            read_policy(reading.beside(system.policy))
+        settings = Settings.read(system=system.system, connect=system.connect, environment=environment)
+        return replace(settings, audit=None, metrics="")  # it comes and goes
+    except ConfigurationError as wrong:
+        raise ConfigurationError(where=at(reading.path, text, ("system",), ""), problem=str(wrong)) from None
+
+
+class _WithGateways(Tables):
+    """Of a system file, where a container may be a gateway."""
+
+    def check_kind(self, name: str, entry: Entry) -> None:
+        super().check_kind(name, entry)
+        for key in _TELLS_ITSELF if entry.gateway else ():
+            if getattr(entry, key):
+                self.refuse(name, key, "is said by the gateway file; leave it out")
+
+    def check_here(self, name: str, entry: Entry, environment: Mapping[str, str]) -> None:
+        if not entry.gateway:
+            super().check_here(name, entry, environment)
+            return
+        file = self.beside(entry.gateway)
+        with self.about(name, entry):
+            settings = read_gateway_file(file).settings
+        for key, said, wanted in (
+            ("name", settings.container, name),
+            ("system", settings.system, self.around.system),
+        ):
+            if said != wanted:
+                self.refuse(name, "gateway", f"{file} has {key} = {said!r}; here it is {wanted!r}")

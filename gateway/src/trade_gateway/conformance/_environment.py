@@ -1,0 +1,301 @@
+"""A system of its own, on this host only, and in it the container under test: started, ended, killed, started anew."""
+
+import contextlib
+import os
+import secrets
+import shlex
+import shutil
+import signal
+import subprocess
+import threading
+import time
+from collections.abc import Generator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+
+from trade import Container
+from trade._protocol.keys import ALIVE, Address, is_chunk, registry_key
+from trade._protocol.messages import Token
+from trade._resources.lock_request import Granted
+from trade._settings import Settings
+from trade._transport.base import Answer, ChannelClosed
+from trade._transport.endpoints import free_endpoint
+from trade._transport.zenoh import ZenohTransport, configuration
+from trade.errors import ConfigurationError
+from trade_gateway.conformance._assertions import SLACK_S, STOPPED_S, NotHeld, eventually, require
+from trade_gateway.conformance._peer import Peer, end_group
+from trade_gateway.conformance._raw_client import NEVER, SYSTEM, Voice
+
+IDENTITY: Final = "peer"
+NAME: Final = "peer"
+_START_S: Final = 30.0
+_STILL_S: Final = 0.15
+_LOOK_S: Final = 0.05
+_LAST_LINES: Final = 12
+
+
+class Stage:
+    """Everything a check needs. A context manager: nothing of it is left behind."""
+
+    def __init__(self, command: str, folder: Path, *, motion: bool) -> None:
+        try:
+            self._command = shlex.split(command)
+        except ValueError as bad:
+            raise ConfigurationError(where="--peer", problem=f"cannot be read as words: {bad}") from None
+        if not self._command:
+            raise ConfigurationError(where="--peer", problem="names no program; write the command that starts it")
+        if shutil.which(self._command[0]) is None:
+            raise ConfigurationError(
+                where="--peer", problem=f"cannot be started: there is no program {self._command[0]!r}"
+            )
+        self._folder = folder
+        self.motion: Final = motion
+        """Whether the arm may be turned."""
+        self._system = f"conformance-{secrets.token_hex(4)}"
+        self._credentials = ("conformance", secrets.token_hex(16))
+        self._ending = contextlib.ExitStack()
+        self._signs: set[str] = set()
+        self._states = 0
+        self._peer: Peer | None = None
+        self.container: Container
+        """One of ours, of this project: what it offers the container under test calls."""
+
+    def __enter__(self) -> "Stage":
+        with contextlib.ExitStack() as ending:
+            self._endpoint = free_endpoint()
+            self._transport = ZenohTransport(
+                configuration(
+                    namespace=self._system, listen=[self._endpoint], connect=[], credentials=self._credentials
+                )
+            )
+            ending.callback(self._transport.close)
+            signs = self._transport.presences(ALIVE)
+            threading.Thread(target=self._watch, args=(signs,), name="suite-presence", daemon=True).start()
+            settings = Settings.read(
+                system=self._system,
+                identity="judge",
+                container="judge",
+                connect=[self._endpoint],
+                credentials=self._credentials,
+                environment={"TRADE_STATE_DIR": str(self._folder / "judge")},
+            )
+            self.container = ending.enter_context(Container(settings))
+            ending.callback(self.dismiss)
+            self._ending = ending.pop_all()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._ending.close()
+
+    # --- the container under test
+
+    @property
+    def peer(self) -> Peer:
+        """The one that runs; started if none does."""
+        if self._peer is None or not self._peer.alive:
+            self.dismiss()
+            self._peer = self.start()
+        return self._peer
+
+    def environment(self) -> dict[str, str]:
+        """What it is started with, as docs/wire-protocol.md says."""
+        return {
+            "TRADE_SYSTEM": self._system,
+            "TRADE_IDENTITY": IDENTITY,
+            "TRADE_CONTAINER": NAME,
+            "TRADE_CONNECT": self._endpoint,
+            "TRADE_CREDENTIALS": ":".join(self._credentials),
+            "TRADE_STATE_DIR": str(self._folder / f"state-{self._states}"),
+        }
+
+    def start(self, *, forgetful: bool = False) -> Peer:
+        """Start it, and wait for its sign of life.
+
+        Args:
+            forgetful: it has a new folder for what outlives it.
+
+        Raises:
+            NotHeld: it ends, or is not seen.
+            ConfigurationError: there is no such program.
+        """
+        self._states += forgetful
+        known = set(self.boots())
+        log = self._folder / "peer.log"
+        try:
+            with log.open("ab") as said:
+                process = subprocess.Popen(  # noqa: S603 - it is what one wants tested
+                    self._command,
+                    stdin=subprocess.DEVNULL,
+                    stdout=said,
+                    stderr=subprocess.STDOUT,
+                    env={**_without_ours(os.environ), **self.environment()},
+                    start_new_session=True,  # what is started may be a shell, or start others: all of it is ended
+                )
+        except OSError as bad:
+            raise ConfigurationError(where="--peer", problem=f"cannot be started: {bad}") from None
+
+        def seen() -> bool:
+            require(process.poll() is None, f"it ended with exit code {process.returncode}: {self.last_words()}")
+            return bool(set(self.boots()) - known)
+
+        try:
+            eventually(seen, f"no sign of life of alive/{IDENTITY}/{NAME}/... is seen", _START_S)
+            rose = set(self.boots()) - known
+            require(len(rose) == 1, f"{len(rose)} signs of life rose: {', '.join(map(str, rose))}")
+            [address] = rose
+            eventually(lambda: self.ask(registry_key("*", address, "*")), "it does not answer what it offers")
+        except BaseException:
+            end_group(process)
+            raise
+        self._peer = Peer(process, address, self.ask, self.seen)
+        return self._peer
+
+    def kill(self) -> Peer:
+        """End the one that runs without any warning; returns it."""
+        was = self.peer
+        was.signal(signal.SIGKILL)
+        was.process.wait()
+        eventually(lambda: not self.seen(was.address), "its sign of life stands after its end")
+        self._peer = None
+        return was
+
+    def dismiss(self) -> None:
+        """Ask the one that runs to end, and see to it that it does. Idempotent."""
+        was, self._peer = self._peer, None
+        if was is not None:
+            end_group(was.process)
+
+    def last_words(self) -> str:
+        """What it said last, for people."""
+        log = self._folder / "peer.log"
+        lines = log.read_text(encoding="utf-8", errors="replace").splitlines() if log.exists() else []
+        return " | ".join(lines[-_LAST_LINES:]) or "it said nothing"
+
+    # --- looking
+
+    def boots(self) -> list[Address]:
+        """The boots of it whose sign of life stands."""
+        found = [sign.split("/")[1:] for sign in set(self._signs)]
+        return [Address(*chunks) for chunks in found if chunks[:2] == [IDENTITY, NAME] and _is_boot(chunks)]
+
+    def seen(self, address: Address) -> bool:
+        """Whether a container's sign of life stands."""
+        return f"alive/{address}" in self._signs
+
+    def _watch(self, signs: Any) -> None:
+        while True:
+            try:
+                message = signs.receive()
+            except ChannelClosed:
+                return
+            known = set(self._signs)
+            self._signs = known - {message.key} if message.payload is None else known | {message.key}
+
+    def ask(self, pattern: str) -> list[Answer]:
+        """What is answered to the question what stands."""
+        return [answer for answer in self._transport.ask(pattern, 2.0) if answer.messages]
+
+    @contextlib.contextmanager
+    def listening(self, pattern: str) -> Generator[list[Any], None, None]:
+        """The messages put on keys that match, in a list that grows."""
+        heard: list[Any] = []
+        channel = self._transport.subscribe(pattern)
+
+        def read() -> None:
+            with contextlib.suppress(ChannelClosed):
+                while True:
+                    heard.append(channel.receive())
+
+        threading.Thread(target=read, name="suite-listening", daemon=True).start()
+        try:
+            yield heard
+        finally:
+            channel.close()
+
+    # --- speaking
+
+    def voice(self, identity: str = "anna", *, client: str = "1") -> Voice:
+        """Somebody who speaks to it; to be closed."""
+        return Voice(self._transport, identity, self.peer.address, client=client, motion=self.motion)
+
+    # --- its arm
+
+    def angle(self, who: Voice) -> float:
+        """Where its arm stands, in rad."""
+        return float(who.result(self.peer.arm, "angle", expires_ns=NEVER))
+
+    def turns(self, who: Voice) -> int:
+        """How many turns have begun since its boot."""
+        return int(who.result(self.peer.arm, "turns", expires_ns=NEVER))
+
+    def begin_turn(self, who: Voice, **how: Any) -> int:
+        """Have it turn for long; returns the call's id once it moves. Raises NotHeld if it does not."""
+        away_rad = self.far_rad(who)
+        call_id = who.call(self.peer.arm, "turn", away_rad, expires_ns=who.expiry_ns(60.0), **how)
+
+        def moves() -> bool:
+            for reply in who.answers(call_id):
+                raise NotHeld(f"a turn did not begin, but was answered with status {reply.status}")
+            return self.moves(who)
+
+        eventually(moves, "a turn that was asked for is not seen at angle()")
+        return call_id
+
+    def far_rad(self, who: Voice) -> float:
+        """An angle that takes half a minute to reach."""
+        return -30.0 if self.angle(who) > 0 else 30.0
+
+    def moves(self, who: Voice) -> bool:
+        """Whether it moves now."""
+        before = self.angle(who)
+        threading.Event().wait(_LOOK_S)
+        return self.angle(who) != before
+
+    @contextlib.contextmanager
+    def stopping(self, who: Voice, after: str) -> Generator[None, None, None]:
+        """Raises NotHeld unless the arm rests in time, from when what stops it is begun, and stays there.
+
+        What stops it is not to wait for its answer: an answer may come later than the arm has to rest.
+        """
+        since = time.monotonic()
+        yield
+        self.require_rest(who, after, since)
+
+    def require_rest(self, who: Voice, after: str, since: float) -> None:
+        """Raises NotHeld unless the arm rests in time, from that moment of time.monotonic(), and stays there."""
+        limit_s, before = STOPPED_S + SLACK_S, self.angle(who)
+        while True:
+            took_s = time.monotonic() - since
+            require(took_s < limit_s, f"the arm is not seen at rest after {after} within {limit_s:g} s")
+            threading.Event().wait(_LOOK_S)
+            where = self.angle(who)
+            if where == before:
+                break
+            before = where
+        threading.Event().wait(_STILL_S)
+        require(self.angle(who) == where, f"the arm moves again after {after}, at rest for {took_s:.1f} s")
+
+    def acquire(self, who: Voice, resources: Sequence[str], **terms: Any) -> Any:
+        """Ask for a lock; the answer."""
+        return who.ask(SYSTEM, "acquire", list(resources), terms)
+
+    def granted(self, who: Voice, resources: Sequence[str], **terms: Any) -> Token:
+        """Take a lock; raises NotHeld if it is not given."""
+        found = who.result(SYSTEM, "acquire", list(resources), terms)
+        try:
+            granted = msgspec.convert(found, Granted)
+        except msgspec.ValidationError as bad:
+            raise NotHeld(f"what acquire answered cannot be read: {bad}") from None
+        if granted.token is None or not set(resources) <= set(granted.resources):
+            raise NotHeld(f"acquire answered {found!r}, which is not what was asked for")
+        return granted.token
+
+
+def _is_boot(chunks: Sequence[str]) -> bool:
+    return len(chunks) == 3 and all(map(is_chunk, chunks))
+
+
+def _without_ours(environment: Mapping[str, str]) -> dict[str, str]:
+    return {name: value for name, value in environment.items() if not name.startswith("TRADE_") or "RUNTIME" in name}

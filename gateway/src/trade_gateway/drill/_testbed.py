@@ -1,0 +1,213 @@
+"""Where a drill is held: a simulator, the driver, two linked gateways and a caller, each in a process of its own.
+
+The driver and the caller reach each other only by way of the gateways, and these only by way of a cable that can be
+cut. All of it is on the loopback interface, in a system of its own.
+"""
+
+import json
+import secrets
+import socket
+import time
+from collections.abc import Generator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import msgspec
+
+from trade.errors import ConfigurationError
+from trade_drivers.robotfile import Robot
+from trade_gateway.drill._caller import Order
+from trade_gateway.drill._judge import Judge
+from trade_gateway.drill._processes import Actor, bare_environment
+from trade_gateway.drill._scenes import VALID_S, Scene
+from trade_gateway.drill._targets import Target
+
+if TYPE_CHECKING:
+    from trade_hil_sim import SimProcess
+
+__all__ = ["Stand", "standing"]
+
+UP_S: Final = 60.0
+"""How long a process may take to be up; a busy computer needs seconds to import."""
+
+
+class Stand:
+    """All that takes part, up until it is closed.
+
+    Args:
+        robot: as its file has it.
+        left_out: the parts that are not brought up.
+        sim: simulates the buses of the targets.
+        folder: for files of its own.
+    """
+
+    def __init__(self, robot: Robot, left_out: Sequence[str], sim: "SimProcess", folder: Path) -> None:
+        self._sim = sim
+        self._folder = folder
+        self._unplugged: list[str] = []
+        self._off: list[str] = []
+        self._system = f"drill-{secrets.token_hex(3)}"
+        self._secret = f"drill:{secrets.token_hex(16)}"
+        self._actors: dict[str, Actor] = {}
+        self.judge = Judge(sim.log_path)
+        ports = [word for bus, port in sim.ports.items() for word in ("--port", f"{bus}={port}")]
+        without = [word for part in left_out for word in ("--without", part)]
+        self._driver = ["up", robot.where, *ports, *without, "--name", "driver", "--json"]
+        self._near, self._far = _free_ports(2)
+
+    def begin(self) -> None:
+        """Bring it up. Raises DrillFailed."""
+        self._actors["link"] = self._actor(
+            "link", ["trade_gateway.drill._tcp_relay", str(self._near), str(self._far)], {}
+        )
+        to_near, to_far = self._actors["link"].said(UP_S)["ports"]
+        self._write_gateway("gateway", self._near, dials=to_far)
+        self._write_gateway("lab", self._far, dials=to_near)
+        for name in ("gateway", "lab", "driver"):
+            self._start(name)
+
+    def call(self, scene: Scene, targets: Sequence[Target]) -> Actor:
+        """A caller that has found and enabled what it will move, and waits for its cue. Raises DrillFailed."""
+        orders = [self._order(scene, target) for target in targets]
+        words = ["trade_gateway.drill._caller", msgspec.json.encode(orders).decode()]
+        caller = self._actors["caller"] = self._actor("caller", words, self._settings("caller", self._far))
+        caller.said(UP_S)
+        return caller
+
+    def strike(self, scene: Scene, targets: Sequence[Target]) -> float:
+        """Do what the scene says; the time on CLOCK_MONOTONIC right before."""
+        done_at = time.monotonic()
+        match scene.deed:
+            case "kill":
+                self._actors[scene.whom].kill()
+            case "freeze":
+                self._actors[scene.whom].freeze()
+            case "hush":
+                self._actors[scene.whom].tell()
+            case "unplug":
+                self._unplugged = [target.bus for target in targets]
+                for bus in self._unplugged:
+                    self._sim.control.unplug(bus)
+            case "bus_off":
+                self._off = [target.bus for target in targets]
+                for bus in self._off:
+                    self._switch(bus, off=True)
+        return done_at
+
+    def mend(self) -> None:
+        """Wake who is frozen, start who was killed, plug in what was unplugged. Raises DrillFailed."""
+        for actor in self._actors.values():
+            actor.wake()
+        for bus in self._unplugged:
+            self._sim.control.replug(bus)
+        for bus in self._off:
+            self._switch(bus, off=False)
+        self._unplugged, self._off = [], []
+        for name in ("gateway", "driver"):
+            if not self._actors[name].running:
+                self._actors[name].close(gently=False)
+                self._start(name)
+
+    def dismiss(self) -> None:
+        """The caller has done its part."""
+        if caller := self._actors.pop("caller", None):
+            caller.close(gently=False)
+
+    def look(self) -> None:
+        """Have the judge see what has happened up to now."""
+        self._sim.control.state()  # simulated devices work out what has become of them when they are asked
+        self.judge.look()
+
+    def close(self) -> None:
+        """End all of it, the driver before its gateway. Idempotent."""
+        self.dismiss()
+        for name in ("driver", "lab", "link", "gateway"):
+            if actor := self._actors.pop(name, None):
+                actor.close(gently=name != "link")
+
+    def _start(self, name: str) -> None:
+        """A command of ours."""
+        words = self._driver if name == "driver" else ["gateway", str(self._folder / f"{name}.toml"), "--json"]
+        settings = self._settings("driver", self._near) if name == "driver" else self._places(name)
+        self._actors[name] = actor = self._actor(name, ["trade_gateway", "--with-stdin", *words], settings)
+        actor.said(UP_S)
+
+    def _actor(self, name: str, words: Sequence[str], settings: dict[str, str]) -> Actor:
+        return Actor(name, words, {**bare_environment(), **settings}, self._folder / f"{name}.complaints")
+
+    def _places(self, name: str) -> dict[str, str]:
+        """Folders of its own: nobody finds another one on this host."""
+        own = self._folder / name
+        return {"TRADE_RUNTIME_DIR": str(own / "runtime"), "TRADE_STATE_DIR": str(own / "state")}
+
+    def _settings(self, name: str, port: int) -> dict[str, str]:
+        return {
+            **self._places(name),
+            "TRADE_SYSTEM": self._system,
+            "TRADE_CREDENTIALS": self._secret,
+            "TRADE_CONTAINER": name,
+            "TRADE_CONNECT": f"tcp/127.0.0.1:{port}",
+        }
+
+    def _write_gateway(self, name: str, port: int, *, dials: int) -> None:
+        lines = {"system": self._system, "name": name, "credentials": self._secret}
+        text = "".join(f"{key} = {json.dumps(value)}\n" for key, value in lines.items()) + "insecure_lan = true\n"
+        text += f'connect = ["tcp/127.0.0.1:{dials}"]\n\n'
+        text += f'[network.host]\ninterface = "lo"\nlisten = ["tcp/127.0.0.1:{port}"]\n'
+        (self._folder / f"{name}.toml").write_text(text, encoding="utf-8")
+
+    def _order(self, scene: Scene, target: Target) -> Order:
+        control = self._sim.control
+        now = control.arm(target.name).positions_rad if target.arm else [control.device(target.name).position_rad]
+        goal, speed = target.way(now[0])
+        return Order(
+            group=target.group,
+            arm=target.arm,
+            stream=scene.motion == "stream",
+            from_rad=now,
+            goal_rad=[goal, *now[1:]],
+            speed_rad_s=speed,
+            valid_s=VALID_S,
+        )
+
+    def _switch(self, bus: str, *, off: bool) -> None:
+        from trade_hil_sim import BusOff  # noqa: PLC0415 - only needed here
+
+        self._sim.control.do(BusOff(bus=bus, on=off))
+
+
+@contextmanager
+def standing(robot: Robot, targets: Sequence[Target], left_out: Sequence[str], folder: Path) -> Generator[Stand]:
+    """A stand that is up; all of it is ended afterwards.
+
+    Raises:
+        ConfigurationError: there is no simulator, or it refuses this robot.
+        DrillFailed: something does not come up.
+    """
+    try:
+        from trade_hil_sim import SimProcess, SimulationError, remove_leftovers  # noqa: PLC0415 - only a drill needs it
+    except ImportError:
+        raise ConfigurationError(
+            where="trade drill", problem="needs trade-hil-sim; pip install trade-hil-sim"
+        ) from None
+    remove_leftovers()
+    try:
+        with SimProcess(robot.where, buses=[target.bus for target in targets]) as simulated:
+            stand = Stand(robot, left_out, simulated, folder)
+            try:
+                stand.begin()
+                yield stand
+            finally:
+                stand.close()
+    except SimulationError as problem:
+        raise ConfigurationError(where=robot.where, problem=str(problem)) from None
+
+
+def _free_ports(count: int) -> list[int]:
+    """Ports of 127.0.0.1 that nobody listens on at present."""
+    with ExitStack() as held:
+        found = [held.enter_context(socket.socket()) for _ in range(count)]
+        for each in found:
+            each.bind(("127.0.0.1", 0))
+        return [each.getsockname()[1] for each in found]

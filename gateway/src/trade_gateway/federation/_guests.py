@@ -1,0 +1,67 @@
+"""The gateway as a guest in other systems: a container in each, and a border between it and our own."""
+
+import threading
+from contextlib import ExitStack
+from typing import Final
+
+from trade import Container, Settings
+from trade.errors import TradeError
+from trade.sharing import Border
+from trade_gateway.config._gateway import Plan, Share
+
+_TRIES: Final = 5
+_AGAIN_S: Final = 0.2
+
+
+class _Guest:
+    """In one other system."""
+
+    def __init__(self, ours: Container, settings: Settings, share: Share) -> None:
+        with ExitStack() as leaving:
+            self.ours = ours
+            self.container = opened(settings)
+            leaving.callback(self.container.close)
+            self.border = Border(ours, self.container, exported=share.export, imported=share.import_)
+            leaving.callback(self.border.close)
+            self._leaving = leaving.pop_all()
+
+    def close(self) -> None:
+        self._leaving.close()
+
+
+class Guests:
+    """In all other systems that a gateway file names."""
+
+    def __init__(self) -> None:
+        self._guests: dict[str, _Guest] = {}
+
+    def apply(self, ours: Container, plan: Plan) -> None:
+        """Be where the file says, with its lists; who was there and stays there is not disturbed.
+
+        Raises:
+            ConfigurationError: one of them cannot be started; the others are as the file says.
+        """
+        for name, guest in list(self._guests.items()):
+            if plan.shares.get(name) != guest.container.settings or guest.ours is not ours:
+                self._guests.pop(name).close()
+        for name, share in plan.file.share.items():
+            guest = self._guests.get(name)
+            if guest is None:
+                self._guests[name] = _Guest(ours, plan.shares[name], share)
+            else:
+                guest.border.share(exported=share.export, imported=share.import_)
+
+    def close(self) -> None:
+        """Leave all of them: what their clients set moving stops. Idempotent."""
+        for name in list(self._guests):
+            self._guests.pop(name).close()
+
+
+def opened(settings: Settings) -> Container:
+    """A container; the one before may need a moment to let go of its addresses. Raises ConfigurationError."""
+    for _ in range(_TRIES - 1):
+        try:
+            return Container(settings)
+        except TradeError:
+            threading.Event().wait(_AGAIN_S)
+    return Container(settings)

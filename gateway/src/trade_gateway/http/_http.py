@@ -1,0 +1,287 @@
+"""The door over HTTP: each request a session of its own, or of one that was opened before."""
+
+import asyncio
+from collections.abc import AsyncGenerator, Awaitable, Callable
+from contextlib import asynccontextmanager
+from typing import Any, Final, TypeVar
+
+import msgspec
+from starlette.exceptions import HTTPException
+from starlette.requests import Request
+from starlette.responses import Response
+from starlette.routing import Route
+
+from trade.errors import InvalidResult, LockLost, TooLarge, TradeError
+from trade_gateway.clients import Client, Deeds, NoSuchSession
+from trade_gateway.clients import _schemas as messages
+from trade_gateway.http._authentication import Entry
+from trade_gateway.http._openapi import document
+from trade_gateway.http._origin_check import problem_response
+from trade_gateway.http._problem_json import BadMessage, HttpError, NeedsSession, NotLetIn
+from trade_gateway.http._session_timeouts import Leases
+
+MOST_BODY_BYTES: Final = 1 << 20
+SESSION: Final = "Trade-Session"
+_BODY_S: Final = 10.0
+"""How long a body may take to arrive."""
+
+Body = TypeVar("Body")
+Answer = Callable[[Request], Awaitable[Response]]
+
+
+class Http:
+    """The routes."""
+
+    def __init__(self, deeds: Deeds, entry: Entry, leases: Leases) -> None:
+        self._deeds = deeds
+        self._entry = entry
+        self._leases = leases
+
+    def routes(self) -> list[Route]:
+        """All of them, for an application."""
+        return [
+            self._route("/openapi.json", GET=self.openapi),
+            self._route("/services", "group", "name", GET=self.services),
+            self._route("/me", GET=self.me),
+            self._route("/containers", GET=self.containers),
+            self._route("/sight", GET=self.sight),
+            self._route("/loads", GET=self.loads),
+            self._route("/notifications", GET=self.notifications),
+            self._route("/hooks", GET=self.hooks),
+            self._route("/policy", GET=self.policy),
+            self._route("/audit", GET=self.audit),
+            self._route("/tracing", POST=self.tracing),
+            self._route("/call/{group}/{name}", POST=self.call),
+            self._route("/session", POST=self.open_session, GET=self.session, DELETE=self.close_session),
+            self._route("/locks", GET=self.locks, POST=self.lock),
+            self._route("/locks/request", POST=self.request_release),
+            self._route("/locks/break", POST=self.break_locks),
+            self._route("/locks/{lock}", DELETE=self.unlock),
+            self._route("/resume", POST=self.resume),
+            self._route("/estops", GET=self.estops),
+            self._route("/estop", POST=self.estop),
+            self._route("/estop/clear", POST=self.clear),
+        ]
+
+    def _route(self, path: str, *query: str, **by_method: Answer) -> Route:
+        async def answer(request: Request) -> Response:
+            method = "GET" if request.method == "HEAD" else request.method
+            asked = [name for name, _ in request.query_params.multi_items()]
+            try:
+                if unknown := sorted({name for name in asked if name not in query or asked.count(name) > 1}):
+                    raise BadMessage(problem=f"{', '.join(unknown)} cannot be asked for here, or not twice")
+                return await by_method[method](request)
+            except TradeError as error:
+                self._deeds.note_refused(error)
+                headers = {"WWW-Authenticate": 'Bearer realm="trade"'} if isinstance(error, NotLetIn) else None
+                return problem_response(error, headers)
+
+        return Route(path, answer, methods=list(by_method))
+
+    # --- looking
+
+    async def openapi(self, request: Request) -> Response:
+        return _answer(document(self._deeds.seen(self._who(request))))
+
+    async def services(self, request: Request) -> Response:
+        asked = request.query_params
+        who = self._who(request)
+        found = self._deeds.seen(who, asked.get("group"), asked.get("name"))
+        return _answer([self._deeds.view(who, handle) for handle in found])
+
+    async def me(self, request: Request) -> Response:
+        return _answer(self._deeds.overview.me(self._who(request)))
+
+    async def loads(self, request: Request) -> Response:
+        return _answer(await self._deeds.overview.loads(self._who(request)))
+
+    async def notifications(self, request: Request) -> Response:
+        return _answer(await self._deeds.overview.notifications(self._who(request)))
+
+    async def hooks(self, request: Request) -> Response:
+        return _answer(await self._deeds.overview.hooks(self._who(request)))
+
+    async def policy(self, request: Request) -> Response:
+        return _answer(self._deeds.overview.policy(self._who(request)))
+
+    async def audit(self, request: Request) -> Response:
+        return _answer(await self._deeds.overview.audit(self._who(request)))
+
+    async def tracing(self, request: Request) -> Response:
+        who, body = self._who(request), await _body(request, messages.TracingBody)
+        return _answer({"containers": await self._deeds.overview.set_tracing(who, on=body.on)})
+
+    async def containers(self, request: Request) -> Response:
+        return _answer(self._deeds.overview.containers(self._who(request)))
+
+    async def sight(self, request: Request) -> Response:
+        return _answer(await self._deeds.overview.sight(self._who(request)))
+
+    # --- calling
+
+    async def call(self, request: Request) -> Response:
+        who, body = self._entry.who(request.scope), await _body(request, messages.CallBody)
+        handle = self._deeds.find(who, request.path_params["group"], request.path_params["name"], body.container)
+        named = self._heard(request, who, stops=handle.effect == "stop")
+        async with self._client(request, who, named) as (client, alone):
+            gone = lambda: _gone(request)  # noqa: E731
+            run = await self._deeds.call(client, handle, body, gone, alone=alone)
+        error = run.exception(0)
+        if error is not None:
+            return problem_response(error)
+        try:
+            return _answer({"result": run.result(0)})
+        except messages.NO_JSON as bad:
+            raise InvalidResult(service=handle.label, problem=f"it has no form in JSON: {bad}") from None
+
+    # --- sessions
+
+    async def open_session(self, request: Request) -> Response:
+        who, body = self._who(request), await _body(request, messages.SessionBody)
+        client = await self._deeds.apart(self._deeds.clients.open, who)
+        self._leases.begin(client, body.lease_s, lambda: self._entry.still(request.scope, who))
+        return _answer(messages.SessionOpened(client.secret, client.session.name, body.lease_s), 201)
+
+    async def session(self, request: Request) -> Response:
+        client = self._lasting(request, self._who(request), "this")
+        return _answer({"name": client.session.name, "lease_s": self._leases.lease_s(client)})
+
+    async def close_session(self, request: Request) -> Response:
+        client = self._lasting(request, self._who(request), "this")
+        await self._deeds.apart(client.close, stops=True)
+        return Response(status_code=204)
+
+    # --- locks and stops
+
+    async def locks(self, request: Request) -> Response:
+        return _answer(await self._deeds.locks(self._who(request)))
+
+    async def lock(self, request: Request) -> Response:
+        who, body = self._who(request), await _body(request, messages.LockBody)
+        client = self._lasting(request, who, "a lock")
+        return _answer(await self._deeds.lock(client, body, _lost), 201)
+
+    async def unlock(self, request: Request) -> Response:
+        client = self._lasting(request, self._who(request), "a lock")
+        if not await self._deeds.apart(client.unlock, request.path_params["lock"]):
+            raise HttpError(status=404, problem="this session has no such lock, or it was lost")
+        return Response(status_code=204)
+
+    async def request_release(self, request: Request) -> Response:
+        who, body = self._who(request), await _body(request, messages.RequestBody)
+        return _answer({"asked": await self._deeds.request_release(who, body)})
+
+    async def break_locks(self, request: Request) -> Response:
+        who, body = self._who(request), await _body(request, messages.RequestBody)
+        return _answer(await self._deeds.break_locks(who, body))
+
+    async def resume(self, request: Request) -> Response:
+        who, body = self._who(request), await _body(request, messages.GroupBody)
+        async with self._client(request, who, self._heard(request, who)) as (client, _):
+            return _answer({"resumed": await self._deeds.resume(client, body)})
+
+    async def estops(self, request: Request) -> Response:
+        return _answer(self._deeds.estops(self._who(request)))
+
+    async def estop(self, request: Request) -> Response:
+        who = self._entry.who(request.scope)
+        self._heard(request, who, stops=True)
+        return _answer(await self._deeds.estop(who, await _body(request, messages.EstopBody)))
+
+    async def clear(self, request: Request) -> Response:
+        return _answer(await self._deeds.clear(self._who(request), await _body(request, messages.ClearBody)))
+
+    # --- who, and in which session
+
+    def _who(self, request: Request) -> str:
+        who = self._entry.who(request.scope)
+        self._heard(request, who)
+        return who
+
+    def _heard(self, request: Request, who: str, *, stops: bool = False) -> Client | None:
+        """The session that a request names, which is renewed by it; None if it names none.
+
+        Raises NoSuchSession, but not to a request that stops something: that needs none (S07).
+        """
+        secret = request.headers.get(SESSION)
+        if secret is None:
+            return None
+        try:
+            client = self._deeds.clients.of(secret, who)
+        except NoSuchSession:
+            if stops:
+                return None
+            raise
+        self._leases.renew(client)
+        return client
+
+    def _lasting(self, request: Request, who: str, what: str) -> Client:
+        """The session that a request names. Raises NeedsSession, NoSuchSession."""
+        client = self._heard(request, who)
+        if client is None:
+            raise NeedsSession(what=what)
+        return client
+
+    @asynccontextmanager
+    async def _client(self, request: Request, who: str, named: Client | None) -> AsyncGenerator[tuple[Client, bool]]:
+        """The session that a request names; else one of its own, for as long as it lasts, and that it is so."""
+        if named is not None:
+            yield named, False
+            return
+        client = await self._deeds.apart(self._deeds.clients.open_for_one, who, stops=True)
+        self._leases.begin(client, 0, lambda: self._entry.still(request.scope, who))
+        try:
+            yield client, True
+        finally:
+            await asyncio.shield(asyncio.ensure_future(self._deeds.apart(client.close, stops=True)))
+
+
+def _lost(_name: str, _error: LockLost) -> None:
+    """A request cannot be told later; what is done under the lock next says that it is lost."""
+
+
+async def _gone(request: Request) -> None:
+    """Wait until the client's end of the connection is closed."""
+    while (await request.receive())["type"] != "http.disconnect":
+        pass
+
+
+async def _body(request: Request, kind: type[Body]) -> Body:
+    """What the client has sent, as the record that belongs here; nothing at all is an empty one."""
+    media_type = request.headers.get("content-type", "application/json").partition(";")[0].strip().lower()
+    if media_type != "application/json":
+        raise HttpError(status=415, problem=f"send application/json, not {media_type}")
+    try:
+        data = await asyncio.wait_for(_read(request), _BODY_S)
+    except asyncio.TimeoutError:
+        raise HttpError(status=408, problem=f"the body did not arrive within {_BODY_S:g} s") from None
+    try:
+        return msgspec.json.decode(data or b"{}", type=kind)
+    except (msgspec.DecodeError, ValueError, RecursionError) as bad:
+        raise BadMessage(problem=str(bad)) from None
+
+
+async def _read(request: Request) -> bytes:
+    data = bytearray()
+    async for chunk in request.stream():
+        data += chunk
+        if len(data) > MOST_BODY_BYTES:
+            path, size = request.url.path, len(data)
+            raise TooLarge(service=path, what="a body", size_bytes=size, limit_bytes=MOST_BODY_BYTES)
+    return bytes(data)
+
+
+def _answer(value: Any, status: int = 200) -> Response:
+    return Response(messages.encoder.encode(value), status, media_type="application/json")
+
+
+async def refused(_request: Request, error: Exception) -> Response:
+    """What HTTP itself refuses, as a problem."""
+    assert isinstance(error, HTTPException)  # noqa: S101 - it is set for these
+    problem = HttpError(status=error.status_code, problem=error.detail)
+    return problem_response(problem, dict(error.headers or {}))
+
+
+async def broken(_request: Request, _error: Exception) -> Response:
+    """A fault of the door's own; the server logs what it was."""
+    return problem_response(HttpError(status=500, problem="the door itself failed at this; its log says how"))

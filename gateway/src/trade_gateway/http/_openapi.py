@@ -1,0 +1,247 @@
+"""The door as an OpenAPI document: what it offers always, and the services that the asking client may know of now."""
+
+from collections.abc import Mapping, Sequence
+from importlib.metadata import version
+from typing import Any, Final, cast
+
+import msgspec
+
+from trade import Handle, HookInfo, LoadInfo, NotificationInfo, Sight
+from trade_gateway.clients import _schemas as messages
+from trade_gateway.http._problem_json import MEDIA_TYPE, Problem
+
+Schema = dict[str, Any]
+
+_OPENAPI: Final = "3.1.0"
+_BODIES: Final = (
+    messages.CallBody,
+    messages.LockBody,
+    messages.GroupBody,
+    messages.RequestBody,
+    messages.EstopBody,
+    messages.ClearBody,
+    messages.SessionBody,
+    messages.Me,
+    messages.ServiceView,
+    messages.ContainerView,
+    messages.LockView,
+    messages.LockTaken,
+    messages.SessionOpened,
+    messages.EstopView,
+    messages.Stopped,
+    LoadInfo,
+    NotificationInfo,
+    HookInfo,
+    Sight,
+    Problem,
+)
+_COMPONENTS: Final = "#/components/schemas/"
+_FORMATS: Final = {"datetime": "date-time", "date": "date", "time": "time", "UUID": "uuid"}
+_TAG: Final = "door"
+_VALUES: Final = ("const", "default", "enum", "examples")
+"""What these have is no schema."""
+_SESSION: Final = {
+    "name": "Trade-Session",
+    "in": "header",
+    "description": "A session that POST /session opened; without it the request is one of its own.",
+    "schema": {"type": "string"},
+}
+
+
+def document(handles: Sequence[Handle]) -> Schema:
+    """The document, as JSON.
+
+    Args:
+        handles: the services to describe, each under ``/call/GROUP/NAME``.
+    """
+    _, components = msgspec.json.schema_components(_BODIES, ref_template=_COMPONENTS + "{name}")
+    schemas: Schema = _led(components, "")
+    schemas["Problem"]["additionalProperties"] = True
+    call = schemas.pop("CallBody")
+    paths: Schema = {}
+    for handle in handles:
+        path = f"/call/{handle.key.domain}/{handle.name}"
+        if path not in paths:
+            paths[path] = {"post": _call(handle, call, schemas)}
+    return {
+        "openapi": _OPENAPI,
+        "info": {"title": "TRADE", "version": version("trade-gateway"), "description": __doc__},
+        "paths": {**paths, **_fixed()},
+        "components": {
+            "schemas": schemas,
+            "securitySchemes": {"token": {"type": "http", "scheme": "bearer"}},
+        },
+        "security": [{"token": []}],
+    }
+
+
+def _call(handle: Handle, call: Schema, schemas: Schema) -> Schema:
+    record, described = handle.record, handle.schema
+    name = f"{handle.key.domain}.{handle.name}"
+    arguments = _placed(described["arguments"], name, schemas)
+    named = {**arguments, "additionalProperties": False}
+    needs_some = any(one.required for one in record.info.parameters)
+    body = {**call, "properties": {**call["properties"], "args": named}, "required": ["args"] if needs_some else []}
+    result = {
+        "type": "object",
+        "properties": {"result": _placed(described["result"], name, schemas)},
+        "required": ["result"],
+    }
+    return {
+        "operationId": name,
+        "summary": handle.signature,
+        "description": handle.doc,
+        "tags": [handle.key.domain],
+        "parameters": [_SESSION],
+        "requestBody": _json(body, required=needs_some),
+        "responses": _responses(result),
+        "x-trade-effect": handle.effect,
+    }
+
+
+def _placed(schema: Mapping[str, Any], name: str, schemas: Schema) -> Schema:
+    """A service's own schema, with what it refers to among the document's under the service's name."""
+    own = schema.get("$defs", {})
+    for title, definition in own.items():
+        schemas[f"{name}.{title}"] = _led(definition, name)
+    return _led({key: value for key, value in schema.items() if key != "$defs"}, name)
+
+
+def _led(part: Any, name: str) -> Any:
+    """References into the document, formats where there are some, and what an integer holds.
+
+    Titles go, as generators of clients take them for names, which have to be different. So does ``items: false``, which
+    few of them read: the greatest length says the same.
+    """
+    if isinstance(part, list):
+        return [_led(one, name) for one in cast("list[Any]", part)]
+    if not isinstance(part, dict):
+        return part
+    led = {
+        key: value if key in _VALUES else _led(value, name)
+        for key, value in cast("Schema", part).items()
+        if not (key == "title" and isinstance(value, str))
+    }
+    if name and isinstance(ref := led.get("$ref"), str):
+        led["$ref"] = f"{_COMPONENTS}{name}.{ref.rpartition('/')[2]}"
+    if led.get("items") is False:
+        del led["items"]
+        led.setdefault("maxItems", len(led.get("prefixItems", ())))
+    if (form := _FORMATS.get(str(led.get("x-trade-kind")))) is not None:
+        led.setdefault("format", form)
+    if led.get("type") == "integer":
+        led = {"minimum": messages.LEAST_INTEGER, "maximum": messages.MOST_INTEGER, **led}
+    return led
+
+
+# --- what is there always
+
+
+def _fixed() -> Schema:
+    query = [
+        {"name": name, "in": "query", "schema": {"type": "string"}, "description": text}
+        for name, text in (("group", "This group and beneath it."), ("name", "`*` and `?` stand for anything."))
+    ]
+    held = {**_SESSION, "required": True}
+    lock = {"name": "lock", "in": "path", "required": True, "schema": {"type": "string"}}
+    names = {"type": "array", "items": {"type": "string"}}
+    asked = {"type": "object", "properties": {"asked": names}, "required": ["asked"]}
+    resumed = {"type": "object", "properties": {"resumed": names}, "required": ["resumed"]}
+    opened = {"type": "object", "properties": {"name": {"type": "string"}, "lease_s": {"type": "number"}}}
+    return {
+        "/openapi.json": {"get": _operation("document", "This document.", {"type": "object"})},
+        "/services": {"get": _operation("services", "Services.", _list("ServiceView"), parameters=query)},
+        "/me": {"get": _operation("me", "As whom the client is known, and its rights over the system.", _ref("Me"))},
+        "/containers": {"get": _operation("containers", "Containers.", _list("ContainerView"))},
+        "/sight": {"get": _operation("sight", "Whom the door has found, and where nobody.", _ref("Sight"))},
+        "/loads": {
+            "get": _operation("loads", "How busy they are, over the second that this takes.", _list("LoadInfo"))
+        },
+        "/notifications": {"get": _operation("notifications", "Notifications that stand.", _list("NotificationInfo"))},
+        "/hooks": {"get": _operation("hooks", "Hooks that are attached.", _list("HookInfo"))},
+        "/session": {
+            "post": _operation(
+                "open_session", "Open a session.", _ref("SessionOpened"), body="SessionBody", status="201"
+            ),
+            "get": _operation(
+                "renew_session", "Renew a session, as any request in it does.", opened, parameters=[held]
+            ),
+            "delete": _operation(
+                "end_session", "End a session: what it moves stops.", None, parameters=[held], status="204"
+            ),
+        },
+        "/locks": {
+            "get": _operation("locks", "Locks.", _list("LockView")),
+            "post": _operation(
+                "take_lock",
+                "Take a lock.",
+                _ref("LockTaken"),
+                body="LockBody",
+                needed=True,
+                parameters=[held],
+                status="201",
+            ),
+        },
+        "/locks/request": {
+            "post": _operation(
+                "request_locks", "Ask their owners to give locks back.", asked, body="RequestBody", needed=True
+            )
+        },
+        "/locks/break": {
+            "post": _operation("break_locks", "Take locks away.", _list("LockView"), body="RequestBody", needed=True)
+        },
+        "/locks/{lock}": {
+            "delete": _operation("release_lock", "Release a lock.", None, parameters=[lock, held], status="204")
+        },
+        "/resume": {
+            "post": _operation(
+                "resume",
+                "Let move again what somebody else stopped.",
+                resumed,
+                body="GroupBody",
+                needed=True,
+                parameters=[_SESSION],
+            )
+        },
+        "/estops": {"get": _operation("estops", "Open e-stops.", _list("EstopView"))},
+        "/estop": {
+            "post": _operation("estop", "Stop everything. Not safety-rated.", _ref("Stopped"), body="EstopBody")
+        },
+        "/estop/clear": {"post": _operation("clear_estops", "Clear e-stops.", _ref("Stopped"), body="ClearBody")},
+    }
+
+
+def _operation(
+    name: str,
+    summary: str,
+    answer: Schema | None,
+    *,
+    body: str = "",
+    needed: bool = False,
+    parameters: Sequence[Schema] = (),
+    status: str = "200",
+) -> Schema:
+    asked = {"requestBody": _json(_ref(body), required=needed)} if body else {}
+    said = {"operationId": name, "summary": summary, "tags": [_TAG]}
+    return {**said, "parameters": list(parameters), **asked, "responses": _responses(answer, status)}
+
+
+def _responses(answer: Schema | None, status: str = "200") -> Schema:
+    done = {"description": "Done.", **({} if answer is None else _content(answer, "application/json"))}
+    return {status: done, "default": {"description": "Why not.", **_content(_ref("Problem"), MEDIA_TYPE)}}
+
+
+def _json(schema: Schema, *, required: bool) -> Schema:
+    return {"required": required, **_content(schema, "application/json")}
+
+
+def _content(schema: Schema, media_type: str) -> Schema:
+    return {"content": {media_type: {"schema": schema}}}
+
+
+def _ref(name: str) -> Schema:
+    return {"$ref": _COMPONENTS + name}
+
+
+def _list(name: str) -> Schema:
+    return {"type": "array", "items": _ref(name)}

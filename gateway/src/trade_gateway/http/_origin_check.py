@@ -1,0 +1,64 @@
+"""What stands before everything else: under which name the door was called, and by a page of which site."""
+
+from collections.abc import Collection
+from typing import Final
+
+from starlette.datastructures import Headers
+from starlette.responses import Response
+from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.websockets import WebSocket
+
+from trade_gateway.clients._schemas import encoder
+from trade_gateway.http._problem_json import MEDIA_TYPE, WrongDoor, problem_of
+
+LOOPBACK_NAMES: Final = frozenset({"127.0.0.1", "localhost", "[::1]"})
+
+
+class Gate:
+    """Refuses requests that a page made without its user's knowledge.
+
+    A page of the door itself has as ``Origin`` what ``Host`` says, one of another site something that is not listed.
+    One that let its own name lead to this host (DNS rebinding) has that name in ``Host``.
+    """
+
+    def __init__(self, app: ASGIApp, *, hosts: Collection[str], origins: Collection[str]) -> None:
+        self._app = app
+        self._hosts = frozenset(host.lower() for host in hosts)
+        self._origins = frozenset(origins)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] not in ("http", "websocket"):
+            await self._app(scope, receive, send)
+            return
+        wrong = self._wrong(scope, Headers(scope=scope))
+        if wrong is None:
+            await self._app(scope, receive, send)
+        elif scope["type"] == "http":
+            await problem_response(wrong)(scope, receive, send)
+        else:
+            await WebSocket(scope, receive, send).send_denial_response(problem_response(wrong))
+
+    def _wrong(self, scope: Scope, headers: Headers) -> WrongDoor | None:
+        host = _without_port(headers.get("host", "")).lower()
+        if host not in self._hosts:
+            remedy = f"this door answers to {', '.join(sorted(self._hosts))}; `trade door --host NAME` adds one"
+            return WrongDoor(what=f"host {host!r}", remedy=remedy)
+        origin = headers.get("origin")
+        if origin is not None and origin not in self._origins and origin != _own_site(scope, headers):
+            return WrongDoor(what=f"a page of {origin!r}", remedy="`trade door --origin URL` lets one in")
+        return None
+
+
+def problem_response(error: BaseException, headers: dict[str, str] | None = None) -> Response:
+    """An error as an answer."""
+    problem = problem_of(error)
+    return Response(encoder.encode(problem), problem.status, headers, MEDIA_TYPE)
+
+
+def _own_site(scope: Scope, headers: Headers) -> str:
+    """The origin of pages that the door itself has given, under the name that it was called by now."""
+    return f"{'https' if scope['scheme'] in ('https', 'wss') else 'http'}://{headers.get('host', '').lower()}"
+
+
+def _without_port(host: str) -> str:
+    return host if host.endswith("]") else host.rpartition(":")[0] if ":" in host else host

@@ -1,0 +1,220 @@
+"""The door open: a socket that listens, and a thread that serves it."""
+
+import asyncio
+import logging
+import ssl
+import threading
+from collections.abc import AsyncGenerator, Collection, Sequence
+from contextlib import asynccontextmanager
+from pathlib import Path
+from socket import AF_INET, AF_INET6, SO_REUSEADDR, SOL_SOCKET, socket
+from typing import Final
+
+import uvicorn
+from starlette.applications import Starlette
+from starlette.exceptions import HTTPException
+from starlette.middleware import Middleware
+from starlette.middleware.cors import CORSMiddleware
+from starlette.routing import WebSocketRoute
+
+from trade import Container
+from trade.errors import ConfigurationError
+from trade.listening import BoundedListener
+from trade_gateway.cli._addresses import in_url, is_loopback
+from trade_gateway.clients import Deeds
+from trade_gateway.dashboard import pages
+from trade_gateway.http._authentication import Entry
+from trade_gateway.http._http import SESSION, Http, broken, refused
+from trade_gateway.http._origin_check import LOOPBACK_NAMES, Gate
+from trade_gateway.http._protocols import HttpProtocol, SocketProtocol
+from trade_gateway.http._session_timeouts import Leases
+from trade_gateway.http._tokens import Tokens
+from trade_gateway.http._websocket import Socket
+
+_logger = logging.getLogger("trade")
+
+MOST_CONNECTIONS: Final = 256
+_MOST_DESCRIPTORS: Final = 2 * MOST_CONNECTIONS
+"""Of connections, also of those that have not asked for anything, or shown a certificate, yet."""
+MOST_MESSAGE_BYTES: Final = 1 << 20
+_PING_EVERY_S: Final = 0.5
+_PONG_WITHIN_S: Final = 1.5
+"""With the ping before it, the 2 s after which who is silent is gone (S05)."""
+_IDLE_S: Final = 10
+_PARTING_S: Final = 2
+_BACKLOG: Final = 128
+_LAST_PORT: Final = 65_535
+_JOINED_WITHIN_S: Final = 10.0
+
+
+class Door:
+    """A door of a container: HTTP and WebSocket for those who speak nothing else. A context manager.
+
+    Args:
+        container: whose system it opens; it stays its maker's.
+        listen: ``HOST:PORT``; port 0 is any.
+        tokens: who is who.
+        tls: folder with ``ca.pem``, ``cert.pem`` and ``key.pem``, as ``trade pki issue`` makes it.
+        origins: sites whose pages may come in, such as ``http://localhost:5173``.
+        hosts: further names by which it is called.
+
+    Raises:
+        ConfigurationError: the address is taken, or would reach a network by accident; nobody could come in.
+    """
+
+    def __init__(
+        self,
+        container: Container,
+        *,
+        listen: str = "127.0.0.1:7080",
+        tokens: Tokens,
+        tls: Path | None = None,
+        origins: Sequence[str] = (),
+        hosts: Sequence[str] = (),
+    ) -> None:
+        host, port = _address(listen)
+        deeds = Deeds(container)
+        _check_reach(listen, host, deeds, tls)
+        if not tokens and tls is None and not deeds.judge.lets_anybody_in:
+            problem = "nobody could come in: make a token with trade door token NAME"
+            raise ConfigurationError(where=f"door {listen}", problem=problem)
+        self._deeds = deeds
+        names = {*LOOPBACK_NAMES, *hosts} if is_loopback(host) else {in_url(host), *hosts}
+        self._app = _application(deeds, tokens, names, origins)
+        context = None if tls is None else _context(tls)
+        self._socket = BoundedListener(_bound(host, port), _MOST_DESCRIPTORS)
+        self.url: Final = f"http{'s' if tls else ''}://{in_url(host)}:{self._socket.getsockname()[1]}"
+        """Where it is."""
+        config = uvicorn.Config(
+            self._app,
+            loop="asyncio",
+            http=HttpProtocol,
+            ws=SocketProtocol,
+            ws_max_size=MOST_MESSAGE_BYTES,
+            ws_ping_interval=_PING_EVERY_S,
+            ws_ping_timeout=_PONG_WITHIN_S,
+            ws_per_message_deflate=False,
+            lifespan="on",
+            log_config=None,
+            log_level="info",  # more would tell of headers, and of the tokens in them
+            access_log=False,
+            proxy_headers=False,
+            server_header=False,
+            limit_concurrency=MOST_CONNECTIONS,
+            timeout_keep_alive=_IDLE_S,
+            timeout_graceful_shutdown=_PARTING_S,
+            ssl_context_factory=None if context is None else lambda _config, _default: context,
+        )
+        self._server = uvicorn.Server(config)
+        self._thread = threading.Thread(target=self._serve, name="trade-door", daemon=True)
+
+    def open(self) -> "Door":
+        """Let clients in; who comes before it is ready waits."""
+        self._thread.start()
+        return self
+
+    @property
+    def serving(self) -> bool:
+        """Whether it goes on."""
+        return self._thread.is_alive()
+
+    def close(self) -> None:
+        """Let nobody in any more; what clients have set moving stops. Idempotent."""
+        self._deeds.clients.close()
+        self._server.should_exit = True
+        if self._thread.ident is not None:
+            self._thread.join(_JOINED_WITHIN_S)
+        self._socket.close()
+
+    def _serve(self) -> None:
+        try:
+            asyncio.run(self._server.serve(sockets=[self._socket]))
+        except Exception:
+            _logger.exception("the door at %s has ended", self.url)
+
+    def __enter__(self) -> "Door":
+        return self.open()
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def _application(deeds: Deeds, tokens: Tokens, hosts: Collection[str], origins: Sequence[str]) -> Starlette:
+    entry, leases = Entry(tokens, deeds.judge), Leases(deeds)
+
+    @asynccontextmanager
+    async def lifespan(_: Starlette) -> AsyncGenerator[None]:
+        watching = asyncio.ensure_future(leases.keep_watch())
+        try:
+            yield
+        finally:
+            watching.cancel()
+            await deeds.apart(deeds.clients.close, stops=True)
+
+    middleware = [Middleware(Gate, hosts=hosts, origins=origins)]
+    if origins:
+        allowed = ["Authorization", "Content-Type", SESSION]
+        methods = ["GET", "POST", "DELETE"]
+        middleware.append(
+            Middleware(CORSMiddleware, allow_origins=list(origins), allow_methods=methods, allow_headers=allowed)
+        )
+    application = Starlette(
+        routes=[
+            *Http(deeds, entry, leases).routes(),
+            WebSocketRoute("/ws", Socket(deeds, entry, leases).serve),
+            *pages(),
+        ],
+        middleware=middleware,
+        exception_handlers={HTTPException: refused, 500: broken},
+        lifespan=lifespan,
+    )
+    application.router.redirect_slashes = False
+    return application
+
+
+# --- where it listens
+
+
+def _address(listen: str) -> tuple[str, int]:
+    host, colon, port = listen.rpartition(":")
+    if not colon or not host or not port.isdecimal() or int(port) > _LAST_PORT:
+        raise ConfigurationError(where=f"listen {listen}", problem="write HOST:PORT, such as 127.0.0.1:7080")
+    return host.strip("[]"), int(port)
+
+
+def _check_reach(listen: str, host: str, deeds: Deeds, tls: Path | None) -> None:
+    """S21: raises ConfigurationError if it would be reached from a network by accident."""
+    if is_loopback(host):
+        return
+    if tls is None:
+        problem = "is beyond this host, where tokens would be read by others: --tls FOLDER, which trade pki issue makes"
+        raise ConfigurationError(where=f"listen {listen}", problem=problem)
+    if not deeds.judge.governed:
+        problem = "is beyond this host, and no policy says who may do what: set TRADE_POLICY"
+        raise ConfigurationError(where=f"listen {listen}", problem=problem)
+
+
+def _bound(host: str, port: int) -> socket:
+    made = socket(AF_INET6 if ":" in host else AF_INET)
+    try:
+        made.setsockopt(SOL_SOCKET, SO_REUSEADDR, 1)
+        made.bind((host, port))
+        made.listen(_BACKLOG)
+    except OSError as bad:
+        made.close()
+        raise ConfigurationError(where=f"listen {host}:{port}", problem=f"cannot be used: {bad.strerror}") from None
+    return made
+
+
+def _context(folder: Path) -> ssl.SSLContext:
+    """Encryption as our own end, and certificates of the system's authority, if shown, as the clients'."""
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.minimum_version = ssl.TLSVersion.TLSv1_2
+    context.verify_mode = ssl.CERT_OPTIONAL
+    try:
+        context.load_cert_chain(folder / "cert.pem", folder / "key.pem")
+        context.load_verify_locations(folder / "ca.pem")
+    except (OSError, ssl.SSLError) as bad:
+        problem = f"has no ca.pem, cert.pem and key.pem that fit together ({bad.strerror or bad}); trade pki issue NAME"
+        raise ConfigurationError(where=str(folder), problem=problem) from None
+    return context

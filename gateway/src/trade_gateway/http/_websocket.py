@@ -1,0 +1,367 @@
+"""The door over a WebSocket: one client, one session, for as long as the connection lasts."""
+
+import asyncio
+from collections import defaultdict, deque
+from collections.abc import Awaitable, Callable
+from contextlib import nullcontext, suppress
+from typing import Any, Final
+
+import anyio
+import msgspec
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from trade import Handle, Run
+from trade.errors import InvalidResult, LockLost, TradeError
+from trade_gateway.clients import Client, Deeds, TooMany
+from trade_gateway.clients import _schemas as messages
+from trade_gateway.http._authentication import SUBPROTOCOL, Entry
+from trade_gateway.http._origin_check import problem_response
+from trade_gateway.http._problem_json import BadMessage, problem_of
+from trade_gateway.http._session_timeouts import Leases
+
+MOST_UNDER_WAY: Final = 64
+"""Calls, streams and watches of one connection; stops do not count."""
+_MOST_STOPS: Final = 4
+"""Of one service, or e-stops, of one connection, that are under way at once; further ones share the next."""
+_MOST_ANSWERS: Final = 256
+"""To stops of one connection, that are waited for."""
+_MOST_WAITING: Final = 256
+"""Events that wait for a slow client; the oldest goes first."""
+_SENT_WITHIN_S: Final = 2.0
+"""A client that takes nothing for so long is gone (S05)."""
+_LOG_EVERY_S: Final = 0.5
+_OLD_LINES: Final = 200
+"""Of the log, that are told at first."""
+
+_ENDED: Final = 1008
+
+
+class Socket:
+    """Its endpoint."""
+
+    def __init__(self, deeds: Deeds, entry: Entry, leases: Leases) -> None:
+        self._deeds = deeds
+        self._entry = entry
+        self._leases = leases
+
+    async def serve(self, websocket: WebSocket) -> None:
+        """One connection, from its handshake to its end."""
+        try:
+            who = self._entry.who(websocket.scope)
+            client = await self._deeds.apart(self._deeds.clients.open, who, stops=True)
+        except TradeError as error:
+            await websocket.send_denial_response(problem_response(error))
+            return
+        try:
+            offered = SUBPROTOCOL in websocket.scope["subprotocols"]
+            await websocket.accept(SUBPROTOCOL if offered else None)
+            self._leases.begin(client, 0, lambda: self._entry.still(websocket.scope, who))
+            await Conversation(websocket, client, self._deeds).run()
+            with anyio.move_on_after(_SENT_WITHIN_S), suppress(WebSocketDisconnect, RuntimeError):  # it is gone
+                await websocket.close(_ENDED)
+        finally:
+            await asyncio.shield(asyncio.ensure_future(self._deeds.apart(client.close, stops=True)))
+
+
+class _Ongoing:
+    """What one message has begun."""
+
+    def __init__(self, asked: messages.Asked, handle: Handle | None, admitted: int) -> None:
+        self.asked: Final = asked
+        self.handle: Final = handle
+        """Of what to call or stream."""
+        self.admitted = admitted
+        """At which of the client's stops."""
+        self.scope = anyio.CancelScope()
+        self.run: Run | None = None
+        self.unwanted = False
+        """Whether a call was cancelled, if only before it had begun."""
+
+
+class _Line:
+    """Stops of one kind: a few at once, and one that is shared by all who come meanwhile."""
+
+    def __init__(self) -> None:
+        self._places = anyio.Semaphore(_MOST_STOPS)
+        self._next: asyncio.Future[Any] | None = None
+        """What those get who come before it has begun."""
+
+    @property
+    def idle(self) -> bool:
+        """Whether none is under way."""
+        return self._next is None and self._places.value == _MOST_STOPS
+
+    @property
+    def shared(self) -> bool:
+        """Whether one is about to begin that counts for whoever comes now, too."""
+        return self._next is not None
+
+    async def take(self, do: Callable[[], Awaitable[Any]]) -> Any:
+        """Do it, or share it: it begins after this was called in any case."""
+        if self._next is not None:
+            return await asyncio.shield(self._next)
+        shared = self._next = asyncio.get_running_loop().create_future()
+        shared.add_done_callback(lambda told: told.cancelled() or told.exception())  # perhaps nobody shares it
+        try:
+            async with self._places:
+                self._next = None
+                shared.set_result(await do())
+        except Exception as error:  # noqa: BLE001 - whatever comes of it is for all of them
+            shared.set_exception(error)
+        finally:
+            if not shared.done():
+                self._next = None
+                shared.cancel()
+        return shared.result()
+
+
+class Conversation:
+    """With one client."""
+
+    def __init__(self, websocket: WebSocket, client: Client, deeds: Deeds) -> None:
+        self._websocket = websocket
+        self._client = client
+        self._deeds = deeds
+        self._tasks = anyio.create_task_group()
+        self._ongoing: dict[messages.Id, _Ongoing] = {}
+        self._stops: defaultdict[object, _Line] = defaultdict(_Line)
+        """By the service that stops."""
+        self._speaking = anyio.Lock()
+        self._beginning = anyio.Lock()
+        """Calls begin in the order in which they were asked for: of two set-points the later one counts."""
+        self._waiting: deque[dict[str, Any]] = deque(maxlen=_MOST_WAITING)
+        self._missed = 0
+        self._more = asyncio.Event()
+        self._loop = asyncio.get_running_loop()
+
+    async def run(self) -> None:
+        """Until one of both ends it. What was begun ends with it."""
+        async with self._tasks:
+            self._client.when_closed(lambda: self._soon(self._tasks.cancel_scope.cancel))
+            self._tasks.start_soon(self._carry)
+            while (message := await self._websocket.receive())["type"] != "websocket.disconnect":
+                self._hear(message.get("text") or "")
+                await asyncio.sleep(0)  # what it has begun goes on before the next one, however many wait
+            await self._end()
+
+    async def _end(self) -> None:
+        """First what moves stops, then the rest is put away."""
+        await self._apart(self._client.close)
+        self._tasks.cancel_scope.cancel()
+
+    # --- speaking
+
+    async def _say(self, message: dict[str, Any]) -> None:
+        text = _text(message)
+        with anyio.move_on_after(_SENT_WITHIN_S) as limit:
+            async with self._speaking:
+                with suppress(WebSocketDisconnect, RuntimeError):  # it is gone; who listens hears of it
+                    await self._websocket.send_text(text)
+        if limit.cancelled_caught:
+            await self._end()
+
+    def _post(self, message: dict[str, Any]) -> None:
+        """Say it as soon as it can be said; from any thread."""
+        self._soon(self._note, message)
+
+    def _soon(self, do: Callable[..., None], *args: Any) -> None:
+        with suppress(RuntimeError):  # that loop has ended
+            self._loop.call_soon_threadsafe(do, *args)
+
+    def _note(self, message: dict[str, Any]) -> None:
+        self._missed += len(self._waiting) == _MOST_WAITING
+        self._waiting.append(message)
+        self._more.set()
+
+    async def _carry(self) -> None:
+        while True:
+            await self._more.wait()
+            self._more.clear()
+            while self._waiting:
+                message, missed = self._waiting.popleft(), self._missed
+                self._missed = 0
+                await self._say({**message, "missed": missed} if missed else message)
+
+    # --- hearing
+
+    def _hear(self, text: str) -> None:
+        try:
+            asked = messages.read_asked(text)
+        except (msgspec.DecodeError, ValueError, RecursionError) as bad:
+            self._note({"id": None, "problem": problem_of(BadMessage(problem=str(bad)))})
+            return
+        try:
+            ongoing = self._admitted(asked)
+        except TradeError as error:
+            self._deeds.note_refused(error)
+            self._note({"id": asked.id, "problem": problem_of(error)})
+            return
+        self._ongoing[asked.id] = ongoing
+        self._tasks.start_soon(self._do, ongoing)
+
+    def _admitted(self, asked: messages.Asked) -> _Ongoing:
+        """Raises BadMessage, TooMany, NoSuchService, TooManyServices: it cannot be begun."""
+        if asked.id in self._ongoing:
+            raise BadMessage(problem=f"what has id {asked.id!r} has not ended yet; take another id")
+        handle = None
+        if isinstance(asked, messages.Call | messages.Stream):
+            handle = self._deeds.find(self._client.identity, asked.group, asked.name, asked.container)
+        stop = _stopping(asked, handle)
+        if len(self._ongoing) >= MOST_UNDER_WAY and stop is None:
+            raise TooMany(what="calls, streams and watches of this connection", limit=MOST_UNDER_WAY)
+        admitted = 0 if handle is None else self._client.admit(handle)
+        if len(self._ongoing) >= _MOST_ANSWERS and stop in self._stops and self._stops[stop].shared:
+            raise TooMany(
+                what="stops of this connection that wait for their answer; they are carried out", limit=_MOST_ANSWERS
+            )
+        return _Ongoing(asked, handle, admitted)
+
+    async def _do(self, ongoing: _Ongoing) -> None:
+        result, name = None, ongoing.asked.id
+        try:
+            with ongoing.scope:
+                stop = _stopping(ongoing.asked, ongoing.handle)
+                result = await (self._done(ongoing) if stop is None else self._stop(stop, ongoing))
+            answer = {"id": name, "result": result}
+        except Exception as error:  # noqa: BLE001 - whatever a provider raises is for the client
+            self._deeds.note_refused(error)
+            answer = {"id": name, "problem": problem_of(error)}
+        del self._ongoing[name]
+        await self._say(answer)
+
+    async def _done(self, ongoing: _Ongoing) -> Any:
+        match asked := ongoing.asked:
+            case messages.Call():
+                assert ongoing.handle is not None  # noqa: S101 - it was found when this was admitted
+                return await self._call(asked, ongoing.handle, ongoing)
+            case messages.Stream():
+                assert ongoing.handle is not None  # noqa: S101 - likewise
+                return await self._stream(asked, ongoing.handle)
+            case messages.Watch():
+                return await self._watch(asked)
+            case messages.Logs() | messages.Calls():
+                return await (self._logs(asked) if isinstance(asked, messages.Logs) else self._calls(asked))
+            case messages.TakeLock():
+                return await self._deeds.lock(self._client, asked, self._lock_lost)
+            case messages.Unlock():
+                return {"released": await self._deeds.apart(self._client.unlock, asked.lock)}
+            case messages.Resume():
+                return {"resumed": await self._deeds.resume(self._client, asked)}
+            case messages.Estop():
+                return await self._deeds.estop(self._client.identity, asked)
+            case messages.Cancel():
+                return {"cancelled": await self._cancel(asked.which)}
+
+    # --- doing
+
+    async def _stop(self, which: object, ongoing: _Ongoing) -> Any:
+        """It counts for all that was asked for before it begins."""
+
+        async def stop() -> Any:
+            ongoing.admitted = self._client.stops
+            return await self._done(ongoing)
+
+        line = self._stops[which]
+        try:
+            return await line.take(stop)
+        finally:
+            if line.idle:
+                self._stops.pop(which, None)
+
+    async def _call(self, asked: messages.Call, handle: Handle, ongoing: _Ongoing) -> Any:
+        async with nullcontext() if handle.effect == "stop" else self._beginning:
+            run = await self._deeds.begin(self._client, handle, asked, ongoing.admitted)
+        ongoing.run = run
+        if ongoing.unwanted:
+            await self._deeds.end(self._client, run)
+        run.on_progress(lambda value: self._post({"id": asked.id, "progress": value}))
+        await run.settled()
+        return run.result(0)
+
+    async def _cancel(self, which: messages.Id) -> bool:
+        ongoing = self._ongoing.get(which)
+        if ongoing is None:
+            return False
+        match ongoing.asked:
+            case messages.Call():
+                ongoing.unwanted = True
+                if ongoing.run is not None:
+                    await self._deeds.end(self._client, ongoing.run)
+            case messages.Stream() | messages.Watch() | messages.Logs() | messages.Calls():
+                ongoing.scope.cancel()
+            case _:
+                return False
+        return True
+
+    async def _stream(self, asked: messages.Stream, handle: Handle) -> None:
+        samples = await self._deeds.stream(self._client, handle, asked)
+        try:
+            while True:
+                try:
+                    sample = await samples.anext()
+                    self._deeds.judge.require_call(self._client.identity, handle)
+                except Exception as error:
+                    if samples.ended or not self._deeds.judge.sees(self._client.identity, handle):
+                        raise
+                    await self._say({"id": asked.id, "failed": problem_of(error)})  # this one; others may come
+                else:
+                    await self._say({"id": asked.id, "sample": sample})
+        finally:
+            await self._apart(samples.close)
+
+    async def _watch(self, asked: messages.Watch) -> None:
+        def tell(occasion: str, handle: Handle) -> None:
+            told = self._deeds.view(self._client.identity, handle)
+            self._post({"id": asked.id, "event": occasion, "service": told})
+
+        standing = await self._deeds.apart(self._deeds.watch, self._client, asked, tell)
+        try:
+            await anyio.sleep_forever()
+        finally:
+            for one in standing:
+                await self._apart(one.cancel)
+
+    async def _logs(self, asked: messages.Logs) -> None:
+        reader = self._deeds.overview.log()
+        lines = await self._deeds.overview.log_lines(self._client.identity, reader)
+        lines = lines[-_OLD_LINES:]
+        while True:
+            for line in lines:
+                if line.level >= asked.level:
+                    await self._say({"id": asked.id, "line": line})
+            await anyio.sleep(_LOG_EVERY_S)
+            lines = await self._deeds.overview.log_lines(self._client.identity, reader)
+
+    async def _calls(self, asked: messages.Calls) -> None:
+        reader = self._deeds.overview.ended(reads=asked.reads)
+        while True:
+            for span in await self._deeds.overview.calls(self._client.identity, reader):
+                await self._say({"id": asked.id, "call": messages.call_view(span)})
+            await anyio.sleep(_LOG_EVERY_S)
+
+    async def _apart(self, close: Callable[[], object]) -> None:
+        with anyio.CancelScope(shield=True):
+            await self._deeds.apart(close, stops=True)
+
+    def _lock_lost(self, lock: str, error: LockLost) -> None:
+        self._post({"event": "lock_lost", "lock": lock, "problem": problem_of(error)})
+
+
+def _stopping(asked: messages.Asked, handle: Handle | None) -> object:
+    """Which stop is asked for; None: something else."""
+    match asked:
+        case messages.Estop():
+            return "estop"
+        case messages.Cancel():
+            return "cancel", asked.which
+        case _:
+            return handle.key if handle is not None and handle.effect == "stop" else None
+
+
+def _text(message: dict[str, Any]) -> str:
+    try:
+        return messages.encoder.encode(message).decode()
+    except messages.NO_JSON as bad:
+        what = "problem" if "result" in message else "failed"
+        wrong = InvalidResult(service=str(message["id"]), problem=f"it has no form in JSON: {bad}")
+        return messages.encoder.encode({"id": message["id"], what: problem_of(wrong)}).decode()

@@ -1,0 +1,7 @@
+"""Words into calls, and answers into words: the lexicon says which sentences mean what."""
+
+from trade_gateway.language._dialogue import Reply, Talk
+from trade_gateway.language._lexicon import Lexicon, NotUnderstood, read_lexicon
+from trade_gateway.language._previous_answer import Memory
+
+__all__ = ["Lexicon", "Memory", "NotUnderstood", "Reply", "Talk", "read_lexicon"]

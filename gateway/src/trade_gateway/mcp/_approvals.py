@@ -1,0 +1,187 @@
+"""Calls that wait for a person's word: what policy or the command line marks is asked for, and done once."""
+
+import asyncio
+import secrets
+import threading
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, Final
+
+import msgspec
+from anyio.to_thread import run_sync
+from msgspec import Struct
+
+from trade import Container, Handle, current_call, service, where
+from trade.errors import AccessDenied, ConfigurationError
+from trade_gateway.cli.rights._approvals import GROUP
+from trade_gateway.clients import places
+from trade_gateway.mcp._errors import NeedsApproval
+
+__all__ = ["Approvals", "Request"]
+
+_MOST: Final = 16
+_MOST_TEXT: Final = 2_000
+"""Characters of the arguments that are shown; who cannot be shown all of them is not asked."""
+
+
+class Request(Struct, frozen=True):
+    """A call that waits."""
+
+    id: str
+    agent: str
+    service: str
+    args: str
+    """As JSON."""
+    why: str
+    """In the agent's words."""
+    asked_at: float
+    """``time.time()``"""
+    until: float
+    """Then it is refused by itself."""
+
+
+class _Waiting(Struct):
+    request: Request
+    group: str
+    tell: Callable[[str], None]
+    """Told once: why not; empty for yes."""
+
+
+class Approvals:
+    """Requests of one agent's process, as services of group ``approvals``.
+
+    Whoever may call these and administers what is asked for may say yes, but for the agent itself.
+
+    Args:
+        container: the agent's.
+        ask_first: groups of which everything that does something needs a word, whatever the policy says.
+    """
+
+    def __init__(self, container: Container, ask_first: Sequence[str] = ()) -> None:
+        self._container = container
+        self._ask_first = tuple(ask_first)
+        self._guard = threading.Lock()
+        self._waiting: dict[str, _Waiting] = {}
+        self._offered = False
+        self._offering = asyncio.Lock()
+
+    # --- services
+
+    @service(effect="read")
+    def pending(self) -> list[Request]:
+        """The calls that wait for a word, oldest first."""
+        with self._guard:
+            return [one.request for one in self._waiting.values()]
+
+    @service(effect="note")
+    def approve(self, id: str) -> Request:  # noqa: A002 - as `pending` names it
+        """Let that call be made, once, as it was asked for.
+
+        Raises:
+            ConfigurationError: nothing of that id waits.
+            AccessDenied: the caller does not administer what it is about, or is the agent itself.
+        """
+        return self._settle(id, "")
+
+    @service(effect="note")
+    def refuse(self, id: str, reason: str = "") -> Request:  # noqa: A002
+        """Have that call not be made. Raises like ``approve``."""
+        by = current_call()
+        return self._settle(id, f"{by.caller if by else 'somebody'} refused{f': {reason}' if reason else ''}")
+
+    def _settle(self, name: str, verdict: str) -> Request:
+        with self._guard:
+            waiting = self._waiting.get(name)
+        if waiting is None:
+            raise ConfigurationError(
+                where=f"approval {name!r}", problem="nothing of that id waits; see trade approvals"
+            )
+        self._require(waiting)
+        with self._guard:
+            if self._waiting.pop(name, None) is None:
+                raise ConfigurationError(where=f"approval {name!r}", problem="somebody else has just decided that")
+        waiting.tell(verdict)
+        return waiting.request
+
+    def _require(self, waiting: _Waiting) -> None:
+        call, agent = current_call(), waiting.request.agent
+        if call is None or call.session.startswith(f"{self._container.address}"):
+            rule = "the agent's own process cannot approve what it asks for"
+            raise AccessDenied(who=agent, verb="administer", what=waiting.request.service, rule=rule)
+        if call.caller == agent:
+            rule = (
+                "an identity cannot approve its own call, with or without a policy; approve it under another identity"
+            )
+            raise AccessDenied(who=agent, verb="administer", what=waiting.request.service, rule=rule)
+        self._container.access.require(call.caller, "administer", waiting.group, waiting.request.service)
+
+    # --- asking
+
+    def needed(self, handle: Handle) -> bool:
+        """Whether somebody has to say yes before the agent may call that.
+
+        What a marked group moves is asked for whichever service moves it: the head also as two joints of the neck.
+        """
+        if handle.effect in ("read", "stop"):
+            return False
+        if self._is_marked(handle):
+            return True
+        own = places([handle])
+        others = (one for one in self._container.services(where()) if one.effect == "actuate")
+        return any(not own.isdisjoint(places([one])) and self._is_marked(one) for one in others)
+
+    def _is_marked(self, handle: Handle) -> bool:
+        return any(self._marks(group) for group in dict.fromkeys((handle.key.domain, *handle.groups)))
+
+    def _marks(self, domain: str) -> bool:
+        if any(domain == group or domain.startswith(f"{group}.") for group in self._ask_first):
+            return True
+        policy = self._container.access.policy
+        return policy is not None and policy.asks_first(self._container.address.identity, domain)
+
+    async def ask(self, handle: Handle, args: Any, why: str, wait_s: float) -> None:
+        """Wait for somebody's yes. Raises NeedsApproval: there was none within ``wait_s``."""
+        text = msgspec.json.encode(args).decode()
+        if len(text) > _MOST_TEXT:
+            raise NeedsApproval(service=handle.label, reason="its arguments are too long to be shown to anybody")
+        async with self._offering:
+            await run_sync(self._offer, handle)
+        now, name, loop = time.time(), secrets.token_hex(3), asyncio.get_running_loop()
+        said: asyncio.Future[str] = loop.create_future()
+
+        def settle(verdict: str) -> None:
+            if not said.done():
+                said.set_result(verdict)
+
+        agent = self._container.address.identity
+        request = Request(name, agent, handle.label, text, why[:_MOST_TEXT], now, now + wait_s)
+        waiting = _Waiting(request, handle.key.domain, lambda verdict: _soon(loop, partial(settle, verdict)))
+        with self._guard:
+            if len(self._waiting) >= _MOST:
+                raise NeedsApproval(service=handle.label, reason=f"{_MOST} requests wait already")
+            self._waiting[name] = waiting
+        try:
+            verdict = await asyncio.wait_for(said, wait_s)
+        except asyncio.TimeoutError:
+            verdict = f"nobody said yes within {wait_s:g} s (trade approvals shows what waits)"
+        finally:
+            with self._guard:
+                self._waiting.pop(name, None)
+        if verdict:
+            raise NeedsApproval(service=handle.label, reason=verdict)
+
+    def _offer(self, handle: Handle) -> None:
+        """They are services only once they are needed: who never needs them needs no right to offer them."""
+        if self._offered:
+            return
+        try:
+            self._container.register(self, f"{GROUP}.{self._container.name}")
+        except AccessDenied as denied:
+            raise NeedsApproval(service=handle.label, reason=f"it cannot be asked for: {denied}") from None
+        self._offered = True
+
+
+def _soon(loop: asyncio.AbstractEventLoop, do: Callable[[], None]) -> None:
+    if not loop.is_closed():
+        loop.call_soon_threadsafe(do)

@@ -1,0 +1,170 @@
+"""The tools over the Model Context Protocol, on standard input and output."""
+
+import asyncio
+import os
+import signal
+from collections.abc import AsyncGenerator, Callable
+from contextlib import asynccontextmanager
+from importlib.metadata import version
+from typing import Any, Final
+
+import anyio
+import msgspec
+from anyio.streams.memory import MemoryObjectReceiveStream, MemoryObjectSendStream
+from mcp import types
+from mcp.server.lowlevel import Server
+from mcp.server.stdio import stdio_server
+from mcp.shared.message import SessionMessage
+
+from trade import Container
+from trade_gateway.clients import Deeds
+from trade_gateway.clients import _schemas as messages
+from trade_gateway.language import Lexicon
+from trade_gateway.mcp._approvals import Approvals
+from trade_gateway.mcp._simulation_twin import Twin
+from trade_gateway.mcp._tools import TOOLS, Tools
+
+__all__ = ["converse", "serve"]
+
+Hears = MemoryObjectReceiveStream[SessionMessage | Exception]
+Says = MemoryObjectSendStream[SessionMessage]
+
+_TOLD: Final = """Robots as services. Look with `services` and `describe` first. Whatever moves something needs a lock \
+over its group (`lock`), may need a person's approval, and can be tried with `dry_run`, which moves nothing. Give \
+locks back with `unlock`. What you have set moving stops when you disconnect. `stop` and `estop` need no lock."""
+_KILLED_BY: Final = 128
+
+
+async def serve(
+    container: Container, approvals: Approvals, lexicon: Lexicon, twin: Twin | None, leave: Callable[[], None]
+) -> None:
+    """Serve the agent that has started this process, until it closes our standard input; what it moves stops then.
+
+    Args:
+        container: the agent's: it is what the agent may do.
+        approvals: who is asked first, and when.
+        lexicon: which sentences mean what.
+        twin: for dry runs.
+        leave: ends all that is the process's own; called when a signal ends it.
+    """
+    async with stdio_server() as (hears, says):
+        await converse(container, approvals, lexicon, twin, hears, says, leave)
+
+
+async def converse(
+    container: Container,
+    approvals: Approvals,
+    lexicon: Lexicon,
+    twin: Twin | None,
+    hears: Hears,
+    says: Says,
+    leave: Callable[[], None],
+) -> None:
+    """As `serve`, over any two streams: what the agent moves stops once nothing more can be heard of it."""
+    deeds = Deeds(container)
+    client = await deeds.apart(deeds.clients.open, container.address.identity)
+    tools = Tools(container, deeds, client, approvals, lexicon, twin)
+    server = _server_of(tools)
+    passed_on, heard = anyio.create_memory_object_stream[SessionMessage | Exception](0)
+
+    async def hear() -> None:
+        """Its end is the agent's end; the server would first wait for all that was asked of it."""
+        try:
+            async with hears, passed_on:
+                async for message in hears:
+                    await passed_on.send(message)
+        finally:
+            with anyio.CancelScope(shield=True):
+                await deeds.apart(client.close, stops=True)
+
+    async with _signals(client.close, leave), anyio.create_task_group() as tasks:
+        tasks.start_soon(hear)
+        await server.run(heard, says, server.create_initialization_options())
+        tasks.cancel_scope.cancel()
+
+
+def _server_of(tools: Tools) -> "Server[Any, Any]":
+    server: Server[Any, Any] = Server("trade", version=version("trade-gateway"), instructions=_TOLD)
+
+    async def listed() -> list[types.Tool]:
+        return [
+            types.Tool(
+                name=name,
+                description=tool.text,
+                inputSchema=tool.schema,
+                annotations=types.ToolAnnotations(readOnlyHint=tool.reads, destructiveHint=not tool.reads),
+            )
+            for name, tool in TOOLS.items()
+        ]
+
+    async def used(name: str, arguments: dict[str, Any]) -> list[types.ContentBlock]:
+        async with _reporting(server) as progress:
+            try:
+                return _content(await tools.use(name, arguments, progress))
+            except Exception as error:
+                raise RuntimeError(f"{type(error).__name__}: {error}") from error
+
+    server.list_tools()(listed)
+    server.call_tool(validate_input=False)(used)
+    return server
+
+
+@asynccontextmanager
+async def _reporting(server: "Server[Any, Any]") -> AsyncGenerator[Callable[[Any], None]]:
+    """Passes the newest word of how far a call is on to the agent, if it has asked for that."""
+    context = server.request_context
+    token = context.meta.progressToken if context.meta is not None else None
+    if token is None:
+        yield lambda _: None
+        return
+    loop, more = asyncio.get_running_loop(), asyncio.Event()
+    newest: list[Any] = []
+
+    def note(value: Any) -> None:
+        newest[:] = [value]
+        loop.call_soon_threadsafe(more.set)
+
+    async def report() -> None:
+        count = 0
+        while True:
+            await more.wait()
+            more.clear()
+            count += 1
+            [said] = newest
+            text = said if isinstance(said, str) else messages.encoder.encode(said).decode()
+            await context.session.send_progress_notification(token, float(count), message=text)
+
+    reporting = asyncio.ensure_future(report())  # no group of tasks: that would wrap what the call raises
+    try:
+        yield note
+    finally:
+        reporting.cancel()
+
+
+def _content(result: Any) -> list[types.ContentBlock]:
+    """A result as text, and a picture as a picture."""
+    text = messages.encoder.encode(result).decode()
+    match msgspec.json.decode(text):
+        case {"result": {"format": ("jpeg" | "png") as kind, "data": str() as data, **rest}}:
+            said = messages.encoder.encode({"format": kind, **rest}).decode()
+            picture = types.ImageContent(type="image", data=data, mimeType=f"image/{kind}")
+            return [types.TextContent(type="text", text=said), picture]
+        case _:
+            return [types.TextContent(type="text", text=text)]
+
+
+@asynccontextmanager
+async def _signals(stop: Callable[[], None], leave: Callable[[], None]) -> AsyncGenerator[None]:
+    """SIGTERM, SIGINT: what moves stops, and the process ends; nothing else ends one that reads its standard input."""
+
+    async def wait() -> None:
+        with anyio.open_signal_receiver(signal.SIGTERM, signal.SIGINT) as signals:
+            async for number in signals:
+                await asyncio.get_running_loop().run_in_executor(None, stop)
+                await asyncio.get_running_loop().run_in_executor(None, leave)
+                os._exit(_KILLED_BY + number)
+
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(wait)
+        yield
+        tasks.cancel_scope.cancel()

@@ -1,0 +1,173 @@
+"""A simulated robot of its own, on which a call is tried before the real one is asked."""
+
+import os
+import secrets
+import shutil
+import tempfile
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final, cast
+
+import msgspec
+from msgspec import Struct
+
+from trade import Container, Handle, Settings
+from trade.errors import NoSuchService, TradeError
+from trade_gateway.cli.services._call import find
+from trade_gateway.drill._processes import Actor, DrillFailed, bare_environment
+from trade_gateway.mcp._errors import NoTwin
+
+__all__ = ["Tried", "Twin"]
+
+_UP_S: Final = 60.0
+_SEEN_S: Final = 10.0
+_PLACED_WITHIN_S: Final = 60.0
+_PLACES: Final = "TRADE_RUNTIME_DIR"
+
+
+class Tried(Struct, frozen=True):
+    """What came of a call on the twin."""
+
+    ok: bool
+    error: str
+    """Why not; empty if it went well."""
+    result: Any
+    took_s: float
+    """As long as it takes in simulation."""
+    began_where_the_robot_is: bool
+    """Whether the twin could be brought there first."""
+    before: Any
+    """What its ``state`` said before, and"""
+    after: Any
+    """after the call."""
+
+
+class Twin:
+    """``trade up ROBOT.toml --sim`` in a system of its own, started when it is needed first.
+
+    Args:
+        robot: the robot file.
+    """
+
+    def __init__(self, robot: Path) -> None:
+        self._robot = robot
+        self._lock = threading.Lock()
+        self._folder = Path(tempfile.mkdtemp(prefix="trade-twin-"))
+        self._system = f"twin-{secrets.token_hex(4)}"
+        self._process: Actor | None = None
+        self._container: Container | None = None
+
+    def call(self, handle: Handle, args: Any, deadline_s: float, state: Any) -> Tried:
+        """Bring the twin to where the robot is, make the call there, and see what came of it; one at a time.
+
+        Args:
+            handle: the service of the real robot.
+            args: by place or by name.
+            deadline_s: of the call.
+            state: what the real robot's ``state`` of the same group says; None if it has none.
+
+        Raises:
+            NoTwin: it does not come up, or has no such service.
+        """
+        with self._lock:
+            here = self._up()
+            group, name = handle.key.domain, handle.name
+            tried = self._find(here, group, name, _SEEN_S)
+            if tried is None:
+                raise NoTwin(reason=f"the twin of {self._robot.name} has no {handle.label}")
+            placed = self._place(here, group, state)
+            before, began = self._state(here, group), time.monotonic()
+            result, error = None, ""
+            try:
+                result = _called(tried, args, deadline_s)
+            except Exception as failed:  # noqa: BLE001 - whatever a provider raises is what is asked for
+                error = f"{type(failed).__name__}: {failed}"
+            took_s = time.monotonic() - began
+            return Tried(not error, error, result, round(took_s, 3), placed, before, self._state(here, group))
+
+    def _up(self) -> Container:
+        if self._container is not None and self._process is not None and self._process.running:
+            return self._container
+        self._end()
+        environment = {**bare_environment(), "TRADE_SYSTEM": self._system, "TRADE_STATE_DIR": str(self._folder)}
+        environment |= {name: value for name, value in os.environ.items() if name == _PLACES}
+        words = ["trade_gateway", "--with-stdin", "up", str(self._robot), "--sim", "--name", "twin", "--json"]
+        self._process = Actor("twin", words, environment, self._folder / "complaints")
+        try:
+            self._process.said(_UP_S)
+        except DrillFailed as failed:
+            raise NoTwin(reason=failed.problem) from None
+        own = Settings.read(system=self._system, container="tries", connect=[])
+        self._container = Container(
+            replace(own, tls=None, policy=None, listen=(), lock="", audit=None, metrics="", instantiable=())
+        )
+        return self._container
+
+    def _place(self, here: Container, group: str, state: Any) -> bool:
+        """Bring what belongs to a group where the real one is; returns whether it is there."""
+        told = msgspec.to_builtins(state)
+        try:
+            match told:
+                case list() if told:
+                    angles = [one["position_rad"] for one in cast("list[dict[str, Any]]", told)]
+                    self._do(here, group, "move_to", angles)
+                case {"positions_rad": list()}:
+                    self._do(here, group, "power_on")
+                    self._do(here, group, "release_brakes")
+                    self._do(here, group, "move_joints", told["positions_rad"])
+                case {"position_rad": float() | int() as angle}:
+                    self._do(here, group, "move_to", angle)
+                case {"width_m": float() | int() as width}:
+                    self._do(here, group, "activate")
+                    self._do(here, group, "move_to", width)
+                case _:
+                    return False
+        except (TradeError, KeyError):
+            return False
+        return True
+
+    def _do(self, here: Container, group: str, name: str, *args: Any) -> None:
+        found = self._find(here, group, name)
+        if found is None:
+            raise NoTwin(reason=f"the twin has no {group}.{name}")
+        found.with_(deadline_s=_PLACED_WITHIN_S)(*args)
+
+    def _state(self, here: Container, group: str) -> Any:
+        reader = self._find(here, group, "state")
+        try:
+            return None if reader is None else msgspec.to_builtins(reader())
+        except TradeError:
+            return None
+
+    def _find(self, here: Container, group: str, name: str, wait_s: float = 0.0) -> Handle | None:
+        """Those of one provider are seen together: only the first is waited for."""
+        try:
+            return find(here, f"{group}.{name}", None, wait_s)
+        except NoSuchService:
+            return None
+
+    def close(self) -> None:
+        """End it, whatever is tried there. Idempotent."""
+        if process := self._process:
+            process.kill()  # what is tried there ends by that
+        with self._lock:
+            self._end()
+            shutil.rmtree(self._folder, ignore_errors=True)
+
+    def _end(self) -> None:
+        container, self._container = self._container, None
+        process, self._process = self._process, None
+        if container is not None:
+            container.close()
+        if process is not None:
+            process.close(gently=True)
+
+
+def _called(handle: Handle, args: Any, deadline_s: float) -> Any:
+    called = handle.with_(deadline_s=deadline_s)
+    if isinstance(args, Mapping):
+        return called(**cast("Mapping[str, Any]", args))
+    return called(*cast("Sequence[Any]", args))

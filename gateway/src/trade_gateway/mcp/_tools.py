@@ -1,0 +1,294 @@
+"""The tools of an agent: what it may see, and what it may do under a lock."""
+
+import time
+from collections.abc import Awaitable, Callable, Mapping
+from functools import partial
+from typing import Annotated, Any, Final, NamedTuple
+
+import anyio
+import msgspec
+from anyio.to_thread import run_sync
+from msgspec import Meta, Struct
+
+from trade import Container, Handle
+from trade.errors import LockLost, NoSuchService, TradeError
+from trade_gateway.clients import Client, Deeds
+from trade_gateway.clients import _schemas as messages
+from trade_gateway.language import Lexicon, Memory, Talk
+from trade_gateway.mcp._approvals import Approvals
+from trade_gateway.mcp._errors import NeedsLock, NoSuchTool, NotThatWay, NoTwin
+from trade_gateway.mcp._simulation_twin import Tried, Twin
+
+__all__ = ["TOOLS", "Tool", "Tools"]
+
+Progress = Callable[[Any], None]
+"""Told how far a call is; any thread."""
+_APPROVED_WITHIN_S: Final = 120.0
+_STOPS_WITHIN_S: Final = 10.0
+_TRIED_WITHIN_S: Final = 120.0
+_TEXT: Final = Meta(max_length=500)
+
+
+class Find(Struct, forbid_unknown_fields=True, kw_only=True):
+    group: str = ""
+    """This group and what is beneath it: ``rosie.head``. Empty: all."""
+    name: str = ""
+    """``*`` and ``?`` stand for anything."""
+
+
+class Named(Struct, forbid_unknown_fields=True, kw_only=True):
+    group: messages.Group
+    name: Annotated[str, Meta(min_length=1)]
+    container: str = ""
+    """Only the service of this container."""
+
+
+class ToCall(messages.CallBody, forbid_unknown_fields=True, kw_only=True):
+    group: messages.Group
+    name: Annotated[str, Meta(min_length=1)]
+    why: Annotated[str, _TEXT] = ""
+    """For the person who may be asked to approve it."""
+
+
+class Sentence(Struct, forbid_unknown_fields=True, kw_only=True):
+    sentence: Annotated[str, Meta(min_length=1, max_length=500)]
+
+
+class ALock(Struct, forbid_unknown_fields=True, kw_only=True):
+    lock: str
+    """As the tool ``lock`` named it."""
+
+
+class Nothing(Struct, forbid_unknown_fields=True):
+    pass
+
+
+class Described(Struct, frozen=True):
+    """A service with the JSON Schemas of its arguments and result."""
+
+    service: messages.ServiceView
+    arguments: Mapping[str, Any]
+    result: Mapping[str, Any]
+    needs_lock: bool
+    needs_approval: bool
+
+
+class Tools:
+    """What one agent does; it is a client with a session of its own, which ends with it.
+
+    Args:
+        container: the agent's own: its identity is the agent's.
+        deeds: what clients have done.
+        client: the agent.
+        approvals: who is asked first, and when.
+        lexicon: which sentences mean what.
+        twin: what is tried there moves nothing; None: there is none.
+    """
+
+    def __init__(
+        self,
+        container: Container,
+        deeds: Deeds,
+        client: Client,
+        approvals: Approvals,
+        lexicon: Lexicon,
+        twin: Twin | None = None,
+    ) -> None:
+        self._container = container
+        self._deeds = deeds
+        self._client = client
+        self._approvals = approvals
+        self._twin = twin
+        self._talk = Talk(container, lexicon, Memory())
+        self._lost: list[str] = []
+
+    async def use(self, name: str, given: Any, progress: Progress = lambda _: None) -> Any:
+        """Use a tool; it is on the record of the agent's container, if one is kept.
+
+        Raises:
+            NoSuchTool: there is none of that name.
+            NotThatWay: its arguments are wrong.
+            TradeError: what came of it; also whatever a provider raises.
+        """
+        tool = TOOLS.get(name)
+        if tool is None:
+            raise NoSuchTool(name=name, known=tuple(TOOLS))
+        began, about = time.monotonic_ns(), ""
+        try:
+            try:
+                asked = msgspec.convert(messages.numbers(given), tool.asked)
+            except (msgspec.ValidationError, ValueError, RecursionError) as bad:
+                problem = f"nested more than {messages.MOST_DEEP} deep" if isinstance(bad, RecursionError) else bad
+                raise NotThatWay(problem=f"the arguments of {name} are wrong: {problem}") from None
+            about = _about(asked)
+            result = await tool.do(self, asked, progress)
+        except Exception as error:
+            self._note(name, about, began, type(error).__name__, str(error) if isinstance(error, TradeError) else "")
+            raise
+        self._note(name, about, began, "ok", "")
+        return result
+
+    def _note(self, tool: str, about: str, began: int, outcome: str, why: str) -> None:
+        took_ns = time.monotonic_ns() - began
+        self._container.note_asked(f"agent's tool {tool}", about, outcome=outcome, why=why, took_ns=took_ns)
+
+    # --- looking
+
+    async def services(self, asked: Find, _: Progress) -> Any:
+        """The services there are: what they do, to which joints, whether they are well and may be called."""
+        found = self._deeds.seen(self._client.identity, asked.group or None, asked.name or None)
+        return [self._deeds.view(self._client.identity, handle) for handle in found]
+
+    async def describe(self, asked: Named, _: Progress) -> Any:
+        """One service with the JSON Schemas of its arguments and its result, and what a call of it needs."""
+        handle = self._find(asked.group, asked.name, asked.container)
+        schema = handle.schema
+        return Described(
+            self._deeds.view(self._client.identity, handle),
+            schema["arguments"],
+            schema["result"],
+            needs_lock=handle.effect == "actuate",
+            needs_approval=self._approvals.needed(handle),
+        )
+
+    async def ask(self, asked: Sentence, _: Progress) -> Any:
+        """A question about the system in plain English: what runs where, who holds what, what failed, what is new.
+
+        It does nothing: the tools `stop` and `estop` stop.
+        """
+        return await self._deeds.apart(partial(self._talk.say, asked.sentence, orders=False))
+
+    async def locks(self, _asked: Nothing, _: Progress) -> Any:
+        """Who holds which locks, and those of this agent's that were taken away since it asked last."""
+        lost, self._lost = self._lost, []
+        return {"locks": await self._deeds.locks(self._client.identity), "lost": lost}
+
+    # --- doing
+
+    async def lock(self, asked: messages.LockBody, _: Progress) -> Any:
+        """Take a lock over all that a group uses: rosie.head. Nobody else can move it until it is given back."""
+        return await self._deeds.lock(self._client, asked, self._lock_lost)
+
+    async def unlock(self, asked: ALock, _: Progress) -> Any:
+        """Give a lock back; what moves under it stops."""
+        return {"released": await self._deeds.apart(self._client.unlock, asked.lock)}
+
+    async def call(self, asked: ToCall, progress: Progress) -> Any:
+        """Call a service and wait for its end. What moves something needs a lock, and perhaps a person's approval."""
+        handle = self._find(asked.group, asked.name, asked.container)
+        if handle.effect == "actuate" and not self._client.has_locked(handle):
+            raise NeedsLock(service=handle.label, resources=handle.resources or (handle.label,))
+        self._deeds.judge.require_call(self._client.identity, handle)
+        admitted = self._client.admit(handle)
+        if self._approvals.needed(handle):
+            progress("waits for somebody's approval")
+            await self._approvals.ask(handle, asked.args, asked.why, _APPROVED_WITHIN_S)
+            if handle.effect == "actuate" and not self._client.has_locked(handle):
+                raise NeedsLock(service=handle.label, resources=handle.resources or (handle.label,))
+        run = await self._deeds.begin(self._client, handle, asked, admitted)
+        run.on_progress(progress)
+        try:
+            await run.settled()
+        finally:
+            if not run.done():  # the agent wants it no more, or is gone
+                with anyio.CancelScope(shield=True):
+                    await self._deeds.end(self._client, run)
+        return {"result": run.result(0)}
+
+    async def try_on_twin(self, asked: ToCall, _: Progress) -> Any:
+        """What a call would do, tried on a simulated twin that is brought to where the robot is. Nothing real moves."""
+        if self._twin is None:
+            raise NoTwin(reason="this server has no twin")
+        handle = self._find(asked.group, asked.name, asked.container)
+        state = await self._state_of(handle)
+        trying = partial(self._twin.call, handle, asked.args, min(asked.deadline_s, _TRIED_WITHIN_S), state)
+        tried: Tried = await run_sync(trying, abandon_on_cancel=True)  # nothing of the robot's waits for it
+        return tried
+
+    async def stop(self, asked: messages.GroupBody, _: Progress) -> Any:
+        """Stop all that moves in a group, whoever moves it. Needs no lock and no right."""
+        who = self._client.identity
+        stops = [one for one in self._deeds.seen(who, asked.group) if one.effect == "stop"]
+        if not stops:
+            raise NoSuchService(constraint=f"stop in {asked.group}")
+        said: dict[str, str] = {}
+
+        async def stop(handle: Handle) -> None:
+            try:
+                body = messages.CallBody(deadline_s=_STOPS_WITHIN_S)
+                run = await self._deeds.begin(self._client, handle, body, self._client.admit(handle))
+                await run.settled()
+                run.result(0)
+                said[handle.label] = "stopped"
+            except Exception as error:  # noqa: BLE001 - the others stop all the same
+                said[handle.label] = f"{type(error).__name__}: {error}"
+
+        async with anyio.create_task_group() as tasks:
+            for handle in stops:
+                tasks.start_soon(stop, handle)
+        return said
+
+    async def estop(self, asked: messages.EstopBody, _: Progress) -> Any:
+        """Stop everything in the whole system. A person has to clear that. Not safety-rated."""
+        return await self._deeds.estop(self._client.identity, asked)
+
+    # --- parts of these
+
+    def _find(self, group: str, name: str, container: str) -> Handle:
+        return self._deeds.find(self._client.identity, group, name, container)
+
+    async def _state_of(self, handle: Handle) -> Any:
+        """What the robot says of what the service moves; None if it says nothing."""
+        try:
+            reader = self._find(handle.key.domain, "state", handle.container)
+        except TradeError:
+            return None
+        if reader.effect != "read":  # some other service of that name
+            return None
+        run = await self._deeds.begin(self._client, reader, messages.CallBody(), self._client.admit(reader))
+        await run.settled()
+        return run.result(0)
+
+    def _lock_lost(self, name: str, error: LockLost) -> None:
+        self._lost.append(f"{name}: {error}")
+
+
+class Tool(NamedTuple):
+    """One tool, as it is offered."""
+
+    asked: type[Struct]
+    do: Callable[..., Awaitable[Any]]
+    reads: bool = False
+    """Whether it changes nothing."""
+
+    @property
+    def text(self) -> str:
+        """What it is for."""
+        return self.do.__doc__ or ""
+
+    @property
+    def schema(self) -> dict[str, Any]:
+        """JSON Schema of its arguments, nothing in it refers to anything else."""
+        [schema], parts = msgspec.json.schema_components([self.asked])
+        return {key: value for key, value in parts[schema["$ref"].rpartition("/")[2]].items() if key != "title"}
+
+
+TOOLS: Final = {
+    "services": Tool(Find, Tools.services, reads=True),
+    "describe": Tool(Named, Tools.describe, reads=True),
+    "ask": Tool(Sentence, Tools.ask, reads=True),
+    "locks": Tool(Nothing, Tools.locks, reads=True),
+    "lock": Tool(messages.LockBody, Tools.lock),
+    "unlock": Tool(ALock, Tools.unlock),
+    "call": Tool(ToCall, Tools.call),
+    "dry_run": Tool(ToCall, Tools.try_on_twin, reads=True),
+    "stop": Tool(messages.GroupBody, Tools.stop),
+    "estop": Tool(messages.EstopBody, Tools.estop),
+}
+"""By name."""
+
+
+def _about(asked: Struct) -> str:
+    """What a request is about, without its arguments, which may be nobody's business."""
+    group, name = getattr(asked, "group", ""), getattr(asked, "name", "")
+    return ".".join(filter(None, (group, name))) or getattr(asked, "sentence", "") or getattr(asked, "lock", "")

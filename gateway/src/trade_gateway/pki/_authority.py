@@ -1,0 +1,366 @@
+"""A certificate authority in a folder: gives containers and gateways their identities for a while, and takes them back.
+
+========================  ==========================================================================================
+``ca.pem``, ``ca.key``    the authority; whoever has the key can be anybody
+``names/NAME``            what a name was given for, for ever: ``container`` or ``gateway``
+``issued/NAME/``          ``ca.pem``, ``cert.pem`` and ``key.pem``: what a container is started with (``TRADE_TLS``)
+``revoked/NAME``          marks a name that was taken back, for ever
+``revoked.toml``          ``revoked``, all of them: the names that a policy has to refuse
+========================  ==========================================================================================
+"""
+
+import contextlib
+import ipaddress
+import os
+import secrets
+import stat
+from collections.abc import Iterable, Sequence
+from datetime import datetime, timedelta, timezone
+from pathlib import Path
+from typing import Final, Literal, cast
+
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+from msgspec import Struct
+
+from trade._protocol.keys import is_chunk
+from trade._toml import read_toml_text
+from trade.errors import ConfigurationError
+from trade_gateway.process._atomic_file import claim, replace
+
+__all__ = ["Authority", "Issued", "NameRevoked", "NameTaken", "NoAuthority", "Purpose"]
+
+Purpose = Literal["container", "gateway"]
+
+_LASTS: Final = timedelta(days=7)
+"""Links know no revocation: a stolen key is good until its certificate ends, so that has to be soon. But a container
+listens with the certificate that it started with until it is started again, so it has to be longer than a shift."""
+_AUTHORITY_LASTS: Final = timedelta(days=3650)
+_CLOCKS_DIFFER: Final = timedelta(minutes=5)
+_LONGEST_NAME: Final = 64
+"""X.509 has no room for more in a common name."""
+_HERE: Final = ("localhost", "127.0.0.1", "::1")
+
+_Host = x509.DNSName | x509.IPAddress
+
+
+class NoAuthority(ConfigurationError):
+    """There is none in the folder, it cannot be used, or there is one already."""
+
+
+class NameTaken(ConfigurationError):
+    """A gateway's name is asked for somebody else, or the other way round."""
+
+
+class NameRevoked(ConfigurationError):
+    """The name was taken back."""
+
+
+class Issued(Struct, frozen=True):
+    """A name, and the last certificate it has."""
+
+    name: str
+    purpose: Purpose
+    until: datetime | None
+    """None: its files are not in the folder any more."""
+    hosts: tuple[str, ...]
+    """Names and addresses that it may be dialled by, beyond this host's own."""
+    revoked: bool
+    folder: Path
+
+
+class Authority:
+    """The authority of a folder.
+
+    Raises:
+        NoAuthority: there is none, or it cannot be used.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder: Final = folder.absolute()
+        self._certificate, self._key = self._read()
+
+    @classmethod
+    def create(cls, folder: Path) -> "Authority":
+        """A new one. Raises NoAuthority: there is one already, and what it issued would be worth nothing."""
+        key = ec.generate_private_key(ec.SECP256R1())
+        name = _named(f"TRADE authority {secrets.token_hex(4)}")
+        now = datetime.now(timezone.utc)
+        certificate = (
+            x509.CertificateBuilder(name, name, key.public_key(), x509.random_serial_number())
+            .not_valid_before(now - _CLOCKS_DIFFER)
+            .not_valid_after(now + _AUTHORITY_LASTS)
+            .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+            .add_extension(_usage(certificates=True), critical=True)
+            .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
+            .sign(key, hashes.SHA256())
+        )
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        try:
+            claim(folder / "ca.key", _key_text(key))
+        except FileExistsError:
+            problem = "there is an authority already; use it, or name another folder"
+            raise NoAuthority(where=str(folder), problem=problem) from None
+        replace(folder / "ca.pem", certificate.public_bytes(serialization.Encoding.PEM), 0o644)
+        made = cls(folder)
+        made._list_revoked()  # a policy that names the list must find one
+        return made
+
+    def issue(
+        self,
+        name: str,
+        *,
+        purpose: Purpose | None = None,
+        hosts: Sequence[str] = (),
+        addresses: Sequence[str] = (),
+        lasts: timedelta | None = None,
+        new_key: bool = False,
+    ) -> Issued:
+        """Give a name its certificate, or the next one.
+
+        The next one has the key of the last and its hosts as well, and replaces it in one step.
+
+        Args:
+            name: the identity.
+            purpose: what for; none: as before, and a container if it is new.
+            hosts: names it may be dialled by, besides localhost.
+            addresses: addresses it may be dialled by, besides those of the loopback interface.
+            lasts: how long from now on, a week if not said; not beyond the end of the authority.
+            new_key: as if it were the first one: another key, and only the hosts and addresses given.
+
+        Raises:
+            NameTaken: it was given for another purpose.
+            NameRevoked: it was revoked.
+            NoAuthority: the authority itself has expired.
+            ConfigurationError: it is no name, host or address, or its key is not here any more.
+        """
+        _check_name(name)
+        wanted = [*_addresses(addresses), *map(_dns_name, hosts)]
+        if name in self.revoked():
+            problem = f"was revoked, and is not issued again; choose another name ({self._revoked_file} has the list)"
+            raise NameRevoked(where=name, problem=problem)
+        until = self._end(lasts or _LASTS)
+        known = self._take(name, purpose)
+        folder = self.folder / "issued" / name
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        renewed = known and not new_key
+        key = _read_key(folder / "key.pem", name) if renewed else ec.generate_private_key(ec.SECP256R1())
+        had = _hosts_so_far(folder / "cert.pem") if renewed else [*_addresses(_HERE[1:]), x509.DNSName(_HERE[0])]
+        certificate = self._signed(name, key, list(dict.fromkeys([*had, *wanted])), until)
+        if not renewed:
+            replace(folder / "key.pem", _key_text(key), 0o600)
+        replace(folder / "ca.pem", self._certificate.public_bytes(serialization.Encoding.PEM), 0o644)
+        replace(folder / "cert.pem", certificate.public_bytes(serialization.Encoding.PEM), 0o644)
+        return self._known(name)
+
+    def revoke(self, name: str) -> Issued:
+        """Take a name back for good: it is not issued again, and policies that have the list refuse it.
+
+        Raises:
+            ConfigurationError: no such name was ever issued.
+        """
+        if name not in self._names():
+            problem = f"was never issued; there is {', '.join(self._names()) or 'nobody'}"
+            raise ConfigurationError(where=name, problem=problem)
+        self._listed()  # damaged, it is to be put right first
+        marks = self.folder / "revoked"
+        marks.mkdir(mode=0o700, exist_ok=True)
+        with contextlib.suppress(FileExistsError):
+            claim(marks / name, b"")
+        self._list_revoked()
+        return self._known(name)
+
+    def _list_revoked(self) -> None:
+        """Write the list until it has all: who revokes at the same time has marked it before writing an older one."""
+        while (names := self.revoked()) != self._listed():
+            listed = ", ".join(f'"{name}"' for name in sorted(names))
+            text = f"# Written by trade pki: identities that policies refuse.\nrevoked = [{listed}]\n"
+            replace(self._revoked_file, text.encode(), 0o644)
+
+    def issued(self) -> list[Issued]:
+        """All names that were ever issued, in their order."""
+        return [self._known(name) for name in self._names()]
+
+    def revoked(self) -> frozenset[str]:
+        """The names that were taken back. Raises ConfigurationError: the list is damaged."""
+        marked = frozenset(path.name for path in (self.folder / "revoked").glob("[!.]*"))
+        return marked | (self._listed() or frozenset())
+
+    def _listed(self) -> frozenset[str] | None:
+        """Those in the list for policies; None: there is no list."""
+        try:
+            listed = read_toml_text(self._revoked_file.read_text(encoding="utf-8"))["revoked"]
+        except FileNotFoundError:
+            return None
+        except (ValueError, KeyError):
+            listed = None
+        names = cast("list[object]", listed) if isinstance(listed, list) else [None]
+        if not all(isinstance(name, str) and is_chunk(name) for name in names):
+            problem = 'must be like revoked = ["old-arm"]; put that right first: nobody may be forgotten'
+            raise ConfigurationError(where=str(self._revoked_file), problem=problem)
+        return frozenset(map(str, names))
+
+    @property
+    def _revoked_file(self) -> Path:
+        return self.folder / "revoked.toml"
+
+    def _read(self) -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:
+        path = self.folder / "ca.key"
+        try:
+            certificate = _load(self.folder / "ca.pem")
+            key = serialization.load_pem_private_key(path.read_bytes(), None)
+        except FileNotFoundError:
+            problem = f"has no authority; begin one with trade pki init {self.folder}, or name its folder with --ca"
+            raise NoAuthority(where=str(self.folder), problem=problem) from None
+        except (OSError, ValueError, TypeError) as bad:
+            raise NoAuthority(where=str(self.folder), problem=f"ca.pem or ca.key cannot be read: {bad}") from None
+        if os.name == "posix" and stat.S_IMODE(path.stat().st_mode) & 0o077:
+            problem = f"others can read it, and so be anybody; chmod 600 {path}, and begin a new authority if they did"
+            raise NoAuthority(where=str(path), problem=problem)
+        if not isinstance(key, ec.EllipticCurvePrivateKey) or key.public_key() != certificate.public_key():
+            raise NoAuthority(where=str(path), problem="is not the key of ca.pem beside it; take both from one backup")
+        return certificate, key
+
+    def _names(self) -> list[str]:
+        return sorted(path.name for path in (self.folder / "names").glob("[!.]*"))
+
+    def _purpose(self, name: str) -> Purpose:
+        """What a name was given for; one whose mark is damaged is nobody else's than a gateway's."""
+        mark = (self.folder / "names" / name).read_text(encoding="utf-8").strip()
+        return "container" if mark == "container" else "gateway"
+
+    def _take(self, name: str, purpose: Purpose | None) -> bool:
+        """Mark a name as given; returns whether it was before. Raises NameTaken: for another purpose."""
+        marks = self.folder / "names"
+        marks.mkdir(mode=0o700, exist_ok=True)
+        with contextlib.suppress(FileExistsError):
+            claim(marks / name, f"{purpose or 'container'}\n".encode())
+            return False
+        given = self._purpose(name)
+        if purpose not in (None, given):
+            problem = f"is the name of a {given} for ever, not of a {purpose}; choose another name"
+            raise NameTaken(where=name, problem=problem)
+        return True
+
+    def _known(self, name: str) -> Issued:
+        folder = self.folder / "issued" / name
+        purpose, revoked = self._purpose(name), name in self.revoked()
+        try:
+            last = _load(folder / "cert.pem")
+        except (OSError, ValueError):
+            return Issued(name, purpose, None, (), revoked, folder)
+        hosts = tuple(text for text in (str(host.value) for host in _hosts(last)) if text not in _HERE)
+        return Issued(name, purpose, last.not_valid_after_utc, hosts, revoked, folder)
+
+    def _end(self, lasts: timedelta) -> datetime:
+        now, end = datetime.now(timezone.utc), self._certificate.not_valid_after_utc
+        if now >= end:
+            problem = f"has expired ({end:%Y-%m-%d}); begin a new one in another folder, and issue all names there"
+            raise NoAuthority(where=str(self.folder), problem=problem)
+        return min(now + lasts, end)
+
+    def _signed(
+        self, name: str, key: ec.EllipticCurvePrivateKey, hosts: list[_Host], until: datetime
+    ) -> x509.Certificate:
+        public = key.public_key()
+        issuer = x509.AuthorityKeyIdentifier.from_issuer_public_key(self._key.public_key())
+        return (
+            x509.CertificateBuilder(self._certificate.subject, _named(name), public, x509.random_serial_number())
+            .not_valid_before(datetime.now(timezone.utc) - _CLOCKS_DIFFER)
+            .not_valid_after(until)
+            .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+            .add_extension(_usage(certificates=False), critical=True)
+            .add_extension(
+                x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH]),
+                critical=False,
+            )
+            .add_extension(x509.SubjectAlternativeName(hosts), critical=False)
+            .add_extension(issuer, critical=False)
+            .sign(self._key, hashes.SHA256())
+        )
+
+
+def _named(name: str) -> x509.Name:
+    return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
+
+
+def _usage(*, certificates: bool) -> x509.KeyUsage:
+    return x509.KeyUsage(
+        digital_signature=not certificates,
+        content_commitment=False,
+        key_encipherment=False,
+        data_encipherment=False,
+        key_agreement=False,
+        key_cert_sign=certificates,
+        crl_sign=False,
+        encipher_only=False,
+        decipher_only=False,
+    )
+
+
+def _check_name(name: str) -> None:
+    if not is_chunk(name) or name.startswith(".") or len(name) > _LONGEST_NAME:
+        problem = f"is no identity; use letters, digits, _ - and . (at most {_LONGEST_NAME}, not a . first)"
+        raise ConfigurationError(where=repr(name), problem=problem)
+
+
+def _addresses(texts: Iterable[str]) -> list[x509.IPAddress]:
+    try:
+        return [x509.IPAddress(ipaddress.ip_address(text)) for text in texts]
+    except ValueError as bad:
+        raise ConfigurationError(where="--address", problem=f"{bad}; names go with --host") from None
+
+
+def _dns_name(text: str) -> x509.DNSName:
+    if _is_address(text):
+        raise ConfigurationError(where="--host", problem=f"{text} is an address; say --address {text}")
+    try:
+        if not text or any(sign in text for sign in " /:"):
+            raise ValueError(text)
+        return x509.DNSName(text)
+    except ValueError:
+        raise ConfigurationError(where="--host", problem=f"{text!r} is no name of a host") from None
+
+
+def _is_address(text: str) -> bool:
+    try:
+        ipaddress.ip_address(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _load(path: Path) -> x509.Certificate:
+    return x509.load_pem_x509_certificate(path.read_bytes())
+
+
+def _hosts(certificate: x509.Certificate) -> list[_Host]:
+    return cast("list[_Host]", list(certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value))
+
+
+def _hosts_so_far(path: Path) -> list[_Host]:
+    """Whom the last certificate is for."""
+    try:
+        return _hosts(_load(path))
+    except (OSError, ValueError):
+        problem = "cannot be read, so what it was for is not known; with --force it is made anew"
+        raise ConfigurationError(where=str(path), problem=problem) from None
+
+
+def _read_key(path: Path, name: str) -> ec.EllipticCurvePrivateKey:
+    try:
+        key = serialization.load_pem_private_key(path.read_bytes(), None)
+    except (OSError, ValueError, TypeError):
+        key = None
+    if not isinstance(key, ec.EllipticCurvePrivateKey):
+        problem = f"is not there or damaged; put it back, or give {name} another one with --force"
+        raise ConfigurationError(where=str(path), problem=problem)
+    return key
+
+
+def _key_text(key: ec.EllipticCurvePrivateKey) -> bytes:
+    return key.private_bytes(
+        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+    )

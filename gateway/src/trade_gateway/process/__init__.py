@@ -1,0 +1,1 @@
+"""Processes: signals as events, a kernel timer that kills, the parent's end, atomic files."""

@@ -1,0 +1,88 @@
+"""The ring, saved to a folder when something goes wrong."""
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Final
+
+import msgspec
+
+from trade.errors import ConfigurationError
+from trade_gateway.recording._channels import FAULTS, Fault, Message
+from trade_gateway.recording._file import Attachment
+from trade_gateway.recording._ring_buffer import Ring
+
+__all__ = ["SavedAtFault"]
+
+HOLD_OFF_S: Final = 10.0
+"""What goes wrong so soon after what was saved belongs to the same event."""
+_decode: Final = msgspec.json.Decoder(Fault).decode
+
+Told = Callable[[Path, str, int], None]
+"""Told of a file that was saved: where, why, how many messages it has."""
+
+
+class SavedAtFault:
+    """A sink that keeps the last seconds, and writes them once for each event. Used by one thread."""
+
+    def __init__(
+        self,
+        folder: Path,
+        ring: Ring,
+        about: Mapping[str, str],
+        attachments: Sequence[Attachment],
+        told: Told,
+        failed: Callable[[str], None],
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """Keep, and write to the folder.
+
+        Args:
+            folder: made if need be.
+            ring: what keeps.
+            about: metadata of each file.
+            attachments: of each file.
+            told: called after each file.
+            failed: told why one could not be written; what goes on is kept and saved at the next event.
+            clock: seconds that rise.
+
+        Raises:
+            ConfigurationError: there can be no such folder.
+        """
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as bad:
+            raise ConfigurationError(where=str(folder), problem=f"cannot be made: {bad.strerror}") from None
+        self._folder = folder
+        self._ring = ring
+        self._about = about
+        self._attachments = attachments
+        self._told = told
+        self._failed = failed
+        self._clock = clock
+        self._held_until = 0.0
+
+    def write(self, message: Message) -> None:
+        """Keep it; save everything if it says that something has gone wrong."""
+        self._ring.write(message)
+        if message.channel is FAULTS:
+            fault = _decode(message.data)
+            if fault.kind != "gone" and fault.text and fault.new:
+                self._save(fault, message.arrived_ns)
+
+    def _save(self, fault: Fault, at_ns: int) -> None:
+        now = self._clock()
+        if now < self._held_until:
+            return
+        self._held_until = now + HOLD_OFF_S
+        at = datetime.fromtimestamp(at_ns / 1e9, timezone.utc)
+        name = "".join(letter if letter.isalnum() or letter in "._-" else "-" for letter in fault.about)
+        path = self._folder / f"{at:%Y%m%dT%H%M%S}.{at_ns // 1_000_000 % 1000:03d}Z-{name}.mcap"
+        why = f"{fault.about}: {fault.text}"
+        try:
+            count = self._ring.save(path, {**self._about, "fault": why}, self._attachments)
+        except (OSError, ConfigurationError) as bad:
+            self._failed(f"{path} is not whole: {bad}")
+        else:
+            self._told(path, why, count)

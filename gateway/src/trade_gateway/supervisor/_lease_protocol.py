@@ -1,0 +1,306 @@
+"""Both ends of a lease: the gateway that asks for a container, and the one that stands in."""
+
+import math
+import secrets
+import threading
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any, Final, Protocol
+
+import msgspec
+
+from trade import Container, Handle, Run, where
+from trade.errors import AccessDenied, ConfigurationError, NoSuchService, TradeError
+from trade_gateway.process._kill_timer import Term, uptime_s
+from trade_gateway.supervisor._lease import Arbiter, Holder, Lease
+from trade_gateway.supervisor._objects import GROUP
+from trade_gateway.supervisor._single_instance import is_free
+from trade_gateway.supervisor._store import StateStore
+from trade_gateway.supervisor._tables import Child
+
+__all__ = ["Asking", "Leased", "StandIn"]
+
+_KEEP_S: Final = 5.0
+"""How long the arbiter may take to keep states."""
+_MOST_BYTES: Final = 16 * 1024 * 1024
+"""Of the states of one container."""
+_LOOK_EVERY_S: Final = 0.25
+"""Whether the process before has ended."""
+
+Keep = Callable[[Mapping[str, Any]], bool]
+"""Saves states; returns whether they are on disk."""
+
+
+class Leased(Protocol):
+    """What a supervisor needs to know; told and asked on its thread alone, but for what `load` and `keep` give."""
+
+    lock: Path
+    """What its process has for its life."""
+
+    @property
+    def why(self) -> str:
+        """Why the container is not to be up."""
+        ...
+
+    @property
+    def term(self) -> Term | None:
+        """How long it may stay up; None: as long as this gateway has it."""
+        ...
+
+    @property
+    def due(self) -> float:
+        """When to `look` again, by `uptime_s`."""
+        ...
+
+    def look(self, *, alive: bool, wanted: bool) -> bool:
+        """Do what is due. Returns whether the container may be up.
+
+        Args:
+            alive: whether it has a process.
+            wanted: whether it would be up here, if it may.
+        """
+        ...
+
+    def load(self) -> dict[str, Any]:
+        """What it is to begin with."""
+        ...
+
+    def keep(self) -> Keep:
+        """Where to save what is asked for from now on."""
+        ...
+
+
+class Asking:
+    """The end that needs a lease.
+
+    Args:
+        child: the container.
+        member: the container that asks; it may be another one each time.
+        post: has something done on the supervisor's thread.
+        tell: is told what is wrong with saving.
+        lock: see `Leased`.
+    """
+
+    def __init__(
+        self,
+        child: Child,
+        member: Callable[[], Container],
+        post: Callable[[Callable[[], None]], None],
+        tell: Callable[[str], None],
+        lock: Path,
+    ) -> None:
+        self.lock = lock
+        self._name = child.name
+        self._from = child.terms.lease_from
+        self._member = member
+        self._post = post
+        self._tell = tell
+        self._holder = Holder(uptime_s(), self._from)
+        self._states: dict[str, Any] = {}
+        self._begun = ""
+        """The turn that these states are of, or of which they were at first."""
+        self._number = 0
+        self._trouble = ""
+
+    @property
+    def why(self) -> str:
+        return f"no lease: {self._holder.why}" if self._holder.why else ""
+
+    @property
+    def term(self) -> Term | None:
+        return self._holder.term
+
+    @property
+    def due(self) -> float:
+        return self._holder.due
+
+    def look(self, *, alive: bool, wanted: bool) -> bool:
+        now, holder = uptime_s(), self._holder
+        if holder.asks(now) and wanted:
+            self._ask(now, holder.turn)
+        if not holder.held(now):
+            self._begun = ""
+            return False
+        if not self._begun:
+            self._begun, self._states = holder.turn, _decoded(holder.states)
+        return alive or is_free(self.lock)
+
+    def load(self) -> dict[str, Any]:
+        return dict(self._states)
+
+    def keep(self) -> Keep:
+        self._number += 1
+        return partial(self._keep, self._states, self._holder.turn, self._number)
+
+    def _keep(self, known: dict[str, Any], turn: str, number: int, states: Mapping[str, Any]) -> bool:
+        known.update(states)
+        try:
+            data = msgspec.msgpack.encode(states)
+            if len(data) > _MOST_BYTES:
+                raise ConfigurationError(where=self._name, problem=f"its states take more than {_MOST_BYTES} bytes")
+            keep = self._function("keep_child").with_(deadline_s=_KEEP_S)
+            kept = bool(turn) and keep(self._name, self._member().name, turn, number, data)
+        except Exception as error:  # noqa: BLE001 - whatever it is, the container goes on
+            self._say(str(error))
+            return False
+        self._say("" if kept else f"{self._from} does not keep it")
+        return kept
+
+    def _say(self, trouble: str) -> None:
+        if bool(trouble) != bool(self._trouble):
+            what = f"is not saved: {trouble}; all else goes on" if trouble else f"is saved again, by {self._from}"
+            self._tell(f"the state of {self._name} {what}")
+        self._trouble = trouble
+
+    def _ask(self, now: float, turn: str) -> None:
+        try:
+            ask = self._function("lease_child").with_(deadline_s=self._holder.within_s)
+            run = ask.start(self._name, self._member().name, turn)
+        except TradeError as error:
+            seen = not isinstance(error, NoSuchService)
+            self._holder.unanswered(str(error) if seen else f"{self._from} is not seen")
+            return
+        run.when_done(lambda run: self._post(partial(self._answered, now, turn, run)))
+
+    def _answered(self, now: float, turn: str, run: Run) -> None:
+        error = run.exception(0)
+        if error is not None:
+            self._holder.unanswered(f"{self._from} does not answer: {error}")
+        else:
+            self._holder.answered(now, turn, run.result(0))
+
+    def _function(self, name: str) -> Handle:
+        member = self._member()
+        for found in member.services(where(name=name, group=GROUP, container=self._from)):
+            if member.settings.tls is None or found.key.address.identity == self._from:
+                return found
+        raise NoSuchService(constraint=f"{name} of {self._from}")
+
+
+class StandIn:
+    """The end that gives leases, and has the container while there can be none.
+
+    Args:
+        child: the container.
+        store: where states are kept.
+        lock: see `Leased`.
+        rung: has the supervisor look.
+    """
+
+    def __init__(self, child: Child, store: StateStore, lock: Path, rung: Callable[[], None]) -> None:
+        self.lock = lock
+        self._name = child.name
+        self._asker = child.terms.stands_in_for
+        self._store = store
+        self._rung = rung
+        self._lease_s = 0.0
+        self._longest_s = 0.0
+        """No lease was ever longer, by what the store knows."""
+        self._guard = threading.Lock()
+        """Of the arbiter and of the number of the last save."""
+        self._arbiter = Arbiter(self._asker, secrets.token_hex(4))
+        self._saved = 0
+        self._look_at = 0.0
+        self.go_by(child)
+
+    # --- on the supervisor's thread
+
+    def go_by(self, child: Child) -> None:
+        """Leases are as long as its table says from now on."""
+        lease_s, own = child.terms.lease_s, f"{self._name} leases"  # no container has a space in its name
+        known_s = max(self._longest_s, self._store.load(own).get("longest_s", 0.0))
+        if lease_s > known_s:
+            self._store.save(own, {"longest_s": lease_s})
+        self._lease_s, self._longest_s = lease_s, max(lease_s, known_s)
+
+    @property
+    def why(self) -> str:
+        return self._arbiter.why
+
+    @property
+    def term(self) -> None:
+        return None
+
+    @property
+    def due(self) -> float:
+        return min(self._look_at, self._arbiter.due)
+
+    def look(self, *, alive: bool, wanted: bool) -> bool:  # noqa: ARG002 - given up here, it is nowhere
+        ended, now = not alive and is_free(self.lock), uptime_s()
+        with self._guard:
+            if ended:
+                self._arbiter.ended(now, self._longest_s)
+            self._arbiter.looked(now)
+            mine, handing = self._arbiter.mine, self._arbiter.handing
+        self._look_at = now + _LOOK_EVERY_S if mine and not alive and not ended else math.inf
+        return mine and not handing and (alive or ended)
+
+    def load(self) -> dict[str, Any]:
+        return self._store.load(self._name)
+
+    def keep(self) -> Keep:
+        return partial(self._store.save, self._name)
+
+    # --- from other threads
+
+    def lease(self, caller: str | None, gateway: str, turn: str) -> Lease:
+        """The other gateway asks; ``caller`` is None where nobody can prove who it is. Raises AccessDenied."""
+        self._check(caller, gateway)
+        with self._guard:
+            given = self._arbiter.asked(uptime_s(), turn, self._lease_s)
+            its = self._arbiter.turn
+            if given and its != turn:
+                self._saved = 0
+        if not given:
+            return Lease("", why="who stands in has it")
+        states = b"" if its == turn else msgspec.msgpack.encode(self.load())
+        return Lease(its, self._lease_s, states=states)
+
+    def keep_for(self, caller: str | None, gateway: str, turn: str, number: int, states: bytes) -> bool:
+        """Save what the other gateway's container knows, unless it is late; returns whether it is on disk.
+
+        Raises:
+            AccessDenied: it is another gateway.
+            ConfigurationError: it is no states, or too much.
+        """
+        self._check(caller, gateway)
+        problem = f"more than {_MOST_BYTES} bytes" if len(states) > _MOST_BYTES else ""
+        try:
+            known = {} if problem else msgspec.msgpack.decode(states, type=dict[str, Any])
+        except ValueError as error:
+            known, problem = {}, str(error)
+        if problem:
+            raise ConfigurationError(where=f"states of {self._name}", problem=problem)
+        return self._store.save(self._name, known, lambda: self._is_newest(turn, number))
+
+    def hand_back(self) -> None:
+        """Save it, end it here, and let the other gateway have it. Raises ConfigurationError: that one is not there."""
+        with self._guard:
+            if not self._arbiter.mine:
+                problem = f"it is not here: {self._arbiter.why}"
+            elif uptime_s() - self._arbiter.asked_at > self._lease_s:
+                problem = f"{self._asker} has not asked for it for {self._lease_s:g} s; is it up, and is this one seen?"
+            else:
+                self._arbiter.hand_back()
+                problem = ""
+        if problem:
+            raise ConfigurationError(where=f"container {self._name}", problem=problem)
+        self._rung()
+
+    def _is_newest(self, turn: str, number: int) -> bool:
+        with self._guard:
+            if not turn or turn != self._arbiter.turn or number <= self._saved:
+                return False
+            self._saved = number
+            return True
+
+    def _check(self, caller: str | None, gateway: str) -> None:
+        asks = gateway if caller is None else caller
+        if asks != self._asker:
+            rule = f"only {self._asker} has it otherwise"
+            raise AccessDenied(who=asks, verb="call", what=f"the lease of {self._name}", rule=rule)
+
+
+def _decoded(states: bytes) -> dict[str, Any]:
+    return msgspec.msgpack.decode(states, type=dict[str, Any]) if states else {}

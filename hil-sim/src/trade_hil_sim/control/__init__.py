@@ -1,0 +1,1 @@
+"""The simulator as a process: its server, its client, and its command line."""

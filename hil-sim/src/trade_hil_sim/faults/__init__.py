@@ -1,0 +1,1 @@
+"""Scripted faults, and a method of the client for each."""

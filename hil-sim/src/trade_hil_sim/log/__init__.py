@@ -1,0 +1,1 @@
+"""The byte log, and questions about it."""

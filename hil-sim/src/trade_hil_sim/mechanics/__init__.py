@@ -1,0 +1,1 @@
+"""How simulated devices move, and what is true of them."""

@@ -1,0 +1,177 @@
+"""From a robot file to simulated buses: which class simulates which driver. The only module that reads robot files."""
+
+from collections.abc import Callable, Sequence
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from typing import Final, Protocol, cast
+
+from trade_drivers.robotfile import Arm, Bus, Camera, Gripper, Joint, Robot, Sensor, parse
+from trade_hil_sim.faults._faults import Command
+from trade_hil_sim.log._byte_log import ByteLog
+from trade_hil_sim.mechanics._truth import BusState
+from trade_hil_sim.robot._errors import SimulationError
+
+__all__ = [
+    "SimulatedBus",
+    "SimulatedBusClass",
+    "SimulatedSenseClass",
+    "bus_class",
+    "buses_of",
+    "find_simulator",
+    "read_robot",
+]
+
+GROUP: Final = "trade.sims"
+"""Entry points of this group are `SimulatedBusClass`es, or for cameras and sensors `SimulatedSenseClass`es; their names
+are those of the drivers they stand in for."""
+
+Truth = Callable[[], Sequence[BusState]]
+"""What all buses of the robot do at this moment."""
+
+
+class SimulatedBus(Protocol):
+    """One bus with its devices, or a camera, or a sensor: whatever is behind one port."""
+
+    @property
+    def name(self) -> str:
+        """Its name in the robot file."""
+        ...
+
+    @property
+    def port(self) -> Path | str:
+        """What a client opens: a path, or such as ``socketcand:127.0.0.1:29536/can0``; final from `open` on."""
+        ...
+
+    def open(self) -> object:
+        """From now on the port can be opened."""
+        ...
+
+    def close(self) -> None:
+        """Free everything; idempotent."""
+        ...
+
+    def do(self, command: Command) -> None:
+        """Carry out a fault or an order; raises `SimulationError` for what it has not got."""
+        ...
+
+    def state(self) -> BusState:
+        """The truth about its devices."""
+        ...
+
+
+class SimulatedBusClass(Protocol):
+    """What an entry point of the group ``trade.sims`` names."""
+
+    def from_robot(
+        self,
+        bus: Bus,
+        devices: Sequence[Joint | Gripper | Arm],
+        port: Path,
+        *,
+        log: ByteLog | None = None,
+        paced: bool = True,
+    ) -> SimulatedBus:
+        """Make the bus a robot file describes, not yet open; raises `SimulationError` naming what it cannot do."""
+        ...
+
+
+class SimulatedSenseClass(Protocol):
+    """What such an entry point names for a driver of cameras or sensors."""
+
+    def from_record(
+        self,
+        device: Camera | Sensor,
+        port: Path,
+        *,
+        truth: Truth,
+        log: ByteLog | None = None,
+        paced: bool = True,
+    ) -> SimulatedBus:
+        """Make the device a robot file describes, not yet open; raises `SimulationError` naming what it cannot do."""
+        ...
+
+
+def read_robot(path: Path) -> Robot:
+    """Read a robot file; raises what `trade_drivers.robotfile.parse` raises, and `OSError`."""
+    return parse(path.read_text(encoding="utf-8"), str(path))
+
+
+def buses_of(
+    robot: Robot, directory: Path, *, names: Sequence[str] = (), log: ByteLog | None = None, paced: bool = True
+) -> list[SimulatedBus]:
+    """Simulate the buses, cameras and sensors of a robot, not yet open; each gets the port ``directory / name``.
+
+    Args:
+        robot: from `read_robot`.
+        directory: where the ports go.
+        names: which of them; default: all.
+        log: where all of them record.
+        paced: take as long as the real wires.
+    """
+    senses = (*robot.cameras, *robot.sensors)
+    known = {device.name for device in (*robot.buses, *senses)}
+    for name in names:
+        if name not in known:
+            raise SimulationError(f"{robot.where} has no bus {name!r}; it has {', '.join(sorted(known))}")
+    buses = [
+        bus_class(bus.driver).from_robot(
+            bus,
+            [*robot.joints_on(bus.name), *robot.grippers_on(bus.name), *robot.arms_on(bus.name)],
+            directory / bus.name,
+            log=log,
+            paced=paced,
+        )
+        for bus in robot.buses
+        if not names or bus.name in names
+    ]
+
+    def truth() -> list[BusState]:
+        return [bus.state() for bus in buses]
+
+    return buses + [
+        _sense_class(device.driver).from_record(device, directory / device.name, truth=truth, log=log, paced=paced)
+        for device in senses
+        if not names or device.name in names
+    ]
+
+
+def bus_class(driver: str) -> SimulatedBusClass:
+    """The class that simulates the buses of a driver.
+
+    Raises:
+        SimulationError: there is none.
+    """
+    found = find_simulator(driver)
+    if not hasattr(found, "from_robot"):
+        raise SimulationError(f"driver {driver!r} is one of cameras or sensors; a bus needs another")
+    return cast("SimulatedBusClass", found)
+
+
+def _sense_class(driver: str) -> SimulatedSenseClass:
+    found = find_simulator(driver)
+    if not hasattr(found, "from_record"):
+        raise SimulationError(f"driver {driver!r} is one of buses; a camera or sensor needs another")
+    return cast("SimulatedSenseClass", found)
+
+
+def find_simulator(
+    driver: str, installed: Sequence[EntryPoint] | None = None
+) -> SimulatedBusClass | SimulatedSenseClass:
+    """The class that simulates what a driver talks to.
+
+    Args:
+        driver: its name in robot files.
+        installed: where to look; default: the entry points of all installed packages.
+
+    Raises:
+        SimulationError: there is none, or more than one.
+    """
+    offered = list(entry_points(group=GROUP) if installed is None else installed)
+    values = sorted({point.value for point in offered if point.name == driver})
+    if len(values) > 1:
+        raise SimulationError(f"two simulators are named {driver!r}: {' and '.join(values)}; uninstall one")
+    if not values:
+        known = ", ".join(sorted({point.name for point in offered})) or "none"
+        raise SimulationError(f"nothing simulates driver {driver!r}; simulated are: {known}")
+    point = next(point for point in offered if point.name == driver)
+    return cast("SimulatedBusClass | SimulatedSenseClass", point.load())

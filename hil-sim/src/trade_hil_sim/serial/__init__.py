@@ -1,0 +1,1 @@
+"""Serial lines on pseudo-terminals, and buses of devices on them."""

@@ -1,0 +1,211 @@
+"""What simulated serial buses have in common: devices behind one line, faults of their answers, orders to them."""
+
+import threading
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Sequence
+from itertools import zip_longest
+from pathlib import Path
+from typing import Any, Generic, Protocol, TypeVar
+
+import msgspec
+
+from trade_hil_sim.faults import _faults as faults
+from trade_hil_sim.log._byte_log import ByteLog
+from trade_hil_sim.mechanics._truth import BusState, DeviceState, GripperTruth
+from trade_hil_sim.robot._errors import SimulationError
+from trade_hil_sim.serial._line import SerialLine
+
+__all__ = ["DeviceLine", "interleaved"]
+
+
+class Device(Protocol):
+    """Something with an id that does things by itself."""
+
+    @property
+    def device_id(self) -> int:
+        """Its id on the bus."""
+        ...
+
+    def advance(self, t: float) -> None:
+        """Do what is due at time `t`."""
+        ...
+
+    def next_due(self) -> float | None:
+        """When something happens by itself; None if never."""
+        ...
+
+    def state(self, t: float) -> DeviceState | GripperTruth:
+        """The truth about it at time `t`."""
+        ...
+
+
+_Device = TypeVar("_Device", bound=Device)
+_Bus = TypeVar("_Bus", bound="DeviceLine[Any]")
+
+
+class DeviceLine(ABC, Generic[_Device]):
+    """Devices on one serial line; a client opens `port` as it would a real adapter.
+
+    Args:
+        devices: on the bus.
+        port: stable path the client opens; made here, gone after `close`.
+        name: of the bus, in the log.
+        log: where to record; default: a log in memory, at `log`.
+        paced: take as long as the real wire; else answer as fast as possible.
+        clock: the devices' clock, in seconds. The line itself keeps real time.
+    """
+
+    def __init__(
+        self,
+        devices: Iterable[_Device],
+        port: Path,
+        *,
+        name: str,
+        log: ByteLog | None,
+        paced: bool,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.name, self.port = name, port
+        self.log = ByteLog() if log is None else log
+        self._clock = clock
+        self._devices = list(devices)
+        self._lock = threading.RLock()
+        self._script = faults.Script()
+        self._last_byte_at = 0.0
+        self._echo = False
+        self._line = SerialLine(port, self, name=name, log=self.log, paced=paced)
+
+    def open(self: _Bus) -> _Bus:
+        """Plug in: from now on the port can be opened."""
+        self._line.open()
+        return self
+
+    def close(self) -> None:
+        """Hang up and remove the port. Idempotent; a log passed in stays open."""
+        self._line.close()
+
+    def __enter__(self: _Bus) -> _Bus:
+        return self.open()
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    @property
+    def devices(self) -> Sequence[_Device]:
+        """The devices; take care, the bus's own thread uses them, too."""
+        return tuple(self._devices)
+
+    def state(self) -> BusState:
+        """The truth about the bus and its devices, now."""
+        with self._lock:
+            t = self._clock()
+            truths = [msgspec.structs.replace(device.state(t), bus=self.name) for device in self._devices]
+        return BusState(
+            name=self.name,
+            port=str(self.port),
+            plugged=self._line.plugged,
+            devices=[truth for truth in truths if isinstance(truth, DeviceState)],
+            grippers=[truth for truth in truths if isinstance(truth, GripperTruth)],
+        )
+
+    # faults and orders
+
+    def do(self, command: faults.Command) -> None:
+        """Carry out one fault or order; raises `SimulationError` for a device that is not here."""
+        match command:
+            case faults.Unplug():
+                self._line.unplug()
+            case faults.Replug():
+                self._line.replug()
+            case faults.HangUp() | faults.Local():
+                raise SimulationError(f"bus {self.name} is no controller of an arm")
+            case _:
+                with self._lock:
+                    self._do_here(command)
+                self._line.nudge()
+
+    def _do_here(self, command: faults.Command) -> None:
+        t = self._clock()
+        match command:
+            case faults.AnswerFault():
+                self._named(command.ids)
+                self._script.add(command)
+            case faults.Unmute():
+                self._named(command.ids)
+                self._script.unmute(command.ids)
+            case faults.Heal():
+                self._script.heal()
+                self._echo = False
+                for device in self._devices:
+                    device.advance(t)
+                    self._heal(device, t)
+            case faults.Echo():
+                self._echo = command.on
+            case faults.Unplug() | faults.Replug() | faults.HangUp() | faults.Local():
+                pass
+            case faults.Absent(nth=int(nth)) if nth > len(self._devices):
+                raise SimulationError(f"bus {self.name} has {len(self._devices)} devices, no number {nth}")
+            case faults.Absent(nth=int(nth)):
+                self._do_to(self._devices[nth - 1], command, t)
+            case _:
+                for device in self._named(command.ids):
+                    device.advance(t)
+                    self._do_to(device, command, t)
+
+    @abstractmethod
+    def _do_to(self, device: _Device, command: faults.Command, t: float) -> None:
+        """Carry out an order on one device; raises `SimulationError` for what it cannot have."""
+
+    @abstractmethod
+    def _heal(self, device: _Device, t: float) -> None:
+        """End what orders did to one device."""
+
+    def _named(self, ids: tuple[int, ...] | None) -> Sequence[_Device]:
+        here = {device.device_id for device in self._devices}
+        if unknown := set(ids or ()) - here:
+            raise SimulationError(f"bus {self.name} has no device {sorted(unknown)}; it has {sorted(here)}")
+        return [device for device in self._devices if ids is None or device.device_id in ids]
+
+    # the far end of the line; called from its thread
+
+    def wake_in_s(self) -> float | None:
+        """Seconds until a device does something by itself."""
+        with self._lock:
+            due = min((due for device in self._devices if (due := device.next_due()) is not None), default=None)
+            return None if due is None else due - self._clock()
+
+    def wake(self) -> None:
+        """Let the devices do what is due."""
+        with self._lock:
+            t = self._clock()
+            for device in self._devices:
+                device.advance(t)
+
+    def received(self, data: bytes, t: float) -> None:
+        """Bytes from the client."""
+        if self._echo:
+            self._line.send(data, name="echo")
+        silence_s, self._last_byte_at = t - self._last_byte_at, t
+        with self._lock:
+            self._silent_for(silence_s)
+            self._take(data, t)
+
+    @abstractmethod
+    def _silent_for(self, s: float) -> None:
+        """No byte came for so long before those that are taken next."""
+
+    @abstractmethod
+    def _take(self, data: bytes, t: float) -> None:
+        """Carry out what the client sent."""
+
+    def _answer(self, data: bytes, ids: tuple[int, ...], instruction: str, *, after_s: float, device_id: int) -> None:
+        """Send an answer as the faults in force leave it."""
+        for piece, late_s in self._script.shape(data, ids, instruction):
+            self._line.send(piece, after_s=after_s, late_s=late_s, name=instruction, device_id=device_id)
+            after_s = 0.0
+
+
+def interleaved(answers: Sequence[bytes]) -> bytes:
+    """What comes of answers on top of each other: the bytes of all, none of them where it belongs."""
+    return bytes(byte for column in zip_longest(*answers) for byte in column if byte is not None)

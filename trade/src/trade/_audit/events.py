@@ -1,0 +1,319 @@
+"""What happened in a container, told to whoever writes it down: calls, locks, stops, refusals, changes of its set-up.
+
+Off, nothing of it stands in the way of a call. On, a call puts one record into a queue; `_audit_writer` does the rest.
+"""
+
+import time
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, Protocol
+
+from msgspec import Struct
+
+from trade._container.system import DOMAIN
+from trade._context.call_context import CallContext
+from trade._context.sessions import foreign
+from trade._counters import Calls
+from trade._protocol.keys import Address
+from trade._settings import Settings
+from trade.errors import (
+    AccessDenied,
+    Busy,
+    DeadlineExceeded,
+    IncompleteGroup,
+    InUse,
+    InvalidArgument,
+    LimitExceeded,
+    LockedByOther,
+    LockLost,
+    NotInstantiable,
+    NotLocked,
+    SessionEnded,
+    Stopped,
+    TradeError,
+)
+
+if TYPE_CHECKING:
+    from trade._services.local_service import Around, LocalService
+
+Kind = Literal["call", "read", "stop", "lock", "configure", "refused", "audit"]
+
+_REFUSALS: Final = (
+    AccessDenied,
+    Busy,
+    DeadlineExceeded,
+    IncompleteGroup,
+    InUse,
+    InvalidArgument,
+    LimitExceeded,
+    LockedByOther,
+    LockLost,
+    NotInstantiable,
+    NotLocked,
+    SessionEnded,
+    Stopped,
+)
+"""Errors that say that nothing was done, and why."""
+
+
+class Event(Struct, frozen=True, gc=False):
+    """One thing that happened."""
+
+    at_ns: int
+    """``time.time_ns()``"""
+    monotonic_ns: int
+    """``time.monotonic_ns()`` of the same moment."""
+    kind: Kind
+    what: str
+    """The service, as errors name it, or a word."""
+    about: Any
+    """What else to say of it: a text, a handle, names; made into text by who writes it."""
+    who: str
+    """Identity of who asked; empty: nobody, it came about by itself."""
+    session: str
+    call_id: int
+    """0: it was no call."""
+    outer_id: int
+    """The call that led to that one first of all, the same in all containers; 0: it was no call."""
+    outcome: str
+    """``ok``, or the type of the error."""
+    why: str
+    """What errors of ours say; nothing of others, and nothing where an argument is secret."""
+    took_ns: int
+
+
+Tell = Callable[[Event], None]
+"""Takes an event; returns at once, whatever becomes of it."""
+
+
+class Record(Protocol):
+    """How far what writes a record is."""
+
+    written: int
+    lost: int
+
+    @property
+    def waiting(self) -> int: ...
+
+
+class Audit:
+    """Where a container tells what happens in it; with nobody to tell, it does nothing.
+
+    Args:
+        tell: told of each event.
+        own: the container.
+        reads: tell of services that only read, too.
+        calls: where calls and refusals are counted, if they are.
+        record: what writes the events down, for who wants to know how far it is.
+    """
+
+    def __init__(
+        self,
+        tell: Tell | None = None,
+        own: Address | None = None,
+        *,
+        reads: bool = False,
+        calls: Calls | None = None,
+        record: Record | None = None,
+    ) -> None:
+        self._tell = tell
+        self.calls = calls
+        self.record = record
+        self._own = own
+        self._reads = reads
+
+    def note(
+        self,
+        kind: Kind,
+        what: str,
+        *,
+        about: Any = "",
+        who: str = "",
+        session: str = "",
+        call_id: int = 0,
+        outer_id: int = 0,
+        outcome: str = "ok",
+        why: str = "",
+        took_ns: int = 0,
+    ) -> None:
+        """Tell of something that is no call of a service."""
+        if self._tell is not None:
+            at_ns, now_ns = time.time_ns(), time.monotonic_ns()
+            self._tell(Event(at_ns, now_ns, kind, what, about, who, session, call_id, outer_id, outcome, why, took_ns))
+
+    def refused(
+        self,
+        what: str,
+        error: TradeError | str,
+        *,
+        who: str,
+        session: str = "",
+        call_id: int = 0,
+        outer_id: int = 0,
+    ) -> None:
+        """Tell that somebody was refused something, and by which error or for what reason."""
+        outcome = "Malformed" if isinstance(error, str) else type(error).__name__
+        if self.calls is not None:
+            self.calls.refuse(outcome)
+        if self._tell is not None:
+            self.note(
+                "refused",
+                what,
+                who=who,
+                session=session,
+                call_id=call_id,
+                outer_id=outer_id,
+                outcome=outcome,
+                why=str(error),
+            )
+
+    def changed(self, what: str, about: str, call: CallContext | None) -> None:
+        """Tell of a change of configuration, made in a call, or by this container itself."""
+        if self._tell is None:
+            return
+        if call is not None:
+            self.note(
+                "configure",
+                what,
+                about=about,
+                who=call.caller,
+                session=call.session,
+                call_id=call.id,
+                outer_id=call.outer_id,
+            )
+        elif self._own is not None:
+            self.note("configure", what, about=about, who=self._own.identity, session=str(self._own))
+
+    def watch(self, domain: str, service: "LocalService") -> None:
+        """From now on tell of calls of a service that is about to be offered."""
+        if self._tell is None and self.calls is None:
+            return
+        rule = _rule(domain, service.info.name, service.effect, reads=self._reads)
+        if rule is not None:
+            service.around = service.audited = Audited(self._tell, rule, None, self.calls, service.label)
+
+
+class _Rule(NamedTuple):
+    kind: Kind
+    always: bool
+    """Tell also if nothing is wrong."""
+    about: bool
+    """Tell the first argument, too: of the middleware's own functions only, whose arguments are known."""
+
+
+_LOCKS: Final = frozenset(("break_lock", "request_release"))
+_STOPS: Final = frozenset(("estop", "estop_clear", "resume"))
+_TABLE_TELLS: Final = frozenset(("acquire",))
+"""What the lock table tells itself, and better; their refusals are told."""
+_SILENT: Final = frozenset(
+    ("renew", "release", "release_requested", "notification_failed", "hook_suspended", "listen", "unlisten")
+)
+"""The small talk of containers."""
+
+
+def open_audit(settings: Settings, own: Address, leaving: ExitStack) -> Audit:
+    """Where a container tells what happens in it; what writes it down, if anything does, ends with the stack."""
+    calls = Calls() if settings.metrics else None
+    if settings.audit is None:
+        return Audit(calls=calls)
+    from trade._audit.writer import start_writing  # noqa: PLC0415 - who keeps no record needs no database
+
+    writer = start_writing(settings, settings.audit, own)
+    leaving.callback(writer.close)
+    return Audit(writer.tell, own, reads=settings.audit_reads, calls=calls, record=writer)
+
+
+def _rule(domain: str, name: str, effect: str, *, reads: bool) -> _Rule | None:
+    """How calls of a service are told of; None: not at all."""
+    if domain != DOMAIN:
+        if effect == "read":
+            return _Rule("read", reads, about=False)
+        return _Rule("stop" if effect == "stop" else "call", always=True, about=False)
+    if name in _SILENT or (effect == "read" and not reads):
+        return None
+    if effect == "read":
+        return _Rule("read", always=True, about=False)
+    kind: Kind = "lock" if name in _LOCKS or name in _TABLE_TELLS else "stop" if name in _STOPS else "configure"
+    return _Rule(kind, name not in _TABLE_TELLS, about=True)
+
+
+class Audited:
+    """What is around a service whose calls are told of: what was there without that, and an event at the end."""
+
+    __slots__ = ("_around", "_calls", "_label", "_rule", "_tell", "_timed")
+
+    def __init__(
+        self, tell: Tell | None, rule: _Rule, around: "Around | None", calls: Calls | None, label: str
+    ) -> None:
+        self._tell = tell
+        self._rule = rule
+        self._around = around
+        self._calls = calls
+        self._label = label
+        self._timed = None if calls is None else calls.of(label)
+
+    def over(self, around: "Around | None") -> "Audited":
+        """The same, with something else between it and the service."""
+        return Audited(self._tell, self._rule, around, self._calls, self._label)
+
+    def run(self, service: "LocalService", args: Sequence[Any], kwargs: dict[str, Any], context: CallContext) -> Any:
+        """Call the service and tell of that. Its errors pass."""
+        began_ns, outer_id = time.monotonic_ns(), context.outer_id  # when it has ended, it belongs to nobody
+        try:
+            if self._around is None:
+                result = service.call(args, kwargs, context, bare=True)
+            else:
+                result = self._around.run(service, args, kwargs, context)
+        except BaseException as error:
+            if self._timed is not None:
+                self._timed.add(time.monotonic_ns() - began_ns, failed=True)
+            self.failed(service, context, error, began_ns, args, kwargs, outer_id)
+            raise
+        if self._timed is not None:
+            self._timed.add(time.monotonic_ns() - began_ns, failed=False)
+        if self._rule.always:
+            self._say(service, context, self._rule.kind, "ok", "", began_ns, args, kwargs, outer_id)
+        return result
+
+    def failed(
+        self,
+        service: "LocalService",
+        context: CallContext,
+        error: BaseException,
+        began_ns: int = 0,
+        args: Sequence[Any] = (),
+        kwargs: dict[str, Any] | None = None,
+        outer_id: int = 0,
+    ) -> None:
+        """Tell of a call that ended with an error, or never began."""
+        refused = isinstance(error, _REFUSALS)
+        if refused and self._calls is not None:
+            self._calls.refuse(type(error).__name__)
+        if refused or self._rule.always:
+            kind: Kind = "refused" if refused else self._rule.kind
+            told = isinstance(error, TradeError) and not service.signature.has_secrets
+            why = str(error) if told else ""
+            self._say(service, context, kind, type(error).__name__, why, began_ns, args, kwargs or {}, outer_id)
+
+    def _say(
+        self,
+        service: "LocalService",
+        context: CallContext,
+        kind: Kind,
+        outcome: str,
+        why: str,
+        began_ns: int,
+        args: Sequence[Any],
+        kwargs: dict[str, Any],
+        outer_id: int,
+    ) -> None:
+        if self._tell is None:
+            return
+        about: Any = ""
+        if self._rule.about and (args or kwargs):
+            about = args[0] if args else next(iter(kwargs.values()))
+        now_ns = time.monotonic_ns()
+        who, session = foreign(context.session) or context.caller, context.session
+        took_ns = now_ns - began_ns if began_ns else 0
+        at_ns, ids = time.time_ns(), (context.id, outer_id or context.outer_id)
+        self._tell(Event(at_ns, now_ns, kind, service.label, about, who, session, *ids, outcome, why, took_ns))

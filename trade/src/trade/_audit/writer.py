@@ -1,0 +1,292 @@
+"""Writes down what happened: one thread, fed by a queue that never keeps anybody waiting."""
+
+import importlib.metadata
+import json
+import logging
+import os
+import socket
+import sqlite3
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from trade._audit.events import Event
+from trade._audit.hash_chain import AuditRow, Head
+from trade._audit.store import SUFFIX, AuditStore, Keep, move_aside
+from trade._calls.handle import Handle
+from trade._protocol.keys import Address
+from trade._settings import Settings
+
+_logger = logging.getLogger("trade")
+
+_MOST: Final = 20_000
+"""So many events wait at most; what comes then is counted, and lost."""
+_BATCH: Final = 1_000
+_GATHER_S: Final = 0.1
+"""How long events are gathered before they are written together."""
+_AGAIN_S: Final = 1.0
+"""How long to wait before trying once more to write."""
+_LOOK_S: Final = 3600.0
+"""How often it is looked for rows to drop, and where the record ends is logged."""
+_PARTING_S: Final = 3.0
+_LONGEST: Final = 500
+_MOST_ID: Final = (1 << 63) - 1
+_JUMP_NS: Final = 2_000_000_000
+"""A clock on the wall that has moved so far against the monotonic one was set."""
+_FAR_NS: Final = 86_400_000_000_000
+"""And after such a jump nothing is dropped for its age: it may be wrong."""
+_EVER_DAYS: Final = 1_000_000
+
+
+class AuditWriter:
+    """Owns the record of one container. Closed, it has written what it could, and says what it could not.
+
+    Args:
+        path: of the file; made when the first event is written.
+        boot: names this boot of the container.
+        about: what the first row of this boot says.
+        keep: how much.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        boot: str,
+        about: str,
+        keep: Keep,
+        clocks: Callable[[], tuple[int, int]] = lambda: (time.time_ns(), time.monotonic_ns()),
+    ) -> None:
+        self._path = path
+        self._boot = boot
+        self._keep = keep
+        self._clocks = clocks
+        self._offset_ns = self._offset()
+        self._far = False
+        """The clock was set by so much that ages mean nothing."""
+        self._waiting: deque[Event] = deque()
+        self._some = threading.Event()
+        self._closing = threading.Event()
+        self._guard = threading.Lock()
+        self._lost = 0
+        self.lost = 0
+        """Events that were not written down, since the start."""
+        self.written = 0
+        self._rows: list[AuditRow] = [self._row("began", about)]
+        """What is to be written next; kept until it is."""
+        self._to_drop = False
+        """It is time to look for rows to drop."""
+        self._unlooked = 0
+        """Rows written since that was done last."""
+        self._store: AuditStore | None = None
+        self._head = Head(0, b"")
+        self._trouble = ""
+        self._some.set()
+        self._thread = threading.Thread(target=self._run, name="trade-audit", daemon=True)
+        self._thread.start()
+
+    @property
+    def waiting(self) -> int:
+        """Events that are not written yet."""
+        return len(self._waiting)
+
+    @property
+    def running(self) -> bool:
+        """It still writes, or tries to."""
+        return self._thread.is_alive()
+
+    def tell(self, event: Event) -> None:
+        """Take an event, on any thread; without waiting for anything."""
+        if len(self._waiting) >= _MOST:
+            with self._guard:
+                self._lost += 1
+                self.lost += 1
+            return
+        self._waiting.append(event)
+        if not self._some.is_set():
+            self._some.set()
+
+    # --- on its own thread
+
+    def _run(self) -> None:
+        looked = time.monotonic()
+        while not self._closing.is_set():
+            self._some.wait(max(0.0, looked + _LOOK_S - time.monotonic()))
+            self._closing.wait(_GATHER_S)
+            self._some.clear()
+            if time.monotonic() - looked >= _LOOK_S:
+                looked, self._to_drop = time.monotonic(), True
+                self._say_head("stands at")
+            self._write_all(last=False)
+        self._write_all(last=True)
+        self._part()
+
+    def _write_all(self, *, last: bool) -> None:
+        while self._waiting or self._rows or self._lost or (self._to_drop and not last):
+            self._gather()
+            if self._write() and (last or self._drop()):
+                continue
+            if last or self._closing.wait(_AGAIN_S):
+                return
+
+    def _gather(self) -> None:
+        if self._rows:  # they could not be written before
+            return
+        offset_ns = self._offset()
+        if abs(jump_ns := offset_ns - self._offset_ns) >= _JUMP_NS:
+            self._offset_ns = offset_ns
+            self._far = self._far or abs(jump_ns) >= _FAR_NS
+            self._rows.append(self._row("clock set", f"by {jump_ns / 1e9:+.3f} s"))
+        if self._lost:
+            with self._guard:
+                lost, self._lost = self._lost, 0
+            self._rows.append(self._row("lost", f"{lost} records that could not be written in time"))
+        for _ in range(min(_BATCH, len(self._waiting))):
+            self._rows.append(_row_of(self._waiting.popleft(), self._boot))
+
+    def _write(self, *, anew: bool = True) -> bool:
+        """Write the rows down, into a new file if the one there is broken. Whether that could be done."""
+        fresh = self._store is None
+        try:
+            self._store = self._store or AuditStore(self._path)
+            self._head = self._store.add(self._rows)
+        except (sqlite3.OperationalError, OSError) as trouble:  # no space, no right, read-only: it may pass
+            self._say_trouble(str(trouble))
+            return False
+        except sqlite3.DatabaseError as broken:
+            self._let_go()
+            return anew and self._move_aside(str(broken)) and self._write(anew=False)
+        self.written += len(self._rows)
+        self._unlooked += len(self._rows)
+        self._to_drop = self._to_drop or fresh or self._unlooked >= 10 * self._keep.piece
+        self._rows.clear()
+        if self._trouble:
+            self._trouble = ""
+            _logger.warning("audit: %s is written again", self._path)
+        if fresh:
+            self._say_head("goes on at")
+        return True
+
+    def _say_trouble(self, trouble: str) -> None:
+        self._let_go()
+        if trouble != self._trouble:  # the same again says nothing new
+            self._trouble = trouble
+            _logger.error(
+                "audit: %s cannot be written: %s; trying again every %g s, and up to %d records wait",
+                self._path,
+                trouble,
+                _AGAIN_S,
+                _MOST,
+            )
+
+    def _move_aside(self, broken: str) -> bool:
+        try:
+            aside = move_aside(self._path, str(self._clocks()[0] // 1_000_000))
+        except OSError as trouble:
+            self._say_trouble(f"it is broken ({broken}), and cannot be moved aside: {trouble}")
+            return False
+        _logger.error("audit: %s is broken (%s); it is %s now, and a new one is begun", self._path, broken, aside.name)
+        self._rows.insert(0, self._row("began anew", f"the record before is broken, and is {aside.name} now: {broken}"))
+        return True
+
+    def _drop(self) -> bool:
+        """Drop some of what need not be kept any more, if it is time to look. Whether that could be done."""
+        if not self._to_drop or self._store is None:
+            return True
+        keep = self._keep._replace(days=_EVER_DAYS) if self._far else self._keep
+        try:
+            self._to_drop = self._store.drop(keep, self._row("", "")) > 0
+        except (sqlite3.Error, OSError) as trouble:
+            self._say_trouble(f"old rows cannot be dropped: {trouble}")
+            return False
+        self._unlooked = 0
+        return True
+
+    def _part(self) -> None:
+        if not self._rows and not self._waiting:
+            self._rows.append(self._row("ended", ""))
+            self._write()
+        if unwritten := sum(row.kind != "audit" for row in self._rows) + len(self._waiting):
+            _logger.error("audit: %d records of %s were never written", unwritten, self._path)
+        self._say_head("ends at")
+        self._let_go()
+
+    def _let_go(self) -> None:
+        if self._store is not None:
+            self._store.close()
+            self._store = None
+
+    def _say_head(self, verb: str) -> None:
+        """In the log: a witness that stands elsewhere."""
+        if self._head.seq:
+            _logger.info("audit: %s %s row %d, %s", self._path, verb, self._head.seq, self._head.hash.hex())
+
+    def _row(self, what: str, about: str) -> AuditRow:
+        at_ns, now_ns = self._clocks()
+        return AuditRow(0, at_ns, now_ns, self._boot, "audit", what, about, "", "", 0, 0, "ok", "", 0)
+
+    def _offset(self) -> int:
+        at_ns, now_ns = self._clocks()
+        return at_ns - now_ns
+
+    def close(self) -> None:
+        """Write what waits, for a few seconds at most. Idempotent."""
+        self._closing.set()
+        self._some.set()
+        if self._thread is not threading.current_thread():
+            self._thread.join(_PARTING_S)
+            if self.running:
+                _logger.error("audit: %s is still held up after %g s; what waits may be lost", self._path, _PARTING_S)
+
+
+def _row_of(event: Event, boot: str) -> AuditRow:
+    return AuditRow(
+        0,
+        event.at_ns,
+        event.monotonic_ns,
+        boot,
+        event.kind,
+        _clipped(event.what),
+        _clipped(_text(event.about)),
+        _clipped(event.who),
+        _clipped(event.session),
+        event.call_id & _MOST_ID,
+        event.outer_id & _MOST_ID,
+        event.outcome,
+        _clipped(event.why),
+        event.took_ns,
+    )
+
+
+def _clipped(text: str) -> str:
+    """What can be written, and no more than anybody reads."""
+    text = text[:_LONGEST]
+    return text if text.isascii() else text.encode(errors="replace").decode()
+
+
+def _text(about: Any) -> str:
+    """In words; of what a caller may have made of any length, little."""
+    if isinstance(about, str):
+        return about
+    if isinstance(about, Handle):
+        return f"{about.key.address}: {about.label}"
+    if isinstance(about, Sequence) and not isinstance(about, bytes):
+        return ", ".join(_text(one) for one in about[:100])  # pyright: ignore[reportUnknownVariableType]
+    return str(about) if isinstance(about, bool | int | float | Path) else type(about).__name__
+
+
+def start_writing(settings: Settings, folder: Path, own: Address) -> AuditWriter:
+    """The writer of a container's record in that folder; its first row says who is up here, and by which policy."""
+    about = {
+        "container": own.container,
+        "identity": own.identity,
+        "system": settings.system,
+        "host": socket.gethostname(),
+        "pid": os.getpid(),
+        "version": importlib.metadata.version("trade-core"),
+        "policy": str(settings.policy or ""),
+    }
+    keep = Keep(settings.audit_keep_days, settings.audit_keep_rows)
+    return AuditWriter(folder / f"{own.container}{SUFFIX}", own.epoch, json.dumps(about), keep)

@@ -1,0 +1,1 @@
+"""The caller's side of calls: handles, runs, targets, and the calls that wait for a reply."""

@@ -1,0 +1,104 @@
+"""Several calls: at once, or one after the other, each with an outcome of its own."""
+
+import asyncio
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+from trade._calls.handle import Bound, Handle
+from trade._calls.run import Run
+
+__all__ = ["Outcome"]
+
+_MOST_AT_ONCE: Final = 256
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """How one of several calls ended."""
+
+    handle: Handle
+    result: Any = None
+    error: BaseException | None = None
+
+    @property
+    def ok(self) -> bool:
+        """Whether it ended with a result."""
+        return self.error is None
+
+    def value(self) -> Any:
+        """The result, or the error raised."""
+        if self.error is not None:
+            raise self.error
+        return self.result
+
+
+def begun(call: Bound) -> Run:
+    """The call under way; what keeps it from beginning is its outcome, too."""
+    try:
+        return call.start()
+    except Exception as error:  # noqa: BLE001 - it belongs to whoever looks at the outcome
+        run = Run(call.handle)
+        run.fail(error)
+        return run
+
+
+def _ended(call: Bound, run: Run) -> Outcome:
+    error = run.exception()
+    return Outcome(call.handle, error=error) if error is not None else Outcome(call.handle, run.result())
+
+
+def bound(calls: Iterable[Handle | Bound], args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> list[Bound]:
+    """Calls as they are, handles with the arguments."""
+    return [call if isinstance(call, Bound) else call.bind(*args, **kwargs) for call in calls]
+
+
+def all_outcomes(calls: Iterable[Bound]) -> list[Outcome]:
+    """Run at once and wait for all; outcomes in order."""
+    return list(_waves(list(calls)))
+
+
+def _waves(calls: list[Bound]) -> Iterator[Outcome]:
+    """At most so many at once: a call of this process is a thread while it runs."""
+    running = [begun(call) for call in calls[:_MOST_AT_ONCE]]
+    for index, call in enumerate(calls):
+        yield _ended(call, running[index])
+        if len(running) < len(calls):
+            running.append(begun(calls[len(running)]))
+
+
+async def all_outcomes_async(calls: Iterable[Bound]) -> list[Outcome]:
+    """The same from asyncio."""
+    limit = asyncio.Semaphore(_MOST_AT_ONCE)
+
+    async def one(call: Bound) -> Outcome:
+        async with limit:
+            return await _ended_async(call)
+
+    return await asyncio.gather(*map(one, calls))
+
+
+async def _ended_async(call: Bound) -> Outcome:
+    run = begun(call)
+    await run.settled()
+    return _ended(call, run)
+
+
+def sequence(calls: Iterable[Bound], *, go_on: bool) -> list[Outcome]:
+    """One after the other; outcomes of those that ran."""
+    outcomes: list[Outcome] = []
+    for call in calls:
+        outcomes.append(_ended(call, begun(call)))
+        if not (go_on or outcomes[-1].ok):
+            break
+    return outcomes
+
+
+async def sequence_async(calls: Iterable[Bound], *, go_on: bool) -> list[Outcome]:
+    """The same from asyncio."""
+    outcomes: list[Outcome] = []
+    for call in calls:
+        outcomes.append(await _ended_async(call))
+        if not (go_on or outcomes[-1].ok):
+            break
+    return outcomes

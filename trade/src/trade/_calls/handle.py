@@ -1,0 +1,275 @@
+"""Handles: values that name one service of one boot."""
+
+import asyncio
+import logging
+from collections.abc import Mapping
+from contextvars import Context
+from types import MappingProxyType
+from typing import Any, Final, NoReturn, Protocol
+
+from trade._calls.run import Run
+from trade._protocol.keys import Address, ServiceKey
+from trade._protocol.messages import Scalar
+from trade._protocol.schema import read_schema
+from trade._registry.registry import Record
+from trade.errors import ConfigurationError
+
+__all__ = ["Bound", "Handle"]
+
+_logger = logging.getLogger("trade")
+
+LONGEST_DEADLINE_S: Final = 86_400.0
+
+
+class Home(Protocol):
+    """What a handle asks of the container that made it."""
+
+    @property
+    def address(self) -> Address: ...
+    @property
+    def closed(self) -> bool: ...
+    def invoke(
+        self, handle: "Handle", args: tuple[Any, ...], kwargs: dict[str, Any], deadline_s: float | None
+    ) -> Any: ...
+    def begin(
+        self, handle: "Handle", args: tuple[Any, ...], kwargs: dict[str, Any], deadline_s: float | None
+    ) -> "Run": ...
+    def record(self, handle: "Handle") -> Record: ...
+    def has(self, key: ServiceKey) -> bool: ...
+    def asked_for(self, handle: "Handle") -> tuple[str, tuple[str, ...]]: ...
+
+
+class Handle:
+    """One service of one boot epoch: call it, compare it, keep it, pass it as argument or result.
+
+    A call raises ServiceGone once the service was deregistered or its container ended or restarted.
+    """
+
+    __slots__ = ("_deadline_s", "_home", "_record", "key")
+    __trade_type__: Final = "Handle"
+    """Its name in JSON Schema."""
+
+    def __init__(self, home: Home, key: ServiceKey, record: Record | None, deadline_s: float | None = None) -> None:
+        self._home = home
+        self.key = key
+        """What the handle is over the wire."""
+        self._record = record
+        self._deadline_s = deadline_s
+
+    # --- calling
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        """Call and wait for the result, at most until the deadline."""
+        return self._home.invoke(self, args, kwargs, self._deadline_s)
+
+    def start(self, *args: Any, **kwargs: Any) -> Run:
+        """Call without waiting."""
+        return self._home.begin(self, args, kwargs, self._deadline_s)
+
+    async def acall(self, *args: Any, **kwargs: Any) -> Any:
+        """Call from asyncio. Cancelling the task that waits here cancels the call, see `Run.cancel`."""
+        run = self.start(*args, **kwargs)
+        try:
+            return await run
+        except asyncio.CancelledError:
+            if not run.done():
+                Context().run(run.end_soon)
+            raise
+
+    def note_not_cancelled(self, error: BaseException) -> None:
+        """Told by a call of it: it was to end, and could not be ended."""
+        level = logging.DEBUG if self._home.closed else logging.WARNING
+        _logger.log(level, "%s could not be cancelled: %s: %s", self.label, type(error).__name__, error)
+
+    def with_(self, *, deadline_s: float) -> "Handle":
+        """The same service, called with other options.
+
+        Args:
+            deadline_s: how long a call may take, in seconds; greater than zero, at most a day.
+        """
+        if not 0 < deadline_s <= LONGEST_DEADLINE_S:
+            problem = f"deadline_s must be more than 0 and at most {LONGEST_DEADLINE_S:.0f} (a day), not {deadline_s}"
+            raise ConfigurationError(problem=problem)
+        return Handle(self._home, self.key, self._record, deadline_s)
+
+    def bind(self, *args: Any, **kwargs: Any) -> "Bound":
+        """The call as a value, to be made later; arguments are checked then."""
+        return Bound(self, args, kwargs)
+
+    # --- telling
+
+    @property
+    def record(self) -> Record:
+        """What the registry says of it now, or said last. Raises ServiceGone if it never knew the service."""
+        self._record = self._home.record(self)
+        return self._record
+
+    @property
+    def last_record(self) -> Record | None:
+        """What the registry said of it last, if anything."""
+        return self._record
+
+    @property
+    def name(self) -> str:
+        """The service's name."""
+        return self.key.name
+
+    @property
+    def label(self) -> str:
+        """Group and name, as on the command line."""
+        return self._record.label if self._record else f"{self.key.domain}.{self.key.name}"
+
+    @property
+    def groups(self) -> tuple[str, ...]:
+        """The provider's groups."""
+        return self.record.groups
+
+    @property
+    def host(self) -> str:
+        """The computer it runs on."""
+        return self.record.host
+
+    @property
+    def container(self) -> str:
+        """The name of the container it lives in."""
+        return self.key.address.container
+
+    @property
+    def local(self) -> bool:
+        """Whether it lives in this very container."""
+        return self.key.address == self._home.address
+
+    @property
+    def alive(self) -> bool:
+        """Whether the registry has it now."""
+        return self._home.has(self.key)
+
+    @property
+    def signature(self) -> str:
+        """Name, arguments and result with their types."""
+        return self.record.info.signature
+
+    @property
+    def doc(self) -> str:
+        """The method's docstring."""
+        return self.record.info.doc
+
+    @property
+    def effect(self) -> str:
+        """``read``, ``note``, ``actuate`` or ``stop``."""
+        return self.record.info.effect
+
+    @property
+    def resources(self) -> tuple[str, ...]:
+        """Physical things it needs for itself."""
+        return self.record.info.uses
+
+    @property
+    def achieves(self) -> tuple[str, ...]:
+        """Its post-conditions."""
+        return self.record.info.achieves
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """Names of its provider's class and of the bases and interfaces that have services."""
+        return self.record.kinds
+
+    @property
+    def meta(self) -> Mapping[str, Scalar]:
+        """What it is declared with, and its provider over it."""
+        return dict(self.record.meta)
+
+    @property
+    def health(self) -> str:
+        """``healthy``, or what its provider says is wrong."""
+        return self.record.health
+
+    @property
+    def verb(self) -> str:
+        """What a policy must allow a caller over its first group: ``call``, ``read``...; empty: everybody may call."""
+        return self._home.asked_for(self)[0]
+
+    @property
+    def roles(self) -> tuple[str, ...]:
+        """The roles whose identities may call it, by the policy of this container; none if that asks for none."""
+        return self._home.asked_for(self)[1]
+
+    @property
+    def schema(self) -> Mapping[str, Mapping[str, Any]]:
+        """JSON Schema of ``arguments`` and ``result``."""
+        info = self.record.info
+        return {"arguments": read_schema(info.arguments_schema), "result": read_schema(info.result_schema)}
+
+    def cancel_service(self) -> "Handle":
+        """The service that ends this one early. Raises ConfigurationError if there is none."""
+        cancel = self.record.info.cancel
+        if cancel is None:
+            raise ConfigurationError(
+                where=self.label, problem="it cannot be cancelled: its provider names no service for that"
+            )
+        key = ServiceKey(self.key.address, self.key.domain, self.key.provider, cancel)
+        return Handle(self._home, key, None)
+
+    # --- being a value
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Handle) and self.key == other.key
+
+    def __hash__(self) -> int:
+        return hash(self.key)
+
+    def __copy__(self) -> "Handle":
+        return self
+
+    def __deepcopy__(self, memo: object) -> "Handle":
+        return self
+
+    def __reduce__(self) -> NoReturn:
+        raise TypeError(
+            f"{self!r} cannot be pickled: a handle belongs to its container. Give it to the other process as an "
+            "argument or a result of a service, or look the service up there with trade.find(...)"
+        )
+
+    def __repr__(self) -> str:
+        return f"<Handle {self.label} in {self.container}>"
+
+
+class Bound:
+    """A call that can be made: a handle with arguments. Call it, compare it, put it into a sequence."""
+
+    __slots__ = ("args", "handle", "kwargs")
+
+    def __init__(self, handle: Handle, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> None:
+        self.handle = handle
+        """Which service."""
+        self.args = args
+        """Positional arguments."""
+        self.kwargs = MappingProxyType(dict(kwargs))
+        """Arguments by name."""
+
+    def __call__(self) -> Any:
+        """Make the call and wait for the result."""
+        return self.handle(*self.args, **self.kwargs)
+
+    def start(self) -> Run:
+        """Make the call without waiting."""
+        return self.handle.start(*self.args, **self.kwargs)
+
+    async def acall(self) -> Any:
+        """Make the call from asyncio."""
+        return await self.start()
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Bound) and (self.handle, self.args, self.kwargs) == (
+            other.handle,
+            other.args,
+            other.kwargs,
+        )
+
+    def __hash__(self) -> int:
+        """Raises TypeError if an argument has no hash."""
+        return hash((self.handle, self.args, frozenset(self.kwargs.items())))
+
+    def __repr__(self) -> str:
+        given = [*map(repr, self.args), *(f"{name}={value!r}" for name, value in self.kwargs.items())]
+        return f"<Bound {self.handle.label}({', '.join(given)}) in {self.handle.container}>"

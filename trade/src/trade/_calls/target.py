@@ -1,0 +1,358 @@
+"""From a handle to a result: the same checks whether the service is here or elsewhere."""
+
+import logging
+from collections.abc import Callable
+from functools import partial
+from time import monotonic_ns
+from typing import Any, Final
+
+import msgspec
+from msgspec import Raw
+
+from trade._calls.caller import Caller
+from trade._calls.peer import Peer
+from trade._calls.run import Run
+from trade._container.system import CLOCK, DOMAIN, PROVIDER
+from trade._context.active_calls import Ongoing
+from trade._context.call_context import CallContext, handed_down, holding, patience_s, running
+from trade._context.outgoing import DEFAULT_DEADLINE_S, Request, in_ns, new_request
+from trade._context.sessions import speaking
+from trade._protocol.codec import Codec
+from trade._protocol.keys import Address
+from trade._protocol.messages import EMPTY_ARGUMENTS, UNREADABLE, Call, ErrorInfo, Reply, ServiceInfo, Status
+from trade._protocol.remote_errors import unpack_error
+from trade._protocol.schema import read_schema
+from trade._protocol.schema_types import type_from_schema
+from trade._registry.registry import Record
+from trade._services.arguments import encode_arguments, encode_call, given
+from trade._services.local_service import LocalService
+from trade._services.serial_queue import Serial, Turn
+from trade._telemetry.spans import traceable
+from trade._threads.thread_pool import Hands
+from trade.errors import (
+    Busy,
+    Cancelled,
+    ConfigurationError,
+    ContainerLost,
+    DeadlineExceeded,
+    InvalidResult,
+    LockLost,
+    OutcomeUnknown,
+    RemoteError,
+    ServiceGone,
+)
+
+_logger = logging.getLogger("trade")
+
+_decode_error: Final = msgspec.msgpack.Decoder(ErrorInfo).decode
+
+
+_Taken = bytes | tuple[tuple[Any, ...], dict[str, Any]]
+"""The arguments of a strict call, and those of one that goes straight through."""
+
+
+class LocalTarget:
+    """A service of this container: called directly, with the validation and the copies a wire would make."""
+
+    def __init__(
+        self,
+        service: LocalService,
+        record: Record,
+        codec: Codec,
+        own: Address,
+        session: str,
+        new_id: Callable[[], int],
+        hands: Hands,
+    ) -> None:
+        self._service = service
+        self._record = record
+        self._hands = hands
+        self._thread_name = f"trade-run-{service.label}"
+        self._codec = codec
+        self._label = service.label
+        self.is_stop = service.effect == "stop"
+        self._own = own
+        self._identity = own.identity
+        self._session = session
+        self._new_id = new_id
+
+    def call(self, args: tuple[Any, ...], kwargs: dict[str, Any], deadline_s: float | None) -> Any:
+        """A call that begins now; most inherit nothing and wait for nothing, and need no request."""
+        inherits = running.get() is not None or speaking.get() is not None or holding.get() or handed_down
+        if inherits or self._service.serial is not None:
+            return self.invoke(args, kwargs, new_request(deadline_s))
+        expires_ns = None if self.is_stop else monotonic_ns() + in_ns(deadline_s)
+        context = CallContext(self._new_id(), self._label, self._identity, self._session, expires_ns)
+        if not self._service.strict:
+            return self._service.call(args, kwargs, context)
+        taken = self._taken(args, kwargs)
+        self._check_time(expires_ns, deadline_s or DEFAULT_DEADLINE_S)
+        return self._copied(taken, context)
+
+    def invoke(self, args: tuple[Any, ...], kwargs: dict[str, Any], request: Request) -> Any:
+        """A call that was asked for already."""
+        taken = self._taken(args, kwargs) if self._service.strict else (args, kwargs)
+        if self._service.serial is None:
+            return self._run(taken, request, None)
+        return self._take_turn(self._service.serial, taken, request, None)
+
+    def begin(self, args: tuple[Any, ...], kwargs: dict[str, Any], request: Request, run: Run, *, here: bool) -> None:
+        """The same on a thread of its own, or on this one (``here``), with the arguments as they are now."""
+        service = self._service
+        taken = self._taken(args, kwargs) if service.strict else (args, kwargs)
+
+        def report(_: Ongoing, value: Any) -> None:
+            run.note_progress(service.signature.copy_progress(service.label, value) if service.strict else value)
+
+        ongoing = Ongoing(service, self._identity, None, report)
+        run.on_cancel(ongoing.cancel)
+        if service.serial is None:
+            outcome = partial(self._run, taken, request, ongoing)
+        else:
+            outcome = partial(self._take_turn, service.serial, taken, request, ongoing)
+        if here:
+            run.end(outcome)
+        else:
+            self._hands.begin(partial(run.end, outcome), self._thread_name)
+
+    def _taken(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> bytes:
+        """The arguments as they are now, whatever becomes of them."""
+        return encode_arguments(self._codec, self._service.info, self._service.label, args, kwargs)
+
+    def _take_turn(self, serial: Serial, taken: _Taken, request: Request, ongoing: Ongoing | None) -> Any:
+        if serial.mine:
+            return self._run(taken, request, ongoing)
+        turn = Turn()
+        if ongoing is not None:
+            ongoing.on_cancel(lambda: serial.drop(turn))
+        if not serial.enter(turn, patience_s((request.deadline_ns - monotonic_ns()) / 1e9)):
+            if ongoing is not None and ongoing.cancelled:
+                raise Cancelled(service=self._service.label)
+            raise DeadlineExceeded(service=self._service.label, deadline_s=request.deadline_s)
+        try:
+            with serial.held():
+                return self._run(taken, request, ongoing)
+        finally:
+            serial.leave()
+
+    def _run(self, taken: _Taken, request: Request, ongoing: Ongoing | None) -> Any:
+        service = self._service
+        if ongoing is not None and ongoing.cancelled:
+            raise Cancelled(service=service.label)
+        context = self._context(request, ongoing)
+        try:
+            return service.call(*taken, context) if isinstance(taken, tuple) else self._copied(taken, context)
+        except LockLost as lost:
+            request.refused(self._own, lost)
+            raise
+
+    def _context(self, request: Request, ongoing: Ongoing | None) -> CallContext:
+        expires_ns = None if self.is_stop else request.deadline_ns
+        self._check_time(expires_ns, request.deadline_s)
+        behalf, session = None, self._session
+        if request.inherited is not None:
+            behalf, client = request.presence(self._record, self._own)
+            session = client or session
+        call_id, chain = self._new_id(), request.chain
+        return CallContext(call_id, self._label, self._identity, session, expires_ns, chain, ongoing, behalf)
+
+    def _check_time(self, expires_ns: int | None, deadline_s: float) -> None:
+        if expires_ns is not None and monotonic_ns() >= expires_ns:
+            raise DeadlineExceeded(service=self._label, deadline_s=deadline_s)
+
+    def _copied(self, raw: bytes, context: CallContext) -> Any:
+        service = self._service
+        try:
+            return service.signature.copy_result(service.label, service.run(raw, context))
+        except Exception as error:  # whatever a provider raises
+            if not service.signature.has_secrets:
+                raise
+            masked = unpack_error(service.failure(error, raw), service.label)
+        raise masked  # as it would come over the wire: without what is secret
+
+
+class RemoteTarget:
+    """A service of another container, with everything about calling it that can be decided beforehand."""
+
+    def __init__(self, record: Record, caller: Caller, codec: Codec, known: ServiceInfo | None = None) -> None:
+        """``known`` describes the result, if that is not to be what the callee says of it."""
+        address, key = record.key.address, record.key
+        self._label = record.label
+        self._record = record
+        self._info: ServiceInfo = record.info
+        self._codec = codec
+        self._caller = caller
+        self._peer: Peer = caller.peer(address)
+        self.is_stop = record.info.effect == "stop"
+        self._publisher = caller.publishers.get(address, key.domain, key.provider, stop=self.is_stop)
+        self._clock = caller.publishers.get(address, DOMAIN, PROVIDER, stop=False)
+        self._decode = result_decoder(codec, known or record.info)
+        self._decode_any = codec.decoder(Any)
+        self._traceable = traceable(key)
+
+    def call(self, args: tuple[Any, ...], kwargs: dict[str, Any], deadline_s: float | None) -> Any:
+        """A call that begins now."""
+        return self.invoke(args, kwargs, new_request(deadline_s))
+
+    def invoke(self, args: tuple[Any, ...], kwargs: dict[str, Any], request: Request) -> Any:
+        """A call that was asked for already."""
+        values = self._values(args, kwargs, request)
+        if not self._may_go:
+            reply = self._ask(self._clock, CLOCK, EMPTY_ARGUMENTS, None, request)
+            if reply.status != Status.OK:
+                raise self._not_begun(reply, request)
+        reply = self._ask(self._publisher, self._info.name, values, self._expiry(request), request)
+        return self._unpack(reply, request)
+
+    def begin(
+        self,
+        args: tuple[Any, ...],
+        kwargs: dict[str, Any],
+        request: Request,
+        run: Run,
+        *,
+        here: bool,  # noqa: ARG002 - it runs elsewhere
+    ) -> None:
+        """The same without waiting; the outcome goes into the run."""
+        values = self._values(args, kwargs, request)
+
+        def go() -> None:
+            if run.cancelling:
+                run.fail(Cancelled(service=self._label))
+                return
+            call_id = self._start(
+                self._publisher, self._info.name, values, self._expiry(request), request, finish, note
+            )
+            run.on_cancel(lambda: self._caller.cancel(self._peer, call_id, self._label, request.deadline_ns))
+
+        def note(reply: Reply) -> None:
+            try:
+                run.note_progress(self._decode_any(reply.body))
+            except Exception as bad:  # noqa: BLE001 - the bytes are anything
+                _logger.debug("%s said something of its progress that cannot be read: %s", self._label, bad)
+
+        def finish(reply: Reply) -> None:
+            run.end(lambda: self._unpack(reply, request))
+
+        def clock_heard(reply: Reply) -> None:
+            go() if reply.status == Status.OK else run.fail(self._not_begun(reply, request))
+
+        if self._may_go:
+            go()
+        else:
+            self._start(self._clock, CLOCK, EMPTY_ARGUMENTS, None, request, clock_heard)
+
+    @property
+    def _may_go(self) -> bool:
+        """Whether nothing need be asked first."""
+        return self.is_stop or self._peer.clock_known
+
+    def _values(self, args: tuple[Any, ...], kwargs: dict[str, Any], request: Request) -> Any:
+        """The arguments, for a message that is made now; as bytes, checked already, for one that comes later."""
+        if self.is_stop:
+            request.ignore_outer_deadline()
+        elif request.deadline_s <= 0:
+            raise DeadlineExceeded(service=self._label, deadline_s=request.deadline_s)
+        if self._may_go:
+            return given(self._info, self._label, args, kwargs)
+        return Raw(encode_arguments(self._codec, self._info, self._label, args, kwargs))
+
+    def _message(self, call: Call) -> bytes:
+        return encode_call(self._codec, self._info, self._label, call)
+
+    def _expiry(self, request: Request) -> int | None:
+        return None if self.is_stop else self._peer.expiry_ns(request.deadline_ns)
+
+    def _ask(self, publisher: Any, service: str, args: Any, expires_ns: int | None, request: Request) -> Reply:
+        chain = request.chain
+        behalf, session = request.presence(self._record, self._caller.own)
+        return self._caller.ask(
+            self._peer, publisher, service, args, request.deadline_ns, expires_ns, chain, behalf, self._message, session
+        )
+
+    def _start(
+        self,
+        publisher: Any,
+        service: str,
+        args: Any,
+        expires_ns: int | None,
+        request: Request,
+        then: Callable[[Reply], None],
+        on_progress: Callable[[Reply], None] | None = None,
+    ) -> int:
+        peer, deadline_ns, chain = self._peer, request.deadline_ns, request.chain
+        encode = self._message
+        behalf, session = request.presence(self._record, self._caller.own)
+        return self._caller.start(
+            peer, publisher, service, args, deadline_ns, expires_ns, chain, then, on_progress, behalf, encode, session
+        )
+
+    def _unpack(self, reply: Reply, request: Request) -> Any:
+        error = None if reply.status == Status.OK else self._failure(reply, request)
+        spans = self._caller.spans
+        if spans is not None and self._traceable:
+            spans.asked(reply.id, self._label, request, error)
+        if error is not None:
+            request.refused(self._peer.address, error)
+            raise error
+        try:
+            return self._decode(reply.body)
+        except UNREADABLE as bad:
+            raise InvalidResult(service=self._label, problem=str(bad)) from None
+
+    def _not_begun(self, reply: Reply, request: Request) -> BaseException:
+        """The answer to the question before the call was none: the call itself was never sent."""
+        if reply.status == Status.TIMED_OUT:
+            return DeadlineExceeded(service=self._label, deadline_s=request.deadline_s)
+        if reply.status == Status.LOST:
+            return self._gone()
+        return self._failure(reply, request)
+
+    def _gone(self) -> BaseException:
+        if self._caller.closed:
+            return container_closed(self._caller.own)
+        reason = f"container {self._peer.address.container} has ended, restarted or cannot be reached"
+        return ServiceGone(service=self._label, reason=reason)
+
+    def _failure(self, reply: Reply, request: Request) -> BaseException:
+        container = self._peer.address.container
+        match reply.status:
+            case Status.ERROR:
+                error = self._error(reply)
+                if self._caller.leaving and isinstance(error, Cancelled):  # as its session has ended
+                    return ContainerLost(service=self._label, container=self._caller.own.container)
+                return error
+            case Status.BUSY:
+                return Busy(service=self._label, container=container)
+            case Status.EXPIRED:
+                return DeadlineExceeded(service=self._label, deadline_s=request.deadline_s)
+            case Status.GONE:
+                return ServiceGone(service=self._label)
+            case Status.TIMED_OUT:
+                return OutcomeUnknown(service=self._label, deadline_s=request.deadline_s)
+            case Status.UNSENT:
+                return self._gone()
+            case Status.LOST:
+                return ContainerLost(service=self._label, container=container)
+            case _:
+                return ContainerLost(service=self._label, container=self._caller.own.container)
+
+    def _error(self, reply: Reply) -> BaseException:
+        try:
+            return unpack_error(_decode_error(reply.body), self._label)
+        except UNREADABLE as bad:
+            return RemoteError(service=self._label, type_name="an error that cannot be read", message=str(bad))
+
+
+def result_decoder(codec: Codec, info: ServiceInfo) -> Callable[[Any], Any]:
+    """A decoder for the result, as typed as its description allows."""
+    try:
+        return codec.decoder(type_from_schema(read_schema(info.result_schema), info.types))
+    except Exception as bad:  # noqa: BLE001 - a schema from elsewhere may be anything
+        _logger.debug("the result of %s stays plain data: %s", info.name, bad)
+        return codec.decoder(Any)
+
+
+def container_closed(own: Address) -> ConfigurationError:
+    """What every use of a closed container raises."""
+    return ConfigurationError(where=own.container, problem="this container is closed; start another one")

@@ -1,0 +1,135 @@
+"""Where calls lead: what was looked up once for a handle is kept until something about it changes."""
+
+from typing import Final
+
+from trade._audit.events import Audit
+from trade._calls.caller import Caller
+from trade._calls.handle import Handle
+from trade._calls.target import LocalTarget, RemoteTarget, container_closed
+from trade._container.system import DOMAIN, ESTOPS, PROVIDER
+from trade._protocol.codec import Codec
+from trade._protocol.keys import Address, ServiceKey
+from trade._protocol.messages import ServiceInfo
+from trade._registry.registry import Change, Record, Registry, gone_to
+from trade._security.authorizer import Access
+from trade._services.providers import Providers
+from trade._threads.thread_pool import Hands
+from trade._transport.base import ChannelClosed
+from trade.errors import AccessDenied, ServiceGone
+
+Target = LocalTarget | RemoteTarget
+
+_PATIENCE_S: Final = 1.0
+"""How long a call waits for the registry to hear of a handle that came by message before its registry entry did."""
+
+
+class Targets:
+    """What a container may call, and how, by service."""
+
+    def __init__(
+        self,
+        own: Address,
+        session: str,
+        access: Access,
+        registry: Registry,
+        providers: Providers,
+        caller: Caller,
+        codec: Codec,
+        audit: Audit,
+    ) -> None:
+        self._audit = audit
+        self._own = own
+        self._session = session
+        self._access = access
+        self._registry = registry
+        self._providers = providers
+        self._caller = caller
+        self._codec = codec
+        self._hands = Hands()
+        self._closed = False
+        self.known: Final[dict[ServiceKey, Target]] = {}
+        """Looked up already, and allowed."""
+
+    def look_up(self, handle: Handle) -> Target:
+        """The target of a handle, known from now on.
+
+        Raises:
+            ServiceGone: it is not there, or not any more.
+            AccessDenied: the policy does not let this container call it.
+            ConfigurationError: the container is closed.
+        """
+        key, policy = handle.key, self._access.policy
+        known = self._registry.get(key) is not None or handle.last_record is not None or self._registry.removed(key)
+        if not known:
+            self._registry.wait_for(lambda: self._registry.get(key) is not None, _PATIENCE_S)
+        record = self._registry.get(key)
+        if record is not None:
+            self._require(record)
+        target = None if record is None else self._make(record)
+        if target is None:
+            raise self.gone(handle)
+        self.known[key] = target
+        changed = self._registry.get(key) is not record or self._access.policy is not policy
+        if self._closed or changed:  # it left, or is another one, since we looked
+            self.known.pop(key, None)
+        return target
+
+    def _require(self, record: Record) -> None:
+        key, who = record.key, self._own.identity
+        try:
+            self._access.require_call(who, key.domain, key.name, record.info.effect, record.label)
+        except AccessDenied as denied:
+            self._audit.refused(record.label, denied, who=who, session=self._session)
+            raise
+
+    def _make(self, record: Record) -> Target | None:
+        if not record.local:
+            try:
+                return RemoteTarget(record, self._caller, self._codec, self._our_own(record))
+            except ChannelClosed:  # closed meanwhile
+                raise container_closed(self._own) from None
+        service = self._providers.lookup(f"{record.key.domain}/{record.key.provider}", record.key.name)
+        if service is None:  # deregistered since we looked
+            return None
+        return LocalTarget(service, record, self._codec, self._own, self._session, self._caller.new_id, self._hands)
+
+    def _our_own(self, record: Record) -> ServiceInfo | None:
+        """How this container describes a function of the middleware that another one has, too.
+
+        What it answers is known here, whatever that one says of it: it may be written in another language.
+        """
+        key = record.key
+        if key.domain != DOMAIN or key.provider not in (PROVIDER, ESTOPS):
+            return None
+        service = self._providers.services_at(f"{DOMAIN}/{key.provider}").get(key.name)
+        return None if service is None else service.info
+
+    def gone(self, handle: Handle) -> ServiceGone:
+        """Why a handle leads nowhere."""
+        address = handle.key.address
+        if moved_to := self._registry.moved_to(handle.key):
+            return gone_to(handle.label, moved_to)
+        if self._registry.is_alive(address):
+            reason = "its provider was deregistered" if self._registry.removed(handle.key) else "it is not known here"
+        else:
+            reason = f"container {address.container} has ended, restarted or cannot be reached"
+        return ServiceGone(service=handle.label, reason=reason)
+
+    def changed(self, change: Change) -> None:
+        """Told by the registry: calls to what left must fail at once."""
+        for record in (*change.left, *change.replaced):
+            self.known.pop(record.key, None)
+        for record in change.left:
+            key = record.key
+            if not record.local and (self._registry.removed(key) or not self._registry.is_alive(key.address)):
+                self._caller.publishers.forget(key.address, key.domain, key.provider)
+
+    def judge_anew(self) -> None:
+        """The policy is another one."""
+        self.known.clear()
+
+    def close(self) -> None:
+        """Keep none from now on."""
+        self._closed = True
+        self._hands.close()
+        self.known.clear()

@@ -1,0 +1,160 @@
+"""How a container comes into its system: where it listens, whom it dials, with which credentials, what it bridges."""
+
+import contextlib
+import logging
+import socket
+from collections.abc import Sequence
+from typing import Any, Final
+
+from trade._discovery.host_folder import Rendezvous
+from trade._security.certificate_expiry import Ending
+from trade._security.certificates import Certificate
+from trade._security.policy_file import read_policy
+from trade._security.zenoh_acl import acl, crossings
+from trade._settings import Settings
+from trade._transport.credentials import user_secret
+from trade._transport.endpoints import Endpoint, dialled_from_here, loopback_interface, with_free_port
+from trade._transport.port_guard import PortGuard
+from trade._transport.zenoh import ZenohTransport, configuration
+from trade._transport.zenoh_links import Links
+from trade.errors import ConfigurationError
+
+__all__ = ["join"]
+
+_logger = logging.getLogger("trade")
+_PORTS_TRIED: Final = 4
+
+
+def join(settings: Settings, leaving: contextlib.ExitStack) -> ZenohTransport:
+    """Open the main session; what has to be undone when the container leaves goes onto the stack."""
+    networks, certificate = _networks(settings.bridge), settings.certificate()
+    transport = _join(settings, certificate, networks, leaving)
+    try:
+        _check_bridged(settings.bridge, transport.links)
+    except ConfigurationError:
+        transport.close()
+        raise
+    guard = PortGuard((own.port for own in transport.links.listen), transport.links.count)
+    leaving.callback(guard.close)
+    if certificate is not None:
+        leaving.callback(Ending(certificate).close)
+    return transport
+
+
+def _join(
+    settings: Settings, certificate: Certificate | None, networks: list[list[str]], leaving: contextlib.ExitStack
+) -> ZenohTransport:
+    anywhere_here = Endpoint("tcp" if certificate is None else "tls", "127.0.0.1", 0)
+    wanted = [Endpoint.read(endpoint) for endpoint in settings.listen] or [anywhere_here]
+    for _ in range(0 if all(endpoint.port for endpoint in wanted) else _PORTS_TRIED):
+        with contextlib.suppress(ConfigurationError):  # somebody else took the free port first
+            return _join_at(settings, certificate, _chosen(wanted), networks, leaving)
+    return _join_at(settings, certificate, _chosen(wanted), networks, leaving)
+
+
+def _chosen(wanted: list[Endpoint]) -> list[str]:
+    return [str(with_free_port(endpoint)) for endpoint in wanted]
+
+
+def _join_at(
+    settings: Settings,
+    certificate: Certificate | None,
+    listen: list[str],
+    networks: list[list[str]],
+    leaving: contextlib.ExitStack,
+) -> ZenohTransport:
+    connect, certified = list(settings.connect), certificate is not None
+    if settings.bridge or not connect:
+        rendezvous = Rendezvous(settings.system)
+        leaving.callback(rendezvous.leave)
+        connect += _of_our_kind(rendezvous.enter(_nearest(listen)), certified)
+    if settings.insecure_lan and not certified:
+        _logger.warning("TRADE_INSECURE_LAN: %s is open to its network, unencrypted", listen)
+    return ZenohTransport(
+        configuration(
+            namespace=settings.system,
+            listen=listen,
+            connect=connect,
+            credentials=None if certified else settings.credentials or user_secret(),
+            certificate=certificate,
+            bridge=networks,
+            rules=_rules(settings, networks),
+        )
+    )
+
+
+def _rules(settings: Settings, networks: list[list[str]]) -> dict[str, Any]:
+    """The transport's access rules: who may what, if certificates tell who is who, and what crosses a gateway."""
+    policy = read_policy(settings.policy) if settings.policy and settings.tls else None
+    if policy is None and settings.exports is None:
+        return {}
+    if policy is not None and (patterns := policy.patterns()):
+        _logger.warning(
+            "%s: %s: the transport knows names in full only; whoever such a pattern stands for can send nothing",
+            policy.source,
+            ", ".join(patterns),
+        )
+    crossing = None
+    if settings.exports is not None:
+        known = crossings(settings.exports, settings.stream_hz)
+        crossing = {tuple(interfaces): known[interfaces[0]] for interfaces in networks}
+    return acl(policy, namespace=settings.system, networks=crossing)
+
+
+def _of_our_kind(endpoints: list[str], certified: bool) -> list[str]:
+    """Those of them that we can link to: either all of a system have certificates, or none has."""
+    ours = [endpoint for endpoint in endpoints if (Endpoint.read(endpoint).protocol == "tls") == certified]
+    if others := [endpoint for endpoint in endpoints if endpoint not in ours]:
+        kinds = ("without certificates", "with certificates")
+        _logger.warning(
+            "%s: %s, and this container is %s: they cannot be linked; set TRADE_TLS for all of the system or for none",
+            ", ".join(others),
+            kinds[not certified],
+            kinds[certified],
+        )
+    return ours
+
+
+def _nearest(listen: list[str]) -> str:
+    """Where others of this host dial: the loopback interface if we listen there."""
+    endpoints = sorted(map(Endpoint.read, listen), key=lambda endpoint: not endpoint.loopback)
+    return dialled_from_here(endpoints[0])
+
+
+def _networks(bridge: Sequence[str]) -> list[list[str]]:
+    """The interfaces of each network that a bridge joins; the containers of its own host belong to the first.
+
+    Raises:
+        ConfigurationError: there is no such interface.
+    """
+    known = [name for _, name in socket.if_nameindex()] if bridge else []
+    for name in bridge:
+        if name not in known:
+            problem = f"this host has no such interface, or not yet; it has {', '.join(known)}"
+            raise ConfigurationError(where=f"bridge {name}", problem=problem)
+    networks = [[name] for name in dict.fromkeys(bridge)]
+    here = loopback_interface()
+    if networks and here and here not in bridge:
+        networks[0].append(here)
+    return networks
+
+
+def _check_bridged(bridge: Sequence[str], links: Links) -> None:
+    """Raises ConfigurationError: nobody can come in by one of the interfaces.
+
+    An endpoint that does not answer itself may be flooded by strangers. That must not keep a bridge from starting.
+    """
+    if not bridge or any(own.everywhere for own in links.listen):
+        return
+    heard = {str(own): links.interfaces(str(own)) for own in links.listen}
+    silent = [endpoint for endpoint, names in heard.items() if not names]
+    if silent:
+        _logger.warning("%s cannot be reached from here: its interface is not checked", ", ".join(silent))
+        return
+    for name in bridge:
+        if not any(name in names for names in heard.values()):
+            problem = (
+                f"nothing listens on it, only on {', '.join(map(str, links.listen))}; let TRADE_LISTEN name an address "
+                f"of {name}, too (in a gateway file: listen), or {links.listen[0].protocol}/0.0.0.0:PORT"
+            )
+            raise ConfigurationError(where=f"bridge {name}", problem=problem)

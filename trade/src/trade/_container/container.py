@@ -1,0 +1,339 @@
+"""One participant: starts, joins, hosts providers, looks up, leaves. Ties the other modules together."""
+
+import itertools
+import secrets
+import threading
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any, Final, Literal
+
+from trade._calls.handle import Handle
+from trade._calls.run import Run
+from trade._calls.target import container_closed
+from trade._calls.target_cache import Target
+from trade._container.assembly import Parts
+from trade._container.builtin_services import OwnServices
+from trade._container.federating import Bordering
+from trade._container.migrating import Moving
+from trade._container.motion_control import Guarding
+from trade._container.registering import Hosting
+from trade._container.streaming import Streaming
+from trade._container.system import ContainerInfo, System
+from trade._container.tracing import Tracing
+from trade._context.call_context import running
+from trade._context.outgoing import new_request
+from trade._context.sessions import Session
+from trade._counters import Measure
+from trade._discovery.dialer import Reach
+from trade._estop.services import EstopServices
+from trade._protocol.keys import Address, ServiceKey, alive_key, as_chunk
+from trade._registry.registry import Record
+from trade._security.authorizer import Access, verb_of
+from trade._settings import Settings
+from trade._threads import fork_guard
+from trade._transport.base import ChannelClosed, Transport
+from trade.errors import ConfigurationError
+
+__all__ = ["Container"]
+
+_STOPPING_S: Final = 2.0
+
+
+class Container(Hosting, Moving, Streaming, Tracing, Guarding, Bordering):
+    """A participant of a system; most programs use the default one through the functions of ``trade``.
+
+    Joins on construction. A context manager; ``close()`` leaves and is idempotent.
+
+    Raises:
+        ConfigurationError: a setting is wrong, the endpoint is taken, or this process was forked from one that has a
+            container.
+    """
+
+    def __init__(self, settings: Settings | None = None, *, transport: Transport | None = None) -> None:
+        fork_guard.refuse_after_fork()
+        fork_guard.note_start()
+        self.settings = settings or Settings.read()
+        """What it was started with."""
+        self.address = Address(self.settings.identity, self.settings.container, secrets.token_hex(6))
+        self.session = str(self.address)
+        self.system: Final = System(lambda: self)
+        """Its own switches: who it is linked to, and whether it lets itself be found."""
+        self.access = Access(self.settings.policy, certified=self.settings.tls is not None)
+        """What the policy means for it."""
+        self._clients = itertools.count(1)
+        self._closing = threading.RLock()
+        self._closed = False
+        self._parts = Parts(self, self.settings, transport)
+        self._known = self._parts.targets.known
+        self.locking = self._parts.locking
+        """Its locks on what others offer, and on what it offers itself."""
+        self.borrowed = self._parts.borrowed
+        """What is locked in other systems behind its grants."""
+        self.withdrawn: Final = self._parts.withdrawn
+        """What was taken off from elsewhere and can be offered again."""
+        self.making: Final = self._parts.making
+        """What it made for others."""
+        self.arriving: Final = self._parts.arriving
+        """What comes to it from elsewhere, or from before."""
+        self.meter: Final = self._parts.meter
+        """How busy it is."""
+        self.terminating: Final = self._parts.terminating
+        """Its end, if others want it."""
+        self._parts.appear(OwnServices(self._parts, self), EstopServices(self._parts.estopping))
+        fork_guard.live.add(self)
+
+    def load_policy(self, path: Path | str) -> None:
+        """Go by another access policy, or by the same file as it is now; calls under way go on.
+
+        A container that was started with one (`Settings.policy`) reads it again by itself when its files change, and
+        so it does with what is loaded here.
+
+        What may no longer be offered leaves the registry, and locks that may no longer be held are lost.
+
+        Raises:
+            ConfigurationError: it is wrong, and says where; what was loaded before stays.
+        """
+        self._check_open()
+        self.access.load(Path(path))
+        self._parts.audit.changed("policy loaded", str(path), running.get())
+        self._parts.judge_anew()
+
+    def note_change(self, what: str, about: str = "") -> None:
+        """Have a change of configuration in the record of what happened here, if one is kept (`Settings.audit`).
+
+        Args:
+            what: in a few words.
+            about: which file, which device.
+        """
+        self._parts.audit.changed(what, about, running.get())
+
+    def note_asked(
+        self,
+        what: str,
+        about: str = "",
+        *,
+        kind: Literal["call", "stop", "refused"] = "call",
+        who: str = "",
+        outcome: str = "ok",
+        why: str = "",
+        took_ns: int = 0,
+    ) -> None:
+        """Have in the record, if one is kept, what somebody asked of a program that speaks for him: an agent's tool.
+
+        Args:
+            what: in a few words.
+            about: which service; no arguments, as these may be secret.
+            kind: of the row.
+            who: whom it speaks for, where that is another one each time; else it is this container.
+            outcome: ``ok``, or the type of the error.
+            why: what the error says.
+            took_ns: how long it took.
+        """
+        own = self.address
+        self._parts.audit.note(
+            kind,
+            what,
+            about=about,
+            who=who or own.identity,
+            session=str(own),
+            outcome=outcome,
+            why=why,
+            took_ns=took_ns,
+        )
+
+    def measured_by(self, tell: Callable[[], Iterable[Measure]]) -> None:
+        """Have more in this container's metrics (`Settings.metrics`): it is called whenever somebody looks.
+
+        Args:
+            tell: gives numbers that are known already, without waiting for anything.
+        """
+        self._parts.measured.append(tell)
+
+    @property
+    def metrics_port(self) -> int:
+        """Where its metrics are; 0: nowhere."""
+        return self._parts.metrics_port
+
+    # --- looking up
+
+    def addresses(self) -> list[Address]:
+        """Where the containers of the system are, this one included."""
+        return [state.address for state in self._parts.registry.containers()]
+
+    def containers(self) -> list[ContainerInfo]:
+        """The containers of the system, this one included."""
+        self._check_open()
+        infos: list[ContainerInfo] = []
+        for state in self._parts.registry.containers():
+            records = [record for entry in list(state.providers.values()) for record in entry.records]
+            first = records[0] if records else None
+            infos.append(
+                ContainerInfo(
+                    name=state.address.container,
+                    identity=state.address.identity,
+                    epoch=state.address.epoch,
+                    host=first.host if first else "",
+                    pid=first.pid if first else 0,
+                    providers=len(state.providers),
+                    services=len(records),
+                    protocol=state.protocol,
+                )
+            )
+        return infos
+
+    @property
+    def reach(self) -> Reach:
+        """Whom it is linked to; raises ConfigurationError on a transport that has no such switches."""
+        self._check_open()
+        if self._parts.reach is None:
+            raise ConfigurationError(problem="this container's transport cannot be linked to others while it runs")
+        return self._parts.reach
+
+    def handle(self, key: ServiceKey) -> Handle:
+        """A handle of a service whose key is known."""
+        return Handle(self, key, self._parts.registry.get(key))
+
+    def has(self, key: ServiceKey) -> bool:
+        """Whether the registry has the service now."""
+        return self._parts.registry.get(key) is not None
+
+    def record(self, handle: Handle) -> Record:
+        """What is known of a service; raises ServiceGone if nothing ever was."""
+        record = self._parts.registry.get(handle.key) or handle.last_record
+        if record is None:
+            raise self._parts.targets.gone(handle)
+        return record
+
+    # --- calling
+
+    def invoke(self, handle: Handle, args: tuple[Any, ...], kwargs: dict[str, Any], deadline_s: float | None) -> Any:
+        """Call a service and wait; what ``handle(...)`` does."""
+        outer = running.get()
+        if outer is not None and outer.ongoing is not None:
+            return self._begin(handle, args, kwargs, deadline_s, here=True).result()
+        target = self._known.get(handle.key)
+        if target is not None:
+            return target.call(args, kwargs, deadline_s)
+        request = new_request(deadline_s)
+        return self._look_up(handle).invoke(args, kwargs, request)
+
+    def begin(self, handle: Handle, args: tuple[Any, ...], kwargs: dict[str, Any], deadline_s: float | None) -> Run:
+        """Call a service without waiting; what ``handle.start(...)`` does."""
+        return self._begin(handle, args, kwargs, deadline_s, here=False)
+
+    def _begin(
+        self, handle: Handle, args: tuple[Any, ...], kwargs: dict[str, Any], deadline_s: float | None, *, here: bool
+    ) -> Run:
+        """The same; what is made inside another call ends with that."""
+        request, run, outer = new_request(deadline_s), Run(handle), running.get()
+        target = self._known.get(handle.key) or self._look_up(handle)
+        alone = outer is None or outer.cancelled or target.is_stop  # one that was cancelled may look, and stop
+        ongoing = None if outer is None or alone else outer.ongoing
+        forget = _nothing if ongoing is None else run.end_with(ongoing)
+        try:
+            target.begin(args, kwargs, request, run, here=here)
+        except BaseException:
+            forget()
+            raise
+        return run
+
+    def _look_up(self, handle: Handle) -> Target:
+        self._check_open()
+        return self._parts.targets.look_up(handle)
+
+    # --- being
+
+    def open_session(self, client: str, *, system: str = "") -> Session:
+        """A presence for one client of a program that acts for many: a page, a connection (S03).
+
+        Inside ``with container.open_session("page"):`` calls and locks are the client's: when it is closed, what the
+        client set moving stops and its locks fall, and nothing else does.
+
+        Args:
+            client: a word for it; others see ``identity/container/epoch/client.number``.
+            system: the other system that it is of, if any; others are told ``system/client via identity``.
+
+        Raises:
+            ConfigurationError: the container is closed.
+        """
+        self._check_open()
+        whose = f"{as_chunk(system)[:20]}:" if system else ""
+        name = f"{self.address}/{whose}{as_chunk(client)[:40]}.{next(self._clients)}"
+        try:
+            presence = self._parts.transport.appear(alive_key(name))
+        except ChannelClosed:  # closed by another thread meanwhile
+            raise container_closed(self.address) from None
+        return Session(self.address, name, presence, self._parts.session_ended)
+
+    @property
+    def name(self) -> str:
+        """The container's name."""
+        return self.address.container
+
+    def asked_for(self, handle: Handle) -> tuple[str, tuple[str, ...]]:
+        """The verb that callers of a service need over its group, and the roles of the policy here that have it."""
+        key, policy = handle.key, self.access.policy
+        verb = verb_of(key.domain, key.name, handle.record.info.effect)
+        return verb, policy.roles_with(verb, key.domain) if policy is not None and verb else ()
+
+    def require_call(self, who: str, handle: Handle) -> None:
+        """Raises AccessDenied: somebody for whom this container acts may not call that service."""
+        key, record = handle.key, handle.record
+        self.access.require_call(who, key.domain, key.name, record.info.effect, record.label)
+
+    @property
+    def dropped_messages(self) -> int:
+        """Messages that were malformed or of another protocol version."""
+        return self._parts.dropped_messages
+
+    @property
+    def catching_up(self) -> bool:
+        """Whether it is asking others for what it may have missed."""
+        return self._parts.watch.busy
+
+    def healthy(self) -> bool:
+        """Whether it can still take a call now; what feeds hardware watchdogs asks this."""
+        return not self._closed and self._parts.dispatcher.draining
+
+    @property
+    def closed(self) -> bool:
+        """Whether it was closed."""
+        return self._closed
+
+    def _check_open(self) -> None:
+        fork_guard.refuse_after_fork()
+        if self._closed:
+            raise container_closed(self.address)
+
+    def close(self) -> None:
+        """Leave: services, handles and notifications end; nothing stays behind. Idempotent.
+
+        Stops that are under way are waited for, up to 2 s; other calls end with ContainerLost.
+        """
+        if fork_guard.forked():
+            return
+        with self._closing:  # who comes second waits until it is done
+            if self._closed:
+                return
+            self.locking.keeper.close()  # gives back what it holds, while it can still be heard
+            self._parts.caller.finish_stops(_STOPPING_S)
+            self._closed = True
+            self._parts.close()
+
+    def abandon(self) -> None:
+        """In a forked child: everything belongs to the parent; touch nothing, refuse everything."""
+        self._closed = True
+        self._parts.abandon()
+
+    def __enter__(self) -> "Container":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def __repr__(self) -> str:
+        return f"<Container {self.address} of {self.settings.system}>"
+
+
+def _nothing() -> None:
+    pass

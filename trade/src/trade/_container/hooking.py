@@ -1,0 +1,148 @@
+"""The part of a container that attaches hooks: call this before that service, or after it, wherever that runs."""
+
+import contextlib
+import logging
+from typing import Final
+
+from trade._calls.handle import Bound, Handle
+from trade._calls.run import Run
+from trade._container.notifying import Notifying
+from trade._container.system import DOMAIN, PROVIDER
+from trade._hooks.hook import HookInfo, Side
+from trade._notifications.notification import Notification
+from trade._protocol.keys import ServiceKey
+from trade._registry.constraints import Constraint, where
+from trade.errors import AccessDenied, ConfigurationError, ContainerLost, NoSuchHook, ServiceGone, TradeError
+
+_logger = logging.getLogger("trade")
+
+
+class Hook:
+    """A hook that this container has attached; it ends when it is detached or this container does."""
+
+    def __init__(self, home: "Hooking", name: str, side: Side, target: Handle | Constraint, call: Handle) -> None:
+        self.id: Final = name
+        """Names it in the whole system."""
+        self.told_as: Final = f"hook {name}"
+        self.side: Final[Side] = side
+        self.target: Final = target
+        self.call: Final = call
+        self._home = home
+        self._later: Notification | None = None
+        self._attached = True
+
+    def begin(self) -> None:
+        """Attach it where services are now, and where containers come later. Raises what the first of them does."""
+        if isinstance(self.target, Handle):
+            self._attach(
+                self._home.handle(ServiceKey(self.target.key.address, DOMAIN, PROVIDER, "attach_hook"))
+            ).result()
+            return
+        everywhere = where(name="attach_hook", group=DOMAIN)
+        runs = [self._attach(handle) for handle in self._home.services(everywhere)]
+        errors = [error for error in (run.exception() for run in runs) if error is not None]
+        refusal = next((error for error in errors if isinstance(error, AccessDenied | ConfigurationError)), None)
+        if refusal is not None:
+            self.detach()
+            raise refusal
+        self._later = self._home.joined(everywhere, self._join, existing=True)  # to be told twice does no harm
+
+    def _attach(self, handle: Handle) -> Run:
+        if isinstance(self.target, Handle):
+            return handle.start(self.id, self.side, self.call, handle=self.target)
+        return handle.start(self.id, self.side, self.call, constraint=self.target)
+
+    def _join(self, handle: Handle) -> None:
+        if not self._attached:
+            return
+        try:
+            self._attach(handle).result()
+            if not self._attached:  # meanwhile, and perhaps before this got there
+                self._home.handle(ServiceKey(handle.key.address, DOMAIN, PROVIDER, "detach_hook"))(self.id)
+        except (ContainerLost, ServiceGone):  # it has left already
+            _logger.debug("hook %s is not attached in %s, which has ended", self.call.label, handle.container)
+        except TradeError as error:
+            _logger.warning("hook %s is not attached in %s: %s", self.call.label, handle.container, error)
+
+    def infos(self) -> list[HookInfo]:
+        """How it fares, by container."""
+        return [info for info in self._home.hooks() if info.id == self.id]
+
+    def detach(self) -> None:
+        """Call it no more; a call of it under way finishes. Idempotent."""
+        if self._attached:
+            self._attached = False
+            if self._later is not None:
+                self._later.cancel()
+            with contextlib.suppress(NoSuchHook):  # those it was attached to have gone
+                self._home.detach_hook(self.id)
+
+    def __repr__(self) -> str:
+        return f"<Hook {self.call.label} {self.side} {self.target}{'' if self._attached else ', detached'}>"
+
+
+class Hooking(Notifying):
+    """Hooks of this container on services anywhere."""
+
+    def before_service(self, target: Handle | Constraint, call: Handle) -> Hook:
+        """Have a service called before each call of another one, with what that is called with.
+
+        It runs where that one runs and holds its call up, for 0.1 s at most, and together with others 0.25 s. It
+        changes nothing of the call, whatever becomes of it. After three failures in a row it is suspended.
+
+        Args:
+            target: a service, or all that match: those that join later, too. Nothing comes before a stop.
+            call: takes one argument, a `Called`.
+
+        Raises:
+            AccessDenied: the policy does not let this container ``instrument`` the service, or none of those here now.
+            ConfigurationError: nothing comes before a stop; or what is no handle.
+        """
+        return self._hook("before", target, call)
+
+    def after_service(self, target: Handle | Constraint, call: Handle) -> Hook:
+        """Have a service called after each call of another one, with how it ended; before its caller is answered.
+
+        After a stop it is called once that is answered. The rest is as for `before_service`.
+        """
+        return self._hook("after", target, call)
+
+    def _hook(self, side: Side, target: Handle | Constraint, call: Handle) -> Hook:
+        self._check_open()
+        named = f"trade.{side}_service"
+        if not isinstance(target, Handle | Constraint):  # pyright: ignore[reportUnnecessaryIsInstance]
+            raise ConfigurationError(where=named, problem=f"target must be a handle or where(...), not {target!r}")
+        if not isinstance(call, Handle):  # pyright: ignore[reportUnnecessaryIsInstance]
+            rest = "without arguments of its own" if isinstance(call, Bound) else "as it runs where the service does"
+            raise ConfigurationError(where=named, problem=f"call must be a handle, {rest}, not {call!r}")
+        self._require_instrument(target)
+        hook = Hook(self, f"{self.address.epoch}.h{next(self._parts.hook_numbers)}", side, target, call)
+        hook.begin()
+        return hook
+
+    def _require_instrument(self, target: Handle | Constraint) -> None:
+        """Raises AccessDenied: by the policy as it is here, all of these would refuse it."""
+        known = [target] if isinstance(target, Handle) else self.services(target)
+        mine = [one for one in known if one.key.domain != DOMAIN]
+        who = self.address.identity
+        denials = [self.access.denied(who, "instrument", one.key.domain, one.label) for one in mine]
+        denied = next((one for one in denials if one is not None), None)
+        if denied is not None and all(denials):
+            raise denied
+
+    def hooks(self) -> list[HookInfo]:
+        """Every hook in the system, once for each container it is attached in."""
+        self._check_open()
+        found = [info for infos in self._ask_all("hooks") for info in infos]
+        return sorted(found, key=lambda info: (info.container, info.id))
+
+    def detach_hook(self, hook: str) -> None:
+        """End a hook by its id, wherever it is attached and whoever did.
+
+        Raises:
+            NoSuchHook: none has that id.
+            AccessDenied: it is another's, and the policy does not let this container administer the system.
+        """
+        self._check_open()
+        if not any(self._ask_all("detach_hook", hook)):
+            raise NoSuchHook(id=hook)

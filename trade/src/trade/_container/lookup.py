@@ -1,0 +1,150 @@
+"""The part of a container that looks services up, is told of them, and calls them by what they are."""
+
+import asyncio
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+from trade._calls import batch
+from trade._calls.handle import Bound, Handle
+from trade._container.base import Member
+from trade._container.reachability import Sight, look_around
+from trade._container.system import DOMAIN
+from trade._context.call_context import patience_s
+from trade._registry.constraints import Constraint, where
+from trade._registry.registry import Record
+from trade._registry.suggestions import asked_for, no_such_service, too_many_services
+from trade.errors import AccessDenied
+
+
+class Looking(Member):
+    """Finds services here and elsewhere."""
+
+    # --- looking up
+
+    def services(self, constraint: Constraint | None = None) -> list[Handle]:
+        """Handles of all services that match, ordered by group and name; without a constraint, of everything."""
+        self._check_open()
+        wanted = where() if constraint is None else constraint
+        return [Handle(self, record.key, record) for record in self._parts.registry.select(wanted)]
+
+    def find(self, constraint: Constraint, *, wait_s: float = 2.0) -> Handle:
+        """The only service that matches; waits for it to appear.
+
+        Raises:
+            NoSuchService: none within ``wait_s`` seconds.
+            TooManyServices: more than one.
+        """
+        self._check_open()
+        matches: list[Record] = []
+
+        def found() -> bool:
+            matches[:] = self._parts.registry.select(constraint)
+            return bool(matches)
+
+        self.await_services(constraint, found, wait_s)
+        if len(matches) > 1:
+            raise too_many_services(constraint, matches)
+        return Handle(self, matches[0].key, matches[0])
+
+    def await_services(self, constraint: Constraint, ready: Callable[[], bool], wait_s: float) -> None:
+        """Wait until something holds of what the constraint is to match.
+
+        Args:
+            constraint: what was asked for; the error says what there is instead.
+            ready: whether it holds; asked now and after every change.
+            wait_s: how long to wait for it, in seconds.
+
+        Raises:
+            NoSuchService: it does not hold within ``wait_s`` seconds.
+        """
+        wait_s = patience_s(wait_s)
+        if self._parts.registry.wait_for(ready, wait_s):
+            return
+        apart = self._unanswered(wait_s) if len(self.addresses()) == 1 else ()
+        hidden = self.access.hidden(self.address.identity, asked_for(constraint, "group"))
+        raise no_such_service(constraint, self._parts.registry.select(where()), wait_s, apart, hidden)
+
+    def _unanswered(self, wait_s: float) -> Sequence[str]:
+        """Where nobody was found; why is only looked at for who has waited, as it takes half a second for each."""
+        reach = self._parts.reach
+        if wait_s > 0 or reach is None:
+            return self.sight(limit_s=0).unanswered
+        return tuple(f"{endpoint} (TRADE_CONNECT)" for endpoint in reach.configured)
+
+    def sight(self, *, limit_s: float = 3.0) -> Sight:
+        """Whom it has found: what nobody tells is only told by nobody if somebody was there to tell.
+
+        Returns at once when it is `Sight.complete`.
+
+        Args:
+            limit_s: how long to wait for that, in seconds; also if nobody is found. Finding out why there is no link to
+                an endpoint takes up to 3 s more for each.
+        """
+        self._check_open()
+        return look_around(self._parts.registry, self._parts.reach, self.address, self.settings.system, limit_s)
+
+    # --- calling
+
+    def call(self, constraint: Constraint, /, *args: Any, **kwargs: Any) -> Any:
+        """Call the only service that matches. Raises what `find` raises, and what the call does."""
+        return self.find(constraint)(*args, **kwargs)
+
+    def call_all(
+        self, which: Constraint | Iterable[Handle | Bound], /, *args: Any, **kwargs: Any
+    ) -> list[batch.Outcome]:
+        """Call several services at once and wait for all of them.
+
+        Args:
+            which: a constraint (all that match now), or handles; bound calls bring arguments of their own.
+            args: for each.
+            kwargs: for each.
+
+        Returns:
+            An outcome for each, in order; what one raises is its own outcome and stops no other.
+        """
+        return batch.all_outcomes(self._bound(which, args, kwargs))
+
+    def call_sequence(self, calls: Iterable[Handle | Bound], /, *, go_on: bool = False) -> list[batch.Outcome]:
+        """Make calls one after the other.
+
+        Args:
+            calls: bound calls, or handles of services without arguments.
+            go_on: also after an error, at which it stops otherwise.
+
+        Returns:
+            Outcomes of those that ran.
+        """
+        return batch.sequence(self._bound(calls, (), {}), go_on=go_on)
+
+    async def acall(self, constraint: Constraint, /, *args: Any, **kwargs: Any) -> Any:
+        """`call` from asyncio."""
+        handle = await asyncio.to_thread(self.find, constraint)
+        return await handle.acall(*args, **kwargs)
+
+    async def acall_all(
+        self, which: Constraint | Iterable[Handle | Bound], /, *args: Any, **kwargs: Any
+    ) -> list[batch.Outcome]:
+        """`call_all` from asyncio."""
+        return await batch.all_outcomes_async(self._bound(which, args, kwargs))
+
+    async def acall_sequence(self, calls: Iterable[Handle | Bound], /, *, go_on: bool = False) -> list[batch.Outcome]:
+        """`call_sequence` from asyncio."""
+        return await batch.sequence_async(self._bound(calls, (), {}), go_on=go_on)
+
+    def _ask_all(self, name: str, *args: Any) -> list[Any]:
+        """What a function of the middleware's own says in each container; those that leave meanwhile say nothing.
+
+        Raises:
+            AccessDenied: one of them does not allow it.
+        """
+        outcomes = self.call_all(where(name=name, group=DOMAIN), *args)
+        denied = next((outcome.error for outcome in outcomes if isinstance(outcome.error, AccessDenied)), None)
+        if denied is not None:
+            raise denied
+        return [outcome.result for outcome in outcomes if outcome.ok]
+
+    def _bound(
+        self, which: Constraint | Iterable[Handle | Bound], args: tuple[Any, ...], kwargs: dict[str, Any]
+    ) -> list[Bound]:
+        self._check_open()
+        return batch.bound(self.services(which) if isinstance(which, Constraint) else which, args, kwargs)

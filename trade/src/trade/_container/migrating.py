@@ -1,0 +1,85 @@
+"""The part of a container that moves providers, and takes and gives their state."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
+
+from trade._calls.handle import Handle
+from trade._container.lookup import Looking
+from trade._container.system import DOMAIN, PROVIDER
+from trade._protocol.keys import ServiceKey
+from trade._registry.constraints import Constraint
+from trade.errors import NoSuchService, TooManyServices
+
+_LONGEST_S: Final = 45.0
+_HEARD_S: Final = 1.0
+"""How long to wait until its new place is known here."""
+
+
+class Moving(Looking):
+    """Asks the containers that providers are in."""
+
+    def migrate(
+        self, which: Handle | Constraint, *, to: str, args: Sequence[Any] | Mapping[str, Any] | None = None
+    ) -> tuple[Handle, ...]:
+        """Have a provider go on in another container, on this host or another one, with its state.
+
+        Nobody can call it meanwhile, and at no time it is offered twice. What its class gives with ``save_state()`` is
+        given to another object of the class with ``restore_state(state)``; classes without them begin anew. Its groups
+        and metadata go with it, the object that stays behind is closed (``close()``, if it has that). Handles do not
+        follow: they raise ServiceGone, which says where it is; constraints find it.
+
+        Args:
+            which: a service of the provider, or what matches services of no other.
+            to: name of the container; with ``*`` or ``?`` the least busy one that fits. It must allow the class.
+            args: for the constructor there; by default those it was instantiated with, if it was.
+
+        Returns:
+            Handles of its services there.
+
+        Raises:
+            LockedByOther: somebody has it locked, it moves, or a call of it does not end.
+            Stopped: a stop holds, and nobody has resumed it.
+            NoSuchService, TooManyServices: not one provider, or no such container.
+            NotInstantiable, NoSuchClass, CannotInstantiate: it cannot be made there.
+            CannotMigrate: the class is another version there, its state is not given or taken, or it took too long.
+            ConfigurationError: it drives hardware of its host, or shares something with other providers.
+            AccessDenied: the policy does not let this container administer its groups, or those not offer it.
+            Busy: the other container has no room at the moment.
+            MigrationUnknown: the other container was lost at the moment it moved; it is withdrawn here. With all the
+                others it is offered as before.
+        """
+        moved: tuple[Handle, ...] = tuple(self._of(which, "migrate", to, args))
+        self._parts.registry.wait_for(lambda: all(self.has(one.key) for one in moved), _HEARD_S)
+        return moved
+
+    def save_state(self, which: Handle | Constraint) -> Any:
+        """What a provider gives with ``save_state()``, while nothing of it runs or moves: plain data.
+
+        Raises:
+            ConfigurationError: its class has no such method.
+            LockedByOther, Stopped, NoSuchService, TooManyServices, AccessDenied: as for `migrate`.
+        """
+        return self._of(which, "save_state")
+
+    def restore_state(self, which: Handle | Constraint, state: Any) -> None:
+        """Give a provider what it gave before. What it commands to move meanwhile is refused (S18).
+
+        Raises:
+            ConfigurationError, LockedByOther, Stopped, NoSuchService, TooManyServices, AccessDenied: as for
+                `save_state`.
+        """
+        self._of(which, "restore_state", state)
+
+    def _of(self, which: Handle | Constraint, name: str, *args: Any) -> Any:
+        self._check_open()
+        service = which if isinstance(which, Handle) else self._one(which)
+        key = ServiceKey(service.key.address, DOMAIN, PROVIDER, name)
+        return self.handle(key).with_(deadline_s=_LONGEST_S)(service, *args)
+
+    def _one(self, which: Constraint) -> Handle:
+        found = {(one.key.address, one.key.domain, one.key.provider): one for one in self.services(which)}
+        if not found:
+            raise NoSuchService(constraint=str(which))
+        if len(found) > 1:
+            raise TooManyServices(constraint=str(which), matches=[one.label for one in found.values()])
+        return next(iter(found.values()))

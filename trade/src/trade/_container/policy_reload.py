@@ -1,0 +1,85 @@
+"""A policy's files are looked at again and again: who is revoked in them is refused without anybody telling."""
+
+import logging
+import time
+from collections.abc import Callable
+from typing import Final, Protocol
+
+from trade._security.authorizer import Access
+from trade._security.policy import Policy
+from trade._security.policy_file import Seen
+from trade._threads.scheduler import Clockwork
+from trade.errors import ConfigurationError
+
+__all__ = ["begin_watching", "different"]
+
+_logger = logging.getLogger("trade")
+_EVERY_NS: Final = 1_000_000_000
+_AGAIN_NS: Final = 10 * _EVERY_NS
+"""Files that were refused are tried again although they look the same: what kept them from being read may be over."""
+
+
+class _Audit(Protocol):
+    def changed(self, what: str, about: str, call: None) -> None: ...
+
+
+def begin_watching(access: Access, clockwork: Clockwork, audit: _Audit, judge_anew: Callable[[], None]) -> None:
+    """Have a container go by its policy as the files are; those that are wrong are refused, and the old one stays.
+
+    Args:
+        access: what it goes by.
+        clockwork: does it, once a second.
+        audit: told of what has changed.
+        judge_anew: applies another policy.
+    """
+    _Watching(access, clockwork, audit, judge_anew)
+
+
+class _Watching:
+    def __init__(self, access: Access, clockwork: Clockwork, audit: _Audit, judge_anew: Callable[[], None]) -> None:
+        self._access, self._audit, self._judge_anew = access, audit, judge_anew
+        self._last: Seen = access.seen
+        """At the look before: what is being written is let come to rest."""
+        self._refused: Seen | None = None
+        """Files that were wrong, which is said once."""
+        self._again_ns = 0
+        clockwork.begin(self._look, time.monotonic_ns() + _EVERY_NS)
+
+    def _look(self) -> int:
+        now = self._access.look()
+        due = now != self._refused or time.monotonic_ns() >= self._again_ns
+        if now == self._last and now != self._access.seen and due:
+            self._read(now)
+        self._last = now
+        return time.monotonic_ns() + _EVERY_NS
+
+    def _read(self, now: Seen) -> None:
+        before, path = self._access.policy, self._access.path
+        assert before is not None and path is not None  # noqa: S101 - who has none is not watched
+        try:
+            self._access.load(path)
+        except ConfigurationError as wrong:
+            if now != self._refused:
+                _logger.warning("the policy was changed and is wrong; going on by the old one: %s", wrong)
+            self._refused, self._again_ns = now, time.monotonic_ns() + _AGAIN_NS
+            return
+        self._refused = None
+        after = self._access.policy
+        assert after is not None  # noqa: S101 - it has just been read
+        said = f"{path}: {', '.join(different(before, after)) or 'nothing is different'}"
+        _logger.warning("read again: %s", said)
+        self._audit.changed("policy read again", said, None)
+        try:
+            self._judge_anew()
+        except Exception:
+            _logger.exception("not all could be judged anew by %s", path)
+
+
+def different(before: Policy, after: Policy) -> list[str]:
+    """What has become different, in words."""
+    changed = [f"{name} is revoked now" for name in sorted(after.revoked - before.revoked)]
+    changed += [f"{name} is revoked no more" for name in sorted(before.revoked - after.revoked)]
+    parts = ("roles", "identities", "gateways", "approval")
+    others = [part for part in parts if getattr(before, part) != getattr(after, part)]
+    changed += [f"other {' and '.join(others)}"] if others else []
+    return changed

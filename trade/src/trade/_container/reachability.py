@@ -1,0 +1,77 @@
+"""Whom a container has found, and at which of the endpoints that it dials there is nobody."""
+
+import time
+from typing import Final
+
+from msgspec import Struct
+
+from trade._discovery.dialer import Reach
+from trade._protocol.keys import Address
+from trade._registry.registry import Registry
+from trade.errors import NobodyFound
+
+__all__ = ["Sight", "look_around"]
+
+_LOOK_S: Final = 0.02
+_HIDDEN: Final = (
+    "there is a link, and nobody shows himself to {identity}; is its certificate revoked, does the policy there not "
+    "know it, or is it another system than {system} there?"
+)
+
+
+class Sight(Struct, frozen=True):
+    """Whom a container has found so far."""
+
+    others: tuple[str, ...]
+    """The other containers (``identity/container``) that are there."""
+    silent: tuple[str, ...] = ()
+    """Those of them that have not said yet what is theirs."""
+    apart: dict[str, str] = {}
+    """The endpoints of ``Settings.connect`` where nobody was found, and why, as far as is known."""
+
+    @property
+    def unanswered(self) -> tuple[str, ...]:
+        """The same in words, as errors tell it."""
+        return tuple(f"{endpoint} (TRADE_CONNECT): {why}" for endpoint, why in self.apart.items())
+
+    @property
+    def complete(self) -> bool:
+        """Whether somebody was found, at each endpoint, and all have said what is theirs."""
+        return bool(self.others) and not self.silent and not self.apart
+
+    def nobody(self, system: str, so: str = "") -> NobodyFound:
+        """The error of who could not be told something.
+
+        Args:
+            system: where it was asked.
+            so: what cannot be told therefore.
+        """
+        return NobodyFound(system=system, so=so, others=bool(self.others), silent=self.silent, apart=self.unanswered)
+
+
+def look_around(registry: Registry, reach: Reach | None, own: Address, system: str, limit_s: float) -> Sight:
+    """Wait until the sight is complete, for ``limit_s`` seconds at most; what it is then."""
+    until = time.monotonic() + limit_s
+    while not (sight := _sight(registry, reach, own)).complete and time.monotonic() < until:
+        time.sleep(_LOOK_S)
+    return sight if reach is None else Sight(sight.others, sight.silent, _apart(reach, own, system, sight))
+
+
+def _sight(registry: Registry, reach: Reach | None, own: Address) -> Sight:
+    states = [state for state in registry.containers() if state.address != own]
+    unlinked = () if reach is None else reach.unlinked()
+    return Sight(
+        others=tuple(state.address.who for state in states),
+        silent=tuple(state.address.who for state in states if not state.heard.complete),
+        apart=dict.fromkeys(unlinked, ""),
+    )
+
+
+def _apart(reach: Reach, own: Address, system: str, sight: Sight) -> dict[str, str]:
+    """Those without a link, and why; an endpoint may be linked by a link that leads from there to here."""
+    found = {endpoint: reach.why_apart(endpoint, certain=not sight.others) for endpoint in sight.apart}
+    apart = {endpoint: why for endpoint, why in found.items() if why}
+    if not sight.others:
+        hidden = _HIDDEN.format(identity=own.identity, system=system)
+        apart |= {endpoint: hidden for endpoint in reach.configured if endpoint not in apart}
+    return apart

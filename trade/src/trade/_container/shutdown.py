@@ -1,0 +1,67 @@
+"""The end of a container because somebody asks for it from anywhere."""
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Sequence
+from typing import Final
+
+from trade._resources.resource import Resource
+from trade.errors import InUse
+
+_logger = logging.getLogger("trade")
+_ANSWERED_S: Final = 2.0
+_LOOK_EVERY_S: Final = 0.01
+
+
+class Terminating:
+    """Brings what moves to rest at once, then closes the container as soon as whoever asked has been answered."""
+
+    def __init__(
+        self,
+        name: str,
+        rest: Callable[[Sequence[Resource], str], list[str]],
+        resources: Callable[[], Sequence[Resource]],
+        running: Callable[[], int],
+        close: Callable[[], None],
+    ) -> None:
+        self._name = name
+        self._rest = rest
+        self._resources = resources
+        self._running = running
+        self.close = close
+        """What ends it; a program that lives for its container puts its own end here, which closes the container."""
+        self._first = threading.Lock()
+
+    def begin(self, reason: str, who: str, *, only_at_rest: bool = False) -> list[str]:
+        """Stop what moves, and see to it that the container closes; what could not be stopped, and why.
+
+        Raises:
+            InUse: something is locked or moves, and it was to end ``only_at_rest``; nothing was done.
+        """
+        if only_at_rest and (uses := _uses(self._resources())):
+            raise InUse(container=self._name, uses=uses)
+        problems = self._rest(self._resources(), f"container {self._name} is terminated: {reason}")
+        if self._first.acquire(blocking=False):
+            _logger.warning("container %s is terminated by %s: %s", self._name, who, reason or "no reason given")
+            threading.Thread(target=self._end, name="trade-terminate", daemon=True).start()
+        return problems
+
+    def _end(self) -> None:
+        until = time.monotonic() + _ANSWERED_S
+        while self._running() and time.monotonic() < until:
+            time.sleep(_LOOK_EVERY_S)
+        self.close()
+
+
+def _uses(resources: Sequence[Resource]) -> list[str]:
+    """What speaks against an end, a text for each resource."""
+    uses: list[str] = []
+    for resource in resources:
+        holder = resource.pending or resource.holder
+        if resource.guarded and holder is not None:
+            aim = f" for {holder.purpose!r}" if holder.purpose else ""
+            uses.append(f"{resource.name} is locked by {holder.owner}{aim}")
+        elif resource.busy:
+            uses.append(f"{resource.name} moves")
+    return uses

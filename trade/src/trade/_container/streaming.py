@@ -1,0 +1,130 @@
+"""The part of a container that listens: services sampled for it, for as long as it does."""
+
+import contextlib
+import logging
+import math
+import time
+from typing import Final
+
+from trade._calls.handle import Handle
+from trade._container.hooking import Hooking
+from trade._context.sessions import speaking
+from trade._notifications.triggers import Deed, Target, What, target_of
+from trade._registry.constraints import Constraint
+from trade._streams.source import LEAST_HZ, MOST_HZ, check_sampled
+from trade._streams.stream import If, Stream
+from trade._threads.scheduler import Clockwork
+from trade.errors import ConfigurationError, ServiceGone, SourceLost
+
+_logger = logging.getLogger("trade")
+
+_MOST_KEPT = 100_000
+_AGAIN: Final = "; trade.joined(where(...), call=listen, existing=True) has another one opened whenever it comes again"
+
+
+class Streaming(Hooking):
+    """Streams that this container has opened."""
+
+    def stream(
+        self,
+        target: Handle | Constraint,
+        *,
+        hz: float = 10.0,
+        on_change: bool = False,
+        if_: If | None = None,
+        call: What | None = None,
+        keep: int = 16,
+    ) -> Stream:
+        """Have a service sampled as long as one listens: ``with container.stream(state, hz=20) as samples:``.
+
+        It is called by its own container, once for all who listen, as often as the quickest of them asks; while nobody
+        listens it is not called at all. The stream ends with `Stream.close`, the session it was opened in, or this
+        container.
+
+        Args:
+            target: a service that only reads and needs no arguments, or a constraint that one such fits.
+            hz: how many samples a second at most, from 0.001 to 1000.
+            on_change: only samples that differ from the one before.
+            if_: only samples whose value this answers True for; a function of this process.
+            call: call this with the value of each instead of keeping them: a handle, a bound call, a constraint that
+                one service fits, or a function. One at a time; who is slow is given the newest.
+            keep: how many wait to be taken; the oldest goes first.
+
+        Raises:
+            NoSuchService, TooManyServices: no service fits, or more than one.
+            AccessDenied: the policy does not let this container read it.
+            ConfigurationError: it cannot be sampled; no such rate; nothing that can be called.
+            ServiceGone: it was deregistered.
+        """
+        self._check_open()
+        _check("hz", hz, LEAST_HZ, MOST_HZ)
+        _check("keep", keep, 1, _MOST_KEPT)
+        if not isinstance(target, Handle | Constraint):  # pyright: ignore[reportUnnecessaryIsInstance]
+            problem = f"target must be a handle or where(...), not {target!r}"
+            raise ConfigurationError(where="trade.stream", problem=problem)
+        if if_ is not None and (isinstance(if_, Handle) or not callable(if_)):
+            problem = f"if_ must be a function of the value, not {if_!r}"
+            raise ConfigurationError(where="trade.stream", problem=problem)
+        pushed = None if call is None else target_of(call, "trade.stream", "call", 1)
+        source = target if isinstance(target, Handle) else self.find(target)
+        check_sampled(source)
+        client = speaking.get()
+        opened_by = client if client is not None and client.owner == self.address else None
+        stream = self._parts.listening.open(source, hz, on_change=on_change, if_=if_, keep=keep, opened_by=opened_by)
+        if pushed is not None:
+            _Push(self, stream, pushed, self._parts.clockwork)
+        return stream
+
+
+class _Push:
+    """Calls something with each value of a stream, one at a time."""
+
+    def __init__(self, home: Streaming, stream: Stream, target: Target, clockwork: Clockwork) -> None:
+        self._home = home
+        self._stream = stream
+        self._target = target
+        self._problem = ""
+        due = clockwork.due(self._act)
+        stream.tell(lambda: due.at(time.monotonic_ns()))
+        due.at(time.monotonic_ns())  # some may have come already
+
+    def _act(self) -> None:
+        while True:
+            try:
+                sample = self._stream.take()
+                if sample is None:
+                    return
+                self._do(sample.value)
+                self._problem = ""
+            except BaseException as error:  # noqa: BLE001 - whatever it raises ends nothing
+                over = error is self._stream.why_ended
+                if not (over and isinstance(error, ConfigurationError)):  # closed on purpose
+                    self._failed(error)
+                if over:
+                    return
+
+    def _do(self, value: object) -> None:
+        opened_by, target = self._stream.opened_by, self._target
+        with contextlib.nullcontext() if opened_by is None else opened_by.use():
+            if not isinstance(target, Deed):
+                target(value)
+                return
+            handle = target.handle
+            if handle is None:
+                assert target.constraint is not None  # noqa: S101
+                handle = self._home.find(target.constraint, wait_s=0)
+            handle(value, *target.args, **target.kwargs)
+
+    def _failed(self, error: BaseException) -> None:
+        kind = type(error).__name__
+        if kind != self._problem:  # the same again says nothing new, whatever numbers are in its text
+            hint = _AGAIN if isinstance(error, SourceLost | ServiceGone) else ""
+            _logger.warning("a sample of %r was not passed on: %s: %s%s", self._stream, kind, error, hint)
+        self._problem = kind
+
+
+def _check(name: str, value: float, least: float, most: float) -> None:
+    number = isinstance(value, int | float) and not isinstance(value, bool)  # pyright: ignore[reportUnnecessaryIsInstance]
+    if not number or not math.isfinite(value) or not least <= value <= most:
+        problem = f"{name} must be from {least:g} to {most:g}, not {value!r}"
+        raise ConfigurationError(where="trade.stream", problem=problem)

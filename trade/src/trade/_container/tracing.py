@@ -1,0 +1,186 @@
+"""The part of a container that looks at calls and log lines of the whole system."""
+
+import itertools
+from collections.abc import Iterable, Sequence
+from typing import Final
+
+from msgspec import Struct
+
+from trade._calls.batch import Outcome
+from trade._container.lookup import Looking
+from trade._container.system import DOMAIN
+from trade._protocol.keys import ServiceKey
+from trade._registry.constraints import where
+from trade._telemetry.log_buffer import LogLine
+from trade._telemetry.spans import Span
+from trade.errors import AccessDenied, NoSuchCall
+
+NOT_TRACED: Final = "(not traced)"
+
+
+class Trace(Struct, frozen=True, kw_only=True):
+    """A call, and those it led to."""
+
+    call_id: int
+    asked: Span | None
+    """By who called; None if that was in the same container, or one that is not traced."""
+    served: Span | None
+    """By who ran it; None if that one is not traced, or it never ran."""
+    lines: tuple[LogLine, ...]
+    """Logged while it ran."""
+    calls: tuple["Trace", ...]
+    """Those it made, in order."""
+
+    @property
+    def spans(self) -> tuple[Span, ...]:
+        """What is known of it, the caller's side first."""
+        return tuple(span for span in (self.asked, self.served) if span is not None)
+
+    @property
+    def service(self) -> str:
+        """What was called; ``(not traced)`` if only calls are known that it led to."""
+        return next((span.service for span in self.spans), NOT_TRACED)
+
+    @property
+    def began(self) -> float:
+        """``time.time()`` of the host that noted it."""
+        return next((span.began for span in self.spans), None) or min((call.began for call in self.calls), default=0.0)
+
+
+class LogReader:
+    """Reads on where it was: each line of the system once."""
+
+    def __init__(self, home: "Tracing", container: str) -> None:
+        self._home = home
+        self._where = where(name="log_lines", group=DOMAIN, container=container)
+        self._read: dict[ServiceKey, int] = {}
+        self._known: dict[str, int] = {}
+        """By process, the last line given."""
+
+    def read(self) -> list[LogLine]:
+        """What came since the last time, in order of time by the clocks of their hosts.
+
+        Raises:
+            AccessDenied: the policy does not let this container read group ``trade``.
+        """
+        handles = self._home.services(self._where)
+        outcomes = self._home.call_all([handle.bind(self._read.get(handle.key, 0)) for handle in handles])
+        new: dict[tuple[str, int], LogLine] = {}
+        for outcome in granted(outcomes):
+            lines: list[LogLine] = outcome.result
+            if lines:
+                self._read[outcome.handle.key] = lines[-1].number
+            for line in lines:
+                if line.number > self._known.get(line.process, 0):
+                    new.setdefault((line.process, line.number), line)
+        for process, number in new:
+            self._known[process] = max(number, self._known.get(process, 0))
+        return sorted(new.values(), key=lambda line: (line.at, line.process, line.number))
+
+
+class Tracing(Looking):
+    """Notes of calls and log lines, from everywhere."""
+
+    def set_tracing(self, on: bool, *, container: str = "*") -> list[str]:
+        """Have containers note every call they make and serve, or no more; what was noted stays.
+
+        Each keeps its newest 10,000 notes. Those that start later do not know of it; `TRADE_TRACE=1` does that.
+
+        Args:
+            on: whether to.
+            container: which; ``*`` and ``?`` stand for anything.
+
+        Returns:
+            The names of those that do.
+
+        Raises:
+            AccessDenied: the policy does not let this container ``instrument`` group ``trade``.
+        """
+        outcomes = self.call_all(where(name="set_tracing", group=DOMAIN, container=container), on)
+        return sorted(outcome.handle.container for outcome in granted(outcomes))
+
+    def spans(self, *, container: str = "*") -> list[Span]:
+        """What the containers noted of calls while they were traced, by time.
+
+        Raises:
+            AccessDenied: the policy does not let this container ``read`` group ``trade``.
+        """
+        return self._spans_of(None, container)
+
+    def trace(self, call_id: int) -> Trace:
+        """The whole tree that a call belongs to, from all containers, with what was logged in it.
+
+        Times are those of each host's clock on the wall: between hosts they are as good as these agree.
+
+        Raises:
+            NoSuchCall: no container noted it, or not any more.
+            AccessDenied: the policy does not let this container ``read`` group ``trade``.
+        """
+        wanted, asked_for, spans = {call_id}, set[int](), list[Span]()
+        while wanted - asked_for:  # what a hook calls knows the call it watches, but not what led to that
+            asked_for = set(wanted)
+            spans = self._spans_of(sorted(wanted), "*")
+            wanted.update(*(span.ids for span in spans))
+        if not spans:
+            raise NoSuchCall(id=call_id)
+        return _tree(spans, self.logs())
+
+    def logs(self, *, container: str = "*") -> list[LogLine]:
+        """What the processes of the system logged lately to the logger ``trade``, by the clocks of their hosts.
+
+        Each keeps its newest 2,000 lines, of those that its level lets pass.
+
+        Raises:
+            AccessDenied: the policy does not let this container ``read`` group ``trade``.
+        """
+        return LogReader(self, container).read()
+
+    def _spans_of(self, calls: Sequence[int] | None, container: str) -> list[Span]:
+        outcomes = self.call_all(where(name="spans", group=DOMAIN, container=container), calls)
+        return sorted(itertools.chain.from_iterable(one.result for one in granted(outcomes)), key=_when)
+
+
+def granted(outcomes: Iterable[Outcome]) -> list[Outcome]:
+    """Those that said something: who leaves meanwhile says nothing. Raises AccessDenied if one does not allow it."""
+    found: list[Outcome] = []
+    for outcome in outcomes:
+        if isinstance(outcome.error, AccessDenied):
+            raise outcome.error
+        if outcome.ok:
+            found.append(outcome)
+    return found
+
+
+def _when(span: Span) -> tuple[float, int]:
+    return span.began, span.call_id
+
+
+def _tree(spans: Sequence[Span], lines: Iterable[LogLine]) -> Trace:
+    """The tree of these spans, which have a call in common that led to all of them."""
+    known: dict[int, dict[str, Span]] = {}
+    for span in spans:
+        known.setdefault(span.call_id, {}).setdefault(span.side, span)
+    logged: dict[int, list[LogLine]] = {}
+    for line in lines:
+        logged.setdefault(line.call_id, []).append(line)
+    children: dict[int, list[int]] = {}
+    tops: list[int] = []
+    for call_id, sides in known.items():
+        calls = max((span.calls for span in sides.values()), key=len)
+        parent = next((one for one in calls if one in known), calls[-1] if calls else None)
+        if parent is None:
+            tops.append(call_id)
+        else:
+            children.setdefault(parent, []).append(call_id)
+            if parent not in known and parent not in tops:
+                tops.append(parent)
+
+    def node(call_id: int) -> Trace:
+        sides = known.get(call_id, {})
+        calls = sorted(map(node, children.get(call_id, ())), key=lambda call: (call.began, call.call_id))
+        served, asked = sides.get("served"), sides.get("asked")
+        return Trace(
+            call_id=call_id, asked=asked, served=served, lines=tuple(logged.get(call_id, ())), calls=tuple(calls)
+        )
+
+    return node(tops[0])

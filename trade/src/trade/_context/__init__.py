@@ -1,0 +1,1 @@
+"""Who calls, and under what: sessions, deadlines, call ids, and the calls in progress."""

@@ -1,0 +1,277 @@
+"""What a container runs and has run: every call id once, cancelled on request, telling how far it is."""
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Sequence
+from heapq import heappop, heappush
+from typing import TYPE_CHECKING, Any, Final
+
+from msgspec import Raw
+
+from trade._context.ended_sessions import within
+from trade._protocol.messages import Call, Status, encode_message
+from trade._protocol.remote_errors import pack_error
+from trade.errors import Cancelled, OutcomeUnknown
+
+if TYPE_CHECKING:
+    from trade._services.local_service import LocalService
+
+_logger = logging.getLogger("trade")
+
+GRACE_NS: Final = 5_000_000_000
+"""How long after its deadline a call's answer is kept."""
+MOST_BYTES: Final = 64 << 20
+MOST_CALLS: Final = 65_536
+_MOST_CALLERS: Final = 1024
+
+Answer = tuple[int, Raw]
+Key = tuple[str, int]
+"""Who called, and the call's id."""
+
+_rare = threading.Lock()
+"""Guards what few calls have: an event, something to do when they are cancelled."""
+
+
+class Ongoing:
+    """One call from its arrival on."""
+
+    __slots__ = (
+        *("_event", "_on_cancel", "also", "answer", "call", "caller"),
+        *("cancelled", "queued_ns", "report", "said", "service", "size"),
+    )
+
+    def __init__(
+        self,
+        service: "LocalService | None",
+        caller: str,
+        call: Call | None,
+        report: "Callable[[Ongoing, Any], None] | None",
+    ) -> None:
+        self.service = service
+        self.caller = caller
+        self.call = call
+        self.report = report
+        """Takes what the provider says of its progress, and keeps nobody waiting."""
+        self.said: Raw | None = None
+        """The latest that was said of it and is not sent yet."""
+        self.cancelled = False
+        self.answer: Answer | None = None
+        self.also: list[Call] | None = None
+        """The same call, come again while it ran."""
+        self.size = 0
+        self.queued_ns = 0
+        """When it was put in the queue of a serial provider; 0 if it was not."""
+        self._event: threading.Event | None = None
+        self._on_cancel: list[Callable[[], object]] | None = None
+
+    def cancel(self) -> None:
+        """Ask the provider to end it. Idempotent."""
+        with _rare:
+            if self.cancelled:
+                return
+            self.cancelled = True
+            told, self._on_cancel = self._on_cancel, None
+            if self._event is not None:
+                self._event.set()
+        for tell in told or ():
+            tell()
+
+    def on_cancel(self, tell: Callable[[], object]) -> Callable[[], None]:
+        """Call this when it is cancelled, at once if it was. Returns what takes that back."""
+        with _rare:
+            known = not self.cancelled
+            if known:
+                self._on_cancel = [*(self._on_cancel or ()), tell]
+        if not known:
+            tell()
+
+        def forget() -> None:
+            with _rare:
+                self._on_cancel = [one for one in self._on_cancel or () if one is not tell]
+
+        return forget
+
+    def wait_cancelled(self, timeout_s: float | None) -> bool:
+        with _rare:
+            if self._event is None:
+                self._event = threading.Event()
+                if self.cancelled:
+                    self._event.set()
+            event = self._event
+        return event.wait(timeout_s)
+
+
+def end_calls(cancels: Sequence[Callable[[], object]]) -> None:
+    """Ask calls to end, on a thread of their own: what they do then keeps nobody waiting."""
+    if cancels:
+        threading.Thread(target=_end, args=(cancels,), name="trade-cancel", daemon=True).start()
+
+
+def _end(cancels: Sequence[Callable[[], object]]) -> None:
+    for cancel in cancels:
+        try:
+            cancel()
+        except Exception:
+            _logger.exception("a call that was to end failed to")
+
+
+class Once:
+    """Every call that runs, and the answers of those that commanded something, until they can come no more.
+
+    What merely reads is forgotten when it has ended: to run it again changes nothing. A call under way is never
+    forgotten. Too many or too large answers: the oldest lose their text first, and are then known by their number only.
+    """
+
+    def __init__(self) -> None:
+        self._calls: dict[Key, Ongoing] = {}
+        self._until: list[tuple[int, Key]] = []
+        """A heap of when which kept call may go."""
+        self._bodies: dict[Key, Ongoing] = {}
+        self._bytes = 0
+        self._evicted: dict[Key, int] = {}
+        """Caller and the upper bits of its ids -> the highest id let go before its time; they count upwards."""
+        self._lock = threading.Lock()
+
+    def begin(self, call: Call, ongoing: Ongoing) -> Ongoing:
+        """Note a call; returns the earlier one if it came before, which is then not to be run again."""
+        found = self._calls.setdefault((ongoing.caller, call.id), ongoing)
+        if self._evicted and found is ongoing and call.id <= self._evicted.get((ongoing.caller, call.id >> 24), -1):
+            ongoing.answer = _unknown(call.service)
+            self._calls.pop((ongoing.caller, call.id), None)
+        return found
+
+    def find(self, caller: str, call: Call) -> Ongoing | None:
+        return self._calls.get((caller, call.id))
+
+    def attach(self, ongoing: Ongoing, again: Call) -> Answer | None:
+        """The answer of a call that came again; None while it runs: the answer then goes to this one, too."""
+        with self._lock:
+            if ongoing.answer is None:
+                ongoing.also = [*(ongoing.also or ()), again]
+            return ongoing.answer
+
+    def end(self, ongoing: Ongoing, call: Call, answer: Answer, *, keep: bool) -> list[Call] | None:
+        """Note how it ended; returns the other arrivals to answer."""
+        with self._lock:
+            ongoing.answer = answer
+            ongoing.call = ongoing.report = None  # the arguments may be large
+            key = (ongoing.caller, call.id)
+            if keep:
+                now = time.monotonic_ns()
+                self._keep_body(key, ongoing, len(memoryview(answer[1])), call.service)
+                heappush(self._until, ((call.expires_ns or now) + GRACE_NS, key))
+                self._let_go(now)
+            else:
+                self._calls.pop(key, None)
+            return ongoing.also
+
+    def cancel(self, caller: str, call_id: int, service: str, keep_s: float) -> None:
+        """Cancel a call of this caller: ask it to end, or see to it that it never begins when it is yet to come."""
+        with self._lock:
+            found = self._calls.get((caller, call_id))
+            if found is None:
+                never = Ongoing(None, caller, None, None)
+                never.answer = cancelled(service)
+                now = time.monotonic_ns()
+                self._calls[caller, call_id] = never
+                heappush(self._until, (now + int(keep_s * 1e9) + GRACE_NS, (caller, call_id)))
+                self._let_go(now)
+        if found is not None and found.answer is None:
+            found.cancel()
+
+    def made_for(self, session: str) -> list[Ongoing]:
+        """Calls under way that are made for a session, or for a part of it: by itself, or on its behalf."""
+        return [one for one in list(self._calls.values()) if one.answer is None and _is_for(one.call, session)]
+
+    def _keep_body(self, key: Key, ongoing: Ongoing, size: int, service: str) -> None:
+        ongoing.size = size
+        self._bytes += size
+        self._bodies[key] = ongoing
+        while self._bytes > MOST_BYTES:
+            oldest = self._bodies.pop(next(iter(self._bodies)))
+            self._bytes -= oldest.size
+            oldest.answer = _unknown(service)
+
+    def _let_go(self, now_ns: int) -> None:
+        """Forget what can come no more, and what is nearest to that where there is too much."""
+        while self._until and (self._until[0][0] < now_ns or len(self._calls) > MOST_CALLS):
+            until_ns, key = heappop(self._until)
+            self._calls.pop(key, None)
+            if key in self._bodies:
+                self._bytes -= self._bodies.pop(key).size
+            if until_ns >= now_ns:
+                self._note_evicted(*key)
+
+    def _note_evicted(self, caller: str, call_id: int) -> None:
+        place = (caller, call_id >> 24)
+        self._evicted[place] = max(call_id, self._evicted.pop(place, -1))
+        if len(self._evicted) > _MOST_CALLERS:
+            del self._evicted[next(iter(self._evicted))]
+
+
+def _is_for(call: Call | None, session: str) -> bool:
+    behalf = () if call is None or call.behalf is None else call.behalf.sessions
+    return call is not None and any(within(one, session) for one in (call.session, *behalf))
+
+
+def _unknown(service: str) -> Answer:
+    return Status.ERROR, Raw(encode_message(pack_error(OutcomeUnknown(service=service, deadline_s=0.0))))
+
+
+def cancelled(service: str) -> Answer:
+    """What a call that was cancelled before it began is answered."""
+    return Status.ERROR, Raw(encode_message(pack_error(Cancelled(service=service))))
+
+
+class Herald:
+    """Sends what providers say of their progress: the latest of each call, at most every 50 ms, on its own thread.
+
+    What was said last goes out before the answer, whenever that comes.
+    """
+
+    EVERY_S: Final = 0.05
+
+    def __init__(self, send: Callable[[Ongoing, Raw], None]) -> None:
+        self._send = send
+        self._news = set[Ongoing]()
+        self._lock = threading.Lock()
+        self._some = threading.Event()
+        self._ended = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def tell(self, ongoing: Ongoing, body: Raw) -> None:
+        """Have this sent soon, unless something newer comes first."""
+        with self._lock:
+            ongoing.said = body
+            self._news.add(ongoing)
+            self._some.set()
+            if self._thread is None and not self._ended.is_set():
+                self._thread = threading.Thread(target=self._main, name="trade-progress", daemon=True)
+                self._thread.start()
+
+    def _main(self) -> None:
+        while not self._ended.is_set():
+            self._some.wait()
+            with self._lock:
+                self._some.clear()
+                news, self._news = self._news, set[Ongoing]()
+            for ongoing in news:
+                self.send(ongoing)
+            self._ended.wait(self.EVERY_S)
+
+    def send(self, ongoing: Ongoing) -> None:
+        """Send what was said last of it, unless it has been or is of no use any more."""
+        body = ongoing.said
+        if body is None or ongoing.answer is not None:
+            return
+        self._send(ongoing, body)
+        if ongoing.said is body:  # only now: rather twice than never
+            ongoing.said = None
+
+    def close(self) -> None:
+        """End the thread. Idempotent."""
+        self._ended.set()
+        self._some.set()
+        if self._thread is not None and self._thread is not threading.current_thread():
+            self._thread.join(2)

@@ -1,0 +1,201 @@
+"""What a provider may know of the call it serves: who asks, until when, on whose behalf; and what it may say of it."""
+
+import time
+from collections.abc import Callable, Iterable
+from contextvars import ContextVar
+from typing import Any, Final, Protocol
+
+from msgspec import Struct
+
+from trade._context.active_calls import Ongoing
+from trade._context.sessions import client_of
+from trade._locks.claims import Claim
+from trade._protocol.keys import Address
+from trade._protocol.messages import Behalf, Token
+from trade.errors import Cancelled, LockLost
+
+__all__ = ["CallContext", "current_call", "progress"]
+
+_MOST_EVENTS: Final = 100
+_ANSWER_S: Final = 0.3
+"""For an answer to be made, and to travel back through whatever lies between."""
+
+
+def outer_of(call_id: int, behalf: Behalf | None) -> int:
+    """The id of the call that began it all, of a call with that id and what it inherited."""
+    return behalf.calls[-1] if behalf is not None and behalf.calls else call_id
+
+
+class Permitted(Protocol):
+    """What a call was admitted under; see `trade.Permit`."""
+
+    def gate(self) -> None: ...
+
+
+class CallContext(Struct, frozen=True, gc=False):
+    """One call, seen from inside the service."""
+
+    id: int
+    """Unique in the system."""
+    service: str
+    caller: str
+    """Identity of who asks."""
+    session: str
+    """The client's presence on whose behalf this runs; motion belongs to it."""
+    expires_ns: int | None
+    """``time.monotonic_ns()`` of this process after which nothing may begin; None if being late is harmless."""
+    chain: tuple[str, ...] = ()
+    """Services whose calls led to this one, outermost first."""
+
+    ongoing: Ongoing | None = None
+    """The middleware's own notes on it."""
+    behalf: Behalf | None = None
+    """What it inherited; its own calls inherit it, too, while it runs."""
+    permit: Permitted | None = None
+    """What it may do to the resources of its service."""
+    events: list[tuple[int, str]] | None = None
+    """What was noted of it, and when by ``time.monotonic_ns()``; None if it is not traced."""
+
+    @property
+    def asker(self) -> str:
+        """Who asks, for people: its caller, and the client that this one acts for: ``page for anna``."""
+        client = client_of(self.session)
+        return f"{self.caller} for {client}" if client else self.caller
+
+    @property
+    def sessions(self) -> tuple[str, ...]:
+        """For whom it runs, nearest first: what it moves stops when one of them ends."""
+        return (self.session,) if self.behalf is None else (self.session, *self.behalf.sessions)
+
+    @property
+    def outer_id(self) -> int:
+        """The id of the call that began it all, in whatever process: one for everything that comes of it."""
+        return outer_of(self.id, self.behalf)
+
+    @property
+    def tokens(self) -> tuple[Token, ...]:
+        """The locks under which it runs."""
+        return () if self.behalf is None else self.behalf.tokens
+
+    @property
+    def cancelled(self) -> bool:
+        """Whether its caller wants it to end; to heed it is up to the provider."""
+        return self.ongoing is not None and self.ongoing.cancelled
+
+    def wait_cancelled(self, timeout_s: float | None = None) -> bool:
+        """Wait until its caller wants it to end, at most this long, and never beyond its deadline.
+
+        Returns:
+            Whether it was cancelled.
+        """
+        left_s = self.remaining_s
+        allowed_s = left_s if timeout_s is None else timeout_s if left_s is None else min(timeout_s, left_s)
+        if self.ongoing is not None:
+            return self.ongoing.wait_cancelled(allowed_s)
+        time.sleep(allowed_s or 0.0)  # nobody can cancel it
+        return False
+
+    def on_cancel(self, tell: Callable[[], object]) -> None:
+        """Have this called, on another thread, once its caller wants it to end; at once if it does already."""
+        if self.ongoing is not None:
+            self.ongoing.on_cancel(tell)
+
+    def raise_if_cancelled(self) -> None:
+        """Raise Cancelled, the way to end a cancelled call, if its caller wants it to end."""
+        if self.cancelled:
+            raise Cancelled(service=self.service)
+
+    def progress(self, value: Any) -> None:
+        """Tell the caller how far it is: the latest value counts. Never waits.
+
+        Args:
+            value: plain data, a struct, a handle: what ``run.progress()`` then gives.
+        """
+        ongoing = self.ongoing
+        report = None if ongoing is None else ongoing.report
+        if ongoing is not None and report is not None:
+            report(ongoing, value)
+
+    def event(self, text: str) -> None:
+        """Note what has just happened, for whoever traces it; never a secret. Untraced it does nothing.
+
+        Of one call the first hundred are kept.
+        """
+        events = self.events
+        if events is not None and len(events) < _MOST_EVENTS:
+            events.append((time.monotonic_ns(), text))
+
+    @property
+    def remaining_s(self) -> float | None:
+        """Seconds until it expires, never below zero; None if it does not."""
+        return None if self.expires_ns is None else max(0.0, (self.expires_ns - time.monotonic_ns()) / 1e9)
+
+    def patience_s(self, wait_s: float) -> float:
+        """How long it may wait for others so that its caller is told of it if that was in vain, in seconds.
+
+        Args:
+            wait_s: how long it would wait if it had no deadline.
+        """
+        left_s = self.remaining_s
+        return wait_s if left_s is None else min(wait_s, left_s - min(_ANSWER_S, left_s / 5))
+
+
+class Held(Protocol):
+    """A lock that the running code holds or uses."""
+
+    @property
+    def owner(self) -> Address:
+        """The container whose lock it is; calls of others in this process do not carry it."""
+        ...
+
+    @property
+    def held(self) -> bool:
+        """Whether it holds now."""
+        ...
+
+    @property
+    def claim(self) -> Claim:
+        """What it selects, and what of that it holds."""
+        ...
+
+    def tokens(self) -> Iterable[Token]:
+        """What shows it to those it was granted by; raises LockLost if it holds no more."""
+        ...
+
+    def refused(self, by: Address, error: LockLost) -> None:
+        """Told that a container refused a call made under it."""
+        ...
+
+
+holding: ContextVar[tuple[Held, ...]] = ContextVar("trade_locks", default=())
+"""The locks around the running code, outermost first."""
+
+handed_down: Final[dict[Address, Held]] = {}
+"""Locks that other processes passed on to this one, by the container whose calls carry them."""
+
+running: ContextVar[CallContext | None] = ContextVar("trade_call", default=None)
+
+
+def current_call() -> CallContext | None:
+    """The call the running code serves, or None outside of one (also in a plain call of the method)."""
+    return running.get()
+
+
+def served_call() -> CallContext:
+    """The call the running code serves: for the middleware's own functions, which are only called as services."""
+    call = running.get()
+    assert call is not None  # noqa: S101
+    return call
+
+
+def patience_s(wait_s: float) -> float:
+    """How long the running code may wait for others, in seconds; see `CallContext.patience_s`."""
+    call = running.get()
+    return wait_s if call is None else call.patience_s(wait_s)
+
+
+def progress(value: Any) -> None:
+    """Inside a service: tell the caller how far it is; see `CallContext.progress`. Elsewhere it does nothing."""
+    call = running.get()
+    if call is not None:
+        call.progress(value)

@@ -1,0 +1,122 @@
+"""A call on its way out: until when, and what it inherits from where it is made."""
+
+from time import monotonic_ns
+from typing import Final
+
+from msgspec import Struct
+
+from trade._container.system import DOMAIN
+from trade._context.call_context import CallContext, Held, handed_down, holding, running
+from trade._context.sessions import Session, speaking
+from trade._locks.claims import require_held
+from trade._protocol.keys import Address
+from trade._protocol.messages import Behalf, Token
+from trade._registry.registry import Record
+from trade.errors import Cancelled, LockLost
+
+DEFAULT_DEADLINE_S: Final = 10.0
+_DEFAULT_DEADLINE_NS: Final = int(DEFAULT_DEADLINE_S * 1e9)
+_NOBODY: Final = Behalf()
+
+
+class Inherited(Struct, gc=False):
+    """What a call has from where it is made; most have nothing."""
+
+    outer: CallContext | None
+    """The call that makes it."""
+    around: tuple[Held, ...]
+    """The locks it is made under."""
+    client: Session | None
+    """For whom it is made; none: the container itself."""
+    asked_s: float
+    """Without the outer call's deadline, which a stop does not heed: it is sent and waited for however late that is."""
+    asked_ns: int
+
+    def session(self, own: Address) -> str:
+        """The client's session, if that container acts for one; else nothing.
+
+        Raises:
+            SessionEnded: the client is gone.
+        """
+        if self.client is None or self.client.owner != own:
+            return ""
+        self.client.check()
+        return self.client.name
+
+    def behalf(self, record: Record, own: Address) -> Behalf | None:
+        """What the call passes on; the locks around it unless it stops, which needs none.
+
+        Raises:
+            LockLost: it actuates, and would do so under a lock that holds no more.
+            NotLocked: it actuates, and the locks around it select its service and do not hold it.
+            Cancelled: it actuates, and the call that makes it was cancelled.
+        """
+        effect = record.info.effect
+        commands = effect == "actuate" and record.key.domain != DOMAIN  # the middleware's own functions are nobody's
+        outer, around = self.outer, self.around
+        if own in handed_down:
+            around = (handed_down[own], *around)
+        if outer is None and not around:
+            return None
+        if commands and outer is not None and outer.cancelled:
+            raise Cancelled(service=record.label)
+        locks = [lock for lock in around if lock.owner == own]
+        tokens: tuple[Token, ...] = ()
+        if effect != "stop":
+            tokens = tuple(token for lock in locks if effect == "actuate" or lock.held for token in lock.tokens())
+        if commands:
+            require_held(locks, record)
+        if outer is None:
+            return Behalf((), (), tokens) if tokens else None
+        inherited = outer.behalf or _NOBODY
+        if effect != "stop":
+            tokens += inherited.tokens
+        return Behalf(outer.sessions, (outer.id, *inherited.calls), tokens)
+
+
+class Request(Struct, gc=False):
+    """One call on its way out."""
+
+    deadline_s: float
+    deadline_ns: int
+    chain: tuple[str, ...] = ()
+    inherited: Inherited | None = None
+
+    def presence(self, record: Record, own: Address) -> tuple[Behalf | None, str]:
+        """On whose behalf it is made, and in which session if not the container's own.
+
+        Raises:
+            LockLost, NotLocked: it would be made under a lock that holds no more, or that selects it and has it not.
+            SessionEnded, Cancelled: it would be made for a client that is gone, or by a call that was cancelled.
+        """
+        inherited = self.inherited
+        return (None, "") if inherited is None else (inherited.behalf(record, own), inherited.session(own))
+
+    def refused(self, by: Address, error: BaseException) -> None:
+        """The locks around it learn of a refusal at once, and not when they are renewed."""
+        if isinstance(error, LockLost) and self.inherited is not None:
+            for lock in (*self.inherited.around, *handed_down.values()):
+                lock.refused(by, error)
+
+    def ignore_outer_deadline(self) -> None:
+        if self.inherited is not None:
+            self.deadline_s, self.deadline_ns = self.inherited.asked_s, self.inherited.asked_ns
+
+
+def new_request(deadline_s: float | None) -> Request:
+    """A call that begins now."""
+    now, outer, around, client = monotonic_ns(), running.get(), holding.get(), speaking.get()
+    asked_s, asked_ns = DEFAULT_DEADLINE_S if deadline_s is None else deadline_s, now + in_ns(deadline_s)
+    if outer is None and client is None and not around and not handed_down:
+        return Request(asked_s, asked_ns)
+    inherited = Inherited(outer, around, client, asked_s, asked_ns)
+    if outer is None:
+        return Request(asked_s, asked_ns, (), inherited)
+    chain = (*outer.chain, outer.service)
+    if outer.expires_ns is None or outer.expires_ns >= asked_ns:
+        return Request(asked_s, asked_ns, chain, inherited)
+    return Request(max(0.0, (outer.expires_ns - now) / 1e9), outer.expires_ns, chain, inherited)
+
+
+def in_ns(deadline_s: float | None) -> int:
+    return _DEFAULT_DEADLINE_NS if deadline_s is None else int(deadline_s * 1e9)

@@ -1,0 +1,85 @@
+"""One client of a program that acts for many: what it sets moving is its own, and stops with it (S03)."""
+
+import contextlib
+from collections.abc import Callable, Generator
+from contextvars import ContextVar
+from typing import Final
+
+from trade._protocol.keys import Address
+from trade._transport.base import Presence
+from trade.errors import SessionEnded
+
+__all__ = ["Session", "client_of", "foreign", "speaking"]
+
+speaking: ContextVar["Session | None"] = ContextVar("trade_session", default=None)
+"""The session that calls are made in now; none: the container's own."""
+
+
+def foreign(session: str) -> str:
+    """``clinic/anna via door``, if that session is one of another system's client; else nothing.
+
+    ``door`` says so, and answers for it: nobody here can see who is behind.
+    """
+    identity, *chunks = session.split("/")
+    system, crossed, client = chunks[2].partition(":") if len(chunks) == 3 else ("", "", "")
+    return f"{system}/{client.rpartition('.')[0]} via {identity}" if crossed else ""
+
+
+def client_of(session: str) -> str:
+    """``anna``, if that session is one of a client for whom a container acts; else nothing."""
+    client = session.split("/")[3:]
+    return client[0].rpartition(".")[0] if client else ""
+
+
+class Session:
+    """A client's presence within a container's: a context manager; calls made inside are the client's.
+
+    Locks taken inside are the client's, too. When it is closed, or the container ends, what was moved in it stops and
+    its locks fall; nothing else does. Made by `Container.open_session`.
+    """
+
+    def __init__(self, owner: Address, name: str, presence: Presence, ended: Callable[[str], None]) -> None:
+        self.owner: Final = owner
+        """The container that acts for the client."""
+        self.name: Final = name
+        """As everybody sees it: ``identity/container/epoch/client``."""
+        self._presence = presence
+        self._ended = ended
+        self._closed = False
+
+    @property
+    def closed(self) -> bool:
+        """Whether it has ended."""
+        return self._closed
+
+    def check(self) -> None:
+        """Raises SessionEnded if it has."""
+        if self._closed:
+            raise SessionEnded(session=self.name, reason="it was closed")
+
+    @contextlib.contextmanager
+    def use(self) -> Generator["Session", None, None]:
+        """Make calls in it, in any thread or task, without closing it afterwards."""
+        reset = speaking.set(self)
+        try:
+            yield self
+        finally:
+            speaking.reset(reset)
+
+    def close(self) -> None:
+        """The client is gone: what it set moving stops. Does not wait for that. Idempotent."""
+        if not self._closed:
+            self._closed = True
+            self._presence.close()
+            self._ended(self.name)
+
+    def __enter__(self) -> "Session":
+        self._using = self.use()
+        return self._using.__enter__()
+
+    def __exit__(self, *error: object) -> None:
+        self._using.__exit__(None, None, None)
+        self.close()
+
+    def __repr__(self) -> str:
+        return f"<Session {self.name}{', ended' if self._closed else ''}>"

@@ -1,0 +1,211 @@
+"""Whom a running container links to, and whether it lets itself be found; none of it touches the main session.
+
+One thread, there only while it has something to do: it looks for containers while discovery is on, and dials again
+what it was told to connect to whenever the link is gone.
+"""
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Sequence
+from typing import Final
+
+from trade._transport.endpoints import Endpoint, accepts
+from trade._transport.zenoh_links import Beacon, Links
+from trade.errors import CannotConnect, ConfigurationError, LinkStays
+
+_logger = logging.getLogger("trade")
+
+_ROUND_S: Final = 1.0
+_SCOUT_S: Final = 0.5
+_JOIN_S: Final = 2.0
+_AGAIN_S: Final = 5.0
+"""Who did not let us in is left alone so long."""
+_REFUSED_S: Final = 3.0
+"""A configured endpoint that accepts connections but is not linked by then refuses us."""
+
+
+class Reach:
+    """Switches of one container; safe to use from any thread."""
+
+    def __init__(self, links: Links, may_dial: Callable[[str], None], configured: Sequence[str] = ()) -> None:
+        self._links = links
+        self._may_dial = may_dial
+        self._lock = threading.RLock()
+        self._beacon: Beacon | None = None
+        self._discovering = False
+        self._kept: dict[str, str] = {}
+        """Endpoint -> id of the session found there."""
+        self.configured: Final = tuple(configured)
+        """The endpoints it was told to dial when it was started."""
+        self._unsure = list(configured)
+        self._unsure_until = time.monotonic() + _REFUSED_S
+        self._refused: dict[str, float] = {}
+        self._thread: threading.Thread | None = None
+        self._wake = threading.Event()
+        self._closed = False
+        with self._lock:
+            self._ensure_thread()
+
+    @property
+    def broadcasts(self) -> bool:
+        return self._beacon is not None
+
+    @property
+    def discovers(self) -> bool:
+        return self._discovering
+
+    def set_broadcast(self, on: bool) -> None:
+        with self._lock:
+            self._check_open()
+            if on and self._beacon is None:
+                self._beacon = self._links.beacon()
+            elif not on:
+                self._dim()
+
+    def _dim(self) -> None:
+        beacon, self._beacon = self._beacon, None
+        if beacon is not None:
+            beacon.close()
+
+    def set_discovery(self, on: bool) -> None:
+        with self._lock:
+            self._check_open()
+            self._discovering = on
+            self._refused.clear()
+            self._ensure_thread()
+        self._wake.set()
+
+    def connect(self, endpoint: str) -> None:
+        self._check_open()
+        self._may_dial(endpoint)
+        there = self._dial(endpoint)
+        if not there:
+            raise CannotConnect(endpoint=endpoint, reason=_why(endpoint, self._links))
+        with self._lock:
+            self._check_open()
+            self._kept[endpoint] = there
+            self._ensure_thread()
+
+    def disconnect(self, endpoint: str) -> None:
+        """Dial it no more; raises LinkStays while the link is there, which only its ends' closing can end."""
+        Endpoint.read(endpoint)
+        with self._lock:
+            self._check_open()
+            there = self._kept.pop(endpoint, "")
+        if (there and self._links.linked(there)) or self._links.linked_at(endpoint):
+            raise LinkStays(to=endpoint)
+
+    def _dial(self, endpoint: str) -> str:
+        asked = Endpoint.read(endpoint)
+        found = asked.resolved() if asked.protocol in ("tcp", "udp") and not asked.rest else [endpoint]
+        return self._links.join(found, "", _JOIN_S, self._ended) if found else ""
+
+    def unlinked(self) -> list[str]:
+        """Those of the configured endpoints that none of the links leads to."""
+        return [endpoint for endpoint in self.configured if not self._links.linked_at(endpoint)]
+
+    def why_apart(self, endpoint: str, *, certain: bool) -> str:
+        """Why there is no link to an endpoint that none leads to.
+
+        Args:
+            endpoint: a configured one.
+            certain: whether it is known that there is none; else somebody there may have dialled us, which is looked at
+                for two seconds at most.
+
+        Returns:
+            The reason; empty if there is a link.
+        """
+        why = _why(endpoint, self._links)
+        if certain or not accepts(endpoint):
+            return why
+        return "" if self._dial(endpoint) else why
+
+    # --- the thread
+
+    def _ensure_thread(self) -> None:
+        if self._thread is None and self._has_work():
+            self._thread = threading.Thread(target=self._run, name="trade-reach", daemon=True)
+            self._thread.start()
+
+    def _has_work(self) -> bool:
+        return not self._closed and (self._discovering or bool(self._kept) or bool(self._unsure))
+
+    def _run(self) -> None:
+        while True:
+            with self._lock:
+                if not self._has_work():
+                    self._thread = None
+                    return
+            for step in (self._discover, self._redial, self._judge):
+                try:
+                    step()
+                except Exception:
+                    if not self._closed:
+                        _logger.exception("looking for other containers failed; trying again")
+            self._wake.wait(_ROUND_S)
+            self._wake.clear()
+
+    def _discover(self) -> None:
+        if not self._discovering:
+            return
+        for found in self._links.scouted(_SCOUT_S, lambda: self._closed or not self._discovering):
+            patient = time.monotonic() >= self._refused.get(found.session, 0.0)
+            if patient and not self._links.linked(found.session):
+                joined = self._links.join(found.endpoints, found.session, _JOIN_S, self._ended)
+                if not joined:
+                    self._refused[found.session] = time.monotonic() + _AGAIN_S
+
+    def _redial(self) -> None:
+        for endpoint, session in list(self._kept.items()):
+            if self._links.linked(session):
+                continue
+            there = self._dial(endpoint)
+            with self._lock:
+                if there and endpoint in self._kept:
+                    self._kept[endpoint] = there
+
+    def _judge(self) -> None:
+        """Say once which of the configured endpoints refuse us; nothing else ever would."""
+        self._unsure = [endpoint for endpoint in self._unsure if not self._links.linked_at(endpoint)]
+        if time.monotonic() < self._unsure_until:
+            return
+        silent, self._unsure = self._unsure, []
+        for endpoint in silent:
+            if accepts(endpoint):
+                _logger.warning("%s", CannotConnect(endpoint=endpoint, reason=_REFUSED[self._links.certified]))
+
+    def _ended(self) -> bool:
+        return self._closed
+
+    def _check_open(self) -> None:
+        if self._closed:
+            raise ConfigurationError(problem="the container is closed")
+
+    def close(self) -> None:
+        """End the thread and the beacon. Idempotent."""
+        with self._lock:
+            self._closed = True
+            self._dim()
+            thread = self._thread
+        self._wake.set()
+        if thread is not None and thread is not threading.current_thread():
+            thread.join(5)
+
+
+_REFUSED: Final = {
+    False: "something listens there but does not let us in; do both have the same user and password?",
+    True: (
+        "something listens there but there is no link; are both certificates in date and of one authority, and is the "
+        "other one for the addresses it listens on?"
+    ),
+}
+"""By whether we have a certificate."""
+_BRIDGES: Final = " Or is it a bridge? Those link to each other by connect in their settings, when they start."
+
+
+def _why(endpoint: str, links: Links) -> str:
+    if not accepts(endpoint):
+        return "nothing accepts connections there; is it up, and the address right?"
+    refused = _REFUSED[links.certified]
+    return refused + _BRIDGES if links.bridges else refused

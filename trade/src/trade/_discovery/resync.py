@@ -1,0 +1,180 @@
+"""Asking containers for what stands there, when something they announced may have been missed."""
+
+import logging
+import math
+import threading
+import time
+from collections.abc import Callable, Sequence
+from typing import Final
+
+from trade._protocol.keys import REGISTRY, Address, registry_key
+from trade._registry.registry import ContainerState, Registry
+from trade._transport.base import Answer, ChannelClosed, Transport
+
+_logger = logging.getLogger("trade")
+
+_ANSWER_S: Final = 1.5
+"""An answer that takes longer is none at first. Who starts waits longer than this for all."""
+_SLOW_ANSWER_S: Final = 10.0
+"""So long who was waited for in vain is waited for from then on, apart from the others."""
+_FIRST_PAUSE_S: Final = 0.1
+_LONGEST_PAUSE_S: Final = 5.0
+"""Between two questions to a container that is alive and does not answer, or announces nonsense."""
+
+Take = Callable[[Answer, dict[Address, ContainerState]], None]
+
+
+class Asker:
+    """One thread that asks; several requests for one container are one question.
+
+    Those who were waited for in vain are asked by a second one, there from the first such case on: nobody waits behind
+    them. The first also has the container say how far it is itself (`beat`), every ``Transport.beat_s``.
+    """
+
+    def __init__(self, transport: Transport, registry: Registry, take: Take, beat: Callable[[], None]) -> None:
+        self._transport = transport
+        self._registry = registry
+        self._take = take
+        self._beat = beat
+        self._changed = threading.Condition()
+        self._due: dict[Address, float] = {}
+        """When to ask, in monotonic seconds."""
+        self._pauses: dict[Address, float] = {}
+        """In seconds until it is asked again, of those whose last answer left something open."""
+        self._slow: set[Address] = set()
+        """Waited for in vain the last time."""
+        self._asking = False
+        self._closed = False
+        self._next_beat = time.monotonic() + transport.beat_s
+        self._threads: list[threading.Thread] = []
+
+    def start(self) -> None:
+        self._spawn("trade-asking", slow=False)
+
+    def _spawn(self, name: str, *, slow: bool) -> None:
+        self._threads.append(threading.Thread(target=self._run, args=(slow,), name=name, daemon=True))
+        self._threads[-1].start()
+
+    def request(self, address: Address, *, anew: bool = False) -> None:
+        """Ask a container soon; does not wait.
+
+        Args:
+            address: whom.
+            anew: it has just appeared: whatever was the matter before does not count.
+        """
+        with self._changed:
+            if anew:
+                self._due.pop(address, None)
+                self._forget(address)
+            self._due.setdefault(address, time.monotonic() + self._pauses.get(address, 0.0))
+            self._changed.notify_all()
+
+    @property
+    def busy(self) -> bool:
+        """Whether somebody is asked, or is to be asked, who has not failed to answer."""
+        with self._changed:
+            return not self._closed and (self._asking or any(address not in self._pauses for address in self._due))
+
+    def wait(self, timeout_s: float) -> None:
+        """Wait until it is not busy."""
+        with self._changed:
+            self._changed.wait_for(lambda: not self.busy, timeout_s)
+
+    def _run(self, slow: bool) -> None:
+        while not self._closed:
+            try:
+                if not slow:
+                    self._beat_if_due()
+                self._ask(self._wait(slow), slow)
+            except ChannelClosed:
+                with self._changed:
+                    self._closed = True
+                    self._changed.notify_all()
+            except Exception:
+                _logger.exception("asking for what stands failed")
+
+    def _beat_if_due(self) -> None:
+        if time.monotonic() >= self._next_beat:
+            self._next_beat = time.monotonic() + self._transport.beat_s
+            self._beat()
+
+    def _wait(self, slow: bool) -> list[Address]:
+        """Whom to ask now; nobody when it is time for something else."""
+        with self._changed:
+            if not slow and self._asking:
+                self._asking = False
+                self._changed.notify_all()
+            soonest = min(self._mine(slow).values(), default=math.inf)
+            left = (soonest if slow else min(soonest, self._next_beat)) - time.monotonic()
+            if left > 0 and not self._closed:
+                self._changed.wait(min(left, threading.TIMEOUT_MAX))
+            now = time.monotonic()
+            due = [address for address, when in self._mine(slow).items() if when <= now]
+            for address in due:
+                del self._due[address]
+            if not slow:
+                self._asking = bool(due)
+            return due
+
+    def _mine(self, slow: bool) -> dict[Address, float]:
+        return {address: when for address, when in self._due.items() if (address in self._slow) is slow}
+
+    def _ask(self, due: list[Address], slow: bool) -> None:
+        alive = {state.address: state for state in self._registry.containers()}
+        open_ones = [address for address in due if address in alive and not alive[address].heard.complete]
+        if not slow and 2 * len(open_ones) > len(alive):
+            self._ask_with(REGISTRY, alive, open_ones, _ANSWER_S)
+        else:
+            for address in open_ones:
+                pattern, patience_s = registry_key("*", address, "*"), _SLOW_ANSWER_S if slow else _ANSWER_S
+                self._ask_with(pattern, alive, [address], patience_s)
+        with self._changed:
+            for address in set(due).difference(open_ones):
+                self._forget(address)
+
+    def _ask_with(
+        self, pattern: str, alive: dict[Address, ContainerState], asked: Sequence[Address], patience_s: float
+    ) -> None:
+        before, began = {address: alive[address].heard.answered for address in asked}, time.monotonic()
+        answers = self._transport.ask(pattern, patience_s)
+        in_vain = time.monotonic() - began >= _ANSWER_S
+        for answer in answers:
+            try:
+                self._take(answer, alive)
+            except Exception:
+                _logger.exception("the registry could not take an answer")
+        left_open = [address for address in asked if self._registry.left_open(address)]
+        with self._changed:
+            for address in asked:
+                if address not in left_open:
+                    self._forget(address)
+                elif alive[address].heard.answered > before[address]:  # more has been missed meanwhile
+                    self._forget(address)
+                    self._due[address] = time.monotonic()
+                else:
+                    self._put_off(address, in_vain)
+            self._changed.notify_all()
+
+    def _forget(self, address: Address) -> None:
+        """That it ever failed to answer."""
+        self._pauses.pop(address, None)
+        self._slow.discard(address)
+
+    def _put_off(self, address: Address, in_vain: bool) -> None:
+        """Who is alive and does not answer is asked again, less and less often."""
+        pause_s = min(2 * self._pauses.get(address, _FIRST_PAUSE_S / 2), _LONGEST_PAUSE_S)
+        self._pauses[address] = pause_s
+        self._due[address] = time.monotonic() + pause_s
+        if in_vain:
+            self._slow.add(address)
+            if len(self._threads) == 1 and not self._closed:
+                self._spawn("trade-asking-slow", slow=True)
+
+    def close(self) -> None:
+        """End the threads. Idempotent."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+        for thread in self._threads:
+            if thread is not threading.current_thread():
+                thread.join(2)

@@ -1,0 +1,200 @@
+"""The line that e-stops travel on (S09): orders and confirmations that wait for nobody, and are repeated instead."""
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
+from itertools import chain
+from typing import Final
+
+import msgspec
+from msgspec import Struct
+
+from trade._audit.events import Audit
+from trade._protocol.estop_messages import decode_estop_confirmed, decode_estop_order
+from trade._protocol.keys import ESTOPS, Address, estop_confirmed_key, estop_key, is_chunk
+from trade._protocol.messages import PROTOCOL, EstopConfirmed, EstopOrder, Malformed, encode_message
+from trade._security.authorizer import Access
+from trade._transport.base import ChannelClosed, Message, Transport
+
+_logger = logging.getLogger("trade")
+
+_AGAIN_S: Final = 0.1
+
+Expected = Callable[[], set[Address]]
+
+
+class EstopReport(Struct, frozen=True):
+    """Who did what an e-stop, or its clearing, told them."""
+
+    id: str
+    """Of the e-stop; of a clearing all ids, with commas."""
+    confirmed: tuple[str, ...]
+    """Containers (``identity/container``) that did it: what they drive is at rest."""
+    missing: tuple[str, ...] = ()
+    """Containers with something to stop that did not answer in time."""
+    failed: dict[str, str] = {}
+    """Containers that answered that something of it failed, and what."""
+    versions: dict[str, int] = {}
+    """Those of the above that speak another version of the protocol, and which. What they offer cannot be read here, so
+    each of them counts as one with something to stop. A clearing they do not heed: one of their version is needed."""
+
+    apart: tuple[str, ...] = ()
+    """Containers that did not say what they offer and, by the policy, may offer nothing: they have nothing to stop."""
+
+    @property
+    def complete(self) -> bool:
+        """Whether somebody was found, and all of them did it."""
+        return bool(self.confirmed) and not self.missing and not self.failed
+
+
+class EstopLine:
+    """Where one container hears orders and confirmations, and gives its own."""
+
+    def __init__(self, transport: Transport, own: Address, access: Access, audit: Audit) -> None:
+        self._access = access
+        self._audit = audit
+        self._own = own
+        self._orders = transport.publish(estop_key(own.identity), urgent=True, droppable=True)
+        self._confirmations = transport.publish(estop_confirmed_key(own), urgent=True, droppable=True)
+        self._channel = transport.subscribe(ESTOPS)
+        self._take: Callable[[EstopOrder, str], None] | None = None
+        self._asked: list[dict[str, dict[Address, str]]] = []
+        """Of each who asks, by request: who has confirmed it, and what failed there."""
+        self._changed = threading.Condition()
+        self._thread = threading.Thread(target=self._read, name="trade-estop", daemon=True)
+        self.malformed = 0
+
+    def listen(self, take: Callable[[EstopOrder, str], None]) -> None:
+        """Begin to hear, told of each order and of who gives it; what was put before waits until then."""
+        self._take = take
+        self._thread.start()
+
+    def confirm(self, request: str, problem: str) -> None:
+        """Say that it was done, and what of it failed."""
+        try:
+            self._confirmations.put(encode_message(EstopConfirmed(PROTOCOL, request, problem[:500])))
+        except ChannelClosed:
+            _logger.debug("e-stop %s is not confirmed: the container is closing", request)
+
+    def ask(
+        self,
+        orders: Sequence[EstopOrder],
+        expected: Expected,
+        limit_s: float,
+        over: Callable[[], bool],
+        *,
+        beyond: bool = True,
+    ) -> EstopReport:
+        """Repeat orders until all that are expected have confirmed each of them.
+
+        Args:
+            orders: what to do.
+            expected: whose confirmation to wait for, as far as is known; who was expected once stays expected.
+            limit_s: how long to try, in seconds; also if nobody is found.
+            over: whether they are to be repeated no more: somebody has cleared it, or it is known to be done.
+            beyond: whether others are told, too; else this container alone does it.
+        """
+        until = time.monotonic() + limit_s
+        data = [encode_message(order) for order in orders]
+        awaited: set[Address] = set()
+        heard: dict[str, dict[Address, str]] = {order.request: {} for order in orders}
+        with self._changed:
+            self._asked.append(heard)
+        if (take := self._take) is not None:
+            for order in orders:
+                take(order, self._own.identity)
+        while (left_s := until - time.monotonic()) > 0 and not over():
+            for payload in data if beyond else ():
+                self._orders.put(payload)
+            awaited.update(expected())
+            with self._changed:
+                if self._changed.wait_for(partial(_confirmed, awaited, heard), min(_AGAIN_S, left_s)):
+                    break
+        with self._changed:
+            self._asked = [one for one in self._asked if one is not heard]
+        return _report(orders, awaited, list(heard.values()))
+
+    # --- hearing
+
+    def _read(self) -> None:
+        while True:
+            try:
+                self._heard(self._channel.receive())
+            except ChannelClosed:
+                return
+            except (Malformed, msgspec.DecodeError) as bad:
+                self.malformed += 1
+                if self.malformed == 1:
+                    _logger.warning("dropped an e-stop message: %s (further ones are counted, not logged)", bad)
+            except Exception:
+                _logger.exception("an e-stop could not be dealt with")
+
+    def _heard(self, message: Message) -> None:
+        _, *chunks = message.key.split("/")
+        if not all(map(is_chunk, chunks)):
+            raise Malformed(f"{message.key!r} is a pattern")
+        if len(chunks) == 1 and self._take is not None:
+            order = decode_estop_order(message.payload or b"", chunks[0])
+            denied = self._access.denied_order(chunks[0], clears=order.opened is None)
+            if denied is not None:
+                self._audit.refused("trade.estop" if order.opened else "trade.estop_clear", denied, who=chunks[0])
+                raise Malformed(str(denied))
+            self._take(order, chunks[0])
+        elif len(chunks) == 3:
+            self._hear_confirmed(Address(*chunks), decode_estop_confirmed(message.payload or b""))
+
+    def _hear_confirmed(self, address: Address, confirmed: EstopConfirmed) -> None:
+        with self._changed:
+            for asked in self._asked:
+                if (heard := asked.get(confirmed.request)) is not None:
+                    heard[address] = confirmed.problem
+            self._changed.notify_all()
+
+    def close(self) -> None:
+        """End the thread. Idempotent."""
+        self._channel.close()
+        if self._thread.is_alive() and self._thread is not threading.current_thread():
+            self._thread.join(2)
+
+
+def all_of(estop_id: str, reports: Iterable[EstopReport]) -> EstopReport:
+    """What several containers report of one e-stop, as one: who confirmed it to one of them has done it."""
+    confirmed, missing = set[str](), set[str]()
+    failed, versions, apart = dict[str, str](), dict[str, int](), set[str]()
+    for report in reports:
+        confirmed.update(report.confirmed)
+        missing.update(report.missing)
+        failed.update(report.failed)
+        versions.update(report.versions)
+        apart.update(report.apart)
+    confirmed -= failed.keys()
+    missing -= confirmed | failed.keys()
+    apart -= confirmed | missing | failed.keys()
+    return EstopReport(
+        estop_id, tuple(sorted(confirmed)), tuple(sorted(missing)), failed, versions, tuple(sorted(apart))
+    )
+
+
+def _confirmed(awaited: set[Address], heard: Mapping[str, Mapping[Address, str]]) -> bool:
+    return bool(awaited) and all(awaited <= who.keys() for who in heard.values())
+
+
+def _report(orders: Sequence[EstopOrder], awaited: set[Address], heard: Sequence[Mapping[Address, str]]) -> EstopReport:
+    """What became of orders that were given together, by what was heard of each."""
+    done = awaited.intersection(*heard)
+    problems: dict[Address, str] = {}
+    for address, problem in chain.from_iterable(one.items() for one in heard):
+        problems[address] = "; ".join(filter(None, (problems.get(address, ""), problem)))
+    names = (order.cleared if order.opened is None else (order.opened.id,) for order in orders)
+    return EstopReport(
+        id=",".join(chain.from_iterable(names)),
+        confirmed=_names(address for address in done if not problems[address]),
+        missing=_names(awaited - done),
+        failed={address.who: problem for address, problem in problems.items() if problem},
+    )
+
+
+def _names(addresses: Iterable[Address]) -> tuple[str, ...]:
+    return tuple(sorted(address.who for address in addresses))

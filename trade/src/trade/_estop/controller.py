@@ -1,0 +1,306 @@
+"""E-stops of one container, tied together: hearing and giving orders, telling of what is open, taking the union."""
+
+import logging
+import secrets
+import time
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Final, Protocol
+
+from msgspec import structs
+
+from trade._audit.events import Audit
+from trade._container.system import DOMAIN
+from trade._estop.broadcast import EstopLine, EstopReport, all_of
+from trade._estop.deadman import Deadman
+from trade._estop.latch import Estops
+from trade._estop.ledger import as_told
+from trade._estop.store import EstopStore
+from trade._protocol.keys import Address, is_chunk
+from trade._protocol.messages import MOST_CLEARED, PROTOCOL, Estop, EstopOrder, ProviderInfo
+from trade._registry.registry import Change, ContainerState, Record, Registry
+from trade._resources.lock_table import LockTable
+from trade._security.authorizer import Access
+from trade._services.providers import Providers
+from trade._transport.base import ChannelClosed, Transport
+from trade.errors import ConfigurationError, NoSuchEstop
+
+_logger = logging.getLogger("trade")
+
+LIMIT_S: Final = 3.0
+_LONGEST_LIMIT_S: Final = 60.0
+_TOLD_S: Final = 1.0
+"""How long the entries of others may lag behind their confirmations."""
+_LONGEST_REASON: Final = 500
+
+
+class LineReports(Protocol):
+    """An e-stop under way on the stop lines."""
+
+    def report(self) -> EstopReport: ...
+
+    def wait(self) -> EstopReport: ...
+
+
+Beside = Callable[[str, str, float], LineReports]
+
+
+class Estopping:
+    """``container.estop`` and its kind."""
+
+    def __init__(
+        self,
+        transport: Transport,
+        own: Address,
+        registry: Registry,
+        table: LockTable,
+        providers: Providers,
+        folder: Path | None,
+        access: Access,
+        audit: Audit,
+    ) -> None:
+        self._own = own
+        self._registry = registry
+        self._providers = providers
+        self._access = access
+        self._line = EstopLine(transport, own, access, audit)
+        self.deadman: Final = Deadman(providers.stop_of, providers.stops, table.resources, audit)
+        self._estops = Estops(
+            table,
+            self.deadman,
+            EstopStore(folder, own),
+            self._line.confirm,
+            self._tell,
+            lambda: bool(providers.stops()),
+            audit,
+        )
+        self._provider: object = None
+        self._beside: Beside | None = None
+
+    def open_here(self) -> tuple[Estop, ...]:
+        """What is open in this very container."""
+        return self._estops.open()
+
+    def knows(self, estop_id: str) -> bool:
+        """Whether that e-stop was opened or cleared here."""
+        return self._estops.knows(estop_id)
+
+    def begin(self, provider: object, lines: Beside | None = None) -> None:
+        """Hear orders from now on.
+
+        Args:
+            provider: that of e-stops, registered; its entry tells what is open, as its ``open_estops``.
+            lines: begins an e-stop on the stop lines of others, by its id, reason and limit.
+        """
+        self._provider = provider
+        self._beside = lines
+        self._registry.listen(self._heard)
+        self._line.listen(self._estops.take)
+
+    @property
+    def malformed(self) -> int:
+        """Messages that were dropped."""
+        return self._line.malformed
+
+    # --- asking
+
+    def estop(self, reason: str, limit_s: float, estop_id: str = "") -> EstopReport:
+        """See `Container.estop`."""
+        check_limit(limit_s)
+        if estop_id and not is_chunk(estop_id):
+            raise ConfigurationError(where="estop", problem=f"{estop_id!r} is no id; use letters, digits, . _ -")
+        estop = Estop(estop_id or new_estop_id(), str(self._own), reason[:_LONGEST_REASON], time.time())
+        order = EstopOrder(PROTOCOL, estop.id, estop)
+
+        beside: LineReports | None = None
+        rounds = 0
+
+        def over() -> bool:
+            nonlocal beside, rounds
+            rounds += 1
+            if rounds > 1 and beside is None and self._beside is not None:  # the links alone did not do it at once
+                beside = self._beside(estop.id, estop.reason, limit_s)
+            return self._estops.is_cleared(estop.id) or (beside is not None and self._is_done(beside.report()))
+
+        report = self._line.ask([order], self._awaited, limit_s, over)
+        if self._beside is not None:
+            beside = beside or self._beside(estop.id, estop.reason, limit_s)  # for whom there is no link to
+            told = report.complete and any(who != self._own.who for who in report.confirmed)
+            report = all_of(estop.id, [report, beside.report() if told else beside.wait()])
+        return self._with_versions(report)
+
+    def _is_done(self, report: EstopReport) -> bool:
+        """Whether it says of all that are known here that they did it."""
+        known = {address.who for address in self._awaited()} - {self._own.who}
+        return report.complete and known <= {*report.confirmed, *report.failed}
+
+    def relay(self, estop_id: str, reason: str, limit_s: float, *, beyond: bool) -> EstopReport:
+        """Stop for somebody who asks on the stop line: everything, or what is here alone."""
+        mine = Estop(estop_id, str(self._own), reason[:_LONGEST_REASON], time.time())
+        order = EstopOrder(PROTOCOL, estop_id, mine)
+        expected = self._awaited if beyond else lambda: {self._own}
+        cleared = partial(self._estops.is_cleared, estop_id)
+        report = self._line.ask([order], expected, limit_s, cleared, beyond=beyond)
+        return self._with_versions(report)
+
+    def hear(self, tell: Callable[[Estop], None]) -> None:
+        """Have this called, on a thread of its own, with every e-stop: those that are open, and those to come."""
+        self._estops.hear(tell)
+
+    def deafen(self, tell: Callable[[Estop], None]) -> None:
+        """Have it called no more."""
+        self._estops.deafen(tell)
+
+    def carry(self, estop: Estop, system: str) -> None:
+        """Open an e-stop of another system here, under its id; once: it is cleared here by itself."""
+        if self._estops.knows(estop.id) or not is_chunk(estop.id):
+            return
+        reason = f"{estop.reason} (in system {system}, by {estop.by})"[:_LONGEST_REASON]
+        mine = Estop(estop.id, str(self._own), reason, estop.at)
+        order = EstopOrder(PROTOCOL, estop.id, mine)
+        report = self._line.ask([order], self._awaited, LIMIT_S, lambda: self._estops.is_cleared(estop.id))
+        if report.missing or report.failed:
+            _logger.error("e-stop %s of system %s: missing %s, %s", estop.id, system, report.missing, report.failed)
+
+    def open(self) -> list[Estop]:
+        """See `Container.estops`."""
+        told: dict[str, Estop] = {}
+        for teller, estops in self._told():
+            for estop in as_told(estops, teller):
+                if estop.id not in told or not estop.told_by:  # its giver's own word counts most
+                    told[estop.id] = estop
+        told.update((estop.id, estop) for estop in self._estops.open())
+        return sorted(told.values(), key=lambda estop: (estop.at, estop.id))
+
+    def clear(self, ids: Sequence[str], limit_s: float) -> EstopReport:
+        """See `Container.estop_clear`."""
+        check_limit(limit_s)
+        if isinstance(ids, str) or not ids:
+            problem = "name the e-stops to clear in a list; trade.estops() tells which are open"
+            raise ConfigurationError(where="estop_clear", problem=problem)
+        there = [estop.id for estop in self.open()]
+        if unknown := [name for name in ids if name not in there]:
+            raise NoSuchEstop(ids=unknown, open=there)
+        self._access.require(self._own.identity, "administer", DOMAIN, f"e-stop {', '.join(ids)}")
+        pieces = [tuple(ids[first : first + MOST_CLEARED]) for first in range(0, len(ids), MOST_CLEARED)]
+        orders = [EstopOrder(PROTOCOL, secrets.token_hex(4), None, piece) for piece in pieces]
+
+        def expected() -> set[Address]:
+            knowing = (r.key.address for r in self._own_records() if any(estop.id in ids for estop in r.estops))
+            return {*self._with_stops(), *self._unread(), *knowing}
+
+        report = self._line.ask(orders, expected, limit_s, lambda: False)
+        self._registry.wait_for(lambda: not self._still_told(ids, report.confirmed), _TOLD_S)
+        unheeding = (state for state in self._others() if any(estop.id in ids for estop in state.open_estops()))
+        names = {state.address.who for state in unheeding}
+        report = structs.replace(report, missing=tuple(sorted({*report.missing, *names})))
+        return self._with_versions(report)
+
+    def _with_versions(self, report: EstopReport) -> EstopReport:
+        there = {state.address.who: state.protocol for state in self._others()}
+        named = {*report.confirmed, *report.missing, *report.failed}
+        unable = (state.address for state in self._silent() if not self._access.may_have_stops(state.address.identity))
+        return structs.replace(
+            report,
+            versions={name: there[name] for name in sorted(there) if name in named},
+            apart=tuple(sorted({address.who for address in unable} - named)),
+        )
+
+    def _still_told(self, ids: Sequence[str], by: Sequence[str]) -> bool:
+        """Whether the entries of those who confirmed still have them: what they say now may not have arrived."""
+        return any(
+            estop.id in ids for record in self._own_records() if record.key.address.who in by for estop in record.estops
+        )
+
+    def _with_stops(self) -> set[Address]:
+        return {state.address for state in self._registry.containers() if _has_stop(state)}
+
+    def _awaited(self) -> set[Address]:
+        """Who has something to stop, or may have, as far as that can be known."""
+        return {*self._with_stops(), *self._unread(), *(state.address for state in self._others())}
+
+    def _unread(self) -> set[Address]:
+        """Who is there and has not said yet what is its own: nobody can tell that it has nothing to stop."""
+        return {state.address for state in self._silent() if self._access.may_have_stops(state.address.identity)}
+
+    def _silent(self) -> list[ContainerState]:
+        containers = self._registry.containers()
+        return [state for state in containers if not state.heard.complete and state.address != self._own]
+
+    def _others(self) -> list[ContainerState]:
+        """Those that speak another version."""
+        return [state for state in self._registry.containers() if state.protocol not in (0, PROTOCOL)]
+
+    def _told(self) -> list[tuple[Address, Sequence[Estop]]]:
+        """What each container tells of, of whatever version."""
+        of_ours = [(record.key.address, record.estops) for record in self._own_records()]
+        return [*of_ours, *((state.address, state.open_estops()) for state in self._others())]
+
+    def _own_records(self) -> list[Record]:
+        """One record of each container, of the provider that tells what is open there."""
+        containers = self._registry.containers()
+        entries = [entry for state in containers for entry in list(state.providers.values())]
+        return [entry.records[0] for entry in entries if _tells(entry.records)]
+
+    # --- telling and hearing of what is open
+
+    def learn(self, estops: Iterable[Estop], teller: Address) -> None:
+        """Told by the watch: a container of another version has these open."""
+        self._estops.learn(estops, teller)
+
+    def _tell(self) -> None:
+        """Let our registry entry say what is open, for those who join."""
+        try:
+            self._providers.alter(self._provider, lambda info: _with(info, self._estops.open()))
+        except (ChannelClosed, ConfigurationError):  # the container is closing
+            return
+        self._learn_from_all()
+
+    def _learn_from_all(self) -> None:
+        """What had no room here before may have some now."""
+        for teller, estops in self._told():
+            if teller != self._own:
+                self._estops.learn(estops, teller)
+
+    def _heard(self, change: Change) -> None:
+        """Told by the registry."""
+        for record in (*change.joined, *change.replaced):
+            if record.estops and not record.local:
+                self._estops.learn(record.estops, record.key.address)
+        if self._estops.open() and any(record.local and is_stop(record) for record in change.joined):
+            self._estops.keep()
+
+    def close(self) -> None:
+        """Hear no more. Idempotent."""
+        self._line.close()
+        self._estops.close()
+
+
+def new_estop_id() -> str:
+    """One that no other e-stop has."""
+    return secrets.token_hex(4)
+
+
+def _with(info: ProviderInfo, estops: tuple[Estop, ...]) -> ProviderInfo:
+    return structs.replace(info, estops=estops)
+
+
+def is_stop(record: Record) -> bool:
+    """Whether it stops something: not one of the middleware's own."""
+    return record.info.effect == "stop" and record.key.domain != DOMAIN
+
+
+def _has_stop(state: ContainerState) -> bool:
+    return any(is_stop(record) for entry in list(state.providers.values()) for record in entry.records)
+
+
+def _tells(records: Sequence[Record]) -> bool:
+    return bool(records) and records[0].key.domain == DOMAIN
+
+
+def check_limit(limit_s: float, where: str = "estop") -> None:
+    """Raises ConfigurationError: it is no limit of a stop, in seconds."""
+    if not 0 < limit_s <= _LONGEST_LIMIT_S:
+        problem = f"limit_s must be above 0 and at most {_LONGEST_LIMIT_S:g}, not {limit_s!r}"
+        raise ConfigurationError(where=where, problem=problem)

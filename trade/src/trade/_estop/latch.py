@@ -1,0 +1,240 @@
+"""E-stops as they hold in one container (S09): latched at once, stopped, written down, confirmed, in the end cleared.
+
+The other side, who orders one and waits for the confirmations, is `_estop_line`.
+"""
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Iterable, Sequence
+from typing import Final
+
+from trade._audit.events import Audit
+from trade._context.sessions import foreign
+from trade._estop.deadman import Deadman
+from trade._estop.ledger import Ledger, age, as_told, identity_of
+from trade._estop.store import EstopStore
+from trade._estop.worker import SHARED_S, Pending, Relay, Round, Worker
+from trade._protocol.keys import Address
+from trade._protocol.messages import Estop, EstopOrder
+from trade._resources.lock_table import LockTable
+from trade._resources.resource import Latch
+
+_logger = logging.getLogger("trade")
+
+_LOOK_AGAIN_S: Final = 0.005
+
+Confirm = Callable[[str, str], None]
+"""Says that a request was done, and what of it failed; waits for nobody."""
+
+
+class Estops:
+    """What is open here. Nothing that actuates begins in this container while anything is.
+
+    Args:
+        table: its resources.
+        deadman: what stops them.
+        store: where open ones outlive the process.
+        confirm: tells who asked.
+        changed: called, on a thread of its own, when what is open has become another set.
+        keeps: whether this container has something to stop, so that it must remember.
+    """
+
+    def __init__(
+        self,
+        table: LockTable,
+        deadman: Deadman,
+        store: EstopStore,
+        confirm: Confirm,
+        changed: Callable[[], None],
+        keeps: Callable[[], bool],
+        audit: Audit,
+    ) -> None:
+        self._audit = audit
+        self._table = table
+        self._deadman = deadman
+        self._store = store
+        self._confirm = confirm
+        self._changed = changed
+        self._keeps = keeps
+        self._guard = threading.Lock()
+        self._ledger = Ledger(store.read())
+        self._pending: dict[str, Pending] = {}
+        self._round: Round | None = None
+        """The last one, if something was open here ever since it began."""
+        self._finished = 0.0
+        self._worker = Worker(self._work, "trade-estop-work")
+        self._relays: list[Relay] = []
+        self._latch()
+
+    def open(self) -> tuple[Estop, ...]:
+        """Those that are open, oldest first."""
+        with self._guard:
+            return tuple(sorted(self._ledger.open.values(), key=age))
+
+    def is_open(self, estop_id: str) -> bool:
+        """Whether that one is open here."""
+        return estop_id in self._ledger.open
+
+    def is_cleared(self, estop_id: str) -> bool:
+        """Whether somebody has cleared it here, lately."""
+        return estop_id in self._ledger.cleared
+
+    def knows(self, estop_id: str) -> bool:
+        """Whether an e-stop of that id was opened or cleared here."""
+        with self._guard:
+            return self._ledger.knows(estop_id)
+
+    def hear(self, tell: Callable[[Estop], None]) -> None:
+        """Have this called, on a thread of its own, with every e-stop: those that are open, and those to come."""
+        relay = Relay(tell, self.is_open)
+        self._relays = [*self._relays, relay]
+        for estop in self.open():
+            relay.give(estop)
+
+    def deafen(self, tell: Callable[[Estop], None]) -> None:
+        """Have it called no more."""
+        for relay in [one for one in self._relays if one.tell == tell]:
+            self._relays = [one for one in self._relays if one is not relay]
+            relay.close()
+
+    def take(self, order: EstopOrder, who: str) -> None:
+        """Do what that identity asks, without waiting; an order that comes again is confirmed again."""
+        with self._guard:
+            known = self._ledger.knows(order.request)
+            if known and order.opened is not None:
+                self._ledger.hear(order.opened)
+            answer = self._ledger.answer(order.request) if known else None
+            if not known:
+                self._start(order.request, order.opened)
+        if answer is not None:
+            self._confirm(order.request, answer)
+        elif not known and order.opened is not None:
+            self._begin(order.opened)
+        elif not known:
+            self._clear(order.request, order.cleared, who)
+
+    def learn(self, estops: Iterable[Estop], teller: Address) -> None:
+        """Another container has these open: take the union. One that was cleared here is not opened again."""
+        for estop in as_told(estops, teller):
+            with self._guard:
+                if not self._ledger.wants(estop):
+                    continue
+                self._start(estop.id, estop)
+            self._begin(estop)
+
+    def _start(self, request: str, opened: Estop | None) -> None:
+        self._pending.pop(self._ledger.begin(request, opened), None)
+
+    def keep(self) -> None:
+        """This container has something to stop from now on: what is open is written down."""
+        for estop in self.open():
+            if problem := self._written(estop):
+                _logger.error("e-stop %s %s", estop.id, problem)
+
+    # --- stopping
+
+    def _begin(self, estop: Estop) -> None:
+        reason = f"e-stop {estop.id}{f': {estop.reason}' if estop.reason else ''}"
+        who = foreign(estop.by) or identity_of(estop)
+        why = f"{estop.reason} (told by {estop.told_by})".lstrip() if estop.told_by else estop.reason
+        self._audit.note("stop", "e-stop", about=estop.id, who=who, session=estop.by, why=why)
+        with self._guard:
+            self._latch()
+            fresh = self._round is None or not self._round.serves
+            stopping = Round(self._table.resources) if self._round is None or fresh else self._round
+            self._round = stopping
+        try:
+            for resource in self._table.resources():
+                resource.stop(estop.by, (estop.by,), reason, estop=True)
+            if fresh:
+                stopping.begin(self._deadman)
+        finally:
+            self._wait(Pending(estop.id, stopping, opened=estop))
+        if fresh and self._keeps():
+            _logger.error("%s, by %s: everything here stops", reason, estop.giver)
+        for relay in self._relays:
+            relay.give(estop)
+
+    def _written(self, estop: Estop) -> str:
+        """Write it down unless it is cleared meanwhile; what went wrong."""
+        try:
+            self._store.write(estop)
+            if not self.is_open(estop.id):
+                self._store.remove(estop.id)
+        except OSError as bad:
+            return f"is not written down and will not outlive this process: {bad}"
+        return ""
+
+    # --- clearing
+
+    def _clear(self, request: str, ids: Sequence[str], who: str) -> None:
+        self._audit.note("stop", "e-stop cleared", about=list(ids), who=who)
+        with self._guard:
+            self._ledger.clear(ids)
+            if not self._ledger.open:
+                self._round = None
+            self._latch()
+        self._wait(Pending(request, cleared=ids))
+
+    def _removed(self, ids: Sequence[str]) -> str:
+        try:
+            for estop_id in ids:
+                self._store.remove(estop_id)
+        except OSError as bad:
+            return f"is cleared, but its note on disk stays and will be read at the next start: {bad}"
+        return ""
+
+    # --- both
+
+    def _latch(self) -> None:
+        first = self._ledger.first
+        self._table.estop(None if first is None else Latch(first.by, f"e-stop {first.id}: {first.reason}"))
+
+    def _wait(self, pending: Pending) -> None:
+        with self._guard:
+            self._pending[pending.request] = pending
+        self._worker.wake()
+
+    def _work(self) -> float | None:
+        """Write down what is new, and confirm what is over; when to look again, in seconds."""
+        with self._guard:
+            pending, replaced = list(self._pending.values()), list(self._ledger.replaced)
+        if replaced and (early_s := self._finished + SHARED_S - time.monotonic()) > 0:
+            return early_s  # there are more than anybody needs, and each that is told costs everybody
+        for one in pending:
+            self._note(one)
+        if problem := self._removed([name for name in replaced if not self.is_open(name)]):
+            _logger.error("an e-stop that a newer one stands for %s", problem)
+        del self._ledger.replaced[: len(replaced)]
+        over = [(one, result) for one in pending if (result := one.result()) is not None]
+        if over:
+            self._done(over)
+        return _LOOK_AGAIN_S if self._pending else None
+
+    def _note(self, one: Pending) -> None:
+        if one.noted:
+            return
+        one.noted = True
+        if one.opened is None:
+            one.problem = self._removed(one.cleared)
+        elif self._keeps() and self.is_open(one.opened.id):
+            one.problem = self._written(one.opened)
+
+    def _done(self, over: Sequence[tuple[Pending, str]]) -> None:
+        with self._guard:
+            for one, problem in over:
+                self._ledger.answered(one.request, problem)
+                self._pending.pop(one.request, None)
+        self._finished = time.monotonic()
+        self._changed()  # first: who has heard of everybody may look at once
+        for one, problem in over:
+            if problem:
+                _logger.error("e-stop %s: %s", one.request, problem)
+            self._confirm(one.request, problem)
+
+    def close(self) -> None:
+        """Wait for what is being done. Idempotent."""
+        self._worker.close()
+        for relay in self._relays:
+            relay.close()

@@ -1,0 +1,66 @@
+"""Open e-stops on disk: a folder for each container, and in it a file for each e-stop, read at the next start."""
+
+import os
+import secrets
+from pathlib import Path
+from typing import Final
+
+import msgspec
+
+from trade._protocol.keys import Address, is_chunk
+from trade._protocol.messages import UNREADABLE, Estop
+
+_PRIVATE: Final = 0o700
+
+
+class EstopStore:
+    """What one container keeps. Notes that an earlier release left for all containers of a host are read, too.
+
+    Args:
+        shared: the folder of all of a system's containers on this host; none: nothing is kept.
+        own: the container; a program that has no name but its process id finds its notes under the next one.
+    """
+
+    def __init__(self, shared: Path | None, own: Address) -> None:
+        self._shared = shared
+        name = own.container.removesuffix(f"-{os.getpid()}") or own.container
+        self._own = None if shared is None else shared / own.identity / name
+
+    def read(self) -> list[Estop]:
+        """Those that were open when this container last ended. One that cannot be read is open all the same."""
+        notes = {path.stem: path for folder in self._folders() for path in sorted(folder.glob("*.json"))}
+        return [_read(path) for name, path in notes.items() if is_chunk(name) and not path.is_dir()]
+
+    def _folders(self) -> list[Path]:
+        return [] if self._shared is None or self._own is None else [self._shared, self._own]
+
+    def write(self, estop: Estop) -> None:
+        """Keep it. Raises OSError."""
+        if self._shared is None or self._own is None:
+            return
+        for folder in (self._shared, self._own.parent, self._own):
+            folder.mkdir(mode=_PRIVATE, parents=True, exist_ok=True)
+        fresh = self._own / f".{estop.id}.{secrets.token_hex(4)}"  # a program that runs twice writes it twice
+        try:
+            with fresh.open("wb") as file:
+                file.write(msgspec.json.encode(estop))
+                file.flush()
+                os.fsync(file.fileno())
+            fresh.replace(self._own / f"{estop.id}.json")
+        finally:
+            fresh.unlink(missing_ok=True)
+
+    def remove(self, estop_id: str) -> None:
+        """Keep it no more. Raises OSError, but not if it is not there."""
+        for folder in self._folders():
+            note = folder / f"{estop_id}.json"
+            if not note.is_dir():  # an identity's name
+                note.unlink(missing_ok=True)
+
+
+def _read(path: Path) -> Estop:
+    try:
+        found = msgspec.json.decode(path.read_bytes(), type=Estop)
+    except (OSError, *UNREADABLE) as bad:
+        return Estop(path.stem, "unknown", f"its file {path} cannot be read: {bad}", 0.0)
+    return found if found.id == path.stem else Estop(path.stem, found.by, found.reason, found.at)

@@ -1,0 +1,152 @@
+"""What an e-stop leaves to do beside the thread that heard it: one thread for all of them, while there is something."""
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Sequence
+from typing import Final
+
+from msgspec import Struct
+
+from trade._estop.deadman import Deadman
+from trade._protocol.messages import Estop
+from trade._resources.resource import Resource
+
+_logger = logging.getLogger("trade")
+
+_ANSWER_S: Final = 2.5
+"""When a container says what did not come to rest; a stop service that does not return is reported after 2 s."""
+SHARED_S: Final = 0.1
+"""An e-stop that comes so soon after another one needs no stops of its own; whoever repeats an order waits so long."""
+
+
+class Round:
+    """The stops of everything here, called once for all e-stops that come at about the same time."""
+
+    def __init__(self, resources: Callable[[], Sequence[Resource]]) -> None:
+        self._resources = resources
+        self._begun = time.monotonic()
+        self._problems: Sequence[str] | None = None
+
+    def begin(self, deadman: Deadman) -> None:
+        """Does not wait."""
+        deadman.everything(self._ended)
+
+    def _ended(self, problems: Sequence[str]) -> None:
+        self._problems = problems
+
+    @property
+    def serves(self) -> bool:
+        """Whether it does for an e-stop that comes now, if one was open here ever since it began."""
+        limit_s = _ANSWER_S if self._problems is None else SHARED_S
+        return time.monotonic() < self._begun + limit_s
+
+    def result(self) -> list[str] | None:
+        """What failed; None: that is not known yet."""
+        problems, moving = self._problems, [one.name for one in self._resources() if one.moving]
+        if time.monotonic() < self._begun + _ANSWER_S and (problems is None or moving):
+            return None
+        late = ["its stop services did not end"] if problems is None else []
+        return [*(problems or ()), *late, *(f"{name} still moves" for name in moving)]
+
+
+class Pending(Struct, gc=False):
+    """A request that is not confirmed yet: an e-stop, or ids that are cleared."""
+
+    request: str
+    round: Round | None = None
+    opened: Estop | None = None
+    cleared: Sequence[str] = ()
+    noted: bool = False
+    """The disk has it."""
+    problem: str = ""
+
+    def result(self) -> str | None:
+        """What failed; None: that is not known yet."""
+        failed = [] if self.round is None else self.round.result()
+        return None if failed is None else "; ".join([*failed, *([self.problem] if self.problem else [])])
+
+
+class Worker:
+    """One thread while there is something to do, and none else.
+
+    Args:
+        step: does what there is; returns after how many seconds it is to be called again, or None: all is done.
+        name: of the thread.
+    """
+
+    def __init__(self, step: Callable[[], float | None], name: str) -> None:
+        self._step = step
+        self._name = name
+        self._changed = threading.Condition()
+        self._woken = False
+        self._thread: threading.Thread | None = None
+
+    def wake(self) -> None:
+        """There is something to do."""
+        with self._changed:
+            self._woken = True
+            self._changed.notify()
+            if self._thread is None:
+                thread = threading.Thread(target=self._run, name=self._name, daemon=True)
+                thread.start()
+                self._thread = thread
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                self._woken = False
+            wait_s = self._once()
+            with self._changed:
+                if self._woken:
+                    continue
+                if wait_s is None:
+                    self._thread = None
+                    return
+                self._changed.wait(wait_s)
+
+    def _once(self) -> float | None:
+        try:
+            return self._step()
+        except Exception:
+            _logger.exception("an e-stop could not be dealt with")
+            return SHARED_S
+
+    def close(self) -> None:
+        """Wait for what is being done. Idempotent."""
+        thread = self._thread
+        if thread is not None and thread is not threading.current_thread():
+            thread.join(_ANSWER_S)
+
+
+class Relay:
+    """Tells one who asked for it of each e-stop while that is open, one after the other."""
+
+    def __init__(self, tell: Callable[[Estop], None], is_open: Callable[[str], bool]) -> None:
+        self.tell: Final = tell
+        self._is_open = is_open
+        self._guard = threading.Lock()
+        self._waiting: dict[str, Estop] = {}
+        self._worker = Worker(self._next, "trade-estop-relay")
+
+    def give(self, estop: Estop) -> None:
+        """Have it told; does not wait."""
+        with self._guard:
+            self._waiting = {name: one for name, one in self._waiting.items() if self._is_open(name)}
+            self._waiting[estop.id] = estop
+        self._worker.wake()
+
+    def _next(self) -> float | None:
+        with self._guard:
+            if not self._waiting:
+                return None
+            estop = self._waiting.pop(next(iter(self._waiting)))
+        if self._is_open(estop.id):
+            self.tell(estop)
+        return 0.0
+
+    def close(self) -> None:
+        """Wait for what is being told. Idempotent."""
+        with self._guard:
+            self._waiting.clear()
+        self._worker.close()

@@ -1,0 +1,1 @@
+"""Before and after calls: hooks on services, and the services that manage them."""

@@ -1,0 +1,388 @@
+"""What is called before and after a service, where that runs: attached from anywhere, never able to change the call."""
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any, Final, Literal, Protocol
+
+import msgspec
+from msgspec import Struct
+
+from trade._calls.handle import Handle
+from trade._container.system import DOMAIN
+from trade._context.call_context import CallContext, holding, running
+from trade._context.sessions import speaking
+from trade._protocol.codec import Codec
+from trade._protocol.keys import ServiceKey
+from trade._registry.constraints import Constraint
+from trade._registry.registry import Change, Record
+from trade._services.local_service import LocalService
+from trade._telemetry.spans import Recorded, Spans, traceable
+from trade._threads.scheduler import Clockwork
+from trade.errors import AccessDenied, ConfigurationError, DeadlineExceeded
+
+_logger = logging.getLogger("trade")
+
+ONE_S: Final = 0.1
+"""How long a hook may take."""
+ALL_S: Final = 0.25
+"""How long all hooks of one side of a call may take together."""
+_TRIES: Final = 3
+"""After so many failures in a row a hook is suspended."""
+_MOST: Final = 1000
+"""So many may be attached in a container."""
+
+Side = Literal["before", "after"]
+
+
+class Called(Struct, frozen=True, kw_only=True):
+    """What a hook is told: which service, with what, for whom; and after it, how it ended."""
+
+    service: Handle
+    args: dict[str, Any]
+    """By name, as plain data; ``***`` stands for what is secret."""
+    caller: str
+    """Identity of who calls."""
+    session: str
+    call_id: int
+    chain: tuple[str, ...]
+    """Services whose calls led to it, outermost first."""
+    ended: bool = False
+    """Whether it has run: True for hooks that are called after it."""
+    result: Any = None
+    """As plain data; None also if it failed."""
+    error: str = ""
+    """Type and message of the error it ended with."""
+    took_s: float = 0.0
+
+    @property
+    def ok(self) -> bool:
+        """Whether it ended with a result."""
+        return self.ended and not self.error
+
+
+class HookInfo(Struct, frozen=True, kw_only=True):
+    """One hook in one container, as everybody may know it."""
+
+    id: str
+    side: Side
+    target: str
+    """Which services, as text."""
+    call: str
+    """What is called: ``rosie.watch.saw``."""
+    owner: str
+    """The session of who attached it."""
+    container: str
+    """Where the services run."""
+    services: tuple[str, ...]
+    """Those of them that it is attached to there."""
+    fired: int
+    skipped: int
+    """Times it was left out: it is among the services that led to the call, or there was no time left."""
+    failures: int
+    suspended: bool
+    last_error: str
+
+
+class Home(Protocol):
+    """What hooks need of their container."""
+
+    @property
+    def name(self) -> str: ...
+    def handle(self, key: ServiceKey) -> Handle: ...
+    def require_call(self, who: str, handle: Handle) -> None: ...
+
+
+Denied = Callable[[str, Record], "AccessDenied | None"]
+"""Why somebody may not instrument a service; None if it may."""
+
+
+class Attached:
+    """One hook in this container."""
+
+    def __init__(
+        self,
+        name: str,
+        side: Side,
+        target: Handle | Constraint,
+        call: Handle,
+        owner: str,
+        identity: str,
+        suspended: Callable[["Attached"], None],
+    ) -> None:
+        self.name: Final = name
+        self.side: Final[Side] = side
+        self.target: Final = target
+        self.call: Final = call
+        self.owner: Final = owner
+        self.identity: Final = identity
+        self._tell_suspended = suspended
+        self.suspended = False
+        self.services: dict[ServiceKey, str] = {}
+        self.fired = self.skipped = self.failures = 0
+        self._in_a_row = 0
+        self.last_error = ""
+
+    def means(self, record: Record) -> bool:
+        """Whether it is about that service."""
+        if isinstance(self.target, Handle):
+            return self.target.key == record.key
+        return self.target.matches(record)
+
+    def tell(self, home: Home, called: Called, chain: Sequence[str], left_s: float) -> None:
+        """Call it, as long as that may take. Whatever becomes of it, the call it watches goes on."""
+        if self.call.label in chain or left_s <= 0:
+            self.skipped += 1
+            return
+        try:
+            home.require_call(self.identity, self.call)
+            allowed_s = min(ONE_S, left_s)
+            self.call.with_(deadline_s=allowed_s).start(called).result(allowed_s)
+            self.fired += 1
+            self._in_a_row = 0
+        except TimeoutError:
+            self._failed(f"cut off: it took longer than the {ONE_S:g} s it may, or than all may together")
+        except BaseException as error:  # noqa: BLE001 - whatever a hook raises is none of the caller's business
+            self._failed(f"{type(error).__name__}: {error}")
+
+    def _failed(self, text: str) -> None:
+        self.failures += 1
+        self._in_a_row += 1
+        self.last_error = text
+        if self._in_a_row >= _TRIES and not self.suspended:
+            self.suspended = True
+            _logger.warning("hook %s is suspended after %d failures: %s", self.call.label, self._in_a_row, text)
+            self._tell_suspended(self)
+
+
+class Around:
+    """The hooks of one service here."""
+
+    def __init__(
+        self, home: Home, codec: Codec, clockwork: Clockwork, handle: Handle, hooks: Sequence[Attached]
+    ) -> None:
+        self._home = home
+        self._encode = codec.encode
+        self._decode = codec.decoder(Any)
+        self._clockwork = clockwork
+        self._handle = handle
+        self._before = [hook for hook in hooks if hook.side == "before"]
+        self._after = [hook for hook in hooks if hook.side == "after"]
+
+    def run(self, service: LocalService, args: Sequence[Any], kwargs: dict[str, Any], context: CallContext) -> Any:
+        """Call the service with its hooks around it. Its own errors pass."""
+        began_ns = time.monotonic_ns()
+        called = self._called(service, args, kwargs, context)
+        if self._before and service.effect != "stop":
+            self._tell(self._before, called, context)
+            if service.too_late(context.expires_ns):
+                raise DeadlineExceeded(service=service.label, deadline_s=(time.monotonic_ns() - began_ns) / 1e9)
+        result, error = None, ""
+        try:
+            result = service.call(args, kwargs, context, bare=True)
+        except BaseException as raised:
+            error = _error_text(service, raised)
+            raise
+        finally:
+            if self._after:
+                took_s = (time.monotonic_ns() - began_ns) / 1e9
+                ended = msgspec.structs.replace(
+                    called, ended=True, result=self._plain(result), error=error, took_s=took_s
+                )
+                if service.effect == "stop":  # nothing holds up the answer to a stop
+                    self._clockwork.begin(lambda: self._tell(self._after, ended, context), time.monotonic_ns())
+                else:
+                    self._tell(self._after, ended, context)
+        return result
+
+    def _tell(self, hooks: Sequence[Attached], called: Called, context: CallContext) -> None:
+        chain = (*context.chain, context.service)
+        until_ns = time.monotonic_ns() + int(ALL_S * 1e9)
+        with _as_the_container(context):
+            for hook in hooks:
+                if not hook.suspended:
+                    hook.tell(self._home, called, chain, (until_ns - time.monotonic_ns()) / 1e9)
+
+    def _called(
+        self, service: LocalService, args: Sequence[Any], kwargs: Mapping[str, Any], context: CallContext
+    ) -> Called:
+        named = service.signature.named(args, kwargs)
+        return Called(
+            service=self._handle,
+            args={name: self._plain(value) for name, value in named.items()},
+            caller=context.caller,
+            session=context.session,
+            call_id=context.id,
+            chain=context.chain,
+        )
+
+    def _plain(self, value: Any) -> Any:
+        """A copy that can be sent: hooks see what was, and change nothing."""
+        try:
+            return self._decode(self._encode(value))
+        except Exception:  # noqa: BLE001 - only a call within this process, and not strict, carries such a thing
+            return repr(value)
+
+
+def _error_text(service: LocalService, error: BaseException) -> str:
+    """Its message may show what is secret."""
+    kind = type(error).__name__
+    return kind if service.signature.has_secrets else f"{kind}: {error}"
+
+
+@contextmanager
+def _as_the_container(context: CallContext):
+    """Calls made inside belong to the watched call's chain and end with its caller; they carry none of its locks."""
+    bare = CallContext(context.id, context.service, context.caller, context.session, context.expires_ns, context.chain)
+    tokens = running.set(bare), holding.set(()), speaking.set(None)
+    try:
+        yield
+    finally:
+        running.reset(tokens[0])
+        holding.reset(tokens[1])
+        speaking.reset(tokens[2])
+
+
+class Hooks:
+    """Owns the hooks of one container."""
+
+    def __init__(
+        self,
+        home: Home,
+        codec: Codec,
+        clockwork: Clockwork,
+        services: Callable[[ServiceKey], LocalService | None],
+        records: Callable[[], list[Record]],
+        denied: Denied,
+    ) -> None:
+        self._home = home
+        self._codec = codec
+        self._clockwork = clockwork
+        self._services = services
+        self._records = records
+        self._denied = denied
+        self._lock = threading.RLock()
+        self._attached: dict[tuple[str, str], Attached] = {}
+        """By session and name."""
+        self._spans: Spans | None = None
+        """Where calls are noted while this container is traced."""
+        self.suspended: Callable[[Attached], None] = lambda _: None
+        """Told of each that is suspended."""
+
+    def attach(
+        self, name: str, side: Side, target: Handle | Constraint, call: Handle, owner: str, identity: str
+    ) -> list[str]:
+        """Attach one; the same again changes nothing. Returns the labels of the services it is attached to.
+
+        Raises:
+            AccessDenied: its owner may instrument none of those it means here.
+            ConfigurationError: a stop service was named for a hook before it, or there are too many.
+        """
+        hook = Attached(name, side, target, call, owner, identity, self.suspended_now)
+        with self._lock:
+            if (owner, name) not in self._attached and len(self._attached) >= _MOST:
+                raise ConfigurationError(where=self._home.name, problem=f"{_MOST} hooks are attached here already")
+            meant = [record for record in self._records() if _hookable(record) and hook.means(record)]
+            stops = [record for record in meant if record.info.effect == "stop" and side == "before"]
+            if stops and isinstance(target, Handle):
+                problem = "nothing comes before a stop; attach it after the service, or to others"
+                raise ConfigurationError(where=stops[0].label, problem=problem)
+            denials = [self._denied(identity, record) for record in meant]
+            if meant and all(denials):
+                raise next(denial for denial in denials if denial is not None)
+            known = self._attached.setdefault((owner, name), hook)
+            self._refresh()
+            return sorted(known.services.values())
+
+    def suspended_now(self, hook: Attached) -> None:
+        self.suspended(hook)
+
+    def detach(self, owner: str, name: str) -> bool:
+        """End one; whether there was one."""
+        with self._lock:
+            gone = self._attached.pop((owner, name), None)
+            if gone is not None:
+                self._refresh()
+            return gone is not None
+
+    def named(self, name: str) -> list[Attached]:
+        """Those of that name."""
+        return [hook for hook in list(self._attached.values()) if hook.name == name]
+
+    def session_ended(self, session: str) -> None:
+        """Who attached them is gone: so are they."""
+        with self._lock:
+            gone = [key for key in self._attached if key[0] == session]
+            for key in gone:
+                del self._attached[key]
+            if gone:
+                self._refresh()
+
+    def changed(self, change: Change) -> None:
+        """Told by the registry."""
+        if self._in_use and any(record.local for record in (*change.joined, *change.replaced, *change.left)):
+            self.judge_anew()
+
+    def judge_anew(self) -> None:
+        """What is offered here, or who may instrument it, has changed."""
+        with self._lock:
+            if self._in_use:
+                self._refresh()
+
+    def trace(self, spans: Spans | None) -> None:
+        """Note every call of a service there from now on; None: none any more."""
+        with self._lock:
+            self._spans = spans
+            self._refresh()
+
+    @property
+    def _in_use(self) -> bool:
+        return bool(self._attached) or self._spans is not None
+
+    def _refresh(self) -> None:
+        hooks = list(self._attached.values())
+        for hook in hooks:
+            hook.services = {}
+        for record in self._records():
+            service = self._services(record.key)
+            if service is None:
+                continue
+            mine = [hook for hook in hooks if _hookable(record) and self._concerns(hook, record)]
+            for hook in mine:
+                hook.services[record.key] = record.label
+            around = None
+            if mine:
+                around = Around(self._home, self._codec, self._clockwork, self._home.handle(record.key), mine)
+            traced = self._spans if traceable(record.key) else None
+            around = around if traced is None else Recorded(traced, around)
+            service.around = around if service.audited is None else service.audited.over(around)
+
+    def _concerns(self, hook: Attached, record: Record) -> bool:
+        return hook.means(record) and self._denied(hook.identity, record) is None
+
+    def infos(self) -> list[HookInfo]:
+        """Those attached here, oldest first."""
+        return [
+            HookInfo(
+                id=hook.name,
+                side=hook.side,
+                target=hook.target.label if isinstance(hook.target, Handle) else str(hook.target),
+                call=hook.call.label,
+                owner=hook.owner,
+                container=self._home.name,
+                services=tuple(sorted(hook.services.values())),
+                fired=hook.fired,
+                skipped=hook.skipped,
+                failures=hook.failures,
+                suspended=hook.suspended,
+                last_error=hook.last_error,
+            )
+            for hook in list(self._attached.values())
+        ]
+
+
+def _hookable(record: Record) -> bool:
+    """The middleware's own services are watched by nobody: locks, stops and hooks depend on them."""
+    return record.local and record.key.domain != DOMAIN

@@ -1,0 +1,65 @@
+"""What every container offers about the hooks on its services, in group ``trade``."""
+
+import contextlib
+import logging
+
+from trade._calls.handle import Handle
+from trade._container.system import DOMAIN, PROVIDER
+from trade._context.call_context import served_call
+from trade._hooks.hook import Attached, HookInfo, Hooks, Side
+from trade._notifications.services import Home
+from trade._protocol.keys import Address, ServiceKey
+from trade._registry.constraints import Constraint
+from trade._security.authorizer import Access
+from trade._services.decorator import service
+from trade.errors import CallerError, CallError, ConfigurationError
+
+_logger = logging.getLogger("trade")
+
+
+class HookServices:
+    """The wire's side of `Hooks`."""
+
+    def __init__(self, hooks: Hooks, home: Home, access: Access) -> None:
+        self._hooks = hooks
+        self._watched = home
+        self._judge = access
+        hooks.suspended = self._tell_who_attached
+
+    @service
+    def attach_hook(
+        self, name: str, side: Side, call: Handle, handle: Handle | None = None, constraint: Constraint | None = None
+    ) -> list[str]:
+        """Call that one before or after services of this container, now and later ones; which they are now."""
+        asked, target = served_call(), constraint if handle is None else handle
+        if target is None:
+            raise ConfigurationError(where="attach_hook", problem="it needs a handle or a constraint")
+        return self._hooks.attach(name, side, target, call, asked.session, asked.caller)
+
+    @service
+    def detach_hook(self, name: str) -> bool:
+        """End hooks of that name here; whether there were any. Another's is for who administers the system."""
+        asked, found = served_call(), self._hooks.named(name)
+        for hook in found:
+            if hook.identity != asked.caller:
+                self._judge.require(asked.caller, "administer", DOMAIN, f"hook {name}")
+            self._hooks.detach(hook.owner, name)
+        return bool(found)
+
+    @service(effect="read")
+    def hooks(self) -> list[HookInfo]:
+        """What is attached to services of this container, whoever attached it."""
+        return self._hooks.infos()
+
+    @service
+    def hook_suspended(self, name: str, call: str, error: str) -> None:
+        """Told by another container: a hook that was attached from here failed too often there."""
+        _logger.warning(
+            "hook %s (%s), attached from here, is suspended by %s: %s", name, call, served_call().session, error
+        )
+
+    def _tell_who_attached(self, hook: Attached) -> None:
+        owner = Address(*hook.owner.split("/")[:3])
+        with contextlib.suppress(CallerError, CallError):  # it has gone
+            told = self._watched.handle(ServiceKey(owner, DOMAIN, PROVIDER, "hook_suspended"))
+            told.start(hook.name, hook.call.label, hook.last_error)

@@ -1,0 +1,1 @@
+"""The owner's side of locks: acquiring, renewing the lease, releasing."""

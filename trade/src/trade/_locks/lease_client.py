@@ -1,0 +1,248 @@
+"""Every lock a container has or wants: asked for everywhere, renewed, given back. One of them: `_lock`."""
+
+import contextlib
+import math
+import threading
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, Final, NoReturn, Protocol
+
+from msgspec import structs
+
+from trade._calls.handle import Bound, Handle
+from trade._calls.run import Run
+from trade._container.system import DOMAIN, PROVIDER
+from trade._locks.lock import Lock, apart
+from trade._protocol.keys import Address, ServiceKey
+from trade._protocol.messages import Token
+from trade._resources.lock_request import Terms
+from trade.errors import Busy, ContainerLost, LockedByOther, ServiceGone, TradeError
+
+_ANSWER_S: Final = 2.0
+"""How long a container may take to answer, on top of what it is asked to wait."""
+_AGAIN_S: Final = 0.1
+_BEATS: Final = 4
+"""Renewals within one lease."""
+
+
+class Home(Protocol):
+    """What locking asks of its container."""
+
+    @property
+    def address(self) -> Address: ...
+    def handle(self, key: ServiceKey) -> Handle: ...
+
+
+class Keeper:
+    """Every lock of a container, and the thread that renews them while there are any."""
+
+    def __init__(self, home: Home) -> None:
+        self._home = home
+        self._locks: list[Lock] = []
+        self._changed = threading.Condition()
+        self._thread: threading.Thread | None = None
+        self._due = math.inf
+        """When the next renewals go out."""
+        self._closed = False
+
+    @property
+    def owner(self) -> Address:
+        return self._home.address
+
+    def over(self) -> bool:
+        """Whether its container closes, or has."""
+        return self._closed
+
+    # --- taking
+
+    def acquire(self, lock: Lock, wanted: dict[Address, list[str]], terms: Terms) -> Lock:
+        """Take all or nothing: all containers at once first, then one after the other in the order all keep (S13).
+
+        Raises:
+            LockedByOther, NotStopped, ServiceGone, ContainerLost: not within ``terms.wait_s``; nothing is held.
+            LockLost: one part was lost while it waited for the others; nothing is held.
+        """
+        until = time.monotonic() + terms.wait_s
+        self._keep(lock)
+        try:
+            try:
+                self._try_all(lock, wanted, structs.replace(terms, wait_s=0.0))
+            except (LockedByOther, Busy):
+                self._give_back(lock)
+                if time.monotonic() >= until:
+                    raise
+                self._wait_in_order(lock, wanted, terms, until)
+            lock.check()
+        except BaseException:
+            lock.release()
+            raise
+        return lock
+
+    def _try_all(self, lock: Lock, wanted: dict[Address, list[str]], terms: Terms) -> None:
+        asked_at = time.monotonic()
+        asks = [(address, self._ask(address, names, terms)) for address, names in wanted.items()]
+        refused: TradeError | None = None
+        for address, result in _at_once(asks):
+            try:
+                lock.add(address, result(), asked_at)
+            except TradeError as error:
+                refused = refused or error
+        if refused is not None:
+            raise refused
+
+    def _wait_in_order(self, lock: Lock, wanted: dict[Address, list[str]], terms: Terms, until: float) -> None:
+        for address in sorted(wanted, key=str):
+            while True:
+                asked_at = time.monotonic()
+                try:
+                    ask = self._ask(address, wanted[address], structs.replace(terms, wait_s=max(0.0, until - asked_at)))
+                    lock.add(address, ask(), asked_at)
+                    lock.check()
+                    break
+                except Busy:  # its queue is full
+                    if time.monotonic() + _AGAIN_S >= until:
+                        raise
+                    time.sleep(_AGAIN_S)
+
+    def _ask(self, address: Address, names: Sequence[str], terms: Terms) -> Bound:
+        ask = self._service(address, "acquire").with_(deadline_s=terms.wait_s + _ANSWER_S)
+        return ask.bind(list(names), terms)
+
+    def _service(self, address: Address, name: str) -> Handle:
+        return self._home.handle(ServiceKey(address, DOMAIN, PROVIDER, name))
+
+    # --- giving back
+
+    def let_go(self, lock: Lock, lost: str = "") -> bool:
+        """Renew it no more, and give back what is held of it; if it is lost, what it moves stops.
+
+        Returns:
+            Whether it was held until then, as far as those say who answer.
+        """
+        with self._changed:
+            if lock in self._locks:
+                self._locks.remove(lock)
+        return self._give_back(lock, lost)
+
+    def _give_back(self, lock: Lock, lost: str = "") -> bool:
+        parts = lock.take_parts()
+        gifts = [
+            (address, self._service(address, "release").with_(deadline_s=_ANSWER_S).bind(token.number, lost))
+            for address, token in parts.items()
+        ]
+        held = True
+        for _, result in _at_once(gifts):
+            with contextlib.suppress(TradeError):  # where it is not heard, its lease ends it
+                held &= result()
+        return held
+
+    # --- keeping
+
+    def _keep(self, lock: Lock) -> None:
+        with self._changed:
+            self._locks.append(lock)
+            if self._thread is None:
+                self._thread = threading.Thread(target=self._run, name="trade-locks", daemon=True)
+                self._thread.start()
+            if time.monotonic() + lock.lease_s / _BEATS < self._due:
+                self._changed.notify_all()
+
+    def _run(self) -> None:
+        renewed = time.monotonic()
+        while True:
+            with self._changed:
+                while not self._closed:
+                    self._due = renewed + min((lock.lease_s for lock in self._locks), default=math.inf) / _BEATS
+                    left_s = self._due - time.monotonic()
+                    if left_s <= 0:
+                        break
+                    self._changed.wait(None if left_s == math.inf else left_s)
+                if self._closed:
+                    return
+                locks = list(self._locks)
+            renewed = time.monotonic()
+            self._renew(locks)
+
+    def _renew(self, locks: Sequence[Lock]) -> None:
+        """One call for each container, whatever the number of locks; nobody waits for the answers here."""
+        parts: dict[Address, list[tuple[Lock, int]]] = {}
+        for lock in locks:
+            if lock.wanted:
+                for address, token in lock.granted.items():
+                    parts.setdefault(address, []).append((lock, token.number))
+        for address, held in parts.items():
+            asked_at = time.monotonic()
+            numbers = [number for _, number in held]
+            try:
+                run = self._service(address, "renew").with_(deadline_s=_ANSWER_S).start(numbers)
+            except TradeError as error:
+                self._not_renewed(address, held, error)
+            else:
+                run.when_done(partial(self._renewed, address, held, asked_at))
+
+    def _renewed(self, address: Address, held: list[tuple[Lock, int]], asked_at: float, run: Run) -> None:
+        try:
+            over: dict[int, str] = run.result(0)
+        except (TradeError, TimeoutError) as error:
+            self._not_renewed(address, held, error)
+            return
+        for lock, number in held:
+            if number not in over:
+                lock.confirm(address, number, asked_at)
+            elif lock.has(address, number):
+                lock.lose(over[number])
+
+    def _not_renewed(self, address: Address, held: list[tuple[Lock, int]], error: Exception) -> None:
+        if not isinstance(error, (ServiceGone, ContainerLost)):  # too late or refused: its own lease judges
+            return
+        for lock, number in held:
+            if lock.has(address, number):
+                lock.drop(address)
+                lock.lose(str(error))
+
+    def lost(self, address: Address) -> None:
+        """A container has ended or cannot be reached: locks it has a part in are lost as a whole (S14)."""
+        with self._changed:
+            hit = [lock for lock in self._locks if address in lock.granted]
+        for lock in hit:
+            lock.drop(address)
+            lock.lose(f"container {address.container} has ended or cannot be reached")
+
+    def asked(self, token: Token, who: str, reason: str) -> bool:
+        """Somebody would like to have what a grant holds. Returns whether its owner has an ear for that."""
+        with self._changed:
+            found = next((lock for lock in self._locks if token in lock.granted.values()), None)
+        if found is None or found.on_request is None:
+            return False
+        apart(self.over, found.on_request, who, reason)
+        return True
+
+    def close(self) -> None:
+        """Give everything back and end the thread. Idempotent."""
+        with self._changed:
+            locks, self._closed = list(self._locks), True
+            self._changed.notify_all()
+        for lock in locks:
+            lock.release()
+        if self._thread is not None and self._thread is not threading.current_thread():
+            self._thread.join(2)
+
+
+def _at_once(calls: Sequence[tuple[Address, Bound]]) -> list[tuple[Address, Callable[[], Any]]]:
+    """Make calls side by side; returns how to get each result, the first one's by making it on this very thread."""
+    if not calls:
+        return []
+    (first, call), *others = calls
+    return [(first, call), *((address, _started(other)) for address, other in others)]
+
+
+def _started(call: Bound) -> Callable[[], Any]:
+    try:
+        return call.start().result
+    except TradeError as error:  # it is not even there; the others are asked all the same
+        return partial(_fail, error)
+
+
+def _fail(error: TradeError) -> NoReturn:
+    raise error

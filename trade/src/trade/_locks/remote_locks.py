@@ -1,0 +1,185 @@
+"""What is locked in other systems behind the grants of this container: where a resource is shared, its home judges."""
+
+import contextlib
+import time
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from contextvars import Context
+from typing import Final, Protocol
+
+from msgspec import structs
+
+from trade._context.call_context import CallContext
+from trade._locks.lock import Lock, OnLost, OnRequest
+from trade._protocol.keys import Address
+from trade._protocol.messages import Token
+from trade._resources.lock_request import Granted, Terms
+from trade._resources.lock_table import LockTable
+from trade._resources.resource import Resource
+from trade.errors import LockLost
+
+Wanted = Mapping[Address, Sequence[str]]
+"""Resources by the container that judges them, all of one other system."""
+Wish = Callable[[int, str, str], None]
+"""Told who would like to have what stands behind a grant, and why."""
+
+
+class Lender(Protocol):
+    """The way to another system, for a call that was made in this one."""
+
+    def lock(self, call: CallContext, wanted: Wanted, terms: Terms, on_lost: OnLost, on_request: OnRequest) -> Lock: ...
+    def resume(self, call: CallContext, address: Address, names: Sequence[str]) -> list[str]: ...
+    def request_release(self, call: CallContext, address: Address, names: Sequence[str], reason: str) -> list[str]: ...
+
+
+class SharedResource(Resource):
+    """A resource of another system, as it is known here."""
+
+    __slots__ = ("__weakref__", "home", "home_name", "lender")
+
+    def __init__(self, name: str, home: Address, home_name: str, lender: Lender) -> None:
+        super().__init__(name)
+        self.home: Final = home
+        self.home_name: Final = home_name
+        self.lender: Final = lender
+
+    def stop(
+        self,
+        by: str,
+        sessions: Iterable[str] = (),  # noqa: ARG002
+        reason: str = "stop() was called",
+        *,
+        estop: bool = False,
+    ) -> None:
+        """Void what was admitted; whether it latches is judged at home."""
+        super().stop(by, (), reason, estop=estop)
+
+
+class Loan:
+    """The locks in other systems behind one grant."""
+
+    def __init__(self, borrowed: "Borrowed", wish: Wish) -> None:
+        self._borrowed = borrowed
+        self._wish = wish
+        self.number = 0
+        """Of the grant; 0 while there is none."""
+        self.locks: list[Lock] = []
+        self.waited_s = 0.0
+        """How long it took to get them."""
+
+    def stand_for(self, granted: Granted) -> None:
+        """They are behind that from now on. Raises LockLost: one of the two does not hold any more."""
+        if granted.token is not None and self.locks:
+            self.number = granted.token.number
+            self._borrowed.keep(self)
+
+    def lost(self, why: LockLost) -> None:
+        """Told by a lock of another system."""
+        self._borrowed.lose(self.number, why.reason)
+
+    def asked(self, who: str, reason: str) -> None:
+        """Told by a lock of another system: somebody there would like to have it."""
+        self._wish(self.number, who, reason)
+
+    def release(self) -> None:
+        """Give them back, for nobody here any more."""
+        for lock in self.locks:
+            Context().run(lock.release)
+
+
+class Borrowed:
+    """The loans of one container, by its own grants."""
+
+    def __init__(self, table: LockTable, epoch: str) -> None:
+        self._table = table
+        self._epoch = epoch
+        self._loans: dict[int, Loan] = {}
+        table.tell_of_losses(self._lost)
+
+    @contextlib.contextmanager
+    def behind(
+        self, call: CallContext, resources: Iterable[Resource], terms: Terms, wish: Wish
+    ) -> Generator[Loan, None, None]:
+        """Take those of these that are shared where they are at home; given back unless they stand for a grant then.
+
+        Raises:
+            TradeError: what the home says.
+        """
+        loan, begun = Loan(self, wish), time.monotonic()
+        try:
+            for lender, wanted in _by_lender(resources).items():
+                left = structs.replace(terms, wait_s=max(0.0, terms.wait_s - loan.waited_s))
+                loan.locks.append(lender.lock(call, wanted, left, loan.lost, loan.asked))
+                loan.waited_s = time.monotonic() - begun
+            yield loan
+        finally:
+            if not loan.number:
+                loan.release()
+
+    def keep(self, loan: Loan) -> None:
+        """Told by the loan: it stands for a grant now. Raises LockLost."""
+        number = loan.number
+        self._loans[number] = loan
+        reason = self._table.over(number) or next((_lapsed(lock) for lock in loan.locks if not lock.held), "")
+        if reason:
+            self._loans.pop(number, None)
+            loan.number = 0
+            raise LockLost(resources=tuple(name for lock in loan.locks for name in lock.resources), reason=reason)
+
+    def lose(self, number: int, reason: str) -> None:
+        """What stood behind a grant is lost: so is the grant."""
+        if number:
+            self._table.lose(number, reason)
+
+    def _lost(self, number: int, reason: str) -> None:
+        """Told by the table: a grant was taken away, and what moves under it is to stop there, too."""
+        loan = self._loans.pop(number, None)
+        for lock in () if loan is None else loan.locks:
+            lock.lose(reason)
+
+    def give_back(self, number: int) -> None:
+        """A grant was given back."""
+        loan = self._loans.pop(number, None)
+        if loan is not None:
+            loan.release()
+
+    def shown(self, call: CallContext) -> tuple[Lock, ...]:
+        """The locks that a call which shows its tokens here is made under elsewhere."""
+        return tuple(lock for token in call.tokens if self._may_show(call, token) for lock in self._behind(token))
+
+    def _may_show(self, call: CallContext, token: Token) -> bool:
+        return token.epoch == self._epoch and self._table.may_use(token.number, call.caller)
+
+    def _behind(self, token: Token) -> Sequence[Lock]:
+        loan = self._loans.get(token.number)
+        return () if loan is None else loan.locks
+
+    def resume(self, call: CallContext, resources: Iterable[Resource]) -> list[str]:
+        """Let those of these that are shared move again; which were stopped, by their names here."""
+        shared = [one for one in resources if isinstance(one, SharedResource)]
+        return [one.name for one in shared if one.lender.resume(call, one.home, [one.home_name])]
+
+    def request_release(self, call: CallContext, resources: Iterable[Resource], reason: str) -> list[str]:
+        """Ask for those of these that are shared and locked elsewhere; who was asked."""
+        asked = [
+            who
+            for lender, wanted in _by_lender(resources).items()
+            for address, names in wanted.items()
+            for who in lender.request_release(call, address, names, reason)
+        ]
+        return list(dict.fromkeys(asked))
+
+
+def _lapsed(lock: Lock) -> str:
+    try:
+        lock.check()
+    except LockLost as lost:
+        return lost.reason
+    return "it was given back"
+
+
+def _by_lender(resources: Iterable[Resource]) -> dict[Lender, dict[Address, list[str]]]:
+    found: dict[Lender, dict[Address, list[str]]] = {}
+    for one in resources:
+        if isinstance(one, SharedResource):
+            found.setdefault(one.lender, {}).setdefault(one.home, []).append(one.home_name)
+    return found

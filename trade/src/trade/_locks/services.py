@@ -1,0 +1,185 @@
+"""What every container offers about the locks of its resources, in group ``trade``."""
+
+import threading
+import time
+from collections.abc import Callable, Iterable
+from typing import Final
+
+from msgspec import structs
+
+from trade._context.call_context import CallContext, served_call
+from trade._context.sessions import foreign
+from trade._locks.remote_locks import Borrowed
+from trade._protocol.keys import Address
+from trade._protocol.messages import Token
+from trade._resources.lock_request import Granted, LockInfo, Terms
+from trade._resources.lock_table import LockTable
+from trade._resources.resource import Holder, Resource
+from trade._security.authorizer import Access
+from trade._services.decorator import service
+from trade.errors import Busy, LockedByOther, TradeError
+
+_MOST_WAITING: Final = 24
+"""So many may stand in the queues of a container at once; who comes then asks again."""
+
+GroupsOf = Callable[[str], set[str]]
+"""The groups of the services that use a resource."""
+Ask = Callable[[Holder, Token, str, str], None]
+"""Passes a wish on to the holder of a grant: whose, which, who asks and why."""
+Asked = Callable[[Token, str, str], bool]
+"""Told of such a wish for a lock of this container; whether anybody heeds it."""
+
+
+class LockServices:
+    """The wire's side of a `LockTable`."""
+
+    def __init__(
+        self,
+        table: LockTable,
+        own: Address,
+        ask: Ask,
+        asked: Asked,
+        access: Access,
+        groups: GroupsOf,
+        borrowed: Borrowed,
+    ) -> None:
+        self._table = table
+        self._borrowed = borrowed
+        self._access = access
+        self._groups = groups
+        self._own = own
+        self._ask = ask
+        self._asked = asked
+        self._places = threading.BoundedSemaphore(_MOST_WAITING)
+
+    @service
+    def acquire(self, resources: list[str], terms: Terms) -> Granted:
+        """Take all of these and what is coupled to them for the calling session."""
+        call = served_call()
+        named = self._table.named(resources)
+        self._require(call, "lock", [resource.name for resource in named])
+        calls = () if call.behalf is None else call.behalf.calls
+        holder = Holder(
+            identity=call.caller,
+            container=_container_of(call.session),
+            session=call.session,
+            purpose=terms.purpose,
+            since=time.time(),
+            delegates=terms.delegates,
+        )
+        if not self._places.acquire(blocking=False):
+            raise Busy(service="trade.acquire", container=self._own.container)
+        terms = structs.replace(terms, wait_s=call.patience_s(terms.wait_s))
+        try:
+            with self._borrowed.behind(call, named, terms, self._pass_wish) as loan:  # elsewhere first: judged there
+                wait = structs.replace(terms, wait_s=max(0.0, terms.wait_s - loan.waited_s))
+                granted = self._table.acquire(resources, holder, wait, call.tokens, (call.id, *calls))
+                try:
+                    self._require(call, "lock", granted.resources)  # once more: it may have waited for long
+                    loan.stand_for(granted)
+                except TradeError:
+                    if granted.token is not None:
+                        self._table.release(granted.token.number, call.caller)
+                    raise
+        finally:
+            self._places.release()
+        return structs.replace(granted, waited_s=granted.waited_s + loan.waited_s)
+
+    def _pass_wish(self, number: int, who: str, reason: str) -> None:
+        """Somebody in another system would like to have what stands behind a grant."""
+        holders = [info.holder for info in self._table.infos() if info.token.number == number]
+        if holders:
+            self._ask(holders[0], Token(self._own.epoch, number), who, reason)
+
+    @service(effect="stop")
+    def renew(self, grants: list[int]) -> dict[int, str]:
+        """Begin the leases of these grants anew; why those that hold no more do not."""
+        held = self._table.renew(grants, served_call().caller)
+        return {number: self._table.over(number) or "it is another's" for number in grants if number not in held}
+
+    @service(effect="stop")
+    def release(self, grant: int, lost: str = "") -> bool:
+        """Give a grant back; ``lost`` says why the rest of its lock is, and then what it moves stops."""
+        identity = served_call().caller
+        if lost and self._table.renew([grant], identity):
+            return self._table.lose(grant, lost)
+        held = self._table.release(grant, identity)
+        if held:
+            self._borrowed.give_back(grant)
+        return held
+
+    @service(effect="read")
+    def locks(self) -> list[LockInfo]:
+        """What is locked here, by whom, and who waits for it; and what nobody gets, as it could not be stopped."""
+        return self._table.infos() + self._table.withheld()
+
+    @service(effect="stop")
+    def break_lock(self, grant: int, reason: str) -> bool:
+        """Take a lock away from its owner; what it moves stops. Whether it was held."""
+        call = served_call()
+        held = [info.resources for info in self._table.infos() if info.token.number == grant]
+        self._require(call, "administer", held[0] if held else ())
+        return self._table.lose(grant, f"broken by {call.caller}: {reason}")
+
+    @service
+    def request_release(self, resources: list[str], reason: str) -> list[str]:
+        """Ask the owners of these to give them back; who was asked."""
+        call = served_call()
+        who = foreign(call.session) or f"{call.caller}/{_container_of(call.session)}"
+        holders: dict[Token, Holder] = {}
+        for resource in self._table.named(resources):
+            if (holder := resource.holder) is not None:
+                holders[Token(self._own.epoch, resource.live)] = holder
+        for token, holder in holders.items():
+            self._ask(holder, token, who, reason)
+        free = [resource for resource in self._table.named(resources) if resource.holder is None]
+        return [holder.owner for holder in holders.values()] + self._borrowed.request_release(call, free, reason)
+
+    @service
+    def release_requested(self, token: Token, who: str, reason: str) -> bool:
+        """Somebody would like to have what a lock of this container holds; whether its owner has an ear for that."""
+        return self._asked(token, who, reason)
+
+    @service
+    def resume(self, resources: list[str]) -> list[str]:
+        """Let these move again after a stop; for the owner of their lock, or who administers what is not locked."""
+        call = served_call()
+        found = self._table.named(resources)
+        for resource in found:
+            if resource.holder is not None and not self._is_for(resource, resource.holder, call):
+                raise LockedByOther(
+                    resources=(resource.name,),
+                    owner=resource.holder.owner,
+                    purpose=resource.holder.purpose,
+                    since=resource.holder.since,
+                )
+        self._require(call, "administer", [resource.name for resource in found if resource.holder is None])
+        there = self._borrowed.resume(call, found)
+        return [resource.name for resource in found if _resumed(resource) or resource.name in there]
+
+    def _is_for(self, resource: Resource, holder: Holder, call: CallContext) -> bool:
+        """Whether a call is made for whoever holds a lock, or under it, as by the command of `trade lock`.
+
+        For whom else than itself, and under what, is what its caller says: who that is has to fit.
+        """
+        mine = holder.session in call.sessions or Token(self._own.epoch, resource.live) in call.tokens
+        return mine and (call.caller == holder.identity or call.caller in holder.delegates)
+
+    def _require(self, call: CallContext, verb: str, resources: Iterable[str]) -> None:
+        """Of each resource one service that uses it is enough for the caller to have the right over.
+
+        Raises:
+            AccessDenied: the policy gives it over none.
+        """
+        for name in resources if self._access.policy is not None else ():
+            self._access.require_any(call.caller, verb, self._groups(name), name)
+
+
+def _resumed(resource: Resource) -> bool:
+    was = resource.latch is not None or bool(resource.unsafe)
+    resource.resume()
+    return was
+
+
+def _container_of(session: str) -> str:
+    return session.split("/")[1] if session.count("/") >= 2 else session

@@ -1,0 +1,1 @@
+"""Moving a provider to another container with its state, and making providers on request."""

@@ -1,0 +1,149 @@
+"""Objects that a container makes because somebody asks, of classes that its settings allow."""
+
+import importlib
+import logging
+import re
+import threading
+from collections.abc import Mapping, Sequence
+from fnmatch import fnmatchcase
+from typing import Any, Final, NamedTuple, Protocol
+
+from trade._calls.handle import Handle
+from trade._protocol.keys import Address
+from trade._services.providers import Providers
+from trade._services.withdrawn import Withdrawn
+from trade.errors import CannotInstantiate, ConfigurationError, NoSuchClass, NotInstantiable
+
+_logger = logging.getLogger("trade")
+_PATH: Final = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*")
+
+
+Arguments = Sequence[Any] | Mapping[str, Any]
+
+
+class _Made(NamedTuple):
+    provider: object
+    args: Arguments
+
+
+class Home(Protocol):
+    """The container they are registered in."""
+
+    @property
+    def address(self) -> Address: ...
+    def register(self, provider: object, groups: str | Sequence[str] = ()) -> tuple[Handle, ...]: ...
+
+
+class Making:
+    """Owns what was made here: it is closed when somebody terminates it, or with the container."""
+
+    def __init__(self, home: Home, providers: Providers, withdrawn: Withdrawn, allowed: Sequence[str]) -> None:
+        self._home = home
+        self._providers = providers
+        self._withdrawn = withdrawn
+        self._allowed = tuple(allowed)
+        self._lock = threading.Lock()
+        self._made: dict[int, _Made] = {}
+
+    def find(self, class_path: str) -> type:
+        """The class of a path; it stands in the module that defines it, and only modules of allowed ones are imported.
+
+        Raises:
+            NotInstantiable: the settings do not allow it.
+            NoSuchClass: there is none.
+            CannotInstantiate: its module cannot be imported.
+        """
+        where = self._home.address.container
+        if not any(fnmatchcase(class_path, pattern) for pattern in self._allowed):
+            raise NotInstantiable(class_path=class_path, container=where, allowed=self._allowed)
+        if not _PATH.fullmatch(class_path):
+            raise NoSuchClass(class_path=class_path, container=where, reason="a path looks like package.module:Class")
+        module_name, _, qualified = class_path.partition(":")
+        try:
+            found: Any = importlib.import_module(module_name)
+        except Exception as error:
+            if isinstance(error, ModuleNotFoundError) and f"{module_name}.".startswith(f"{error.name}."):
+                raise NoSuchClass(class_path=class_path, container=where, reason=str(error)) from None
+            raise CannotInstantiate(class_path=class_path, container=where, problem=_told(error)) from error
+        for part in qualified.split("."):
+            found = getattr(found, "__dict__", {}).get(part)
+        if not isinstance(found, type):
+            raise NoSuchClass(class_path=class_path, container=where, reason=f"{module_name} has no such class")
+        if path_of(found) != class_path:  # a pattern means what its modules define, not what they import
+            raise NoSuchClass(class_path=class_path, container=where, reason=f"it is defined as {path_of(found)}")
+        return found
+
+    def make(self, kind: type, args: Arguments) -> object:
+        """An object of a class that `find` gave. Raises CannotInstantiate."""
+        try:
+            return kind(**args) if isinstance(args, Mapping) else kind(*args)
+        except Exception as error:
+            where = self._home.address.container
+            raise CannotInstantiate(class_path=path_of(kind), container=where, problem=_told(error)) from error
+
+    def offer(self, made: object, groups: Sequence[str], args: Arguments = ()) -> tuple[Handle, ...]:
+        """Register what was made; it is closed if that cannot be."""
+        try:
+            handles = self._home.register(made, groups)
+        except BaseException:
+            end(made)
+            raise
+        self.keep(made, args)
+        return handles
+
+    def keep(self, made: object, args: Arguments) -> None:
+        """Something was made here with these arguments."""
+        with self._lock:
+            self._made[id(made)] = _Made(made, args)
+
+    def arguments_of(self, provider: object) -> Arguments:
+        """What it was made with; nothing if it was not made here."""
+        with self._lock:
+            made = self._made.get(id(provider))
+        return () if made is None else made.args
+
+    def let_go(self, provider: object) -> None:
+        """It has moved away: it is not offered again, and is closed, whoever made it."""
+        self._withdrawn.forget(provider)
+        with self._lock:
+            self._made.pop(id(provider), None)
+        end(provider)
+
+    def terminate(self, service: Handle) -> None:
+        """See `System.terminate`."""
+        key, offered = service.key, None
+        if key.address == self._home.address:
+            offered = self._providers.offer(f"{key.domain}/{key.provider}") or self._withdrawn.offer(key.provider)
+        made = None if offered is None else self._made.get(id(offered.provider))
+        if made is None:
+            problem = "it was not made by instantiate of this container; deregister withdraws others"
+            raise ConfigurationError(where=service.label, problem=problem)
+        if self._withdrawn.offer(key.provider) is None:
+            self._withdrawn.take_off(key)
+        self.let_go(made.provider)
+
+    def close(self) -> None:
+        """Close all that was made here. Idempotent."""
+        with self._lock:
+            made, self._made = list(self._made.values()), {}
+        for one in reversed(made):
+            end(one.provider)
+
+
+def path_of(kind: type) -> str:
+    """``module:qualified name``."""
+    return f"{kind.__module__}:{kind.__qualname__}"
+
+
+def end(made: object) -> None:
+    """Close an object, if it can be; what it raises then is logged."""
+    close = getattr(made, "close", None)
+    if callable(close):
+        try:
+            close()
+        except Exception:
+            _logger.exception("%s could not be closed", type(made).__qualname__)
+
+
+def _told(error: Exception) -> str:
+    return f"{type(error).__name__}: {error}"

@@ -1,0 +1,260 @@
+"""The side of a migration that a provider leaves: held still, prepared elsewhere, withdrawn here, offered there.
+
+It is withdrawn here before it is offered there, so it is alive once at most. Up to that moment whatever goes wrong
+leaves it as it was. After it, it is offered here again only if the other side says that it never will.
+"""
+
+import contextlib
+import logging
+import threading
+from collections.abc import Generator, Mapping
+from typing import Any, Final, Protocol
+
+from trade._calls.handle import Handle
+from trade._container.system import DOMAIN, PROVIDER
+from trade._context.call_context import running
+from trade._migration.factory import Arguments, Making, path_of
+from trade._migration.quiesce import Freezing, Frozen
+from trade._migration.state import is_stateful, restore, save
+from trade._migration.target import Luggage, Prepared, fingerprint
+from trade._protocol.codec import Codec
+from trade._protocol.keys import Address, ServiceKey
+from trade._registry.constraints import Constraint, where
+from trade._security.authorizer import Access
+from trade._services.providers import Providers
+from trade._services.registration import Offer
+from trade._services.withdrawn import Withdrawn
+from trade._telemetry.load import LoadInfo
+from trade.errors import (
+    CannotMigrate,
+    ConfigurationError,
+    ContainerLost,
+    LockedByOther,
+    MigrationUnknown,
+    NoSuchService,
+    OutcomeUnknown,
+    ServiceGone,
+    TradeError,
+)
+
+_logger = logging.getLogger("trade")
+PREPARE: Final = "prepare_arrival"
+_PREPARE_S: Final = 15.0
+_ARRIVE_S: Final = 5.0
+_ASK_S: Final = 2.0
+
+
+class Home(Protocol):
+    """The container it leaves."""
+
+    @property
+    def address(self) -> Address: ...
+    def handle(self, key: ServiceKey) -> Handle: ...
+    def has(self, key: ServiceKey) -> bool: ...
+    def find(self, constraint: Constraint, *, wait_s: float = ...) -> Handle: ...
+    def services(self, constraint: Constraint | None = ...) -> list[Handle]: ...
+
+
+class Departing:
+    """Sends providers of one container to another one, and takes or gives their state."""
+
+    def __init__(
+        self,
+        home: Home,
+        providers: Providers,
+        making: Making,
+        withdrawn: Withdrawn,
+        freezing: Freezing,
+        access: Access,
+        codec: Codec,
+    ) -> None:
+        self._home = home
+        self._providers = providers
+        self._making = making
+        self._withdrawn = withdrawn
+        self._freezing = freezing
+        self._access = access
+        self._codec = codec
+        self._lock = threading.Lock()
+        self._away: set[str] = set()
+        """Places of what is being held still."""
+
+    # --- state
+
+    def save_state(self, service: Handle, who: str) -> Any:
+        """See `Container.save_state`."""
+        offer = self._stateful(service, who)
+        with self._still(service, offer, f"saving the state of {service.label}"):
+            return save(offer.provider)
+
+    def restore_state(self, service: Handle, state: Any, who: str) -> None:
+        """See `Container.restore_state`."""
+        offer = self._stateful(service, who)
+        with self._still(service, offer, f"restoring the state of {service.label}") as still:
+            restore(offer.provider, state)
+            still.check()
+
+    def _stateful(self, service: Handle, who: str) -> Offer:
+        offer = self._offer(service, who)
+        if not is_stateful(type(offer.provider)):
+            problem = "it has no state to give and take; its class needs save_state() and restore_state(state)"
+            raise ConfigurationError(where=service.label, problem=problem)
+        return offer
+
+    def _offer(self, service: Handle, who: str) -> Offer:
+        """What is registered here; raises ServiceGone, AccessDenied, ConfigurationError."""
+        key = service.key
+        if key.address != self._home.address:
+            problem = f"it belongs to another container, or to an earlier boot; ask {key.address.container}"
+            raise ConfigurationError(where=service.label, problem=problem)
+        if key.domain == DOMAIN:
+            raise ConfigurationError(where=service.label, problem="the middleware's own services stay where they are")
+        self._providers.lookup(_place(key), key.name)
+        offer = self._providers.offer(_place(key))
+        if offer is None:
+            raise ServiceGone(service=service.label)
+        self._require(who, key, offer)
+        return offer
+
+    def _require(self, who: str, key: ServiceKey, offer: Offer) -> None:
+        for group in dict.fromkeys((key.domain, *offer.groups)):
+            self._access.require(who, "administer", group, f"{type(offer.provider).__qualname__} in {group}")
+
+    @contextlib.contextmanager
+    def _still(self, service: Handle, offer: Offer, purpose: str) -> Generator[Frozen, None, None]:
+        place = _place(service.key)
+        with self._lock:
+            if place in self._away:
+                own = self._home.address
+                owner = own.who
+                raise LockedByOther(resources=(place,), owner=owner, purpose="moving it, or its state, already")
+            self._away.add(place)
+        try:
+            services = self._providers.services_at(place)
+            with self._freezing.frozen(services, lambda: self._providers.alone_with(offer.provider), purpose) as still:
+                yield still
+        finally:
+            with self._lock:
+                self._away.discard(place)
+
+    # --- migrating
+
+    def migrate(self, service: Handle, to: str, args: Arguments | None, who: str) -> list[Handle]:
+        """See `Container.migrate`."""
+        offer = self._offer(service, who)
+        self._require_free(service, offer)
+        there = self._target(to)
+        with self._still(service, offer, f"migrating to container {there.container}") as still:
+            luggage = self._packed(service, offer, there, args)
+            prepared: Prepared = there.with_(deadline_s=_PREPARE_S)(luggage)
+            keys = _keys(there.key.address, prepared)
+            try:
+                self._require(who, service.key, offer)  # once more: it took its time
+                _require_time(service, there)
+                still.check()
+                still.seal()
+                name = self._withdrawn.take_off(service.key, moved_to=_moved_to(keys[0]))
+            except BaseException:
+                still.unseal()
+                with contextlib.suppress(TradeError):  # it ends there by itself then
+                    self._ask(there.key.address, "arrived", _ASK_S, prepared.ticket)
+                raise
+            free = running.set(None)  # whoever asked for it may be gone: it is brought to its end
+            try:
+                self._hand_over(service, offer, keys, prepared.ticket, name)
+            finally:
+                running.reset(free)
+        return [self._home.handle(key) for key in keys]
+
+    def _require_free(self, service: Handle, offer: Offer) -> None:
+        """S20: hardware is pinned to its host, unless its driver says that it can be reached from elsewhere."""
+        uses = {name for one in self._providers.services_at(_place(service.key)).values() for name in one.info.uses}
+        if uses and not getattr(offer.provider, "relocatable", False):
+            problem = f"it drives {', '.join(sorted(uses))} of this host; only a class that is relocatable can leave"
+            raise ConfigurationError(where=service.label, problem=problem)
+
+    def _target(self, to: str) -> Handle:
+        """`PREPARE` of the container of that name; of several that match, of the one whose host is least busy."""
+        asked = where(name=PREPARE, group=DOMAIN, container=to)
+        found = [one for one in self._home.services(asked) if one.key.address != self._home.address]
+        if not found:
+            raise NoSuchService(constraint=f"{asked}, other than {self._home.address.container} itself")
+        return found[0] if len(found) == 1 else min(found, key=self._load)
+
+    def _load(self, there: Handle) -> tuple[float, float]:
+        try:
+            return busyness(self._ask(there.key.address, "load", _ASK_S))
+        except TradeError as error:
+            _logger.info("container %s does not tell its load: %s", there.container, error)
+            return float("inf"), 0.0
+
+    def _packed(self, service: Handle, offer: Offer, there: Handle, args: Arguments | None) -> Luggage:
+        kind, stateful = type(offer.provider), is_stateful(type(offer.provider))
+        try:
+            state = save(offer.provider) if stateful else None
+        except Exception as error:
+            problem = f"save_state: {type(error).__name__}: {error}"
+            raise CannotMigrate(provider=service.label, to=there.container, problem=problem) from error
+        given = self._making.arguments_of(offer.provider) if args is None else args
+        return Luggage(
+            class_path=path_of(kind),
+            fingerprint=fingerprint(kind, offer.implements, self._codec),
+            args=dict(given) if isinstance(given, Mapping) else tuple(given),
+            groups=offer.groups,
+            implements=tuple(path_of(one) for one in offer.implements),
+            meta=dict(offer.meta),
+            has_state=stateful,
+            state=state,
+        )
+
+    def _hand_over(self, service: Handle, offer: Offer, keys: list[ServiceKey], ticket: str, name: str) -> None:
+        """It is withdrawn: offer it there, or here again if it is certain that nobody offers it there."""
+        there, problem = keys[0].address, ""
+        try:
+            self._ask(there, "arrive", _ARRIVE_S, ticket)
+        except (OutcomeUnknown, ContainerLost):
+            try:
+                if not self._came(keys, ticket):
+                    problem = "it was not offered there in time"
+            except TradeError as error:
+                here = self._home.address.container
+                raise MigrationUnknown(
+                    provider=service.label, container=here, to=there.container, withdrawn=name
+                ) from error
+        except TradeError as error:
+            problem = error.problem if isinstance(error, CannotMigrate) else str(error)
+        if problem:
+            self._withdrawn.put_back(name, None)
+            raise CannotMigrate(provider=service.label, to=there.container, problem=problem, withdrawn=True)
+        self._making.let_go(offer.provider)
+
+    def _came(self, keys: list[ServiceKey], ticket: str) -> bool:
+        """Whether it is offered there; if not, it never will be. Raises TradeError if nobody can say."""
+        return self._home.has(keys[0]) or self._ask(keys[0].address, "arrived", _ASK_S, ticket)
+
+    def _ask(self, there: Address, name: str, deadline_s: float, *args: object) -> Any:
+        return self._home.handle(ServiceKey(there, DOMAIN, PROVIDER, name)).with_(deadline_s=deadline_s)(*args)
+
+
+def busyness(load: LoadInfo) -> tuple[float, float]:
+    """By what containers are compared: the CPU of their hosts, then their calls a second."""
+    return load.host_cpu_percent or load.cpu_percent, load.calls_per_s
+
+
+def _require_time(service: Handle, there: Handle) -> None:
+    call = running.get()
+    if call is not None and call.remaining_s == 0:
+        problem = "whoever asked for it waits no more"
+        raise CannotMigrate(provider=service.label, to=there.container, problem=problem)
+
+
+def _place(key: ServiceKey) -> str:
+    return f"{key.domain}/{key.provider}"
+
+
+def _keys(there: Address, prepared: Prepared) -> list[ServiceKey]:
+    return [ServiceKey(there, prepared.domain, prepared.provider, name) for name in prepared.services]
+
+
+def _moved_to(key: ServiceKey) -> str:
+    return f"{key.address}/{_place(key)}"

@@ -1,0 +1,1 @@
+"""Notifications: triggers, their actions, and the services that manage them."""

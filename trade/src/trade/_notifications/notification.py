@@ -1,0 +1,308 @@
+"""Standing requests: on this occasion, if this holds, make that call."""
+
+import contextlib
+import logging
+import time
+from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Callable
+from enum import Enum
+from typing import Any, Final, Protocol
+
+from msgspec import Struct
+
+from trade._calls.handle import Handle
+from trade._context.sessions import Session
+from trade._notifications.triggers import Deed, Target, Terms, text_of
+from trade._registry.constraints import Constraint
+from trade._registry.registry import Record
+from trade._threads.scheduler import Clockwork
+from trade.errors import ConfigurationError
+
+_logger = logging.getLogger("trade")
+
+_SINGLE: Final = ("at", "after", "once")
+_LOOK_NS: Final = 1_000_000_000
+"""How often the clock on the wall is looked at: it may be set."""
+
+
+class State(str, Enum):
+    """Of a standing request."""
+
+    WAITING = "waiting"
+    """For ``when`` to hold."""
+    STANDING = "standing"
+    ENDED = "ended"
+    """It has fired, or its moment has passed."""
+    CANCELLED = "cancelled"
+
+
+class NotificationInfo(Struct, frozen=True, kw_only=True):
+    """One standing request, as everybody may know it."""
+
+    id: str
+    occasion: str
+    """Such as ``every 10 s``."""
+    call: str
+    """What is called, as text."""
+    condition: str
+    owner: str
+    """The session of who asked for it."""
+    container: str
+    """Where it lives."""
+    state: str
+    """``waiting`` for its ``when``, ``standing``, ``ended`` or ``cancelled``."""
+    fired: int
+    failures: int
+    merged: int
+    """Ticks left out because the call of an earlier one still ran."""
+    last_error: str
+    detached: bool
+    """Whether it outlives its owner."""
+
+
+class Notification(ABC):
+    """A standing request; it ends when it has fired for the last time, is cancelled, or its owner ends."""
+
+    def __init__(self, name: str, text: str) -> None:
+        self.id: Final = name
+        """Names it in the whole system."""
+        self._text = text
+
+    @abstractmethod
+    def info(self) -> NotificationInfo:
+        """How it stands."""
+
+    @property
+    def active(self) -> bool:
+        """Whether it can still fire."""
+        return self.info().state in (State.WAITING, State.STANDING)
+
+    @abstractmethod
+    def cancel(self) -> None:
+        """End it; a call under way finishes. Idempotent."""
+
+    @abstractmethod
+    def detach(self) -> None:
+        """Let it outlive whoever asked for it; it then stands until it is cancelled.
+
+        Raises:
+            ConfigurationError: it lives in the container that asked for it, and ends with that.
+        """
+
+    def __repr__(self) -> str:
+        return f"<Notification {self._text}>"
+
+
+class Home(Protocol):
+    """What a standing request needs of its container."""
+
+    @property
+    def name(self) -> str: ...
+    def find(self, constraint: Constraint, *, wait_s: float = ...) -> Handle: ...
+    def require_call(self, who: str, handle: Handle) -> None: ...
+
+
+class Owner(Struct, frozen=True):
+    """Who asked for it."""
+
+    session: str
+    identity: str = ""
+    """If it asked from another container: checked again whenever a call is made for it."""
+    acts_as: Session | None = None
+    """Calls are made in this session."""
+
+
+class Standing(Notification):
+    """One that lives in this container. Done by the clockwork: never twice at once."""
+
+    def __init__(
+        self,
+        name: str,
+        terms: Terms,
+        call: Target,
+        if_: Target | None,
+        when: Target | None,
+        owner: Owner,
+        home: Home,
+        ended: Callable[["Standing"], None],
+        failed: Callable[["Standing", str], None],
+    ) -> None:
+        super().__init__(name, str(terms))
+        self.owner: Final = owner
+        self.terms: Final = terms
+        self._call = call
+        self._if = if_
+        self._when = when
+        self._home = home
+        self._tell_ended = ended
+        self._tell_failed = failed
+        self.detached = False
+        self._state = State.STANDING if when is None else State.WAITING
+        self._due_ns: int | None = None
+        """Of after and every."""
+        self._held = False
+        """Whether the condition held at the last tick."""
+        self._concerned: deque[Handle] = deque()
+        """Services that came, went or changed and were not told of yet."""
+        self._fired = self._failures = self._merged = 0
+        self._last_error = ""
+        self._said: set[tuple[str, str]] = set()
+        """What failed, and with which error, as far as it was told."""
+        self._cancel_due: Callable[[], None] = lambda: None
+
+    # --- being
+
+    def begin(self, clockwork: Clockwork) -> Callable[[int], None]:
+        """Have it done; returns what has it done once more."""
+        due = clockwork.begin(self._act, time.monotonic_ns())
+        self._cancel_due = due.cancel
+        return due.at
+
+    @property
+    def active(self) -> bool:
+        return self._state in (State.WAITING, State.STANDING)
+
+    def info(self) -> NotificationInfo:
+        conditions = [("if", self._if), ("when", self._when)]
+        return NotificationInfo(
+            id=self.id,
+            occasion=str(self.terms),
+            call=text_of(self._call),
+            condition=", ".join(f"{word} {text_of(what)}" for word, what in conditions if what is not None),
+            owner=self.owner.session,
+            container=self._home.name,
+            state=self._state.value,
+            fired=self._fired,
+            failures=self._failures,
+            merged=self._merged,
+            last_error=self._last_error,
+            detached=self.detached,
+        )
+
+    def cancel(self) -> None:
+        self._end(State.CANCELLED)
+
+    def detach(self) -> None:
+        if not self.owner.identity:
+            problem = (
+                f"it lives in container {self._home.name}, which asked for it, and ends with that; "
+                "ask for it with host= another container"
+            )
+            raise ConfigurationError(where=repr(self), problem=problem)
+        self.detached = True
+
+    def _end(self, state: State) -> None:
+        if self.active:
+            self._state = state
+            self._cancel_due()
+            self._tell_ended(self)
+
+    # --- firing
+
+    def concerns(self, record: Record) -> bool:
+        """Whether it is about that service."""
+        assert self.terms.constraint is not None  # noqa: S101
+        return self.terms.constraint.matches(record)
+
+    def add(self, handle: Handle) -> None:
+        """Tell of that service, too, when it is done next."""
+        self._concerned.append(handle)
+
+    def _act(self) -> int | None:
+        now = time.monotonic_ns()
+        if self._state is State.WAITING:
+            if not self._asked(self._when):
+                return now + int(self.terms.poll_s * 1e9)
+            if not self.active:  # cancelled meanwhile
+                return None
+            self._state = State.STANDING
+        if self._state is not State.STANDING:
+            return None
+        match self.terms.occasion:
+            case "joined" | "left" | "changed":
+                return self._tell()
+            case "every":
+                return self._tick(now)
+            case "at":
+                left_ns = int((self.terms.at - time.time()) * 1e9)
+                return now + min(left_ns, _LOOK_NS) if left_ns > 0 else self._once()
+            case "after":
+                self._due_ns = self._due_ns or now + int(self.terms.s * 1e9)
+                return self._due_ns if self._due_ns > now else self._once()
+            case "once":
+                return self._once()
+
+    def _once(self) -> None:
+        self._fire()
+        self._end(State.ENDED)
+
+    def _tick(self, now: int) -> int:
+        period = int(self.terms.s * 1e9)
+        if self._due_ns is None:
+            self._due_ns = now + period
+            return self._due_ns
+        if self._due_ns <= now:
+            self._fire()
+            self._due_ns += period
+            missed = max(0, (time.monotonic_ns() - self._due_ns) // period)
+            self._merged += missed
+            self._due_ns += missed * period
+        return self._due_ns
+
+    def _tell(self) -> None:
+        while self._concerned and self._state is State.STANDING:
+            self._fire(self._concerned.popleft())
+
+    def _fire(self, *given: Handle) -> None:
+        if self._if is not None:
+            held, before = self._asked(self._if), self._held
+            self._held = held
+            if not held or (self.terms.edge and before):
+                return
+        if not self.active:
+            return
+        try:
+            self._do(self._call, *given)
+            self._fired += 1
+        except BaseException as error:  # noqa: BLE001 - whatever a callback raises kills nothing
+            self._failed("call", self._call, error)
+
+    def _asked(self, condition: Target | None) -> bool:
+        """Whether a condition holds; one that fails does not."""
+        assert condition is not None  # noqa: S101
+        try:
+            held = self._do(condition)
+            if not isinstance(held, bool):
+                problem = f"a condition answers with True or False, not {held!r}"
+                raise ConfigurationError(where=text_of(condition), problem=problem)
+        except BaseException as error:  # noqa: BLE001
+            self._failed("condition", condition, error)
+            return False
+        return held
+
+    def _do(self, target: Target, *given: Handle) -> Any:
+        acts_as = self.owner.acts_as
+        with contextlib.nullcontext() if acts_as is None else acts_as.use():
+            if not isinstance(target, Deed):
+                return target(*given)
+            handle = target.handle
+            if handle is None:
+                assert target.constraint is not None  # noqa: S101
+                handle = self._home.find(target.constraint, wait_s=0)
+            if self.owner.identity:
+                self._home.require_call(self.owner.identity, handle)
+            return handle(*given, *target.args, **target.kwargs)
+
+    def _failed(self, part: str, target: Target, error: BaseException) -> None:
+        self._failures += 1
+        kind = type(error).__name__
+        self._last_error = f"{kind}: {error}"
+        if (part, kind) in self._said:  # the same again says nothing new, whatever numbers are in its text
+            return
+        self._said.add((part, kind))
+        over = self._state is not State.WAITING and self.terms.occasion in _SINGLE
+        stays = "" if over else "; it stays attached, and this kind is told once"
+        text = "the %s of %r failed (%s, id %s)%s: %s"
+        _logger.warning(text, part, self, text_of(target), self.id, stays, self._last_error)
+        self._tell_failed(self, self._last_error)

@@ -1,0 +1,129 @@
+"""What stands in one container, for itself and for others: who asked for it, and what it is told of services."""
+
+import threading
+import time
+from collections.abc import Callable
+from typing import Final
+
+from trade._calls.handle import Handle
+from trade._notifications.notification import Home, NotificationInfo, Owner, Standing
+from trade._notifications.triggers import OF_SERVICES, Target, Terms
+from trade._registry.registry import Change, Record
+from trade._threads.scheduler import Clockwork
+from trade.errors import ConfigurationError
+
+_MOST: Final = 10_000
+"""So many may stand in a container for others at once."""
+
+
+class Notifier:
+    """Owns what stands in one container, for itself and for others."""
+
+    def __init__(self, home: Home, clockwork: Clockwork, epoch: str, handle: Callable[[Record], Handle]) -> None:
+        self._home = home
+        self._clockwork = clockwork
+        self._epoch = epoch
+        self._handle = handle
+        self._lock = threading.Lock()
+        self._standing: dict[str, Standing] = {}
+        self._of_services: dict[str, tuple[Standing, Callable[[int], None]]] = {}
+        self._count = 0
+        self.failed: Callable[[Standing, str], None] = lambda _standing, _error: None
+        """Told of failures of what stands for others."""
+        self.ended: Callable[[str], None] = lambda _session: None
+        """Told when nothing stands any more for a session of another container."""
+
+    def add(
+        self,
+        terms: Terms,
+        call: Target,
+        if_: Target | None,
+        when: Target | None,
+        owner: Owner,
+        existing: list[Record],
+    ) -> Standing:
+        """Begin one; services that are there already are told of first.
+
+        Raises:
+            ConfigurationError: a time that is none, or too many stand here for others.
+        """
+        terms.check()
+        with self._lock:
+            if owner.identity and len(self._standing) >= _MOST:
+                problem = f"{len(self._standing)} notifications stand here already"
+                raise ConfigurationError(where=self._home.name, problem=problem)
+            self._count += 1
+            name = f"{self._epoch}.{self._count}"
+            standing = Standing(name, terms, call, if_, when, owner, self._home, self._forget, self._failed)
+            self._standing[name] = standing
+            for record in existing:
+                standing.add(self._handle(record))
+            again = standing.begin(self._clockwork)
+            if terms.occasion in OF_SERVICES:
+                self._of_services[name] = (standing, again)
+        return standing
+
+    def _failed(self, standing: Standing, error: str) -> None:
+        if standing.owner.identity:
+            self.failed(standing, error)
+
+    def _forget(self, standing: Standing) -> None:
+        with self._lock:
+            self._standing.pop(standing.id, None)
+            self._of_services.pop(standing.id, None)
+        if standing.owner.identity:
+            self.tidy(standing.owner.session)
+
+    def tidy(self, session: str) -> None:
+        """See whether anything stands for that session."""
+        with self._lock:
+            left = any(one.owner.session == session for one in self._standing.values())
+        if not left:
+            self.ended(session)
+
+    def changed(self, change: Change) -> None:
+        """Told by the registry."""
+        with self._lock:
+            told = list(self._of_services.values())
+        now = time.monotonic_ns()
+        for standing, again in told:
+            concerned = _concerned(standing, change)
+            for record in concerned:
+                standing.add(self._handle(record))
+            if concerned:
+                again(now)
+
+    def session_ended(self, session: str) -> None:
+        """Nobody of it is there any more: what it asked for ends, unless it was detached."""
+        with self._lock:
+            orphans = [one for one in self._standing.values() if one.owner.session == session and not one.detached]
+        for standing in orphans:
+            standing.cancel()
+        self.tidy(session)
+
+    def get(self, name: str) -> Standing | None:
+        return self._standing.get(name)
+
+    def infos(self) -> list[NotificationInfo]:
+        """What stands here, oldest first."""
+        with self._lock:
+            standing = list(self._standing.values())
+        return [one.info() for one in standing]
+
+    def close(self) -> None:
+        """End all. Idempotent."""
+        with self._lock:
+            standing = list(self._standing.values())
+        for one in standing:
+            one.cancel()
+
+
+def _concerned(standing: Standing, change: Change) -> list[Record]:
+    match standing.terms.occasion:
+        case "joined":
+            return [record for record in change.joined if standing.concerns(record)]
+        case "left":
+            return [record for record in change.left if standing.concerns(record)]
+        case _:
+            altered = [(old, new) for old, new in zip(change.before, change.replaced, strict=True) if old != new]
+            return [new for old, new in altered if standing.concerns(old) or standing.concerns(new)]

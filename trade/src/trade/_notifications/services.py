@@ -1,0 +1,173 @@
+"""What every container offers about its standing requests, in group ``trade``."""
+
+import contextlib
+import logging
+import threading
+from collections.abc import Callable
+from typing import Protocol
+
+from trade._calls.handle import Handle
+from trade._container.system import DOMAIN, PROVIDER
+from trade._context.call_context import served_call
+from trade._context.sessions import Session
+from trade._notifications.notification import Notification, NotificationInfo, Owner, Standing
+from trade._notifications.notifier import Notifier
+from trade._notifications.triggers import OF_SERVICES, Deed, Terms
+from trade._protocol.keys import Address, ServiceKey
+from trade._registry.registry import Record, Registry
+from trade._security.authorizer import Access
+from trade._services.decorator import service
+from trade.errors import CallerError, CallError, NoSuchNotification
+
+_logger = logging.getLogger("trade")
+
+
+class Home(Protocol):
+    """The container they belong to."""
+
+    @property
+    def address(self) -> Address: ...
+    @property
+    def name(self) -> str: ...
+    def handle(self, key: ServiceKey) -> Handle: ...
+    def open_session(self, client: str) -> Session: ...
+
+
+class Guests:
+    """Whoever has notifications standing here for it acts in a session of its own: what that moves stops with it."""
+
+    def __init__(self, open_session: Callable[[str], Session]) -> None:
+        self._open = open_session
+        self._lock = threading.Lock()
+        self._sessions: dict[str, Session] = {}
+
+    def of(self, owner: str) -> Session:
+        with self._lock:
+            known = self._sessions.get(owner)
+            if known is None:
+                parts = owner.split("/")
+                known = self._sessions[owner] = self._open(f"for.{parts[0]}.{parts[1] if len(parts) > 1 else ''}")
+            return known
+
+    def leave(self, owner: str) -> None:
+        with self._lock:
+            known = self._sessions.pop(owner, None)
+        if known is not None:
+            known.close()
+
+
+class NotificationServices:
+    """The wire's side of a `Notifier`."""
+
+    def __init__(self, notifier: Notifier, registry: Registry, home: Home, access: Access) -> None:
+        self._notifier = notifier
+        self._records = registry
+        self._home = home
+        self._rights = access
+        self._guests = Guests(home.open_session)
+        notifier.failed = self._tell_owner
+        notifier.ended = self._guests.leave
+
+    @service
+    def notify(self, terms: Terms, call: Deed, if_: Deed | None = None, when: Deed | None = None) -> str:
+        """Make that call on that occasion, for who asks, who must be allowed to make it then; its id."""
+        asked = served_call()
+        owner = Owner(asked.session, asked.caller, self._guests.of(asked.session))
+        try:
+            return placed(self._notifier, self._records, terms, call, if_, when, owner).id
+        finally:
+            self._notifier.tidy(asked.session)
+
+    @service(effect="read")
+    def notifications(self) -> list[NotificationInfo]:
+        """What stands here, whoever asked for it."""
+        return self._notifier.infos()
+
+    @service
+    def cancel_notification(self, notification: str) -> bool:
+        """End a notification that stands here; whether there was one. Another's is for who administers the system."""
+        standing = self._mine_or_administered(notification)
+        if standing is not None:
+            standing.cancel()
+        return standing is not None
+
+    @service
+    def detach_notification(self, notification: str) -> None:
+        """Let a notification that stands here outlive who asked for it."""
+        standing = self._mine_or_administered(notification)
+        if standing is None:
+            raise NoSuchNotification(id=notification)
+        standing.detach()
+
+    @service
+    def notification_failed(self, notification: str, text: str, error: str) -> None:
+        """Told by another container: a call that it makes for this one failed."""
+        _logger.warning(
+            "the call of %s (%s), asked for here, failed at %s: %s", notification, text, served_call().caller, error
+        )
+
+    def _mine_or_administered(self, notification: str) -> Standing | None:
+        standing, asked = self._notifier.get(notification), served_call()
+        if standing is not None and (standing.owner.identity or self._home.address.identity) != asked.caller:
+            self._rights.require(asked.caller, "administer", DOMAIN, f"notification {notification}")
+        return standing
+
+    def _tell_owner(self, standing: Standing, error: str) -> None:
+        owner = Address(*standing.owner.session.split("/")[:3])
+        with contextlib.suppress(CallerError, CallError):  # it has gone
+            told = self._home.handle(ServiceKey(owner, DOMAIN, PROVIDER, "notification_failed"))
+            told.start(standing.id, str(standing.terms), error)
+
+
+def placed(
+    notifier: Notifier,
+    registry: Registry,
+    terms: Terms,
+    call: Deed | Callable[..., object],
+    if_: Deed | Callable[..., object] | None,
+    when: Deed | Callable[..., object] | None,
+    owner: Owner,
+) -> Standing:
+    """Begin one, such that no change of the registry is missed or told of twice."""
+    made: list[Standing] = []
+
+    def add() -> None:
+        existing: list[Record] = []
+        if terms.occasion in OF_SERVICES and terms.existing and terms.constraint is not None:
+            existing = registry.select(terms.constraint)
+        made.append(notifier.add(terms, call, if_, when, owner, existing))
+
+    registry.between_changes(add)
+    return made[0]
+
+
+class Hosted(Notification):
+    """One that lives in another container."""
+
+    def __init__(self, name: str, terms: Terms, host: Address, handle: Callable[[ServiceKey], Handle]) -> None:
+        super().__init__(name, f"{terms}, in {host.container}")
+        self._host = host
+        self._handle = handle
+
+    def _service(self, name: str) -> Handle:
+        return self._handle(ServiceKey(self._host, DOMAIN, PROVIDER, name))
+
+    def info(self) -> NotificationInfo:
+        for info in self._service("notifications")():
+            if info.id == self.id:
+                return info
+        raise NoSuchNotification(id=self.id)
+
+    @property
+    def active(self) -> bool:
+        try:
+            self.info()
+        except NoSuchNotification:
+            return False
+        return True
+
+    def cancel(self) -> None:
+        self._service("cancel_notification")(self.id)
+
+    def detach(self) -> None:
+        self._service("detach_notification")(self.id)

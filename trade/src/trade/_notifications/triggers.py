@@ -1,0 +1,163 @@
+"""What a notification is asked for with: an occasion, a call to make, conditions. Data, so that it can be sent."""
+
+import inspect
+import math
+from collections.abc import Callable, Mapping
+from datetime import datetime, timezone
+from typing import Any, Final, Literal
+
+from msgspec import Struct
+
+from trade._calls.handle import Bound, Handle
+from trade._registry.constraints import Constraint
+from trade.errors import ConfigurationError
+
+Occasion = Literal["joined", "left", "changed", "once", "after", "at", "every"]
+OF_SERVICES: Final = frozenset({"joined", "left", "changed"})
+
+SHORTEST_S: Final = 0.001
+_YEAR_10000_S: Final = 253_402_300_800
+"""Since 1970."""
+LONGEST_S: Final = 10 * 366 * 86_400.0
+
+
+class Deed(Struct, frozen=True):
+    """A call that can be sent: of a service, or of the only one that matches when the time has come."""
+
+    handle: Handle | None = None
+    constraint: Constraint | None = None
+    args: tuple[Any, ...] = ()
+    kwargs: dict[str, Any] = {}
+
+    def __str__(self) -> str:
+        given = ", ".join([*map(repr, self.args), *(f"{name}={value!r}" for name, value in self.kwargs.items())])
+        if self.handle is not None:
+            return f"{self.handle.label}({given})"
+        return f"the service with {self.constraint}"
+
+
+What = Callable[..., Any] | Handle | Bound | Constraint
+"""What may be called: a service, a bound call, the only service that matches, or a function of this process."""
+Target = Deed | Callable[..., Any]
+
+
+class Terms(Struct, frozen=True, kw_only=True):
+    """The occasion."""
+
+    occasion: Occasion
+    constraint: Constraint | None = None
+    """Which services, of joined, left, changed."""
+    existing: bool = False
+    s: float = 0.0
+    at: float = 0.0
+    """Seconds since the epoch."""
+    poll_s: float = 1.0
+    """How often ``when`` is asked."""
+    edge: bool = False
+
+    def check(self) -> None:
+        """Raises ConfigurationError: no such time."""
+        if self.occasion in OF_SERVICES and self.constraint is None:
+            raise ConfigurationError(where=f"trade.{self.occasion}", problem="say which services, with where(...)")
+        if self.occasion == "every":
+            _check_s(self.occasion, "s", self.s, SHORTEST_S)
+        elif self.occasion == "after":
+            _check_s(self.occasion, "s", self.s, 0.0)
+        elif self.occasion == "at" and not 0 <= self.at < _YEAR_10000_S:
+            raise ConfigurationError(where="trade.at", problem=f"there is no such moment: {self.at!r} s since 1970")
+        _check_s(self.occasion, "poll_s", self.poll_s, SHORTEST_S)
+
+    def __str__(self) -> str:
+        match self.occasion:
+            case "every" | "after":
+                return f"{self.occasion} {self.s:g} s"
+            case "at":
+                return f"at {datetime.fromtimestamp(self.at, timezone.utc):%Y-%m-%d %H:%M:%S} UTC"
+            case "once":
+                return "once"
+            case _:
+                return f"{self.occasion} {self.constraint}"
+
+
+def _check_s(occasion: str, name: str, value: float, least: float) -> None:
+    number = isinstance(value, int | float) and not isinstance(value, bool)  # pyright: ignore[reportUnnecessaryIsInstance]
+    if not number or not math.isfinite(value) or not least <= value <= LONGEST_S:
+        problem = f"{name} must be seconds, from {least:g} to {LONGEST_S:.0f} (ten years), not {value!r}"
+        raise ConfigurationError(where=f"trade.{occasion}", problem=problem)
+
+
+def epoch_s(moment: datetime, now_s: float) -> float:
+    """A moment as seconds since the epoch.
+
+    Raises:
+        ConfigurationError: it has passed, or names no time zone.
+    """
+    if not isinstance(moment, datetime):  # pyright: ignore[reportUnnecessaryIsInstance]
+        raise ConfigurationError(where="trade.at", problem=f"a datetime says when, not {moment!r}")
+    if moment.tzinfo is None or moment.utcoffset() is None:
+        problem = f"{moment} names no time zone; {moment!r}.astimezone() is that moment by this computer's"
+        raise ConfigurationError(where="trade.at", problem=problem)
+    if moment.timestamp() <= now_s:
+        ago_s = now_s - moment.timestamp()
+        raise ConfigurationError(where="trade.at", problem=f"{moment} has passed, {ago_s:.1f} s ago")
+    return moment.timestamp()
+
+
+def target_of(what: What, where: str, argument: str, given: int) -> Target:
+    """What to call, as data if it can be.
+
+    Args:
+        what: a service, a bound call, a constraint or a function.
+        where: for whom, for the error.
+        argument: which one it is, for the error.
+        given: so many values it is called with.
+
+    Raises:
+        ConfigurationError: it cannot be called, or not with so many values.
+    """
+    if isinstance(what, Handle):
+        return Deed(handle=what)
+    if isinstance(what, Bound):
+        return Deed(handle=what.handle, args=what.args, kwargs=dict(what.kwargs))
+    if isinstance(what, Constraint):
+        return Deed(constraint=what)
+    if callable(what):
+        _check_takes(what, where, argument, given)
+        return what
+    problem = f"{argument} must be a handle, a bound call, where(...), or a function, not {what!r}"
+    raise ConfigurationError(where=where, problem=problem)
+
+
+def _check_takes(function: Callable[..., Any], where: str, argument: str, given: int) -> None:
+    try:
+        signature = inspect.signature(function)
+    except (TypeError, ValueError):  # one of C: only calling it shows
+        return
+    try:
+        signature.bind(*range(given))
+    except TypeError as bad:
+        values = {0: "without arguments", 1: "with one argument"}[given]
+        problem = f"{argument} is called {values}, and {text_of(function)} takes {signature}: {bad}"
+        raise ConfigurationError(where=where, problem=problem) from None
+
+
+def deed_of(target: Target, host: str, where: str) -> Deed:
+    """The same for another container. Raises ConfigurationError: that one cannot call a function of this process."""
+    if isinstance(target, Deed):
+        return target
+    problem = (
+        f"{host} cannot call {target!r}, a function of this process; "
+        "make it a service (@service, trade.register) and give its handle"
+    )
+    raise ConfigurationError(where=where, problem=problem)
+
+
+def text_of(target: Target) -> str:
+    """For people. An object of the middleware's own says of its methods what they are, as ``told_as``."""
+    if isinstance(target, Deed):
+        return str(target)
+    told_as: str = getattr(getattr(target, "__self__", None), "told_as", "")
+    if told_as:
+        return told_as
+    owner: Mapping[str, Any] | Any = getattr(target, "__qualname__", None)
+    return f"{owner or repr(target)} (a function)"

@@ -1,0 +1,94 @@
+"""What is read of e-stops: orders to stop, confirmations and what is open in others are so in every protocol version.
+
+That part is never changed; docs/wire-protocol.md, "Versions", has it in prose.
+"""
+
+import math
+from typing import Annotated, Final, TypeVar
+
+import msgspec
+from msgspec import Meta, Raw, Struct
+
+from trade._protocol.keys import is_chunk
+from trade._protocol.messages import (
+    NO_CHUNK,
+    UNREADABLE,
+    Estop,
+    EstopConfirmed,
+    EstopOrder,
+    Malformed,
+    decoded,
+    read_any,
+)
+
+_LONGEST_REASON: Final = 500
+_Value = TypeVar("_Value")
+
+
+class _AnyEstop(Struct, array_like=True, gc=False):
+    """What of an e-stop stands in every version: two fields, and two more that are understood if they can be."""
+
+    id: Annotated[str, Meta(min_length=1, max_length=80)]
+    by: Annotated[str, Meta(max_length=300)]
+    reason: Raw = Raw()
+    at: Raw = Raw()
+
+    def read(self) -> Estop:
+        if not is_chunk(self.id):
+            raise Malformed(NO_CHUNK)
+        at = _if_it_is(_number_decoder, self.at)
+        reason = _if_it_is(_text_decoder, self.reason)
+        return Estop(self.id, self.by, (reason or "")[:_LONGEST_REASON], at if at and math.isfinite(at) else 0.0)
+
+
+class _AnyOrder(Struct, array_like=True, gc=False):
+    """What of an order to stop stands in every version."""
+
+    v: Annotated[int, Meta(ge=1)]
+    request: str
+    opened: _AnyEstop | None = None
+
+
+class _AnyEntry(Struct, gc=False):
+    """What of an entry that tells of open e-stops stands in every version."""
+
+    estops: tuple[_AnyEstop, ...] = ()
+
+
+_order_decoder: Final = msgspec.msgpack.Decoder(EstopOrder)
+_confirmed_decoder: Final = msgspec.msgpack.Decoder(EstopConfirmed)
+_any_order_decoder: Final = msgspec.msgpack.Decoder(_AnyOrder)
+_any_entry_decoder: Final = msgspec.msgpack.Decoder(_AnyEntry)
+_text_decoder: Final = msgspec.msgpack.Decoder(str)
+_number_decoder: Final = msgspec.msgpack.Decoder(float)
+
+
+def decode_estop_order(payload: bytes, identity: str) -> EstopOrder:
+    """An order, given by that identity: to stop, of any version; to clear, of this one."""
+    any_order = read_any(_any_order_decoder, payload)
+    if any_order.opened is None:
+        order = decoded(_order_decoder, payload)
+        if not all(map(is_chunk, (order.request, *order.cleared))):
+            raise Malformed(NO_CHUNK)
+        return order
+    estop = any_order.opened.read()
+    if estop.id != any_order.request or not estop.by.startswith(f"{identity}/"):
+        raise Malformed(f"e-stop {estop.id!r} of {estop.by!r} is not one of {identity}")
+    return EstopOrder(any_order.v, estop.id, estop)
+
+
+def decode_estop_confirmed(payload: bytes) -> EstopConfirmed:
+    """Of any version."""
+    return read_any(_confirmed_decoder, payload)
+
+
+def decode_open_estops(payload: bytes) -> tuple[Estop, ...]:
+    """Those that a registry entry of whatever version tells of."""
+    return tuple(estop.read() for estop in read_any(_any_entry_decoder, payload).estops)
+
+
+def _if_it_is(decoder: msgspec.msgpack.Decoder[_Value], raw: Raw) -> _Value | None:
+    try:
+        return decoder.decode(raw)
+    except UNREADABLE:
+        return None

@@ -1,0 +1,228 @@
+"""Types as JSON Schema text, and whether values of one schema can stand where another one is asked for."""
+
+# pyright: reportUnknownVariableType=false, reportUnknownArgumentType=false, reportUnknownMemberType=false
+
+import types
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
+from typing import Any, Final, Literal, Union, get_origin
+
+import msgspec
+from msgspec import Raw
+
+from trade._protocol.messages import NO_SCHEMA, encode_message
+from trade._protocol.schema_limits import limits_text
+from trade._protocol.schema_types import noted
+from trade.errors import ConfigurationError
+
+_Schema = Mapping[str, Any]
+_NAMES: Final = {"number": "float", "integer": "int", "string": "str", "boolean": "bool", "null": "None"}
+_SAME: Final = ("format", "contentEncoding", "x-trade-type", "x-trade-kind")
+"""What makes another kind of value of the same JSON type."""
+_MOST_REFERENCES: Final = 100
+_decode_schema: Final = msgspec.msgpack.Decoder(dict[str, Any]).decode
+
+
+def types_text(kinds: Sequence[Any]) -> str:
+    """The JSON Schemas of types, as one canonical text; raises ConfigurationError for a type that cannot be sent."""
+    try:
+        schemas, definitions = msgspec.json.schema_components([noted(kind) for kind in kinds], schema_hook=_own_schema)
+    except TypeError as bad:
+        raise ConfigurationError(problem=f"this type cannot be sent, so no service has it: {bad}") from None
+    return msgspec.json.encode([list(schemas), definitions], order="sorted").decode()
+
+
+def _own_schema(kind: Any) -> dict[str, Any]:
+    name = getattr(kind, "__trade_type__", None)
+    if name is None:
+        raise TypeError(f"{kind!r} is no plain data")
+    return {"type": "object", "title": name, "x-trade-type": name}
+
+
+@lru_cache(1024)
+def read_types(text: str) -> tuple[tuple[_Schema, ...], _Schema]:
+    """The schemas in such a text, and the definitions they refer to. Raises ValueError for another text."""
+    schemas, definitions = read_json(text, tuple[list[dict[str, Any]], dict[str, Any]])
+    return tuple(schemas), definitions
+
+
+def schema_message(schema: _Schema, definitions: _Schema) -> Raw:
+    """A schema as it travels, with the definitions it refers to."""
+    if not schema and not definitions:
+        return NO_SCHEMA  # which is left out
+    return Raw(encode_message({**schema, "$defs": definitions} if definitions else schema))
+
+
+def read_schema(raw: Raw) -> dict[str, Any]:
+    """A schema as it travels, anew each time; what cannot be read describes nothing."""
+    try:
+        return _decode_schema(raw)
+    except (msgspec.DecodeError, ValueError, RecursionError):
+        return {}
+
+
+@lru_cache(1024)
+def known_schema(data: bytes) -> _Schema:
+    """The same, kept: for looking only."""
+    return read_schema(Raw(data))
+
+
+def read_json(text: str, kind: Any) -> Any:
+    """A JSON text as one type; raises ValueError for another text."""
+    try:
+        return msgspec.json.decode(text, type=kind)
+    except msgspec.DecodeError as bad:
+        raise ValueError(str(bad)) from None
+
+
+def readable(text: str) -> str:
+    """Such a text as a person would write the types."""
+    return f"[{', '.join(map(_name, read_types(text)[0]))}]"
+
+
+def _name(schema: _Schema) -> str:
+    if "$ref" in schema:
+        return str(schema["$ref"]).rsplit("/", 1)[-1]
+    if "anyOf" in schema:
+        return " | ".join(map(_name, schema["anyOf"]))
+    if "enum" in schema:
+        return f"Literal[{', '.join(map(repr, schema['enum']))}]"
+    kind = schema.get("type")
+    if kind == "array":
+        return f"list[{_name(schema['items'])}]" if schema.get("items") else "list"
+    if kind == "object":
+        return str(schema.get("title", "dict"))
+    return str(schema.get("format") or ("bytes" if "contentEncoding" in schema else _NAMES.get(str(kind), "Any")))
+
+
+def type_text(kind: Any) -> str:
+    """A type as a person would write it: without modules and ``typing``, with its limits in parentheses."""
+    if hasattr(kind, "__metadata__"):
+        limits = limits_text(kind.__metadata__)
+        return type_text(kind.__origin__) + (f" ({limits})" if limits else "")
+    if kind is None or kind is type(None):
+        return "None"
+    if kind is Ellipsis:
+        return "..."
+    inner = [type_text(arg) for arg in getattr(kind, "__args__", ())]
+    origin = get_origin(kind)
+    if origin in (Union, types.UnionType):
+        return " | ".join(inner)
+    if origin is Literal:
+        return f"Literal[{', '.join(map(repr, kind.__args__))}]"
+    name = getattr(origin or kind, "__name__", str(kind))
+    return f"{name}[{', '.join(inner)}]" if inner else name
+
+
+def fits(given: _Schema, given_definitions: _Schema, wanted: _Schema, wanted_definitions: _Schema) -> bool:
+    """Whether every value of the given schema is of the wanted type; ranges and lengths are not looked at.
+
+    Schemas come from other containers and may be anything; what makes no sense fits nothing.
+    """
+    try:
+        return _Comparison(given_definitions, wanted_definitions).fits(given, wanted)
+    except (TypeError, ValueError, LookupError, AttributeError, RecursionError):
+        return False
+
+
+class _Comparison:
+    def __init__(self, given_definitions: _Schema, wanted_definitions: _Schema) -> None:
+        self._given = given_definitions
+        self._wanted = wanted_definitions
+        self._known: dict[tuple[int, int], bool] = {}
+
+    def fits(self, given: _Schema, wanted: _Schema) -> bool:
+        given, wanted = _resolved(given, self._given), _resolved(wanted, self._wanted)
+        pair = (id(given), id(wanted))
+        if pair not in self._known:
+            self._known[pair] = True  # a type that contains itself fits unless something else does not
+            self._known[pair] = self._compare(given, wanted)
+        return self._known[pair]
+
+    def _compare(self, given: _Schema, wanted: _Schema) -> bool:
+        if "anyOf" in given:
+            return all(self.fits(option, wanted) for option in given["anyOf"])
+        if "anyOf" in wanted:
+            return any(self.fits(given, option) for option in wanted["anyOf"])
+        if "enum" in given:
+            return all(_is_of(value, wanted) for value in given["enum"])
+        if _means_anything(wanted):
+            return True
+        kind = wanted.get("type")
+        same = given.get("type") == kind or (given.get("type"), kind) == ("integer", "number")
+        if "enum" in wanted or not same:
+            return False
+        if kind == "array":  # a list, a tuple, a set travel alike
+            return self._array(given, wanted)
+        if any(given.get(part) != wanted.get(part) for part in _SAME):
+            return False
+        return kind != "object" or self._object(given, wanted)
+
+    def _array(self, given: _Schema, wanted: _Schema) -> bool:
+        places: Sequence[_Schema] = wanted.get("prefixItems", ())
+        own: Sequence[_Schema] = given.get("prefixItems", ())
+        rest, own_rest = wanted.get("items", {}), given.get("items", {})
+        least = given.get("minItems", 0) if own else 0
+        if least < wanted.get("minItems", 0) and places:
+            return False
+        if own_rest is False:
+            return all(self._place(item, places, rest, index) for index, item in enumerate(own))
+        return not places and rest is not False and all(self.fits(item, rest) for item in (*own, own_rest))
+
+    def _place(self, item: _Schema, places: Sequence[_Schema], rest: Any, index: int) -> bool:
+        if index < len(places):
+            return self.fits(item, places[index])
+        return rest is not False and self.fits(item, rest)
+
+    def _object(self, given: _Schema, wanted: _Schema) -> bool:
+        own: _Schema = given.get("properties", {})
+        if "properties" not in wanted:
+            values = _values(wanted)
+            return all(self.fits(value, values) for value in (*own.values(), *_open_values(given)))
+        if "properties" not in given:
+            return False
+        asked = set(wanted["properties"])
+        missing = set(wanted.get("required", ())) - set(given.get("required", ()))
+        if missing or (asked and not asked & set(own)):  # nothing in common, though nothing is required
+            return False
+        return all(self.fits(own[name], value) for name, value in wanted["properties"].items() if name in own)
+
+
+def _resolved(schema: _Schema, definitions: _Schema) -> _Schema:
+    for _ in range(_MOST_REFERENCES):
+        if "$ref" in schema:
+            schema = definitions[schema["$ref"].rsplit("/", 1)[-1]]
+        elif "allOf" in schema:
+            [schema] = schema["allOf"]
+        else:
+            return schema
+    raise ValueError("a reference to itself")
+
+
+def _means_anything(schema: _Schema) -> bool:
+    return not any(part in schema for part in ("type", "enum", "anyOf", *_SAME))
+
+
+_ANYTHING: Final[_Schema] = {}
+
+
+def _values(schema: _Schema) -> _Schema:
+    values = schema.get("additionalProperties", _ANYTHING)
+    return values if isinstance(values, Mapping) else _ANYTHING
+
+
+def _open_values(given: _Schema) -> Sequence[_Schema]:
+    """What values a mapping may have beside its named ones; a record has none."""
+    return () if "properties" in given else (_values(given),)
+
+
+def _is_of(value: Any, wanted: _Schema) -> bool:
+    """Whether one plain value is of a type."""
+    if _means_anything(wanted):
+        return True
+    if "enum" in wanted:
+        return any(value == other and type(value) is type(other) for other in wanted["enum"])
+    if any(part in wanted for part in _SAME):
+        return False
+    kinds = {bool: ("boolean",), int: ("integer", "number"), float: ("number",), str: ("string",)}
+    return wanted.get("type") in kinds.get(type(value), ("null",) if value is None else ())

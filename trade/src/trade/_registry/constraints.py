@@ -1,0 +1,325 @@
+"""``where``: what a service must be. And, or, not, kept as disjunctive normal form; plain data that can be sent."""
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from fnmatch import fnmatchcase
+from functools import lru_cache
+from typing import Any, Final, Literal, Protocol
+
+import msgspec
+from msgspec import Struct
+
+from trade._protocol.messages import Scalar, ServiceInfo
+from trade._protocol.schema import fits, known_schema, read_json, read_types, readable, types_text
+from trade._registry.predicates import achieves_all, parse_predicates
+from trade.errors import ConfigurationError
+
+__all__ = ["Candidate", "Constraint", "where"]
+
+GROUP: Final = re.compile(r"[A-Za-z0-9_-]{1,80}(\.[A-Za-z0-9_-]{1,80})*")
+"""What a group looks like: whole segments joined by dots."""
+_MOST_CLAUSES: Final = 1000
+_GLOB: Final = frozenset("*?[")
+_Field = Literal[
+    "name", "group", "host", "container", "local", "args", "returns", "achieves", "uses", "kind", "meta", "healthy"
+]
+
+
+class Candidate(Protocol):
+    """What a constraint looks at."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def groups(self) -> Sequence[str]: ...
+    @property
+    def host(self) -> str: ...
+    @property
+    def container(self) -> str: ...
+    @property
+    def local(self) -> bool: ...
+    @property
+    def info(self) -> ServiceInfo: ...
+    @property
+    def kinds(self) -> Sequence[str]: ...
+    @property
+    def meta(self) -> Mapping[str, Scalar]: ...
+    @property
+    def healthy(self) -> bool: ...
+
+
+class Term(Struct, frozen=True, array_like=True, order=True):
+    """One test: a field against a pattern.
+
+    Patterns are texts: names and groups as they are, types as JSON Schema, predicates, a key and its value as JSON.
+    """
+
+    field: _Field
+    pattern: str
+    negated: bool = False
+
+    def __post_init__(self) -> None:
+        """What comes by message is checked like what is written."""
+        match self.field:
+            case "args" | "returns":
+                schemas, _ = read_types(self.pattern)
+                if self.field == "returns" and len(schemas) != 1:
+                    raise ValueError("a service returns one thing")
+            case "achieves":
+                parse_predicates(self.pattern)
+            case "meta":
+                _key_and_value(self.pattern)
+            case "group":
+                _check_group(self.pattern)
+            case "uses":
+                _check_no_pattern(self.field, self.pattern)
+            case _:
+                pass
+
+    def __invert__(self) -> "Term":
+        return Term(self.field, self.pattern, not self.negated)
+
+    def matches(self, candidate: Candidate) -> bool:
+        return self._holds(candidate) is not self.negated
+
+    def _holds(self, candidate: Candidate) -> bool:
+        match self.field:
+            case "local" | "healthy":
+                return bool(getattr(candidate, self.field))
+            case "group":
+                return any(under(group, self.pattern) for group in candidate.groups)
+            case "uses":
+                return any(under(resource, self.pattern) for resource in candidate.info.uses)
+            case "kind":
+                return any(_like(kind, self.pattern) for kind in candidate.kinds)
+            case "args":
+                return _takes(candidate.info, self.pattern)
+            case "returns":
+                return _returns(candidate.info, self.pattern)
+            case "achieves":
+                return achieves_all(candidate.info.achieves, parse_predicates(self.pattern))
+            case "meta":
+                key, value = _key_and_value(self.pattern)
+                return key in candidate.meta and _same(candidate.meta[key], value)
+            case "name" | "host" | "container":
+                return _like(getattr(candidate, self.field), self.pattern)
+
+    def __str__(self) -> str:
+        return f"not {self._text()}" if self.negated else self._text()
+
+    def _text(self) -> str:
+        match self.field:
+            case "local" | "healthy":
+                return self.field
+            case "args":
+                return f"args={readable(self.pattern)}"
+            case "returns":
+                return f"returns={readable(self.pattern)[1:-1]}"
+            case "meta":
+                key, value = _key_and_value(self.pattern)
+                return f"meta {key}={value!r}"
+            case _:
+                return f"{self.field}={self.pattern!r}"
+
+
+def _check_group(group: str) -> None:
+    _check_no_pattern("group", group)
+    if not GROUP.fullmatch(group):
+        raise ConfigurationError(problem=f"group={group!r} is no group; use words joined by dots, such as rosie.head")
+
+
+def _check_no_pattern(field: str, text: str) -> None:
+    if is_exact(text):
+        return
+    whole = re.split(r"\.?[^.]*[*?\[]", text)[0]
+    problem = f"{field}={text!r} would match nothing: it is whole dotted segments, and one selects all beneath it"
+    raise ConfigurationError(problem=f"{problem}; write {field}={whole!r}" if whole else f"{problem}, as rosie does")
+
+
+def under(group: str, selected: str) -> bool:
+    """Whether a dotted group is the selected one or beneath it; whole segments only."""
+    return group == selected or group.startswith(selected + ".")
+
+
+def is_exact(pattern: str) -> bool:
+    """Whether a name's pattern stands for one name only."""
+    return _GLOB.isdisjoint(pattern)
+
+
+def _like(name: str, pattern: str) -> bool:
+    return name == pattern or fnmatchcase(name, pattern)
+
+
+def _takes(info: ServiceInfo, pattern: str) -> bool:
+    """Whether the service can be called with so many positional arguments of these types."""
+    given, definitions = read_types(pattern)
+    places = [parameter for parameter in info.parameters if not parameter.keyword_only]
+    left_out = [parameter for parameter in info.parameters if parameter not in places[: len(given)]]
+    if len(given) > len(places) or any(parameter.required for parameter in left_out):
+        return False
+    whole = known_schema(bytes(info.arguments_schema))
+    properties, own = whole.get("properties", {}), whole.get("$defs", {})
+    return all(
+        not schema or fits(schema, definitions, properties.get(place.name, {}), own)  # {} is Any: of whatever type
+        for schema, place in zip(given, places, strict=False)
+    )
+
+
+def _returns(info: ServiceInfo, pattern: str) -> bool:
+    [wanted], definitions = read_types(pattern)
+    given = known_schema(bytes(info.result_schema))
+    return fits(given, given.get("$defs", {}), wanted, definitions)
+
+
+@lru_cache(1024)
+def _key_and_value(pattern: str) -> tuple[str, Scalar]:
+    return read_json(pattern, tuple[str, Scalar])
+
+
+def _same(one: Scalar, other: Scalar) -> bool:
+    """Equal, and true is not 1."""
+    return one == other and isinstance(one, bool) is isinstance(other, bool)
+
+
+class Constraint(Struct, frozen=True):
+    """A disjunction of conjunctions of terms. Combine with ``&``, ``|``, ``~``."""
+
+    clauses: tuple[frozenset[Term], ...]
+
+    def __and__(self, other: "Constraint") -> "Constraint":
+        return _normal([left | right for left in self.clauses for right in other.clauses])
+
+    def __or__(self, other: "Constraint") -> "Constraint":
+        return _normal([*self.clauses, *other.clauses])
+
+    def __invert__(self) -> "Constraint":
+        result = Constraint((frozenset(),))
+        for clause in self.clauses:
+            result &= _normal([frozenset((~term,)) for term in clause])
+        return result
+
+    def __bool__(self) -> bool:
+        raise TypeError("a constraint is neither true nor false; combine with & | ~ instead of and, or, not")
+
+    def matches(self, candidate: Candidate) -> bool:
+        """Whether a service is one of those meant."""
+        return any(all(term.matches(candidate) for term in clause) for clause in self.clauses)
+
+    def __str__(self) -> str:
+        if not self.clauses:
+            return "nothing"
+        texts = [" and ".join(str(term) for term in sorted(clause)) or "everything" for clause in self.clauses]
+        return texts[0] if len(texts) == 1 else " or ".join(f"({text})" for text in texts)
+
+
+def _normal(clauses: Sequence[frozenset[Term]]) -> Constraint:
+    """Without clauses that contradict themselves or say no more than another one."""
+    if len(clauses) > _MOST_CLAUSES:
+        raise ConfigurationError(problem=f"this constraint has more than {_MOST_CLAUSES} alternatives; make it simpler")
+    sound = {clause for clause in clauses if not any(~term in clause for term in clause)}
+    return Constraint(tuple(clause for clause in sorted(sound, key=sorted) if not any(c < clause for c in sound)))
+
+
+class _Where:
+    """Makes constraints; see ``where``."""
+
+    local: Final = Constraint((frozenset((Term("local", ""),)),))
+    """Services of this very container."""
+    healthy: Final = Constraint((frozenset((Term("healthy", ""),)),))
+    """Services whose provider says that nothing is wrong."""
+
+    def __call__(
+        self,
+        *,
+        name: str | None = None,
+        group: str | None = None,
+        host: str | None = None,
+        container: str | None = None,
+        local: bool | None = None,
+        args: Sequence[Any] | None = None,
+        returns: Any = msgspec.UNSET,
+        achieves: str | Sequence[str] | None = None,
+        uses: str | None = None,
+        kind: str | None = None,
+        meta: Mapping[str, Scalar] | None = None,
+        healthy: bool | None = None,
+    ) -> Constraint:
+        """Services that fit everything said; nothing said: all.
+
+        Args:
+            name: the service's name, ``*`` and ``?`` stand for anything.
+            group: a dotted group; selects everything beneath it, too.
+            host: the computer's name, ``*`` and ``?`` allowed.
+            container: the container's name, ``*`` and ``?`` allowed.
+            local: whether it lives in this container.
+            args: types of positional arguments it can be called with; ``[]`` is a call without any. ``int`` fits
+                ``float``, a struct one that asks for no more fields; ``Any`` is an argument of whatever type.
+            returns: the type of its result, or one that fits it; ``None`` is a service without one.
+            achieves: a predicate that one of its post-conditions must fit; ``?x`` is a variable. Of several, each must
+                fit one, and a variable means the same in all.
+            uses: a physical resource; selects everything beneath it, too.
+            kind: name of its provider's class, or of a base or interface of that; ``*`` and ``?`` allowed.
+            meta: keys and values it is declared with.
+            healthy: whether its provider says that nothing is wrong.
+
+        Raises:
+            ConfigurationError: a pattern is empty or stands where none may, a type cannot be sent, a predicate is
+                malformed.
+        """
+        given: tuple[tuple[_Field, str | None], ...]
+        given = (("name", name), ("group", group), ("host", host), ("container", container))
+        given = (*given, ("uses", uses), ("kind", kind))
+        terms = [Term(field, _pattern(field, pattern)) for field, pattern in given if pattern is not None]
+        flags: tuple[tuple[_Field, bool | None], ...] = (("local", local), ("healthy", healthy))
+        terms += [Term(field, "", negated=not flag) for field, flag in flags if flag is not None]
+        if args is not None:
+            terms.append(Term("args", types_text(_checked_types(args))))
+        if returns is not msgspec.UNSET:
+            terms.append(Term("returns", types_text([returns])))
+        if achieves is not None:
+            terms.append(Term("achieves", _predicates(achieves)))
+        for key, value in (meta or {}).items():
+            terms.append(Term("meta", _meta_text(key, value)))
+        return Constraint((frozenset(terms),))
+
+
+def _checked_types(args: Any) -> Sequence[Any]:
+    if not isinstance(args, list | tuple):
+        raise ConfigurationError(problem=f"args must be a list of types, such as [float, str], not {args!r}")
+    return args  # pyright: ignore[reportUnknownVariableType]
+
+
+def _predicates(achieves: str | Sequence[str]) -> str:
+    several = [achieves] if isinstance(achieves, str) else achieves
+    text = ", ".join(_pattern("achieves", pattern) for pattern in several)
+    return ", ".join(map(str, parse_predicates(text)))
+
+
+def _meta_text(key: str, value: Scalar) -> str:
+    checked_meta({key: value})
+    return msgspec.json.encode([key, value]).decode()
+
+
+def checked_meta(meta: Mapping[str, Any]) -> dict[str, Scalar]:
+    """Plain key/values; raises ConfigurationError for anything else."""
+    for key, value in meta.items():
+        plain = value is None or isinstance(value, bool | int | float | str)
+        whole = not isinstance(value, int) or -(2**63) <= value < 2**63
+        if not isinstance(key, str) or not key or not plain or not whole:  # pyright: ignore[reportUnnecessaryIsInstance]
+            raise ConfigurationError(
+                problem=f"meta maps names to numbers, texts, booleans or None, not {key!r}: {value!r}"
+            )
+        if isinstance(value, float) and not math.isfinite(value):
+            raise ConfigurationError(problem=f"meta {key!r} must be finite, not {value}")
+    return dict(meta)
+
+
+def _pattern(field: str, pattern: str) -> str:
+    if not isinstance(pattern, str) or not pattern:  # pyright: ignore[reportUnnecessaryIsInstance]
+        raise ConfigurationError(problem=f"{field} must be a non-empty text, not {pattern!r}")
+    return pattern
+
+
+where: Final = _Where()
+"""``where(name=..., group=...) & ~where.local``: what a service must be."""

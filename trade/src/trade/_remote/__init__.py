@@ -1,0 +1,1 @@
+"""Containers started on other hosts through ssh."""

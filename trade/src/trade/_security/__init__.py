@@ -1,0 +1,1 @@
+"""Access policies, the decisions they lead to, and certificates."""

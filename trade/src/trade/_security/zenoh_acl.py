@@ -1,0 +1,230 @@
+"""The transport's own access rules, made from the policy: they pin every identity to its keys at the first hop.
+
+docs/access-control.md has the table and how it was found. One table serves a container's own session and a gateway's:
+what an identity may send to whoever holds the rules, and what it may be sent.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from math import inf
+from types import MappingProxyType
+from typing import Any, Final, Literal, NamedTuple
+
+from trade._container.system import DOMAIN
+from trade._protocol.keys import ALIVE, ESTOPS, REGISTRY
+from trade._protocol.samples import STEPS_HZ, STREAMS
+from trade._security.policy import EVERYTHING, VERBS, Policy
+
+__all__ = ["acl"]
+
+_IN: Final = "ingress"
+_OUT: Final = "egress"
+_ALL_MESSAGES: Final = (
+    "put",
+    "delete",
+    "query",
+    "reply",
+    "declare_subscriber",
+    "declare_queryable",
+    "liveliness_token",
+    "declare_liveliness_subscriber",
+    "liveliness_query",
+)
+_SEEING: Final = tuple(verb for verb in VERBS if verb != "register")
+"""Who may do one of these in a group may know what is offered there."""
+
+_BEHIND: Final = {
+    "id": "calls behind",
+    "flows": [_IN],
+    "messages": ["put"],
+    "overwrite": {"priority": "data_low", "express": False},
+}
+
+_ANYBODY: Final = "*"
+"""In place of an identity where nothing tells who is who: on links without certificates."""
+
+
+class Crossing(NamedTuple):
+    """What a gateway lets pass between one of its networks and the others."""
+
+    offered: Sequence[str]
+    """Groups whose services of this network the others see and call."""
+    seen: Sequence[str]
+    """Groups of the others that are seen and called from this network."""
+    offered_hz: Mapping[str, float] = MappingProxyType({})
+    """Of the groups offered whose streams are limited: samples a second."""
+    seen_hz: Mapping[str, float] = MappingProxyType({})
+
+
+def crossings(
+    exports: Mapping[str, Sequence[str]], limits: Mapping[str, Mapping[str, float]] = MappingProxyType({})
+) -> dict[str, Crossing]:
+    """From what each network lets out, by interface, and how fast, to what crosses at each.
+
+    A group that several let out is seen at the highest of their limits; each one's own holds where it is offered.
+    """
+    made: dict[str, Crossing] = {}
+    for name, groups in exports.items():
+        others = [other for other in exports if other != name]
+        seen: dict[str, float] = {}
+        for other in others:
+            for group in exports[other]:
+                seen[group] = max(seen.get(group, 0.0), limits.get(other, {}).get(group, inf))
+        seen_hz = {group: hz for group, hz in seen.items() if hz < inf}
+        made[name] = Crossing(groups, sorted(seen), limits.get(name, {}), seen_hz)
+    return made
+
+
+_EVERYTHING_CROSSES: Final = Crossing((EVERYTHING,), (EVERYTHING,))
+
+_SLOWER: Final = "0.$*"
+"""All rates below 1 Hz, as they stand in keys."""
+
+_Row = tuple[str, str, Sequence[str]]
+"""Flow, message, keys."""
+
+
+def acl(
+    policy: Policy | None,
+    *,
+    namespace: str,
+    identities: Iterable[str] | None = None,
+    networks: Mapping[tuple[str, ...], Crossing] | None = None,
+    subject: Literal["cert_common_names", "usernames"] = "cert_common_names",
+    calls_hz: float | None = None,
+) -> dict[str, Any]:
+    """Settings of a zenoh session that let each identity send and hear what the policy allows, and nothing else.
+
+    Args:
+        policy: who may what; none: everybody may everything that crosses, and nobody can be told from others.
+        namespace: the system id: rules go by the keys on the wire, which begin with it.
+        identities: everybody there is; by default those the policy names in full, as rules know no patterns.
+        networks: of a gateway, what crosses at the interfaces of each of its networks; none: everything.
+        subject: what tells who is at the other end of a link; user names are known to the end that was dialled only.
+        calls_hz: how often an identity may call at most, evenly spread: of two calls that come closer together than
+            that the second is dropped. None: as often as it likes.
+
+    Returns:
+        ``access_control``, ``downsampling`` and ``qos/network``, as zenoh names them. They are read when a session
+        opens: another policy needs another session. The last one sends calls on behind everything else, so that who
+        floods with them holds up nobody's stops and answers.
+    """
+    places = networks or {(): _EVERYTHING_CROSSES}
+    if policy is None:
+        known, gateways = [_ANYBODY], list[str]()
+    else:
+        gateways = [name for name in policy.gateways if name not in policy.revoked]
+        named = policy.names() if identities is None else identities
+        known = [name for name in dict.fromkeys(named) if name not in policy.revoked and name not in gateways]
+    rules: list[dict[str, Any]] = []
+    subjects: list[dict[str, Any]] = []
+    policies: list[dict[str, Any]] = []
+
+    def let(name: str, interfaces: Sequence[str], rows: Iterable[_Row]) -> None:
+        who = " ".join((name, *interfaces))
+        made = [_rule(who, *row, namespace) for row in rows if row[2]]
+        told: dict[str, Any] = {} if name == _ANYBODY else {subject: [name]}
+        subjects.append({"id": who, **told, **({"interfaces": list(interfaces)} if interfaces else {})})
+        rules.extend(made)
+        policies.append({"rules": [rule["id"] for rule in made], "subjects": [who]})
+
+    for interfaces, crossing in places.items():
+        for name in known:
+            let(name, interfaces, _rows(policy, name, crossing))
+    for name in gateways:
+        let(name, (), _trusted())
+    return {
+        "access_control": {
+            "enabled": True,
+            "default_permission": "deny",
+            "rules": rules,
+            "subjects": subjects,
+            "policies": policies,
+        },
+        "qos/network": [_BEHIND | {"key_exprs": [f"{namespace}/call/**"]}],
+        "downsampling": [] if calls_hz is None else _limits(known, namespace, calls_hz),
+    }
+
+
+def _rows(policy: Policy | None, me: str, crossing: Crossing) -> list[_Row]:
+    """What one identity may send to us, and what we may send to it."""
+    calls = _over(policy, me, ("call", "read"), crossing.seen, f"call/{me}/*/*/*/{{}}/*")
+    offers = _over(policy, me, ("register",), crossing.offered, f"registry/{{}}/{me}/*/*/*")
+    sees = _over(policy, me, _SEEING, crossing.seen, "registry/{}/*/*/*/*")
+    puts = _paced(policy, me, "register", crossing.offered, crossing.offered_hz, f"stream/{{}}/{me}/*/*/*/*")
+    hears = _paced(policy, me, "read", crossing.seen, crossing.seen_hz, "stream/{}/*/*/*/*/*")
+    own = f"registry/*/{me}/*/*/*"
+    to_it = [f"call/*/{me}/**", f"stop/*/{me}/**", f"reply/*/{me}/**", ESTOPS]
+    return [
+        (_IN, "put", [*calls, f"stop/{me}/**", f"reply/{me}/**", *offers, *puts, f"estop/{me}/**"]),
+        (_IN, "reply", offers),
+        (_IN, "query", [REGISTRY]),
+        (_IN, "declare_subscriber", [REGISTRY, *to_it, *hears]),
+        (_IN, "declare_queryable", [own]),
+        (_IN, "liveliness_token", [f"alive/{me}/**", *puts]),
+        (_IN, "declare_liveliness_subscriber", [ALIVE]),
+        (_IN, "liveliness_query", [ALIVE, STREAMS]),
+        (_OUT, "put", [*sees, *to_it, *hears]),
+        (_OUT, "reply", sees),
+        (_OUT, "query", [REGISTRY]),
+        (_OUT, "declare_subscriber", [REGISTRY, "call/**", "stop/**", "reply/**", STREAMS, ESTOPS]),
+        (_OUT, "declare_queryable", [REGISTRY]),
+        (_OUT, "liveliness_token", [ALIVE, *hears]),
+    ]
+
+
+def _over(policy: Policy | None, who: str, verbs: Iterable[str], among: Sequence[str], pattern: str) -> list[str]:
+    """Keys of the groups among some that an identity has one of the verbs over, and of the middleware's own."""
+    groups = _both([EVERYTHING] if policy is None else policy.groups_of(who, verbs), among)
+    if groups == [EVERYTHING]:
+        return [pattern.format("*")]
+    own = [DOMAIN] if DOMAIN not in groups else []
+    beneath = [chunk for group in groups for chunk in (group, f"{group}.$*")]
+    return [pattern.format(chunk) for chunk in (*own, *beneath)]
+
+
+def _paced(
+    policy: Policy | None,
+    who: str,
+    verb: str,
+    among: Sequence[str],
+    limits: Mapping[str, float],
+    pattern: str,
+) -> list[str]:
+    """Keys of the streams of these groups, of limited ones at those rates only."""
+    keys: list[str] = []
+    for limit in sorted({limits.get(group, inf) for group in among} or {inf}):
+        groups = [group for group in among if limits.get(group, inf) == limit]
+        rates = ["*"] if limit == inf else [_SLOWER, *(str(step) for step in STEPS_HZ if step <= limit)]
+        keys += [f"{key}/{rate}" for key in _over(policy, who, (verb,), groups, pattern) for rate in rates]
+    return list(dict.fromkeys(keys))
+
+
+def _both(some: Sequence[str], others: Sequence[str]) -> list[str]:
+    """The groups that both name, where each stands for all beneath it."""
+    return sorted({narrow for one in some for other in others if (narrow := _narrower(one, other))})
+
+
+def _narrower(one: str, other: str) -> str:
+    if other in (EVERYTHING, one) or one.startswith(f"{other}."):
+        return one
+    return other if one == EVERYTHING or other.startswith(f"{one}.") else ""
+
+
+def _trusted() -> list[_Row]:
+    return [(flow, message, ["**"]) for flow in (_IN, _OUT) for message in _ALL_MESSAGES]
+
+
+def _rule(who: str, flow: str, message: str, keys: Sequence[str], namespace: str) -> dict[str, Any]:
+    return {
+        "id": f"{who} {flow} {message}",
+        "permission": "allow",
+        "flows": [flow],
+        "messages": [message],
+        "key_exprs": [f"{namespace}/{key}" for key in keys],
+    }
+
+
+def _limits(identities: Iterable[str], namespace: str, calls_hz: float) -> list[dict[str, Any]]:
+    """One rule is one clock, of one link: so one for each identity."""
+    rules = [{"key_expr": f"{namespace}/call/{name}/**", "freq": calls_hz} for name in sorted(identities)]
+    return [{"id": "calls", "flows": [_IN], "messages": ["put"], "rules": rules}] if rules else []

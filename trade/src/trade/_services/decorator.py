@@ -1,0 +1,167 @@
+"""``@service``, and reading a class with its interfaces into the services it provides."""
+
+# pyright: reportUnknownArgumentType=false
+
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal, TypeVar, overload
+
+from trade._protocol.messages import Scalar
+from trade._registry.constraints import checked_meta
+from trade._registry.predicates import parse_achieved
+from trade.errors import ConfigurationError
+
+__all__ = ["Effect", "ServiceMark", "effect_of", "marked_methods", "service"]
+
+Effect = Literal["read", "note", "actuate", "stop"]
+
+_Function = TypeVar("_Function", bound=Callable[..., Any])
+_MARK = "__trade_service__"
+_EFFECTS = ("read", "note", "actuate", "stop")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ServiceMark:
+    """What ``@service`` notes on a method; each decoration is one of its own."""
+
+    effect: Effect = "actuate"
+    cancel: str | None = None
+    achieves: tuple[str, ...] = ()
+    uses: tuple[str, ...] = ()
+    meta: Mapping[str, Scalar] = field(default_factory=dict[str, Scalar])
+    serial: bool = False
+    strict: bool = True
+
+
+@overload
+def service(function: _Function, /) -> _Function: ...
+@overload
+def service(
+    *,
+    effect: Effect = "actuate",
+    cancel: str | None = None,
+    achieves: Sequence[str] = (),
+    uses: Sequence[str] = (),
+    meta: Mapping[str, Scalar] | None = None,
+    serial: bool = False,
+    strict: bool = True,
+) -> Callable[[_Function], _Function]: ...
+def service(
+    function: Callable[..., Any] | None = None,
+    /,
+    *,
+    effect: Effect = "actuate",
+    cancel: str | None = None,
+    achieves: Sequence[str] = (),
+    uses: Sequence[str] = (),
+    meta: Mapping[str, Scalar] | None = None,
+    serial: bool = False,
+    strict: bool = True,
+) -> Any:
+    """Mark a method as a service, in a class or in an interface whose implementations then have it.
+
+    Args:
+        effect: ``"read"`` changes nothing, ``"note"`` only writes something down, so that no lock takes it or holds it
+            up, ``"actuate"`` (default) may move something or change state, ``"stop"`` ends motion: it overtakes
+            everything and ignores deadlines.
+        cancel: name of the service of the same provider that ends this one early.
+        achieves: post-conditions, predicates such as ``"open(gripper)"`` or ``"at(?place)"``.
+        uses: physical resources it needs for itself.
+        meta: numbers, texts, booleans by name, for others to select by: ``{"payload_kg": 2}``.
+        serial: it never runs beside another serial service of the same object; calls wait in order of arrival.
+        strict: a local call sees what a remote one would, validated arguments and copies. False: it goes straight
+            through by reference, checked and copied by nobody; what needs physical resources is always strict.
+
+    Raises:
+        ConfigurationError: the effect is none of these, the options contradict each other, a post-condition is
+            malformed, metadata is no plain value.
+    """
+    if effect not in _EFFECTS:
+        raise ConfigurationError(problem=f"effect must be one of {', '.join(_EFFECTS)}, not {effect!r}")
+    if serial and effect == "stop":
+        raise ConfigurationError(problem="a stop waits for nobody: it cannot be serial")
+    if uses and effect == "note":
+        raise ConfigurationError(problem="a note needs nothing physical; leave out uses, or have it actuate")
+    for condition in _several(achieves):
+        parse_achieved(condition)
+    mark = ServiceMark(
+        effect, cancel, _several(achieves), _several(uses), checked_meta(meta or {}), serial=serial, strict=strict
+    )
+
+    def note(target: _Function) -> _Function:
+        function: Any = getattr(target, "__func__", target)  # a class or static method: its function carries the mark
+        if not inspect.isroutine(function):
+            raise ConfigurationError(problem=f"@service stands on a method, not on {target!r}")
+        setattr(function, _MARK, mark)
+        return target
+
+    return note if function is None else note(function)
+
+
+def _several(texts: str | Sequence[str]) -> tuple[str, ...]:
+    return (texts,) if isinstance(texts, str) else tuple(texts)
+
+
+def marked_methods(cls: type, interfaces: Sequence[type] = ()) -> dict[str, tuple[ServiceMark, Callable[..., Any]]]:
+    """The services of a class: name -> its mark and the function whose signature counts.
+
+    A mark on any class of the method resolution order, or on an interface named beside it, holds for the
+    implementation.
+    The most derived marked declaration gives the signature.
+    """
+    found: dict[str, tuple[ServiceMark, Callable[..., Any]]] = {}
+    for owner in (*cls.__mro__, *(base for interface in interfaces for base in interface.__mro__)):
+        for name, member in vars(owner).items():
+            function: Any = getattr(member, "__func__", member)
+            mark = getattr(function, _MARK, None)
+            if isinstance(mark, ServiceMark) and name not in found:
+                found[name] = (mark, function)
+    _check(cls, found)
+    return found
+
+
+def effect_of(function: Callable[..., Any]) -> Effect | None:
+    """What a method does, by its mark; None: it is no service."""
+    mark = getattr(function, _MARK, None)
+    return mark.effect if isinstance(mark, ServiceMark) else None
+
+
+def kinds_of(cls: type, interfaces: Sequence[type] = ()) -> tuple[str, ...]:
+    """Names of a class and of its bases and interfaces that have services."""
+    every = (*cls.__mro__, *(base for interface in interfaces for base in interface.__mro__))
+    serving = [base.__name__ for base in every if base is cls or any(map(_has_marks, base.__mro__))]
+    return tuple(dict.fromkeys(serving))
+
+
+def _has_marks(cls: type) -> bool:
+    return any(
+        isinstance(getattr(getattr(member, "__func__", member), _MARK, None), ServiceMark)
+        for member in vars(cls).values()
+    )
+
+
+def _check(cls: type, found: dict[str, tuple[ServiceMark, Callable[..., Any]]]) -> None:
+    lacking = [name for name in found if not _implements(cls, name)]
+    if len(lacking) == 1:
+        problem = "the interface has this service, but the class does not implement it"
+        raise ConfigurationError(where=f"{cls.__qualname__}.{lacking[0]}", problem=problem)
+    if lacking:
+        problem = f"the interface has the services {', '.join(lacking)}, but the class does not implement them"
+        raise ConfigurationError(where=cls.__qualname__, problem=problem)
+    for name, (mark, _) in found.items():
+        where = f"{cls.__qualname__}.{name}"
+        if mark.cancel is not None and mark.cancel not in found:
+            raise ConfigurationError(where=where, problem=f"cancel={mark.cancel!r} names no service of this class")
+
+
+def _implements(cls: type, name: str) -> bool:
+    """Whether the class has a method of its own: neither an abstract one nor the empty body in a protocol."""
+    owner = next((base for base in cls.__mro__ if name in vars(base)), None)
+    method = getattr(cls, name, None)
+    return (
+        owner is not None
+        and not getattr(owner, "_is_protocol", False)
+        and not getattr(method, "__isabstractmethod__", False)
+        and callable(method)
+    )

@@ -1,0 +1,141 @@
+"""A service of this container: validating, admitting and running one call of it."""
+
+import asyncio
+import time
+from collections.abc import Callable, Sequence
+from types import CoroutineType
+from typing import Any, Final, Protocol
+
+from msgspec import Raw, structs
+
+from trade._audit.events import Audited
+from trade._context.call_context import CallContext, running
+from trade._context.sessions import foreign
+from trade._protocol.messages import ErrorInfo, ServiceInfo
+from trade._protocol.remote_errors import pack_error, unpack_error
+from trade._resources.resource import Resource, admitted
+from trade._security.policy import Policy
+from trade._services.decorator import ServiceMark
+from trade._services.event_loop import AsyncLoop
+from trade._services.serial_queue import Serial
+from trade._services.signature import Signature
+from trade.errors import TradeError
+
+__all__ = ["Around", "LocalService"]
+
+_COROUTINE: Final[type] = CoroutineType
+"""What an ``async def`` gives; asked of every result, so without a call."""
+
+
+class Around(Protocol):
+    """What is called before and after a service."""
+
+    def run(
+        self, service: "LocalService", args: Sequence[Any], kwargs: dict[str, Any], context: CallContext
+    ) -> Any: ...
+
+
+class LocalService:
+    """A method of a registered provider, ready to be called."""
+
+    __slots__ = (
+        "_loop",
+        "admitted",
+        "around",
+        "audited",
+        "effect",
+        "info",
+        "label",
+        "method",
+        "resources",
+        "serial",
+        "signature",
+        "strict",
+    )
+
+    def __init__(
+        self,
+        label: str,
+        info: ServiceInfo,
+        signature: Signature,
+        method: Callable[..., Any],
+        mark: ServiceMark,
+        loop: AsyncLoop,
+        serial: Serial | None,
+        resources: tuple[Resource, ...] = (),
+    ) -> None:
+        self.label = label
+        self.info = info
+        self.signature = signature
+        self.method = method
+        self.effect = mark.effect
+        self.strict = mark.strict
+        self.serial = serial
+        self.resources = resources
+        """What it needs for itself, or stops."""
+        self.around: Around | None = None
+        """What is called before and after it."""
+        self.audited: Audited | None = None
+        """Of that, what tells of each call for the record."""
+        self.admitted: dict[str, Policy] = {}
+        """Who may call it, and by which policy that was decided."""
+        self._loop = loop
+
+    def run(self, raw: Raw | bytes, context: CallContext) -> Any:
+        """Validate, then call. Raises what the provider raises."""
+        try:
+            args, kwargs = self.signature.decode(self.label, raw)
+        except TradeError as error:
+            if self.audited is not None:
+                self.audited.failed(self, context, error)
+            raise
+        return self.call(args, kwargs, context)
+
+    def call(self, args: Sequence[Any], kwargs: dict[str, Any], context: CallContext, *, bare: bool = False) -> Any:
+        """Call with the arguments as they are; ``bare``: without what is called before and after it."""
+        around = self.around  # it may end at any time
+        if around is not None and not bare:
+            return around.run(self, args, kwargs, context)
+        if not self.resources or self.effect != "actuate":
+            self._look(context)
+            return self.run_admitted(args, kwargs, context)
+        permit = admitted(self.resources, context)
+        try:
+            return self.run_admitted(args, kwargs, context)
+        finally:
+            permit.close()
+            structs.force_setattr(context, "permit", None)
+
+    def _look(self, context: CallContext) -> None:
+        """What reads is open to all, unless it was locked by its own handle; what stops does so first."""
+        for resource in self.resources:
+            if self.effect == "stop":
+                resource.stop(foreign(context.session) or context.caller, context.sessions)
+            elif resource.guarded or context.behalf is not None:
+                resource.check_lock(context.tokens, context.caller, context.session)
+
+    def run_admitted(self, args: Sequence[Any], kwargs: dict[str, Any], context: CallContext) -> Any:
+        """Call with the arguments as they are and nothing more asked: its resources are its own, or it stops them."""
+        token = running.set(context)
+        try:
+            result = self.method(*args, **kwargs) if kwargs else self.method(*args)
+            return self._loop.complete(result, context) if type(result) is _COROUTINE else result
+        except (SystemExit, GeneratorExit, asyncio.CancelledError) as error:  # the provider's, not this thread's
+            raise unpack_error(pack_error(error), self.label) from error
+        finally:
+            running.reset(token)
+            if context.behalf is not None:  # what it began and left running inherits nothing any more
+                structs.force_setattr(context, "behalf", None)
+
+    def failure(self, error: BaseException, raw: Raw | bytes) -> ErrorInfo:
+        """What the caller is told of an error of a call with these arguments."""
+        info = pack_error(error)
+        return self.signature.without_secrets(info, raw) if self.signature.has_secrets else info
+
+    def too_late(self, expires_ns: int | None) -> bool:
+        """Whether running it now would be running it late; a stop is never late, a command of unknown expiry always."""
+        if self.effect == "stop":
+            return False
+        if expires_ns is None:
+            return self.effect != "read"
+        return time.monotonic_ns() >= expires_ns

@@ -1,0 +1,394 @@
+"""The objects a container offers: reading them into services, announcing and withdrawing them."""
+
+import os
+import socket
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Final, cast
+from weakref import WeakValueDictionary
+
+from msgspec import structs
+
+from trade._audit.events import Audit
+from trade._container.system import DOMAIN
+from trade._discovery.announcer import Announcer
+from trade._protocol.codec import Codec
+from trade._protocol.keys import Address, ServiceKey, as_chunk, domain_of
+from trade._protocol.messages import ProviderInfo, Scalar, ServiceInfo
+from trade._registry.constraints import checked_meta
+from trade._registry.registry import Registry, gone_to
+from trade._resources.lock_table import LockTable
+from trade._resources.resource import Resource
+from trade._security.authorizer import Access
+from trade._services.decorator import ServiceMark, kinds_of, marked_methods
+from trade._services.event_loop import AsyncLoop
+from trade._services.local_service import LocalService
+from trade._services.offerable import require_stop
+from trade._services.registration import Built, Offer, Registered
+from trade._services.serial_queue import Serial
+from trade._services.signature import Signature
+from trade.errors import ConfigurationError
+
+_MOST_MOVED: Final = 4096
+
+_Method = tuple[str, ServiceMark, Callable[..., Any]]
+
+
+class Providers:
+    """Owns what this container hosts; the registry and the rest of the system are told from here."""
+
+    def __init__(
+        self,
+        announcer: Announcer,
+        registry: Registry,
+        own: Address,
+        codec: Codec,
+        loop: AsyncLoop,
+        table: LockTable,
+        access: Access,
+        audit: Audit,
+    ) -> None:
+        self._audit = audit
+        self._access = access
+        self._announcer = announcer
+        self._registry = registry
+        self._own = own
+        self._codec = codec
+        self._loop = loop
+        self._table = table
+        self._lock = threading.Lock()
+        self._announcing = threading.RLock()
+        """Revisions go out in order, one at a time."""
+        self._revision = 0
+        self._hosted: dict[str, Registered] = {}
+        self._names: dict[int, str] = {}
+        self._moved: dict[str, str] = {}
+        """Where the last ones are that moved away, by place."""
+        self._counter = 0
+        self._signatures: WeakValueDictionary[_Method, Signature] = WeakValueDictionary()
+        """What objects of one class share, as long as one of them is hosted."""
+
+    def add(
+        self,
+        provider: object,
+        groups: tuple[str, ...],
+        implements: Sequence[type] = (),
+        *,
+        meta: Mapping[str, Scalar] | None = None,
+        name: str | None = None,
+    ) -> list[ServiceKey]:
+        """Host an object: callable first, announced then. Returns the keys of its services.
+
+        Args:
+            provider: the object; kept until it is removed.
+            groups: dotted labels, checked by the caller of this.
+            implements: interfaces beside those it inherits from.
+            meta: holds for all its services, over what they say themselves.
+            name: of the provider in keys; by default its class and a number.
+
+        Raises:
+            ConfigurationError, AccessDenied: see `Container.register`.
+        """
+        built = self.build(provider, groups, implements, meta=meta, name=name)
+        self.host(built)
+        return list(built.keys)
+
+    def build(
+        self,
+        provider: object,
+        groups: tuple[str, ...],
+        implements: Sequence[type] = (),
+        *,
+        meta: Mapping[str, Scalar] | None = None,
+        name: str | None = None,
+    ) -> Built:
+        """All of `add` that can go wrong: `host` offers it then, or `discard` gives its resources back."""
+        kind, domain = type(provider).__qualname__, domain_of(groups)
+        if domain != DOMAIN:
+            self._access.require_offer(self._own.identity, groups, kind)
+        chunk = name or self._new_chunk(provider, type(provider).__name__)
+        place = f"{domain}/{chunk}"
+        services = self._services_of(provider, groups, implements, place)
+        info = ProviderInfo(
+            revision=1,  # told before it is announced
+            groups=groups,
+            kind=kind,
+            host=socket.gethostname(),
+            pid=os.getpid(),
+            services=_infos(services),
+            kinds=(kind,) if domain == DOMAIN else kinds_of(type(provider), implements),
+            meta=checked_meta({**_own_meta(provider), **(meta or {})}),
+            members={group: tuple(names) for group, names in getattr(provider, "members", {}).items()},
+            estops=getattr(provider, "open_estops", ()) if domain == DOMAIN else (),
+        )
+        keys = tuple(ServiceKey(self._own, domain, chunk, service) for service in services)
+        return Built(place, Registered(provider, services, tuple(implements), info), keys)
+
+    def host(self, built: Built) -> None:
+        """Offer what was built: callable first, announced then."""
+        self._host(built.place, built.registered)
+
+    def discard(self, built: Built) -> None:
+        """It is not offered after all."""
+        self._drop(built.services)
+
+    def pass_on(
+        self, provider: object, info: ProviderInfo, make: Callable[[str], dict[str, LocalService]]
+    ) -> tuple[str, str]:
+        """Host what stands for a provider of another system, described by its own words. Returns domain and name.
+
+        Args:
+            provider: stands for it; kept until it is removed.
+            info: what is told of it.
+            make: its services, for the place (``domain/provider``) that it gets.
+
+        Raises:
+            ConfigurationError: what it uses is another one's here.
+            AccessDenied: this container may not offer it in these groups.
+        """
+        self._access.require_offer(self._own.identity, info.groups, info.kind)
+        domain, chunk = domain_of(info.groups), self._new_chunk(provider, info.kind)
+        place = f"{domain}/{chunk}"
+        self._host(place, Registered(provider, make(place), (), info))
+        return domain, chunk
+
+    def _new_chunk(self, provider: object, kind: str) -> str:
+        with self._lock:
+            self._require_new(provider)
+            self._counter += 1
+            return f"{as_chunk(kind)[:60]}-{self._counter}"
+
+    def _host(self, place: str, registered: Registered) -> None:
+        with self._announcing:
+            self._watch(place, registered.services)
+            with self._lock:
+                self._require_new(registered.provider)
+                self._names[id(registered.provider)] = place
+                self._hosted[place] = registered
+            self._announce(place, registered.info)
+
+    def _watch(self, place: str, services: Mapping[str, LocalService]) -> None:
+        for service in services.values():
+            self._audit.watch(place.partition("/")[0], service)
+
+    def _require_new(self, provider: object) -> None:
+        if id(provider) in self._names:
+            problem = "this object is registered already; deregister it first"
+            raise ConfigurationError(where=type(provider).__qualname__, problem=problem)
+
+    def alter(self, provider: object, change: Callable[[ProviderInfo], ProviderInfo], *, reread: bool = False) -> None:
+        """Tell everybody something else about a provider, in a new revision. Its place stays: handles hold.
+
+        Args:
+            provider: the object.
+            change: from what was announced to what is to be.
+            reread: read its class and resources again, too; calls under way end as they began.
+
+        Raises:
+            ConfigurationError: it is not registered here, or the class has become wrong.
+            AccessDenied: this container may not offer it in these groups.
+        """
+        with self._announcing:
+            place, known = self._known(provider)
+            info = change(known.info)
+            if info.groups != known.info.groups:
+                self._access.require_offer(self._own.identity, info.groups, info.kind)
+            services = known.services
+            if reread:
+                self._signatures.clear()
+                services = self._services_of(provider, info.groups, known.implements, place)
+                self._watch(place, services)
+                kinds = kinds_of(type(provider), known.implements)
+                info = structs.replace(info, services=_infos(services), kinds=kinds)
+            if not reread and info == known.info:
+                return
+            with self._lock:
+                self._hosted[place] = structs.replace(known, services=services, info=info)
+            if reread:
+                self._drop(known.services)
+            self._announce(place, info)
+
+    def _known(self, provider: object) -> tuple[str, Registered]:
+        with self._lock:
+            place = self._names.get(id(provider))
+            if place is None:
+                raise _not_registered(provider)
+            return place, self._hosted[place]
+
+    def _announce(self, place: str, info: ProviderInfo) -> None:
+        """Known here first, then everywhere; in the next revision."""
+        self._revision += 1
+        info = structs.replace(info, revision=self._revision)
+        domain, _, chunk = place.partition("/")
+        self._registry.put(self._own, domain, chunk, info)
+        self._announcer.announce(domain, chunk, info)
+
+    def remove(self, provider: object, moved_to: str = "") -> None:
+        """Stop hosting an object: gone from the registry first, uncallable then.
+
+        Args:
+            provider: the object.
+            moved_to: where what took it over is offered, if it did: ``identity/container/epoch/domain/provider``.
+
+        Raises:
+            ConfigurationError: it is not registered here.
+        """
+        with self._announcing:
+            with self._lock:
+                place = self._names.pop(id(provider), None)
+                if place is None:
+                    raise _not_registered(provider)
+                registered = self._hosted.pop(place)
+                if moved_to:
+                    self._moved[place] = moved_to
+                    for forgotten in list(self._moved)[:-_MOST_MOVED]:
+                        del self._moved[forgotten]
+            self._announce(place, structs.replace(registered.info, services=(), moved_to=moved_to))
+            self._drop(registered.services)
+
+    def _drop(self, services: Mapping[str, LocalService]) -> None:
+        for service in services.values():
+            for resource in service.resources:
+                self._table.drop(resource)
+
+    def alone_with(self, provider: object) -> list[Resource]:
+        """What services of a registered object use, and those of no other."""
+        used: dict[bool, set[Resource]] = {True: set(), False: set()}
+        for registered in list(self._hosted.values()):
+            for service in registered.services.values():
+                used[registered.provider is provider].update(service.resources)
+        return sorted(used[True] - used[False], key=lambda resource: resource.name)
+
+    def stop_of(self, resource: Resource) -> LocalService | None:
+        """The service that stops a resource, and as few others as there are."""
+        found = [
+            service
+            for registered in list(self._hosted.values())
+            for service in registered.services.values()
+            if service.effect == "stop" and resource in service.resources
+        ]
+        return min(found, key=lambda service: len(service.resources), default=None)
+
+    def groups_of(self, resource: str) -> set[str]:
+        """The groups, as keys name them, of the services that use a resource."""
+        return {
+            place.partition("/")[0]
+            for place, registered in list(self._hosted.items())
+            for service in registered.services.values()
+            if any(one.name == resource for one in service.resources)
+        }
+
+    def stops(self) -> list[LocalService]:
+        """Every stop service that needs no arguments, the middleware's own left out."""
+        return [
+            service
+            for place, registered in list(self._hosted.items())
+            for service in registered.services.values()
+            if service.effect == "stop" and not place.startswith(f"{DOMAIN}/")
+            if not any(parameter.required for parameter in service.signature.info.parameters)
+        ]
+
+    def waiting(self) -> int:
+        """Calls of serial services whose turn has not come."""
+        services = [service for hosted in list(self._hosted.values()) for service in hosted.services.values()]
+        return sum(serial.waiting for serial in {service.serial for service in services} if serial is not None)
+
+    def offer(self, place: str) -> Offer | None:
+        """What is registered at a place (``domain/provider``)."""
+        known = self._hosted.get(place)
+        return None if known is None else Offer(known.provider, known.info.groups, known.implements, known.info.meta)
+
+    def lookup(self, place: str, service: str) -> LocalService | None:
+        """A service as calls name it.
+
+        Args:
+            place: ``domain/provider``. The domain must be the provider's own: access rules go by it.
+            service: its name.
+
+        Raises:
+            ServiceGone: its provider has moved, and where to.
+        """
+        registered = self._hosted.get(place)
+        if registered is None:
+            if (moved_to := self._moved.get(place)) is not None:
+                raise gone_to(f"{place.partition('/')[0]}.{service}", moved_to)
+            return None
+        return registered.services.get(service)
+
+    def services_at(self, place: str) -> Mapping[str, LocalService]:
+        """What is offered at a place, by name."""
+        registered = self._hosted.get(place)
+        return {} if registered is None else registered.services
+
+    def service(self, key: ServiceKey) -> LocalService | None:
+        """A service of this container by its key."""
+        return self.services_at(f"{key.domain}/{key.provider}").get(key.name)
+
+    def _services_of(
+        self, provider: object, groups: tuple[str, ...], implements: Sequence[type], place: str
+    ) -> dict[str, LocalService]:
+        kind = type(provider).__qualname__
+        marked = marked_methods(type(provider), implements)
+        if not marked:
+            problem = "it has no services; mark methods of its class with @trade.service"
+            if isinstance(provider, type):
+                kind, problem = provider.__qualname__, "it is a class; register an object of it"
+            raise ConfigurationError(where=kind, problem=problem)
+        resources = cast("tuple[Resource | str, ...]", tuple(getattr(provider, "resources", ())))
+        require_stop(kind, resources, [mark for mark, _ in marked.values()])
+        serial = Serial()
+        services: dict[str, LocalService] = {}
+        for name, (mark, function) in marked.items():
+            label = f"{groups[0] if groups else kind}.{name}"
+            if not mark.strict and mark.effect != "read" and (mark.uses or resources):
+                problem = "it needs physical resources, so its arguments are always checked; leave out strict=False"
+                raise ConfigurationError(where=label, problem=problem)
+            signature = self._signature(label, name, mark, function)
+            info = signature.info
+            if resources and mark.effect not in {"read", "note"}:
+                names = [one if isinstance(one, str) else one.name for one in resources]
+                info = structs.replace(info, uses=tuple(dict.fromkeys((*mark.uses, *names))))
+            services[name] = LocalService(
+                label,
+                info,
+                signature,
+                getattr(provider, name),
+                mark,
+                self._loop,
+                serial if mark.serial else None,
+                self._adopt(mark, (*resources, *mark.uses), f"{place}/{name}"),
+            )
+        return services
+
+    def _signature(self, where: str, name: str, mark: ServiceMark, function: Callable[..., Any]) -> Signature:
+        """The one that other objects of the class have already, if any."""
+        key = (name, mark, function)
+        found = self._signatures.get(key)
+        if found is None:
+            found = self._signatures[key] = Signature(where, name, mark, function, self._codec)
+        return found
+
+    def _adopt(self, mark: ServiceMark, needed: Sequence[Resource | str], itself: str) -> tuple[Resource, ...]:
+        """What a service needs for itself; what names nothing, or only reads, can be locked as itself."""
+        if itself.startswith(f"{DOMAIN}/") or mark.effect == "note":
+            return ()
+        if mark.effect == "read" or (not needed and mark.effect == "actuate"):
+            needed = (itself,)
+        given = {one.name for one in needed if isinstance(one, Resource)}
+        try:
+            return tuple(self._table.adopt(one) for one in dict.fromkeys(needed) if one not in given)
+        except ValueError as twice:
+            raise ConfigurationError(where=itself, problem=str(twice)) from None
+
+
+def _infos(services: Mapping[str, LocalService]) -> tuple[ServiceInfo, ...]:
+    return tuple(service.info for service in services.values())
+
+
+def _not_registered(provider: object) -> ConfigurationError:
+    return ConfigurationError(where=type(provider).__qualname__, problem="it is not registered in this container")
+
+
+def _own_meta(provider: object) -> dict[str, Scalar]:
+    """What others need to know of its class: that it may go on elsewhere although it drives something (S20)."""
+    return {"relocatable": True} if getattr(provider, "relocatable", False) is True else {}

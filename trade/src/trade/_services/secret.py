@@ -1,0 +1,101 @@
+"""Arguments that reach the provider and nobody else: masked wherever a text might show them."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Annotated, Any, Final, TypeVar, cast, get_args
+
+import msgspec
+from msgspec import Meta, Raw, structs
+
+from trade._protocol.messages import UNREADABLE, ErrorInfo
+
+# What is masked has no types: it came over the wire.
+# pyright: reportUnknownVariableType=false, reportUnknownArgumentType=false
+
+__all__ = ["MASK", "Secret", "is_secret"]
+
+MASK: Final = "***"
+_T = TypeVar("_T")
+_NOTE: Final = Meta(extra_json_schema={"writeOnly": True})
+
+Secret = Annotated[_T, _NOTE]
+"""Marks an argument: ``Secret[str]``. Its value never shows in errors, tracebacks, logs or descriptions."""
+
+
+def is_secret(kind: Any) -> bool:
+    """Whether a parameter's annotation marks it as secret, however it is written."""
+    if any(note is _NOTE for note in getattr(kind, "__metadata__", ())):
+        return True
+    return any(map(is_secret, get_args(kind)))
+
+
+def mask(info: ErrorInfo, raw: Raw | bytes, names: Sequence[str], secrets: frozenset[str]) -> ErrorInfo:
+    """An error without the values of secret arguments.
+
+    Args:
+        info: the error as it would be sent.
+        raw: the arguments of the call.
+        names: the service's parameters that may be given by place, in their order.
+        secrets: the ones to mask.
+    """
+    named = _named(raw, names)
+    try:
+        texts = {form for name in secrets if name in named for value in _leaves(named[name]) for form in _forms(value)}
+        ordered = sorted(texts, key=len, reverse=True)
+        return structs.replace(
+            info,
+            message=_masked(info.message, ordered),
+            fields=_masked(info.fields, ordered),
+            traceback=_masked(info.traceback, ordered),
+        )
+    except RecursionError:  # nested too deeply to be looked through
+        return structs.replace(info, message=MASK, fields={}, traceback="")
+
+
+def _named(raw: Raw | bytes, names: Sequence[str]) -> Mapping[str, Any]:
+    """The arguments by name; none where the message has no arguments: no provider has seen a value then."""
+    try:
+        given: Any = msgspec.msgpack.decode(raw)
+    except UNREADABLE:
+        return {}
+    match given:
+        case dict():
+            return cast("dict[str, Any]", given)
+        case list():
+            return dict(zip(names, cast("list[Any]", given), strict=False))
+        case _:
+            return {}
+
+
+def _leaves(value: Any) -> Iterator[Any]:
+    if isinstance(value, Mapping):
+        for inner in value.values():
+            yield from _leaves(inner)
+    elif isinstance(value, list | tuple):
+        for inner in value:
+            yield from _leaves(inner)
+    elif value is not None and not isinstance(value, bool):
+        yield value
+
+
+def _forms(value: Any) -> Iterator[str]:
+    """How a value may stand in a text."""
+    for text in (str(value), repr(value), repr(value)[1:-1] if isinstance(value, str) else ""):
+        if text:
+            yield text
+    if isinstance(value, bytes):
+        yield value.hex()
+        yield value.decode(errors="backslashreplace")
+        yield repr(value)[2:-1]
+
+
+def _masked(value: Any, texts: Sequence[str]) -> Any:
+    if isinstance(value, str):
+        for text in texts:
+            if text:
+                value = value.replace(text, MASK)
+        return value
+    if isinstance(value, Mapping):
+        return {name: _masked(inner, texts) for name, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [_masked(inner, texts) for inner in value]
+    return MASK if value is not None and not isinstance(value, bool) and str(value) in texts else value

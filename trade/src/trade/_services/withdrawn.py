@@ -1,0 +1,84 @@
+"""Providers that were taken off from anywhere in the system, kept by their container to be offered again."""
+
+import threading
+from collections.abc import Callable, Sequence
+from typing import Final
+
+from trade._container.system import DOMAIN, WithdrawnInfo
+from trade._protocol.keys import ServiceKey
+from trade._resources.resource import Resource
+from trade._services.offerable import checked_groups
+from trade._services.providers import Providers
+from trade._services.registration import Offer
+from trade.errors import ConfigurationError, DeviceFault
+
+
+class Withdrawn:
+    """Owns what is not offered at the moment; whoever registered the object keeps the last word on it."""
+
+    def __init__(self, providers: Providers, rest: Callable[[Sequence[Resource], str], list[str]]) -> None:
+        self._providers: Final = providers
+        self._rest: Final = rest
+        self._lock = threading.Lock()
+        self._kept: dict[str, Offer] = {}
+
+    def take_off(self, key: ServiceKey, moved_to: str = "") -> str:
+        """Stop offering the provider of a service; returns the name it is put back by.
+
+        What it moves is stopped first: afterwards nobody could. ``moved_to`` is where it is offered instead, if it is.
+
+        Raises:
+            ConfigurationError: it is not offered here, or is the middleware's own.
+            DeviceFault: it could not be stopped; it is offered as before.
+        """
+        if key.domain == DOMAIN:
+            raise ConfigurationError(where=key.provider, problem="the middleware's own services cannot be withdrawn")
+        offer = self._providers.offer(f"{key.domain}/{key.provider}")
+        if offer is None:
+            raise ConfigurationError(where=key.provider, problem=f"container {key.address.container} does not offer it")
+        if problems := self._rest(self._providers.alone_with(offer.provider), "its services are withdrawn"):
+            raise DeviceFault(device=key.provider, bus=key.address.container, fault="; ".join(problems))
+        with self._lock:
+            self._kept[key.provider] = offer
+        try:
+            self._providers.remove(offer.provider, moved_to)
+        except ConfigurationError:  # somebody was quicker; its owner perhaps, who has the last word
+            self.forget(offer.provider)
+            raise
+        return key.provider
+
+    def put_back(self, provider: str, groups: str | Sequence[str] | None) -> list[ServiceKey]:
+        """Offer it again, in other groups if some are given. Returns the keys of its services.
+
+        Raises:
+            ConfigurationError: no such provider was withdrawn, or a malformed group.
+        """
+        with self._lock:
+            offer = self._kept.get(provider)
+            known = ", ".join(self._kept) or "none"
+        if offer is None:
+            problem = f"no provider of that name was withdrawn; there is {known}"
+            raise ConfigurationError(where=provider, problem=problem)
+        named = offer.groups if groups is None else checked_groups(offer.provider, groups)
+        keys = self._providers.add(offer.provider, named, offer.implements, meta=offer.meta)
+        self.forget(offer.provider)
+        return keys
+
+    def forget(self, provider: object) -> bool:
+        """Its owner registers or deregisters it; returns whether it was kept."""
+        with self._lock:
+            names = [name for name, offer in self._kept.items() if offer.provider is provider]
+            for name in names:
+                del self._kept[name]
+        return bool(names)
+
+    def offer(self, provider: str) -> Offer | None:
+        """What was withdrawn under that name, and how it was registered."""
+        with self._lock:
+            return self._kept.get(provider)
+
+    def infos(self) -> list[WithdrawnInfo]:
+        """What can be put back, by name."""
+        with self._lock:
+            kept = sorted(self._kept.items())
+        return [WithdrawnInfo(name, type(offer.provider).__qualname__, offer.groups) for name, offer in kept]

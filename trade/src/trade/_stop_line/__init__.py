@@ -1,0 +1,11 @@
+"""The stop line: stops and e-stops that need neither the transport nor a link of it (S07).
+
+Each container listens on it, and whoever may reach the container may ask it to stop a group or everything.
+docs/wire-protocol.md, "The stop line", has what is said on it.
+"""
+
+from trade._stop_line.client import LineCall, StopLines
+from trade._stop_line.group_stop import StopReport, stop_group, stops_of, together
+from trade._stop_line.service import StopLineService
+
+__all__ = ["LineCall", "StopLineService", "StopLines", "StopReport", "stop_group", "stops_of", "together"]

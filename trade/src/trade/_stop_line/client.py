@@ -1,0 +1,146 @@
+"""Asking on the stop line: everybody who may be asked at once, and whoever answers counts."""
+
+import contextlib
+import logging
+import socket
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Collection, Sequence
+from typing import Final, Generic, TypeVar
+
+from trade._estop.broadcast import EstopReport, all_of
+from trade._protocol.messages import Malformed
+from trade._settings import Settings
+from trade._stop_line.group_stop import StopReport, together
+from trade._stop_line.messages import LONGEST_REASON, VERSION, StopAnswer, StopRequest, encoded, read_answer
+from trade._stop_line.places import Place, places
+
+_logger = logging.getLogger("trade")
+
+_THREADS: Final = 32
+_RELAYS: Final = 4
+"""So many on this host are asked to pass an e-stop on, by orders of their own; the others stop themselves alone."""
+_CONNECT_S: Final = 1.0
+_MOST_BYTES: Final = 1 << 20
+_Report = TypeVar("_Report")
+
+
+class LineCall(Generic[_Report]):
+    """One question to several places, under way."""
+
+    def __init__(
+        self,
+        asked: Sequence[tuple[Place, StopRequest]],
+        limit_s: float,
+        report_of: Callable[[StopAnswer], _Report | None],
+        merge: Callable[[list[_Report]], _Report],
+    ) -> None:
+        self._until = time.monotonic() + limit_s
+        self._report_of = report_of
+        self._merge = merge
+        self._reports: list[_Report] = []
+        self._left = len(asked)
+        self._waiting = deque(asked)
+        self._changed = threading.Condition()
+        self.problems: Final[dict[str, str]] = {}
+        """Places that did not answer, and why."""
+        for _ in range(min(_THREADS, len(asked))):
+            threading.Thread(target=self._work, name="trade-stop-ask", daemon=True).start()
+
+    def report(self) -> _Report:
+        """What was answered so far, as one."""
+        with self._changed:
+            return self._merge(list(self._reports))
+
+    def over(self) -> bool:
+        """Whether all have answered, or will not."""
+        return self._left == 0
+
+    def wait(self) -> _Report:
+        """What was answered when all have, or the time is over."""
+        with self._changed:
+            self._changed.wait_for(self.over, max(0.0, self._until - time.monotonic()))
+        return self.report()
+
+    def _work(self) -> None:
+        while True:
+            try:
+                place, request = self._waiting.popleft()
+            except IndexError:
+                return
+            self._ask(place, request)
+
+    def _ask(self, place: Place, request: StopRequest) -> None:
+        report, problem = None, "its answer is missing"
+        try:
+            with place.connect(min(_CONNECT_S, self._left_s())) as sock:
+                sock.sendall(encoded(request))
+                for answer in _answers(sock, self._left_s):
+                    problem = f"{answer.error}: {answer.why}" if answer.error else problem
+                    report = self._report_of(answer) or report
+        except (OSError, Malformed, ValueError) as bad:
+            problem = str(bad) or type(bad).__name__
+        with self._changed:
+            if report is None:
+                self.problems[place.name] = problem
+                _logger.debug("nobody answers on the stop line at %s: %s", place.name, problem)
+            else:
+                self._reports.append(report)
+            self._left -= 1
+            self._changed.notify_all()
+
+    def _left_s(self) -> float:
+        return max(0.01, self._until - time.monotonic())
+
+
+def _answers(sock: socket.socket, left_s: Callable[[], float]) -> "deque[StopAnswer]":
+    """All lines until the other end closes."""
+    heard, found = bytearray(), deque[StopAnswer]()
+    while len(heard) <= _MOST_BYTES:
+        sock.settimeout(left_s())
+        more = sock.recv(65536)
+        if not more:
+            break
+        heard += more
+    for line in heard.splitlines():
+        with contextlib.suppress(Malformed):
+            found.append(read_answer(bytes(line)))
+    return found
+
+
+class StopLines:
+    """Asks for stops without the transport.
+
+    Args:
+        settings: of who asks; what they say of where others are counts.
+        own: the place to leave out: one's own.
+    """
+
+    def __init__(self, settings: Settings, own: Callable[[], Collection[str]] = tuple) -> None:
+        self._settings = settings
+        self._own = own
+
+    def estop(self, estop_id: str, reason: str, limit_s: float) -> LineCall[EstopReport]:
+        """Begin to stop everything, as the e-stop with that id; does not wait."""
+        relays, asked = _RELAYS, list[tuple[Place, StopRequest]]()
+        for place in self._places():
+            relays -= place.path is not None
+            beyond = place.path is None or relays >= 0
+            asked.append((place, self._request("estop", limit_s, reason, id=estop_id, pass_on=beyond)))
+        return LineCall(asked, limit_s, lambda answer: answer.estop, lambda reports: all_of(estop_id, reports))
+
+    def stop(self, group: str, reason: str, limit_s: float) -> LineCall[StopReport]:
+        """Begin to stop all of a group; does not wait."""
+        request = self._request("stop", limit_s, reason, group=group)
+        asked = [(place, request) for place in self._places()]
+        return LineCall(asked, limit_s, lambda answer: answer.stop, lambda reports: together(group, reports))
+
+    def _request(self, ask: str, limit_s: float, reason: str, **more: object) -> StopRequest:
+        by = f"{self._settings.identity}/{self._settings.container}"
+        said = reason[:LONGEST_REASON]  # no stop is refused for its reason
+        return StopRequest(v=VERSION, ask=ask, by=by, limit_s=limit_s, reason=said, **more)  # type: ignore[arg-type]
+
+    def _places(self) -> list[Place]:
+        own = self._own()
+        return [place for place in places(self._settings) if place.name not in own]

@@ -1,0 +1,181 @@
+"""Hears who asks on the stop line: one thread, and a bound on how many strangers it listens to.
+
+A stranger is who has not asked yet. It has a second for its handshake and its question. If too many are there, one goes
+of the address that has most: at first who has said nothing.
+"""
+
+import contextlib
+import logging
+import selectors
+import socket
+import ssl
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from typing import Final
+
+from trade._security.certificates import common_name
+from trade._stop_line.messages import MOST_BYTES
+from trade._stop_line.places import is_own_user
+
+_logger = logging.getLogger("trade")
+
+MOST_STRANGERS: Final = 256
+_STRANGE_S: Final = 1.0
+_AT_ONCE: Final = 64
+"""So many are accepted before the others are heard again."""
+_LOOK_S: Final = 0.1
+_WANTS: Final = (ssl.SSLWantReadError, ssl.SSLWantWriteError, BlockingIOError)
+
+Serve = Callable[[socket.socket, str, bytes], None]
+"""Takes over who asks: with its identity by its certificate (empty on this host) and its line. Does not wait."""
+
+
+class Stranger:
+    """One that has not asked yet."""
+
+    __slots__ = ("address", "heard", "secure", "since", "sock")
+
+    def __init__(self, sock: socket.socket, address: str, now: float) -> None:
+        self.sock = sock
+        self.address = address
+        self.since = now
+        self.secure = not isinstance(sock, ssl.SSLSocket)
+        self.heard: bytes | None = None
+        """None: nothing yet, not even of a handshake."""
+
+
+class Listener:
+    """Hears at doors until it is closed.
+
+    Args:
+        doors: sockets that listen, and the context of those on a network.
+        serve: takes over who asks.
+    """
+
+    def __init__(self, doors: Sequence[tuple[socket.socket, ssl.SSLContext | None]], serve: Serve) -> None:
+        self._serve = serve
+        self._strangers: dict[socket.socket, Stranger] = {}
+        """The oldest first."""
+        self._ending = threading.Event()
+        self._selector = selectors.DefaultSelector()
+        self._doors = [door for door, _ in doors]
+        for door, context in doors:
+            door.setblocking(False)
+            self._selector.register(door, selectors.EVENT_READ, context)
+        self._bell, self._ear = socket.socketpair()
+        self._selector.register(self._ear, selectors.EVENT_READ)
+        self._thread = threading.Thread(target=self._run, name="trade-stop-line", daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        while not self._ending.is_set():
+            for key, _ in self._selector.select(_LOOK_S if self._strangers else None):
+                try:
+                    self._hear(key)
+                except Exception:
+                    _logger.exception("the stop line goes on without one who asked")
+            self._forget_the_slow()
+        for stranger in list(self._strangers.values()):
+            self._drop(stranger)
+
+    def _hear(self, key: selectors.SelectorKey) -> None:
+        sock = key.fileobj
+        assert isinstance(sock, socket.socket)  # noqa: S101 - nothing else is registered
+        if sock in self._strangers:
+            self._listen_to(self._strangers[sock])
+        elif sock is not self._ear:
+            self._welcome(sock, key.data)
+
+    def _welcome(self, door: socket.socket, context: ssl.SSLContext | None) -> None:
+        for _ in range(_AT_ONCE):
+            try:
+                sock, address = door.accept()
+            except OSError:  # nobody more, or no descriptor is left: then the slow ones go soon
+                return
+            sock.setblocking(False)
+            if context is None:
+                if not is_own_user(sock):
+                    sock.close()
+                    continue
+                stranger = Stranger(sock, "", time.monotonic())
+            else:
+                secure = context.wrap_socket(sock, server_side=True, do_handshake_on_connect=False)
+                stranger = Stranger(secure, str(address[0]), time.monotonic())
+            if len(self._strangers) >= MOST_STRANGERS:
+                self._drop(self._least())
+            self._strangers[stranger.sock] = stranger
+            self._selector.register(stranger.sock, selectors.EVENT_READ)
+
+    def _least(self) -> Stranger:
+        """Who goes if there are too many."""
+        strangers = list(self._strangers.values())
+        busiest, _ = Counter(stranger.address for stranger in strangers).most_common(1)[0]
+        its = [stranger for stranger in strangers if stranger.address == busiest]
+        return next((stranger for stranger in its if stranger.heard is None), its[0])
+
+    def _listen_to(self, stranger: Stranger) -> None:
+        sock = stranger.sock
+        try:
+            if not stranger.secure:
+                assert isinstance(sock, ssl.SSLSocket)  # noqa: S101 - the others are secure from the start
+                stranger.heard = stranger.heard or b""
+                sock.do_handshake()
+                stranger.secure = True
+            while b"\n" not in (heard := stranger.heard or b""):
+                more = sock.recv(MOST_BYTES)
+                stranger.heard = heard + more
+                if not more or len(stranger.heard) > MOST_BYTES:
+                    self._drop(stranger)
+                    return
+        except ssl.SSLWantWriteError:
+            self._selector.modify(sock, selectors.EVENT_READ | selectors.EVENT_WRITE)
+            return
+        except _WANTS:
+            self._selector.modify(sock, selectors.EVENT_READ)
+            return
+        except (OSError, ValueError):
+            self._drop(stranger)
+            return
+        self._hand_over(stranger)
+
+    def _hand_over(self, stranger: Stranger) -> None:
+        sock, line = stranger.sock, (stranger.heard or b"").partition(b"\n")[0]
+        self._selector.unregister(sock)
+        del self._strangers[sock]
+        sock.setblocking(True)
+        certified = common_name(sock) if isinstance(sock, ssl.SSLSocket) else ""
+        if not certified and isinstance(sock, ssl.SSLSocket):  # a certificate of nobody
+            sock.close()
+            return
+        try:
+            self._serve(sock, certified, line)
+        except BaseException:
+            sock.close()
+            raise
+
+    def _forget_the_slow(self) -> None:
+        too_old = time.monotonic() - _STRANGE_S
+        while self._strangers:
+            oldest = next(iter(self._strangers.values()))
+            if oldest.since > too_old:
+                return
+            self._drop(oldest)
+
+    def _drop(self, stranger: Stranger) -> None:
+        with contextlib.suppress(KeyError, ValueError):
+            self._selector.unregister(stranger.sock)
+        self._strangers.pop(stranger.sock, None)
+        stranger.sock.close()
+
+    def close(self) -> None:
+        """Hear nobody any more. Idempotent."""
+        if self._ending.is_set():
+            return
+        self._ending.set()
+        self._bell.send(b"!")
+        self._thread.join(2)
+        for sock in (*self._doors, self._bell, self._ear):
+            sock.close()
+        self._selector.close()

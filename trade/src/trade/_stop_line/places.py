@@ -1,0 +1,156 @@
+"""Where the stop line is: a Unix socket for this user on this host, a TLS port beside each endpoint of a network."""
+
+import contextlib
+import os
+import secrets
+import socket
+import ssl
+import struct
+from collections.abc import Generator
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from trade._discovery.host_folder import runtime_folder
+from trade._security.certificates import line_context
+from trade._settings import Settings
+from trade._transport.endpoints import Endpoint
+from trade.errors import ConfigurationError
+
+_PORTS_BEYOND: Final = 1000
+_LAST_PORT: Final = 65535
+_BACKLOG: Final = 1024
+_MARK: Final = ".stop-"
+_OPEN_FILES: Final = Path("/proc/self/fd")
+_HAS_UNIX: Final = hasattr(socket, "AF_UNIX")
+
+
+def line_port(port: int) -> int:
+    """The port of the stop line of what listens on a port."""
+    return port + _PORTS_BEYOND if port + _PORTS_BEYOND <= _LAST_PORT else port - _PORTS_BEYOND
+
+
+class Place(NamedTuple):
+    """Where one container may be asked."""
+
+    name: str
+    path: Path | None = None
+    endpoint: Endpoint | None = None
+    context: ssl.SSLContext | None = None
+
+    def connect(self, limit_s: float) -> socket.socket:
+        """Raises OSError: nobody is there, or lets us in, within that time (seconds, for each step)."""
+        if self.path is not None:
+            return _dialled(self.path, limit_s)
+        assert self.endpoint is not None and self.context is not None  # noqa: S101 - one or the other
+        host = self.endpoint.host
+        plain = socket.create_connection((host, line_port(self.endpoint.port)), timeout=limit_s)
+        try:
+            return self.context.wrap_socket(plain, server_hostname=host)
+        except BaseException:
+            plain.close()
+            raise
+
+
+def places(settings: Settings) -> list[Place]:
+    """Where containers of this system may be asked: those of this user on this host, and those it connects to."""
+    found = [Place(path.name, path=path) for path in _sockets(settings.system)]
+    certificate = settings.certificate()
+    if certificate is not None:
+        context = line_context(certificate, server=False)
+        ends = map(Endpoint.read, settings.connect)
+        found += [Place(str(end), endpoint=end, context=context) for end in ends if end.protocol == "tls"]
+    return found
+
+
+def _sockets(system: str) -> list[Path]:
+    """Of the containers that live; what others left behind goes."""
+    if not _HAS_UNIX:
+        return []
+    living: list[Path] = []
+    with contextlib.suppress(OSError, ConfigurationError):
+        for path in sorted((runtime_folder() / system).glob(f"{_MARK}*")):
+            process = path.name.removeprefix(_MARK).partition("-")[0]
+            if process.isdigit() and not _lives(int(process)):
+                path.unlink(missing_ok=True)
+            else:
+                living.append(path)
+    return living
+
+
+def _lives(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except OSError:
+        return True
+    return True
+
+
+@contextlib.contextmanager
+def _short(path: Path) -> Generator[str]:
+    """A name for it that fits into the address of a socket, 108 bytes at most."""
+    if not _OPEN_FILES.is_dir():
+        yield str(path)
+        return
+    folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        yield f"{_OPEN_FILES}/{folder}/{path.name}"
+    finally:
+        os.close(folder)
+
+
+def _dialled(path: Path, limit_s: float) -> socket.socket:
+    dialling = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    try:
+        dialling.settimeout(limit_s)
+        with _short(path) as name:
+            dialling.connect(name)
+    except BaseException:
+        dialling.close()
+        raise
+    return dialling
+
+
+def host_door(system: str) -> tuple[socket.socket, Path] | None:
+    """A socket for this user on this host; None where the operating system has none. Raises OSError."""
+    if not _HAS_UNIX:
+        return None
+    path = runtime_folder() / system / f"{_MARK}{os.getpid()}-{secrets.token_hex(4)}"
+    path.parent.mkdir(mode=0o700, exist_ok=True)
+    door = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    try:
+        with _short(path) as name:
+            door.bind(name)
+        path.chmod(0o600)
+        door.listen(_BACKLOG)
+    except BaseException:
+        door.close()
+        raise
+    return door, path
+
+
+def network_door(endpoint: Endpoint) -> socket.socket:
+    """The port beside that endpoint. Raises ConfigurationError: it cannot be had."""
+    host, port = endpoint.host.strip("[]"), line_port(endpoint.port)
+    door = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_STREAM)
+    try:
+        door.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        door.bind((host, port))
+        door.listen(_BACKLOG)
+    except OSError as bad:
+        door.close()
+        problem = (
+            f"its stop line, port {port}, cannot be opened ({bad.strerror or bad}); free that port, or listen on "
+            f"another one: the stop line is {_PORTS_BEYOND} above"
+        )
+        raise ConfigurationError(where=f"listen {endpoint}", problem=problem) from None
+    return door
+
+
+def is_own_user(caller: socket.socket) -> bool:
+    """Whether this user, or root, is at the other end of a Unix socket, as far as the operating system tells."""
+    if not hasattr(socket, "SO_PEERCRED"):
+        return True  # the folder's rights have to do
+    _, user, _ = struct.unpack("3i", caller.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i")))
+    return user in (0, os.getuid())

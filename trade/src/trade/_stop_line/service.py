@@ -1,0 +1,178 @@
+"""One container's end of the stop line: who may ask, what is done, what is answered."""
+
+import contextlib
+import logging
+import socket
+import ssl
+import threading
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+from trade._audit.events import Audit
+from trade._estop.controller import Estopping
+from trade._protocol.keys import Address
+from trade._protocol.messages import Malformed
+from trade._security.authorizer import Access
+from trade._security.certificates import Certificate, line_context
+from trade._settings import Settings
+from trade._stop_line.group_stop import StopReport
+from trade._stop_line.listener import Listener
+from trade._stop_line.messages import StopAnswer, StopRequest, encoded, read_request, told
+from trade._stop_line.places import host_door, network_door
+from trade._transport.endpoints import Endpoint
+from trade.errors import LimitExceeded, TradeError
+
+_logger = logging.getLogger("trade")
+
+MOST_OF_ONE: Final = 8
+"""So many requests of one identity are done at a time."""
+MOST: Final = 64
+"""So many of all."""
+_ANSWER_S: Final = 1.0
+
+
+class StopLineService:
+    """Listens on the networks from the start, and on this host once there is something to stop.
+
+    Args:
+        stop: calls all stop services of a group that are known here, for some seconds at most.
+
+    Raises:
+        ConfigurationError: a port of it cannot be had.
+    """
+
+    def __init__(
+        self,
+        own: Address,
+        settings: Settings,
+        access: Access,
+        audit: Audit,
+        estopping: Estopping,
+        stop: Callable[[str, float], StopReport],
+    ) -> None:
+        self._own = own
+        self._system = settings.system
+        self._access = access
+        self._audit = audit
+        self._estopping = estopping
+        self._stop = stop
+        self._guard = threading.Lock()
+        self._busy: Counter[str] = Counter()
+        self._listeners: list[Listener] = []
+        self._path: Path | None = None
+        self._closed = False
+        certificate = settings.certificate()
+        if certificate is not None and (doors := _network_doors(settings, certificate)):
+            self._listeners.append(Listener(doors, self._serve))
+
+    @property
+    def own_places(self) -> tuple[str, ...]:
+        """What others know its place on this host by."""
+        return () if self._path is None else (self._path.name,)
+
+    def listen_on_host(self) -> None:
+        """Listen for this user on this host, too. Idempotent; what stands in the way is logged."""
+        with self._guard:
+            if self._path is not None or self._closed:
+                return
+            try:
+                door = host_door(self._system)
+            except (OSError, TradeError) as bad:
+                _logger.warning("the stop line on this host cannot be opened: %s; stops need the transport then", bad)
+                return
+            if door is not None:
+                sock, self._path = door
+                self._listeners.append(Listener([(sock, None)], self._serve))
+
+    # --- told by the listener
+
+    def _serve(self, sock: socket.socket, certified: str, line: bytes) -> None:
+        try:
+            request = read_request(line)
+        except Malformed as bad:
+            self._end(sock, StopAnswer(who=self._own.who, error="Malformed", why=str(bad)))
+            return
+        identity = certified or request.by.partition("/")[0] or self._own.identity
+        with self._guard:
+            full = self._busy[identity] >= MOST_OF_ONE or self._busy.total() >= MOST
+            if not full:
+                self._busy[identity] += 1
+        if full:
+            why = f"{MOST_OF_ONE} requests of {identity}, or {MOST} of all, are being done; ask again when one is over"
+            self._end(sock, StopAnswer(who=self._own.who, error=LimitExceeded.__name__, why=why))
+            return
+        work = (sock, identity, request)
+        threading.Thread(target=self._work, args=work, name="trade-stop-work", daemon=True).start()
+
+    def _work(self, sock: socket.socket, identity: str, request: StopRequest) -> None:
+        try:
+            answer = self._answer(sock, identity, request)
+        except TradeError as error:
+            answer = StopAnswer(who=self._own.who, error=type(error).__name__, why=str(error))
+        except Exception as error:
+            _logger.exception("a request on the stop line failed")
+            answer = StopAnswer(who=self._own.who, error=type(error).__name__, why=str(error))
+        finally:
+            with self._guard:
+                self._busy[identity] -= 1
+                self._busy += Counter()  # who has none left is forgotten
+        self._end(sock, answer)
+
+    def _answer(self, sock: socket.socket, identity: str, request: StopRequest) -> StopAnswer:
+        own, asked = self._own.who, f"{identity}/{request.by.partition('/')[2]}".rstrip("/")
+        denied = self._access.denied_order(identity, clears=False)
+        if denied is not None:
+            self._audit.refused(f"trade.{request.ask}", denied, who=identity)
+            raise denied
+        if request.ask == "open":
+            return StopAnswer(who=own, open=tuple(told(estop) for estop in self._estopping.open()))
+        self._say(sock, StopAnswer(who=own, taken=True))
+        if request.ask == "stop":
+            self._audit.note("stop", "stop line", about=request.group, who=identity, why=request.reason)
+            _logger.warning("stopping %s, asked by %s on the stop line: %s", request.group, asked, request.reason)
+            return StopAnswer(who=own, stop=self._stop(request.group, request.limit_s))
+        if not self._estopping.knows(request.id):  # else its giver was heard, and is on record
+            self._audit.note("stop", "stop line", about=request.id, who=identity, why=request.reason)
+        reason = f"{request.reason} (asked by {asked} on the stop line)".lstrip()
+        return StopAnswer(
+            who=own, estop=self._estopping.relay(request.id, reason, request.limit_s, beyond=request.pass_on)
+        )
+
+    def _say(self, sock: socket.socket, answer: StopAnswer) -> None:
+        with contextlib.suppress(OSError):  # who asks need not wait for the answer
+            sock.settimeout(_ANSWER_S)
+            sock.sendall(encoded(answer))
+
+    def _end(self, sock: socket.socket, answer: StopAnswer) -> None:
+        self._say(sock, answer)
+        sock.close()
+
+    def close(self) -> None:
+        """Listen no more. Idempotent."""
+        with self._guard:
+            self._closed = True
+            listeners, self._listeners = self._listeners, []
+        for listener in listeners:
+            listener.close()
+        if self._path is not None:
+            self._path.unlink(missing_ok=True)
+
+
+def _network_doors(settings: Settings, certificate: Certificate) -> list[tuple[socket.socket, ssl.SSLContext | None]]:
+    """One beside each endpoint whose port others can know."""
+    context = line_context(certificate, server=True)
+    doors: list[tuple[socket.socket, ssl.SSLContext | None]] = []
+    try:
+        for endpoint in filter(_is_known, map(Endpoint.read, settings.listen)):
+            doors.append((network_door(endpoint), context))  # noqa: PERF401 - those that are open are closed if one fails
+    except BaseException:
+        for door, _ in doors:
+            door.close()
+        raise
+    return doors
+
+
+def _is_known(endpoint: Endpoint) -> bool:
+    return bool(endpoint.port)

@@ -1,0 +1,1 @@
+"""SQLite files, each with a thread of its own."""

@@ -1,0 +1,1 @@
+"""Streams: the source that samples and publishes, and the subscriber's buffer."""

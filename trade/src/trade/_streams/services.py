@@ -1,0 +1,33 @@
+"""What every container offers about listening to its services, in group ``trade``."""
+
+from typing import Annotated
+
+from msgspec import Meta
+
+from trade._calls.handle import Handle
+from trade._context.call_context import served_call
+from trade._services.decorator import service
+from trade._streams.source import LEAST_HZ, MOST_HZ, Streams, Wish
+
+Hz = Annotated[float, Meta(ge=LEAST_HZ, le=MOST_HZ)]
+
+
+class StreamServices:
+    """The wire's side of `Streams`."""
+
+    def __init__(self, streams: Streams) -> None:
+        self._streams = streams
+
+    @service(effect="read")
+    def listen(self, name: str, service: Handle, hz: Hz, on_change: bool = False) -> None:
+        """Sample that service of this container for who asks, so many times a second; to be asked for again and again.
+
+        ``name`` is the listener's own; the samples are put on the key of the stream.
+        """
+        asked = served_call()
+        self._streams.listen(service, (asked.session, name), Wish(asked.caller, hz, on_change))
+
+    @service(effect="read")
+    def unlisten(self, name: str) -> None:
+        """Who asks listens no more under that name."""
+        self._streams.unlisten((served_call().session, name))

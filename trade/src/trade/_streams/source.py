@@ -1,0 +1,362 @@
+"""Services sampled while somebody listens: the source's side of streams.
+
+However many listen, a service is called once a tick, its answer encoded once, and put once for each rate.
+"""
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from typing import Final, NamedTuple, Protocol
+
+from msgspec import Raw, Struct, structs
+
+from trade._calls.handle import Handle
+from trade._context.call_context import CallContext
+from trade._protocol.keys import Address, ServiceKey
+from trade._protocol.messages import EMPTY_ARGUMENTS, PROTOCOL, encode_message
+from trade._protocol.samples import STEPS_HZ, StreamSample, stream_key
+from trade._registry.registry import Change
+from trade._services.local_service import LocalService
+from trade._services.serial_queue import Turn
+from trade._streams.pace import Pace
+from trade._threads.scheduler import Clockwork
+from trade._transport.base import ChannelClosed, Publisher, Transport
+from trade.errors import AccessDenied, ConfigurationError, DeadlineExceeded, ServiceGone
+
+_logger = logging.getLogger("trade")
+
+LEAST_HZ: Final = 0.001
+MOST_HZ: Final = 1000.0
+LEASE_S: Final = 10.0
+"""Who has not said again for so long that it listens is taken for gone."""
+SIGN_S: Final = 1.0
+"""What does not change is put once in a while all the same."""
+_PATIENCE_S: Final = 10.0
+"""How long a sample may take."""
+_MOST: Final = 10_000
+"""So many may listen to one service."""
+_MOST_RATES: Final = 64
+"""At so many different rates."""
+
+Listener = tuple[str, str]
+"""Session and name."""
+
+
+class Home(Protocol):
+    """What streams need of their container."""
+
+    @property
+    def address(self) -> Address: ...
+    @property
+    def name(self) -> str: ...
+    def handle(self, key: ServiceKey) -> Handle: ...
+    def require_call(self, who: str, handle: Handle) -> None: ...
+
+
+class Wish(Struct, frozen=True):
+    """What one listener would like to have."""
+
+    identity: str
+    hz: float
+    on_change: bool
+    until_ns: int = 0
+    """When its lease ends."""
+
+
+class Wished(NamedTuple):
+    """What all who want the same rate would like to have."""
+
+    always: bool
+    """Somebody wants more than changes."""
+    newly: bool
+    """Somebody wants a sample now."""
+
+
+def period_ns(hz: float) -> int:
+    """Of a rate."""
+    return int(1e9 / hz)
+
+
+class _Rate:
+    """What is put for all who want so many samples a second. Used by the clockwork only."""
+
+    def __init__(self, hz: float, publisher: Publisher) -> None:
+        self._pace = Pace(hz)
+        self._publisher = publisher
+        self._period_ns = period_ns(hz)
+        self._number = 0
+        self._put: tuple[bool, bytes] | None = None
+        self._put_ns = 0
+
+    def offer(self, answer: tuple[bool, bytes], at: float, at_ns: int, wished: Wished, every_ns: int) -> None:
+        """Put it, unless that would be too soon, or nothing new to those who want changes only.
+
+        Args:
+            answer: whether the service failed, and what it answered.
+            at: ``time.time()`` when it was asked.
+            at_ns: the monotonic clock at that moment.
+            wished: how.
+            every_ns: how often it is asked.
+        """
+        stale = at_ns - self._put_ns >= SIGN_S * 1e9
+        if not (wished.newly or stale or wished.always or answer != self._put):
+            return
+        on_time = every_ns >= self._period_ns or self._pace.takes(at_ns)
+        if not (wished.newly or on_time):
+            return
+        self._number += 1
+        self._publisher.put(encode_message(StreamSample(PROTOCOL, self._number, at, at_ns, answer[0], Raw(answer[1]))))
+        self._put, self._put_ns = answer, at_ns
+
+    def close(self) -> None:
+        self._publisher.close()
+
+
+class Source:
+    """A service of this container that is listened to, or once was. Done by the clockwork: never twice at once."""
+
+    def __init__(
+        self,
+        key: ServiceKey,
+        services: Callable[[ServiceKey], LocalService | None],
+        transport: Transport,
+        new_id: Callable[[], int],
+    ) -> None:
+        self._key = key
+        self._services = services
+        self._transport = transport
+        self._new_id = new_id
+        self._shown = ExitStack()
+        self._lock = threading.Lock()
+        self._wishes: dict[Listener, Wish] = {}
+        self._new: set[float] = set()
+        """Rates at which somebody wants a sample at once."""
+        self._rates: dict[float, _Rate] = {}
+        self._next_ns = 0
+        self._problem = ""
+
+    def show(self) -> None:
+        """Put up the signs by which listeners see what rates reach them."""
+        for hz in STEPS_HZ:
+            self._shown.callback(self._transport.appear(stream_key(self._key, hz)).close)
+
+    def wish(self, listener: Listener, wish: Wish) -> bool:
+        """Somebody listens from now on, or still does; whether it is another wish than before.
+
+        Raises:
+            ConfigurationError: too many listen, or at too many rates.
+        """
+        where = f"{self._key.domain}.{self._key.name}"
+        with self._lock:
+            before = self._wishes.get(listener)
+            if before is None and len(self._wishes) >= _MOST:
+                raise ConfigurationError(where=where, problem=f"{_MOST} listen to it already")
+            rates = {other.hz for other in self._wishes.values()}
+            if wish.hz not in rates and len(rates) >= _MOST_RATES:
+                problem = f"it is listened to at {_MOST_RATES} different rates already; ask for one of {sorted(rates)}"
+                raise ConfigurationError(where=where, problem=problem)
+            self._wishes[listener] = wish
+            new = before is None or (before.hz, before.on_change) != (wish.hz, wish.on_change)
+            if new:
+                self._new.add(wish.hz)
+            return new
+
+    def drop(self, which: Callable[[Listener, Wish], bool]) -> None:
+        """Those listen no more."""
+        with self._lock:
+            self._wishes = {who: wish for who, wish in self._wishes.items() if not which(who, wish)}
+
+    def identities(self) -> set[str]:
+        """Of those who listen."""
+        with self._lock:
+            return {wish.identity for wish in self._wishes.values()}
+
+    def tick(self) -> int | None:
+        """Sample it if anybody still listens; when to do so again."""
+        now = time.monotonic_ns()
+        self.drop(lambda _, wish: wish.until_ns <= now)
+        service = self._services(self._key)
+        wished = {} if service is None else self._wished()
+        try:
+            self._keep_only(wished)
+            if service is None or not wished:
+                self._next_ns = 0
+                return None
+            at, every_ns = time.time(), period_ns(max(wished))
+            answer = self._sampled(service, now)
+            for hz, how in wished.items():
+                self._rates[hz].offer(answer, at, now, how, every_ns)
+        except ChannelClosed:
+            return None
+        return self._after(now, every_ns)
+
+    def _wished(self) -> dict[float, Wished]:
+        """By rate."""
+        with self._lock:
+            new, self._new = self._new, set[float]()
+            always = {wish.hz for wish in self._wishes.values() if not wish.on_change}
+            return {wish.hz: Wished(wish.hz in always, wish.hz in new) for wish in self._wishes.values()}
+
+    def _keep_only(self, wished: dict[float, Wished]) -> None:
+        """Put at these rates, and at no others any more."""
+        for hz in [hz for hz in self._rates if hz not in wished]:
+            self._rates.pop(hz).close()
+        for hz in wished:
+            if hz not in self._rates:
+                self._rates[hz] = _Rate(hz, self._transport.publish(stream_key(self._key, hz), droppable=True))
+
+    def _after(self, now: int, period_ns: int) -> int:
+        """The next tick; those that have passed meanwhile are left out, and one out of turn moves no others."""
+        self._next_ns = min(self._next_ns or now, now + period_ns)
+        ended = time.monotonic_ns()
+        if self._next_ns <= ended:
+            self._next_ns += ((ended - self._next_ns) // period_ns + 1) * period_ns
+        return self._next_ns
+
+    def _sampled(self, service: LocalService, now: int) -> tuple[bool, bytes]:
+        """Whether it failed, and what it answered: called as by its own container, behind its own locks and turns."""
+        own = self._key.address
+        until_ns = now + int(_PATIENCE_S * 1e9)
+        context = CallContext(self._new_id(), service.label, own.identity, str(own), until_ns)
+        try:
+            answer = service.signature.encode_result(service.label, _in_turn(service, context))
+        except BaseException as error:  # noqa: BLE001 - whatever a provider raises belongs to who listens
+            info = structs.replace(service.failure(error, EMPTY_ARGUMENTS), traceback="")
+            if info.type != self._problem:  # the same again says nothing new, however long it has lasted by now
+                _logger.warning("%s fails while it is listened to: %s: %s", service.label, info.type, info.message)
+            self._problem = info.type
+            return True, encode_message(info)
+        self._problem = ""
+        return False, answer
+
+    def close(self) -> None:
+        """Sample it no more; the last tick lets go of its keys. Idempotent."""
+        self.drop(lambda _listener, _wish: True)
+        self._shown.close()
+
+
+def _in_turn(service: LocalService, context: CallContext) -> object:
+    if service.serial is None:
+        return service.run(EMPTY_ARGUMENTS, context)
+    if not service.serial.enter(Turn(), _PATIENCE_S):
+        raise DeadlineExceeded(service=service.label, deadline_s=_PATIENCE_S)
+    try:
+        with service.serial.held():
+            return service.run(EMPTY_ARGUMENTS, context)
+    finally:
+        service.serial.leave()
+
+
+class Streams:
+    """Owns the sources of one container."""
+
+    def __init__(
+        self,
+        home: Home,
+        transport: Transport,
+        services: Callable[[ServiceKey], LocalService | None],
+        clockwork: Clockwork,
+        new_id: Callable[[], int],
+    ) -> None:
+        self._home = home
+        self._transport = transport
+        self._services = services
+        self._clockwork = clockwork
+        self._new_id = new_id
+        self._lock = threading.Lock()
+        self._sources: dict[ServiceKey, tuple[Source, Callable[[int], None]]] = {}
+
+    def listen(self, handle: Handle, listener: Listener, wish: Wish) -> None:
+        """Sample a service of this container for somebody from now on, for as long as the lease.
+
+        Raises:
+            AccessDenied: the policy does not let it read the service.
+            ConfigurationError: that is no service of this container which can be listened to.
+            ServiceGone: it was deregistered.
+        """
+        key = handle.key
+        service = self._services(key)
+        if key.address != self._home.address:
+            raise ConfigurationError(where=handle.label, problem=f"it is no service of container {self._home.name}")
+        if service is None:
+            raise ServiceGone(service=handle.label)
+        check_sampled(handle)
+        self._home.require_call(wish.identity, handle)
+        source, again = self._source(key)
+        until_ns = time.monotonic_ns() + int(LEASE_S * 1e9)
+        in_key = float(f"{wish.hz:g}")  # what differs less than that is one rate
+        if source.wish(listener, structs.replace(wish, hz=in_key, until_ns=until_ns)):
+            again(time.monotonic_ns())
+
+    def _source(self, key: ServiceKey) -> tuple[Source, Callable[[int], None]]:
+        known = self._sources.get(key)
+        if known is not None:
+            return known
+        made = Source(key, self._services, self._transport, self._new_id)
+        with self._lock:
+            known = self._sources.get(key)
+            if known is None:
+                due = self._clockwork.due(made.tick)
+                known = self._sources[key] = (made, due.at)
+        if known[0] is made:
+            made.show()
+        return known
+
+    def unlisten(self, listener: Listener) -> None:
+        """It listens no more."""
+        self._drop(lambda who, _wish: who == listener)
+
+    def session_ended(self, session: str) -> None:
+        """Nobody of it is there any more."""
+        self._drop(lambda who, _wish: who[0] == session)
+
+    def judge_anew(self) -> None:
+        """Who may read what has changed: those who may no longer are dropped, and refused when they ask again."""
+        with self._lock:
+            sources = list(self._sources.items())
+        for key, (source, _) in sources:
+            denied = {who for who in source.identities() if self._denied(who, key)}
+            source.drop(lambda _, wish, denied=denied: wish.identity in denied)
+
+    def _denied(self, who: str, key: ServiceKey) -> bool:
+        try:
+            self._home.require_call(who, self._home.handle(key))
+        except (AccessDenied, ServiceGone):
+            return True
+        return False
+
+    def _drop(self, which: Callable[[Listener, Wish], bool]) -> None:
+        with self._lock:
+            sources = list(self._sources.values())
+        for source, _ in sources:
+            source.drop(which)
+
+    def changed(self, change: Change) -> None:
+        """Told by the registry."""
+        for record in change.left:
+            with self._lock:
+                gone = self._sources.pop(record.key, None) if record.local else None
+            if gone is not None:
+                gone[0].close()
+
+    def close(self) -> None:
+        """Sample nothing more. Idempotent."""
+        with self._lock:
+            sources = list(self._sources.values())
+            self._sources.clear()
+        for source, _ in sources:
+            source.close()
+
+
+def check_sampled(handle: Handle) -> None:
+    """Raises ConfigurationError: it cannot be listened to."""
+    info = handle.record.info
+    if info.effect != "read":
+        problem = f"it does not only read (effect={info.effect!r}), so it is not called again and again for listeners"
+        raise ConfigurationError(where=handle.label, problem=problem)
+    required = [parameter.name for parameter in info.parameters if parameter.required]
+    if required:
+        problem = f"it needs {', '.join(required)}; only what needs no arguments can be listened to"
+        raise ConfigurationError(where=handle.label, problem=problem)

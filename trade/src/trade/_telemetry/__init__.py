@@ -1,0 +1,1 @@
+"""What a container measures of itself: spans, metrics, log lines, and load."""

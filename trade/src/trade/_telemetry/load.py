@@ -1,0 +1,130 @@
+"""How busy a container is: its process, its host, the calls that others make to it."""
+
+import os
+import threading
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Final
+
+from msgspec import Struct
+
+from trade._threads.channel_workers import Crew
+
+_WINDOW_S: Final = 1.0
+_STATUS: Final = Path("/proc/self/status")
+_STAT: Final = Path("/proc/stat")
+
+
+class LoadInfo(Struct, frozen=True):
+    """How busy a container is; None is what its system does not tell.
+
+    Rates and percentages are means over the last ``over_s`` seconds.
+    """
+
+    container: str
+    over_s: float
+    """A second at least, once it is that old: who asks every second or so is told of that second."""
+    cpu_percent: float
+    """Of its process; 100 is one core."""
+    host_cpu_percent: float | None
+    """Of its host; 100 is all cores."""
+    load_1min: float | None
+    """Processes of its host that run or want to, a mean of the last minute."""
+    cores: int
+    memory_bytes: int | None
+    """Of its process, resident."""
+    calls: int
+    """That came from other containers since it started, stops and the middleware's own included."""
+    calls_per_s: float
+    in_flight: int
+    """Of those, how many have a thread now: this question, too, and what was answered in the last moment."""
+    queued: int
+    """Calls of serial services whose turn has not come."""
+    threads: int
+
+
+class _Sample(Struct, frozen=True):
+    at_s: float
+    process_s: float
+    busy: int
+    ticks: int
+    """Of the host, by its own clock; both 0 where it does not tell."""
+    calls: int
+
+
+class Load:
+    """Measures when it is asked, and costs nothing otherwise."""
+
+    def __init__(
+        self,
+        container: str,
+        crews: Callable[[], Sequence[Crew]],
+        queued: Callable[[], int],
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._container = container
+        self._crews = crews
+        self._queued = queued
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._before = self._last = self._sample()
+
+    def _sample(self) -> _Sample:
+        busy, ticks = _host_ticks()
+        return _Sample(self._clock(), time.process_time(), busy, ticks, sum(crew.taken for crew in self._crews()))
+
+    @property
+    def running(self) -> int:
+        """Calls of other containers that have a thread now."""
+        return sum(crew.working for crew in self._crews())
+
+    def read(self) -> LoadInfo:
+        """As it is now."""
+        with self._lock:
+            now = self._sample()
+            if now.at_s - self._last.at_s >= _WINDOW_S:
+                self._before, self._last = self._last, now
+            before = self._before
+        over_s = max(now.at_s - before.at_s, 1e-3)
+        ticks = now.ticks - before.ticks
+        return LoadInfo(
+            container=self._container,
+            over_s=over_s,
+            cpu_percent=100 * (now.process_s - before.process_s) / over_s,
+            host_cpu_percent=100 * (now.busy - before.busy) / ticks if ticks > 0 else None,
+            load_1min=_load_1min(),
+            cores=os.cpu_count() or 1,
+            memory_bytes=resident_bytes(),
+            calls=now.calls,
+            calls_per_s=(now.calls - before.calls) / over_s,
+            in_flight=self.running,
+            queued=self._queued(),
+            threads=threading.active_count(),
+        )
+
+
+def _load_1min() -> float | None:
+    ask: Callable[[], tuple[float, float, float]] | None = getattr(os, "getloadavg", None)  # not everywhere
+    try:
+        return None if ask is None else ask()[0]
+    except OSError:
+        return None
+
+
+def resident_bytes() -> int | None:
+    try:
+        lines = _STATUS.read_text().splitlines()
+        return next((int(line.split()[1]) << 10 for line in lines if line.startswith("VmRSS:")), None)
+    except (OSError, ValueError, IndexError):
+        return None
+
+
+def _host_ticks() -> tuple[int, int]:
+    """Ticks that the cores of the host were busy, and all of them."""
+    try:
+        with _STAT.open() as stat:
+            ticks = [int(word) for word in stat.readline().split()[1:9]]  # what comes then is counted in these already
+    except (OSError, ValueError):
+        return 0, 0
+    return sum(ticks) - sum(ticks[3:5]), sum(ticks)  # without idle and waiting for input

@@ -1,0 +1,106 @@
+"""``/metrics`` for Prometheus: an extra, off by default. Everything is read when it is asked for."""
+
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack
+from itertools import accumulate
+from typing import TYPE_CHECKING, Final
+
+from trade._counters import BOUNDS_S, Calls, Measure
+from trade._settings import Settings
+from trade._transport.bounded_listener import BoundedListener
+from trade._transport.endpoints import Endpoint
+from trade.errors import ConfigurationError
+
+if TYPE_CHECKING:
+    from prometheus_client.metrics_core import Metric
+
+INSTALL: Final = 'needs prometheus-client; pip install "trade-core[metrics]"'
+_PREFIX: Final = "trade_"
+_MOST_CONNECTIONS: Final = 32
+"""At once; each has a thread until it has been answered."""
+_ASKED_WITHIN_S: Final = 5.0
+"""How long a connection may say nothing."""
+
+
+class Metrics:
+    """A collector of prometheus-client.
+
+    Args:
+        container: a label of all.
+        calls: what is counted of calls.
+        measures: everything else.
+    """
+
+    def __init__(self, container: str, calls: Calls, measures: Callable[[], Iterable[Measure]]) -> None:
+        self._container = container
+        self._calls = calls
+        self._measures = measures
+
+    def collect(self) -> "Iterator[Metric]":
+        """All of it, as it is now."""
+        from prometheus_client.core import (  # noqa: PLC0415 - an extra
+            CounterMetricFamily,
+            GaugeMetricFamily,
+            HistogramMetricFamily,
+        )
+
+        names = ("container", "service")
+        took = HistogramMetricFamily(f"{_PREFIX}call_seconds", "How long services took, hooks included.", labels=names)
+        failed = CounterMetricFamily(f"{_PREFIX}call_failures", "Calls that ended with an error.", labels=names)
+        for label, timed in sorted(self._calls.timed().items()):
+            counts = list(timed.counts)
+            if not any(counts):
+                continue
+            buckets = zip((*map(str, BOUNDS_S), "+Inf"), accumulate(counts), strict=True)
+            took.add_metric((self._container, label), list(buckets), timed.sum_ns / 1e9)
+            failed.add_metric((self._container, label), timed.failures)
+        refused = CounterMetricFamily(
+            f"{_PREFIX}refusals", "What was refused, by the type of the error.", labels=("container", "reason")
+        )
+        for reason, count in sorted(self._calls.refusals().items()):
+            refused.add_metric((self._container, reason), count)
+        yield from (took, failed, refused)
+        families: dict[str, CounterMetricFamily | GaugeMetricFamily] = {}
+        for measure in self._measures():
+            family = families.get(measure.name)
+            if family is None:
+                kind = CounterMetricFamily if measure.kind == "counter" else GaugeMetricFamily
+                labels = ("container", *measure.labels)
+                family = families[measure.name] = kind(f"{_PREFIX}{measure.name}", measure.doc, labels=labels)
+            family.add_metric((self._container, *measure.labels.values()), measure.value)
+        yield from families.values()
+
+
+def open_metrics(
+    settings: Settings, calls: Calls | None, measures: Callable[[], Iterable[Measure]], leaving: ExitStack
+) -> int:
+    """Serve ``/metrics`` if that is wanted; what ends it goes onto the stack. Returns the port, 0 if it is not.
+
+    Raises:
+        ConfigurationError: the extra is not installed, or the port is taken.
+    """
+    if calls is None:
+        return 0
+    try:
+        from prometheus_client import CollectorRegistry, start_http_server  # noqa: PLC0415 - an extra
+    except ImportError:
+        raise ConfigurationError(where="TRADE_METRICS", problem=INSTALL) from None
+    place = Endpoint.read(f"tcp/{settings.metrics}")
+    registry = CollectorRegistry(auto_describe=False)
+    registry.register(Metrics(settings.container, calls, measures))
+    try:
+        server, thread = start_http_server(place.port, place.host, registry)
+    except OSError as taken:
+        problem = f"{settings.metrics}: {taken.strerror}; each container of a host needs a port of its own"
+        raise ConfigurationError(where="TRADE_METRICS", problem=problem) from None
+
+    server.socket = BoundedListener(server.socket, _MOST_CONNECTIONS)
+    server.RequestHandlerClass.timeout = _ASKED_WITHIN_S  # type: ignore[attr-defined] # as for every stream handler
+
+    def close() -> None:
+        server.shutdown()
+        server.server_close()
+        thread.join(2)
+
+    leaving.callback(close)
+    return server.server_port

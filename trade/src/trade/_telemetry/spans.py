@@ -1,0 +1,203 @@
+"""What a container notes of calls while it is traced: what was called for whom, when, how long, how it ended."""
+
+import itertools
+import time
+from collections import deque
+from collections.abc import Callable, Collection, Sequence
+from threading import Lock
+from typing import TYPE_CHECKING, Any, Final, Literal
+
+from msgspec import Struct, structs
+
+from trade._container.system import DOMAIN
+from trade._context.call_context import CallContext
+from trade._context.outgoing import Request
+from trade._protocol.keys import Address, ServiceKey
+from trade._protocol.messages import Token
+from trade._telemetry.log_buffer import listen
+
+if TYPE_CHECKING:
+    from trade._resources.lock_table import LockTable
+    from trade._services.local_service import Around, LocalService
+
+MOST: Final = 10_000
+"""So many spans a container keeps: the newest."""
+_LOCKING: Final = frozenset(("acquire", "release"))
+"""Of the middleware's own functions, those that belong to what a program does."""
+
+
+class Span(Struct, frozen=True, kw_only=True):
+    """One call, as the container noted it that asked for it or that served it. Without arguments and results."""
+
+    call_id: int
+    calls: tuple[int, ...]
+    """The calls that led to it, nearest first."""
+    service: str
+    side: Literal["asked", "served"]
+    container: str
+    """The one that noted it."""
+    caller: str
+    """Identity of who asked."""
+    session: str
+    began: float
+    """``time.time()`` of that container's host."""
+    waited_s: float = 0.0
+    """In the queue of a serial provider, for who called from another container; it had not begun then."""
+    took_s: float
+    """From ``began`` to its end; what is called before and after it included."""
+    outcome: str
+    """``ok``, or the type of its error."""
+    locks: tuple[str, ...] = ()
+    """The locks it ran under in that container: what for, and whose."""
+    events: tuple[tuple[float, str], ...] = ()
+    """What was noted of it, and how many seconds after it began."""
+    remote: bool = False
+    """Whether it was ``served`` for another container."""
+    number: int = 0
+    """Counted from 1 in the container that noted it."""
+
+    @property
+    def ids(self) -> tuple[int, ...]:
+        """Its own id and those of the calls that led to it."""
+        return (self.call_id, *self.calls)
+
+
+def traceable(key: ServiceKey) -> bool:
+    """Whether calls of a service are noted at all."""
+    return key.domain != DOMAIN or key.name in _LOCKING
+
+
+class Spans:
+    """Owns what one container noted."""
+
+    def __init__(
+        self,
+        container: str,
+        identity: str,
+        session: str,
+        locks: Callable[[Sequence[Token]], list[str]],
+        tell: Callable[[Span], None] | None = None,
+    ) -> None:
+        self._container = container
+        self._identity = identity
+        self._session = session
+        self.locks = locks
+        """What those tokens stand for here."""
+        self._tell = tell
+        """Told of each span."""
+        self._lock = Lock()
+        self._kept: deque[Span] = deque(maxlen=MOST)
+        self._noted = 0
+
+    def asked(self, call_id: int, service: str, request: Request, error: BaseException | None) -> None:
+        """A call of this container to another one has ended."""
+        now_ns = time.monotonic_ns()
+        took_s = (now_ns - request.deadline_ns) / 1e9 + request.deadline_s
+        inherited = request.inherited
+        outer, client = (None, None) if inherited is None else (inherited.outer, inherited.client)
+        self._keep(
+            Span(
+                call_id=call_id,
+                calls=() if outer is None else (outer.id, *ancestors(outer)),
+                service=service,
+                side="asked",
+                container=self._container,
+                caller=self._identity,
+                session=self._session if client is None else client.name,
+                began=time.time() - took_s,
+                took_s=took_s,
+                outcome=_outcome(error),
+            )
+        )
+
+    def served(
+        self,
+        context: CallContext,
+        calls: tuple[int, ...],
+        began: float,
+        began_ns: int,
+        locks: Sequence[str],
+        error: BaseException | None,
+    ) -> None:
+        """A call to this container has ended."""
+        ongoing = context.ongoing
+        queued_ns = 0 if ongoing is None else ongoing.queued_ns
+        self._keep(
+            Span(
+                call_id=context.id,
+                calls=calls,
+                service=context.service,
+                side="served",
+                container=self._container,
+                caller=context.caller,
+                session=context.session,
+                began=began,
+                waited_s=(began_ns - queued_ns) / 1e9 if queued_ns else 0.0,
+                took_s=(time.monotonic_ns() - began_ns) / 1e9,
+                outcome=_outcome(error),
+                locks=tuple(locks),
+                events=tuple(((at_ns - began_ns) / 1e9, text) for at_ns, text in context.events or ()),
+                remote=ongoing is not None and ongoing.call is not None,
+            )
+        )
+
+    def _keep(self, span: Span) -> None:
+        with self._lock:
+            self._noted += 1
+            structs.force_setattr(span, "number", self._noted)
+            self._kept.append(span)
+        if self._tell is not None:
+            self._tell(span)
+
+    def kept(self, calls: Collection[int] | None = None, after: int = 0) -> list[Span]:
+        """What is kept above that number, oldest first; of these calls and those that they led to, or of all."""
+        with self._lock:
+            old = max(0, after - self._noted + len(self._kept))
+            kept = list(itertools.islice(self._kept, old, None))
+        return kept if calls is None else [span for span in kept if not frozenset(span.ids).isdisjoint(calls)]
+
+
+class Recorded:
+    """What is around a service while it is traced: what was there without that, and a span."""
+
+    def __init__(self, spans: Spans, around: "Around | None") -> None:
+        self._spans = spans
+        self._around = around
+
+    def run(self, service: "LocalService", args: Sequence[Any], kwargs: dict[str, Any], context: CallContext) -> Any:
+        """Call the service and note that. Its errors pass."""
+        structs.force_setattr(context, "events", [])
+        calls = ancestors(context)  # it forgets them when it ends
+        locks = self._spans.locks(context.tokens) if context.tokens else ()
+        began, began_ns = time.time(), time.monotonic_ns()
+        failed: BaseException | None = None
+        try:
+            if self._around is None:
+                return service.call(args, kwargs, context, bare=True)
+            return self._around.run(service, args, kwargs, context)
+        except BaseException as error:
+            failed = error
+            raise
+        finally:
+            self._spans.served(context, calls, began, began_ns, locks, failed)
+            del failed  # it knows this frame
+
+
+def ancestors(context: CallContext) -> tuple[int, ...]:
+    """The calls that led to one that runs, nearest first."""
+    return () if context.behalf is None else context.behalf.calls
+
+
+def _outcome(error: BaseException | None) -> str:
+    return "ok" if error is None else type(error).__name__
+
+
+def new_spans(own: Address, session: str, table: "LockTable", tell: Callable[[Span], None] | None) -> Spans:
+    """For a container, which tells of each as well, if asked; its process keeps what it logs from now on."""
+    listen()
+
+    def purposes(tokens: Sequence[Token]) -> list[str]:
+        held = (info.holder for info in table.infos() if info.token in tokens)
+        return [f"{holder.purpose} ({holder.owner})" if holder.purpose else holder.owner for holder in held]
+
+    return Spans(own.container, own.identity, session, purposes, tell)

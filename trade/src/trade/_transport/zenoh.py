@@ -1,0 +1,357 @@
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
+# pyright: reportUnknownLambdaType=false, reportCallIssue=false
+"""The transport on eclipse-zenoh.
+
+No Python runs on zenoh's threads: every subscriber is a channel that our threads read. Puts block for a stalled
+receiver instead of dropping (zenoh's default), and go out at once. All sessions carry the same short lease.
+"""
+
+import contextlib
+import threading
+from collections.abc import Callable, Generator, Mapping, Sequence
+from types import MappingProxyType
+from typing import Any, Final
+
+import zenoh
+
+from trade._protocol.keys import PASSING
+from trade._security.certificates import Certificate, transport_settings
+from trade._transport.base import (
+    Answer,
+    Channel,
+    ChannelClosed,
+    Message,
+    Presence,
+    Publisher,
+    Question,
+    Questions,
+    Transport,
+)
+from trade._transport.endpoints import Endpoint
+from trade._transport.zenoh_links import Links, new_session_id, open_session
+from trade.errors import ConfigurationError
+
+LEASE_MS: Final = 2000
+_COMING_IN_MS: Final = 4000
+_CHANNEL_CAPACITY: Final = 4096
+_MOST_KNOWN_KEYS: Final = 1024
+_BLOCK: Final = zenoh.CongestionControl.BLOCK
+_DROP: Final = zenoh.CongestionControl.DROP
+_CLOSED: Final = (zenoh.ZError, RuntimeError)
+"""What zenoh raises for something closed already, and for something that another thread closes or uses right now."""
+_PUT: Final = zenoh.SampleKind.PUT
+
+
+_SHARED_FROM_BYTES: Final = 32 << 10
+"""Larger messages go through shared memory on one host; what containers tell of their services is smaller."""
+
+
+def configuration(
+    *,
+    namespace: str,
+    listen: Sequence[str],
+    connect: Sequence[str],
+    credentials: tuple[str, str] | None = None,
+    certificate: Certificate | None = None,
+    bridge: Sequence[Sequence[str]] = (),
+    rules: Mapping[str, Any] = MappingProxyType({}),
+) -> dict[str, Any]:
+    """The settings of one session, as zenoh names them; ``bridge`` has the interfaces of each network it joins.
+
+    Whom it lets in is decided by certificates or else by credentials, and what they may send by the rules (see `_acl`).
+    """
+    entry: dict[str, Any] = {} if certificate is None else {"transport/link/tls": transport_settings(certificate)}
+    if credentials is not None:
+        entry["transport/auth/usrpwd/user"], entry["transport/auth/usrpwd/password"] = credentials
+    return {
+        "id": new_session_id(dials=all(Endpoint.read(own).loopback for own in listen)),
+        "mode": "router" if bridge else "peer",
+        "gateway": {"south": [_region(interfaces) for interfaces in bridge]} if bridge else {},
+        # A bridge's neighbours are on other hosts; what it would share with those of its own takes 16 MiB for each.
+        "transport/shared_memory/enabled": not bridge,
+        "namespace": namespace,
+        "listen/endpoints": list(listen),
+        "connect/endpoints": list(connect),
+        "connect/timeout_ms": -1,  # 0 would be no retry; opening itself waits half a second at most
+        "connect/exit_on_failure": False,
+        "connect/retry": {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2},
+        "scouting/multicast/enabled": False,
+        # Two that hear of each other at once must not both dial: each would refuse the other as a second link.
+        # Of a bridge its neighbours do not hear by gossip; it dials them.
+        "scouting/gossip/autoconnect": {"router": ["peer"], "peer": ["router", "peer"]},
+        "scouting/gossip/autoconnect_strategy": {
+            "peer": {"to_router": "always", "to_peer": "greater-zid"},
+            "router": {"to_peer": "always"},
+        },
+        **entry,
+        **rules,
+        # The first message above it takes a pool of 16 MiB of locked memory that lives as long as the process.
+        "transport/shared_memory/transport_optimization/message_size_threshold": _SHARED_FROM_BYTES,
+        # Whoever is slow to come in takes one of 100 places; zenoh would leave it that for 10 s.
+        "transport/unicast/accept_timeout": _COMING_IN_MS,
+        "transport/unicast/open_timeout": _COMING_IN_MS,
+        "transport/link/tx/lease": LEASE_MS,
+        "transport/link/tx/keep_alive": 4,
+        "transport/link/tx/queue/congestion_control/block/wait_before_close": 1_000_000,
+    }
+
+
+def _region(interfaces: Sequence[str]) -> dict[str, Any]:
+    """Who comes by these is of one network; routers are not: those are other bridges."""
+    return {"filters": [{"modes": ["peer", "client"], "interfaces": list(interfaces)}]}
+
+
+class ZenohChannel(Channel):
+    """A subscriber of any of zenoh's three kinds.
+
+    Where the same few keys are heard over and over, they are declared on the session: zenoh keeps the route of a key it
+    knows, and works it out for every message of one it does not.
+    """
+
+    def __init__(self, subscriber: Any, declare_on: zenoh.Session | None = None) -> None:
+        self._subscriber = subscriber
+        self._next_recv: Callable[[], zenoh.Sample] | None = None
+        """Of another subscriber, for when all is read that the one before it has got."""
+        self._closed = False
+        self._moving = threading.Lock()
+        self._session = declare_on
+        self._known: dict[str, zenoh.KeyExpr] = {}
+        self._recv = _reader(subscriber)
+
+    def receive(self) -> Message:
+        recv = self._recv
+        try:
+            sample: zenoh.Sample = recv()
+        except zenoh.ZError:
+            if self._go_on(recv):
+                return self.receive()
+            raise ChannelClosed from None
+        key, payload = str(sample.key_expr), sample.payload.to_bytes()
+        if self._session is not None and key not in self._known:
+            self._learn(self._session, key)
+        return Message(key, payload if payload or sample.kind == _PUT else None)
+
+    def _learn(self, session: zenoh.Session, key: str) -> None:
+        if len(self._known) >= _MOST_KNOWN_KEYS:
+            self._forget(session)
+        _quietly(lambda: self._known.setdefault(key, session.declare_keyexpr(key)))
+
+    def _forget(self, session: zenoh.Session) -> None:
+        known, self._known = self._known, {}
+        for declared in known.values():
+            _quietly(lambda declared=declared: session.undeclare(declared))
+
+    def move(self, declare: Callable[[], Any]) -> None:
+        """Hear another subscriber from now on; what both have got is heard twice. Raises ZError of a closed session."""
+        with self._moving:
+            if self._closed:
+                return
+            before, self._subscriber = self._subscriber, declare()
+            self._next_recv = _reader(self._subscriber)
+        _quietly(before.undeclare)
+
+    def _go_on(self, ended: Any) -> bool:
+        """A subscriber has no more; returns whether there is another one."""
+        with self._moving:
+            if self._next_recv is not None:
+                self._recv, self._next_recv = self._next_recv, None
+            return self._recv is not ended and not self._closed
+
+    def close(self) -> None:
+        with self._moving:
+            self._closed = True
+        _quietly(self._subscriber.undeclare)
+        if self._session is not None:
+            self._forget(self._session)
+
+
+def _reader(subscriber: Any) -> Callable[[], zenoh.Sample]:
+    return subscriber.handler.recv if hasattr(subscriber, "handler") else subscriber.recv
+
+
+class ZenohPublisher(Publisher):
+    def __init__(self, publisher: Any, forget_key: Callable[[], Any] | None = None) -> None:
+        self._publisher = publisher
+        self._forget_key = forget_key
+
+    def put(self, payload: bytes) -> None:
+        try:
+            self._publisher.put(payload)
+        except _CLOSED:
+            raise ChannelClosed from None
+
+    def close(self) -> None:
+        _quietly(self._publisher.undeclare)
+        if self._forget_key is not None:
+            _quietly(self._forget_key)
+
+
+class ZenohQuestion(Question):
+    def __init__(self, query: zenoh.Query) -> None:
+        self._query = query
+        self._asked = query.key_expr
+
+    def answer(self, key: str, payload: bytes) -> None:
+        if not self._asked.intersects(key):
+            return
+        try:
+            self._query.reply(key, payload)
+        except _CLOSED:
+            raise ChannelClosed from None
+
+    def close(self) -> None:
+        _quietly(self._query.drop)
+
+
+class ZenohQuestions(Questions):
+    def __init__(self, queryable: Any) -> None:
+        self._queryable = queryable
+        self._recv = queryable.handler.recv  # to ask for it while another thread closes is refused
+
+    def receive(self) -> Question:
+        try:
+            return ZenohQuestion(self._recv())
+        except zenoh.ZError:
+            raise ChannelClosed from None
+
+    def close(self) -> None:
+        _quietly(self._queryable.undeclare)
+
+
+class ZenohPresence(Presence):
+    def __init__(self, token: zenoh.LivelinessToken) -> None:
+        self._token = token
+
+    def close(self) -> None:
+        _quietly(self._token.undeclare)
+
+
+class ZenohTransport(Transport):
+    def __init__(self, settings: dict[str, Any]) -> None:
+        try:
+            self._session = open_session(settings)
+        except zenoh.ZError as bad:
+            reason = str(bad).partition(" at /")[0]  # what follows is a place in zenoh's sources
+            raise ConfigurationError(
+                where=f"listen {', '.join(settings['listen/endpoints'])}",
+                problem=f"cannot listen there: {reason}; is the address taken, or not of this host?",
+            ) from None
+        self.links: Final = Links(self._session, settings)
+        self._passing: list[tuple[ZenohChannel, Callable[[], Any]]] = []
+        """What is heard under another pattern until this is known to stay, and how to hear it then."""
+
+    def publish(self, key: str, *, urgent: bool = False, droppable: bool = False) -> Publisher:
+        behind = droppable and not urgent
+        priority = zenoh.Priority.REAL_TIME if urgent else zenoh.Priority.BACKGROUND if behind else zenoh.Priority.DATA
+        with _refusing():
+            known = self._session.declare_keyexpr(key)
+            declared = self._session.declare_publisher(
+                known, congestion_control=_DROP if droppable else _BLOCK, express=not behind, priority=priority
+            )
+        return ZenohPublisher(declared, lambda: self._session.undeclare(known))
+
+    def subscribe(self, pattern: str, *, newest: int = 0) -> Channel:
+        def heard(pattern: str) -> Any:
+            return self._session.declare_subscriber(pattern, zenoh.handlers.RingChannel(newest) if newest else _fifo())
+
+        return self._hear(pattern, heard, declare_on=self._session)
+
+    def announce(self, key: str, payload: bytes) -> None:
+        with _refusing():
+            self._session.put(key, payload, congestion_control=_BLOCK, express=True)
+
+    def announcements(self, pattern: str) -> Channel:
+        def heard(pattern: str) -> Any:
+            return self._session.declare_subscriber(pattern, _fifo(), allowed_origin=zenoh.Locality.REMOTE)
+
+        return self._hear(pattern, heard)
+
+    def _hear(self, pattern: str, heard: Callable[[str], Any], declare_on: zenoh.Session | None = None) -> ZenohChannel:
+        """Who passes by hears what everybody hears under another pattern that matches the same keys.
+
+        zenoh 1.10 keeps the link to whoever subscribed to a pattern, 6 KiB and more, for as long as anybody
+        subscribes to that one (https://github.com/eclipse-zenoh/zenoh/issues/2393).
+        """
+        with _refusing():
+            channel = ZenohChannel(heard(PASSING.get(pattern, pattern)), declare_on)
+        if pattern in PASSING:
+            self._passing.append((channel, lambda: heard(pattern)))
+        return channel
+
+    def settle(self) -> None:
+        passing, self._passing = self._passing, []
+        with _refusing():
+            for channel, heard in passing:
+                channel.move(heard)
+
+    def questions(self, pattern: str) -> Questions:
+        with _refusing():
+            return ZenohQuestions(self._session.declare_queryable(pattern, _fifo()))
+
+    def ask(self, pattern: str, timeout_s: float) -> list[Answer]:
+        with _refusing():
+            replies = self._session.get(
+                pattern,
+                _fifo(),
+                target=zenoh.QueryTarget.ALL,
+                consolidation=zenoh.ConsolidationMode.NONE,
+                congestion_control=_BLOCK,
+                allowed_destination=zenoh.Locality.REMOTE,
+                timeout=timeout_s,
+            )
+        answers: dict[str, Answer] = {}
+        for reply in replies:
+            if reply.ok is not None:
+                who = str(reply.replier_id)
+                answer = answers.setdefault(who, Answer(who, []))
+                answer.messages.append(Message(str(reply.ok.key_expr), reply.ok.payload.to_bytes()))
+        return list(answers.values())
+
+    def appear(self, key: str) -> Presence:
+        with _refusing():
+            return ZenohPresence(self._session.liveliness().declare_token(key))
+
+    def presences(self, pattern: str) -> Channel:
+        with _refusing():
+            return ZenohChannel(self._session.liveliness().declare_subscriber(pattern, _fifo(), history=True))
+
+    def present(self, pattern: str, timeout_s: float) -> list[str]:
+        with _refusing():
+            replies = self._session.liveliness().get(pattern, _fifo(), timeout=timeout_s)
+        return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
+
+    def bridged(self) -> bool:
+        return self.links.bridged()
+
+    def bridge_lost(self) -> bool:
+        return self.links.bridge_lost()
+
+    def wake(self, key: str, payload: bytes) -> None:
+        _quietly(lambda: self._session.put(key, payload, allowed_destination=zenoh.Locality.SESSION_LOCAL))
+
+    def close(self) -> None:
+        _quietly(self._session.close)
+
+
+def _fifo() -> Any:
+    return zenoh.handlers.FifoChannel(_CHANNEL_CAPACITY)
+
+
+@contextlib.contextmanager
+def _refusing() -> Generator[None, None, None]:
+    """What a closed session refuses is refused in our words."""
+    try:
+        yield
+    except zenoh.ZError:
+        raise ChannelClosed from None
+
+
+def _quietly(action: Any) -> None:
+    """Do it unless the session is closed already: closing is idempotent and never fails.
+
+    What another thread uses at this moment zenoh lets go of when that is done.
+    """
+    try:
+        action()
+    except _CLOSED:
+        return

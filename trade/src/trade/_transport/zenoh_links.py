@@ -1,0 +1,246 @@
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
+"""The small zenoh sessions beside a container's main one, which link it to others while it runs.
+
+zenoh can neither dial nor answer scouts anew in an open session, and the main one is never reopened. What a second,
+short-lived session that is linked to two others hears of one it tells the other (gossip); they link, and stay linked
+when it closes.
+"""
+
+import hashlib
+import hmac
+import json
+import math
+import secrets
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any, Final, NamedTuple
+
+import zenoh
+
+from trade._security.certificates import authority
+from trade._transport.credentials import dictionary_file
+from trade._transport.endpoints import Endpoint, dialled_from_here, loopback_interface
+from trade.errors import ConfigurationError
+
+_NOBODY: Final[dict[str, Any]] = {"router": [], "peer": []}
+_DIGITS: Final = 32
+_TAG: Final = 16
+_NAME: Final = 12
+"""Hexadecimal digits: the id of a beacon is made of its system's tag, of so much of the id of the main session as names
+it, and of the port that the main session listens on. So a scout knows whom it found, and dials the main session."""
+_LOOK_S: Final = 0.01
+_MOMENT_S: Final = 1.0
+
+_USER: Final = "transport/auth/usrpwd/user"
+_TLS: Final = "transport/link/tls"
+_PASSWORD: Final = "transport/auth/usrpwd/password"  # noqa: S105 - the name of a setting
+
+
+def new_session_id(*, dials: bool = False) -> str:
+    """An id that zenoh keeps as it is written: its first digit is not zero.
+
+    Of two that hear of each other the one with the greater id dials; zenoh compares the last byte first. Who listens on
+    this host only can dial others, but not be dialled from elsewhere: its id is greater than theirs.
+    """
+    digits = secrets.token_hex(_DIGITS // 2)
+    return f"{secrets.choice('123456789abcdef')}{digits[1:-2]}{secrets.randbelow(128) + 128 * dials:02x}"
+
+
+def open_session(settings: dict[str, Any]) -> zenoh.Session:
+    """Open what the settings say, as zenoh names them; it lets in who has its own credentials, or a certificate of its
+    authority. Raises zenoh.ZError.
+    """
+    if _USER not in settings:
+        return zenoh.open(_config(settings))
+    with dictionary_file((settings[_USER], settings[_PASSWORD])) as allowed:
+        return zenoh.open(_config({**settings, "transport/auth/usrpwd/dictionary_file": str(allowed)}))
+
+
+def _config(settings: dict[str, Any]) -> zenoh.Config:
+    config = zenoh.Config()
+    for key, value in settings.items():
+        config.insert_json5(key, json.dumps(value))
+    return config
+
+
+class Beacon:
+    """Answers scouts until it is closed."""
+
+    def __init__(self, session: zenoh.Session) -> None:
+        self._session = session
+
+    def close(self) -> None:
+        self._session.close()
+
+
+class Found(NamedTuple):
+    """A container of this system that lets itself be found."""
+
+    session: str
+    """How the id of its main session begins."""
+    endpoints: tuple[str, ...]
+
+
+class Links:
+    """Who the main session is linked to, and how to link it to more."""
+
+    def __init__(self, session: zenoh.Session, settings: dict[str, Any]) -> None:
+        self._session = session
+        self._settings = settings
+        self._own = str(session.zid())
+        self.bridges: Final[bool] = settings["mode"] == "router"
+        self.certified: Final = _TLS in settings
+        self.listen: Final = [Endpoint.read(text) for text in settings["listen/endpoints"]]
+        self._tag = _tag(settings)
+        self._shown = next((own for own in self.listen if not own.loopback), self.listen[0])
+        self._routers: set[str] = set()
+        self._router_lost_s = -math.inf
+        self._beacon_id = f"{self._tag}{self._own[:_NAME]}{self._shown.port:04x}"
+
+    def bridge_lost(self) -> bool:
+        """Whether the main session's link to a bridge went within the last second, as far as was looked."""
+        try:
+            there = {str(router) for router in self._session.info.routers_zid()}
+        except zenoh.ZError:  # closed
+            return False
+        if self._routers - there:
+            self._router_lost_s = time.monotonic()
+        self._routers = there
+        return time.monotonic() - self._router_lost_s < _MOMENT_S
+
+    def bridged(self) -> bool:
+        """Whether the main session is linked to a bridge, or was within the last second."""
+        return self.bridge_lost() or bool(self._routers)
+
+    def count(self) -> int:
+        """How many links the main session has."""
+        try:
+            return len(_others(self._session))
+        except zenoh.ZError:  # closed
+            return 0
+
+    def linked(self, session: str) -> bool:
+        """Whether the main session is linked to one whose id begins so."""
+        try:
+            return any(other.startswith(session) for other in _others(self._session))
+        except zenoh.ZError:  # closed
+            return False
+
+    def interfaces(self, endpoint: str) -> list[str]:
+        """By which interfaces one comes to the main session at that endpoint of its own; none if one cannot."""
+        asking = self._beside([], [endpoint], {})
+        try:
+            return [name for link in asking.info.links() for name in link.interfaces]
+        finally:
+            asking.close()
+
+    def linked_at(self, endpoint: str) -> bool:
+        """Whether one of the main session's links leads there."""
+        wanted = set(Endpoint.read(endpoint).resolved())
+        try:
+            return any(_plain(str(link.dst)) in wanted for link in self._session.info.links())
+        except zenoh.ZError:  # closed
+            return False
+
+    def beacon(self) -> Beacon:
+        """A session linked to the main one that answers scouts and dials nobody, until it is closed."""
+        listen = str(self._shown._replace(port=0))
+        return Beacon(self._beside([listen], [self._door()], {**self._scouting(), "id": self._beacon_id}))
+
+    def scouted(self, for_s: float, ended: Callable[[], bool]) -> Iterator[Found]:
+        """Ask who is there; each container of this system that lets itself be found, once."""
+        seen = {self._beacon_id}
+        asking = zenoh.scout(zenoh.handlers.FifoChannel(256), what="peer", config=_config(self._scouting()))
+        try:
+            until = time.monotonic() + for_s
+            while time.monotonic() < until and not ended():
+                hello = asking.try_recv()
+                if hello is None:
+                    time.sleep(_LOOK_S)
+                    continue
+                found = str(hello.zid)
+                if found not in seen and found.startswith(self._tag):
+                    seen.add(found)
+                    yield _found(found, map(str, hello.locators))
+        finally:
+            asking.stop()
+
+    def join(self, endpoints: Sequence[str], session: str, wait_s: float, ended: Callable[[], bool]) -> str:
+        """Link the main session with one whose id begins so, or else with whoever listens there.
+
+        Returns:
+            The id of whom it is linked to now; empty if nobody lets us in within ``wait_s``.
+        """
+        helper = self._beside([], [self._door(), *endpoints], {})
+        try:
+            until = time.monotonic() + wait_s
+            while time.monotonic() < until and not ended():
+                there = session or next((p for p in _others(helper) if p != self._own), "")
+                if there and self.linked(there):
+                    return there
+                time.sleep(_LOOK_S)
+            return ""
+        finally:
+            helper.close()
+
+    def _door(self) -> str:
+        """Where a session of this process reaches the main one."""
+        return dialled_from_here(self.listen[0])
+
+    def _beside(self, listen: Sequence[str], connect: Sequence[str], more: dict[str, Any]) -> zenoh.Session:
+        settings = {
+            **self._settings,
+            "id": new_session_id(),
+            "mode": "peer",
+            "gateway": {},
+            "listen/endpoints": list(listen),
+            "connect/endpoints": list(connect),
+            "scouting/gossip/autoconnect": _NOBODY,
+            **more,
+        }
+        try:
+            return open_session(settings)
+        except zenoh.ZError as bad:
+            raise ConfigurationError(where="links beside the main one", problem=f"cannot be opened: {bad}") from None
+
+    def _scouting(self) -> dict[str, Any]:
+        return {
+            "scouting/multicast/enabled": True,
+            "scouting/multicast/listen": True,
+            "scouting/multicast/autoconnect": _NOBODY,
+            "scouting/multicast/interface": self._interface(),
+        }
+
+    def _interface(self) -> str:
+        """S21: who listens on this host only asks and answers on this host only."""
+        if not all(own.loopback for own in self.listen):
+            return "auto"
+        loopback = loopback_interface()
+        if not loopback:
+            problem = "no loopback interface was found, and this container may not be found from other hosts"
+            raise ConfigurationError(where="discovery", problem=problem)
+        return loopback
+
+
+def _others(session: zenoh.Session) -> list[str]:
+    """Ids of whom a session is linked to."""
+    return [str(other) for other in (*session.info.peers_zid(), *session.info.routers_zid())]
+
+
+def _found(beacon: str, locators: Iterable[str]) -> Found:
+    port = int(beacon[_TAG + _NAME :], 16)
+    endpoints = (Endpoint.read(locator)._replace(port=port) for locator in locators)
+    return Found(beacon[_TAG:][:_NAME], tuple(map(str, endpoints)))
+
+
+def _tag(settings: dict[str, Any]) -> str:
+    """What the ids of one system's beacons begin with; without its password, or its authority's certificate, nobody can
+    tell which system it is.
+    """
+    known = authority(settings[_TLS]) if _TLS in settings else str(settings[_PASSWORD]).encode()
+    digest = hmac.digest(known, str(settings["namespace"]).encode(), hashlib.sha256).hex()
+    return "b" + digest[: _TAG - 1]
+
+
+def _plain(locator: str) -> str:
+    return locator.split("?", maxsplit=1)[0].split("#", maxsplit=1)[0]

@@ -1,0 +1,368 @@
+"""Rules that configure a running system: on this occasion, if this holds, take these steps."""
+
+import itertools
+import logging
+import time
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+import msgspec
+from msgspec import Struct, structs
+
+from trade._calls.handle import Handle
+from trade._container.container import Container
+from trade._notifications.notification import Notification
+from trade._protocol.messages import HEALTHY
+from trade._services.decorator import service
+from trade.rules._file import Rule, read_rules
+from trade.rules._loop_detector import TURNS, Causes, Mark, Way, turns
+from trade.rules._steps import Did, Firing, done, fired, holds
+
+GROUP: Final = "rules"
+MOST: Final = 5
+"""So often a rule fires within `WITHIN_S` for the same service; more is a loop."""
+WITHIN_S: Final = 60.0
+LOOK_S: Final = 1.0
+"""How often it is looked whether a service is missing."""
+_KEPT: Final = 200
+_LONGEST_HEALTH: Final = 500
+
+_logger = logging.getLogger("trade.rules")
+
+
+class RuleInfo(Struct, frozen=True, kw_only=True):
+    """One rule, as everybody may know it."""
+
+    name: str
+    occasion: str
+    condition: str
+    container: str
+    """Where it runs, with whose rights."""
+    state: str
+    """``standing``, or ``stopped`` until the file is read again."""
+    why: str
+    """It was stopped."""
+    cooldown_s: float
+    fired: int
+    failed: int
+    """Times a step failed, or the condition could not be asked."""
+    skipped: int
+    """Occasions during the cooldown."""
+    last_error: str
+    dry_run: bool
+
+
+class _Standing:
+    """One rule at work. Its occasions are told of one after the other."""
+
+    def __init__(self, engine: "Rules", name: str, rule: Rule) -> None:
+        self.name: Final = name
+        self.told_as: Final = f"rule {name}"
+        self.rule: Final = rule
+        self._engine = engine
+        self.why = ""
+        self._notifications: list[Notification] = []
+        self._resting: dict[str, int] = {}
+        """Services, and until when nothing is done for them."""
+        self._recent: deque[tuple[int, str]] = deque()
+        """When it fired, for which service."""
+        self._not_so_ns = time.monotonic_ns()
+        """When what it waits for was last seen not to be so."""
+        self._way: Way = ()
+        """What led to its being so, while it is."""
+        self._fired = self._failed = self._skipped = 0
+        self._last_error = ""
+
+    def begin(self) -> None:
+        container, when = self._engine.container, self.rule.when
+        if when.every_s is not None:
+            self._notifications.append(container.every(when.every_s, self._tick))
+            return
+        assert when.selection is not None  # noqa: S101 - checked with the file
+        constraint = when.selection.constraint()
+        match when.kind:
+            case "joined":
+                self._notifications.append(container.joined(constraint, self._happened))
+            case "left":
+                self._notifications.append(container.left(constraint, self._happened))
+            case "changed":
+                self._notifications.append(container.changed(constraint, self._altered))
+            case _:
+                self._notifications.append(container.joined(constraint, self._there))
+                self._notifications.append(container.every(LOOK_S, self._look))
+
+    def end(self) -> None:
+        for notification in self._notifications:
+            notification.cancel()
+
+    def info(self) -> RuleInfo:
+        return RuleInfo(
+            name=self.name,
+            occasion=str(self.rule.when),
+            condition="" if self.rule.if_ is None else f"if {self.rule.if_}",
+            container=self._engine.container.name,
+            state="stopped" if self.why else "standing",
+            why=self.why,
+            cooldown_s=self.rule.cooldown_s,
+            fired=self._fired,
+            failed=self._failed,
+            skipped=self._skipped,
+            last_error=self._last_error,
+            dry_run=self._engine.dry_run,
+        )
+
+    # --- occasions
+
+    def _happened(self, about: Handle) -> None:
+        now = time.monotonic_ns()
+        if now < self._resting.get(about.label, 0):
+            self._skipped += 1
+        elif self._holds(about)[0]:
+            self._fire(about, self._way_to(about.label, now))
+
+    def _altered(self, about: Handle) -> None:
+        selection = self.rule.when.selection
+        if selection is not None and selection.constraint().matches(about.record):  # and has not just ceased to
+            self._happened(about)
+
+    def _there(self, _about: Handle) -> None:
+        self._not_so()
+
+    def _look(self) -> None:
+        selection = self.rule.when.selection
+        if selection is not None and self._engine.container.services(selection.constraint()):
+            self._not_so()
+        else:
+            self._tick()
+
+    def _tick(self) -> None:
+        if time.monotonic_ns() < self._resting.get("", 0):
+            return
+        held, about = self._holds(None)
+        if not held:
+            self._not_so()
+            return
+        if self.rule.when.every_s is None or self.rule.if_ is not None:  # time alone has no cause
+            self._way = self._way or self._way_to("", self._not_so_ns)
+        self._fire(about, self._way or (Mark(self.name),))
+
+    def _not_so(self) -> None:
+        self._not_so_ns, self._way = time.monotonic_ns(), ()
+
+    def _holds(self, about: Handle | None) -> tuple[bool, Handle | None]:
+        try:
+            return holds(self._engine.container, self.rule.if_, about)
+        except Exception as error:  # noqa: BLE001 - a condition that cannot be asked does not hold, and is told of
+            self._fail(f"{type(error).__name__}: {error}")
+            return False, about
+
+    def _way_to(self, label: str, since_ns: int) -> Way:
+        return self._engine.causes.way_to(Mark(self.name, label), since_ns)
+
+    # --- firing
+
+    def _fire(self, about: Handle | None, way: Way) -> None:
+        loop = self._loop(way)
+        if loop:
+            self.end()
+            self.why = loop
+            self._engine.note(self._firing(about, way, stopped=loop))
+            return
+        firing, began = self._firing(about, way), time.monotonic_ns()
+        self._recent.append((began, way[-1].service))
+        past = self._engine.causes.begin(way)
+        try:
+            steps = done(self._engine.container, self.rule.do, about, dry_run=self._engine.dry_run)
+        finally:
+            past.ended_ns = time.monotonic_ns()
+        self._fired += 1
+        for error in (did.error for did in steps if did.error):
+            self._fail(error)
+        self._rest(way[-1].service, past.ended_ns)
+        self._engine.note(structs.replace(firing, steps=steps, took_s=(past.ended_ns - began) / 1e9))
+
+    def _firing(self, about: Handle | None, way: Way, *, stopped: str = "") -> Firing:
+        return fired(self.name, str(self.rule.when), about, way, dry_run=self._engine.dry_run, stopped=stopped)
+
+    def _loop(self, way: Way) -> str:
+        """Why it must not fire once more, if it must not."""
+        if turns(way) >= TURNS:
+            last_turn = max(place for place, mark in enumerate(way[:-1]) if mark == way[-1])
+            circle = " -> ".join(mark.rule for mark in way[last_turn:])
+            return f"it brings itself about, {turns(way)} times over: {circle}"
+        if self.rule.when.every_s is not None:
+            return ""
+        since_ns = time.monotonic_ns() - int(WITHIN_S * 1e9)
+        while self._recent and self._recent[0][0] < since_ns:
+            self._recent.popleft()
+        often = sum(service == way[-1].service for _, service in self._recent)
+        return f"it fired {often} times within {WITHIN_S:g} s; give it a longer cooldown_s" if often >= MOST else ""
+
+    def _rest(self, label: str, now_ns: int) -> None:
+        if self.rule.cooldown_s:
+            self._resting = {known: until for known, until in self._resting.items() if until > now_ns}
+            self._resting[label] = now_ns + int(self.rule.cooldown_s * 1e9)
+
+    def _fail(self, error: str) -> None:
+        self._failed += 1
+        if error != self._last_error:  # the same again says nothing new
+            self._last_error = error
+            _logger.warning("rule %s: %s", self.name, error)
+
+
+class Rules:
+    """The rules of a file at work in a container, with its identity and rights. Ends with ``close()``.
+
+    It is a provider in group ``rules``; its health names the rules that were stopped.
+    """
+
+    def __init__(
+        self,
+        container: Container,
+        file: Path,
+        *,
+        audit: Path | None = None,
+        dry_run: bool = False,
+        tell: Callable[[Firing], object] = lambda _firing: None,
+    ) -> None:
+        """Begin.
+
+        Args:
+            container: where they run.
+            file: the rules file.
+            audit: a file that gets a line of JSON for every firing; the logger ``trade.rules`` gets them all the same.
+            dry_run: look at what would be called on each occasion, and call nothing.
+            tell: called with every firing, on the thread that fired.
+
+        Raises:
+            ConfigurationError: the file is wrong, and says where.
+            AccessDenied: the policy does not let this container offer something in group ``rules``.
+        """
+        self.container: Final = container
+        self.dry_run: Final = dry_run
+        self.causes: Final = Causes()
+        self._audit = audit
+        self._tell = tell
+        self._firings: deque[Firing] = deque(maxlen=_KEPT)
+        self._numbers = itertools.count(1)
+        self._standing: dict[str, _Standing] = {}
+        self._closed = False
+        rules = read_rules(file)
+        container.register(self, GROUP)
+        self._go_by(rules)
+        container.note_change("rules read", str(file))
+
+    def load(self, file: Path) -> None:
+        """Go by another file, or by the same one as it is now. Rules that it leaves as they are go on undisturbed.
+
+        Those that were stopped begin anew.
+
+        Raises:
+            ConfigurationError: it is wrong, and says where; all goes on as before.
+        """
+        self._go_by(read_rules(file))
+        self.container.note_change("rules read", str(file))
+
+    def _go_by(self, rules: dict[str, Rule]) -> None:
+        old = self._standing
+        kept = {name for name, one in old.items() if one.rule == rules.get(name) and not one.why}
+        self._standing = {name: old[name] if name in kept else _Standing(self, name, rules[name]) for name in rules}
+        for name in old.keys() - kept:
+            old[name].end()
+        for name in (name for name in rules if name not in kept):
+            self.causes.forget(name)
+            self._standing[name].begin()
+        self._show_health()
+
+    @service(effect="read")
+    def rules(self) -> list[RuleInfo]:
+        """The rules that stand here, and how they fare."""
+        return [standing.info() for _, standing in sorted(self._standing.items())]
+
+    @service(effect="read")
+    def rule_firings(self) -> list[Firing]:
+        """The last firings, the oldest first."""
+        return list(self._firings)
+
+    def note(self, firing: Firing) -> None:
+        """Told by a rule that fired, or was stopped."""
+        self._firings.append(firing)
+        line = msgspec.json.encode(firing).decode()
+        _logger.log(logging.ERROR if firing.stopped else logging.INFO, "%s", line)
+        self.container.note_change("rule stopped" if firing.stopped else "rule fired", firing.rule)
+        if self._audit is not None:
+            try:
+                with self._audit.open("a", encoding="utf-8") as file:
+                    file.write(f"{line}\n")
+            except OSError as full:
+                _logger.warning("%s cannot be written: %s", self._audit, full)
+        if firing.stopped and not self._closed:
+            self._show_health()
+        self._tell(firing)
+
+    def _show_health(self) -> None:
+        stopped = [f"rule {standing.name}: {standing.why}" for standing in self._standing.values() if standing.why]
+        health = f"stopped: {'; '.join(stopped)}"[:_LONGEST_HEALTH] if stopped else HEALTHY
+        self.container.set_health(self, health)
+
+    def close(self) -> None:
+        """End all rules; what fires finishes. Idempotent."""
+        if not self._closed:
+            self._closed = True
+            for standing in self._standing.values():
+                standing.end()
+            self.container.deregister(self)
+
+    def __enter__(self) -> "Rules":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+class Rehearsal(Struct, frozen=True, kw_only=True):
+    """What a rule would do."""
+
+    rule: str
+    occasion: str
+    condition: str
+    now: str
+    """How things stand."""
+    fires: bool
+    """Whether it would fire now."""
+    steps: tuple[Did, ...]
+
+
+def rehearse(container: Container, rules: dict[str, Rule]) -> list[Rehearsal]:
+    """What the rules would do as things are now, in that container. Reads conditions, and calls nothing else."""
+    return [_rehearsed(container, name, rule) for name, rule in rules.items()]
+
+
+def _rehearsed(container: Container, name: str, rule: Rule) -> Rehearsal:
+    selection = rule.when.selection
+    found = container.services(selection.constraint()) if selection is not None else []
+    about = found[0] if found and rule.when.of_services else None
+    now = [f"{len(found)} match: {', '.join(handle.label for handle in found)}" if found else "nothing matches"]
+    fires = not rule.when.of_services and not found
+    if selection is None:
+        now = []
+    if rule.if_ is not None:
+        try:
+            held, about = holds(container, rule.if_, about)
+            now.append("the condition holds" if held else "the condition does not hold")
+        except Exception as error:  # noqa: BLE001 - told in its place
+            held = False
+            now.append(f"the condition cannot be asked: {type(error).__name__}: {error}")
+        fires = fires and held
+    unknown = about is None and (rule.when.of_services or rule.if_ is not None)
+    steps = () if unknown else done(container, rule.do, about, dry_run=True)
+    return Rehearsal(
+        rule=name,
+        occasion=str(rule.when),
+        condition="" if rule.if_ is None else f"if {rule.if_}",
+        now="; ".join(now),
+        fires=fires,
+        steps=steps,
+    )

@@ -1,0 +1,323 @@
+"""A rules file: on which occasion what is called. Everything in it is checked before any of it counts."""
+
+import math
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final, cast
+
+import msgspec
+from msgspec import UNSET, Struct, UnsetType
+
+from trade._calls.handle import LONGEST_DEADLINE_S, Handle
+from trade._notifications.triggers import LONGEST_S, SHORTEST_S
+from trade._protocol.keys import is_chunk
+from trade._protocol.messages import Scalar
+from trade._registry.constraints import Constraint, where
+from trade._toml import read_toml_text
+from trade.errors import ConfigurationError
+
+SERVICE: Final = "$service"
+"""Stands for the service that joined, left or changed; if the occasion is about none, for the one that ``if`` asks."""
+CONTAINER: Final = "$container"
+"""Stands for the name of its container."""
+
+_AT: Final = re.compile(r" - at `\$\.?([^`]*)`$")
+_MISSING: Final = re.compile(r"missing required field `([^`]*)`")
+_UNKNOWN: Final = re.compile(r"contains unknown field `([^`]*)`")
+_EXAMPLES: Final = {
+    "when": 'when = { left = { name = "look", group = "rosie" } }',
+    "do": 'do = [{ call = { name = "set_broadcast", group = "trade", local = true }, args = [true] }]',
+    "service": 'service = { name = "level", group = "rosie.battery" }',
+}
+
+
+class Selection(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Which services: the words of `where` that are plain data; of several each must hold."""
+
+    name: str | None = None
+    group: str | None = None
+    host: str | None = None
+    container: str | None = None
+    local: bool | None = None
+    achieves: str | list[str] | None = None
+    uses: str | None = None
+    kind: str | None = None
+    meta: dict[str, Scalar] | None = None
+    healthy: bool | None = None
+
+    def constraint(self, about: Handle | None = None) -> Constraint:
+        """The same as a constraint; ``about``: the service that the occasion is about."""
+        container = about.container if about is not None and self.container == CONTAINER else self.container
+        return where(
+            name=self.name,
+            group=self.group,
+            host=self.host,
+            container=container,
+            local=self.local,
+            achieves=self.achieves,
+            uses=self.uses,
+            kind=self.kind,
+            meta=self.meta,
+            healthy=self.healthy,
+        )
+
+
+class Occasion(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """When a rule fires: exactly one of these."""
+
+    joined: Selection | None = None
+    left: Selection | None = None
+    changed: Selection | None = None
+    """A service matches after its groups, metadata, health or description have become others."""
+    missing: Selection | None = None
+    """As long as no service matches."""
+    every_s: float | None = None
+
+    @property
+    def kind(self) -> str:
+        """The one that it is."""
+        return next(name for name in self.__struct_fields__ if getattr(self, name) is not None)
+
+    @property
+    def selection(self) -> Selection | None:
+        """Which services it is about."""
+        return self.joined or self.left or self.changed or self.missing
+
+    @property
+    def of_services(self) -> bool:
+        """Whether there is a ``$service``."""
+        return self.missing is None and self.every_s is None
+
+    def __str__(self) -> str:
+        if self.every_s is not None:
+            return f"every {self.every_s:g} s"
+        return f"{self.kind} {cast('Selection', self.selection).constraint()}"
+
+
+class Condition(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, rename={"is_": "is"}):
+    """A service that only reads, and what it must answer: True, if nothing is said."""
+
+    service: Selection
+    args: list[Any] | dict[str, Any] = []
+    field: str = ""
+    """Of its answer."""
+    above: float | None = None
+    below: float | None = None
+    is_: Scalar | UnsetType = UNSET
+
+    def holds(self, answer: Any) -> bool:
+        """Whether that answer is as it must be.
+
+        Raises:
+            ConfigurationError: it cannot be compared.
+        """
+        value = _picked(answer, self.field)
+        if self.is_ is not UNSET:
+            return value == self.is_ and isinstance(value, bool) is isinstance(self.is_, bool)
+        if self.above is None and self.below is None:
+            if not isinstance(value, bool):
+                raise ConfigurationError(where=str(self), problem=f"needs above, below or is: it answers {value!r}")
+            return value
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise ConfigurationError(where=str(self), problem=f"answers {value!r}, which is no number")
+        return (self.above is None or value > self.above) and (self.below is None or value < self.below)
+
+    def __str__(self) -> str:
+        said = [f"above {self.above:g}" if self.above is not None else ""]
+        said += [f"below {self.below:g}" if self.below is not None else ""]
+        said += [f"is {self.is_!r}" if self.is_ is not UNSET else ""]
+        field = f", {self.field}" if self.field else ""
+        return " ".join(["the service with", f"{self.service.constraint()}{field}", *filter(None, said)])
+
+
+def _picked(answer: Any, field: str) -> Any:
+    if not field:
+        return answer
+    fields: Any = answer
+    value = fields.get(field, UNSET) if isinstance(answer, Mapping) else getattr(fields, field, UNSET)
+    if value is UNSET:
+        raise ConfigurationError(where=f"field {field!r}", problem=f"the answer has none: {answer!r}")
+    return value
+
+
+class Step(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A call of the only service that matches, or waiting until there is one."""
+
+    call: Selection | str | None = None
+    """``$service``: the one that the rule is about."""
+    args: list[Any] | dict[str, Any] = []
+    """In order, or by name."""
+    deadline_s: float = 10.0
+    wait_for: Selection | None = None
+    s: float = 10.0
+    """How long to wait."""
+    always: bool = False
+    """Also after a step that failed."""
+
+    def __str__(self) -> str:
+        if isinstance(self.wait_for, Selection):
+            return f"wait {self.s:g} s for {self.wait_for.constraint()}"
+        return f"call {self.call.constraint() if isinstance(self.call, Selection) else self.call}"
+
+
+class Rule(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, rename={"if_": "if"}):
+    """One rule."""
+
+    when: Occasion
+    do: list[Step]
+    if_: Condition | None = None
+    cooldown_s: float = 0.0
+    """After it has fired, for the same service, occasions are left out for so long."""
+
+
+class RulesFile(Struct, frozen=True, forbid_unknown_fields=True):
+    """All of it."""
+
+    rule: dict[str, Any]
+
+
+def read_rules(path: Path) -> dict[str, Rule]:
+    """Read and check a rules file; the rules by name.
+
+    Raises:
+        ConfigurationError: names the file, the key and what would be right.
+    """
+    file = str(path)
+    try:
+        text = path.read_text(encoding="utf-8")
+        raw = read_toml_text(text)
+    except OSError as bad:
+        raise ConfigurationError(where=file, problem=f"cannot be read: {bad.strerror or bad}") from None
+    except ValueError as bad:  # no TOML, or no UTF-8
+        raise ConfigurationError(where=file, problem=f"not valid TOML: {bad}") from None
+    tables = _converted(raw, RulesFile, file, "").rule
+    rules: dict[str, Rule] = {}
+    for name, table in tables.items():
+        at = f"{file}: rule.{name}"
+        if not is_chunk(name):
+            raise ConfigurationError(where=at, problem="is no name; use letters, digits, . _ - (at most 80)")
+        rules[name] = _converted(table, Rule, at, ".")
+        _Check(rules[name], at).all()
+    return rules
+
+
+def _converted(raw: Any, kind: Any, where: str, joint: str) -> Any:
+    try:
+        return msgspec.convert(raw, kind)
+    except msgspec.ValidationError as bad:
+        said = str(bad)
+    at = _AT.search(said)
+    path = at.group(1) if at else ""
+    place = f"{where}{joint or ': '}{path}" if path else where
+    if missing := _MISSING.search(said):
+        key = missing.group(1)
+        raise ConfigurationError(where=place, problem=f"{key} is missing; write {_EXAMPLES.get(key, key)}")
+    if unknown := _UNKNOWN.search(said):
+        raise ConfigurationError(where=place, problem=f"has no {unknown.group(1)!r}; {_known(path, kind)}")
+    raise ConfigurationError(where=place, problem=said[: at.start()] if at else said)
+
+
+def _known(path: str, kind: Any) -> str:
+    """The keys that there are at that place."""
+    last = re.sub(r"\[.*?\]", "", path).rpartition(".")[2]
+    kinds: dict[str, Any] = {"": kind, "when": Occasion, "if": Condition, "do": Step}
+    return f"there is {', '.join(kinds.get(last, Selection).__struct_encode_fields__)}"
+
+
+class _Check:
+    """What the types do not say."""
+
+    def __init__(self, rule: Rule, at: str) -> None:
+        self._rule = rule
+        self._at = at
+
+    def all(self) -> None:
+        rule = self._rule
+        said = [name for name in rule.when.__struct_fields__ if getattr(rule.when, name) is not None]
+        if len(said) != 1:
+            self._wrong("when", f"says {' and '.join(said) or 'nothing'}; it is exactly one: {_EXAMPLES['when']}")
+        if rule.when.selection is not None:
+            self._selection(rule.when.selection, f"when.{said[0]}", known=None)
+        self._number("when.every_s", rule.when.every_s, SHORTEST_S, LONGEST_S)
+        self._number("cooldown_s", rule.cooldown_s, 0.0, LONGEST_S)
+        if rule.when.missing is not None and rule.cooldown_s <= 0:
+            self._wrong("cooldown_s", "missing; say how long to wait before the next try: cooldown_s = 60")
+        if rule.if_ is not None:
+            self._condition(rule.if_)
+        if not rule.do:
+            self._wrong("do", f"has no steps; write {_EXAMPLES['do']}")
+        for number, step in enumerate(rule.do):
+            self._step(step, f"do[{number}]")
+
+    def _condition(self, condition: Condition) -> None:
+        self._selection(condition.service, "if.service", known=self._rule.when.of_services)
+        self._filled(condition.args, "if.args", known=self._rule.when.of_services)
+        self._number("if.above", condition.above, -math.inf, math.inf)
+        self._number("if.below", condition.below, -math.inf, math.inf)
+        if condition.is_ is not UNSET and (condition.above is not None or condition.below is not None):
+            self._wrong("if", "is goes with neither above nor below")
+
+    def _step(self, step: Step, at: str) -> None:
+        if (step.call is None) is (step.wait_for is None):
+            self._wrong(at, "is one of call and wait_for")
+        if step.wait_for is not None:
+            self._selection(step.wait_for, f"{at}.wait_for")
+        elif isinstance(step.call, Selection):
+            self._selection(step.call, f"{at}.call")
+        elif step.call == SERVICE:
+            self._filled(step.call, f"{at}.call")
+        else:
+            problem = f'{step.call!r} is no service; write call = {{ name = "...", group = "..." }}, or "{SERVICE}"'
+            self._wrong(f"{at}.call", problem)
+        self._filled(step.args, f"{at}.args")
+        self._number(f"{at}.deadline_s", step.deadline_s, SHORTEST_S, LONGEST_DEADLINE_S)
+        self._number(f"{at}.s", step.s, 0.0, LONGEST_DEADLINE_S)
+
+    def _selection(self, selection: Selection, at: str, *, known: bool | None = True) -> None:
+        if selection == Selection():
+            self._wrong(at, f"says nothing; there is {', '.join(Selection.__struct_fields__)}")
+        if selection.container == CONTAINER:
+            if known is None:
+                self._wrong(at, f"{CONTAINER} is known only once it has happened")
+            self._filled(CONTAINER, at, known=bool(known))
+        try:
+            selection.constraint()
+        except ConfigurationError as bad:
+            self._wrong(at, bad.problem)
+
+    def _filled(self, value: Any, at: str, *, known: bool = True) -> None:
+        """What stands for something does so; ``known``: once there is a condition, too."""
+        about = self._rule.when.of_services or (known and self._rule.if_ is not None)
+        for text in _texts(value):
+            if text.startswith("$") and text not in (SERVICE, CONTAINER):
+                self._wrong(at, f"{text!r} stands for nothing; there is {SERVICE} and {CONTAINER}")
+            if text in (SERVICE, CONTAINER) and not about:
+                problem = f"{text} is of rules with joined, left, changed or if; this one has {self._rule.when.kind}"
+                self._wrong(at, problem)
+
+    def _number(self, key: str, value: float | None, least: float, most: float) -> None:
+        if value is not None and not (math.isfinite(value) and least <= value <= most):
+            self._wrong(key, f"must be a number from {least:g} to {most:g}, not {value}")
+
+    def _wrong(self, key: str, problem: str) -> None:
+        raise ConfigurationError(where=f"{self._at}.{key}", problem=problem)
+
+
+def _texts(value: Any) -> list[str]:
+    if isinstance(value, str):
+        return [value]
+    if isinstance(value, Mapping):
+        value = list(cast("Mapping[str, Any]", value).values())
+    return [text for one in cast("list[Any]", value) for text in _texts(one)] if isinstance(value, list) else []
+
+
+def filled(value: Any, about: Handle | None) -> Any:
+    """A value of the file with what ``$service`` and ``$container`` stand for."""
+    if isinstance(value, Mapping):
+        return {key: filled(one, about) for key, one in cast("Mapping[str, Any]", value).items()}
+    if isinstance(value, list):
+        return [filled(one, about) for one in cast("list[Any]", value)]
+    if about is not None and isinstance(value, str):
+        return {SERVICE: about, CONTAINER: about.container}.get(value, value)
+    return value

@@ -1,0 +1,148 @@
+"""What a rule does when it fires, and what it would do."""
+
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, Final, Protocol
+
+from msgspec import Struct
+
+from trade._calls.handle import Handle
+from trade._protocol.keys import Address
+from trade._registry.constraints import Constraint
+from trade.errors import ConfigurationError
+from trade.rules._file import SERVICE, Condition, Selection, Step, filled
+from trade.rules._loop_detector import Way
+
+_LONGEST_RESULT: Final = 200
+
+
+class Home(Protocol):
+    """What rules need of the container they run in."""
+
+    @property
+    def address(self) -> Address: ...
+    @property
+    def name(self) -> str: ...
+    def find(self, constraint: Constraint, *, wait_s: float = ...) -> Handle: ...
+    def services(self, constraint: Constraint | None = ...) -> list[Handle]: ...
+    def require_call(self, who: str, handle: Handle) -> None: ...
+
+
+class Did(Struct, frozen=True, kw_only=True):
+    """One step as it was done. Arguments are not repeated: they stand in the file, and may be secret."""
+
+    step: str
+    service: str = ""
+    """What was called, or waited for."""
+    container: str = ""
+    result: str = ""
+    error: str = ""
+    """Its type and message."""
+
+
+class Firing(Struct, frozen=True, kw_only=True):
+    """A rule that fired, or was stopped instead."""
+
+    rule: str
+    occasion: str
+    service: str = ""
+    """Which it was about, if any."""
+    at: float
+    """Seconds since the epoch."""
+    took_s: float = 0.0
+    steps: tuple[Did, ...] = ()
+    led_by: tuple[str, ...] = ()
+    """Rules that may have brought it about, the first cause first."""
+    dry_run: bool = False
+    """Nothing was called: it says what would have been."""
+    stopped: str = ""
+    """Why it does not fire any more."""
+
+    @property
+    def ok(self) -> bool:
+        """Whether it was done, every step of it."""
+        return not self.stopped and not any(did.error for did in self.steps)
+
+
+def fired(rule: str, occasion: str, about: Handle | None, way: Way, *, dry_run: bool, stopped: str = "") -> Firing:
+    """A firing that begins now."""
+    return Firing(
+        rule=rule,
+        occasion=occasion,
+        service=about.label if about is not None else "",
+        at=time.time(),
+        led_by=tuple(mark.rule for mark in way[:-1]),
+        dry_run=dry_run,
+        stopped=stopped,
+    )
+
+
+def done(home: Home, steps: Sequence[Step], about: Handle | None, *, dry_run: bool) -> tuple[Did, ...]:
+    """Do the steps one after the other, up to one that fails; beyond it only those that are to be done always.
+
+    In a dry run each is looked at, and nothing is called.
+    """
+    do: Callable[[Home, Step, Handle | None], Did] = _rehearse if dry_run else _do
+    all_done: list[Did] = []
+    failed = False
+    for step in steps:
+        if failed and not step.always:
+            continue
+        try:
+            did = do(home, step, about)
+        except Exception as error:  # noqa: BLE001 - whatever a service raises is noted
+            did, failed = Did(step=str(step), error=f"{type(error).__name__}: {error}"), not dry_run
+        all_done.append(did)
+    return tuple(all_done)
+
+
+def _do(home: Home, step: Step, about: Handle | None) -> Did:
+    if step.wait_for is not None:
+        found = home.find(step.wait_for.constraint(about), wait_s=step.s)
+        return Did(step=str(step), service=found.label, container=found.container)
+    handle = _called(home, step, about)
+    result = _call(handle.with_(deadline_s=step.deadline_s), step.args, about)
+    text = repr(result)[:_LONGEST_RESULT]
+    return Did(step=str(step), service=handle.label, container=handle.container, result=text)
+
+
+def _rehearse(home: Home, step: Step, about: Handle | None) -> Did:
+    if step.wait_for is not None:
+        found = home.services(step.wait_for.constraint(about))
+        there = found[0] if found else None
+        return Did(
+            step=str(step),
+            service=there.label if there else "",
+            container=there.container if there else "",
+            result="is there" if there else "would wait for it",
+        )
+    handle = _called(home, step, about)
+    home.require_call(home.address.identity, handle)
+    return Did(step=str(step), service=handle.label, container=handle.container, result="would be called")
+
+
+def _called(home: Home, step: Step, about: Handle | None) -> Handle:
+    if step.call == SERVICE:
+        assert about is not None  # noqa: S101 - checked with the file
+        return about
+    assert isinstance(step.call, Selection)  # noqa: S101
+    return home.find(step.call.constraint(about), wait_s=0)
+
+
+def _call(handle: Handle, args: list[Any] | dict[str, Any], about: Handle | None) -> Any:
+    given = filled(args, about)
+    return handle(**given) if isinstance(given, dict) else handle(*given)
+
+
+def holds(home: Home, condition: Condition | None, about: Handle | None) -> tuple[bool, Handle | None]:
+    """Whether a rule's condition holds now, and which service the steps are about: if the occasion has none, the asked.
+
+    Raises what finding and asking the service does.
+    """
+    if condition is None:
+        return True, about
+    handle = home.find(condition.service.constraint(about), wait_s=0)
+    if handle.effect != "read":
+        problem = f"{handle.label} does not only read, so it is no condition"
+        raise ConfigurationError(where=str(condition), problem=problem)
+    return condition.holds(_call(handle, condition.args, about)), handle if about is None else about
