@@ -16,7 +16,7 @@ from tests.holds import Ask, Done, Held, Log, Seen, now
 
 from trade import Container, Handle, Settings, where
 from trade._context.call_context import holding
-from trade._locks.claims import Claim
+from trade._context.claims import Claim
 from trade._protocol.keys import Address
 from trade._protocol.messages import Token
 from trade._transport.base import ChannelClosed

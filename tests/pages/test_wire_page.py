@@ -11,7 +11,7 @@ import pytest
 from msgspec import Struct, structs
 
 from pages.blocks import DOCS
-from trade._discovery.host_folder import runtime_folder
+from trade._paths import runtime_folder
 from trade._protocol.messages import ProviderInfo, ServiceInfo, decode_provider
 from trade._transport.credentials import user_secret
 

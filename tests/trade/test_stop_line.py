@@ -12,8 +12,8 @@ import pytest
 
 from trade import Container, Settings, service
 from trade._audit.events import Event
-from trade._discovery.host_folder import runtime_folder
 from trade._estop.broadcast import EstopReport, all_of
+from trade._paths import runtime_folder
 from trade._protocol.messages import Malformed
 from trade._stop_line import StopLines, StopReport
 from trade._stop_line.group_stop import together

@@ -19,7 +19,7 @@ from trade._container.container import Container
 from trade._container.hooking import Hook
 from trade._container.notifying import POLL_S
 from trade._container.reachability import Sight
-from trade._container.system import ContainerInfo, System, WithdrawnInfo
+from trade._container.system import System
 from trade._container.tracing import LogReader, Trace
 from trade._context.call_context import CallContext, current_call, progress
 from trade._context.sessions import Session
@@ -32,6 +32,7 @@ from trade._locks.lock import Lock, OnLost, OnRequest
 from trade._migration.target import Prepared
 from trade._notifications.notification import Notification, NotificationInfo
 from trade._notifications.triggers import What
+from trade._protocol.container_info import ContainerInfo
 from trade._protocol.messages import HEALTHY, Estop, Scalar, Token
 from trade._protocol.samples import Sample
 from trade._protocol.schema_types import publish
@@ -40,6 +41,7 @@ from trade._resources.lock_request import Granted, LockInfo
 from trade._resources.resource import Holder, Permit, Resource, permit
 from trade._services.decorator import service
 from trade._services.secret import Secret
+from trade._services.withdrawn import WithdrawnInfo
 from trade._settings import Settings
 from trade._stop_line import StopReport
 from trade._streams.stream import If, Stream

@@ -7,7 +7,7 @@ from typing import Annotated, Literal, TypeVar, cast
 import msgspec
 from msgspec import Meta, Struct
 
-from trade._container.system import DOMAIN
+from trade._protocol.keys import DOMAIN
 from trade._toml import read_toml_text
 from trade.errors import ConfigurationError
 from trade_drivers.robotfile._convert import explain, record_of, wrong

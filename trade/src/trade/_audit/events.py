@@ -6,15 +6,15 @@ Off, nothing of it stands in the way of a call. On, a call puts one record into 
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, Protocol
+from typing import Any, Final, Literal, NamedTuple, Protocol
 
 from msgspec import Struct
 
-from trade._container.system import DOMAIN
 from trade._context.call_context import CallContext
+from trade._context.interceptor import Interceptor, ServedService
 from trade._context.sessions import foreign
 from trade._counters import Calls
-from trade._protocol.keys import Address
+from trade._protocol.keys import DOMAIN, Address
 from trade._settings import Settings
 from trade.errors import (
     AccessDenied,
@@ -32,9 +32,6 @@ from trade.errors import (
     Stopped,
     TradeError,
 )
-
-if TYPE_CHECKING:
-    from trade._services.local_service import Around, LocalService
 
 Kind = Literal["call", "read", "stop", "lock", "configure", "refused", "audit"]
 
@@ -184,7 +181,7 @@ class Audit:
         elif self._own is not None:
             self.note("configure", what, about=about, who=self._own.identity, session=str(self._own))
 
-    def watch(self, domain: str, service: "LocalService") -> None:
+    def watch(self, domain: str, service: ServedService) -> None:
         """From now on tell of calls of a service that is about to be offered."""
         if self._tell is None and self.calls is None:
             return
@@ -243,7 +240,7 @@ class Audited:
     __slots__ = ("_around", "_calls", "_label", "_rule", "_tell", "_timed")
 
     def __init__(
-        self, tell: Tell | None, rule: _Rule, around: "Around | None", calls: Calls | None, label: str
+        self, tell: Tell | None, rule: _Rule, around: Interceptor | None, calls: Calls | None, label: str
     ) -> None:
         self._tell = tell
         self._rule = rule
@@ -252,11 +249,11 @@ class Audited:
         self._label = label
         self._timed = None if calls is None else calls.of(label)
 
-    def over(self, around: "Around | None") -> "Audited":
+    def over(self, around: Interceptor | None) -> "Audited":
         """The same, with something else between it and the service."""
         return Audited(self._tell, self._rule, around, self._calls, self._label)
 
-    def run(self, service: "LocalService", args: Sequence[Any], kwargs: dict[str, Any], context: CallContext) -> Any:
+    def run(self, service: ServedService, args: Sequence[Any], kwargs: dict[str, Any], context: CallContext) -> Any:
         """Call the service and tell of that. Its errors pass."""
         began_ns, outer_id = time.monotonic_ns(), context.outer_id  # when it has ended, it belongs to nobody
         try:
@@ -277,7 +274,7 @@ class Audited:
 
     def failed(
         self,
-        service: "LocalService",
+        service: ServedService,
         context: CallContext,
         error: BaseException,
         began_ns: int = 0,
@@ -297,7 +294,7 @@ class Audited:
 
     def _say(
         self,
-        service: "LocalService",
+        service: ServedService,
         context: CallContext,
         kind: Kind,
         outcome: str,

@@ -16,8 +16,7 @@ from typing import Any, Final
 from trade._audit.events import Event
 from trade._audit.hash_chain import AuditRow, Head
 from trade._audit.store import SUFFIX, AuditStore, Keep, move_aside
-from trade._calls.handle import Handle
-from trade._protocol.keys import Address
+from trade._protocol.keys import Address, ServiceKey
 from trade._settings import Settings
 
 _logger = logging.getLogger("trade")
@@ -270,8 +269,8 @@ def _text(about: Any) -> str:
     """In words; of what a caller may have made of any length, little."""
     if isinstance(about, str):
         return about
-    if isinstance(about, Handle):
-        return f"{about.key.address}: {about.label}"
+    if isinstance(key := getattr(about, "key", None), ServiceKey):  # a handle
+        return f"{key.address}: {about.label}"
     if isinstance(about, Sequence) and not isinstance(about, bytes):
         return ", ".join(_text(one) for one in about[:100])  # pyright: ignore[reportUnknownVariableType]
     return str(about) if isinstance(about, bool | int | float | Path) else type(about).__name__

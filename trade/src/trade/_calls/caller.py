@@ -17,8 +17,7 @@ from msgspec import Raw, structs
 from trade._calls.peer import NEVER, Peer
 from trade._calls.publishers import CallPublishers
 from trade._calls.reply_slot import Box, OnReply, Pending
-from trade._container.system import CLOCK, DOMAIN, PROVIDER
-from trade._protocol.keys import Address, reply_key
+from trade._protocol.keys import CLOCK, DOMAIN, PROVIDER, Address, reply_key
 from trade._protocol.messages import (
     CANCEL,
     EMPTY,

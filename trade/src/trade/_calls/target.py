@@ -12,13 +12,12 @@ from msgspec import Raw
 from trade._calls.caller import Caller
 from trade._calls.peer import Peer
 from trade._calls.run import Run
-from trade._container.system import CLOCK, DOMAIN, PROVIDER
 from trade._context.active_calls import Ongoing
 from trade._context.call_context import CallContext, handed_down, holding, patience_s, running
 from trade._context.outgoing import DEFAULT_DEADLINE_S, Request, in_ns, new_request
 from trade._context.sessions import speaking
 from trade._protocol.codec import Codec
-from trade._protocol.keys import Address
+from trade._protocol.keys import CLOCK, DOMAIN, PROVIDER, Address
 from trade._protocol.messages import EMPTY_ARGUMENTS, UNREADABLE, Call, ErrorInfo, Reply, ServiceInfo, Status
 from trade._protocol.remote_errors import unpack_error
 from trade._protocol.schema import read_schema

@@ -6,9 +6,8 @@ from trade._audit.events import Audit
 from trade._calls.caller import Caller
 from trade._calls.handle import Handle
 from trade._calls.target import LocalTarget, RemoteTarget, container_closed
-from trade._container.system import DOMAIN, ESTOPS, PROVIDER
 from trade._protocol.codec import Codec
-from trade._protocol.keys import Address, ServiceKey
+from trade._protocol.keys import DOMAIN, ESTOPS, PROVIDER, Address, ServiceKey
 from trade._protocol.messages import ServiceInfo
 from trade._registry.registry import Change, Record, Registry, gone_to
 from trade._security.authorizer import Access

@@ -15,7 +15,6 @@ from trade._calls.target_cache import Targets
 from trade._container.connect import join
 from trade._container.policy_reload import begin_watching
 from trade._container.shutdown import Terminating
-from trade._container.system import DOMAIN, ESTOPS, PROVIDER
 from trade._context.call_context import handed_down
 from trade._counters import Measure
 from trade._discovery.announcer import Announcer
@@ -35,7 +34,7 @@ from trade._migration.source import Departing
 from trade._migration.target import Arriving
 from trade._notifications import notification
 from trade._notifications.notifier import Notifier
-from trade._protocol.keys import Address, ServiceKey
+from trade._protocol.keys import DOMAIN, ESTOPS, PROVIDER, Address, ServiceKey
 from trade._protocol.messages import Token
 from trade._registry.constraints import where
 from trade._registry.registry import Change, Record, Registry

@@ -1,10 +1,12 @@
 """The provider of the middleware's own functions: what is in group ``trade`` of every container, e-stops left out."""
 
+from collections.abc import Callable
 from typing import Final, Protocol
+
+from msgspec import structs
 
 from trade._container.assembly import Parts
 from trade._container.system import System, SystemServices
-from trade._container.trace_services import TraceServices
 from trade._hooks.services import HookServices
 from trade._locks.services import LockServices
 from trade._migration.factory_services import MakingServices
@@ -12,7 +14,36 @@ from trade._migration.services import MigrationServices
 from trade._notifications.services import Home as Member
 from trade._notifications.services import NotificationServices
 from trade._security.authorizer import Access
+from trade._services.decorator import service
 from trade._streams.services import StreamServices
+from trade._telemetry.log_buffer import LogLine, logbook
+from trade._telemetry.spans import Span, Spans
+
+Switch = Callable[[bool], bool]
+
+
+class TraceServices:
+    """The wire's side of `Spans` and `Logbook`."""
+
+    def __init__(self, container: str, spans: Spans, switch: Switch) -> None:
+        self._teller = container
+        self._noted = spans
+        self._switch = switch
+
+    @service
+    def set_tracing(self, on: bool) -> bool:
+        """Note every call that this container makes and serves; off: what was noted stays. Whether it was on before."""
+        return self._switch(on)
+
+    @service(effect="read")
+    def spans(self, calls: list[int] | None = None, after: int = 0) -> list[Span]:
+        """What this container noted above that number, of these calls and those they led to, or all; oldest first."""
+        return self._noted.kept(None if calls is None else frozenset(calls), after)
+
+    @service(effect="read")
+    def log_lines(self, after: int = 0) -> list[LogLine]:
+        """What the process logged lately, of its lines after that one."""
+        return [structs.replace(line, container=self._teller) for line in logbook.lines(after)]
 
 
 class Home(Member, Protocol):

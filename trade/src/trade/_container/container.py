@@ -18,7 +18,7 @@ from trade._container.migrating import Moving
 from trade._container.motion_control import Guarding
 from trade._container.registering import Hosting
 from trade._container.streaming import Streaming
-from trade._container.system import ContainerInfo, System
+from trade._container.system import System
 from trade._container.tracing import Tracing
 from trade._context.call_context import running
 from trade._context.outgoing import new_request
@@ -26,6 +26,7 @@ from trade._context.sessions import Session
 from trade._counters import Measure
 from trade._discovery.dialer import Reach
 from trade._estop.services import EstopServices
+from trade._protocol.container_info import ContainerInfo
 from trade._protocol.keys import Address, ServiceKey, alive_key, as_chunk
 from trade._registry.registry import Record
 from trade._security.authorizer import Access, verb_of

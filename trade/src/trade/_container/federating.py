@@ -9,13 +9,12 @@ from msgspec import structs
 from trade._calls.handle import Handle
 from trade._container.base import Member
 from trade._container.proxy import Speaking, passed_on_service
-from trade._container.system import DOMAIN, PROVIDER
 from trade._context.sessions import Session
 from trade._estop.controller import Estopping
 from trade._locks.api import Locking
 from trade._locks.remote_locks import Borrowed, SharedResource
 from trade._protocol.codec import Codec
-from trade._protocol.keys import Address, ServiceKey
+from trade._protocol.keys import DOMAIN, PROVIDER, Address, ServiceKey
 from trade._protocol.messages import ProviderInfo, ServiceInfo
 from trade._registry.registry import Registry
 from trade._resources.resource import Resource

@@ -7,10 +7,9 @@ from typing import Final
 from trade._calls.handle import Bound, Handle
 from trade._calls.run import Run
 from trade._container.notifying import Notifying
-from trade._container.system import DOMAIN, PROVIDER
 from trade._hooks.hook import HookInfo, Side
 from trade._notifications.notification import Notification
-from trade._protocol.keys import ServiceKey
+from trade._protocol.keys import DOMAIN, PROVIDER, ServiceKey
 from trade._registry.constraints import Constraint, where
 from trade.errors import AccessDenied, ConfigurationError, ContainerLost, NoSuchHook, ServiceGone, TradeError
 

@@ -8,8 +8,8 @@ from trade._calls import batch
 from trade._calls.handle import Bound, Handle
 from trade._container.base import Member
 from trade._container.reachability import Sight, look_around
-from trade._container.system import DOMAIN
 from trade._context.call_context import patience_s
+from trade._protocol.keys import DOMAIN
 from trade._registry.constraints import Constraint, where
 from trade._registry.registry import Record
 from trade._registry.suggestions import asked_for, no_such_service, too_many_services

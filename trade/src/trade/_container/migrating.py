@@ -5,8 +5,7 @@ from typing import Any, Final
 
 from trade._calls.handle import Handle
 from trade._container.lookup import Looking
-from trade._container.system import DOMAIN, PROVIDER
-from trade._protocol.keys import ServiceKey
+from trade._protocol.keys import DOMAIN, PROVIDER, ServiceKey
 from trade._registry.constraints import Constraint
 from trade.errors import NoSuchService, TooManyServices
 

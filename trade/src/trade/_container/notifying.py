@@ -5,11 +5,11 @@ from datetime import datetime
 from typing import Final
 
 from trade._container.lookup import Looking
-from trade._container.system import DOMAIN
 from trade._context.sessions import speaking
 from trade._notifications.notification import Notification, NotificationInfo, Owner
 from trade._notifications.services import Hosted, placed
 from trade._notifications.triggers import OF_SERVICES, Terms, What, deed_of, epoch_s, target_of
+from trade._protocol.keys import DOMAIN
 from trade._registry.constraints import Constraint, where
 from trade.errors import NoSuchNotification
 

@@ -8,7 +8,7 @@ from msgspec import structs
 from trade._calls.handle import Handle
 from trade._calls.target import container_closed
 from trade._container.base import Member
-from trade._container.system import DOMAIN
+from trade._protocol.keys import DOMAIN
 from trade._protocol.messages import HEALTHY, ProviderInfo, Scalar
 from trade._registry.constraints import checked_meta
 from trade._services.offerable import checked_groups, checked_health

@@ -6,47 +6,17 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, Protocol
 
-from msgspec import Struct
-
 from trade._calls.handle import Handle
 from trade._discovery.dialer import Reach
-from trade._protocol.keys import Address, ServiceKey
-from trade._protocol.messages import PROTOCOL
+from trade._protocol.container_info import ContainerInfo
+from trade._protocol.keys import CLOCK, DOMAIN, Address, ServiceKey
 from trade._registry.constraints import Constraint, where
 from trade._remote.ssh import start
 from trade._services.decorator import service
+from trade._services.withdrawn import WithdrawnInfo
 from trade._settings import Settings
 from trade._telemetry.load import Load, LoadInfo
 from trade.errors import CannotStart, ConfigurationError, LinkStays, NoSuchService, TooManyServices
-
-DOMAIN: Final = "trade"
-PROVIDER: Final = "system"
-ESTOPS: Final = "estops"
-"""The provider of what has to do with e-stops, in the same domain."""
-CLOCK: Final = "clock"
-
-
-class ContainerInfo(Struct, frozen=True):
-    """One container as another one knows it."""
-
-    name: str
-    identity: str
-    epoch: str
-    host: str
-    pid: int
-    providers: int
-    services: int
-    protocol: int = PROTOCOL
-    """The version that it speaks; 0 before it has said anything to the one that tells of it. If it is another one than
-    that one's, nothing of what it offers is known there."""
-
-
-class WithdrawnInfo(Struct, frozen=True):
-    """A provider that was deregistered through its container and can be registered again by its name."""
-
-    provider: str
-    kind: str
-    groups: tuple[str, ...]
 
 
 class _Withdrawn(Protocol):

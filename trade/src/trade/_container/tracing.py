@@ -8,8 +8,7 @@ from msgspec import Struct
 
 from trade._calls.batch import Outcome
 from trade._container.lookup import Looking
-from trade._container.system import DOMAIN
-from trade._protocol.keys import ServiceKey
+from trade._protocol.keys import DOMAIN, ServiceKey
 from trade._registry.constraints import where
 from trade._telemetry.log_buffer import LogLine
 from trade._telemetry.spans import Span

@@ -5,7 +5,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from heapq import heappop, heappush
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final, Protocol
 
 from msgspec import Raw
 
@@ -13,9 +13,6 @@ from trade._context.ended_sessions import within
 from trade._protocol.messages import Call, Status, encode_message
 from trade._protocol.remote_errors import pack_error
 from trade.errors import Cancelled, OutcomeUnknown
-
-if TYPE_CHECKING:
-    from trade._services.local_service import LocalService
 
 _logger = logging.getLogger("trade")
 
@@ -33,6 +30,21 @@ _rare = threading.Lock()
 """Guards what few calls have: an event, something to do when they are cancelled."""
 
 
+class ProgressSignature(Protocol):
+    """Of what a service reports while it runs."""
+
+    def encode_progress(self, service: str, value: Any) -> bytes: ...
+
+
+class Reporting(Protocol):
+    """A service, as far as its progress goes."""
+
+    label: str
+
+    @property
+    def signature(self) -> ProgressSignature: ...
+
+
 class Ongoing:
     """One call from its arrival on."""
 
@@ -43,7 +55,7 @@ class Ongoing:
 
     def __init__(
         self,
-        service: "LocalService | None",
+        service: Reporting | None,
         caller: str,
         call: Call | None,
         report: "Callable[[Ongoing, Any], None] | None",

@@ -8,8 +8,8 @@ from typing import Any, Final, Protocol
 from msgspec import Struct
 
 from trade._context.active_calls import Ongoing
+from trade._context.claims import Claim
 from trade._context.sessions import client_of
-from trade._locks.claims import Claim
 from trade._protocol.keys import Address
 from trade._protocol.messages import Behalf, Token
 from trade.errors import Cancelled, LockLost

@@ -5,11 +5,10 @@ from typing import Final
 
 from msgspec import Struct
 
-from trade._container.system import DOMAIN
 from trade._context.call_context import CallContext, Held, handed_down, holding, running
+from trade._context.claims import require_held
 from trade._context.sessions import Session, speaking
-from trade._locks.claims import require_held
-from trade._protocol.keys import Address
+from trade._protocol.keys import DOMAIN, Address
 from trade._protocol.messages import Behalf, Token
 from trade._registry.registry import Record
 from trade.errors import Cancelled, LockLost

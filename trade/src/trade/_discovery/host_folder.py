@@ -7,16 +7,14 @@ two that start together at least one sees the other; the newcomer dials everybod
 import contextlib
 import logging
 import os
-import stat
-import tempfile
 import time
 from pathlib import Path
 from typing import Final
 
+from trade._paths import runtime_folder
 from trade._transport.endpoints import accepts, free_endpoint
-from trade.errors import ConfigurationError
 
-__all__ = ["Rendezvous", "free_endpoint", "runtime_folder"]
+__all__ = ["Rendezvous", "free_endpoint"]
 
 _logger = logging.getLogger("trade")
 
@@ -87,17 +85,3 @@ def _may_live(writer: str) -> bool:
     except PermissionError:
         return True
     return True
-
-
-def runtime_folder() -> Path:
-    named = os.environ.get("TRADE_RUNTIME_DIR")
-    base = named or os.environ.get("XDG_RUNTIME_DIR")
-    uid = str(os.getuid()) if hasattr(os, "getuid") else "user"
-    folder = Path(base) / "trade" if base else Path(tempfile.gettempdir()) / f"trade-{uid}"
-    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-    if hasattr(os, "getuid"):
-        state = folder.lstat()  # a link may lead anywhere
-        if state.st_uid != os.getuid() or stat.S_IMODE(state.st_mode) & 0o022:
-            problem = "others may write there; remove it, or set TRADE_RUNTIME_DIR to a folder of your own"
-            raise ConfigurationError(where=str(folder), problem=problem)
-    return folder

@@ -7,11 +7,10 @@ import time
 from collections.abc import Callable, Iterable
 from typing import Final
 
-from trade._container.system import DOMAIN
 from trade._discovery.grace_period import Absences
 from trade._discovery.resync import Asker
 from trade._protocol.estop_messages import decode_open_estops
-from trade._protocol.keys import ALIVE, REGISTRY, TALLY, Address, is_chunk, tally_key
+from trade._protocol.keys import ALIVE, DOMAIN, REGISTRY, TALLY, Address, is_chunk, tally_key
 from trade._protocol.messages import (
     PROTOCOL,
     Estop,

@@ -11,13 +11,12 @@ from typing import Final, Protocol
 from msgspec import structs
 
 from trade._audit.events import Audit
-from trade._container.system import DOMAIN
 from trade._estop.broadcast import EstopLine, EstopReport, all_of
 from trade._estop.deadman import Deadman
 from trade._estop.latch import Estops
 from trade._estop.ledger import as_told
 from trade._estop.store import EstopStore
-from trade._protocol.keys import Address, is_chunk
+from trade._protocol.keys import DOMAIN, Address, is_chunk
 from trade._protocol.messages import MOST_CLEARED, PROTOCOL, Estop, EstopOrder, ProviderInfo
 from trade._registry.registry import Change, ContainerState, Record, Registry
 from trade._resources.lock_table import LockTable

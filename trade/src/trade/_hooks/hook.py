@@ -11,11 +11,10 @@ import msgspec
 from msgspec import Struct
 
 from trade._calls.handle import Handle
-from trade._container.system import DOMAIN
 from trade._context.call_context import CallContext, holding, running
 from trade._context.sessions import speaking
 from trade._protocol.codec import Codec
-from trade._protocol.keys import ServiceKey
+from trade._protocol.keys import DOMAIN, ServiceKey
 from trade._registry.constraints import Constraint
 from trade._registry.registry import Change, Record
 from trade._services.local_service import LocalService

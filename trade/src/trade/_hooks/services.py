@@ -4,11 +4,10 @@ import contextlib
 import logging
 
 from trade._calls.handle import Handle
-from trade._container.system import DOMAIN, PROVIDER
 from trade._context.call_context import served_call
 from trade._hooks.hook import Attached, HookInfo, Hooks, Side
 from trade._notifications.services import Home
-from trade._protocol.keys import Address, ServiceKey
+from trade._protocol.keys import DOMAIN, PROVIDER, Address, ServiceKey
 from trade._registry.constraints import Constraint
 from trade._security.authorizer import Access
 from trade._services.decorator import service

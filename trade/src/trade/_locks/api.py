@@ -7,11 +7,10 @@ from typing import Final, NamedTuple, Protocol
 
 from trade._calls.handle import Handle
 from trade._calls.run import Run
-from trade._container.system import DOMAIN, PROVIDER
-from trade._locks.claims import Claim, Selection
+from trade._context.claims import Claim, Selection
 from trade._locks.lease_client import Keeper
 from trade._locks.lock import Lock, OnLost, OnRequest
-from trade._protocol.keys import Address, ServiceKey
+from trade._protocol.keys import DOMAIN, PROVIDER, Address, ServiceKey
 from trade._registry.constraints import Constraint, Term, under
 from trade._resources.lock_request import LockInfo, Terms
 from trade._security.authorizer import Access

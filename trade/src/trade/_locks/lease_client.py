@@ -12,9 +12,8 @@ from msgspec import structs
 
 from trade._calls.handle import Bound, Handle
 from trade._calls.run import Run
-from trade._container.system import DOMAIN, PROVIDER
 from trade._locks.lock import Lock, apart
-from trade._protocol.keys import Address, ServiceKey
+from trade._protocol.keys import DOMAIN, PROVIDER, Address, ServiceKey
 from trade._protocol.messages import Token
 from trade._resources.lock_request import Terms
 from trade.errors import Busy, ContainerLost, LockedByOther, ServiceGone, TradeError

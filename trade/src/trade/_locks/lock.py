@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 from msgspec import structs
 
 from trade._context.call_context import Held, holding, patience_s
-from trade._locks.claims import Claim, Selection
+from trade._context.claims import Claim, Selection
 from trade._locks.inherited import VARIABLE, passed_on
 from trade._protocol.keys import Address
 from trade._protocol.messages import Token

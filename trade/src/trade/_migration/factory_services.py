@@ -1,17 +1,31 @@
 """What every container offers about making objects and ending them, in group ``trade``."""
 
-from typing import Any
+from typing import Any, Protocol
 
 from trade._calls.handle import Handle
-from trade._container.system import ContainerInfo, System
 from trade._context.call_context import current_call
+from trade._protocol.container_info import ContainerInfo
 from trade._services.decorator import service
+
+
+class Maker(Protocol):
+    """What makes objects and containers, and ends them."""
+
+    def instantiate(
+        self, class_path: str, args: tuple[Any, ...] | dict[str, Any], groups: tuple[str, ...], state: Any
+    ) -> tuple[Handle, ...]: ...
+
+    def start_container(self, host: str, name: str, *, allow: tuple[str, ...]) -> ContainerInfo: ...
+
+    def terminate(self, service: Handle) -> None: ...
+
+    def terminate_container(self, reason: str, *, only_at_rest: bool, who: str) -> list[str]: ...
 
 
 class MakingServices:
     """The wire's side of `Making`, and of the end of a container."""
 
-    def __init__(self, system: System) -> None:
+    def __init__(self, system: Maker) -> None:
         self._of_here = system
 
     @service

@@ -11,14 +11,13 @@ from collections.abc import Generator, Mapping
 from typing import Any, Final, Protocol
 
 from trade._calls.handle import Handle
-from trade._container.system import DOMAIN, PROVIDER
 from trade._context.call_context import running
 from trade._migration.factory import Arguments, Making, path_of
 from trade._migration.quiesce import Freezing, Frozen
 from trade._migration.state import is_stateful, restore, save
 from trade._migration.target import Luggage, Prepared, fingerprint
 from trade._protocol.codec import Codec
-from trade._protocol.keys import Address, ServiceKey
+from trade._protocol.keys import DOMAIN, PROVIDER, Address, ServiceKey
 from trade._registry.constraints import Constraint, where
 from trade._security.authorizer import Access
 from trade._services.providers import Providers

@@ -7,13 +7,12 @@ from collections.abc import Callable
 from typing import Protocol
 
 from trade._calls.handle import Handle
-from trade._container.system import DOMAIN, PROVIDER
 from trade._context.call_context import served_call
 from trade._context.sessions import Session
 from trade._notifications.notification import Notification, NotificationInfo, Owner, Standing
 from trade._notifications.notifier import Notifier
 from trade._notifications.triggers import OF_SERVICES, Deed, Terms
-from trade._protocol.keys import Address, ServiceKey
+from trade._protocol.keys import DOMAIN, PROVIDER, Address, ServiceKey
 from trade._registry.registry import Record, Registry
 from trade._security.authorizer import Access
 from trade._services.decorator import service

@@ -10,6 +10,7 @@ from typing import Any, Final, Literal, Protocol
 import msgspec
 from msgspec import Struct
 
+from trade._protocol.keys import GROUP
 from trade._protocol.messages import Scalar, ServiceInfo
 from trade._protocol.schema import fits, known_schema, read_json, read_types, readable, types_text
 from trade._registry.predicates import achieves_all, parse_predicates
@@ -17,7 +18,6 @@ from trade.errors import ConfigurationError
 
 __all__ = ["Candidate", "Constraint", "where"]
 
-GROUP: Final = re.compile(r"[A-Za-z0-9_-]{1,80}(\.[A-Za-z0-9_-]{1,80})*")
 """What a group looks like: whole segments joined by dots."""
 _MOST_CLAUSES: Final = 1000
 _GLOB: Final = frozenset("*?[")

@@ -4,7 +4,7 @@ import difflib
 from collections.abc import Iterable, Sequence
 from typing import Final
 
-from trade._container.system import DOMAIN
+from trade._protocol.keys import DOMAIN
 from trade._registry.constraints import Constraint
 from trade._registry.registry import Record
 from trade.errors import NoSuchService, TooManyServices

@@ -8,8 +8,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Final
 
-from trade._container.system import DOMAIN, ESTOPS, PROVIDER
-from trade._protocol.keys import domain_of
+from trade._protocol.keys import DOMAIN, ESTOPS, PROVIDER, domain_of
 from trade._security.policy import Decision, Policy
 from trade._security.policy_file import Seen, look_at, policy_files, read_policy
 from trade.errors import AccessDenied

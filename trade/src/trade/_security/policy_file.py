@@ -6,8 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Final, cast
 
-from trade._protocol.keys import NO_GROUP, is_chunk
-from trade._registry.constraints import GROUP
+from trade._protocol.keys import GROUP, NO_GROUP, is_chunk
 from trade._security.policy import EVERYTHING, VERBS, Policy, Role
 from trade._toml import read_toml_text
 from trade.errors import ConfigurationError

@@ -9,8 +9,7 @@ from math import inf
 from types import MappingProxyType
 from typing import Any, Final, Literal, NamedTuple
 
-from trade._container.system import DOMAIN
-from trade._protocol.keys import ALIVE, ESTOPS, REGISTRY
+from trade._protocol.keys import ALIVE, DOMAIN, ESTOPS, REGISTRY
 from trade._protocol.samples import STEPS_HZ, STREAMS
 from trade._security.policy import EVERYTHING, VERBS, Policy
 

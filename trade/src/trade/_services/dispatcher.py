@@ -14,11 +14,10 @@ import msgspec
 from msgspec import Raw
 
 from trade._audit.events import Audit
-from trade._container.system import DOMAIN, PROVIDER
 from trade._context.active_calls import Answer, Herald, Once, Ongoing, cancelled, end_calls
 from trade._context.call_context import CallContext, outer_of
 from trade._context.sessions import foreign
-from trade._protocol.keys import Address, calls_to, is_chunk, reply_key
+from trade._protocol.keys import DOMAIN, PROVIDER, Address, calls_to, is_chunk, reply_key
 from trade._protocol.messages import (
     CANCEL,
     EMPTY,

@@ -4,12 +4,13 @@ import asyncio
 import time
 from collections.abc import Callable, Sequence
 from types import CoroutineType
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 from msgspec import Raw, structs
 
 from trade._audit.events import Audited
 from trade._context.call_context import CallContext, running
+from trade._context.interceptor import Interceptor
 from trade._context.sessions import foreign
 from trade._protocol.messages import ErrorInfo, ServiceInfo
 from trade._protocol.remote_errors import pack_error, unpack_error
@@ -21,18 +22,10 @@ from trade._services.serial_queue import Serial
 from trade._services.signature import Signature
 from trade.errors import TradeError
 
-__all__ = ["Around", "LocalService"]
+__all__ = ["LocalService"]
 
 _COROUTINE: Final[type] = CoroutineType
 """What an ``async def`` gives; asked of every result, so without a call."""
-
-
-class Around(Protocol):
-    """What is called before and after a service."""
-
-    def run(
-        self, service: "LocalService", args: Sequence[Any], kwargs: dict[str, Any], context: CallContext
-    ) -> Any: ...
 
 
 class LocalService:
@@ -73,7 +66,7 @@ class LocalService:
         self.serial = serial
         self.resources = resources
         """What it needs for itself, or stops."""
-        self.around: Around | None = None
+        self.around: Interceptor | None = None
         """What is called before and after it."""
         self.audited: Audited | None = None
         """Of that, what tells of each call for the record."""

@@ -3,9 +3,7 @@
 from collections.abc import Sequence
 from typing import Final
 
-from trade._container.system import DOMAIN
-from trade._protocol.keys import is_chunk
-from trade._registry.constraints import GROUP
+from trade._protocol.keys import DOMAIN, GROUP, is_chunk
 from trade._services.decorator import ServiceMark
 from trade.errors import ConfigurationError
 

@@ -10,10 +10,9 @@ from weakref import WeakValueDictionary
 from msgspec import structs
 
 from trade._audit.events import Audit
-from trade._container.system import DOMAIN
 from trade._discovery.announcer import Announcer
 from trade._protocol.codec import Codec
-from trade._protocol.keys import Address, ServiceKey, as_chunk, domain_of
+from trade._protocol.keys import DOMAIN, Address, ServiceKey, as_chunk, domain_of
 from trade._protocol.messages import ProviderInfo, Scalar, ServiceInfo
 from trade._registry.constraints import checked_meta
 from trade._registry.registry import Registry, gone_to

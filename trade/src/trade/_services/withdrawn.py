@@ -4,13 +4,22 @@ import threading
 from collections.abc import Callable, Sequence
 from typing import Final
 
-from trade._container.system import DOMAIN, WithdrawnInfo
-from trade._protocol.keys import ServiceKey
+from msgspec import Struct
+
+from trade._protocol.keys import DOMAIN, ServiceKey
 from trade._resources.resource import Resource
 from trade._services.offerable import checked_groups
 from trade._services.providers import Providers
 from trade._services.registration import Offer
 from trade.errors import ConfigurationError, DeviceFault
+
+
+class WithdrawnInfo(Struct, frozen=True):
+    """A provider that was deregistered through its container and can be registered again by its name."""
+
+    provider: str
+    kind: str
+    groups: tuple[str, ...]
 
 
 class Withdrawn:

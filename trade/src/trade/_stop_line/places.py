@@ -10,7 +10,7 @@ from collections.abc import Generator
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from trade._discovery.host_folder import runtime_folder
+from trade._paths import runtime_folder
 from trade._security.certificates import line_context
 from trade._settings import Settings
 from trade._transport.endpoints import Endpoint

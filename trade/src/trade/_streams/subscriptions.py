@@ -15,10 +15,9 @@ from typing import Final
 
 from trade._calls.handle import Handle
 from trade._calls.target import container_closed, result_decoder
-from trade._container.system import DOMAIN, PROVIDER
 from trade._context.sessions import Session
 from trade._protocol.codec import Codec
-from trade._protocol.keys import ServiceKey
+from trade._protocol.keys import DOMAIN, PROVIDER, ServiceKey
 from trade._protocol.messages import Malformed
 from trade._protocol.samples import STEPS_HZ, decode_sample, rate_of, signs_of, stream_key
 from trade._registry.registry import Change

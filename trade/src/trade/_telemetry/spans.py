@@ -9,16 +9,15 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 from msgspec import Struct, structs
 
-from trade._container.system import DOMAIN
 from trade._context.call_context import CallContext
+from trade._context.interceptor import Interceptor, ServedService
 from trade._context.outgoing import Request
-from trade._protocol.keys import Address, ServiceKey
+from trade._protocol.keys import DOMAIN, Address, ServiceKey
 from trade._protocol.messages import Token
 from trade._telemetry.log_buffer import listen
 
 if TYPE_CHECKING:
     from trade._resources.lock_table import LockTable
-    from trade._services.local_service import Around, LocalService
 
 MOST: Final = 10_000
 """So many spans a container keeps: the newest."""
@@ -160,11 +159,11 @@ class Spans:
 class Recorded:
     """What is around a service while it is traced: what was there without that, and a span."""
 
-    def __init__(self, spans: Spans, around: "Around | None") -> None:
+    def __init__(self, spans: Spans, around: Interceptor | None) -> None:
         self._spans = spans
         self._around = around
 
-    def run(self, service: "LocalService", args: Sequence[Any], kwargs: dict[str, Any], context: CallContext) -> Any:
+    def run(self, service: ServedService, args: Sequence[Any], kwargs: dict[str, Any], context: CallContext) -> Any:
         """Call the service and note that. Its errors pass."""
         structs.force_setattr(context, "events", [])
         calls = ancestors(context)  # it forgets them when it ends

@@ -13,7 +13,7 @@ from collections.abc import Generator
 from pathlib import Path
 from typing import Final
 
-from trade._discovery.host_folder import runtime_folder
+from trade._paths import runtime_folder
 from trade.errors import ConfigurationError
 
 __all__ = ["dictionary_file", "user_secret"]

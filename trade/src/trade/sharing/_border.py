@@ -17,10 +17,10 @@ from trade._calls.handle_codec import handle_codec
 from trade._container.container import Container
 from trade._container.federating import Bordering, Home, Place, inside, shown
 from trade._context.call_context import CallContext, holding, running
+from trade._context.claims import Claim, Selection
 from trade._context.sessions import speaking
 from trade._estop.deadman import NOBODYS
 from trade._locks.api import LEASE_S
-from trade._locks.claims import Claim, Selection
 from trade._locks.lock import Lock, OnLost, OnRequest
 from trade._locks.remote_locks import SharedResource, Wanted
 from trade._protocol.keys import Address, ServiceKey
