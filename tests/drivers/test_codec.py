@@ -192,5 +192,6 @@ def test_the_public_names_are_there() -> None:
 
 
 def test_no_vendor_library_is_imported_before_a_bus_is_attached() -> None:
-    code = "import sys, trade_drivers, trade_drivers.vendors.dynamixel; print({'serial', 'dynamixel_sdk'} & set(sys.modules))"
+    imports = "import sys, trade_drivers, trade_drivers.vendors.dynamixel"
+    code = f"{imports}; print({{'serial', 'dynamixel_sdk'}} & set(sys.modules))"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "set()\n"

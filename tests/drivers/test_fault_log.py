@@ -16,7 +16,7 @@ import pytest
 from trade.errors import DeviceFault, DeviceSilent, InvalidArgument
 from trade_drivers import FaultInfo, FaultLog, MotorState
 from trade_drivers.faults import FaultStore
-from trade_drivers.faults._detector import Found, found_in
+from trade_drivers.faults._trouble import Found, found_in
 
 PAN, TILT = "rosie.pan", "rosie.tilt"
 HOT = Found("overheating", "rosie.pan: overheating", "let it cool")

@@ -14,8 +14,8 @@ from typer.testing import CliRunner
 from trade._audit.hash_chain import AuditRow
 from trade._audit.store import AuditStore, Keep
 from trade.errors import ConfigurationError
+from trade_gateway._usage import UsageError
 from trade_gateway.cli import app
-from trade_gateway.cli._output import UsageError
 
 
 def trade(*words: str | Path) -> Any:

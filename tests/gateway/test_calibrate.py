@@ -12,8 +12,9 @@ from typer.testing import CliRunner, Result
 from robots import HAND, HEAD
 from trade.errors import ConfigurationError, WrongDevice
 from trade_drivers import Joint, WireError, parse
+from trade_gateway._usage import UsageError
 from trade_gateway.cli import app
-from trade_gateway.cli._output import Output, UsageError
+from trade_gateway.cli._output import Output
 from trade_gateway.cli.hardware._calibrate import Ends, Sweep, _measure, homed, measured, with_values
 from trade_hil_sim import DynamixelBus, writes
 

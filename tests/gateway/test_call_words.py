@@ -4,7 +4,8 @@ import json
 
 import pytest
 
-from trade_gateway.cli._output import Output, UsageError
+from trade_gateway._usage import UsageError
+from trade_gateway.cli._output import Output
 from trade_gateway.cli.services._call import parse_arguments
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from trade_drivers import load
 from trade_drivers.robotfile import Drill
-from trade_gateway.cli._output import UsageError
+from trade_gateway._usage import UsageError
 from trade_gateway.cli.hardware._drill import _chosen
 from trade_gateway.drill import SCENES, Played, Report, Scene, Stop, Target, _runner, as_data, page, play, targets_of
 from trade_gateway.drill._judge import Judge

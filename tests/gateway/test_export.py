@@ -11,8 +11,8 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from trade.errors import ConfigurationError
+from trade_gateway._usage import UsageError
 from trade_gateway.cli import app
-from trade_gateway.cli._output import UsageError
 from trade_gateway.recording._channels import LOCKS, JointStates, Lock, Locks, Message, encoded, joints_channel
 from trade_gateway.recording._file import RecordingFile
 

@@ -7,7 +7,7 @@ from unittest.mock import create_autospec
 import pytest
 
 from trade_drivers import FaultLog, Gripper, Motor
-from trade_drivers.faults._detector import Found
+from trade_drivers.faults._trouble import Found
 from trade_gateway.cli._output import Output
 from trade_gateway.cli.robots._fault_reporter import FaultWatch
 

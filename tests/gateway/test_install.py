@@ -14,8 +14,8 @@ from typer.testing import CliRunner, Result
 from robots import HEAD
 from trade.errors import ConfigurationError
 from trade_drivers import load
+from trade_gateway._usage import UsageError
 from trade_gateway.cli import app
-from trade_gateway.cli._output import UsageError
 from trade_gateway.cli.operation import _install
 from trade_gateway.cli.operation._install import _closed_to
 from trade_gateway.cli.operation._systemd_unit import UDEV_RULES, Needs, needs_of, unit_text

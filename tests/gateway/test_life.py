@@ -5,8 +5,8 @@ from typing import Any
 
 import pytest
 
+from trade_gateway.config._children import Supervised
 from trade_gateway.supervisor._state_machine import Do, Life, State
-from trade_gateway.supervisor._tables import Supervised
 
 
 def life(**terms: Any) -> Life:

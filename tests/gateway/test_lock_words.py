@@ -16,8 +16,9 @@ from trade.errors import (
     Stopped,
     TooManyServices,
 )
+from trade_gateway._usage import UsageError
 from trade_gateway.cli import app
-from trade_gateway.cli._output import REMEDIES, UsageError, say_error
+from trade_gateway.cli._output import REMEDIES, say_error
 from trade_gateway.cli.motion._lock import _wanted
 
 

@@ -9,8 +9,8 @@ import pytest
 from typer.testing import CliRunner
 
 from trade.errors import ConfigurationError
+from trade_gateway._usage import UsageError
 from trade_gateway.cli import app
-from trade_gateway.cli._output import UsageError
 
 POLICY = """
 revoked = ["thief"]

@@ -18,9 +18,9 @@ from typer.testing import CliRunner
 
 from disks import FullDisk
 from trade import Container, Resource, Secret, service, where
+from trade_gateway._usage import UsageError
 from trade_gateway.cli import app
-from trade_gateway.cli._output import UsageError
-from trade_gateway.recording import _progress
+from trade_gateway.cli.recordings import _progress
 from trade_gateway.recording._channels import Message
 from trade_gateway.recording._file import RecordingFile
 from trade_gateway.recording._recorder import Recorder

@@ -12,8 +12,8 @@ from typer.testing import CliRunner, Result
 
 from trade.errors import ConfigurationError
 from trade_drivers import Found, parse
+from trade_gateway._usage import UsageError
 from trade_gateway.cli import app
-from trade_gateway.cli._output import UsageError
 from trade_gateway.cli.hardware._robot_file_template import first_file
 from trade_gateway.cli.hardware._scan import _numbers
 from trade_hil_sim import Arm, DynamixelBus, Servo, UrBus

@@ -16,9 +16,9 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, 
 
 from trade.errors import ConfigurationError
 from trade.starting import Started
-from trade_gateway.supervisor import Child, Supervisor
+from trade_gateway.config._children import Child, Supervised
+from trade_gateway.supervisor import Supervisor
 from trade_gateway.supervisor._furnish import Furnished
-from trade_gateway.supervisor._tables import Supervised
 from waiting import PATIENCE_S, wait_until
 
 AFTER = {"a": (), "b": ("a",), "c": ("a", "b"), "d": ()}

@@ -6,8 +6,8 @@ import pytest
 from typer.testing import CliRunner
 
 from robots import HAND, TAIL
+from trade_gateway._usage import UsageError
 from trade_gateway.cli import app
-from trade_gateway.cli._output import UsageError
 from trade_gateway.cli.robots._up import ports_told
 
 

@@ -12,14 +12,14 @@ import trade
 from trade import Measure
 from trade.errors import ConfigurationError, TradeError
 from trade_drivers import robotfile
+from trade_drivers._metrics import measures_of
 from trade_drivers.bus.can._monitor import CanMonitor
 from trade_drivers.faults import FaultLog, FaultRecorder, FaultStore
 from trade_drivers.faults._health import HEALTHY, HealthTeller
-from trade_drivers.faults._metrics import measures_of
 from trade_drivers.interfaces._arm import Arm
 from trade_drivers.interfaces._motion import Gripper, JointGroup, Motor
 from trade_drivers.interfaces._sensing import Camera, Sensor
-from trade_drivers.motion._multi_bus_group import AcrossGroup
+from trade_drivers.joints._multi_bus_group import AcrossGroup
 from trade_drivers.plugins._driver import AttachedBus, Driver, SenseDriver, load_driver
 from trade_drivers.plugins._validate import check
 from trade_drivers.robotfile import Group, Robot

@@ -10,8 +10,9 @@ from typing import Any, Final, Generic, Protocol, TypeVar
 from trade import Measure
 from trade.errors import BusGone, TradeError
 from trade_drivers.bus._cycle import BusExchange
+from trade_drivers.bus._fault_detector import Lookout
 from trade_drivers.bus._jobs import Device, PortLost, PortOpening
-from trade_drivers.faults import Lookout, Tell
+from trade_drivers.faults import Tell
 from trade_drivers.robotfile import Bus
 
 __all__ = ["BusThread", "Port"]

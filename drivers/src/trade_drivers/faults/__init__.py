@@ -1,10 +1,10 @@
 """What has been wrong with the devices of a robot: noticed by bus threads, kept by one log, told as services."""
 
-from trade_drivers.faults._detector import Lookout, Tell, Trouble
 from trade_drivers.faults._log import FaultLog
 from trade_drivers.faults._record import Fault, FaultInfo, FaultSample
 from trade_drivers.faults._recorder import FaultRecorder
 from trade_drivers.faults._store import FaultStore
+from trade_drivers.faults._trouble import Tell, Trouble
 
 __all__ = [
     "Fault",
@@ -13,7 +13,6 @@ __all__ = [
     "FaultRecorder",
     "FaultSample",
     "FaultStore",
-    "Lookout",
     "Tell",
     "Trouble",
 ]

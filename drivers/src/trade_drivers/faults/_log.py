@@ -11,9 +11,9 @@ from msgspec import Struct, structs
 
 from trade import Meta, current_call, service
 from trade.errors import InvalidArgument
-from trade_drivers.faults._detector import Found
 from trade_drivers.faults._record import Fault, FaultInfo, Moment, info_of, samples_of
 from trade_drivers.faults._store import FaultStore, Kept, Key
+from trade_drivers.faults._trouble import Found
 
 __all__ = ["FaultLog"]
 

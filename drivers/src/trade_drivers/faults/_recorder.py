@@ -8,9 +8,9 @@ from collections.abc import Collection, Mapping
 from typing import Any, Final
 
 from trade.errors import DeviceFault
-from trade_drivers.faults._detector import Found, Trouble, found_in
 from trade_drivers.faults._log import FaultLog
 from trade_drivers.faults._record import Moment, when
+from trade_drivers.faults._trouble import Found, Trouble, found_in
 from trade_drivers.interfaces._arm import Arm, ArmState
 from trade_drivers.interfaces._motion import Gripper, Motor
 from trade_drivers.interfaces._sensing import Sensor

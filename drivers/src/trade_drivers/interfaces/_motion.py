@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from msgspec import Struct
 
 from trade import Meta, Resource, service
-from trade_drivers.bus._validation import LONGEST_VALID_S
+from trade_drivers._validation import LONGEST_VALID_S
 from trade_drivers.interfaces._trajectory import Trajectory, planned
 from trade_drivers.motion._plan import JointLimits, Plan, Tolerances
 

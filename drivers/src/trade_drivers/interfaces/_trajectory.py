@@ -8,7 +8,7 @@ from msgspec import Struct
 
 from trade import current_call
 from trade.errors import InvalidArgument, LimitExceeded
-from trade_drivers.bus._validation import finite, one_each
+from trade_drivers._validation import finite, one_each
 from trade_drivers.motion._plan import Course, JointLimits, Plan, Tolerances, Track
 from trade_drivers.motion._spline import Curve
 

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 
 from trade import Measure, Resource, permit
 from trade.errors import DeviceError, DeviceSilent, LimitExceeded
+from trade_drivers._validation import finite, one_each, valid, within
 from trade_drivers.bus._deadlines import expiry, span
 from trade_drivers.bus._thread import BusThread
-from trade_drivers.bus._validation import finite, one_each, valid, within
 from trade_drivers.faults import Tell
 from trade_drivers.interfaces._motion import JointGroup, JointLimits, Motor, MotorState
 from trade_drivers.joints._axis import Axis

@@ -7,7 +7,7 @@ from typing import Final
 
 from trade import Resource, permit
 from trade.errors import ToleranceExceeded
-from trade_drivers.bus._validation import one_each, valid, within
+from trade_drivers._validation import one_each, valid, within
 from trade_drivers.interfaces._motion import JointGroup, MotorState, Position, Speed, Valid
 from trade_drivers.motion._plan import JointLimits, Plan
 

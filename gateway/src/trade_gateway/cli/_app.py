@@ -9,7 +9,8 @@ from typing import Annotated, Final
 import typer
 
 from trade.errors import TradeError
-from trade_gateway.cli._output import UsageError, say_error
+from trade_gateway._usage import UsageError
+from trade_gateway.cli._output import say_error
 from trade_gateway.cli._system_choice import SystemChoice
 from trade_gateway.process._parent_watch import end_with_stdin
 
@@ -41,7 +42,7 @@ _COMMANDS: Final = {
     "calibrate": (_HARDWARE, "cli.hardware._calibrate:calibrate"),
     "doctor": (_HARDWARE, "cli.hardware._doctor:doctor"),
     "drill": (_HARDWARE, "cli.hardware._drill:drill"),
-    "conformance": (_OPERATION, "conformance._command:conformance"),
+    "conformance": (_OPERATION, "cli.operation._conformance:conformance"),
     "services": (_SERVICES, "cli.services._services:services"),
     "containers": (_SERVICES, "cli.services._services:containers"),
     "call": (_SERVICES, "cli.services._call:call"),
@@ -59,10 +60,10 @@ _COMMANDS: Final = {
     "top": (_WATCHING, "cli.watching._top:top"),
     "notifications": (_WATCHING, "cli.watching._notifications:notifications"),
     "hooks": (_WATCHING, "cli.watching._notifications:hooks"),
-    "record": (_RECORDINGS, "recording._record:record"),
-    "foxglove": (_RECORDINGS, "recording._foxglove:foxglove"),
-    "replay": (_RECORDINGS, "recording._replay:replay"),
-    "export": (_RECORDINGS, "recording._export:export"),
+    "record": (_RECORDINGS, "cli.recordings._record:record"),
+    "foxglove": (_RECORDINGS, "cli.recordings._foxglove:foxglove"),
+    "replay": (_RECORDINGS, "cli.recordings._replay:replay"),
+    "export": (_RECORDINGS, "cli.recordings._export:export"),
     "tracing": (_WATCHING, "cli.watching._trace:tracing"),
     "trace": (_WATCHING, "cli.watching._trace:trace"),
     "logs": (_WATCHING, "cli.watching._logs:logs"),

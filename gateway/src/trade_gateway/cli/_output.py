@@ -11,17 +11,13 @@ import msgspec
 from rich.console import Console
 from rich.markup import escape
 
-from trade.errors import ConfigurationError, DeviceFault
+from trade.errors import DeviceFault
 
 _GAP: Final = "  "
 _SMALL: Final = re.compile(r'^( *(?:"(?:[^"\\]|\\.)*": )?)(-?[\d.]+e-\d+)(?=,?$)', re.MULTILINE)
 """A number with an exponent, on its line of indented JSON."""
 _LEAST: Final = 20
 """No column is cut shorter than this; columns on the right are left out before."""
-
-
-class UsageError(ConfigurationError):
-    """The words of the command line are wrong: exit code 2."""
 
 
 class Output:

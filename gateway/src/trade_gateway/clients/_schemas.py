@@ -9,6 +9,9 @@ from msgspec import Meta, Struct
 from trade import Handle, LockInfo, Span
 from trade.policies import VERBS, Policy
 
+APPROVALS: Final = "approvals"
+"""Where what waits is a service."""
+
 MOST_DEADLINE_S: Final = 86_400.0
 SESSION_LEASE_S: Final = 2.0
 LEAST_INTEGER: Final = -(2**63)

@@ -6,11 +6,11 @@ from collections.abc import Callable, Coroutine
 from typing import Any, Final
 
 from trade import Container, HookInfo, LoadInfo, LogLine, LogReader, NotificationInfo, Sight, Span
-from trade_gateway.cli._load_table import loads
 from trade_gateway.clients import _schemas as messages
 from trade_gateway.clients._audit_reader import newest
 from trade_gateway.clients._authorizer import Judge
 from trade_gateway.clients._errors import NoAuditRecord
+from trade_gateway.clients._load_table import loads
 from trade_gateway.clients._span_reader import CallReader
 
 _ROWS: Final = 200

@@ -15,9 +15,9 @@ from trade._toml import read_toml_text
 from trade._transport.endpoints import Endpoint, loopback_interface
 from trade.errors import ConfigurationError
 from trade.policies import EVERYTHING, read_policy
-from trade_gateway.cli._addresses import addresses
+from trade_gateway.config._children import Child, read_children
 from trade_gateway.config._tables import Around
-from trade_gateway.supervisor import Child, read_children
+from trade_gateway.process._addresses import addresses
 
 __all__ = ["GatewayFile", "Network", "Plan", "Share", "read_gateway_file"]
 

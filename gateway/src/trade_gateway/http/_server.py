@@ -20,7 +20,6 @@ from starlette.routing import WebSocketRoute
 from trade import Container
 from trade.errors import ConfigurationError
 from trade.listening import BoundedListener
-from trade_gateway.cli._addresses import in_url, is_loopback
 from trade_gateway.clients import Deeds
 from trade_gateway.dashboard import pages
 from trade_gateway.http._authentication import Entry
@@ -30,6 +29,7 @@ from trade_gateway.http._protocols import HttpProtocol, SocketProtocol
 from trade_gateway.http._session_timeouts import Leases
 from trade_gateway.http._tokens import Tokens
 from trade_gateway.http._websocket import Socket
+from trade_gateway.process._addresses import in_url, is_loopback
 
 _logger = logging.getLogger("trade")
 

@@ -7,7 +7,7 @@ import msgspec
 from msgspec import Struct
 
 from trade import Container
-from trade_gateway.cli.services._call import find
+from trade_gateway._usage import find
 from trade_gateway.language._lexicon import Lexicon, NotUnderstood, Phrase
 from trade_gateway.language._previous_answer import Memory
 from trade_gateway.language._questions import QUESTIONS, Unknown

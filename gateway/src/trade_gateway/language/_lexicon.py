@@ -12,7 +12,7 @@ from msgspec import Meta, Struct
 
 from trade._toml import read_toml_text
 from trade.errors import ConfigurationError
-from trade_gateway.cli._output import UsageError
+from trade_gateway._usage import UsageError
 from trade_gateway.language._questions import QUESTIONS
 
 __all__ = ["Heard", "Lexicon", "NotUnderstood", "Phrase", "read_lexicon"]

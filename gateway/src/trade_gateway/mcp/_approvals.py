@@ -14,8 +14,8 @@ from msgspec import Struct
 
 from trade import Container, Handle, current_call, service, where
 from trade.errors import AccessDenied, ConfigurationError
-from trade_gateway.cli.rights._approvals import GROUP
 from trade_gateway.clients import places
+from trade_gateway.clients._schemas import APPROVALS
 from trade_gateway.mcp._errors import NeedsApproval
 
 __all__ = ["Approvals", "Request"]
@@ -176,7 +176,7 @@ class Approvals:
         if self._offered:
             return
         try:
-            self._container.register(self, f"{GROUP}.{self._container.name}")
+            self._container.register(self, f"{APPROVALS}.{self._container.name}")
         except AccessDenied as denied:
             raise NeedsApproval(service=handle.label, reason=f"it cannot be asked for: {denied}") from None
         self._offered = True

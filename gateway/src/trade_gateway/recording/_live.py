@@ -11,7 +11,7 @@ import msgspec
 from foxglove.websocket import ChannelView, Client, ServerListener
 
 from trade.errors import ConfigurationError
-from trade_gateway.cli._addresses import in_url
+from trade_gateway.process._addresses import in_url
 from trade_gateway.recording._channels import FAULTS, LOCKS, Channel, Fault, FaultKind, Message
 
 __all__ = ["Live"]

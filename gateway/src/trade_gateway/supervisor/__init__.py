@@ -1,11 +1,11 @@
 """Containers as child processes: started in order, asked whether they answer, started again, their state kept."""
 
 from trade._protocol.schema_types import publish
+from trade_gateway.config._children import Child, read_children
 from trade_gateway.supervisor._child import ChildInfo, News
 from trade_gateway.supervisor._lease import Lease
 from trade_gateway.supervisor._services import ChildServices
 from trade_gateway.supervisor._supervisor import Supervisor
-from trade_gateway.supervisor._tables import Child, read_children
 
 __all__ = ["Child", "ChildInfo", "ChildServices", "News", "Supervisor", "read_children"]
 

@@ -5,12 +5,12 @@ from collections.abc import Callable
 
 from msgspec import Struct
 
+from trade_gateway.config._children import Child
 from trade_gateway.process._kill_timer import Term, uptime_s
 from trade_gateway.supervisor._furnish import Furnished
 from trade_gateway.supervisor._lease_protocol import Leased
 from trade_gateway.supervisor._process import Process
 from trade_gateway.supervisor._state_machine import Life, State
-from trade_gateway.supervisor._tables import Child
 
 __all__ = ["ChildInfo", "News", "Unit"]
 

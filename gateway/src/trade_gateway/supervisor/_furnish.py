@@ -8,9 +8,9 @@ from typing import Any, Final, NamedTuple
 from trade import Container, Handle
 from trade.errors import CannotInstantiate, ConfigurationError, NoSuchService, ServiceGone, TradeError
 from trade.starting import Started
+from trade_gateway.config._children import Child
 from trade_gateway.config._tables import Made
 from trade_gateway.supervisor._objects import function_of, make, name_of
-from trade_gateway.supervisor._tables import Child
 
 __all__ = ["Furnished", "furnish", "save"]
 

@@ -12,12 +12,12 @@ import msgspec
 
 from trade import Container, Handle, Run, where
 from trade.errors import AccessDenied, ConfigurationError, NoSuchService, TradeError
+from trade_gateway.config._children import Child
 from trade_gateway.process._kill_timer import Term, uptime_s
 from trade_gateway.supervisor._lease import Arbiter, Holder, Lease
 from trade_gateway.supervisor._objects import GROUP
 from trade_gateway.supervisor._single_instance import is_free
 from trade_gateway.supervisor._store import StateStore
-from trade_gateway.supervisor._tables import Child
 
 __all__ = ["Asking", "Leased", "StandIn"]
 

@@ -11,9 +11,9 @@ from typing import Final
 import msgspec
 
 from trade.starting import Started
+from trade_gateway.config._children import Child
 from trade_gateway.process._kill_timer import Term
 from trade_gateway.supervisor._single_instance import alone
-from trade_gateway.supervisor._tables import Child
 
 __all__ = ["Process", "rss_mb"]
 

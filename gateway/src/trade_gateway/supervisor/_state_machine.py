@@ -5,7 +5,7 @@ import math
 from collections import deque
 from typing import Final
 
-from trade_gateway.supervisor._tables import Supervised
+from trade_gateway.config._children import Supervised
 
 __all__ = ["GRACE_S", "Do", "Life", "State"]
 

@@ -17,6 +17,7 @@ from msgspec import structs
 from trade import Container, Handle, Run
 from trade.errors import Busy, ConfigurationError, ServiceGone, TradeError
 from trade.starting import Started
+from trade_gateway.config._children import Child
 from trade_gateway.process._kill_timer import Term
 from trade_gateway.supervisor._child import ChildInfo, News, Unit
 from trade_gateway.supervisor._furnish import Furnished, furnish, save
@@ -25,7 +26,6 @@ from trade_gateway.supervisor._process import Process, rss_mb
 from trade_gateway.supervisor._single_instance import lock_of
 from trade_gateway.supervisor._state_machine import GRACE_S, SAVE_S, Do, State
 from trade_gateway.supervisor._store import StateStore
-from trade_gateway.supervisor._tables import Child
 
 __all__ = ["Supervisor"]
 

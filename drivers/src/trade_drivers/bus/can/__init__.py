@@ -5,11 +5,9 @@ from trade_drivers.bus.can._errors import ErrorState, error_state
 from trade_drivers.bus.can._listeners import Listeners
 from trade_drivers.bus.can._netlink import Link, look_at
 from trade_drivers.bus.can._port import CanPort, Frame, split_port
-from trade_drivers.bus.can._scan import CanBench
 from trade_drivers.bus.can._sniffer import Talk
 
 __all__ = [
-    "CanBench",
     "CanPort",
     "ErrorState",
     "Frame",

@@ -7,7 +7,7 @@ from trade.errors import ConfigurationError
 from trade_drivers.commissioning._commissioner import Bench, Commissioner
 
 if TYPE_CHECKING:
-    from trade_drivers.bus.can import CanBench
+    from trade_drivers.commissioning._can_scan import CanBench
 
 __all__ = ["CanMotorCommissioner"]
 

@@ -4,8 +4,8 @@ from functools import partial
 from typing import TYPE_CHECKING, Annotated, cast
 
 from trade import Meta, permit, service
+from trade_drivers._validation import within
 from trade_drivers.bus._deadlines import span
-from trade_drivers.bus._validation import within
 from trade_drivers.bus.can._monitor import CanMonitor
 from trade_drivers.joints import AttachedJoints, BusMotor, BusThread
 from trade_drivers.vendors.cia402._axis import DriveAxis

@@ -4,7 +4,8 @@ from collections.abc import Iterable
 from itertools import islice
 from typing import Final
 
-from trade_drivers.bus.can import CanBench, CanPort
+from trade_drivers.bus.can import CanPort
+from trade_drivers.commissioning._can_scan import CanBench
 from trade_drivers.commissioning._commissioner import Found
 from trade_drivers.vendors.cia402 import _table as table
 from trade_drivers.vendors.cia402._machine import state_of

@@ -5,7 +5,8 @@ from collections.abc import Callable
 from math import isclose
 from typing import Final, TypeVar
 
-from trade_drivers.bus.can import CanBench, Frame
+from trade_drivers.bus.can import Frame
+from trade_drivers.commissioning._can_scan import CanBench
 from trade_drivers.commissioning._commissioner import Found
 from trade_drivers.vendors.damiao import _frames as frames
 from trade_drivers.vendors.damiao._frames import MASTER, MODELS, Feedback, Ranges, Register, Status

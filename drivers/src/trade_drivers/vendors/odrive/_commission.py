@@ -6,7 +6,7 @@ from trade_drivers.joints.can._commission import CanMotorCommissioner
 from trade_drivers.vendors.odrive._frames import NODES
 
 if TYPE_CHECKING:
-    from trade_drivers.bus.can import CanBench
+    from trade_drivers.commissioning._can_scan import CanBench
 
 __all__ = ["OdriveCommissioner"]
 

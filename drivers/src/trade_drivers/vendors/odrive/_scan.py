@@ -4,7 +4,7 @@ import struct
 import time
 from typing import Final
 
-from trade_drivers.bus.can import CanBench
+from trade_drivers.commissioning._can_scan import CanBench
 from trade_drivers.commissioning._commissioner import Found
 from trade_drivers.vendors.odrive._axis import MODELS
 from trade_drivers.vendors.odrive._frames import NODES, Command, Heartbeat, State, Version, frame_id, orders

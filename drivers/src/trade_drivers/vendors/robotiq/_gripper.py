@@ -2,9 +2,9 @@
 
 from trade import Resource, permit
 from trade.errors import DeviceError, DeviceSilent
+from trade_drivers._validation import finite, within
 from trade_drivers.bus._deadlines import expiry, span
 from trade_drivers.bus._thread import BusThread
-from trade_drivers.bus._validation import finite, within
 from trade_drivers.interfaces._motion import Gripper, GripperLimits, GripperState
 from trade_drivers.vendors.robotiq import _table as table
 from trade_drivers.vendors.robotiq._cycle import Exchange

@@ -6,9 +6,9 @@ from typing import Final
 
 from trade import Permit, Resource, permit
 from trade.errors import DeadlineExceeded, DeviceError, DeviceSilent, InvalidArgument
+from trade_drivers._validation import finite, one_each, valid, within
 from trade_drivers.bus._deadlines import expiry, span
 from trade_drivers.bus._thread import BusThread
-from trade_drivers.bus._validation import finite, one_each, valid, within
 from trade_drivers.interfaces._arm import Arm, ArmLimits, ArmState
 from trade_drivers.motion._plan import JointLimits, Plan
 from trade_drivers.vendors.ur._arm_state import IDLE, RUNNING, Limb

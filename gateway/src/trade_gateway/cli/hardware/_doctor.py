@@ -11,13 +11,13 @@ from rich.markup import escape
 from trade._toml import read_toml_text
 from trade.errors import ConfigurationError, TradeError
 from trade_drivers import SerialBus, drivers, load, refusals
+from trade_gateway.cli._options import Json
 from trade_gateway.cli._output import Output
 from trade_gateway.cli._system_choice import choice_of, visitor
 from trade_gateway.cli.hardware import _doctor_host as host
 from trade_gateway.cli.hardware import _doctor_robot as robots
 from trade_gateway.cli.hardware._doctor_host import Finding
 from trade_gateway.cli.hardware._scan import serial_ports
-from trade_gateway.cli.services._services import Json
 
 _COLOURS = {"ok": "green", "warning": "yellow", "error": "red"}
 

@@ -15,8 +15,9 @@ from rich.markup import escape
 
 from trade.errors import ConfigurationError
 from trade_drivers import load, without
-from trade_gateway.cli._output import Output, UsageError
-from trade_gateway.cli.services._services import Json
+from trade_gateway._usage import UsageError
+from trade_gateway.cli._options import Json
+from trade_gateway.cli._output import Output
 from trade_gateway.drill import SCENES, Played, Report, Scene, as_data, page, play, standing, targets_of
 
 _COLOURS = {True: "green", False: "bold red"}

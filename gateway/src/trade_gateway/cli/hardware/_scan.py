@@ -13,9 +13,10 @@ from rich.markup import escape
 from trade.errors import ConfigurationError
 from trade_drivers import AnyDriver, Commissioner, Found, drivers, load_driver
 from trade_drivers import scan as scan_line
-from trade_gateway.cli._output import Output, UsageError, complain
+from trade_gateway._usage import UsageError
+from trade_gateway.cli._options import Json
+from trade_gateway.cli._output import Output, complain
 from trade_gateway.cli.hardware._robot_file_template import first_file
-from trade_gateway.cli.services._services import Json
 
 __all__ = ["scan", "serial_ports", "set_baud", "set_id"]
 

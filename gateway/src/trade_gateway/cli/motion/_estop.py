@@ -9,9 +9,10 @@ from trade import Container, EstopReport, Sight
 from trade._estop.controller import new_estop_id
 from trade._stop_line import StopLines
 from trade.errors import NoSuchEstop
-from trade_gateway.cli._output import Output, UsageError
+from trade_gateway._usage import UsageError
+from trade_gateway.cli._options import Json
+from trade_gateway.cli._output import Output
 from trade_gateway.cli._system_choice import choice_of, visitor
-from trade_gateway.cli.services._services import Json
 
 
 def estop(

@@ -15,9 +15,8 @@ from typer.core import TyperCommand
 
 from trade import Constraint
 from trade.errors import LockLost
-from trade_gateway.cli._output import UsageError
+from trade_gateway._usage import UsageError, asked_for
 from trade_gateway.cli._system_choice import SystemChoice, choice_of, visitor_among_others
-from trade_gateway.cli.services._services import asked_for
 
 _COMMAND: Final = "trade_gateway.command"
 _KILLED_BY: Final = 128

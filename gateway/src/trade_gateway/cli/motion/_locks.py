@@ -7,9 +7,10 @@ from rich.markup import escape
 
 from trade import Constraint, Container, LockInfo
 from trade._timestamps import clock
+from trade_gateway._usage import asked_for
+from trade_gateway.cli._options import Json
 from trade_gateway.cli._output import Output
 from trade_gateway.cli._system_choice import visitor_among_others
-from trade_gateway.cli.services._services import Json, asked_for
 
 Group = Annotated[str, typer.Argument(help="A group and what is beneath it: rosie.head.")]
 

@@ -7,9 +7,9 @@ from rich.markup import escape
 
 from trade import StopReport
 from trade._stop_line import StopLines
+from trade_gateway.cli._options import Json
 from trade_gateway.cli._output import Output
 from trade_gateway.cli._system_choice import choice_of, visitor
-from trade_gateway.cli.services._services import Json
 
 
 def stop(

@@ -18,7 +18,8 @@ from rich.markup import escape
 from trade import Settings
 from trade._toml import read_toml_text
 from trade.errors import ConfigurationError
-from trade_gateway.cli._output import Output, UsageError, complain
+from trade_gateway._usage import UsageError
+from trade_gateway.cli._output import Output, complain
 from trade_gateway.cli.operation._archive import (
     CONFIG,
     SQLITE_BESIDE,

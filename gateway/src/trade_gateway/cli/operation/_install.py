@@ -16,7 +16,8 @@ from rich.markup import escape
 
 from trade.errors import ConfigurationError
 from trade_drivers import load
-from trade_gateway.cli._output import Output, UsageError
+from trade_gateway._usage import UsageError
+from trade_gateway.cli._output import Output
 from trade_gateway.cli.operation._file_closure import Named, named_files
 from trade_gateway.cli.operation._systemd_unit import UDEV_RULES, hidden_in, needs_of, program_folders, unit_text
 from trade_gateway.config._gateway import read_gateway_file

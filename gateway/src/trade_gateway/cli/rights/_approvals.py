@@ -9,12 +9,11 @@ from rich.markup import escape
 
 from trade import Container, Handle, where
 from trade.errors import ConfigurationError, TradeError
+from trade_gateway.cli._options import Json
 from trade_gateway.cli._output import Output, complain
 from trade_gateway.cli._system_choice import visitor_among_others
-from trade_gateway.cli.services._services import Json
+from trade_gateway.clients._schemas import APPROVALS
 
-GROUP: Final = "approvals"
-"""Where what waits is a service."""
 _COLUMNS: Final = ("id", "agent", "service", "arguments", "why", "waits")
 
 app = typer.Typer(
@@ -77,7 +76,7 @@ def _decide(context: typer.Context, name: str, word: str, *args: str) -> None:
 
 
 def _pending(container: Container) -> Iterator[tuple[Handle, dict[str, Any]]]:
-    for handle in container.services(where(name="pending", group=GROUP)):
+    for handle in container.services(where(name="pending", group=APPROVALS)):
         try:
             for one in handle():
                 yield handle, {name: getattr(one, name) for name in ("id", "agent", "service", "args", "why", "until")}

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 import typer
 from rich.markup import escape
 
-from trade_gateway.cli._output import Output, UsageError
-from trade_gateway.cli.services._services import Json
+from trade_gateway._usage import UsageError
+from trade_gateway.cli._options import Json
+from trade_gateway.cli._output import Output
 
 if TYPE_CHECKING:
     from trade_gateway.pki._authority import Authority, Issued

@@ -7,8 +7,9 @@ import typer
 from rich.markup import escape
 
 from trade.policies import VERBS, Decision, Policy, decide_call, read_policy
-from trade_gateway.cli._output import Output, UsageError
-from trade_gateway.cli.services._services import Json
+from trade_gateway._usage import UsageError
+from trade_gateway.cli._options import Json
+from trade_gateway.cli._output import Output
 
 app = typer.Typer(no_args_is_help=True, help="Who may do what, by the access policy.")
 

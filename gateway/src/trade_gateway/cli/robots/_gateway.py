@@ -1,12 +1,9 @@
 """``trade gateway GATEWAY.toml``: join networks, and let across what the file and its policy allow."""
 
 import queue
-import signal
 import tempfile
-from collections.abc import Callable, Generator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from types import FrameType
 from typing import Annotated, Final
 
 import typer
@@ -15,16 +12,15 @@ from rich.markup import escape
 from trade import Container, Settings
 from trade.errors import ConfigurationError, TradeError
 from trade.policies import EVERYTHING
-from trade_gateway.cli._addresses import forwarding
+from trade_gateway.cli._options import Json
 from trade_gateway.cli._output import Output, complain
 from trade_gateway.cli._sd_notify import Notifier
 from trade_gateway.cli.robots._detached import Detach, detach_now, ready
-from trade_gateway.cli.robots._up import leaving, settle
-from trade_gateway.cli.services._services import Json
 from trade_gateway.config._changes import Named, digest, named_by
 from trade_gateway.config._gateway import Plan, read_gateway_file
 from trade_gateway.federation._guests import Guests, opened
-from trade_gateway.process._signal_event import Asked
+from trade_gateway.process._addresses import forwarding
+from trade_gateway.process._running import hangups, leaving, settle
 from trade_gateway.supervisor import ChildServices, News, Supervisor
 
 _LOOK_EVERY_S: Final = 1.0
@@ -184,23 +180,6 @@ class Gateway:
         if self._supervisor is not None:
             self._supervisor.close()
         self._leave_networks()
-
-
-@contextmanager
-def hangups() -> Generator[Asked]:
-    """What SIGHUP asks for."""
-    event = Asked()
-
-    def heard(_number: int, _frame: FrameType | None) -> None:
-        event.set()
-
-    number = getattr(signal, "SIGHUP", None)
-    before = None if number is None else signal.signal(number, heard)
-    try:
-        yield event
-    finally:
-        if number is not None:
-            signal.signal(number, before)
 
 
 def _warn_of_forwarding(plan: Plan) -> None:

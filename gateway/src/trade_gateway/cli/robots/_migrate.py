@@ -5,9 +5,11 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
+from trade_gateway._usage import asked_for
+from trade_gateway.cli._options import Json
 from trade_gateway.cli._output import Output
 from trade_gateway.cli._system_choice import visitor_among_others
-from trade_gateway.cli.services._services import Json, asked_for, describe
+from trade_gateway.cli.services._services import describe
 
 
 def migrate(

@@ -1,12 +1,9 @@
 """``trade up ROBOT.toml``: attach a robot's devices and offer them as services until told to leave."""
 
-import gc
 import logging
-import signal
-from collections.abc import Generator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
-from types import FrameType
 from typing import Annotated, Any
 
 import typer
@@ -17,13 +14,14 @@ from trade.errors import ConfigurationError
 from trade_drivers import AttachedRobot, attach, load, without
 from trade_drivers import check as drivers_check
 from trade_drivers.robotfile import Robot
-from trade_gateway.cli._output import Output, UsageError, complain
+from trade_gateway._usage import UsageError
+from trade_gateway.cli._options import Json
+from trade_gateway.cli._output import Output, complain
 from trade_gateway.cli._sd_notify import Notifier
 from trade_gateway.cli._system_choice import choice_of
 from trade_gateway.cli.robots._detached import Detach, detach_now, ready
 from trade_gateway.cli.robots._fault_reporter import FaultWatch
-from trade_gateway.cli.services._services import Json
-from trade_gateway.process._signal_event import Asked
+from trade_gateway.process._running import leaving, refuse_twice, settle
 
 _LOOK_EVERY_S = 0.5
 
@@ -122,31 +120,6 @@ def ports_told(words: Sequence[str]) -> dict[str, str]:
     return ports
 
 
-@contextmanager
-def leaving() -> Generator[Asked]:
-    """What Ctrl-C and SIGTERM ask for, so that devices are always left in order."""
-    event = Asked()
-
-    def leave(_number: int, _frame: FrameType | None) -> None:
-        event.set()
-
-    before = {number: signal.signal(number, leave) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield event
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
-def settle() -> None:
-    """To be called once all stands: from now on garbage collections leave out what is there already.
-
-    A full one looks through all of it, which takes 50 ms in the process of a robot, and every thread waits meanwhile.
-    """
-    gc.collect()
-    gc.freeze()
-
-
 def _simulation(robot: Robot, log: Path | None) -> Any:
     try:
         from trade_hil_sim import SimProcess, SimulationError, remove_leftovers  # noqa: PLC0415 - only needed without hardware
@@ -158,14 +131,6 @@ def _simulation(robot: Robot, log: Path | None) -> Any:
         return SimProcess(robot.where, buses=parts, log=log, logged=log is not None)
     except SimulationError as problem:
         raise ConfigurationError(where=robot.where, problem=str(problem)) from None
-
-
-def refuse_twice(container: Container, command: str) -> None:
-    """Two containers of one name that stay up would make every look-up ambiguous."""
-    for other in container.containers():
-        if other.name == container.name and other.epoch != container.address.epoch:
-            problem = f"{other.name!r} is up already (process {other.pid} on {other.host}); stop it, or choose a --name"
-            raise ConfigurationError(where=command, problem=problem)
 
 
 def _say_left(attached: AttachedRobot) -> None:

@@ -8,9 +8,9 @@ import typer
 from rich.markup import escape
 
 from trade.errors import TradeError
+from trade_gateway.cli._options import Json
 from trade_gateway.cli._output import Output, say_error
 from trade_gateway.cli._system_choice import visitor_among_others
-from trade_gateway.cli.services._services import Json
 from trade_gateway.language import Lexicon, Memory, Reply, Talk, read_lexicon
 
 _FILE: Final = "asked.json"

@@ -11,11 +11,12 @@ from typing import Annotated, Any, Final
 import msgspec
 import typer
 
-from trade import Container, Handle
-from trade.errors import TooManyServices, TradeError
-from trade_gateway.cli._output import Output, UsageError, say_error
+from trade import Handle
+from trade.errors import TradeError
+from trade_gateway._usage import UsageError, find
+from trade_gateway.cli._options import Json
+from trade_gateway.cli._output import Output, say_error
 from trade_gateway.cli._system_choice import visitor
-from trade_gateway.cli.services._services import Json, asked_for
 
 _NO_NUMBER = re.compile(r"(?<![\w\"])(nan|inf|infinity)(?![\w\"])", re.IGNORECASE)
 _WORD = re.compile(r"[^\W\d][\w ./-]*")
@@ -82,23 +83,6 @@ def _cancel(handle: Handle) -> None:
         handle.cancel_service()()
     except TradeError as error:
         say_error(error)
-
-
-def find(visiting: Container, service: str, container: str | None, wait_s: float) -> Handle:
-    """The service of a group and name; one of exactly this group goes before those beneath it.
-
-    Raises:
-        UsageError: the text names no service.
-    """
-    group, _, name = service.rpartition(".")
-    constraint = asked_for(f"service {service!r}", name=name or service, group=group or None, container=container)
-    try:
-        return visiting.find(constraint, wait_s=wait_s)
-    except TooManyServices:
-        exact = [handle for handle in visiting.services(constraint) if group in handle.groups]
-        if len(exact) == 1:
-            return exact[0]
-        raise
 
 
 def parse_arguments(texts: list[str]) -> tuple[list[Any], dict[str, Any]]:

@@ -10,8 +10,8 @@ from trade import Container
 from trade.errors import ConfigurationError
 from trade_gateway.cli._output import complain
 from trade_gateway.cli._system_choice import SystemChoice
-from trade_gateway.cli.robots._up import settle
 from trade_gateway.language import read_lexicon
+from trade_gateway.process._running import settle
 
 
 def mcp(

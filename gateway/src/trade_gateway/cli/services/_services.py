@@ -9,14 +9,14 @@ from rich.markup import escape
 
 from trade import Constraint, Container, ContainerInfo, Handle, LoadInfo, where
 from trade._protocol.messages import PROTOCOL
-from trade.errors import ConfigurationError
-from trade_gateway.cli._load_table import loads, loads_table
-from trade_gateway.cli._output import Output, UsageError
+from trade_gateway._usage import asked_for
+from trade_gateway.cli._options import Json
+from trade_gateway.cli._output import Output
 from trade_gateway.cli._system_choice import visitor_among_others
+from trade_gateway.clients._load_table import loads, loads_table
 
 HEALTHY: Final = "healthy"
 _STARTS: Final = "; [bold]trade up examples/rosie.toml --sim[/] starts one"
-Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
 
 def services(
@@ -47,18 +47,6 @@ def services(
                 out.say(f"[bold]{escape(handle.label)}[/]  {escape(handle.signature)}\n{escape(doc_text)}\n")
         else:
             out.table(*_table(found))
-
-
-def asked_for(what: str, *, name: str | None, group: str | None, container: str | None = None) -> Constraint:
-    """The constraint that words of the command line ask for.
-
-    Raises:
-        UsageError: they make none.
-    """
-    try:
-        return where(name=name, group=group, container=container)
-    except ConfigurationError as bad:
-        raise UsageError(where=what, problem=bad.problem) from None
 
 
 def _nothing(container: Container, constraint: Constraint) -> str:

@@ -8,10 +8,10 @@ import typer
 
 from trade import Sample
 from trade._timestamps import clock
+from trade_gateway._usage import find
+from trade_gateway.cli._options import Json
 from trade_gateway.cli._output import Output
 from trade_gateway.cli._system_choice import visitor
-from trade_gateway.cli.services._call import find
-from trade_gateway.cli.services._services import Json
 
 
 def stream(

@@ -18,9 +18,10 @@ from rich.markup import escape
 from trade._context.sessions import client_of
 from trade.auditing import AuditRow, Verdict, moved_aside_in, reading, records_in, verify
 from trade.errors import ConfigurationError
+from trade_gateway._usage import UsageError
 from trade_gateway.cli._default_command import FirstByDefault
-from trade_gateway.cli._output import Output, UsageError, complain
-from trade_gateway.cli.services._services import Json
+from trade_gateway.cli._options import Json
+from trade_gateway.cli._output import Output, complain
 
 _EVERY_S: Final = 0.5
 _UNITS_S: Final = {"s": 1, "m": 60, "h": 3600, "d": 86_400}

@@ -9,9 +9,9 @@ from rich.markup import escape
 
 from trade import LogLine, LogReader
 from trade._timestamps import clock
+from trade_gateway.cli._options import Json
 from trade_gateway.cli._output import Output
 from trade_gateway.cli._system_choice import visitor_among_others
-from trade_gateway.cli.services._services import Json
 from trade_gateway.cli.watching._trace import Name
 
 _EVERY_S: Final = 0.5

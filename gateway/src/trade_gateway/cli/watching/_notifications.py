@@ -6,9 +6,9 @@ import typer
 from rich.markup import escape
 
 from trade import HookInfo, NotificationInfo
+from trade_gateway.cli._options import Json
 from trade_gateway.cli._output import Output
 from trade_gateway.cli._system_choice import visitor_among_others
-from trade_gateway.cli.services._services import Json
 
 
 def notifications(

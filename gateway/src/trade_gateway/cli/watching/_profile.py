@@ -10,9 +10,10 @@ from msgspec import Struct
 from rich.markup import escape
 
 from trade import Span
-from trade_gateway.cli._output import Output, UsageError
+from trade_gateway._usage import UsageError
+from trade_gateway.cli._options import Json
+from trade_gateway.cli._output import Output
 from trade_gateway.cli._system_choice import visitor_among_others
-from trade_gateway.cli.services._services import Json
 from trade_gateway.cli.watching._call_model import Deviation, deviations, learn, read, write
 from trade_gateway.cli.watching._trace import Name
 

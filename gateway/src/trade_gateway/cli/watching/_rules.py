@@ -11,12 +11,11 @@ from trade import Container, where
 from trade._timestamps import clock
 from trade.errors import TradeError
 from trade.rules import GROUP, Did, Firing, Rehearsal, RuleInfo, Rules, read_rules, rehearse
+from trade_gateway.cli._options import Json
 from trade_gateway.cli._output import Output, complain
 from trade_gateway.cli._system_choice import choice_of, visitor_among_others
 from trade_gateway.cli.robots._detached import Detach, detach_now, ready
-from trade_gateway.cli.robots._gateway import hangups
-from trade_gateway.cli.robots._up import leaving, refuse_twice
-from trade_gateway.cli.services._services import Json
+from trade_gateway.process._running import hangups, leaving, refuse_twice
 
 _LOOK_EVERY_S: Final = 0.5
 

@@ -17,10 +17,10 @@ from rich.text import Text
 from trade import Container, Handle, LoadInfo, where
 from trade._protocol.messages import HEALTHY
 from trade._timestamps import clock
-from trade_gateway.cli._load_table import loads_table
+from trade_gateway.cli._options import Json
 from trade_gateway.cli._output import Output, table_lines
 from trade_gateway.cli._system_choice import visitor
-from trade_gateway.cli.services._services import Json
+from trade_gateway.clients._load_table import loads_table
 
 _ANSWERS_WITHIN_S: Final = 1.0
 

@@ -7,9 +7,10 @@ import typer
 
 from trade import Span, Trace
 from trade._timestamps import clock
-from trade_gateway.cli._output import Output, UsageError
+from trade_gateway._usage import UsageError
+from trade_gateway.cli._options import Json
+from trade_gateway.cli._output import Output
 from trade_gateway.cli._system_choice import visitor_among_others
-from trade_gateway.cli.services._services import Json
 
 _LATEST: Final = 20
 

@@ -16,9 +16,10 @@ from trade import Constraint, Container, Estop, Handle, LockInfo, where
 from trade._protocol.messages import HEALTHY
 from trade._timestamps import clock
 from trade.errors import TradeError
+from trade_gateway._usage import asked_for
+from trade_gateway.cli._options import Json
 from trade_gateway.cli._output import Output
 from trade_gateway.cli._system_choice import visitor
-from trade_gateway.cli.services._services import Json, asked_for
 
 _EVERY_S: Final = 0.3
 """What happens to many services of a container within that is one line."""

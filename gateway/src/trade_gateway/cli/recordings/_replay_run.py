@@ -11,7 +11,7 @@ from msgspec import Struct
 from trade import Container, Handle, Stream, where
 from trade.errors import ConfigurationError, DeviceError
 from trade_drivers import JointLimits, Tolerances
-from trade_gateway.cli._output import UsageError
+from trade_gateway._usage import UsageError
 from trade_gateway.cli.services._call import run_to_end
 from trade_gateway.recording._channels import JointStates
 from trade_gateway.recording._motion import Motion, deviation, fitted, motion_of, motions, moving

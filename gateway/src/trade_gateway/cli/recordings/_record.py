@@ -5,10 +5,11 @@ from typing import Annotated, Final
 
 import typer
 
-from trade_gateway.cli._output import Output, UsageError
+from trade_gateway._usage import UsageError
+from trade_gateway.cli._options import Json
+from trade_gateway.cli._output import Output
 from trade_gateway.cli._system_choice import visitor
-from trade_gateway.cli.robots._up import leaving
-from trade_gateway.cli.services._services import Json
+from trade_gateway.process._running import leaving
 from trade_gateway.recording import require
 from trade_gateway.recording._sources import Wanted
 
@@ -54,7 +55,7 @@ def record(
     wanted = Wanted(group or [], services or [], hz, camera_hz, service_hz)
     attachments = [_read(path) for path in attach or []]
     require("mcap", "record")
-    from trade_gateway.recording import _progress as room  # noqa: PLC0415 - loads what the other commands do not need
+    from trade_gateway.cli.recordings import _progress as room  # noqa: PLC0415 - loads what the other commands do not need
 
     out = Output(as_json=as_json)
     with leaving() as ending, visitor(context) as container, room.Recorder(container, wanted, ending) as recorder:

@@ -8,8 +8,9 @@ import typer
 from rich.markup import escape
 
 from trade.errors import ConfigurationError
-from trade_gateway.cli._output import Output, UsageError, complain
-from trade_gateway.cli.services._services import Json
+from trade_gateway._usage import UsageError
+from trade_gateway.cli._options import Json
+from trade_gateway.cli._output import Output, complain
 from trade_gateway.recording import require
 
 

@@ -7,9 +7,9 @@ import typer
 from rich.markup import escape
 
 from trade import where
+from trade_gateway.cli._options import Json
 from trade_gateway.cli._output import Output
 from trade_gateway.cli._system_choice import visitor
-from trade_gateway.cli.services._services import Json
 from trade_gateway.recording import require
 
 _WAIT_S: Final = 10.0
@@ -39,7 +39,7 @@ def replay(
     For example: trade replay walk.mcap --group rosie.head --speed 0.5
     """
     require("mcap", "record")
-    from trade_gateway.recording import _replay_run as room  # noqa: PLC0415 - loads what the other commands do not need
+    from trade_gateway.cli.recordings import _replay_run as room  # noqa: PLC0415 - loads what the other commands do not need
 
     out = Output(as_json=as_json)
     motion = room.chosen(file, group)

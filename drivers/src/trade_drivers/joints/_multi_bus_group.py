@@ -11,7 +11,7 @@ from typing import Final, TypeVar
 
 from trade import Resource, current_call, permit
 from trade.errors import TradeError
-from trade_drivers.bus._validation import finite, one_each, valid, within
+from trade_drivers._validation import finite, one_each, valid, within
 from trade_drivers.interfaces._motion import JointGroup, MotorState
 from trade_drivers.interfaces._trajectory import checked
 from trade_drivers.motion._plan import JointLimits, Plan, Tolerances, Track

@@ -7,8 +7,9 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
-from trade_gateway.cli._output import Output, UsageError
-from trade_gateway.cli.services._services import Json
+from trade_gateway._usage import UsageError
+from trade_gateway.cli._options import Json
+from trade_gateway.cli._output import Output
 from trade_gateway.conformance import CHECKS, FAILED, LEFT_OUT, OK, Check, Outcome, run
 
 _COLOURS = {OK: "green", FAILED: "bold red", LEFT_OUT: "yellow"}

@@ -1,0 +1,58 @@
+"""The bus thread's part of faults.
+
+After each cycle it compares each device with what is known of it, and tells of changes without waiting.
+"""
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+from trade.errors import TradeError
+from trade_drivers.bus._cycle import BusDevice, BusExchange
+from trade_drivers.bus._jobs import Device
+from trade_drivers.faults._trouble import Respect, Tell, Trouble, found_in
+
+
+class _Seen:
+    """What is known of one device."""
+
+    __slots__ = ("device", "fault", "link", "refusing")
+
+    def __init__(self, device: BusDevice) -> None:
+        self.device = device
+        self.fault = ""
+        self.link = False
+        self.refusing: Callable[[Device], TradeError] | None = None
+
+
+class Lookout:
+    """Tells of every change once; what comes and goes between two cycles was never there."""
+
+    def __init__(self, exchange: BusExchange[Any], tell: Tell) -> None:
+        self._exchange = exchange
+        self._tell = tell
+        self._seen = tuple(_Seen(device) for device in exchange.devices)
+
+    def look(self) -> None:
+        """Compare every device with what is known of it."""
+        exchange = self._exchange
+        now_ns, refusing, stale_ns = exchange.clock(), exchange.refusing, exchange.stale_after_ns
+        for seen in self._seen:
+            device = seen.device
+            if (fault := device.fault) != seen.fault:
+                seen.fault = fault
+                self._say(device, "fault", device.faulty() if fault else None)
+            if refusing is None and not device.silent and device.age_ns(now_ns) <= stale_ns:
+                if seen.link:
+                    seen.link, seen.refusing = False, None
+                    self._say(device, "link", None)
+            elif not seen.link or (refusing is not None and refusing != seen.refusing):
+                seen.link, seen.refusing = (
+                    True,
+                    refusing,
+                )  # until it is heard, it is as it was: it was not silent besides
+                self._say(device, "link", device.deaf(now_ns) if refusing is None else refusing(device))
+
+    def _say(self, device: BusDevice, respect: Respect, error: TradeError | None) -> None:
+        found = () if error is None else found_in(device.name, error)
+        self._tell(Trouble(device.name, respect, time.time(), time.monotonic(), found))

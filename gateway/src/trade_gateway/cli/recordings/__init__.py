@@ -1,0 +1,1 @@
+"""Commands that record, replay, export and show a system live."""
