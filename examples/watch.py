@@ -7,12 +7,12 @@ import logging
 import signal
 
 import trade
-from trade import Called, Settings, service, where
+from trade import HookEvent, Settings, service, where
 
 
 class Diary:
     @service(effect="read")
-    def note(self, called: Called) -> None:
+    def note(self, called: HookEvent) -> None:
         """Write a call down, where `trade logs` finds it."""
         logging.getLogger("trade").warning("the head was sent to %s", called.args["positions_rad"])
 

@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 from trade import Container, Handle, Sample, Stream, service, where
-from trade._transport.memory import Kind, Passage
+from trade._transport.memory import InFlightMessage, Kind
 
 PATIENCE_S = 20.0
 """How long a test waits for what must come; far above what it takes."""
@@ -64,7 +64,7 @@ def some(stream: Stream, count: int) -> list[Sample]:
     return [stream.next(PATIENCE_S) for _ in range(count)]
 
 
-def is_sample(passage: Passage) -> bool:
+def is_sample(passage: InFlightMessage) -> bool:
     """One that is sent from one container to another."""
     return passage.key.startswith("stream/") and passage.kind not in (Kind.RISE, Kind.FALL) and not passage.arrived
 

@@ -4,7 +4,7 @@ import concurrent.futures
 from collections.abc import Callable, Iterable, Sequence
 
 from trade._protocol.messages import Token
-from trade._resources.lock_request import Granted, Terms
+from trade._resources.lock_request import Granted, LockRequest
 from trade._resources.lock_table import LockTable
 from trade._resources.resource import Holder, Permit, Resource, admit
 from waiting import wait_until
@@ -34,7 +34,7 @@ class Table:
     def acquire(self, names: Iterable[str], session: str = "s", calls: Iterable[int] = (), **terms: object) -> Granted:
         holder = Holder("tester", session, session, "test", 0.0)
         tokens = terms.pop("tokens", ())
-        return self.table.acquire(list(names), holder, Terms(**terms), tokens, calls)  # type: ignore[arg-type]
+        return self.table.acquire(list(names), holder, LockRequest(**terms), tokens, calls)  # type: ignore[arg-type]
 
     def take(self, names: Iterable[str], session: str = "s", **terms: object) -> Token:
         token = self.acquire(names, session, **terms).token

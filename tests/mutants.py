@@ -50,10 +50,10 @@ def _never_late(patch: Patch) -> None:
 
 def _no_dedupe(patch: Patch) -> None:
     """A call that comes again runs again."""
-    from trade._context.active_calls import Once
+    from trade._context.active_calls import CallDeduplicator
 
-    patch(Once, "begin", lambda self, call, ongoing: ongoing)
-    patch(Once, "find", lambda self, caller, call: None)
+    patch(CallDeduplicator, "begin", lambda self, call, ongoing: ongoing)
+    patch(CallDeduplicator, "find", lambda self, caller, call: None)
 
 
 def _stop_loses(patch: Patch) -> None:
@@ -78,10 +78,10 @@ def _watchdog_off(patch: Patch) -> None:
 
 def _discovery_stays_on(patch: Patch) -> None:
     """Who looks for containers once looks for ever."""
-    from trade._discovery.dialer import Reach
+    from trade._discovery.dialer import Dialer
 
-    switch = Reach.set_discovery
-    patch(Reach, "set_discovery", lambda self, on: switch(self, on or self.discovers))
+    switch = Dialer.set_discovery
+    patch(Dialer, "set_discovery", lambda self, on: switch(self, on or self.discovers))
 
 
 def _uses_uncounted(patch: Patch) -> None:
@@ -100,10 +100,10 @@ def _uses_uncounted(patch: Patch) -> None:
 
 def _no_priority(patch: Patch) -> None:
     """Whoever locks waits like everybody else, whatever priority it was given."""
-    from trade._locks.api import Locking
+    from trade._locks.api import LockApi
 
-    lock = Locking.lock
-    patch(Locking, "lock", lambda self, which, **terms: lock(self, which, **{**terms, "priority": 0}))
+    lock = LockApi.lock
+    patch(LockApi, "lock", lambda self, which, **terms: lock(self, which, **{**terms, "priority": 0}))
 
 
 def _busiest(patch: Patch) -> None:

@@ -29,7 +29,7 @@ from trade._protocol.messages import (
     Token,
 )
 from trade._protocol.samples import StreamSample
-from trade._resources.lock_request import Granted, LockInfo, Terms
+from trade._resources.lock_request import Granted, LockInfo, LockRequest
 from trade._resources.resource import Holder
 
 FILE: Final = Path(__file__).parents[1] / "docs" / "wire-vectors.json"
@@ -83,7 +83,7 @@ MESSAGES: Final[dict[str, Any]] = {
     "a call with a handle": _call("relay", [_HANDLE, ["rosie.pan"], [0.25]]),
     "a call of stop": _call("stop", [], expires_ns=None),
     "a call of cancel": _call("cancel", CancelArguments(12, "rosie.neck.move_to", 8.0), expires_ns=None),
-    "a call of acquire": _call("acquire", [["rosie.pan"], Terms(purpose="look around", wait_s=3.0)]),
+    "a call of acquire": _call("acquire", [["rosie.pan"], LockRequest(purpose="look around", wait_s=3.0)]),
     "a call of renew": _call("renew", [[7, 8]], expires_ns=None),
     "an answer": _reply(Status.OK, 0.25),
     "an answer with a map by number": _reply(Status.OK, {7: "its lease ended"}),

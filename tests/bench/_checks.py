@@ -168,7 +168,7 @@ def _echo():
 
 def _kinds() -> tuple[type, type]:
     """A joint, and what watches it."""
-    from trade import Called, service
+    from trade import HookEvent, service
 
     class Joint:
         resources = ("bench.joint",)
@@ -183,7 +183,7 @@ def _kinds() -> tuple[type, type]:
 
     class Watch:
         @service(effect="read")
-        def see(self, called: Called) -> None:
+        def see(self, called: HookEvent) -> None:
             """Nothing is done with it."""
 
     return Joint, Watch

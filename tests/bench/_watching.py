@@ -60,7 +60,7 @@ def _measure_ticks(seconds: float) -> tuple[float, float]:
 
 
 def _measure_hooks(n: int, rounds: int) -> dict[str, list[float]]:
-    from trade import Called, Container, Settings, service
+    from trade import Container, HookEvent, Settings, service
 
     class Lamp:
         @service(effect="read")
@@ -69,7 +69,7 @@ def _measure_hooks(n: int, rounds: int) -> dict[str, list[float]]:
 
     class Watch:
         @service(effect="read")
-        def see(self, called: Called) -> None:
+        def see(self, called: HookEvent) -> None:
             """Nothing is done with it."""
 
     with Container(Settings.read(container="hall", system=_SYSTEM)) as container:

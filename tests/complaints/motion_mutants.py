@@ -7,7 +7,7 @@ import pytest
 
 from trade._estop.deadman import Deadman
 from trade_drivers.bus._thread import BusThread
-from trade_drivers.joints import Axis, Course, Exchange
+from trade_drivers.joints import Axis, Exchange, Ramp
 from trade_drivers.joints._jobs import Enable
 from trade_drivers.joints._motion import Motion
 from trade_drivers.joints._setpoint import SetPoint
@@ -73,7 +73,7 @@ def enabling_a_feetech_writes_torque_alone(patch: pytest.MonkeyPatch) -> None:
 def a_course_begins_at_zero(patch: pytest.MonkeyPatch) -> None:
     def stand(self: DamiaoExchange, axis: Any) -> None:
         accel = float(axis.accel_counts)
-        axis.course = Course(0, fastest=axis.speed_counts, accel=accel, braking=accel)
+        axis.course = Ramp(0, fastest=axis.speed_counts, accel=accel, braking=accel)
 
     patch.setattr(DamiaoExchange, "stand", stand)
 

@@ -4,7 +4,7 @@ import pytest
 
 from complaints.hosts import Wifi
 from trade._security.policy import Decision, Policy
-from trade._threads.channel_workers import Crew
+from trade._threads.channel_workers import WorkerPool
 from trade._transport.base import ChannelClosed
 
 
@@ -13,14 +13,14 @@ def the_devices_zero_is_taken_as_it_is(patch: pytest.MonkeyPatch) -> None:
 
 
 def one_thread_serves_all_calls(patch: pytest.MonkeyPatch) -> None:
-    def main(self: Crew) -> None:
+    def main(self: WorkerPool) -> None:
         while not self._dismissed:
             try:
                 self._work(self._channel.receive())
             except ChannelClosed:
                 return
 
-    patch.setattr(Crew, "_main", main)
+    patch.setattr(WorkerPool, "_main", main)
 
 
 def who_is_there_is_asked_by_multicast(patch: pytest.MonkeyPatch) -> None:

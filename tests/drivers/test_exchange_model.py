@@ -13,7 +13,7 @@ from hypothesis.stateful import RuleBasedStateMachine, precondition, rule
 
 from trade import Resource
 from trade.errors import BusGone, DeviceFault, DeviceSilent, TradeError
-from trade_drivers.bus._cycle import HALT_NS, BusExchange, StopTicket, _drained
+from trade_drivers.bus._cycle import HALT_NS, BusCycle, StopTicket, _drained
 from trade_drivers.bus._jobs import Device, Steps, Work
 from waiting import PATIENCE_S
 
@@ -44,7 +44,7 @@ class Joint:
         return DeviceFault(device=self.name, bus=self.bus, fault=fault or self.fault)
 
 
-class Exchange(BusExchange[Joint]):
+class Exchange(BusCycle[Joint]):
     """The least there can be on a bus: stops, work, and what became of the stops."""
 
     def cycle(self) -> None:

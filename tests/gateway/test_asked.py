@@ -6,12 +6,12 @@ import subprocess
 import sys
 import threading
 
-from trade_gateway.process._signal_event import Asked
+from trade_gateway.process._signal_event import SignalEvent
 from waiting import PATIENCE_S, wait_until
 
 
 def test_it_is_heard_by_all_who_wait_and_until_it_is_cleared() -> None:
-    asked, heard = Asked(), list[bool]()
+    asked, heard = SignalEvent(), list[bool]()
     waiting = [threading.Thread(target=lambda: heard.append(asked.wait(PATIENCE_S))) for _ in range(3)]
     for thread in waiting:
         thread.start()
@@ -32,7 +32,7 @@ STRIKES = "import os, sys\nwhile True: os.kill(int(sys.argv[1]), int(sys.argv[2]
 
 def test_a_handler_may_set_it_while_its_own_thread_waits_for_it() -> None:
     """With an Event a few thousand signals are enough for one to strike while the thread has its lock."""
-    asked, struck = Asked(), [0]
+    asked, struck = SignalEvent(), [0]
 
     def handler(_number: int, _frame: object) -> None:
         struck[0] += 1

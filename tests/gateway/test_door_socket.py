@@ -19,7 +19,7 @@ from doors import Axis, Client, Opened, ask, heard, opened, say
 from jointed import Robot
 from trade import progress, service
 from trade._protocol.messages import decode_call
-from trade._transport.memory.network import Passage
+from trade._transport.memory.network import InFlightMessage
 from trade.testing import memory_system
 from waiting import PATIENCE_S, wait_until
 
@@ -102,7 +102,7 @@ def test_what_has_no_form_in_json_ends_one_call_and_nothing_else(door: Opened) -
 def test_S04_set_points_leave_in_the_order_in_which_they_came(door: Opened) -> None:
     wanted, left = [float(number) for number in range(60)], list[float]()
 
-    def note(passage: Passage) -> None:
+    def note(passage: InFlightMessage) -> None:
         if passage.key.startswith("call/") and passage.payload is not None and not passage.arrived:
             call = decode_call(passage.payload)
             left.extend(msgspec.msgpack.decode(call.args) if call.service == "move" else ())

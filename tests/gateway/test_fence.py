@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from trade_gateway.process._kill_timer import Term, uptime_s
+from trade_gateway.process._kill_timer import TimerLease, uptime_s
 from trade_gateway.supervisor._single_instance import alone, is_free
 from waiting import PATIENCE_S, wait_until
 
@@ -36,7 +36,7 @@ class Staying:
     def until(self, leave_s: float, end_s: float) -> None:
         """From now on."""
         assert self.process.stdin is not None
-        self.process.stdin.write(f"{Term(uptime_s() + leave_s, uptime_s() + end_s).line()}\n")
+        self.process.stdin.write(f"{TimerLease(uptime_s() + leave_s, uptime_s() + end_s).line()}\n")
         self.process.stdin.flush()
 
     def says(self) -> str:

@@ -8,7 +8,7 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
-from trade_gateway.process._kill_timer import Term
+from trade_gateway.process._kill_timer import TimerLease
 from trade_gateway.supervisor._lease import Arbiter, Holder, Lease, waits_s
 
 LEASE_S = 10.0
@@ -33,7 +33,7 @@ def test_a_lease_counts_from_before_it_was_asked_for_and_its_last_third_is_for_l
     assert holder.asks(100.0)
     assert not holder.held(100.0)
     holder.answered(100.0, "", Lease("a", 9.0, states=b"saved"))
-    assert holder.term == Term(106.0, 109.0)
+    assert holder.term == TimerLease(106.0, 109.0)
     assert (holder.held(105.9), holder.held(106.0)) == (True, False)
     assert holder.states == b"saved"
 

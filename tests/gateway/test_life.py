@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from trade_gateway.config._children import Supervised
-from trade_gateway.supervisor._state_machine import Do, Life, State
+from trade_gateway.supervisor._state_machine import Life, State, Transition
 
 
 def life(**terms: Any) -> Life:
@@ -16,7 +16,7 @@ def life(**terms: Any) -> Life:
 def up(**terms: Any) -> Life:
     """One that is up at 10 s."""
     made = life(**terms)
-    assert made.start(0.0) is Do.LAUNCH
+    assert made.start(0.0) is Transition.LAUNCH
     assert made.state is State.STARTING
     made.up(10.0)
     assert made.state is State.UP
@@ -27,7 +27,7 @@ def test_one_that_is_up_is_asked_again_and_again_and_stays_up() -> None:
     child, asked = up(), []
     while len(asked) < 5:
         now = child.deadline
-        assert child.due(now) is Do.ASK
+        assert child.due(now) is Transition.ASK
         assert child.deadline == math.inf  # one question at a time
         asked.append(now)
         child.answered(now + 0.25)
@@ -52,7 +52,7 @@ def test_one_that_misses_a_question_is_asked_again_at_once_and_misses_all_in_the
     child, asked = up(), []
     for _ in range(child.terms.misses):
         asked.append(child.deadline)
-        assert child.due(child.deadline) is Do.ASK
+        assert child.due(child.deadline) is Transition.ASK
         child.missed(asked[-1] + 1)
     assert asked == [11.0, 12.0, 13.0, 14.0]
     assert child.state is State.STOPPING  # at 15 s: four after it was asked first
@@ -75,22 +75,22 @@ def test_one_that_never_answers_is_told_to_leave_then_killed_and_started_again()
         child.due(child.deadline)
         assert child.missed(child.deadline if child.deadline < math.inf else 0.0) is None
     child.due(child.deadline)
-    assert child.missed(20.0) is Do.LEAVE  # its state is not asked for: it does not answer
+    assert child.missed(20.0) is Transition.LEAVE  # its state is not asked for: it does not answer
     assert (child.state, child.why) == (State.STOPPING, "it did not answer within 4 s")
-    assert child.due(child.deadline) is Do.KILL
+    assert child.due(child.deadline) is Transition.KILL
     assert child.deadline == math.inf
     assert child.ended(50.0, "crashed (signal 9)") is None
     assert (child.state, child.why) == (State.WAITING, "it did not answer within 4 s; it crashed (signal 9)")
-    assert child.due(child.deadline) is Do.LAUNCH
+    assert child.due(child.deadline) is Transition.LAUNCH
     assert child.restarts == 1
 
 
 def test_a_supervisor_that_slept_counts_no_question_that_it_did_not_ask() -> None:
     child = up()
-    assert child.due(100_000.0) is Do.ASK
+    assert child.due(100_000.0) is Transition.ASK
     child.missed(100_000.0)
     assert child.state is State.SILENT
-    assert child.due(200_000.0) is Do.ASK
+    assert child.due(200_000.0) is Transition.ASK
     child.answered(200_000.0)
     assert child.state is State.UP
 
@@ -102,7 +102,7 @@ def test_the_wait_doubles_and_after_too_many_ends_in_the_window_it_is_given_up()
         child.ended(now, "code 1")
         assert child.state is State.WAITING
         waits.append(child.wait_s)
-        assert child.due(child.deadline) is Do.LAUNCH
+        assert child.due(child.deadline) is Transition.LAUNCH
     assert waits == [0.1, 0.2, 0.4]
     child.ended(4.0, "code 1: no such port")
     assert (child.state, child.why, child.deadline) == (State.GIVEN_UP, "code 1: no such port", math.inf)
@@ -130,17 +130,17 @@ def test_who_asks_by_hand_has_it_started_at_once_with_a_clean_slate(how: str) ->
     child.start(0.0)
     child.ended(1.0, "signal 9")
     assert child.state.value == how
-    assert child.start(2.0) is Do.LAUNCH
+    assert child.start(2.0) is Transition.LAUNCH
     child.up(3.0)
     assert child.state is State.UP
 
 
 def test_one_that_runs_is_saved_told_to_leave_and_started_again_by_hand_which_is_no_failure() -> None:
     child = up(restarts=0)
-    assert child.start(20.0) is Do.SAVE
-    assert child.saved(21.0) is Do.LEAVE
+    assert child.start(20.0) is Transition.SAVE
+    assert child.saved(21.0) is Transition.LEAVE
     assert child.saved(21.5) is None  # twice said is once done
-    assert child.ended(22.0, "code 0") is Do.LAUNCH
+    assert child.ended(22.0, "code 0") is Transition.LAUNCH
     assert (child.state, child.restarts) == (State.STARTING, 1)
     child.up(23.0)
     child.ended(24.0, "signal 11")
@@ -149,10 +149,10 @@ def test_one_that_runs_is_saved_told_to_leave_and_started_again_by_hand_which_is
 
 def test_a_save_that_does_not_end_keeps_nobody_up() -> None:
     child = up()
-    assert child.stop(20.0, "the gateway leaves") is Do.SAVE
-    assert child.due(child.deadline) is Do.LEAVE
+    assert child.stop(20.0, "the gateway leaves") is Transition.SAVE
+    assert child.due(child.deadline) is Transition.LEAVE
     assert child.saved(40.0) is None
-    assert child.due(child.deadline) is Do.KILL
+    assert child.due(child.deadline) is Transition.KILL
 
 
 def test_one_that_is_stopped_stays_stopped_wherever_it_was() -> None:
@@ -163,7 +163,7 @@ def test_one_that_is_stopped_stays_stopped_wherever_it_was() -> None:
     assert (waiting.state, waiting.deadline) == (State.STOPPED, math.inf)
     starting = life()
     starting.start(0.0)
-    assert starting.stop(1.0, "not wanted") is Do.LEAVE
+    assert starting.stop(1.0, "not wanted") is Transition.LEAVE
     starting.up(2.0)
     assert starting.state is State.STOPPING
     assert starting.ended(3.0, "code 0") is None
@@ -182,14 +182,14 @@ def test_who_asks_last_says_what_becomes_of_one_that_is_ending() -> None:
 def test_one_that_is_not_up_in_time_is_ended_and_tried_again() -> None:
     child = life()
     child.start(0.0)
-    assert child.due(child.deadline) is Do.LEAVE
+    assert child.due(child.deadline) is Transition.LEAVE
     child.ended(61.0, "ended (exit code 0)")
     assert (child.state, child.why) == (State.WAITING, "it was not up within 60 s; it ended (exit code 0)")
 
 
 def test_one_that_takes_too_much_memory_is_saved_ended_and_tried_again() -> None:
     child = up()
-    assert child.fail(20.0, "it took 600 MB of memory") is Do.SAVE
+    assert child.fail(20.0, "it took 600 MB of memory") is Transition.SAVE
     child.saved(20.0)
     child.ended(21.0, "ended (exit code 0)")
     assert (child.state, child.why) == (State.WAITING, "it took 600 MB of memory; it ended (exit code 0)")

@@ -18,7 +18,7 @@ from trade.errors import ConfigurationError
 from trade.starting import Started
 from trade_gateway.config._children import Child, Supervised
 from trade_gateway.supervisor import Supervisor
-from trade_gateway.supervisor._furnish import Furnished
+from trade_gateway.supervisor._furnish import CreatedObjects
 from waiting import PATIENCE_S, wait_until
 
 AFTER = {"a": (), "b": ("a",), "c": ("a", "b"), "d": ()}
@@ -177,12 +177,12 @@ class Model(RuleBasedStateMachine):
         self.bodies.append(Body(child.name))
         return self.bodies[-1]
 
-    def _furnished(self, _member: object, child: Child, *_: object) -> Furnished:
+    def _furnished(self, _member: object, child: Child, *_: object) -> CreatedObjects:
         if child.name in self.refused:
             raise ConfigurationError(where=child.name, problem="its object cannot be made")
         clock: Any = SimpleNamespace(with_=lambda deadline_s: clock, start=lambda: self._asked(child.name))
         clock.key = clock
-        return Furnished(clock, {}, [])
+        return CreatedObjects(clock, {}, [])
 
     def _asked(self, name: str) -> Question:
         self.questions.append(Question(self._body(name)))

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from trade import Called, Container, service, where
+from trade import Container, HookEvent, service, where
 from trade.errors import NoSuchHook, NoSuchNotification
 from trade_gateway.cli import app
 
@@ -28,7 +28,7 @@ class Battery:
     def dock(self, speed: float = 0.1) -> None: ...
 
     @service(effect="read")
-    def saw(self, called: Called) -> None: ...
+    def saw(self, called: HookEvent) -> None: ...
 
 
 @pytest.fixture

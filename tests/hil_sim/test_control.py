@@ -14,7 +14,7 @@ import pytest
 from trade_hil_sim import Command, DynamixelBus, Late, Servo, SimControl, SimulationError
 from trade_hil_sim.control._server import ControlServer
 from trade_hil_sim.faults._faults import kinds_of
-from trade_hil_sim.faults._methods import Strikes
+from trade_hil_sim.faults._methods import FaultMethods
 
 KINDS: Final = kinds_of(Command)
 FIELDS: Final[dict[str, Any]] = {
@@ -119,7 +119,7 @@ def test_ids_are_looked_up_on_every_bus_unless_one_is_named(control: SimControl)
         control.unplug("leg")
 
 
-class Listener(Strikes):
+class Listener(FaultMethods):
     """Keeps what it is told to do."""
 
     def __init__(self) -> None:

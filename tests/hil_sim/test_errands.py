@@ -6,13 +6,13 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from trade_hil_sim import SimulationError
-from trade_hil_sim.robot._mailbox import Errands
+from trade_hil_sim.robot._mailbox import Mailbox
 from trade_hil_sim.robot._polling import ready
 from waiting import PATIENCE_S
 
 
 def test_what_was_asked_is_done_in_the_thread_that_listens_and_answered() -> None:
-    errands = Errands("bus leg", PATIENCE_S)
+    errands = Mailbox("bus leg", PATIENCE_S)
     errands.open()
     with ThreadPoolExecutor(1) as other:
         asking = other.submit(errands.ask, threading.get_ident)
@@ -28,7 +28,7 @@ def test_what_was_asked_is_done_in_the_thread_that_listens_and_answered() -> Non
 
 
 def test_who_waits_when_it_closes_is_told_and_so_is_who_asks_later() -> None:
-    errands = Errands("bus leg", PATIENCE_S)
+    errands = Mailbox("bus leg", PATIENCE_S)
     errands.open()
     done: list[str] = []
     with ThreadPoolExecutor(1) as other:

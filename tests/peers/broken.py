@@ -23,21 +23,25 @@ def _put(where: Any, name: str, instead: Any) -> Callable[[], None]:
     return lambda: setattr(where, name, instead)
 
 
-def _as_if_new(self: active_calls.Once, call: messages.Call, ongoing: active_calls.Ongoing) -> active_calls.Ongoing:
+def _as_if_new(
+    self: active_calls.CallDeduplicator, call: messages.Call, ongoing: active_calls.ActiveCall
+) -> active_calls.ActiveCall:
     return ongoing
 
 
-_end: Any = active_calls.Once.end
+_end: Any = active_calls.CallDeduplicator.end
 
 
-def _end_in_64_bits(self: active_calls.Once, ongoing: Any, call: messages.Call, answer: Any, *, keep: bool) -> Any:
+def _end_in_64_bits(
+    self: active_calls.CallDeduplicator, ongoing: Any, call: messages.Call, answer: Any, *, keep: bool
+) -> Any:
     wrapped = ((call.expires_ns or 0) + active_calls.GRACE_NS + 2**63) % 2**64 - 2**63
     return _end(
         self, ongoing, msgspec.structs.replace(call, expires_ns=wrapped - active_calls.GRACE_NS), answer, keep=keep
     )
 
 
-def _confirm_only(self: latch.Estops, order: messages.EstopOrder, who: str) -> None:
+def _confirm_only(self: latch.EstopLatch, order: messages.EstopOrder, who: str) -> None:
     self._confirm(order.request, "")
 
 
@@ -121,8 +125,8 @@ def _nonsense(self: Any, label: str, result: Any) -> bytes:
 
 BREAK: dict[str, Callable[[], None]] = {
     "runs-late": _put(local_service.LocalService, "too_late", lambda self, expires_ns: False),
-    "runs-twice": _put(active_calls.Once, "begin", _as_if_new),
-    "forgets-the-latest": _put(active_calls.Once, "end", _end_in_64_bits),
+    "runs-twice": _put(active_calls.CallDeduplicator, "begin", _as_if_new),
+    "forgets-the-latest": _put(active_calls.CallDeduplicator, "end", _end_in_64_bits),
     "ignores-locks": _put(resource.Resource, "check_lock", lambda self, tokens, caller, session="": None),
     "ignores-sessions": _all_of(
         _put(Deadman, "session_ended", lambda self, session: None),
@@ -137,14 +141,14 @@ BREAK: dict[str, Callable[[], None]] = {
     "believes-any-estop": _put(broadcast, "decode_estop_order", _from_anybody),
     "hears-its-own-version-only": _all_of(  # and does not learn of it from the suite's own container either
         _put(broadcast, "decode_estop_order", _of_our_version),
-        _put(latch.Estops, "learn", lambda self, estops: None),
+        _put(latch.EstopLatch, "learn", lambda self, estops: None),
     ),
     "never-latches": _put(resource.Resource, "_is_of", lambda self, asking: True),
-    "ignores-estops": _put(latch.Estops, "take", _confirm_only),
+    "ignores-estops": _put(latch.EstopLatch, "take", _confirm_only),
     "forgets-estops": _put(store.EstopStore, "read", lambda self: []),
-    "learns-no-estops": _put(latch.Estops, "learn", lambda self, estops: None),
+    "learns-no-estops": _put(latch.EstopLatch, "learn", lambda self, estops: None),
     "any-version": _put(messages, "decoded", _any_version),
-    "ignores-cancels": _put(active_calls.Ongoing, "cancel", lambda self: None),
+    "ignores-cancels": _put(active_calls.ActiveCall, "cancel", lambda self: None),
     "endless-leases": _put(lock_table.LockTable, "expire", lambda self: None),
     "grants-what-moves": _put(lock_table.LockTable, "_running", lambda self, waiter: None),
     "answers-nonsense": _put(local_service.Signature, "encode_result", _nonsense),

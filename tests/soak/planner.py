@@ -17,7 +17,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 import trade
-from trade import Called, Constraint, Handle, Settings, service, where
+from trade import Constraint, Handle, HookEvent, Settings, service, where
 from trade.errors import DeviceSilent, TradeError
 
 SAYS_EVERY_S: Final = 10.0
@@ -39,7 +39,7 @@ class Notes:
         return self.heard
 
     @service
-    def note(self, call: Called) -> None:
+    def note(self, call: HookEvent) -> None:
         self.heard += 1
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import zenoh
 
-from trade import Called, Container, Handle, Lock, Resource, Run, Settings, Stream, current_call, service, where
+from trade import Container, Handle, HookEvent, Lock, Resource, Run, Settings, Stream, current_call, service, where
 from trade._protocol.samples import stream_key
 from trade._transport.zenoh_links import _others
 
@@ -73,7 +73,7 @@ class Watch:
         self.noted: list[Any] = []
 
     @service(effect="read")
-    def see(self, called: Called) -> None:
+    def see(self, called: HookEvent) -> None:
         self.noted.append(called.args)
 
 

@@ -12,7 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 from system.conftest import Program, Rosie
-from trade import Called, Container, Trace, service, where
+from trade import Container, HookEvent, Trace, service, where
 from trade_gateway.cli import app
 from trade_hil_sim import read_log, writes
 
@@ -37,7 +37,7 @@ with Container(Settings.read(container="mind")) as container:
 
 class Eye:
     @service(effect="read")
-    def see(self, called: Called) -> None: ...
+    def see(self, called: HookEvent) -> None: ...
 
 
 @pytest.fixture

@@ -21,7 +21,7 @@ from listening import Battery, Two
 from migrants import Scene, migration_scene
 from ruled import Desk, Engine
 from trade import Container, Handle, service, where
-from trade._discovery.host_folder import Rendezvous
+from trade._discovery.host_folder import HostFolder
 from trade._protocol.keys import ALIVE, alive_key
 from trade._transport.credentials import user_secret
 from trade._transport.endpoints import free_endpoint
@@ -193,7 +193,7 @@ def open_raw(system: str) -> Iterator[OpenRaw]:
     with contextlib.ExitStack() as stack:
 
         def start(*linked: Container) -> ZenohTransport:
-            rendezvous, endpoint = Rendezvous(system), free_endpoint()
+            rendezvous, endpoint = HostFolder(system), free_endpoint()
             stack.callback(rendezvous.leave)
             others = rendezvous.enter(endpoint)
             transport = ZenohTransport(

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from trade._discovery.grace_period import Absences
+from trade._discovery.grace_period import GracePeriods
 
 
 @pytest.fixture
@@ -15,13 +15,13 @@ def told() -> "queue.SimpleQueue[str]":
 
 
 @pytest.fixture
-def absences(told: "queue.SimpleQueue[str]") -> Iterator[Absences]:
-    made = Absences(told.put, lambda: True, grace_s=0.2)
+def absences(told: "queue.SimpleQueue[str]") -> Iterator[GracePeriods]:
+    made = GracePeriods(told.put, lambda: True, grace_s=0.2)
     yield made
     made.close()
 
 
-def test_S12_who_does_not_come_back_is_gone_once(absences: Absences, told: "queue.SimpleQueue[str]") -> None:
+def test_S12_who_does_not_come_back_is_gone_once(absences: GracePeriods, told: "queue.SimpleQueue[str]") -> None:
     absences.begin("me/arm/1")
     absences.begin("me/arm/1")
     absences.begin("me/leg/1")
@@ -31,7 +31,7 @@ def test_S12_who_does_not_come_back_is_gone_once(absences: Absences, told: "queu
 
 
 def test_S12_who_is_back_in_time_was_never_gone(told: "queue.SimpleQueue[str]") -> None:
-    patient = Absences(told.put, lambda: True, grace_s=3600.0)
+    patient = GracePeriods(told.put, lambda: True, grace_s=3600.0)
     patient.begin("me/arm/1")
     assert patient.end("me/arm/1")
     assert not patient.end("me/arm/1")
@@ -40,14 +40,14 @@ def test_S12_who_is_back_in_time_was_never_gone(told: "queue.SimpleQueue[str]") 
 
 
 def test_who_went_without_any_bridge_is_gone_as_soon_as_that_is_sure(told: "queue.SimpleQueue[str]") -> None:
-    absences = Absences(told.put, lambda: False, grace_s=3600.0)
+    absences = GracePeriods(told.put, lambda: False, grace_s=3600.0)
     absences.begin("me/arm/1")
     assert told.get(timeout=60) == "me/arm/1"
     absences.close()
 
 
 def test_nobody_is_told_of_anybody_after_the_end(told: "queue.SimpleQueue[str]") -> None:
-    absences = Absences(told.put, lambda: True, grace_s=3600.0)
+    absences = GracePeriods(told.put, lambda: True, grace_s=3600.0)
     absences.begin("me/arm/1")
     absences.close()
     absences.begin("me/leg/1")
@@ -65,7 +65,7 @@ def test_who_returns_while_he_is_told_of_as_gone_returns_after_that() -> None:
         assert told.wait(60)
         order.append(f"{session} is gone")
 
-    absences = Absences(gone, lambda: False)
+    absences = GracePeriods(gone, lambda: False)
     absences.begin("me/arm/1")
     assert telling.wait(60)
 

@@ -15,7 +15,7 @@ from trade._estop.services import EstopServices
 from trade._protocol.keys import Address, alive_key, estop_key
 from trade._protocol.messages import PROTOCOL, Behalf, EstopOrder, encode_message
 from trade._registry.suggestions import no_such_service
-from trade._security.authorizer import FUNCTIONS, Access
+from trade._security.authorizer import FUNCTIONS, Authorizer
 from trade._services.decorator import marked_methods
 from trade._transport.memory import MemoryTransport
 from trade.errors import AccessDenied, ConfigurationError, LockedByOther, LockLost, NoSuchService, Stopped
@@ -153,11 +153,11 @@ def test_locking_needs_the_right_over_the_group(member: Member, neck: Neck) -> N
 
 
 def test_who_may_not_read_what_he_looks_for_is_told_that(policy: Path) -> None:
-    access = Access(policy, certified=True)
+    access = Authorizer(policy, certified=True)
     hidden = access.hidden("nobody", "rosie.neck")
     assert hidden.startswith("nobody may not read rosie.neck: ")
     assert access.hidden("planner", "rosie.neck") == ""
-    assert Access(policy).hidden("nobody", "rosie.neck") == ""  # without certificates it is told all the same
+    assert Authorizer(policy).hidden("nobody", "rosie.neck") == ""  # without certificates it is told all the same
     assert hidden in str(no_such_service(where(group="rosie.neck"), [], 0.1, hidden=hidden))
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from msgspec import structs
 
-from trade._audit.hash_chain import NOTHING, AuditRow, Head, Link, Verdict, row_hash, verify
+from trade._audit.hash_chain import NOTHING, AuditRow, ChainCheck, Head, Link, row_hash, verify
 from trade._audit.store import AuditStore, Keep, reading
 
 DAY_NS = 86_400_000_000_000
@@ -38,7 +38,7 @@ def tamper(path: Path, *statements: str) -> None:
     file.close()
 
 
-def verdict(path: Path, noted: dict[int, bytes] | None = None) -> Verdict:
+def verdict(path: Path, noted: dict[int, bytes] | None = None) -> ChainCheck:
     with reading(path) as (head, links):
         return verify(links, head, noted)
 

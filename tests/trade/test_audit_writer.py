@@ -13,7 +13,7 @@ import pytest
 
 import trade._audit.writer as writing
 from trade._audit.events import Event
-from trade._audit.hash_chain import AuditRow, Verdict, verify
+from trade._audit.hash_chain import AuditRow, ChainCheck, verify
 from trade._audit.store import AuditStore, Keep, moved_aside_in, reading
 from trade._audit.writer import AuditWriter
 
@@ -54,7 +54,7 @@ def rows(path: Path) -> list[AuditRow]:
         return [link.row for link in links]
 
 
-def verdict(path: Path) -> Verdict:
+def verdict(path: Path) -> ChainCheck:
     with reading(path) as (head, links):
         return verify(links, head)
 

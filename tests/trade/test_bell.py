@@ -5,11 +5,11 @@ import time
 
 import pytest
 
-from trade._threads.condition import Bell
+from trade._threads.condition import InterruptibleCondition
 
 
 def test_it_wakes_everybody_who_waits() -> None:
-    bell, rung, woken = Bell(), threading.Event(), threading.Semaphore(0)
+    bell, rung, woken = InterruptibleCondition(), threading.Event(), threading.Semaphore(0)
 
     def wait() -> None:
         if bell.wait_for(rung.is_set, 20):
@@ -26,14 +26,14 @@ def test_it_wakes_everybody_who_waits() -> None:
 
 
 def test_it_looks_at_once_and_gives_up_in_time() -> None:
-    bell = Bell()
+    bell = InterruptibleCondition()
     assert bell.wait_for(lambda: True, 0)
     assert not bell.wait_for(lambda: False, 0)
     assert not bell.wait_for(lambda: False, 0.01)
 
 
 def test_a_ring_between_looking_and_waiting_is_not_missed() -> None:
-    bell, looks = Bell(), list[float]()
+    bell, looks = InterruptibleCondition(), list[float]()
 
     def ready() -> bool:
         looks.append(time.monotonic())
@@ -47,13 +47,13 @@ def test_a_ring_between_looking_and_waiting_is_not_missed() -> None:
 
 
 def test_nobody_is_kept_once_waiting_is_over() -> None:
-    bell = Bell()
+    bell = InterruptibleCondition()
     bell.wait_for(lambda: False, 0)
     assert not bell._gates
 
 
 def test_an_error_of_what_is_looked_at_is_the_waiters() -> None:
-    bell = Bell()
+    bell = InterruptibleCondition()
     with pytest.raises(ZeroDivisionError):
         bell.wait_for(lambda: bool(1 / 0), 1)
     assert not bell._gates

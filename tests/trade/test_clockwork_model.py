@@ -9,7 +9,7 @@ import pytest
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from trade._threads.scheduler import MOST_THREADS, Clockwork, Due
+from trade._threads.scheduler import MOST_THREADS, ScheduledTask, Scheduler
 from waiting import PATIENCE_S, wait_until
 
 HOUR_NS = 3_600_000_000_000
@@ -22,7 +22,7 @@ class Act:
     def __init__(self, model: "Model") -> None:
         self._model = model
         self._ends: queue.SimpleQueue[int | Exception | None] = queue.SimpleQueue()
-        self.real: Due
+        self.real: ScheduledTask
         self.began: list[int] = []
         """When, by the test's clock."""
         self.inside = 0
@@ -58,7 +58,7 @@ class Model(RuleBasedStateMachine):
     def __init__(self) -> None:
         super().__init__()
         self.now = 0
-        self.clockwork = Clockwork("model-clock", lambda: self.now)
+        self.clockwork = Scheduler("model-clock", lambda: self.now)
         self.turns = itertools.count()
         self.acts: list[Act] = []
 
@@ -175,7 +175,7 @@ def _refuse(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_what_is_due_while_there_can_be_no_thread_is_done_with_the_next_thing(monkeypatch: pytest.MonkeyPatch) -> None:
-    clockwork, first, second = Clockwork("few-clock"), threading.Event(), threading.Event()
+    clockwork, first, second = Scheduler("few-clock"), threading.Event(), threading.Event()
     with monkeypatch.context() as few:
         _refuse(few)
         clockwork.begin(first.set, 0)
@@ -187,7 +187,7 @@ def test_what_is_due_while_there_can_be_no_thread_is_done_with_the_next_thing(mo
 
 
 def test_a_thread_that_can_have_none_beside_it_does_one_thing_after_the_other(monkeypatch: pytest.MonkeyPatch) -> None:
-    clockwork = Clockwork("few-clock")
+    clockwork = Scheduler("few-clock")
     clockwork.begin(lambda: None, 2**62)
     wait_until(lambda: clockwork._leading)
     _refuse(monkeypatch)

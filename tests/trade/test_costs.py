@@ -15,7 +15,7 @@ from msgspec import structs
 
 import trade._services.signature as signatures
 from trade import Container, Handle, Settings, service, where
-from trade._discovery.host_folder import Rendezvous, free_endpoint
+from trade._discovery.host_folder import HostFolder, free_endpoint
 from trade._protocol.keys import TALLY, Address
 from trade._protocol.messages import PROTOCOL, Call, ProviderInfo, ServiceInfo, decode_provider, encode_message
 from trade._registry.registry import Registry
@@ -98,7 +98,7 @@ def pair(system: str, sent: Counter[str]) -> Iterator[tuple[Container, Container
     with contextlib.ExitStack() as stack:
 
         def start(name: str) -> Container:
-            rendezvous, endpoint = Rendezvous(system), free_endpoint()
+            rendezvous, endpoint = HostFolder(system), free_endpoint()
             stack.callback(rendezvous.leave)
             others = rendezvous.enter(endpoint)
             settings = configuration(

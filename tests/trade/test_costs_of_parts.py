@@ -31,10 +31,10 @@ from pathlib import Path
 import pytest
 from tests.trade.test_costs import blocks, functions_run, traced
 
-from trade import Called, Container, Handle, Settings, service, where
+from trade import Container, Handle, HookEvent, Settings, service, where
 from trade._audit.hash_chain import AuditRow
 from trade._audit.store import AuditStore
-from trade._transport.memory import MemoryTransport, Passage
+from trade._transport.memory import InFlightMessage, MemoryTransport
 from trade.sharing import Border
 from trade.testing import Kind, MemorySystem, memory_system
 from waiting import wait_until
@@ -71,7 +71,7 @@ class Heard:
         self.bytes = 0
         system.tap(self._hear)
 
-    def _hear(self, passage: Passage) -> None:
+    def _hear(self, passage: InFlightMessage) -> None:
         if passage.arrived:
             return
         if passage.key.startswith("stream/") and passage.kind not in (Kind.RISE, Kind.FALL):
@@ -252,11 +252,11 @@ def test_a_sample_goes_once_to_each_listener_and_is_read_once_for_all(
 def test_a_hook_of_the_same_container_takes_no_message_and_another_containers_one_call(
     here: Container, there: Container, system: MemorySystem, heard: Heard
 ) -> None:
-    seen: list[Called] = []
+    seen: list[HookEvent] = []
 
     class Watcher:
         @service(effect="note")
-        def watch(self, called: Called) -> None:
+        def watch(self, called: HookEvent) -> None:
             seen.append(called)
 
     move = known(here, there)

@@ -7,7 +7,7 @@ from statistics import median
 
 import pytest
 
-from trade._threads.channel_workers import MOST_THREADS, Crew
+from trade._threads.channel_workers import MOST_THREADS, WorkerPool
 from trade._transport.base import Channel, ChannelClosed, Message
 
 CALL = Message("call/a/b", b"")
@@ -46,7 +46,7 @@ def test_very_many_quick_calls_are_taken_by_few_threads(channel: Queue) -> None:
 
     for _ in range(3000):
         channel.waiting.put(CALL)
-    crew = Crew("quick", channel, work, refuse=work)
+    crew = WorkerPool("quick", channel, work, refuse=work)
     for _ in range(3000):
         assert done.acquire(timeout=60)
     assert median(at_once) < MOST_THREADS // 2
@@ -63,7 +63,7 @@ def test_slow_calls_get_a_thread_each_which_ends_with_them(
         inside.release()
         leave.wait(60)
 
-    crew = Crew("slow", channel, work, refuse=lambda _message: refused.set())
+    crew = WorkerPool("slow", channel, work, refuse=lambda _message: refused.set())
     for _ in range(MOST_THREADS - 1):
         channel.waiting.put(CALL)
     for _ in range(MOST_THREADS - 1):

@@ -18,7 +18,7 @@ from trade._protocol.estop_messages import decode_estop_confirmed, decode_estop_
 from trade._protocol.keys import Address, alive_key, registry_key
 from trade._protocol.messages import PROTOCOL, EstopOrder, ProviderInfo, ServiceInfo, encode_message
 from trade._threads.channel_workers import MOST_THREADS
-from trade._transport.memory import MemoryTransport, Passage
+from trade._transport.memory import InFlightMessage, MemoryTransport
 from trade.errors import Busy, ConfigurationError, MotionStopped, NoSuchEstop, Stopped
 from trade.testing import Kind, MemorySystem, memory_system
 
@@ -378,7 +378,7 @@ def test_S09_one_identity_holds_a_bounded_number_and_each_of_its_orders_stops_an
         [axis] = drivers(system, "one")
         one, caller, confirmed = system.container("one"), system.container("caller"), set[str]()
 
-        def hear(passage: Passage) -> None:
+        def hear(passage: InFlightMessage) -> None:
             if passage.key.startswith("estop/tester/one/"):
                 confirmed.add(decode_estop_confirmed(passage.payload or b"").request)
 
@@ -571,7 +571,7 @@ def test_S09_what_an_estop_has_everybody_tell_everybody_is_small(system: MemoryS
     drivers(system, *(f"d{number}" for number in range(4)))
     caller, told = system.container("caller"), Counter[str]()
 
-    def hear(passage: Passage) -> None:
+    def hear(passage: InFlightMessage) -> None:
         if passage.kind is Kind.ANNOUNCE and not passage.arrived:
             told[passage.source] += len(passage.payload or b"")
 

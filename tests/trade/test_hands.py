@@ -6,17 +6,17 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from trade import Called, Container, service, where
+from trade import Container, HookEvent, service, where
 from trade._threads import thread_pool
-from trade._threads.thread_pool import Hands
+from trade._threads.thread_pool import ThreadPool
 
 NUMBER: contextvars.ContextVar[int] = contextvars.ContextVar("NUMBER", default=0)
 Eventually = Callable[[Callable[[], bool]], bool]
 
 
 @pytest.fixture
-def hands() -> Iterator[Hands]:
-    made = Hands()
+def hands() -> Iterator[ThreadPool]:
+    made = ThreadPool()
     yield made
     made.close()
 
@@ -35,7 +35,7 @@ def started(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return names
 
 
-def done_by(hands: Hands, name: str = "work") -> tuple[int, str, int]:
+def done_by(hands: ThreadPool, name: str = "work") -> tuple[int, str, int]:
     """Which thread does it, called what, and what it finds in its context."""
     said: list[tuple[int, str, int]] = []
     over = threading.Event()
@@ -50,12 +50,12 @@ def done_by(hands: Hands, name: str = "work") -> tuple[int, str, int]:
     return said[0]
 
 
-def idle(hands: Hands) -> int:
+def idle(hands: ThreadPool) -> int:
     return len(hands._idle)
 
 
 def test_one_thread_does_what_comes_one_after_the_other(
-    hands: Hands, started: list[str], eventually: Eventually
+    hands: ThreadPool, started: list[str], eventually: Eventually
 ) -> None:
     for number in range(50):
         _, name, found = done_by(hands, f"work-{number}")
@@ -64,7 +64,7 @@ def test_one_thread_does_what_comes_one_after_the_other(
     assert started == ["work-0"]
 
 
-def test_what_comes_at_once_is_done_at_once_and_few_threads_stay(hands: Hands, eventually: Eventually) -> None:
+def test_what_comes_at_once_is_done_at_once_and_few_threads_stay(hands: ThreadPool, eventually: Eventually) -> None:
     inside, leave = threading.Semaphore(0), threading.Event()
 
     def work() -> None:
@@ -81,7 +81,7 @@ def test_what_comes_at_once_is_done_at_once_and_few_threads_stay(hands: Hands, e
 
 
 def test_what_fails_is_logged_and_harms_nothing(
-    hands: Hands, caplog: pytest.LogCaptureFixture, eventually: Eventually
+    hands: ThreadPool, caplog: pytest.LogCaptureFixture, eventually: Eventually
 ) -> None:
     def fail() -> None:
         raise ValueError("no")
@@ -93,7 +93,7 @@ def test_what_fails_is_logged_and_harms_nothing(
 
 
 def test_who_waits_too_long_ends_and_others_come(
-    monkeypatch: pytest.MonkeyPatch, hands: Hands, eventually: Eventually
+    monkeypatch: pytest.MonkeyPatch, hands: ThreadPool, eventually: Eventually
 ) -> None:
     monkeypatch.setattr(thread_pool, "_PATIENCE_S", 0.01)
     for _ in range(20):
@@ -102,14 +102,14 @@ def test_who_waits_too_long_ends_and_others_come(
     assert idle(hands) == 0
 
 
-def test_work_that_comes_as_one_gives_up_waiting_is_done(monkeypatch: pytest.MonkeyPatch, hands: Hands) -> None:
+def test_work_that_comes_as_one_gives_up_waiting_is_done(monkeypatch: pytest.MonkeyPatch, hands: ThreadPool) -> None:
     """It has been taken from those that wait, and is not told yet, when its patience ends."""
     monkeypatch.setattr(thread_pool, "_PATIENCE_S", 0.001)
     for _ in range(300):
         done_by(hands)
 
 
-def test_once_closed_nobody_waits_any_more(hands: Hands, eventually: Eventually) -> None:
+def test_once_closed_nobody_waits_any_more(hands: ThreadPool, eventually: Eventually) -> None:
     done_by(hands)
     assert eventually(lambda: idle(hands) == 1)
     hands.close()
@@ -125,7 +125,7 @@ class Arm:
     def move(self) -> None: ...
 
     @service(effect="read")
-    def see(self, called: Called) -> None:
+    def see(self, called: HookEvent) -> None:
         self.seen += 1
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from trade import Called, Container, Handle, Secret, current_call, errors, service, where
+from trade import Container, Handle, HookEvent, Secret, current_call, errors, service, where
 from trade._container.hooking import Hook
 from trade._context.call_context import CallContext
 from trade._services.local_service import LocalService
@@ -39,24 +39,24 @@ class Planner:
 
 class Observer:
     def __init__(self) -> None:
-        self.seen: queue.SimpleQueue[Called] = queue.SimpleQueue()
+        self.seen: queue.SimpleQueue[HookEvent] = queue.SimpleQueue()
         self.let_go = threading.Event()
         self.error: Exception | None = None
         self.times = 0
 
     @service(effect="read")
-    def see(self, called: Called) -> None:
+    def see(self, called: HookEvent) -> None:
         self.times += 1
         self.seen.put(called)
         if self.error is not None:
             raise self.error
 
     @service(effect="read")
-    def dawdle(self, called: Called) -> None:
+    def dawdle(self, called: HookEvent) -> None:
         self.times += 1
         self.let_go.wait(5)
 
-    def next(self) -> Called:
+    def next(self) -> HookEvent:
         return self.seen.get(timeout=20)
 
 
@@ -141,7 +141,7 @@ def test_a_hook_gets_copies_and_changes_nothing(here: Container) -> None:
 
     class Thief:
         @service(strict=False, effect="read")
-        def steal(self, called: Called) -> None:
+        def steal(self, called: HookEvent) -> None:
             called.args["things"].clear()
             if called.ended:
                 called.result.clear()
@@ -258,11 +258,11 @@ def test_a_hook_may_be_watched_and_circles_end(here: Container, there: Container
         seen: queue.SimpleQueue[str] = queue.SimpleQueue()
 
         @service(effect="read")
-        def look(self, called: Called) -> None:
+        def look(self, called: HookEvent) -> None:
             self.seen.put(called.service.name)
 
         @service(effect="read")
-        def peek(self, called: Called) -> None:
+        def peek(self, called: HookEvent) -> None:
             self.seen.put(called.service.name)
 
     here.register(Nosy(), "nosy")
@@ -283,7 +283,7 @@ def test_a_hook_belongs_to_the_chain_of_the_call_and_has_none_of_its_locks(
         context: Any = None
 
         @service(effect="read")
-        def look(self, called: Called) -> None:
+        def look(self, called: HookEvent) -> None:
             Curious.context = current_call()
 
     [look] = here.register(Curious(), "curious")
@@ -355,7 +355,7 @@ def test_the_gates_are_looked_at_after_the_hooks(
 
     class Grabber:
         @service(effect="read")
-        def grab(self, called: Called) -> None:
+        def grab(self, called: HookEvent) -> None:
             self.lock = other.lock(where(name="plan"), purpose="mine now")
             self.lock.acquire()
 

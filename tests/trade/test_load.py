@@ -10,8 +10,8 @@ import pytest
 
 from trade import Container, Handle, service, where
 from trade._telemetry import load as module
-from trade._telemetry.load import Load
-from trade._threads.channel_workers import Crew
+from trade._telemetry.load import LoadMeter
+from trade._threads.channel_workers import WorkerPool
 from waiting import wait_until
 
 
@@ -80,7 +80,7 @@ def none_queued() -> int:
 
 def test_a_process_that_works_has_more_than_one_that_waits() -> None:
     clock = Elapsing()
-    load = Load("c", list[Crew], none_queued, clock)
+    load = LoadMeter("c", list[WorkerPool], none_queued, clock)
     end = time.process_time() + 0.2
     while time.process_time() < end:
         pass
@@ -94,7 +94,7 @@ def test_a_process_that_works_has_more_than_one_that_waits() -> None:
 
 def test_who_asks_twice_in_a_second_is_told_of_a_longer_time() -> None:
     clock = Elapsing()
-    load = Load("c", list[Crew], none_queued, clock)
+    load = LoadMeter("c", list[WorkerPool], none_queued, clock)
     told = list[float]()
     for later_s in (0.5, 2.0, 0.5, 0.5, 1.0):
         clock.now_s += later_s
@@ -106,7 +106,7 @@ def test_what_a_system_does_not_tell_is_none(monkeypatch: pytest.MonkeyPatch, tm
     monkeypatch.delattr("os.getloadavg")
     monkeypatch.setattr(module, "_STATUS", tmp_path / "status")
     monkeypatch.setattr(module, "_STAT", tmp_path / "stat")
-    told = Load("c", list[Crew], none_queued).read()
+    told = LoadMeter("c", list[WorkerPool], none_queued).read()
     assert (told.host_cpu_percent, told.load_1min, told.memory_bytes) == (None, None, None)
 
 
@@ -114,6 +114,6 @@ def test_the_share_of_the_host_leaves_out_what_idles(monkeypatch: pytest.MonkeyP
     stat = tmp_path / "stat"
     monkeypatch.setattr(module, "_STAT", stat)
     stat.write_text("cpu  100 10 50 800 40 0 0 0 30 0\ncpu0 1 1 1 1 1 1 1 1 1 1\n")
-    load = Load("c", list[Crew], none_queued)
+    load = LoadMeter("c", list[WorkerPool], none_queued)
     stat.write_text("cpu  160 10 70 900 60 0 0 0 90 0\n")
     assert load.read().host_cpu_percent == pytest.approx(40.0)  # 60 and 20 of 200

@@ -14,7 +14,7 @@ from jointed import WHOLE, Joint, Robot
 from trade import Container, Handle, permit, service, where
 from trade._locks import api
 from trade._protocol.keys import ServiceKey
-from trade._resources.lock_request import Terms
+from trade._resources.lock_request import LockRequest
 from trade.errors import (
     ConfigurationError,
     IncompleteGroup,
@@ -386,7 +386,7 @@ def test_whoever_asks_a_container_for_a_lock_by_itself_is_told_in_time(robot: Ro
     """As containers in other languages do, whose wait may be the deadline of the call."""
     acquire = ServiceKey(robot.find("a").key.address, "trade", "system", "acquire")
     with robot.other.lock(WHOLE, purpose="dance"), pytest.raises(LockedByOther, match="for 'dance'"):
-        robot.me.handle(acquire).with_(deadline_s=1.5)(["a"], Terms(wait_s=1.5))
+        robot.me.handle(acquire).with_(deadline_s=1.5)(["a"], LockRequest(wait_s=1.5))
 
 
 def test_what_a_service_waits_for_in_vain_is_told_before_the_deadline_of_its_call(

@@ -9,7 +9,7 @@ import pytest
 
 from lock_table import EPOCH, Table
 from trade._protocol.messages import Token
-from trade._resources.lock_request import Granted, Terms
+from trade._resources.lock_request import Granted, LockRequest
 from trade._resources.lock_table import LockTable
 from trade._resources.resource import Holder, Permit, Resource
 from trade.errors import LockedByOther, LockLost, MotionStopped, NotStopped, ServiceGone, Stopped
@@ -122,7 +122,7 @@ def test_S12_a_renewed_lease_begins_anew_and_a_lost_one_never_does(table: Table)
 def test_a_lease_ends_on_its_own_thread_too() -> None:
     real = LockTable(EPOCH, "home")
     real.adopt("a")
-    real.acquire(["a"], Holder("tester", "one", "one", "", 0.0), Terms(lease_s=0.1))
+    real.acquire(["a"], Holder("tester", "one", "one", "", 0.0), LockRequest(lease_s=0.1))
     wait_until(lambda: real.infos() == [])
     real.close()
 
@@ -132,9 +132,9 @@ def test_a_short_lease_ends_in_its_time_although_the_thread_sleeps_until_a_longe
     for name in "ab":
         real.adopt(name)
     holder = Holder("tester", "one", "one", "", 0.0)
-    real.acquire(["a"], holder, Terms(lease_s=3600))
+    real.acquire(["a"], holder, LockRequest(lease_s=3600))
     wait_until(lambda: real._leases._next_look < math.inf)
-    real.acquire(["b"], holder, Terms(lease_s=0.1))
+    real.acquire(["b"], holder, LockRequest(lease_s=0.1))
     wait_until(lambda: [info.resources for info in real.infos()] == [("a",)])
     real.close()
 

@@ -10,7 +10,7 @@ import pytest
 from lamps import Lamp, Pair, found, labels
 from trade import Container, where
 from trade._transport.base import ChannelClosed
-from trade._transport.memory import Passage
+from trade._transport.memory import InFlightMessage
 from trade.errors import ContainerLost, NoSuchService, ServiceGone, TradeError
 from trade.testing import MemorySystem, memory_system
 
@@ -22,13 +22,13 @@ class Death:
 
     def __init__(self, system: MemorySystem, victim: str, step: int | None) -> None:
         self.count = 0
-        self.at: Passage | None = None
+        self.at: InFlightMessage | None = None
         self._system = system
         self._victim = victim
         self._step = step
         system.tap(self._hear)
 
-    def _hear(self, passage: Passage) -> None:
+    def _hear(self, passage: InFlightMessage) -> None:
         if self.count == self._step:
             self.at = passage
             self._system.kill(self._victim)
@@ -111,7 +111,7 @@ def test_a_callee_that_dies_around_a_call_or_its_answer_is_told_as_lost(
         _, _, handle = pair(system)
         kind = "reply/" if answering else "call/"
 
-        def kill(passage: Passage) -> None:
+        def kill(passage: InFlightMessage) -> None:
             if passage.key.startswith(kind) and passage.arrived is arrived:
                 system.kill("callee")
 

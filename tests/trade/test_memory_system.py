@@ -16,7 +16,7 @@ from trade import Container, errors, where
 from trade._discovery.announcer import Announcer
 from trade._protocol.keys import Address
 from trade._protocol.messages import ProviderInfo, ServiceInfo
-from trade._transport.memory import MemoryTransport, Passage
+from trade._transport.memory import InFlightMessage, MemoryTransport
 from trade.errors import ContainerLost, ServiceGone
 from trade.testing import Kind, MemorySystem, memory_system
 
@@ -253,7 +253,7 @@ def test_a_partition_of_two_leaves_calls_of_a_third_alone(pair: Pair) -> None:
 # --- messages that get lost
 
 
-def losing(*payloads_of: str) -> Callable[[Passage], bool]:
+def losing(*payloads_of: str) -> Callable[[InFlightMessage], bool]:
     """What is announced of providers whose names begin so gets lost."""
     return lambda passage: passage.kind is Kind.ANNOUNCE and passage.key.rpartition("/")[2].startswith(payloads_of)
 

@@ -6,7 +6,7 @@ import pytest
 from msgspec import structs
 
 from migrants import Scene
-from trade import Called, service, where
+from trade import HookEvent, service, where
 from trade._migration import source as _departing
 from trade.errors import ConfigurationError, LockedByOther, NoSuchService, ServiceGone, TooManyServices
 from waiting import wait_until
@@ -190,7 +190,7 @@ class Ear:
         self.heard: list[str] = []
 
     @service
-    def hear(self, call: Called) -> None:
+    def hear(self, call: HookEvent) -> None:
         self.heard.append(call.service.container)
 
 

@@ -381,7 +381,7 @@ def ask(scene: Scene, name: str) -> Handle:
 def prepare(scene: Scene) -> Any:
     kind = scene.module.Counter
     print_of = target.fingerprint(kind, (), scene.old._parts.codec)
-    luggage = target.Luggage(class_path=path_of(kind), fingerprint=print_of, groups=("hall",))
+    luggage = target.ProviderSnapshot(class_path=path_of(kind), fingerprint=print_of, groups=("hall",))
     return ask(scene, "prepare_arrival")(luggage)
 
 

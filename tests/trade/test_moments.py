@@ -5,7 +5,7 @@ import time
 
 import pytest
 
-from trade._notifications.triggers import Terms
+from trade._notifications.triggers import TriggerSpec
 from trade._timestamps import clock, day_and_clock
 from trade.errors import ConfigurationError, LockedByOther
 
@@ -38,4 +38,4 @@ def test_an_error_with_a_moment_that_is_none_says_what_it_is(at: float) -> None:
 @pytest.mark.parametrize("at", [*NO_MOMENTS, -1.0])
 def test_nothing_is_done_at_a_moment_that_is_none(at: float) -> None:
     with pytest.raises(ConfigurationError, match="no such moment"):
-        Terms(occasion="at", at=at).check()
+        TriggerSpec(occasion="at", at=at).check()

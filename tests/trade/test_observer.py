@@ -3,7 +3,7 @@
 import queue
 from typing import Any
 
-from trade import Called, Container, service, where
+from trade import Container, HookEvent, service, where
 from waiting import wait_until
 
 PLANNER = """
@@ -32,10 +32,10 @@ while goal := hear():
 
 class Observer:
     def __init__(self) -> None:
-        self.seen: queue.SimpleQueue[Called] = queue.SimpleQueue()
+        self.seen: queue.SimpleQueue[HookEvent] = queue.SimpleQueue()
 
     @service(effect="read")
-    def add_observed_output(self, called: Called) -> None:
+    def add_observed_output(self, called: HookEvent) -> None:
         self.seen.put(called)
 
 

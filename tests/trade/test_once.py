@@ -10,7 +10,7 @@ from msgspec import structs
 
 from trade import Container, Handle, service, where
 from trade._context import active_calls
-from trade._context.active_calls import Once, Ongoing
+from trade._context.active_calls import ActiveCall, CallDeduplicator
 from trade._protocol.keys import Address, call_key, reply_key
 from trade._protocol.messages import EMPTY, EMPTY_ARGUMENTS, PROTOCOL, Call, Reply, Status, decode_reply, encode_message
 
@@ -136,19 +136,19 @@ def test_answers_of_what_reads_are_not_kept(here: Container, line: Line) -> None
 # --- the bounds
 
 
-def begun(once: Once, one: Call) -> Ongoing:
-    ongoing = Ongoing(None, "me", one, None)
+def begun(once: CallDeduplicator, one: Call) -> ActiveCall:
+    ongoing = ActiveCall(None, "me", one, None)
     assert once.begin(one, ongoing) is ongoing
     return ongoing
 
 
-def end(once: Once, one: Call, body: bytes = b"") -> None:
+def end(once: CallDeduplicator, one: Call, body: bytes = b"") -> None:
     answer = (Status.OK, msgspec.Raw(msgspec.msgpack.encode(body)) if body else EMPTY)
     once.end(begun(once, one), one, answer, keep=True)
 
 
 def test_answers_go_some_seconds_after_their_deadline(monkeypatch: pytest.MonkeyPatch) -> None:
-    once = Once()
+    once = CallDeduplicator()
     now = time.monotonic_ns()
     for i in range(600):
         end(once, call(i, expires_ns=now - 6 * SECOND_NS))
@@ -160,14 +160,14 @@ def test_answers_go_some_seconds_after_their_deadline(monkeypatch: pytest.Monkey
 
 def test_a_call_under_way_is_never_forgotten_and_too_old_ones_never_run_again(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(active_calls, "MOST_CALLS", 1024)
-    once = Once()
+    once = CallDeduplicator()
     running = begun(once, call(0))
     for i in range(1, 3000):
         end(once, call(i))
     assert len(once._calls) <= 1024
     assert once.find("me", call(0)) is running
     assert running.answer is None
-    forgotten = Ongoing(None, "me", call(1), None)
+    forgotten = ActiveCall(None, "me", call(1), None)
     once.begin(call(1), forgotten)
     assert forgotten.answer is not None  # known only by its number: whether it ran is not said
     assert b"OutcomeUnknown" in bytes(forgotten.answer[1])
@@ -175,7 +175,7 @@ def test_a_call_under_way_is_never_forgotten_and_too_old_ones_never_run_again(mo
 
 def test_large_answers_are_let_go_first_but_not_that_they_were_given(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(active_calls, "MOST_BYTES", 10_000)
-    once = Once()
+    once = CallDeduplicator()
     for i in range(20):
         end(once, call(i, expires_ns=LATER), b"x" * 1000)
     assert once._bytes <= 10_000
@@ -206,7 +206,7 @@ def test_S02_what_waits_is_sent_again_when_the_link_to_the_same_epoch_is_back(
     attach = once.attach
     again = threading.Event()
 
-    def note(ongoing: Ongoing, call: Call) -> Any:
+    def note(ongoing: ActiveCall, call: Call) -> Any:
         sent.append(call)
         answer = attach(ongoing, call)
         again.set()

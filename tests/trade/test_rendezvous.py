@@ -8,14 +8,14 @@ from typing import Any
 import pytest
 
 from trade import Container, where
-from trade._discovery.host_folder import Rendezvous
+from trade._discovery.host_folder import HostFolder
 from trade._transport.endpoints import free_endpoint
 from trade.errors import ConfigurationError
 
 
 @pytest.fixture
 def folder(system: str, tmp_path: Path) -> Path:
-    Rendezvous(system)
+    HostFolder(system)
     return tmp_path / "runtime" / "trade" / system
 
 
@@ -27,7 +27,7 @@ def old(path: Path) -> None:
 
 
 def test_who_enters_leaves_its_endpoint_and_takes_it_away(system: str, folder: Path) -> None:
-    rendezvous = Rendezvous(system)
+    rendezvous = HostFolder(system)
     assert rendezvous.enter("tcp/127.0.0.1:7450") == []
     assert [path.read_text().split()[0] for path in folder.iterdir()] == ["tcp/127.0.0.1:7450"]
     rendezvous.leave()
@@ -38,39 +38,39 @@ def test_who_enters_leaves_its_endpoint_and_takes_it_away(system: str, folder: P
 def test_who_enters_hears_of_those_that_listen(system: str, folder: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as listening:
         endpoint = f"tcp/127.0.0.1:{listening.getsockname()[1]}"
-        Rendezvous(system).enter(endpoint)
+        HostFolder(system).enter(endpoint)
         old(next(folder.iterdir()))
-        assert Rendezvous(system).enter("tcp/127.0.0.1:1") == [endpoint]
+        assert HostFolder(system).enter("tcp/127.0.0.1:1") == [endpoint]
 
 
 def test_endpoints_nobody_listens_on_are_pruned(system: str, folder: Path) -> None:
-    stale = Rendezvous(system)
+    stale = HostFolder(system)
     stale.enter(free_endpoint())
     old(next(folder.iterdir()))
-    assert Rendezvous(system).enter("tcp/127.0.0.1:1") == []
+    assert HostFolder(system).enter("tcp/127.0.0.1:1") == []
     assert [path.read_text().split()[0] for path in folder.iterdir()] == ["tcp/127.0.0.1:1"]
 
 
 def test_endpoints_of_those_that_are_just_starting_are_kept(system: str, folder: Path) -> None:
     starting = free_endpoint()
-    Rendezvous(system).enter(starting)
-    assert Rendezvous(system).enter("tcp/127.0.0.1:1") == [starting]
+    HostFolder(system).enter(starting)
+    assert HostFolder(system).enter("tcp/127.0.0.1:1") == [starting]
 
 
 @pytest.mark.parametrize("at_s", [1, 4e9], ids=["forward", "back"])
 def test_a_clock_that_is_set_while_they_start_hides_nobody(system: str, folder: Path, at_s: float) -> None:
     """As on a computer that has none of its own and asks the network when it starts."""
     starting = free_endpoint()
-    Rendezvous(system).enter(starting)
+    HostFolder(system).enter(starting)
     os.utime(next(folder.iterdir()), (at_s, at_s))
-    assert Rendezvous(system).enter("tcp/127.0.0.1:1") == [starting]
+    assert HostFolder(system).enter("tcp/127.0.0.1:1") == [starting]
 
 
 def test_a_file_of_before_this_host_was_started_is_old(system: str, folder: Path) -> None:
     endpoint = free_endpoint()
     for entered in ("1e9", "nan", "inf", "-1"):
         (folder / "tcp_early").write_text(f"{endpoint}\n{os.getpid()}\n{entered}\n")
-        assert Rendezvous(system).enter("tcp/127.0.0.1:1") == []
+        assert HostFolder(system).enter("tcp/127.0.0.1:1") == []
 
 
 def test_endpoints_of_processes_that_were_killed_are_pruned_at_once(
@@ -87,7 +87,7 @@ def test_endpoints_of_processes_that_were_killed_are_pruned_at_once(
     [path] = folder.iterdir()
     program.kill()
     assert path.exists()
-    assert Rendezvous(system).enter("tcp/127.0.0.1:1") == []
+    assert HostFolder(system).enter("tcp/127.0.0.1:1") == []
     assert not path.exists()
 
 
@@ -101,7 +101,7 @@ def test_where_it_is_not_known_whether_the_writer_lives_the_file_counts_as_young
     monkeypatch.setattr(os, "kill", refuse)  # another user's process
     endpoint = free_endpoint()
     (folder / "tcp_early").write_text(endpoint + writer)
-    assert Rendezvous(system).enter("tcp/127.0.0.1:1") == [endpoint]
+    assert HostFolder(system).enter("tcp/127.0.0.1:1") == [endpoint]
 
 
 def test_endpoints_on_the_newer_loopback_address_are_not_pruned(system: str, folder: Path) -> None:
@@ -113,9 +113,9 @@ def test_endpoints_on_the_newer_loopback_address_are_not_pruned(system: str, fol
         pytest.skip("this host has no IPv6 loopback")
     with listening:
         endpoint = f"tcp/[::1]:{listening.getsockname()[1]}"
-        Rendezvous(system).enter(endpoint)
+        HostFolder(system).enter(endpoint)
         old(next(folder.iterdir()))
-        assert Rendezvous(system).enter("tcp/127.0.0.1:1") == [endpoint]
+        assert HostFolder(system).enter("tcp/127.0.0.1:1") == [endpoint]
 
 
 def test_rubbish_in_the_folder_disturbs_nobody(system: str, folder: Path) -> None:
@@ -124,7 +124,7 @@ def test_rubbish_in_the_folder_disturbs_nobody(system: str, folder: Path) -> Non
     (folder / "tcp_folder").mkdir()
     old(folder / "tcp_rubbish")
     old(folder / "tcp_more")
-    assert Rendezvous(system).enter("tcp/127.0.0.1:1") == []
+    assert HostFolder(system).enter("tcp/127.0.0.1:1") == []
 
 
 def test_a_container_takes_its_file_away(here: Container, folder: Path) -> None:
@@ -150,7 +150,7 @@ def test_a_folder_that_is_a_link_is_refused(system: str, tmp_path: Path) -> None
     (tmp_path / "elsewhere").mkdir(mode=0o700)
     (tmp_path / "runtime" / "trade").symlink_to(tmp_path / "elsewhere")
     with pytest.raises(ConfigurationError, match="others may write there"):
-        Rendezvous(system)
+        HostFolder(system)
 
 
 def test_containers_that_start_at_the_same_moment_see_each_other(start_program: Any, system: str) -> None:
@@ -175,7 +175,7 @@ def test_containers_that_start_at_the_same_moment_see_each_other(start_program: 
 def test_who_is_known_but_does_not_listen_yet_is_dialled_until_it_does(here: Container, start_container: Any) -> None:
     """Its file was there first; it read the folder before ours was."""
     endpoint = free_endpoint()
-    Rendezvous(here.settings.system).enter(endpoint)
+    HostFolder(here.settings.system).enter(endpoint)
     early = start_container("early")
     late = start_container("late", listen=[endpoint], connect=[free_endpoint()])
     assert early.find(where(name="clock", container="late"), wait_s=30)() > 0

@@ -10,7 +10,7 @@ from trade import Container, service, where
 from trade.rules import Firing
 from trade.rules import _engine as rules_module
 from trade.rules import _loop_detector as causes
-from trade.rules._loop_detector import Causes, Mark, turns
+from trade.rules._loop_detector import LoopDetector, Mark, turns
 from waiting import wait_until
 
 
@@ -136,29 +136,29 @@ def test_many_services_that_leave_together_are_no_circle(there: Container, desk:
 # --- what may have led to what
 
 
-def fire(known: Causes, mark: Mark, since_ns: int = 0, ended_ns: int | None = 0) -> int:
+def fire(known: LoopDetector, mark: Mark, since_ns: int = 0, ended_ns: int | None = 0) -> int:
     way = known.way_to(mark, since_ns)
     known.begin(way).ended_ns = ended_ns
     return turns(way)
 
 
 def test_a_way_leads_back_to_where_it_began() -> None:
-    known, a, b = Causes(), Mark("a", "x"), Mark("b", "x")
+    known, a, b = LoopDetector(), Mark("a", "x"), Mark("b", "x")
     assert [fire(known, mark) for mark in (a, b, a, b, a, b, a)] == [0, 0, 1, 1, 2, 2, 3]
 
 
 def test_what_ended_long_before_led_to_nothing() -> None:
-    known, a = Causes(), Mark("a", "x")
+    known, a = LoopDetector(), Mark("a", "x")
     late = causes.AFTERMATH_NS + 1
     assert [fire(known, a, since, since) for since in (0, late, 2 * late)] == [0, 0, 0]
 
 
 def test_what_is_under_way_may_lead_to_anything() -> None:
-    known, a, b = Causes(), Mark("a"), Mark("b")
+    known, a, b = LoopDetector(), Mark("a"), Mark("b")
     fire(known, a, ended_ns=None)
     assert known.way_to(b, 10 * causes.AFTERMATH_NS) == (a, b)
 
 
 def test_the_same_rule_for_another_service_is_another_occasion() -> None:
-    known = Causes()
+    known = LoopDetector()
     assert [fire(known, Mark("a", str(number))) for number in range(9)] == [0] * 9

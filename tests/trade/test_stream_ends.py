@@ -11,7 +11,7 @@ import pytest
 from listening import FAST_HZ, PATIENCE_S, Battery, Display, Two
 from trade import Container, where
 from trade._protocol.samples import stream_key
-from trade._streams.source import Source, Wish
+from trade._streams.source import RateRequest, Source
 from trade._transport.memory import MemoryTransport
 from trade.errors import AccessDenied, ConfigurationError, ServiceGone, SessionEnded, SourceLost
 from trade.testing import MemorySystem
@@ -323,8 +323,8 @@ def test_who_does_not_say_again_that_it_listens_is_let_go_of(here: Container) ->
     local = here._parts.providers.service(count.key)
     source = Source(count.key, lambda _: local, here._parts.transport, itertools.count(1).__next__)
     now = time.monotonic_ns()
-    source.wish(("session", "kept"), Wish("tester", 1, on_change=False, until_ns=now + 10**12))
+    source.wish(("session", "kept"), RateRequest("tester", 1, on_change=False, until_ns=now + 10**12))
     assert source.tick() is not None
-    source.wish(("session", "kept"), Wish("tester", 1, on_change=False, until_ns=now))
+    source.wish(("session", "kept"), RateRequest("tester", 1, on_change=False, until_ns=now))
     assert source.tick() is None
     assert battery.asked == 1

@@ -11,7 +11,7 @@ from trade import Handle, Stream, where
 from trade._protocol.messages import EMPTY, PROTOCOL
 from trade._protocol.samples import STEPS_HZ, StreamSample, stream_key
 from trade._streams.pace import Pace
-from trade._streams.source import Source, Wish
+from trade._streams.source import RateRequest, Source
 from trade.errors import ConfigurationError
 from trade.testing import MemorySystem
 
@@ -202,10 +202,10 @@ def test_a_source_is_not_put_at_any_number_of_rates(apart: Two) -> None:
         apart.service("count").key, lambda _: None, apart.there._parts.transport, itertools.count(1).__next__
     )
     for rate in range(64):
-        source.wish(("session", f"{rate}"), Wish("tester", rate + 1, on_change=False))
+        source.wish(("session", f"{rate}"), RateRequest("tester", rate + 1, on_change=False))
     with pytest.raises(ConfigurationError, match="64 different rates"):
-        source.wish(("session", "another"), Wish("tester", 0.5, on_change=False))
-    source.wish(("session", "the same"), Wish("tester", 1, on_change=False))
+        source.wish(("session", "another"), RateRequest("tester", 0.5, on_change=False))
+    source.wish(("session", "the same"), RateRequest("tester", 1, on_change=False))
 
 
 def test_on_change_only_what_differs_is_given_and_the_first_at_once(two: Two) -> None:

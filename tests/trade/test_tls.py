@@ -283,7 +283,7 @@ def test_the_end_of_a_certificate_is_told_twice(
     monkeypatch.setattr(certificate_expiry, "_TOLD", (timedelta(hours=22), timedelta(hours=21)))
     until = datetime.now(timezone.utc) + timedelta(hours=21, seconds=1)
     with caplog.at_level(logging.WARNING, "trade"):
-        ending = certificate_expiry.Ending(Certificate(papers.of("arm"), "arm", frozenset(), until))
+        ending = certificate_expiry.ExpiryWatch(Certificate(papers.of("arm"), "arm", frozenset(), until))
         assert said_of_the_end(caplog, "arm") == 1
         wait_until(lambda: said_of_the_end(caplog, "arm") == 2, "once more")
         ending.close()

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 import trade._telemetry.spans as noted
-from trade import Called, Container, Handle, Resource, Secret, Trace, current_call, service, where
+from trade import Container, Handle, HookEvent, Resource, Secret, Trace, current_call, service, where
 from trade._services.local_service import LocalService
 from trade.errors import AccessDenied, NoSuchCall
 from trade.testing import MemorySystem, memory_system
@@ -60,7 +60,7 @@ class Eye:
         self.seen: queue.SimpleQueue[int] = queue.SimpleQueue()
 
     @service(effect="read")
-    def see(self, called: Called) -> None:
+    def see(self, called: HookEvent) -> None:
         self.seen.put(called.call_id)
 
 

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from trade._transport.base import Channel, ChannelClosed, Message
-from trade._transport.memory import Clock, Kind, MemoryTransport, Network, Passage
+from trade._transport.memory import Clock, InFlightMessage, Kind, MemoryTransport, Network
 from trade._transport.memory.keys import meet
 from trade.testing import LossConformance, Severable, TransportConformance
 
@@ -323,7 +323,7 @@ def test_a_transport_that_closes_while_it_is_cut_off_is_lost_with_its_lease(room
 
 
 def test_a_tap_sees_each_message_before_it_is_sent_and_after_it_arrived(room: Room) -> None:
-    seen: list[Passage] = []
+    seen: list[InFlightMessage] = []
     end = room.network.tap(seen.append)
     room.say("word")
     end()
@@ -337,7 +337,7 @@ def test_a_tap_sees_each_message_before_it_is_sent_and_after_it_arrived(room: Ro
 def test_a_tap_may_kill_the_receiver_before_a_message_arrives(room: Room) -> None:
     seen: list[bool] = []
 
-    def kill(passage: Passage) -> None:
+    def kill(passage: InFlightMessage) -> None:
         seen.append(passage.arrived)
         room.network.kill(room.other.node)
 

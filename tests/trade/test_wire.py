@@ -41,7 +41,7 @@ from trade._protocol.messages import (
     decode_reply,
     encode_message,
 )
-from trade.testing._ear import Ear, Teller
+from trade.testing._ear import RecordingListener, Teller
 
 CALL = Call(PROTOCOL, 7, "echo", "raw/0", "tester/raw/0", 2**62, (), EMPTY_ARGUMENTS)
 REPLY = Reply(PROTOCOL, 7, Status.OK, 1, EMPTY)
@@ -319,7 +319,7 @@ def test_arguments_however_deep_are_refused_and_answered_also_where_one_is_secre
     here.register(Safe(), "desk")
     raw = open_raw(here)
     key = key_of(here, name)
-    replies = Ear(raw.subscribe(reply_key(here.address.identity, "tester", "raw", "0")))
+    replies = RecordingListener(raw.subscribe(reply_key(here.address.identity, "tester", "raw", "0")))
     publisher = raw.publish(call_key("tester", key.address, key.domain, key.provider, stop=False))
     strange = [b"\x91\xa1\xff", *(encode_message(value) for value in (5, "text", None, b"", {1: 2})), *DEEPER]
     for number, args in enumerate(strange):

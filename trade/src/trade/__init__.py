@@ -26,7 +26,7 @@ from trade._context.sessions import Session
 from trade._counters import Measure
 from trade._estop.broadcast import EstopReport
 from trade._estop.controller import LIMIT_S
-from trade._hooks.hook import Called, HookInfo
+from trade._hooks.hook import HookEvent, HookInfo
 from trade._locks.api import LEASE_S, RESUME_WAIT_S
 from trade._locks.lock import Lock, OnLost, OnRequest
 from trade._migration.target import Prepared
@@ -52,7 +52,6 @@ from trade._telemetry.spans import Span
 __all__ = [
     "Bound",
     "CallContext",
-    "Called",
     "Constraint",
     "Container",
     "ContainerInfo",
@@ -60,6 +59,7 @@ __all__ = [
     "EstopReport",
     "Handle",
     "Hook",
+    "HookEvent",
     "HookInfo",
     "LoadInfo",
     "Lock",

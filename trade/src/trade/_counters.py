@@ -24,7 +24,7 @@ class Measure(Struct, frozen=True):
     kind: Literal["counter", "gauge"] = "gauge"
 
 
-class Timed:
+class Timer:
     """How long calls of one service took, and how many failed. A list's item is counted up in one step of Python's."""
 
     __slots__ = ("counts", "failures", "sum_ns")
@@ -42,25 +42,25 @@ class Timed:
             self.failures += 1
 
 
-class Calls:
+class CallCounters:
     """What is counted of the calls of a container."""
 
     def __init__(self) -> None:
         self._guard = threading.Lock()
-        self._timed: dict[str, Timed] = {}
+        self._timed: dict[str, Timer] = {}
         self._refusals: dict[str, int] = {}
 
-    def of(self, label: str) -> Timed:
+    def of(self, label: str) -> Timer:
         """Where calls of a service are counted; services of one label are counted together."""
         with self._guard:
-            return self._timed.setdefault(label, Timed())
+            return self._timed.setdefault(label, Timer())
 
     def refuse(self, reason: str) -> None:
         """Somebody was refused something."""
         with self._guard:
             self._refusals[reason] = self._refusals.get(reason, 0) + 1
 
-    def timed(self) -> dict[str, Timed]:
+    def timed(self) -> dict[str, Timer]:
         """By service."""
         with self._guard:
             return dict(self._timed)

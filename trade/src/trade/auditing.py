@@ -1,7 +1,7 @@
 """Audit records for those who read and check them. Containers write their own: see `trade.Settings.audit`."""
 
 from trade._audit.events import Kind
-from trade._audit.hash_chain import AuditRow, Head, Verdict, verify
+from trade._audit.hash_chain import AuditRow, ChainCheck, Head, verify
 from trade._audit.store import moved_aside_in, reading, records_in
 
-__all__ = ["AuditRow", "Head", "Kind", "Verdict", "moved_aside_in", "reading", "records_in", "verify"]
+__all__ = ["AuditRow", "ChainCheck", "Head", "Kind", "moved_aside_in", "reading", "records_in", "verify"]

@@ -14,7 +14,7 @@ from trade.errors import DeviceSilent, TradeError
 from trade_drivers.bus._jobs import Device, Work
 from trade_drivers.robotfile import Bus
 
-__all__ = ["HALT_NS", "PROBE_NS", "BusDevice", "BusExchange", "StopTicket", "silences"]
+__all__ = ["HALT_NS", "PROBE_NS", "BusCycle", "BusDevice", "StopTicket", "silences"]
 
 silences: Final = logging.getLogger("trade.silences")
 """Where a device that is not heard is warned of; who tells of faults by itself raises its level."""
@@ -73,7 +73,7 @@ class StopTicket(Work[_Device]):
         """Writes it."""
 
 
-class BusExchange(ABC, Generic[_Device]):
+class BusCycle(ABC, Generic[_Device]):
     """What happens on one bus.
 
     ``submit``, ``leave`` and what gives stops are for any thread, the rest for the one that calls ``cycle()``.

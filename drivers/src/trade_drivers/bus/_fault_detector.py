@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import Any
 
 from trade.errors import TradeError
-from trade_drivers.bus._cycle import BusDevice, BusExchange
+from trade_drivers.bus._cycle import BusCycle, BusDevice
 from trade_drivers.bus._jobs import Device
 from trade_drivers.faults._trouble import Respect, Tell, Trouble, found_in
 
@@ -25,10 +25,10 @@ class _Seen:
         self.refusing: Callable[[Device], TradeError] | None = None
 
 
-class Lookout:
+class FaultDetector:
     """Tells of every change once; what comes and goes between two cycles was never there."""
 
-    def __init__(self, exchange: BusExchange[Any], tell: Tell) -> None:
+    def __init__(self, exchange: BusCycle[Any], tell: Tell) -> None:
         self._exchange = exchange
         self._tell = tell
         self._seen = tuple(_Seen(device) for device in exchange.devices)

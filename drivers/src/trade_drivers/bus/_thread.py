@@ -9,8 +9,8 @@ from typing import Any, Final, Generic, Protocol, TypeVar
 
 from trade import Measure
 from trade.errors import BusGone, TradeError
-from trade_drivers.bus._cycle import BusExchange
-from trade_drivers.bus._fault_detector import Lookout
+from trade_drivers.bus._cycle import BusCycle
+from trade_drivers.bus._fault_detector import FaultDetector
 from trade_drivers.bus._jobs import Device, PortLost, PortOpening
 from trade_drivers.faults import Tell
 from trade_drivers.robotfile import Bus
@@ -40,7 +40,7 @@ class Port(Protocol):
         ...
 
 
-_Exchange_co = TypeVar("_Exchange_co", bound=BusExchange[Any], covariant=True)
+_Exchange_co = TypeVar("_Exchange_co", bound=BusCycle[Any], covariant=True)
 
 
 class BusThread(Generic[_Exchange_co]):
@@ -59,7 +59,7 @@ class BusThread(Generic[_Exchange_co]):
         self._leaving = False
         self.unseen: list[str] = []
         """The devices that were not seen at rest when they were left."""
-        self._lookout: Lookout | None = None
+        self._lookout: FaultDetector | None = None
         self.cycles = 0
         """Since it started."""
         self.late = 0
@@ -77,7 +77,7 @@ class BusThread(Generic[_Exchange_co]):
 
     def watched(self, tell: Tell) -> None:
         """Have ``tell`` told, on the bus thread, what is wrong with devices, now and whenever that changes."""
-        self._lookout = Lookout(self._exchange, tell)
+        self._lookout = FaultDetector(self._exchange, tell)
 
     def alive(self) -> bool:
         """Whether the thread still runs."""

@@ -7,7 +7,7 @@ from trade_drivers.joints._cycle import Exchange
 from trade_drivers.joints._jobs import Job, Manner
 from trade_drivers.joints._motion import Motion
 from trade_drivers.joints._motor import AttachedJoints, BusMotor
-from trade_drivers.joints._ramp import Course, towards
+from trade_drivers.joints._ramp import Ramp, towards
 from trade_drivers.joints._waiting import next_measurement, until
 
 __all__ = [
@@ -15,7 +15,6 @@ __all__ = [
     "Axis",
     "BusMotor",
     "BusThread",
-    "Course",
     "Exchange",
     "Gate",
     "Goal",
@@ -25,6 +24,7 @@ __all__ = [
     "Motion",
     "Port",
     "PortLost",
+    "Ramp",
     "Sample",
     "Steps",
     "next_measurement",

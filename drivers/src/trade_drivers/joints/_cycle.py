@@ -7,7 +7,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from trade.errors import MotionStopped, TradeError
-from trade_drivers.bus._cycle import HALT_NS, BusExchange, StopTicket
+from trade_drivers.bus._cycle import HALT_NS, BusCycle, StopTicket
 from trade_drivers.bus._jobs import Device, Gate, Steps
 from trade_drivers.joints._axis import Axis, Goal
 from trade_drivers.joints._jobs import Job, Leave
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 __all__ = ["Exchange"]
 
 
-class Exchange(BusExchange[Axis]):
+class Exchange(BusCycle[Axis]):
     """What happens on one bus of joints. ``stop`` is for any thread, too."""
 
     def __init__(self, bus: "Bus", axes: Sequence[Axis], clock: Callable[[], int] = time.monotonic_ns) -> None:

@@ -3,13 +3,13 @@
 from math import copysign, sqrt
 from typing import Final
 
-__all__ = ["Course", "towards"]
+__all__ = ["Ramp", "towards"]
 
 _SLACK: Final = 1.02
 """A plan that uses all of a joint's acceleration is followed in whole counts."""
 
 
-class Course:
+class Ramp:
     """It stands where it begins until it is aimed elsewhere. Its aim may jump; it keeps speed and acceleration.
 
     Args:

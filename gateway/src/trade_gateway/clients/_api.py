@@ -32,7 +32,7 @@ from trade.errors import (
     TradeError,
 )
 from trade_gateway.clients import _schemas as messages
-from trade_gateway.clients._authorizer import Judge
+from trade_gateway.clients._authorizer import ClientAuthorizer
 from trade_gateway.clients._clients import Client, Clients, places
 from trade_gateway.clients._quota import MOST, Quota
 from trade_gateway.clients._system_info import Overview
@@ -52,12 +52,12 @@ Gone = Callable[[], Awaitable[object]]
 """Returns when whoever asked is there no more."""
 
 
-class Deeds:
+class ClientApi:
     """The door's side of its system."""
 
     def __init__(self, container: Container) -> None:
         self._container = container
-        self.judge: Final = Judge(container)
+        self.judge: Final = ClientAuthorizer(container)
         self.clients: Final = Clients(container)
         self._threads = anyio.CapacityLimiter(_THREADS)
         self._stop_threads = anyio.CapacityLimiter(inf)
@@ -357,7 +357,9 @@ class Deeds:
 class _Told:
     """Tells a client of services, of those that it may know of."""
 
-    def __init__(self, client: Client, occasion: str, judge: Judge, tell: Callable[[str, Handle], object]) -> None:
+    def __init__(
+        self, client: Client, occasion: str, judge: ClientAuthorizer, tell: Callable[[str, Handle], object]
+    ) -> None:
         self._client = client
         self._occasion = occasion
         self._judge = judge

@@ -19,7 +19,7 @@ _TO_SEE: Final = ("call", "read", "lock", "instrument", "administer")
 """Any of these over a group shows what is in it."""
 
 
-class Judge:
+class ClientAuthorizer:
     """Decides by the policy that the door's container has now; without one everybody may do everything."""
 
     def __init__(self, container: Container) -> None:

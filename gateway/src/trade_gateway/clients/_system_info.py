@@ -8,7 +8,7 @@ from typing import Any, Final
 from trade import Container, HookInfo, LoadInfo, LogLine, LogReader, NotificationInfo, Sight, Span
 from trade_gateway.clients import _schemas as messages
 from trade_gateway.clients._audit_reader import newest
-from trade_gateway.clients._authorizer import Judge
+from trade_gateway.clients._authorizer import ClientAuthorizer
 from trade_gateway.clients._errors import NoAuditRecord
 from trade_gateway.clients._load_table import loads
 from trade_gateway.clients._span_reader import CallReader
@@ -31,7 +31,7 @@ class Overview:
         counted: called with an identity, what to do, and with which arguments.
     """
 
-    def __init__(self, container: Container, judge: Judge, counted: Counted) -> None:
+    def __init__(self, container: Container, judge: ClientAuthorizer, counted: Counted) -> None:
         self._container = container
         self._judge = judge
         self._counted = counted

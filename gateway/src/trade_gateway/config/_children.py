@@ -6,7 +6,7 @@ from typing import Annotated, Any, Final, Literal, NamedTuple
 
 from msgspec import Meta
 
-from trade_gateway.config._tables import Around, Entry, Part, Tables, converted
+from trade_gateway.config._tables import Around, ContainerSpec, Entry, Tables, converted
 
 __all__ = ["Child", "Supervised", "read_children"]
 
@@ -50,7 +50,7 @@ class Supervised(Entry, frozen=True, forbid_unknown_fields=True, kw_only=True):
 class Child(NamedTuple):
     """A container of this host, how it is started, and how it is looked after."""
 
-    part: Part
+    part: ContainerSpec
     terms: Supervised
     environment: Mapping[str, str]
     """All variables of its process."""

@@ -12,7 +12,7 @@ from trade import Settings
 from trade.errors import ConfigurationError
 from trade.policies import read_policy
 from trade_gateway.config._gateway import read_gateway_file
-from trade_gateway.config._tables import Around, Entry, Part, Tables, at, converted, line_of, read_toml
+from trade_gateway.config._tables import Around, ContainerSpec, Entry, Tables, at, converted, line_of, read_toml
 
 __all__ = ["SystemPlan", "read_system_file"]
 
@@ -39,7 +39,7 @@ class SystemPlan(NamedTuple):
     path: Path
     settings: Settings
     """Of who brings it up."""
-    parts: Sequence[Part]
+    parts: Sequence[ContainerSpec]
     """In the order in which they are started."""
     text: str
 

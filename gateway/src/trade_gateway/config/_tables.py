@@ -19,7 +19,18 @@ from trade.policies import read_policy
 from trade.rules import read_rules
 from trade_drivers import check, load, without
 
-__all__ = ["LOCAL", "Around", "Entry", "Made", "Part", "Tables", "at", "converted", "line_of", "read_toml"]
+__all__ = [
+    "LOCAL",
+    "Around",
+    "ContainerSpec",
+    "Entry",
+    "ObjectSpec",
+    "Tables",
+    "at",
+    "converted",
+    "line_of",
+    "read_toml",
+]
 
 LOCAL: Final = "local"
 _KINDS: Final = ("robot", "gateway", "providers", "rules", "door")
@@ -34,7 +45,7 @@ _Text = Annotated[str, Meta(min_length=1)]
 _Read = TypeVar("_Read", bound=Struct)
 
 
-class Made(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, rename={"class_": "class"}):
+class ObjectSpec(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, rename={"class_": "class"}):
     """An object that is made in a container, and offered."""
 
     class_: Annotated[str, Meta(pattern=r"^[A-Za-z_][\w.]*:[A-Za-z_][\w.]*$")]
@@ -44,7 +55,7 @@ class Made(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, rename
     """For its constructor, in order or by name."""
 
 
-class Doorway(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class DoorSpec(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """HTTP and WebSocket for those who speak nothing else: the options of ``trade door``."""
 
     listen: _Text = "127.0.0.1:7080"
@@ -71,13 +82,13 @@ class Entry(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Buses, cameras and sensors of the robot that are left out."""
     gateway: str = ""
     """A gateway file."""
-    providers: list[Made] | None = None
+    providers: list[ObjectSpec] | None = None
     """What is made in it; modules of this host may be beside the system file."""
     allow: list[_Text] = []
     """Classes that others may make in it, besides these."""
     rules: str = ""
     """A rules file."""
-    door: Doorway | None = None
+    door: DoorSpec | None = None
     after: list[_Text] = []
     """Containers that must be up before."""
     tls: str = ""
@@ -108,7 +119,7 @@ class Entry(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
         return self.host == LOCAL
 
 
-_INSIDE: Final[Mapping[str, type[Struct]]] = {"providers": Made, "door": Doorway}
+_INSIDE: Final[Mapping[str, type[Struct]]] = {"providers": ObjectSpec, "door": DoorSpec}
 """What stands under a key of an entry."""
 
 
@@ -127,7 +138,7 @@ class Around(Struct, frozen=True, kw_only=True):
     inherited: Mapping[str, str] = os.environ
 
 
-class Part(NamedTuple):
+class ContainerSpec(NamedTuple):
     """A container, and how it is started."""
 
     name: str
@@ -160,7 +171,7 @@ class Tables:
         self._text = text
         self._entries = entries
 
-    def parts(self) -> "list[Part]":
+    def parts(self) -> "list[ContainerSpec]":
         """All of them, each behind those that it has to wait for. Raises ConfigurationError."""
         return [self._part(name) for name in self._order()]
 
@@ -175,12 +186,12 @@ class Tables:
             ring = cast("list[str]", cycle.args[1])[::-1]
             self.refuse(ring[0], "after", f"is a ring: {' after '.join(ring)}; leave one of them out")
 
-    def _part(self, name: str) -> "Part":
+    def _part(self, name: str) -> "ContainerSpec":
         """How a container is started."""
         entry = self._entries[name]
         self.check_kind(name, entry)
         environment = {} if entry.gateway else self._environment_of(entry)
-        part = Part(name, entry, self._words(name, entry), environment)
+        part = ContainerSpec(name, entry, self._words(name, entry), environment)
         with self.about(name, entry):
             Settings.read(system=self.around.system, container=name, environment={})
         if entry.is_local:
@@ -251,7 +262,7 @@ class Tables:
         return ["--system", self.around.system, *dialled, *does]
 
     def _door_words(self, entry: Entry) -> list[str]:
-        said = entry.door or Doorway()
+        said = entry.door or DoorSpec()
         options = {"--listen": [said.listen], "--origin": said.origins, "--host": said.hosts}
         for option, named in (("--tokens", said.tokens), ("--tls", said.tls)):
             options[option] = [str(self.beside(named)) if entry.is_local else named] if named else []

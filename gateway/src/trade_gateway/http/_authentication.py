@@ -6,7 +6,7 @@ from starlette.datastructures import Headers
 from starlette.types import Scope
 
 from trade.errors import AccessDenied
-from trade_gateway.clients import ANONYMOUS, Judge
+from trade_gateway.clients import ANONYMOUS, ClientAuthorizer
 from trade_gateway.http._problem_json import NotLetIn
 from trade_gateway.http._tokens import Tokens
 
@@ -19,7 +19,7 @@ _BEARER: Final = "bearer."
 class Entry:
     """Tells who is who, and lets in whom the policy has not revoked."""
 
-    def __init__(self, tokens: Tokens, judge: Judge) -> None:
+    def __init__(self, tokens: Tokens, judge: ClientAuthorizer) -> None:
         self._tokens = tokens
         self._judge = judge
 

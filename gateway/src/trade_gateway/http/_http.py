@@ -12,7 +12,7 @@ from starlette.responses import Response
 from starlette.routing import Route
 
 from trade.errors import InvalidResult, LockLost, TooLarge, TradeError
-from trade_gateway.clients import Client, Deeds, NoSuchSession
+from trade_gateway.clients import Client, ClientApi, NoSuchSession
 from trade_gateway.clients import _schemas as messages
 from trade_gateway.http._authentication import Entry
 from trade_gateway.http._openapi import document
@@ -32,7 +32,7 @@ Answer = Callable[[Request], Awaitable[Response]]
 class Http:
     """The routes."""
 
-    def __init__(self, deeds: Deeds, entry: Entry, leases: Leases) -> None:
+    def __init__(self, deeds: ClientApi, entry: Entry, leases: Leases) -> None:
         self._deeds = deeds
         self._entry = entry
         self._leases = leases

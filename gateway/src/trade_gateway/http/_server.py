@@ -20,7 +20,7 @@ from starlette.routing import WebSocketRoute
 from trade import Container
 from trade.errors import ConfigurationError
 from trade.listening import BoundedListener
-from trade_gateway.clients import Deeds
+from trade_gateway.clients import ClientApi
 from trade_gateway.dashboard import pages
 from trade_gateway.http._authentication import Entry
 from trade_gateway.http._http import SESSION, Http, broken, refused
@@ -73,7 +73,7 @@ class Door:
         hosts: Sequence[str] = (),
     ) -> None:
         host, port = _address(listen)
-        deeds = Deeds(container)
+        deeds = ClientApi(container)
         _check_reach(listen, host, deeds, tls)
         if not tokens and tls is None and not deeds.judge.lets_anybody_in:
             problem = "nobody could come in: make a token with trade door token NAME"
@@ -139,7 +139,7 @@ class Door:
         self.close()
 
 
-def _application(deeds: Deeds, tokens: Tokens, hosts: Collection[str], origins: Sequence[str]) -> Starlette:
+def _application(deeds: ClientApi, tokens: Tokens, hosts: Collection[str], origins: Sequence[str]) -> Starlette:
     entry, leases = Entry(tokens, deeds.judge), Leases(deeds)
 
     @asynccontextmanager
@@ -182,7 +182,7 @@ def _address(listen: str) -> tuple[str, int]:
     return host.strip("[]"), int(port)
 
 
-def _check_reach(listen: str, host: str, deeds: Deeds, tls: Path | None) -> None:
+def _check_reach(listen: str, host: str, deeds: ClientApi, tls: Path | None) -> None:
     """S21: raises ConfigurationError if it would be reached from a network by accident."""
     if is_loopback(host):
         return

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Final
 
-from trade_gateway.clients import Client, Deeds
+from trade_gateway.clients import Client, ClientApi
 
 _LOOK_EVERY_S: Final = 1.0
 """How soon a token that was taken back ends a session."""
@@ -23,7 +23,7 @@ class Lease:
 class Leases:
     """Of all sessions. Belongs to the event loop."""
 
-    def __init__(self, deeds: Deeds) -> None:
+    def __init__(self, deeds: ClientApi) -> None:
         self._deeds = deeds
         self._leases: dict[Client, Lease] = {}
         self._closing: set[asyncio.Task[None]] = set()

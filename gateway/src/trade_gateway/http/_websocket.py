@@ -12,7 +12,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from trade import Handle, Run
 from trade.errors import InvalidResult, LockLost, TradeError
-from trade_gateway.clients import Client, Deeds, TooMany
+from trade_gateway.clients import Client, ClientApi, TooMany
 from trade_gateway.clients import _schemas as messages
 from trade_gateway.http._authentication import SUBPROTOCOL, Entry
 from trade_gateway.http._origin_check import problem_response
@@ -39,7 +39,7 @@ _ENDED: Final = 1008
 class Socket:
     """Its endpoint."""
 
-    def __init__(self, deeds: Deeds, entry: Entry, leases: Leases) -> None:
+    def __init__(self, deeds: ClientApi, entry: Entry, leases: Leases) -> None:
         self._deeds = deeds
         self._entry = entry
         self._leases = leases
@@ -118,7 +118,7 @@ class _Line:
 class Conversation:
     """With one client."""
 
-    def __init__(self, websocket: WebSocket, client: Client, deeds: Deeds) -> None:
+    def __init__(self, websocket: WebSocket, client: Client, deeds: ClientApi) -> None:
         self._websocket = websocket
         self._client = client
         self._deeds = deeds

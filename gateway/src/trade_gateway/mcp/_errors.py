@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from trade.errors import CallerError
 
-__all__ = ["NeedsApproval", "NeedsLock", "NoSuchTool", "NoTwin", "NotThatWay"]
+__all__ = ["NeedsApproval", "NeedsLock", "NoSuchTool", "NoTwin", "WrongTool"]
 
 
 @dataclass(kw_only=True, eq=False)
@@ -41,7 +41,7 @@ class NoTwin(CallerError, LookupError):
 
 
 @dataclass(kw_only=True, eq=False)
-class NotThatWay(CallerError, ValueError):
+class WrongTool(CallerError, ValueError):
     """The arguments of a tool are wrong; nothing was done."""
 
     problem: str

@@ -17,7 +17,7 @@ from mcp.server.stdio import stdio_server
 from mcp.shared.message import SessionMessage
 
 from trade import Container
-from trade_gateway.clients import Deeds
+from trade_gateway.clients import ClientApi
 from trade_gateway.clients import _schemas as messages
 from trade_gateway.language import Lexicon
 from trade_gateway.mcp._approvals import Approvals
@@ -61,7 +61,7 @@ async def converse(
     leave: Callable[[], None],
 ) -> None:
     """As `serve`, over any two streams: what the agent moves stops once nothing more can be heard of it."""
-    deeds = Deeds(container)
+    deeds = ClientApi(container)
     client = await deeds.apart(deeds.clients.open, container.address.identity)
     tools = Tools(container, deeds, client, approvals, lexicon, twin)
     server = _server_of(tools)

@@ -12,11 +12,11 @@ from msgspec import Meta, Struct
 
 from trade import Container, Handle
 from trade.errors import LockLost, NoSuchService, TradeError
-from trade_gateway.clients import Client, Deeds
+from trade_gateway.clients import Client, ClientApi
 from trade_gateway.clients import _schemas as messages
 from trade_gateway.language import Lexicon, Memory, Talk
 from trade_gateway.mcp._approvals import Approvals
-from trade_gateway.mcp._errors import NeedsLock, NoSuchTool, NotThatWay, NoTwin
+from trade_gateway.mcp._errors import NeedsLock, NoSuchTool, NoTwin, WrongTool
 from trade_gateway.mcp._simulation_twin import Tried, Twin
 
 __all__ = ["TOOLS", "Tool", "Tools"]
@@ -54,12 +54,12 @@ class Sentence(Struct, forbid_unknown_fields=True, kw_only=True):
     sentence: Annotated[str, Meta(min_length=1, max_length=500)]
 
 
-class ALock(Struct, forbid_unknown_fields=True, kw_only=True):
+class LockArgs(Struct, forbid_unknown_fields=True, kw_only=True):
     lock: str
     """As the tool ``lock`` named it."""
 
 
-class Nothing(Struct, forbid_unknown_fields=True):
+class NoArgs(Struct, forbid_unknown_fields=True):
     pass
 
 
@@ -88,7 +88,7 @@ class Tools:
     def __init__(
         self,
         container: Container,
-        deeds: Deeds,
+        deeds: ClientApi,
         client: Client,
         approvals: Approvals,
         lexicon: Lexicon,
@@ -119,7 +119,7 @@ class Tools:
                 asked = msgspec.convert(messages.numbers(given), tool.asked)
             except (msgspec.ValidationError, ValueError, RecursionError) as bad:
                 problem = f"nested more than {messages.MOST_DEEP} deep" if isinstance(bad, RecursionError) else bad
-                raise NotThatWay(problem=f"the arguments of {name} are wrong: {problem}") from None
+                raise WrongTool(problem=f"the arguments of {name} are wrong: {problem}") from None
             about = _about(asked)
             result = await tool.do(self, asked, progress)
         except Exception as error:
@@ -158,7 +158,7 @@ class Tools:
         """
         return await self._deeds.apart(partial(self._talk.say, asked.sentence, orders=False))
 
-    async def locks(self, _asked: Nothing, _: Progress) -> Any:
+    async def locks(self, _asked: NoArgs, _: Progress) -> Any:
         """Who holds which locks, and those of this agent's that were taken away since it asked last."""
         lost, self._lost = self._lost, []
         return {"locks": await self._deeds.locks(self._client.identity), "lost": lost}
@@ -169,7 +169,7 @@ class Tools:
         """Take a lock over all that a group uses: rosie.head. Nobody else can move it until it is given back."""
         return await self._deeds.lock(self._client, asked, self._lock_lost)
 
-    async def unlock(self, asked: ALock, _: Progress) -> Any:
+    async def unlock(self, asked: LockArgs, _: Progress) -> Any:
         """Give a lock back; what moves under it stops."""
         return {"released": await self._deeds.apart(self._client.unlock, asked.lock)}
 
@@ -277,9 +277,9 @@ TOOLS: Final = {
     "services": Tool(Find, Tools.services, reads=True),
     "describe": Tool(Named, Tools.describe, reads=True),
     "ask": Tool(Sentence, Tools.ask, reads=True),
-    "locks": Tool(Nothing, Tools.locks, reads=True),
+    "locks": Tool(NoArgs, Tools.locks, reads=True),
     "lock": Tool(messages.LockBody, Tools.lock),
-    "unlock": Tool(ALock, Tools.unlock),
+    "unlock": Tool(LockArgs, Tools.unlock),
     "call": Tool(ToCall, Tools.call),
     "dry_run": Tool(ToCall, Tools.try_on_twin, reads=True),
     "stop": Tool(messages.GroupBody, Tools.stop),

@@ -8,13 +8,13 @@ from typing import Final, NamedTuple
 
 from trade.errors import ConfigurationError
 
-__all__ = ["Fence", "Term", "uptime_s"]
+__all__ = ["KillTimer", "TimerLease", "uptime_s"]
 
 _AT: Final = 1
 """TIMER_ABSTIME of time.h."""
 
 
-class Term(NamedTuple):
+class TimerLease(NamedTuple):
     """How long a process may stay; seconds of `uptime_s`, so that all processes of a host mean the same."""
 
     leave_at: float
@@ -27,7 +27,7 @@ class Term(NamedTuple):
         return f"{self.leave_at:.6f} {self.until:.6f}"
 
     @classmethod
-    def read(cls, line: str) -> "Term":
+    def read(cls, line: str) -> "TimerLease":
         """Raises ValueError: it is none."""
         leave_at, until = line.split()
         return cls(float(leave_at), float(until))
@@ -38,19 +38,19 @@ def uptime_s() -> float:
     return time.clock_gettime(time.CLOCK_BOOTTIME)
 
 
-class Fence:
+class KillTimer:
     """Timers that send this process SIGTERM, and later SIGKILL, unless they are moved on before.
 
     Raises:
         ConfigurationError: this system has no such timers.
     """
 
-    def __init__(self, term: Term) -> None:
+    def __init__(self, term: TimerLease) -> None:
         self._leave = _timer(signal.SIGTERM)
         self._end = _timer(signal.SIGKILL)
         self.move(term)
 
-    def move(self, term: Term) -> None:
+    def move(self, term: TimerLease) -> None:
         """Stay so long instead; a time that has passed is now."""
         _set(self._end, term.until)
         _set(self._leave, term.leave_at)

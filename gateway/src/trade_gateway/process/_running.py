@@ -8,13 +8,13 @@ from types import FrameType
 
 from trade import Container
 from trade.errors import ConfigurationError
-from trade_gateway.process._signal_event import Asked
+from trade_gateway.process._signal_event import SignalEvent
 
 
 @contextmanager
-def leaving() -> Generator[Asked]:
+def leaving() -> Generator[SignalEvent]:
     """What Ctrl-C and SIGTERM ask for, so that devices are always left in order."""
-    event = Asked()
+    event = SignalEvent()
 
     def leave(_number: int, _frame: FrameType | None) -> None:
         event.set()
@@ -45,9 +45,9 @@ def refuse_twice(container: Container, command: str) -> None:
 
 
 @contextmanager
-def hangups() -> Generator[Asked]:
+def hangups() -> Generator[SignalEvent]:
     """What SIGHUP asks for."""
-    event = Asked()
+    event = SignalEvent()
 
     def heard(_number: int, _frame: FrameType | None) -> None:
         event.set()

@@ -3,10 +3,10 @@
 import queue
 import time
 
-__all__ = ["Asked"]
+__all__ = ["SignalEvent"]
 
 
-class Asked:
+class SignalEvent:
     """Used as a `threading.Event`, which may not be set in the handler of a signal.
 
     A handler runs on the main thread, amid whatever that is doing. If it just waits for an event, it may have the lock

@@ -9,7 +9,7 @@ from itertools import chain
 from typing import Final, Protocol
 
 from trade import Container
-from trade_gateway.process._signal_event import Asked
+from trade_gateway.process._signal_event import SignalEvent
 from trade_gateway.recording._channels import Message
 from trade_gateway.recording._poller import Watch
 from trade_gateway.recording._sources import Sources, Wanted
@@ -30,7 +30,7 @@ class Sink(Protocol):
 class Recorder:
     """Reads a system until it is told to end. Used by one thread; a context manager."""
 
-    def __init__(self, container: Container, wanted: Wanted, ending: threading.Event | Asked) -> None:
+    def __init__(self, container: Container, wanted: Wanted, ending: threading.Event | SignalEvent) -> None:
         """Begin to watch.
 
         Args:

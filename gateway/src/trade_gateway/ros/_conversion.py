@@ -10,7 +10,7 @@ from trade import Handle
 from trade.errors import ConfigurationError
 from trade_gateway.ros._types import Field, Message, Types
 
-__all__ = ["Asked", "Told", "failure", "ros_path", "ros_stamp", "seconds"]
+__all__ = ["RequestMapping", "ResponseMapping", "failure", "ros_path", "ros_stamp", "seconds"]
 
 _BARE: Final = "data"
 """What messages with one value call it."""
@@ -18,7 +18,7 @@ _STAMPED: Final = "std_msgs/msg/Header"
 _VERDICT: Final = ("success", "message")
 
 
-class Asked:
+class RequestMapping:
     """How a message becomes the arguments of a service."""
 
     def __init__(
@@ -78,7 +78,7 @@ class Asked:
         return {**self._fixed, **{name: _at(message, path) for name, path in self._from.items()}}
 
 
-class Told:
+class ResponseMapping:
     """How what a service answers becomes a message."""
 
     def __init__(self, types: Types, type_name: str, fields: Mapping[str, str] | None = None) -> None:

@@ -7,23 +7,23 @@ from contextlib import contextmanager
 from trade import Container, Handle
 from trade_gateway.clients._clients import Client, Place, places
 
-__all__ = ["Grips"]
+__all__ = ["NodeLocks"]
 
 
-class _Grip:
+class _HeldLock:
     def __init__(self, name: str) -> None:
         self.name = name
         self.users = 1
 
 
-class Grips:
+class NodeLocks:
     """Of one node. What it has locked itself is used and stays its own."""
 
     def __init__(self, container: Container, client: Client) -> None:
         self._container = container
         self._client = client
         self._guard = threading.Lock()
-        self._grips: dict[frozenset[Place], _Grip] = {}
+        self._grips: dict[frozenset[Place], _HeldLock] = {}
 
     @contextmanager
     def hold(self, handles: Sequence[Handle], purpose: str, wait_s: float) -> Generator[None]:
@@ -57,7 +57,7 @@ class Grips:
             self._client.locking()
             with self._client.session.use():
                 lock = self._container.lock(handles, purpose=purpose, wait_s=wait_s).acquire()
-            self._grips[wanted] = _Grip(self._client.keep(lock, list(handles)))
+            self._grips[wanted] = _HeldLock(self._client.keep(lock, list(handles)))
         return wanted
 
     def _give_back(self, taken: frozenset[Place]) -> None:

@@ -13,7 +13,7 @@ from trade import Container, Handle, Run
 from trade.errors import Cancelled
 from trade_gateway.clients._clients import Client
 from trade_gateway.ros._graph import Graph, RosUnreachable
-from trade_gateway.ros._lock_guard import Grips
+from trade_gateway.ros._lock_guard import NodeLocks
 
 __all__ = ["UNKNOWN", "Guest", "Nodes"]
 
@@ -42,7 +42,7 @@ class Guest:
         self.client: Final = client
         self.who: Final = who
         """Its name; empty: nobody knows."""
-        self.grips: Final = Grips(container, client)
+        self.grips: Final = NodeLocks(container, client)
         self.heard_at = time.monotonic()
         self.stopped_at = 0.0
         """When its last stop came: what came before that must not begin any more (S08)."""

@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 from trade import Constraint, Container, Handle, Run, where
 from trade.errors import ConfigurationError, TradeError
 from trade_gateway.clients._clients import Client
-from trade_gateway.ros._conversion import Asked, failure
+from trade_gateway.ros._conversion import RequestMapping, failure
 from trade_gateway.ros._file import Command
 from trade_gateway.ros._graph import Closes, Graph
 from trade_gateway.ros._mapping_sync import Place, named_services
@@ -59,7 +59,7 @@ class CommandsToRos:
         if handle.effect == "stop":
             problem = "a stop is for everybody at any time, a topic hears one node at a time: say [[to_ros.service]]"
             raise ConfigurationError(where=handle.label, problem=problem)
-        asked = Asked(self._graph.types, entry.type, handle, entry.args, entry.fixed)
+        asked = RequestMapping(self._graph.types, entry.type, handle, entry.args, entry.fixed)
         stops = stops_of(self._container, handle) if handle.effect == "actuate" else []
         if handle.effect == "actuate" and not stops:
             problem = "has no stop, so silence could not end what a command begins"
@@ -90,7 +90,7 @@ class _Taking:
         self,
         entry: Command,
         handle: Handle,
-        asked: Asked,
+        asked: RequestMapping,
         stops: Sequence[Handle],
         nodes: Nodes,
         say: Callable[[str], object],

@@ -6,7 +6,7 @@ from typing import Final, NamedTuple
 from trade import Constraint, Container, Handle, Lock, where
 from trade.errors import ConfigurationError
 from trade_gateway.clients._clients import Client
-from trade_gateway.ros._conversion import Asked, Told, ros_path
+from trade_gateway.ros._conversion import RequestMapping, ResponseMapping, ros_path
 from trade_gateway.ros._file import LockService, ServiceEntry
 from trade_gateway.ros._graph import Answer, Closes, Graph, RosRefused
 from trade_gateway.ros._mapping_sync import Place, named_services
@@ -37,7 +37,7 @@ class ServicesToRos:
         self._graph = graph
         self._nodes = nodes
         self._request, response = graph.types.parts(entry.type)
-        self._told = Told(graph.types, response)
+        self._told = ResponseMapping(graph.types, response)
 
     @property
     def of(self) -> Constraint:
@@ -61,8 +61,8 @@ class ServicesToRos:
             return False
         return True
 
-    def _asked(self, handle: Handle) -> Asked:
-        asked = Asked(self._graph.types, self._request, handle, self._entry.args)
+    def _asked(self, handle: Handle) -> RequestMapping:
+        asked = RequestMapping(self._graph.types, self._request, handle, self._entry.args)
         if asked.unused:
             problem = f"says {', '.join(asked.unused)}, and nothing is made of that; it is {handle.signature}"
             raise ConfigurationError(where=f"{self._entry.type} for {handle.label}", problem=problem)
@@ -102,7 +102,7 @@ class LocksToRos:
             yield Place("service", name, f"a lock over {self._entry.group}"), first
 
     def open(self, place: Place, handle: Handle) -> Closes:  # noqa: ARG002 - it is of a whole group
-        told = Told(self._graph.types, self._graph.types.parts(_SET_BOOL)[1])
+        told = ResponseMapping(self._graph.types, self._graph.types.parts(_SET_BOOL)[1])
 
         def answer(request: Message, who: str, came_at: float) -> Message:
             text = self._take(who, came_at) if request["data"] else self._give_back(who)
@@ -139,7 +139,7 @@ class LocksToRos:
         return "given back" if given_back else "it had none"
 
 
-def answering(told: Told, answer: Answer) -> Answer:
+def answering(told: ResponseMapping, answer: Answer) -> Answer:
     """The same, with what goes wrong said in the response where that has words for it."""
 
     def guarded(request: Message, who: str, came_at: float) -> Message:

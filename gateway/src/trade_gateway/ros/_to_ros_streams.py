@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Final
 
 from trade import Constraint, Container, Handle, Sample, Stream, where
-from trade_gateway.ros._conversion import Told, failure, ros_stamp
+from trade_gateway.ros._conversion import ResponseMapping, failure, ros_stamp
 from trade_gateway.ros._file import JointStates, StreamEntry
 from trade_gateway.ros._graph import Closes, Graph, Publisher
 from trade_gateway.ros._joints import LIMBS, JointNames, joints_of, limbs, measured
@@ -56,7 +56,7 @@ class StreamsToRos:
         self._entry = entry
         self._topics = topics
         self._container = container
-        self._told = Told(graph.types, entry.type, entry.fields)
+        self._told = ResponseMapping(graph.types, entry.type, entry.fields)
 
     @property
     def of(self) -> Constraint:

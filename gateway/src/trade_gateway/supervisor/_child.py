@@ -6,8 +6,8 @@ from collections.abc import Callable
 from msgspec import Struct
 
 from trade_gateway.config._children import Child
-from trade_gateway.process._kill_timer import Term, uptime_s
-from trade_gateway.supervisor._furnish import Furnished
+from trade_gateway.process._kill_timer import TimerLease, uptime_s
+from trade_gateway.supervisor._furnish import CreatedObjects
 from trade_gateway.supervisor._lease_protocol import Leased
 from trade_gateway.supervisor._process import Process
 from trade_gateway.supervisor._state_machine import Life, State
@@ -50,7 +50,7 @@ class Unit:
         self.process: Process | None = None
         self.boot = 0
         """Counts processes: what is told of an earlier one counts for nothing."""
-        self.furnished: Furnished | None = None
+        self.furnished: CreatedObjects | None = None
         self.begun = False
         self.was_up = False
         self.leaving = ""
@@ -58,7 +58,7 @@ class Unit:
         self.save_at = math.inf
         self.saved_at = 0.0
         self.lease: Leased | None = None
-        self.told: Term | None = None
+        self.told: TimerLease | None = None
         """How long its process knows that it may stay."""
 
     @property

@@ -9,17 +9,17 @@ from trade import Container, Handle
 from trade.errors import CannotInstantiate, ConfigurationError, NoSuchService, ServiceGone, TradeError
 from trade.starting import Started
 from trade_gateway.config._children import Child
-from trade_gateway.config._tables import Made
+from trade_gateway.config._tables import ObjectSpec
 from trade_gateway.supervisor._objects import function_of, make, name_of
 
-__all__ = ["Furnished", "furnish", "save"]
+__all__ = ["CreatedObjects", "furnish", "save"]
 
 _SEEN_S: Final = 15.0
 _MADE_S: Final = 30.0
 _LOOK_EVERY_S: Final = 0.02
 
 
-class Furnished(NamedTuple):
+class CreatedObjects(NamedTuple):
     """A child that has all that its table names."""
 
     clock: Handle
@@ -29,7 +29,9 @@ class Furnished(NamedTuple):
     problems: list[str]
 
 
-def furnish(member: Callable[[], Container], child: Child, started: Started, states: Mapping[str, Any]) -> Furnished:
+def furnish(
+    member: Callable[[], Container], child: Child, started: Started, states: Mapping[str, Any]
+) -> CreatedObjects:
     """Wait until a child is seen, and make its objects; each has its state before anybody can call it.
 
     Args:
@@ -51,7 +53,7 @@ def furnish(member: Callable[[], Container], child: Child, started: Started, sta
         if any(child.lease):
             _refuse_pinned(one, services)
         made[name] = services[0]
-    return Furnished(clock, made, problems)
+    return CreatedObjects(clock, made, problems)
 
 
 def _function(member: Callable[[], Container], child: Child, started: Started, name: str) -> Handle:
@@ -69,7 +71,7 @@ def _function(member: Callable[[], Container], child: Child, started: Started, n
     raise ConfigurationError(where=f"container.{child.name}", problem=problem)
 
 
-def _made(instantiate: Handle, one: Made, state: Any, problems: list[str]) -> tuple[Handle, ...]:
+def _made(instantiate: Handle, one: ObjectSpec, state: Any, problems: list[str]) -> tuple[Handle, ...]:
     if state is not None:
         try:
             return make(instantiate, one, wait_s=_MADE_S, state=state)
@@ -78,7 +80,7 @@ def _made(instantiate: Handle, one: Made, state: Any, problems: list[str]) -> tu
     return make(instantiate, one, wait_s=_MADE_S)
 
 
-def _refuse_pinned(one: Made, services: tuple[Handle, ...]) -> None:
+def _refuse_pinned(one: ObjectSpec, services: tuple[Handle, ...]) -> None:
     drives = sorted({name for service in services for name in _pinned_by(service)})
     if drives:
         problem = f"it drives {', '.join(drives)} of this host; only a class that is relocatable can be back elsewhere"
@@ -97,7 +99,7 @@ def _pinned_by(service: Handle) -> tuple[str, ...]:
         pause.wait(_LOOK_EVERY_S)
 
 
-def save(member: Container, furnished: Furnished) -> dict[str, Any]:
+def save(member: Container, furnished: CreatedObjects) -> dict[str, Any]:
     """The states of a child's objects, by name; without those that are in use, moving or not there.
 
     What has no state is not asked again.

@@ -10,7 +10,7 @@ from typing import Final
 
 from msgspec import Struct
 
-from trade_gateway.process._kill_timer import Term
+from trade_gateway.process._kill_timer import TimerLease
 
 __all__ = ["Arbiter", "Holder", "Lease", "waits_s"]
 
@@ -53,7 +53,7 @@ class Holder:
         self.turn = ""
         self.why = f"{arbiter} was not asked yet"
         """Why it has no lease."""
-        self.term = Term(-math.inf, -math.inf)
+        self.term = TimerLease(-math.inf, -math.inf)
         """How long the container may stay up."""
         self.states = b""
         """What the container is to begin with, once it is held."""
@@ -95,7 +95,7 @@ class Holder:
             self.states = lease.states
         until = max(self.term.until, asked_at + lease.lease_s)
         self.turn, self.why, self._every_s = lease.turn, "", lease.lease_s / _ASKS
-        self.term = Term(until - lease.lease_s / _LEAVES, until)
+        self.term = TimerLease(until - lease.lease_s / _LEAVES, until)
 
     def unanswered(self, why: str) -> None:
         """A question was lost, or could not be asked."""

@@ -13,7 +13,7 @@ import msgspec
 from trade import Container, Handle, Run, where
 from trade.errors import AccessDenied, ConfigurationError, NoSuchService, TradeError
 from trade_gateway.config._children import Child
-from trade_gateway.process._kill_timer import Term, uptime_s
+from trade_gateway.process._kill_timer import TimerLease, uptime_s
 from trade_gateway.supervisor._lease import Arbiter, Holder, Lease
 from trade_gateway.supervisor._objects import GROUP
 from trade_gateway.supervisor._single_instance import is_free
@@ -44,7 +44,7 @@ class Leased(Protocol):
         ...
 
     @property
-    def term(self) -> Term | None:
+    def term(self) -> TimerLease | None:
         """How long it may stay up; None: as long as this gateway has it."""
         ...
 
@@ -108,7 +108,7 @@ class Asking:
         return f"no lease: {self._holder.why}" if self._holder.why else ""
 
     @property
-    def term(self) -> Term | None:
+    def term(self) -> TimerLease | None:
         return self._holder.term
 
     @property

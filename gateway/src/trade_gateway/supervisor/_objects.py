@@ -8,7 +8,7 @@ from typing import Any, Final
 
 from trade import Container, Handle, where
 from trade.errors import NoSuchService
-from trade_gateway.config._tables import Made, Part
+from trade_gateway.config._tables import ContainerSpec, ObjectSpec
 
 __all__ = ["GROUP", "function_of", "lacking", "make", "name_of"]
 
@@ -32,7 +32,7 @@ def function_of(member: Container, container: str, name: str, *, epoch: str, wai
         pause.wait(_LOOK_EVERY_S)
 
 
-def lacking(member: Container, part: Part) -> list[Made]:
+def lacking(member: Container, part: ContainerSpec) -> list[ObjectSpec]:
     """What the file wants made in a container, and it does not offer."""
     if not part.entry.providers:
         return []
@@ -43,7 +43,7 @@ def lacking(member: Container, part: Part) -> list[Made]:
     ]
 
 
-def make(instantiate: Handle, made: Made, *, wait_s: float, state: Any = None) -> tuple[Handle, ...]:
+def make(instantiate: Handle, made: ObjectSpec, *, wait_s: float, state: Any = None) -> tuple[Handle, ...]:
     """Have an object made; handles of its services. Raises what ``instantiate`` does."""
     args = made.args if isinstance(made.args, Mapping) else tuple(made.args)
     told = (made.class_, args, tuple(made.groups))
@@ -51,7 +51,7 @@ def make(instantiate: Handle, made: Made, *, wait_s: float, state: Any = None) -
     return ask(*told) if state is None else ask(*told, state)
 
 
-def name_of(made: Made, known: Mapping[str, object]) -> str:
+def name_of(made: ObjectSpec, known: Mapping[str, object]) -> str:
     """A name for an object that no other one of the same container has, and the next one in its place has, too."""
     name = " ".join((made.class_, *made.groups))
     return next(one for one in (name, *(f"{name} #{n}" for n in range(2, len(known) + 3))) if one not in known)

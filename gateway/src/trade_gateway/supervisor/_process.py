@@ -12,7 +12,7 @@ import msgspec
 
 from trade.starting import Started
 from trade_gateway.config._children import Child
-from trade_gateway.process._kill_timer import Term
+from trade_gateway.process._kill_timer import TimerLease
 from trade_gateway.supervisor._single_instance import alone
 
 __all__ = ["Process", "rss_mb"]
@@ -35,7 +35,7 @@ class Process:
         OSError: there can be no further process.
     """
 
-    def __init__(self, child: Child, logs: Path, lock: Path | None = None, term: Term | None = None) -> None:
+    def __init__(self, child: Child, logs: Path, lock: Path | None = None, term: TimerLease | None = None) -> None:
         leased = [] if term is None else ["--leased"]
         self._log = logs / f"{child.name}.log"
         self._said = b""
@@ -99,7 +99,7 @@ class Process:
             return None, True
         return msgspec.json.decode(line, type=Started), True
 
-    def stay(self, term: Term) -> None:
+    def stay(self, term: TimerLease) -> None:
         """It may stay so long; one that does not listen is as far as before."""
         with contextlib.suppress(BlockingIOError, BrokenPipeError):
             os.write(self._input, f"{term.line()}\n".encode())

@@ -7,7 +7,7 @@ from typing import Final
 
 from trade_gateway.config._children import Supervised
 
-__all__ = ["GRACE_S", "Do", "Life", "State"]
+__all__ = ["GRACE_S", "Life", "State", "Transition"]
 
 START_S: Final = 60.0
 """How long it may take from its first instruction until it is up."""
@@ -36,7 +36,7 @@ class State(enum.Enum):
     """It ended unasked too often; only somebody who asks for it starts it again."""
 
 
-class Do(enum.Enum):
+class Transition(enum.Enum):
     """What is to be done now."""
 
     LAUNCH = enum.auto()
@@ -82,7 +82,7 @@ class Life:
         self._launched = False
         self._failures: deque[float] = deque()
         self._after = _After.FAILED
-        self._next: deque[Do] = deque()
+        self._next: deque[Transition] = deque()
         """What is still to be tried to end it."""
         self._asked = -math.inf
         self._missed = 0
@@ -99,14 +99,14 @@ class Life:
 
     # --- told by who wants it up or down
 
-    def start(self, now: float) -> Do | None:
+    def start(self, now: float) -> Transition | None:
         """It is wanted: at once if it waits or was given up, again if it runs."""
         self._failures.clear()
         if not self.alive:
             return self._launch(now)
         return self._end(now, "it is to start again", _After.START, save=self._was_up)
 
-    def stop(self, now: float, why: str, *, save: bool = True) -> Do | None:
+    def stop(self, now: float, why: str, *, save: bool = True) -> Transition | None:
         """It is not wanted any more; its state may be worth nothing any more, either."""
         if self.alive:
             return self._end(now, why, _After.STOPPED, save=save and self._was_up)
@@ -127,7 +127,7 @@ class Life:
             self.state, self._missed = State.UP, 0
             self.deadline = self._tick(now)
 
-    def missed(self, now: float) -> Do | None:
+    def missed(self, now: float) -> Transition | None:
         """It has not answered the question asked last, or cannot be reached."""
         if self.state not in (State.UP, State.SILENT):
             return None
@@ -137,19 +137,19 @@ class Life:
         self.deadline = max(now, self._asked + self.terms.question_s)
         return None
 
-    def fail(self, now: float, why: str) -> Do | None:
+    def fail(self, now: float, why: str) -> Transition | None:
         """Something is so wrong with it that it has to go; it is started again as after a crash."""
         if self.state in (State.STARTING, State.UP, State.SILENT):
             return self._end(now, why, _After.FAILED, save=self._was_up)
         return None
 
-    def saved(self, now: float) -> Do | None:
+    def saved(self, now: float) -> Transition | None:
         """Its state is saved, or cannot be."""
-        if self.state is State.STOPPING and self._next and self._next[0] is Do.LEAVE:
+        if self.state is State.STOPPING and self._next and self._next[0] is Transition.LEAVE:
             return self._step(now)
         return None
 
-    def ended(self, now: float, how: str) -> Do | None:
+    def ended(self, now: float, how: str) -> Transition | None:
         """It has no process any more, or could not be given one."""
         after = self._after if self.state is State.STOPPING else _After.FAILED
         if self.state is not State.STOPPING:
@@ -165,14 +165,14 @@ class Life:
                 self._failed(now)
         return None
 
-    def due(self, now: float) -> Do | None:
+    def due(self, now: float) -> Transition | None:
         """`deadline` has passed."""
         match self.state:
             case State.STARTING:
                 return self._end(now, f"it was not up within {START_S:g} s", _After.FAILED)
             case State.UP | State.SILENT:
                 self._asked, self.deadline = now, math.inf
-                return Do.ASK
+                return Transition.ASK
             case State.STOPPING:
                 return self._step(now)
             case State.WAITING:
@@ -187,24 +187,26 @@ class Life:
 
     # --- going on
 
-    def _launch(self, now: float) -> Do:
+    def _launch(self, now: float) -> Transition:
         self.restarts, self._launched = self.restarts + self._launched, True
         self.state, self.deadline = State.STARTING, now + START_S
-        return Do.LAUNCH
+        return Transition.LAUNCH
 
-    def _end(self, now: float, why: str, after: _After, *, save: bool = False) -> Do | None:
+    def _end(self, now: float, why: str, after: _After, *, save: bool = False) -> Transition | None:
         """Have it end; what it means that it has ended is for who asks last to say."""
         self.why, self._after = why, after
         if self.state is State.STOPPING:
             return None
         self.state = State.STOPPING
-        self._next = deque((Do.SAVE, Do.LEAVE, Do.KILL) if save else (Do.LEAVE, Do.KILL))
+        self._next = deque(
+            (Transition.SAVE, Transition.LEAVE, Transition.KILL) if save else (Transition.LEAVE, Transition.KILL)
+        )
         return self._step(now)
 
-    def _step(self, now: float) -> Do | None:
+    def _step(self, now: float) -> Transition | None:
         """The next way to end it; each has its time. One that is killed and does not end is beyond help."""
         do = self._next.popleft() if self._next else None
-        took = {Do.SAVE: SAVE_S, Do.LEAVE: self._grace_s}
+        took = {Transition.SAVE: SAVE_S, Transition.LEAVE: self._grace_s}
         self.deadline = math.inf if do is None else now + took.get(do, math.inf)
         return do
 

@@ -18,13 +18,13 @@ from trade import Container, Handle, Run
 from trade.errors import Busy, ConfigurationError, ServiceGone, TradeError
 from trade.starting import Started
 from trade_gateway.config._children import Child
-from trade_gateway.process._kill_timer import Term
+from trade_gateway.process._kill_timer import TimerLease
 from trade_gateway.supervisor._child import ChildInfo, News, Unit
-from trade_gateway.supervisor._furnish import Furnished, furnish, save
+from trade_gateway.supervisor._furnish import CreatedObjects, furnish, save
 from trade_gateway.supervisor._lease_protocol import Asking, Leased, StandIn
 from trade_gateway.supervisor._process import Process, rss_mb
 from trade_gateway.supervisor._single_instance import lock_of
-from trade_gateway.supervisor._state_machine import GRACE_S, SAVE_S, Do, State
+from trade_gateway.supervisor._state_machine import GRACE_S, SAVE_S, State, Transition
 from trade_gateway.supervisor._store import StateStore
 
 __all__ = ["Supervisor"]
@@ -54,8 +54,8 @@ class Supervisor:
         *,
         grace_s: float = GRACE_S,
         clock: Callable[[], float] = time.monotonic,
-        launch: Callable[[Child, Path, Path | None, Term | None], Process] = Process,
-        furnish: Callable[[Callable[[], Container], Child, Started, Mapping[str, Any]], Furnished] = furnish,
+        launch: Callable[[Child, Path, Path | None, TimerLease | None], Process] = Process,
+        furnish: Callable[[Callable[[], Container], Child, Started, Mapping[str, Any]], CreatedObjects] = furnish,
     ) -> None:
         self._clock = clock
         self._new_process = launch
@@ -234,19 +234,19 @@ class Supervisor:
 
     # --- doing what a life says
 
-    def _do(self, unit: Unit, do: Do | None) -> None:
+    def _do(self, unit: Unit, do: Transition | None) -> None:
         match do:
-            case Do.LAUNCH:
+            case Transition.LAUNCH:
                 self._launch(unit)
-            case Do.ASK:
+            case Transition.ASK:
                 self._ask(unit)
-            case Do.SAVE:
+            case Transition.SAVE:
                 self._save(unit)
-            case Do.LEAVE if unit.process is not None:
+            case Transition.LEAVE if unit.process is not None:
                 if not unit.leaving:
                     self._told(unit, f"{unit.child.name} is told to leave: {unit.life.why}")
                 unit.process.leave()
-            case Do.KILL if unit.process is not None:
+            case Transition.KILL if unit.process is not None:
                 self._told(unit, f"{unit.child.name} does not leave and is killed", bad=True)
                 unit.process.kill()
             case _:
@@ -353,7 +353,7 @@ class Supervisor:
             return lambda: self._do(unit, unit.life.fail(self._clock(), why))
         return lambda: self._up(unit, furnished)
 
-    def _up(self, unit: Unit, furnished: Furnished) -> None:
+    def _up(self, unit: Unit, furnished: CreatedObjects) -> None:
         unit.life.up(self._clock())
         if unit.life.state is not State.UP:
             return

@@ -14,7 +14,7 @@ from trade_hil_sim.faults import _faults as faults
 from trade_hil_sim.log._byte_log import ByteLog, Entry
 from trade_hil_sim.mechanics._truth import BusState
 from trade_hil_sim.robot._errors import SimulationError
-from trade_hil_sim.robot._mailbox import Errands
+from trade_hil_sim.robot._mailbox import Mailbox
 
 from ._adapter import Adapter, Client
 from ._device import Device
@@ -77,7 +77,7 @@ class CanBus:
         self._wall_offset_s = time.time() - time.monotonic()
         self._clients: dict[Client, Station] = {}
         self._stations = {device.device_id: self._attach(device) for device in self._devices}
-        self._errands = Errands(f"bus {name}", ANSWER_S)
+        self._errands = Mailbox(f"bus {name}", ANSWER_S)
         self._closing = False
         self._thread: threading.Thread | None = None
 

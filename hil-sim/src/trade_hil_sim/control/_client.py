@@ -9,7 +9,7 @@ import msgspec
 
 from trade_hil_sim.control._server import Answer, State
 from trade_hil_sim.faults import _faults as faults
-from trade_hil_sim.faults._methods import Strikes
+from trade_hil_sim.faults._methods import FaultMethods
 from trade_hil_sim.mechanics._truth import ArmTruth, BusState, DeviceState, GripperTruth
 from trade_hil_sim.robot._errors import SimulationError
 
@@ -19,7 +19,7 @@ ANSWER_S: Final = 10.0
 """How long a simulator may take over a command."""
 
 
-class SimControl(Strikes):
+class SimControl(FaultMethods):
     """Makes things happen in a running simulator. Threads may share one.
 
     Each fault and order is a method of its name, and `do` takes it as a value. In every method, `ids` are device ids

@@ -6,10 +6,10 @@ from typing import Literal
 
 from trade_hil_sim.faults import _faults as faults
 
-__all__ = ["Strikes"]
+__all__ = ["FaultMethods"]
 
 
-class Strikes(ABC):
+class FaultMethods(ABC):
     """What can be done to simulated devices: a method for each fault, which makes the value and hands it to `do`."""
 
     @abstractmethod

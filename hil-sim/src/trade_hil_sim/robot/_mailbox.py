@@ -10,12 +10,12 @@ from typing import Any, TypeVar
 
 from trade_hil_sim.robot._errors import SimulationError
 
-__all__ = ["Errands"]
+__all__ = ["Mailbox"]
 
 _T = TypeVar("_T")
 
 
-class Errands:
+class Mailbox:
     """Calls to be made in one thread, in the order they came; nobody is left waiting when that ends.
 
     Args:

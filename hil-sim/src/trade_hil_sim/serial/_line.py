@@ -14,7 +14,7 @@ from typing import Final, NamedTuple, Protocol
 
 from trade_hil_sim.log._byte_log import ByteLog, Entry
 from trade_hil_sim.robot._errors import SimulationError
-from trade_hil_sim.robot._mailbox import Errands
+from trade_hil_sim.robot._mailbox import Mailbox
 from trade_hil_sim.serial._pty import Terminal
 
 __all__ = ["Peer", "SerialLine"]
@@ -71,7 +71,7 @@ class SerialLine:
         self._order = 0
         self._wire_free_at = 0.0
         self._baud: int | None = None
-        self._errands = Errands(f"bus {name}", ANSWER_S)
+        self._errands = Mailbox(f"bus {name}", ANSWER_S)
         self._closing = False
         self._terminal: Terminal | None = None
         self._thread: threading.Thread | None = None

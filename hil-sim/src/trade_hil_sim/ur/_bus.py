@@ -15,7 +15,7 @@ from trade_hil_sim.faults import _faults as faults
 from trade_hil_sim.log._byte_log import ByteLog, Entry
 from trade_hil_sim.mechanics._truth import ArmTruth, BusState
 from trade_hil_sim.robot._errors import SimulationError
-from trade_hil_sim.robot._mailbox import Errands
+from trade_hil_sim.robot._mailbox import Mailbox
 from trade_hil_sim.robot._polling import ready
 
 from ._arm import HOME, Arm
@@ -83,7 +83,7 @@ class UrBus:
         self._sessions: dict[Client, RtdeSession] = {}
         self._count = 0
         self._boots_at: float | None = None
-        self._errands = Errands(f"bus {name}", ANSWER_S)
+        self._errands = Mailbox(f"bus {name}", ANSWER_S)
         self._closing = False
         self._thread: threading.Thread | None = None
 

@@ -13,7 +13,7 @@ from msgspec import Struct
 from trade._context.call_context import CallContext
 from trade._context.interceptor import Interceptor, ServedService
 from trade._context.sessions import foreign
-from trade._counters import Calls
+from trade._counters import CallCounters
 from trade._protocol.keys import DOMAIN, Address
 from trade._settings import Settings
 from trade.errors import (
@@ -110,7 +110,7 @@ class Audit:
         own: Address | None = None,
         *,
         reads: bool = False,
-        calls: Calls | None = None,
+        calls: CallCounters | None = None,
         record: Record | None = None,
     ) -> None:
         self._tell = tell
@@ -210,7 +210,7 @@ _SILENT: Final = frozenset(
 
 def open_audit(settings: Settings, own: Address, leaving: ExitStack) -> Audit:
     """Where a container tells what happens in it; what writes it down, if anything does, ends with the stack."""
-    calls = Calls() if settings.metrics else None
+    calls = CallCounters() if settings.metrics else None
     if settings.audit is None:
         return Audit(calls=calls)
     from trade._audit.writer import start_writing  # noqa: PLC0415 - who keeps no record needs no database
@@ -240,7 +240,7 @@ class Audited:
     __slots__ = ("_around", "_calls", "_label", "_rule", "_tell", "_timed")
 
     def __init__(
-        self, tell: Tell | None, rule: _Rule, around: Interceptor | None, calls: Calls | None, label: str
+        self, tell: Tell | None, rule: _Rule, around: Interceptor | None, calls: CallCounters | None, label: str
     ) -> None:
         self._tell = tell
         self._rule = rule

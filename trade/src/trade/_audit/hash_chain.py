@@ -58,7 +58,7 @@ class Head(Struct, frozen=True):
     hash: bytes
 
 
-class Verdict(Struct, frozen=True, kw_only=True):
+class ChainCheck(Struct, frozen=True, kw_only=True):
     """What the rows of a record prove."""
 
     rows: int = 0
@@ -86,7 +86,7 @@ def checkpoint(head: Head) -> str:
     return f"{head.seq} {head.hash.hex()}"
 
 
-def verify(links: Iterable[Link], head: Head, witnessed: Mapping[int, bytes] | None = None) -> Verdict:
+def verify(links: Iterable[Link], head: Head, witnessed: Mapping[int, bytes] | None = None) -> ChainCheck:
     """Walk a record from its oldest row to its newest.
 
     Args:
@@ -114,11 +114,11 @@ def verify(links: Iterable[Link], head: Head, witnessed: Mapping[int, bytes] | N
     if not problem and first > 1 and dropped[-1:] != [begins]:
         broken_at, problem = 1, f"rows 1 to {first - 1} are missing, and no row says that just these were dropped"
     if problem:
-        return Verdict(rows=rows, first=first, head=last, broken_at=broken_at, problem=problem)
+        return ChainCheck(rows=rows, first=first, head=last, broken_at=broken_at, problem=problem)
     told = _dropped_before(first, dropped, witnessed)
     broken_at, problem = next(((seq, _ANOTHER) for seq, right in told.items() if not right), (0, ""))
     untold = tuple(sorted(seq for seq in witnessed if seq < first and seq not in told))
-    return Verdict(
+    return ChainCheck(
         rows=rows,
         first=first,
         head=last,

@@ -16,7 +16,7 @@ from msgspec import Raw, structs
 
 from trade._calls.peer import NEVER, Peer
 from trade._calls.publishers import CallPublishers
-from trade._calls.reply_slot import Box, OnReply, Pending
+from trade._calls.reply_slot import OnReply, Pending, ReplySlot
 from trade._protocol.keys import CLOCK, DOMAIN, PROVIDER, Address, reply_key
 from trade._protocol.messages import (
     CANCEL,
@@ -55,10 +55,10 @@ class Caller:
         self._peers: dict[Address, Peer] = {}
         self.publishers: Final = CallPublishers(transport, own.identity)
         self._lock = threading.Lock()
-        self._every: list[Box] = []
-        self._free: list[Box] = []
+        self._every: list[ReplySlot] = []
+        self._free: list[ReplySlot] = []
         self._pending: dict[int, Pending] = {}
-        self._shared: Box | None = None
+        self._shared: ReplySlot | None = None
         self._threads: list[threading.Thread] = []
         self._closed = False
         self.leaving = False
@@ -126,7 +126,7 @@ class Caller:
             box.waiting = box.sent = None
             self._free.append(box)
 
-    def _await_reply(self, box: Box, call_id: int, peer: Peer, sent_ns: int) -> Reply:
+    def _await_reply(self, box: ReplySlot, call_id: int, peer: Peer, sent_ns: int) -> Reply:
         while True:
             try:
                 message = box.channel.receive()
@@ -242,22 +242,22 @@ class Caller:
 
     # --- reply channels
 
-    def _borrow(self) -> Box:
+    def _borrow(self) -> ReplySlot:
         try:
             return self._free.pop()
         except IndexError:
             return self._new_box()
 
-    def _new_box(self) -> Box:
+    def _new_box(self) -> ReplySlot:
         with self._lock:
             index = f"{self._own.epoch}-{len(self._every)}"  # another container may have our name: answers never cross
             key = reply_key("*", self._own.identity, self._own.container, index)
             own = reply_key(self._own.identity, self._own.identity, self._own.container, index)
-            box = Box(f"{self._own.container}/{index}", own, self._transport.subscribe(key))
+            box = ReplySlot(f"{self._own.container}/{index}", own, self._transport.subscribe(key))
             self._every.append(box)
             return box
 
-    def _shared_box(self) -> Box:
+    def _shared_box(self) -> ReplySlot:
         if self._shared is None:
             box = self._new_box()
             with self._lock:

@@ -21,7 +21,7 @@ _logger = logging.getLogger("trade")
 LONGEST_DEADLINE_S: Final = 86_400.0
 
 
-class Home(Protocol):
+class CallHost(Protocol):
     """What a handle asks of the container that made it."""
 
     @property
@@ -49,7 +49,7 @@ class Handle:
     __trade_type__: Final = "Handle"
     """Its name in JSON Schema."""
 
-    def __init__(self, home: Home, key: ServiceKey, record: Record | None, deadline_s: float | None = None) -> None:
+    def __init__(self, home: CallHost, key: ServiceKey, record: Record | None, deadline_s: float | None = None) -> None:
         self._home = home
         self.key = key
         """What the handle is over the wire."""

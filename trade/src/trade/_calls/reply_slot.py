@@ -17,7 +17,7 @@ Sent = tuple[Publisher, bytes]
 """What was put where, to be put once more if the link had gone."""
 
 
-class Box:
+class ReplySlot:
     """A reply channel lent to one caller at a time."""
 
     __slots__ = ("channel", "ended_id", "name", "sent", "waiting", "wake_key")

@@ -8,8 +8,8 @@ from contextvars import copy_context
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from trade._context.active_calls import Ongoing, end_calls
-from trade._threads.condition import Bell
+from trade._context.active_calls import ActiveCall, end_calls
+from trade._threads.condition import InterruptibleCondition
 from trade.errors import OutcomeUnknown
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ class Run:
         self._handle = handle
         self._outcome: tuple[Any, BaseException | None] | None = None
         """Its result or its error, once it has ended."""
-        self._ended = Bell()
+        self._ended = InterruptibleCondition()
         self._told: list[Callable[[Run], object]] = []
         self._progress: Any = None
         self._on_progress: Callable[[Any], object] | None = None
@@ -165,10 +165,10 @@ class Run:
 
     def _end(self, result: Any, error: BaseException | None) -> None:
         self._outcome = (result, error)
-        self._ended.ring()
+        self._ended.notify_all()
         self._tell()
 
-    def end_with(self, outer: Ongoing) -> Callable[[], None]:
+    def end_with(self, outer: ActiveCall) -> Callable[[], None]:
         """Told by the container: it is made inside another call, and ends with that. Returns what takes that back.
 
         Also at its deadline, when nobody knows whether it ended: what ends it is called all the same.

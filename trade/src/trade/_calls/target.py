@@ -12,7 +12,7 @@ from msgspec import Raw
 from trade._calls.caller import Caller
 from trade._calls.peer import Peer
 from trade._calls.run import Run
-from trade._context.active_calls import Ongoing
+from trade._context.active_calls import ActiveCall
 from trade._context.call_context import CallContext, handed_down, holding, patience_s, running
 from trade._context.outgoing import DEFAULT_DEADLINE_S, Request, in_ns, new_request
 from trade._context.sessions import speaking
@@ -25,9 +25,9 @@ from trade._protocol.schema_types import type_from_schema
 from trade._registry.registry import Record
 from trade._services.arguments import encode_arguments, encode_call, given
 from trade._services.local_service import LocalService
-from trade._services.serial_queue import Serial, Turn
+from trade._services.serial_queue import SerialQueue, Turn
 from trade._telemetry.spans import traceable
-from trade._threads.thread_pool import Hands
+from trade._threads.thread_pool import ThreadPool
 from trade.errors import (
     Busy,
     Cancelled,
@@ -61,7 +61,7 @@ class LocalTarget:
         own: Address,
         session: str,
         new_id: Callable[[], int],
-        hands: Hands,
+        hands: ThreadPool,
     ) -> None:
         self._service = service
         self._record = record
@@ -100,10 +100,10 @@ class LocalTarget:
         service = self._service
         taken = self._taken(args, kwargs) if service.strict else (args, kwargs)
 
-        def report(_: Ongoing, value: Any) -> None:
+        def report(_: ActiveCall, value: Any) -> None:
             run.note_progress(service.signature.copy_progress(service.label, value) if service.strict else value)
 
-        ongoing = Ongoing(service, self._identity, None, report)
+        ongoing = ActiveCall(service, self._identity, None, report)
         run.on_cancel(ongoing.cancel)
         if service.serial is None:
             outcome = partial(self._run, taken, request, ongoing)
@@ -118,7 +118,7 @@ class LocalTarget:
         """The arguments as they are now, whatever becomes of them."""
         return encode_arguments(self._codec, self._service.info, self._service.label, args, kwargs)
 
-    def _take_turn(self, serial: Serial, taken: _Taken, request: Request, ongoing: Ongoing | None) -> Any:
+    def _take_turn(self, serial: SerialQueue, taken: _Taken, request: Request, ongoing: ActiveCall | None) -> Any:
         if serial.mine:
             return self._run(taken, request, ongoing)
         turn = Turn()
@@ -134,7 +134,7 @@ class LocalTarget:
         finally:
             serial.leave()
 
-    def _run(self, taken: _Taken, request: Request, ongoing: Ongoing | None) -> Any:
+    def _run(self, taken: _Taken, request: Request, ongoing: ActiveCall | None) -> Any:
         service = self._service
         if ongoing is not None and ongoing.cancelled:
             raise Cancelled(service=service.label)
@@ -145,7 +145,7 @@ class LocalTarget:
             request.refused(self._own, lost)
             raise
 
-    def _context(self, request: Request, ongoing: Ongoing | None) -> CallContext:
+    def _context(self, request: Request, ongoing: ActiveCall | None) -> CallContext:
         expires_ns = None if self.is_stop else request.deadline_ns
         self._check_time(expires_ns, request.deadline_s)
         behalf, session = None, self._session

@@ -7,12 +7,12 @@ from trade._calls.caller import Caller
 from trade._calls.handle import Handle
 from trade._calls.target import LocalTarget, RemoteTarget, container_closed
 from trade._protocol.codec import Codec
-from trade._protocol.keys import DOMAIN, ESTOPS, PROVIDER, Address, ServiceKey
+from trade._protocol.keys import DOMAIN, ESTOP_PROVIDER, PROVIDER, Address, ServiceKey
 from trade._protocol.messages import ServiceInfo
 from trade._registry.registry import Change, Record, Registry, gone_to
-from trade._security.authorizer import Access
+from trade._security.authorizer import Authorizer
 from trade._services.providers import Providers
-from trade._threads.thread_pool import Hands
+from trade._threads.thread_pool import ThreadPool
 from trade._transport.base import ChannelClosed
 from trade.errors import AccessDenied, ServiceGone
 
@@ -29,7 +29,7 @@ class Targets:
         self,
         own: Address,
         session: str,
-        access: Access,
+        access: Authorizer,
         registry: Registry,
         providers: Providers,
         caller: Caller,
@@ -44,7 +44,7 @@ class Targets:
         self._providers = providers
         self._caller = caller
         self._codec = codec
-        self._hands = Hands()
+        self._hands = ThreadPool()
         self._closed = False
         self.known: Final[dict[ServiceKey, Target]] = {}
         """Looked up already, and allowed."""
@@ -98,7 +98,7 @@ class Targets:
         What it answers is known here, whatever that one says of it: it may be written in another language.
         """
         key = record.key
-        if key.domain != DOMAIN or key.provider not in (PROVIDER, ESTOPS):
+        if key.domain != DOMAIN or key.provider not in (PROVIDER, ESTOP_PROVIDER):
             return None
         service = self._providers.services_at(f"{DOMAIN}/{key.provider}").get(key.name)
         return None if service is None else service.info
@@ -123,7 +123,7 @@ class Targets:
             if not record.local and (self._registry.removed(key) or not self._registry.is_alive(key.address)):
                 self._caller.publishers.forget(key.address, key.domain, key.provider)
 
-    def judge_anew(self) -> None:
+    def recheck_access(self) -> None:
         """The policy is another one."""
         self.known.clear()
 

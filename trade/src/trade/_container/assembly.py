@@ -8,33 +8,32 @@ from typing import Final, Protocol
 
 from trade._audit.events import open_audit
 from trade._calls.caller import Caller
-from trade._calls.handle import Handle
-from trade._calls.handle import Home as HandleHome
+from trade._calls.handle import CallHost, Handle
 from trade._calls.handle_codec import handle_codec
 from trade._calls.target_cache import Targets
 from trade._container.connect import join
 from trade._container.policy_reload import begin_watching
-from trade._container.shutdown import Terminating
+from trade._container.shutdown import Shutdown
 from trade._context.call_context import handed_down
 from trade._counters import Measure
 from trade._discovery.announcer import Announcer
-from trade._discovery.dialer import Reach
-from trade._discovery.listener import Watch
-from trade._estop.controller import Estopping, check_limit, is_stop
+from trade._discovery.dialer import Dialer
+from trade._discovery.listener import RegistryListener
+from trade._estop.controller import EstopController, check_limit, is_stop
 from trade._hooks import hook
 from trade._hooks.hook import Hooks
 from trade._locks import api
-from trade._locks.api import Locking
+from trade._locks.api import LockApi
 from trade._locks.inherited import InheritedLock
-from trade._locks.remote_locks import Borrowed
+from trade._locks.remote_locks import RemoteLocks
 from trade._migration import factory
-from trade._migration.factory import Making
-from trade._migration.quiesce import Freezing
-from trade._migration.source import Departing
-from trade._migration.target import Arriving
+from trade._migration.factory import ProviderFactory
+from trade._migration.quiesce import Quiescer
+from trade._migration.source import MigrationSource
+from trade._migration.target import MigrationTarget
 from trade._notifications import notification
 from trade._notifications.notifier import Notifier
-from trade._protocol.keys import DOMAIN, ESTOPS, PROVIDER, Address, ServiceKey
+from trade._protocol.keys import DOMAIN, ESTOP_PROVIDER, PROVIDER, Address, ServiceKey
 from trade._protocol.messages import Token
 from trade._registry.constraints import where
 from trade._registry.registry import Change, Record, Registry
@@ -48,12 +47,12 @@ from trade._settings import Settings
 from trade._stop_line import StopLines, StopLineService, StopReport, stop_group, stops_of, together
 from trade._streams import source as _streams
 from trade._streams.source import Streams
-from trade._streams.subscriptions import Listening
-from trade._telemetry.load import Load, resident_bytes
+from trade._streams.subscriptions import Subscriptions
+from trade._telemetry.load import LoadMeter, resident_bytes
 from trade._telemetry.otlp import open_export
 from trade._telemetry.prometheus import open_metrics
 from trade._telemetry.spans import Spans, new_spans
-from trade._threads.scheduler import Clockwork
+from trade._threads.scheduler import Scheduler
 from trade._transport.base import Transport
 from trade._transport.zenoh import ZenohTransport
 from trade.errors import AccessDenied
@@ -61,35 +60,43 @@ from trade.errors import AccessDenied
 _LOOK_S: Final = 0.1
 
 
-class Home(hook.Home, api.Home, factory.Home, notification.Home, _streams.Home, HandleHome, Protocol):
+class Host(
+    hook.HookHost,
+    api.LockHost,
+    factory.FactoryHost,
+    notification.NotificationHost,
+    _streams.StreamHost,
+    CallHost,
+    Protocol,
+):
     """The container, as what it is made of sees it."""
 
     def close(self) -> None: ...
 
 
-class Parts:
+class Components:
     """One of each. Data has one owner, and here one sees which."""
 
-    def __init__(self, home: Home, settings: Settings, transport: Transport | None) -> None:
+    def __init__(self, home: Host, settings: Settings, transport: Transport | None) -> None:
         self._home = home
         address, access = home.address, home.access
         epoch, session = address.epoch, str(address)
-        self.told_of_ends: Final[list[Callable[[str], None]]] = []
+        self.session_end_listeners: Final[list[Callable[[str], None]]] = []
         """Told of every session that ends."""
         with contextlib.ExitStack() as leaving:  # what has begun ends again if the rest cannot begin
             self.audit = open_audit(settings, address, leaving)
             self.transport = transport or join(settings, leaving)
             leaving.callback(self.transport.close)
-            self.reach: Reach | None = None
+            self.reach: Dialer | None = None
             """Its links; None on a transport that has no such switches."""
             if isinstance(self.transport, ZenohTransport):
-                self.reach = Reach(self.transport.links, settings.check_may_dial, settings.connect)
+                self.reach = Dialer(self.transport.links, settings.check_may_dial, settings.connect)
                 leaving.callback(self.reach.close)
             self.codec = handle_codec(lambda handle: handle.key, home.handle)
             self.registry = Registry(address, access.may_offer, access.may_have_stops)
             self.caller = Caller(self.transport, address, session)
             leaving.callback(self.caller.close)
-            self.clockwork = Clockwork("trade-clock")
+            self.clockwork = Scheduler("trade-clock")
             leaving.callback(self.clockwork.close)
             self.notifier = Notifier(home, self.clockwork, epoch, lambda record: Handle(home, record.key, record))
             leaving.callback(self.notifier.close)
@@ -99,10 +106,10 @@ class Parts:
                 leaving.callback(handed_down.pop, address)
             self.coroutines = AsyncLoop()
             leaving.callback(self.coroutines.close)
-            self.locking = Locking(home)
+            self.locking = LockApi(home)
             self.locks = LockTable(epoch, home.name, audit=self.audit)
             leaving.callback(self.locks.close)
-            self.borrowed = Borrowed(self.locks, epoch)
+            self.borrowed = RemoteLocks(self.locks, epoch)
             self.announcer = Announcer(self.transport, address)
             leaving.callback(self.announcer.close)
             self.providers = Providers(
@@ -113,7 +120,7 @@ class Parts:
             )
             self.registry.listen(self.targets.changed)  # before anybody is told: who is told may call
             self.registry.listen(self.notifier.changed)
-            self.told_of_ends.append(self.notifier.session_ended)
+            self.session_end_listeners.append(self.notifier.session_ended)
             self.hooks = Hooks(
                 home,
                 self.codec,
@@ -123,31 +130,35 @@ class Parts:
                 self._denied_hook,
             )
             self.registry.listen(self.hooks.changed)
-            self.told_of_ends.append(self.hooks.session_ended)
+            self.session_end_listeners.append(self.hooks.session_ended)
             self.hook_numbers = itertools.count(1)
             self.spans = new_spans(address, session, self.locks, open_export(settings, address, leaving))
             self.trace(settings.trace)
             self.streams = Streams(home, self.transport, self.providers.service, self.clockwork, self.caller.new_id)
             self.registry.listen(self.streams.changed)
-            self.told_of_ends.append(self.streams.session_ended)
+            self.session_end_listeners.append(self.streams.session_ended)
             leaving.callback(self.streams.close)
-            self.listening = Listening(home, self.transport, self.clockwork, self.codec, self.registry.removed)
+            self.listening = Subscriptions(home, self.transport, self.clockwork, self.codec, self.registry.removed)
             self.registry.listen(self.listening.changed)
-            self.told_of_ends.append(self.listening.session_ended)
+            self.session_end_listeners.append(self.listening.session_ended)
             leaving.callback(self.listening.close)
             kept = None if settings.state_dir is None else settings.state_dir / settings.system / "estop"
-            self.estopping = Estopping(
+            self.estopping = EstopController(
                 self.transport, address, self.registry, self.locks, self.providers, kept, access, self.audit
             )
             leaving.callback(self.estopping.close)
             self.deadman = self.estopping.deadman
             self.locks.stop_with(self.deadman.stop)
             self.withdrawn = Withdrawn(self.providers, self.deadman.rest)
-            self.making = Making(home, self.providers, self.withdrawn, settings.instantiable)
+            self.making = ProviderFactory(home, self.providers, self.withdrawn, settings.instantiable)
             leaving.callback(self.making.close)
-            freezing = Freezing(self.locks, address)
-            self.departing = Departing(home, self.providers, self.making, self.withdrawn, freezing, access, self.codec)
-            self.arriving = Arriving(address, self.providers, self.making, freezing, access, self.codec, self.clockwork)
+            freezing = Quiescer(self.locks, address)
+            self.departing = MigrationSource(
+                home, self.providers, self.making, self.withdrawn, freezing, access, self.codec
+            )
+            self.arriving = MigrationTarget(
+                address, self.providers, self.making, freezing, access, self.codec, self.clockwork
+            )
             leaving.callback(self.arriving.close)
             self.dispatcher = Dispatcher(
                 self.transport, address, self.providers.lookup, self.coroutines, access, self.audit, access.callers()
@@ -162,8 +173,8 @@ class Parts:
                 self.registry.listen(self._mind_stops)
                 if settings.bridge:
                     self.stop_line.listen_on_host()
-            self.meter = Load(home.name, lambda: list(self.dispatcher._crews), self.providers.waiting)
-            self.terminating = Terminating(
+            self.meter = LoadMeter(home.name, lambda: list(self.dispatcher._crews), self.providers.waiting)
+            self.terminating = Shutdown(
                 home.name, self.deadman.rest, self.locks.resources, lambda: self.meter.running, home.close
             )
             self.measured: Final[list[Callable[[], Iterable[Measure]]]] = []
@@ -181,10 +192,10 @@ class Parts:
         with contextlib.ExitStack() as undone:
             undone.callback(self.close)
             self.providers.add(own, (DOMAIN,), name=PROVIDER)
-            self.providers.add(estops, (DOMAIN,), name=ESTOPS)
+            self.providers.add(estops, (DOMAIN,), name=ESTOP_PROVIDER)
             self.estopping.begin(estops, self.lines.estop)
             self._leaving.callback(self.announcer.appear().close)
-            self.watch = Watch(
+            self.watch = RegistryListener(
                 self.transport,
                 self.registry,
                 self._home.address,
@@ -196,7 +207,7 @@ class Parts:
             )
             self._leaving.callback(self.watch.close)
             if self._home.access.path is not None:
-                begin_watching(self._home.access, self.clockwork, self.audit, self.judge_anew)
+                begin_watching(self._home.access, self.clockwork, self.audit, self.recheck_access)
             undone.pop_all()
 
     def stop_known(self, group: str, limit_s: float) -> StopReport:
@@ -237,7 +248,7 @@ class Parts:
         self.locks.session_ended(session, reason)
         self.deadman.session_ended(session)
         self.dispatcher.session_ended(session)
-        for tell in list(self.told_of_ends):
+        for tell in list(self.session_end_listeners):
             tell(session)
 
     def ask_for_release(self, holder: Holder, token: Token, who: str, reason: str) -> None:
@@ -280,14 +291,14 @@ class Parts:
     def _denied_hook(self, who: str, record: Record) -> AccessDenied | None:
         return self._home.access.denied(who, "instrument", record.key.domain, record.label)
 
-    def judge_anew(self) -> None:
+    def recheck_access(self) -> None:
         """Told by the container: the policy is another one; locks that may no longer be held are lost."""
         access = self._home.access
-        self.targets.judge_anew()
+        self.targets.recheck_access()
         self.dispatcher.hear(access.callers())
-        self.registry.judge_anew()
-        self.hooks.judge_anew()
-        self.streams.judge_anew()
+        self.registry.recheck_access()
+        self.hooks.recheck_access()
+        self.streams.recheck_access()
         for info in self.locks.infos():
             held = [(name, self.providers.groups_of(name)) for name in info.resources]
             denied = access.denied_lock(info.holder.identity, held)

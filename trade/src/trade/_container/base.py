@@ -5,10 +5,10 @@ from typing import Any
 
 from trade._calls.handle import Handle
 from trade._calls.run import Run
-from trade._container.assembly import Parts
+from trade._container.assembly import Components
 from trade._protocol.keys import Address, ServiceKey
 from trade._registry.registry import Record
-from trade._security.authorizer import Access
+from trade._security.authorizer import Authorizer
 from trade._settings import Settings
 
 
@@ -18,8 +18,8 @@ class Member(ABC):
     settings: Settings
     address: Address
     session: str
-    access: Access
-    _parts: Parts
+    access: Authorizer
+    _parts: Components
 
     @abstractmethod
     def _check_open(self) -> None:

@@ -5,15 +5,15 @@ from typing import Final, Protocol
 
 from msgspec import structs
 
-from trade._container.assembly import Parts
+from trade._container.assembly import Components
 from trade._container.system import System, SystemServices
 from trade._hooks.services import HookServices
 from trade._locks.services import LockServices
-from trade._migration.factory_services import MakingServices
+from trade._migration.factory_services import FactoryServices
 from trade._migration.services import MigrationServices
-from trade._notifications.services import Home as Member
 from trade._notifications.services import NotificationServices
-from trade._security.authorizer import Access
+from trade._notifications.services import NotificationServicesHost as Member
+from trade._security.authorizer import Authorizer
 from trade._services.decorator import service
 from trade._streams.services import StreamServices
 from trade._telemetry.log_buffer import LogLine, logbook
@@ -46,10 +46,10 @@ class TraceServices:
         return [structs.replace(line, container=self._teller) for line in logbook.lines(after)]
 
 
-class Home(Member, Protocol):
+class ServicesHost(Member, Protocol):
     """The container they belong to."""
 
-    access: Final[Access]
+    access: Final[Authorizer]
     system: Final[System]
 
 
@@ -59,13 +59,13 @@ class OwnServices(
     NotificationServices,
     HookServices,
     TraceServices,
-    MakingServices,
+    FactoryServices,
     MigrationServices,
     StreamServices,
 ):
     """One provider, so that one registry entry tells of all its container's own functions."""
 
-    def __init__(self, parts: Parts, home: Home) -> None:
+    def __init__(self, parts: Components, home: ServicesHost) -> None:
         access, locks = home.access, parts.locks
         SystemServices.__init__(self, home.system)
         LockServices.__init__(
@@ -81,6 +81,6 @@ class OwnServices(
         NotificationServices.__init__(self, parts.notifier, parts.registry, home, access)
         HookServices.__init__(self, parts.hooks, home, access)
         TraceServices.__init__(self, home.name, parts.spans, parts.trace)
-        MakingServices.__init__(self, home.system)
+        FactoryServices.__init__(self, home.system)
         MigrationServices.__init__(self, parts.departing, parts.arriving)
         StreamServices.__init__(self, parts.streams)

@@ -6,8 +6,8 @@ import socket
 from collections.abc import Sequence
 from typing import Any, Final
 
-from trade._discovery.host_folder import Rendezvous
-from trade._security.certificate_expiry import Ending
+from trade._discovery.host_folder import HostFolder
+from trade._security.certificate_expiry import ExpiryWatch
 from trade._security.certificates import Certificate
 from trade._security.policy_file import read_policy
 from trade._security.zenoh_acl import acl, crossings
@@ -37,7 +37,7 @@ def join(settings: Settings, leaving: contextlib.ExitStack) -> ZenohTransport:
     guard = PortGuard((own.port for own in transport.links.listen), transport.links.count)
     leaving.callback(guard.close)
     if certificate is not None:
-        leaving.callback(Ending(certificate).close)
+        leaving.callback(ExpiryWatch(certificate).close)
     return transport
 
 
@@ -65,7 +65,7 @@ def _join_at(
 ) -> ZenohTransport:
     connect, certified = list(settings.connect), certificate is not None
     if settings.bridge or not connect:
-        rendezvous = Rendezvous(settings.system)
+        rendezvous = HostFolder(settings.system)
         leaving.callback(rendezvous.leave)
         connect += _of_our_kind(rendezvous.enter(_nearest(listen)), certified)
     if settings.insecure_lan and not certified:

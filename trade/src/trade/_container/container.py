@@ -11,12 +11,12 @@ from trade._calls.handle import Handle
 from trade._calls.run import Run
 from trade._calls.target import container_closed
 from trade._calls.target_cache import Target
-from trade._container.assembly import Parts
+from trade._container.assembly import Components
 from trade._container.builtin_services import OwnServices
-from trade._container.federating import Bordering
-from trade._container.migrating import Moving
-from trade._container.motion_control import Guarding
-from trade._container.registering import Hosting
+from trade._container.federating import Federating
+from trade._container.migrating import Migrating
+from trade._container.motion_control import MotionControl
+from trade._container.registering import Registering
 from trade._container.streaming import Streaming
 from trade._container.system import System
 from trade._container.tracing import Tracing
@@ -24,12 +24,12 @@ from trade._context.call_context import running
 from trade._context.outgoing import new_request
 from trade._context.sessions import Session
 from trade._counters import Measure
-from trade._discovery.dialer import Reach
+from trade._discovery.dialer import Dialer
 from trade._estop.services import EstopServices
 from trade._protocol.container_info import ContainerInfo
 from trade._protocol.keys import Address, ServiceKey, alive_key, as_chunk
 from trade._registry.registry import Record
-from trade._security.authorizer import Access, verb_of
+from trade._security.authorizer import Authorizer, verb_of
 from trade._settings import Settings
 from trade._threads import fork_guard
 from trade._transport.base import ChannelClosed, Transport
@@ -40,7 +40,7 @@ __all__ = ["Container"]
 _STOPPING_S: Final = 2.0
 
 
-class Container(Hosting, Moving, Streaming, Tracing, Guarding, Bordering):
+class Container(Registering, Migrating, Streaming, Tracing, MotionControl, Federating):
     """A participant of a system; most programs use the default one through the functions of ``trade``.
 
     Joins on construction. A context manager; ``close()`` leaves and is idempotent.
@@ -59,12 +59,12 @@ class Container(Hosting, Moving, Streaming, Tracing, Guarding, Bordering):
         self.session = str(self.address)
         self.system: Final = System(lambda: self)
         """Its own switches: who it is linked to, and whether it lets itself be found."""
-        self.access = Access(self.settings.policy, certified=self.settings.tls is not None)
+        self.access = Authorizer(self.settings.policy, certified=self.settings.tls is not None)
         """What the policy means for it."""
         self._clients = itertools.count(1)
         self._closing = threading.RLock()
         self._closed = False
-        self._parts = Parts(self, self.settings, transport)
+        self._parts = Components(self, self.settings, transport)
         self._known = self._parts.targets.known
         self.locking = self._parts.locking
         """Its locks on what others offer, and on what it offers itself."""
@@ -97,7 +97,7 @@ class Container(Hosting, Moving, Streaming, Tracing, Guarding, Bordering):
         self._check_open()
         self.access.load(Path(path))
         self._parts.audit.changed("policy loaded", str(path), running.get())
-        self._parts.judge_anew()
+        self._parts.recheck_access()
 
     def note_change(self, what: str, about: str = "") -> None:
         """Have a change of configuration in the record of what happened here, if one is kept (`Settings.audit`).
@@ -183,7 +183,7 @@ class Container(Hosting, Moving, Streaming, Tracing, Guarding, Bordering):
         return infos
 
     @property
-    def reach(self) -> Reach:
+    def reach(self) -> Dialer:
         """Whom it is linked to; raises ConfigurationError on a transport that has no such switches."""
         self._check_open()
         if self._parts.reach is None:

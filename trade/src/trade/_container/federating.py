@@ -10,9 +10,9 @@ from trade._calls.handle import Handle
 from trade._container.base import Member
 from trade._container.proxy import Speaking, passed_on_service
 from trade._context.sessions import Session
-from trade._estop.controller import Estopping
-from trade._locks.api import Locking
-from trade._locks.remote_locks import Borrowed, SharedResource
+from trade._estop.controller import EstopController
+from trade._locks.api import LockApi
+from trade._locks.remote_locks import RemoteLocks, SharedResource
 from trade._protocol.codec import Codec
 from trade._protocol.keys import DOMAIN, PROVIDER, Address, ServiceKey
 from trade._protocol.messages import ProviderInfo, ServiceInfo
@@ -25,7 +25,7 @@ _PATIENCE_S = 1.0
 """How long a call that came before its caller's sign of life waits for that."""
 
 
-class Place(NamedTuple):
+class Exposed(NamedTuple):
     """Where a provider is."""
 
     address: Address
@@ -37,10 +37,10 @@ class Place(NamedTuple):
         return ServiceKey(self.address, self.domain, self.provider, name)
 
 
-class Home(NamedTuple):
+class MemberSystem(NamedTuple):
     """How what is at home in another system is reached there."""
 
-    place: Place
+    place: Exposed
     handle: Callable[[ServiceKey], Handle]
     speaking: Speaking
     codec: Codec
@@ -48,11 +48,11 @@ class Home(NamedTuple):
     """The resource of a name here that has another one there."""
 
 
-class Bordering(Member):
+class Federating(Member):
     """Offers what is at home elsewhere, and shows what is at home here."""
 
-    locking: Locking
-    borrowed: Borrowed
+    locking: LockApi
+    borrowed: RemoteLocks
 
     # --- showing
 
@@ -60,10 +60,10 @@ class Bordering(Member):
     def open_session(self, client: str, *, system: str = "") -> Session:
         """A presence for one client, here or of another system."""
 
-    def offers(self) -> dict[Place, ProviderInfo]:
+    def offers(self) -> dict[Exposed, ProviderInfo]:
         """Every provider of the system that may offer what it does, the middleware's own left out."""
         return {
-            Place(state.address, entry.domain, name): entry.info
+            Exposed(state.address, entry.domain, name): entry.info
             for state in self._parts.registry.containers()
             for name, entry in list(state.providers.items())
             if entry.records and entry.domain != DOMAIN
@@ -75,12 +75,12 @@ class Bordering(Member):
         return self._parts.registry
 
     @property
-    def told_of_ends(self) -> list[Callable[[str], None]]:
+    def session_end_listeners(self) -> list[Callable[[str], None]]:
         """Called with every session that ends; none of them keeps anybody waiting."""
-        return self._parts.told_of_ends
+        return self._parts.session_end_listeners
 
     @property
-    def estopping(self) -> Estopping:
+    def estopping(self) -> EstopController:
         """Its e-stops."""
         return self._parts.estopping
 
@@ -95,7 +95,7 @@ class Bordering(Member):
 
     # --- offering
 
-    def pass_on(self, provider: object, info: ProviderInfo, home: Home) -> Place:
+    def pass_on(self, provider: object, info: ProviderInfo, home: MemberSystem) -> Exposed:
         """Offer what is at home elsewhere.
 
         Args:
@@ -117,10 +117,10 @@ class Bordering(Member):
                     self._parts.locks.drop(one)
                 raise ConfigurationError(where=place, problem=str(twice)) from None
 
-        return Place(self.address, *self._parts.providers.pass_on(provider, info, make))
+        return Exposed(self.address, *self._parts.providers.pass_on(provider, info, make))
 
     def _passed_on(
-        self, place: str, service: ServiceInfo, info: ProviderInfo, home: Home, adopted: list[Resource]
+        self, place: str, service: ServiceInfo, info: ProviderInfo, home: MemberSystem, adopted: list[Resource]
     ) -> LocalService:
         label = f"{info.groups[0] if info.groups else info.kind}.{service.name}"
         handle, first = home.handle(home.place.service(service.name)), len(adopted)
@@ -142,7 +142,7 @@ class Bordering(Member):
         return self.handle(ServiceKey(address, DOMAIN, PROVIDER, name))
 
 
-def _lockable(place: str, service: ServiceInfo, home: Place) -> dict[str, str]:
+def _lockable(place: str, service: ServiceInfo, home: Exposed) -> dict[str, str]:
     """What locks of a service are about, here and at home. A stop has nothing: it is passed on, and judged there."""
     if service.effect == "stop":
         return {}

@@ -16,7 +16,7 @@ from trade._registry.suggestions import asked_for, no_such_service, too_many_ser
 from trade.errors import AccessDenied
 
 
-class Looking(Member):
+class Lookup(Member):
     """Finds services here and elsewhere."""
 
     # --- looking up

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 from trade._calls.handle import Handle
-from trade._container.lookup import Looking
+from trade._container.lookup import Lookup
 from trade._protocol.keys import DOMAIN, PROVIDER, ServiceKey
 from trade._registry.constraints import Constraint
 from trade.errors import NoSuchService, TooManyServices
@@ -14,7 +14,7 @@ _HEARD_S: Final = 1.0
 """How long to wait until its new place is known here."""
 
 
-class Moving(Looking):
+class Migrating(Lookup):
     """Asks the containers that providers are in."""
 
     def migrate(

@@ -6,7 +6,7 @@ from trade._calls.handle import Handle
 from trade._container.base import Member
 from trade._estop.broadcast import EstopReport
 from trade._estop.controller import LIMIT_S
-from trade._locks.api import LEASE_S, RESUME_WAIT_S, Locking
+from trade._locks.api import LEASE_S, RESUME_WAIT_S, LockApi
 from trade._locks.lock import Lock, OnLost, OnRequest
 from trade._protocol.messages import Estop
 from trade._registry.constraints import Constraint
@@ -14,10 +14,10 @@ from trade._resources.lock_request import LockInfo
 from trade._stop_line import StopReport
 
 
-class Guarding(Member):
+class MotionControl(Member):
     """Who may use what, and who may not move at all."""
 
-    locking: Locking
+    locking: LockApi
 
     # --- locks
 

@@ -4,11 +4,11 @@ import time
 from datetime import datetime
 from typing import Final
 
-from trade._container.lookup import Looking
+from trade._container.lookup import Lookup
 from trade._context.sessions import speaking
 from trade._notifications.notification import Notification, NotificationInfo, Owner
 from trade._notifications.services import Hosted, placed
-from trade._notifications.triggers import OF_SERVICES, Terms, What, deed_of, epoch_s, target_of
+from trade._notifications.triggers import OF_SERVICES, TriggerSpec, What, deed_of, epoch_s, target_of
 from trade._protocol.keys import DOMAIN
 from trade._registry.constraints import Constraint, where
 from trade.errors import NoSuchNotification
@@ -16,7 +16,7 @@ from trade.errors import NoSuchNotification
 POLL_S: Final = 1.0
 
 
-class Notifying(Looking):
+class Notifying(Lookup):
     """Standing requests of this container, and those that others keep for it."""
 
     # --- of services
@@ -39,12 +39,12 @@ class Notifying(Looking):
             ConfigurationError: what cannot be called, a function for another container, too many there.
             AccessDenied: with ``host=``, by the policy.
         """
-        terms = Terms(occasion="joined", constraint=constraint, existing=existing)
+        terms = TriggerSpec(occasion="joined", constraint=constraint, existing=existing)
         return self._notify(terms, call, if_, None, host)
 
     def left(self, constraint: Constraint, call: What, *, if_: What | None = None, host: str = "") -> Notification:
         """Call with the (dead) handle of every service that goes and matched; the rest as for `joined`."""
-        return self._notify(Terms(occasion="left", constraint=constraint), call, if_, None, host)
+        return self._notify(TriggerSpec(occasion="left", constraint=constraint), call, if_, None, host)
 
     def changed(self, constraint: Constraint, call: What, *, if_: What | None = None, host: str = "") -> Notification:
         """Call with the handle of every service whose groups, metadata, health or description become others.
@@ -52,7 +52,7 @@ class Notifying(Looking):
         It fires for what matches, and once more for what has just ceased to. Who is quick may find several changes in
         one. The rest is as for `joined`.
         """
-        return self._notify(Terms(occasion="changed", constraint=constraint), call, if_, None, host)
+        return self._notify(TriggerSpec(occasion="changed", constraint=constraint), call, if_, None, host)
 
     # --- of time
 
@@ -79,7 +79,7 @@ class Notifying(Looking):
             ConfigurationError: what cannot be called, a function for another container, no such time.
             AccessDenied: with ``host=``, by the policy.
         """
-        return self._notify(Terms(occasion="once", poll_s=poll_s), call, if_, when, host)
+        return self._notify(TriggerSpec(occasion="once", poll_s=poll_s), call, if_, when, host)
 
     def after(
         self,
@@ -92,7 +92,7 @@ class Notifying(Looking):
         host: str = "",
     ) -> Notification:
         """Make that call after so many seconds, counted from when ``when`` holds; the rest as for `once`."""
-        return self._notify(Terms(occasion="after", s=s, poll_s=poll_s), call, if_, when, host)
+        return self._notify(TriggerSpec(occasion="after", s=s, poll_s=poll_s), call, if_, when, host)
 
     def at(
         self,
@@ -117,7 +117,7 @@ class Notifying(Looking):
             host: as for `once`.
         """
         at_s = epoch_s(moment, time.time())
-        return self._notify(Terms(occasion="at", at=at_s, poll_s=poll_s), call, if_, when, host)
+        return self._notify(TriggerSpec(occasion="at", at=at_s, poll_s=poll_s), call, if_, when, host)
 
     def every(
         self,
@@ -143,7 +143,7 @@ class Notifying(Looking):
             poll_s: as for `once`.
             host: as for `once`.
         """
-        return self._notify(Terms(occasion="every", s=s, edge=edge, poll_s=poll_s), call, if_, when, host)
+        return self._notify(TriggerSpec(occasion="every", s=s, edge=edge, poll_s=poll_s), call, if_, when, host)
 
     # --- seeing and ending
 
@@ -164,7 +164,7 @@ class Notifying(Looking):
         if not any(self._ask_all("cancel_notification", notification)):
             raise NoSuchNotification(id=notification)
 
-    def _notify(self, terms: Terms, call: What, if_: What | None, when: What | None, host: str) -> Notification:
+    def _notify(self, terms: TriggerSpec, call: What, if_: What | None, when: What | None, host: str) -> Notification:
         self._check_open()
         terms.check()
         named = f"trade.{terms.occasion}"

@@ -5,10 +5,10 @@ import time
 from collections.abc import Callable
 from typing import Final, Protocol
 
-from trade._security.authorizer import Access
+from trade._security.authorizer import Authorizer
 from trade._security.policy import Policy
 from trade._security.policy_file import Seen
-from trade._threads.scheduler import Clockwork
+from trade._threads.scheduler import Scheduler
 from trade.errors import ConfigurationError
 
 __all__ = ["begin_watching", "different"]
@@ -23,21 +23,23 @@ class _Audit(Protocol):
     def changed(self, what: str, about: str, call: None) -> None: ...
 
 
-def begin_watching(access: Access, clockwork: Clockwork, audit: _Audit, judge_anew: Callable[[], None]) -> None:
+def begin_watching(access: Authorizer, clockwork: Scheduler, audit: _Audit, recheck_access: Callable[[], None]) -> None:
     """Have a container go by its policy as the files are; those that are wrong are refused, and the old one stays.
 
     Args:
         access: what it goes by.
         clockwork: does it, once a second.
         audit: told of what has changed.
-        judge_anew: applies another policy.
+        recheck_access: applies another policy.
     """
-    _Watching(access, clockwork, audit, judge_anew)
+    _Watching(access, clockwork, audit, recheck_access)
 
 
 class _Watching:
-    def __init__(self, access: Access, clockwork: Clockwork, audit: _Audit, judge_anew: Callable[[], None]) -> None:
-        self._access, self._audit, self._judge_anew = access, audit, judge_anew
+    def __init__(
+        self, access: Authorizer, clockwork: Scheduler, audit: _Audit, recheck_access: Callable[[], None]
+    ) -> None:
+        self._access, self._audit, self._judge_anew = access, audit, recheck_access
         self._last: Seen = access.seen
         """At the look before: what is being written is let come to rest."""
         self._refused: Seen | None = None

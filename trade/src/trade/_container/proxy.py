@@ -26,7 +26,7 @@ Speaking = Callable[[CallContext], AbstractContextManager[None]]
 """While this lasts, calls are made in the other system on behalf of one that came here."""
 
 
-class _Passed(Signature):
+class _ProxyMethod(Signature):
     """Checks nothing: where the service is at home all is checked, and handles are translated on the way."""
 
     def __init__(self, info: ServiceInfo, codec: Codec) -> None:
@@ -74,7 +74,7 @@ class _Passed(Signature):
         return data
 
 
-class PassedOn(LocalService):
+class ProxyProvider(LocalService):
     """A service of this container that is at home in another system."""
 
     __slots__ = ()
@@ -91,7 +91,7 @@ def passed_on_service(
     codec: Codec,
     resources: tuple[Resource, ...],
     loop: AsyncLoop,
-) -> PassedOn:
+) -> ProxyProvider:
     """What stands here for a service that is called by a handle of its own system.
 
     Args:
@@ -116,7 +116,7 @@ def passed_on_service(
         return run.result()
 
     mark = ServiceMark(effect=_effect(info.effect), cancel=info.cancel)
-    return PassedOn(label, info, _Passed(info, codec), forward, mark, loop, None, resources)
+    return ProxyProvider(label, info, _ProxyMethod(info, codec), forward, mark, loop, None, resources)
 
 
 def _effect(named: str) -> Effect:

@@ -5,7 +5,7 @@ from typing import Final
 
 from msgspec import Struct
 
-from trade._discovery.dialer import Reach
+from trade._discovery.dialer import Dialer
 from trade._protocol.keys import Address
 from trade._registry.registry import Registry
 from trade.errors import NobodyFound
@@ -49,7 +49,7 @@ class Sight(Struct, frozen=True):
         return NobodyFound(system=system, so=so, others=bool(self.others), silent=self.silent, apart=self.unanswered)
 
 
-def look_around(registry: Registry, reach: Reach | None, own: Address, system: str, limit_s: float) -> Sight:
+def look_around(registry: Registry, reach: Dialer | None, own: Address, system: str, limit_s: float) -> Sight:
     """Wait until the sight is complete, for ``limit_s`` seconds at most; what it is then."""
     until = time.monotonic() + limit_s
     while not (sight := _sight(registry, reach, own)).complete and time.monotonic() < until:
@@ -57,7 +57,7 @@ def look_around(registry: Registry, reach: Reach | None, own: Address, system: s
     return sight if reach is None else Sight(sight.others, sight.silent, _apart(reach, own, system, sight))
 
 
-def _sight(registry: Registry, reach: Reach | None, own: Address) -> Sight:
+def _sight(registry: Registry, reach: Dialer | None, own: Address) -> Sight:
     states = [state for state in registry.containers() if state.address != own]
     unlinked = () if reach is None else reach.unlinked()
     return Sight(
@@ -67,7 +67,7 @@ def _sight(registry: Registry, reach: Reach | None, own: Address) -> Sight:
     )
 
 
-def _apart(reach: Reach, own: Address, system: str, sight: Sight) -> dict[str, str]:
+def _apart(reach: Dialer, own: Address, system: str, sight: Sight) -> dict[str, str]:
     """Those without a link, and why; an endpoint may be linked by a link that leads from there to here."""
     found = {endpoint: reach.why_apart(endpoint, certain=not sight.others) for endpoint in sight.apart}
     apart = {endpoint: why for endpoint, why in found.items() if why}

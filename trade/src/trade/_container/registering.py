@@ -17,7 +17,7 @@ from trade._transport.base import ChannelClosed
 _logger = logging.getLogger("trade")
 
 
-class Hosting(Member):
+class Registering(Member):
     """Offers objects to the whole system."""
 
     def register(

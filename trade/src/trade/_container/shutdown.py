@@ -14,7 +14,7 @@ _ANSWERED_S: Final = 2.0
 _LOOK_EVERY_S: Final = 0.01
 
 
-class Terminating:
+class Shutdown:
     """Brings what moves to rest at once, then closes the container as soon as whoever asked has been answered."""
 
     def __init__(

@@ -9,11 +9,11 @@ from typing import Final
 from trade._calls.handle import Handle
 from trade._container.hooking import Hooking
 from trade._context.sessions import speaking
-from trade._notifications.triggers import Deed, Target, What, target_of
+from trade._notifications.triggers import Action, Target, What, target_of
 from trade._registry.constraints import Constraint
 from trade._streams.source import LEAST_HZ, MOST_HZ, check_sampled
 from trade._streams.stream import If, Stream
-from trade._threads.scheduler import Clockwork
+from trade._threads.scheduler import Scheduler
 from trade.errors import ConfigurationError, ServiceGone, SourceLost
 
 _logger = logging.getLogger("trade")
@@ -79,7 +79,7 @@ class Streaming(Hooking):
 class _Push:
     """Calls something with each value of a stream, one at a time."""
 
-    def __init__(self, home: Streaming, stream: Stream, target: Target, clockwork: Clockwork) -> None:
+    def __init__(self, home: Streaming, stream: Stream, target: Target, clockwork: Scheduler) -> None:
         self._home = home
         self._stream = stream
         self._target = target
@@ -106,7 +106,7 @@ class _Push:
     def _do(self, value: object) -> None:
         opened_by, target = self._stream.opened_by, self._target
         with contextlib.nullcontext() if opened_by is None else opened_by.use():
-            if not isinstance(target, Deed):
+            if not isinstance(target, Action):
                 target(value)
                 return
             handle = target.handle

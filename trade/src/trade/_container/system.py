@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Final, Protocol
 
 from trade._calls.handle import Handle
-from trade._discovery.dialer import Reach
+from trade._discovery.dialer import Dialer
 from trade._protocol.container_info import ContainerInfo
 from trade._protocol.keys import CLOCK, DOMAIN, Address, ServiceKey
 from trade._registry.constraints import Constraint, where
@@ -15,7 +15,7 @@ from trade._remote.ssh import start
 from trade._services.decorator import service
 from trade._services.withdrawn import WithdrawnInfo
 from trade._settings import Settings
-from trade._telemetry.load import Load, LoadInfo
+from trade._telemetry.load import LoadInfo, LoadMeter
 from trade.errors import CannotStart, ConfigurationError, LinkStays, NoSuchService, TooManyServices
 
 
@@ -48,10 +48,10 @@ class _Member(Protocol):
     """The container the switches belong to."""
 
     address: Final[Address]
-    meter: Load
+    meter: LoadMeter
 
     @property
-    def reach(self) -> Reach: ...
+    def reach(self) -> Dialer: ...
     @property
     def withdrawn(self) -> _Withdrawn: ...
     @property

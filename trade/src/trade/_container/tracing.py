@@ -7,7 +7,7 @@ from typing import Final
 from msgspec import Struct
 
 from trade._calls.batch import Outcome
-from trade._container.lookup import Looking
+from trade._container.lookup import Lookup
 from trade._protocol.keys import DOMAIN, ServiceKey
 from trade._registry.constraints import where
 from trade._telemetry.log_buffer import LogLine
@@ -77,7 +77,7 @@ class LogReader:
         return sorted(new.values(), key=lambda line: (line.at, line.process, line.number))
 
 
-class Tracing(Looking):
+class Tracing(Lookup):
     """Notes of calls and log lines, from everywhere."""
 
     def set_tracing(self, on: bool, *, container: str = "*") -> list[str]:

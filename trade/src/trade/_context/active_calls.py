@@ -45,7 +45,7 @@ class Reporting(Protocol):
     def signature(self) -> ProgressSignature: ...
 
 
-class Ongoing:
+class ActiveCall:
     """One call from its arrival on."""
 
     __slots__ = (
@@ -58,7 +58,7 @@ class Ongoing:
         service: Reporting | None,
         caller: str,
         call: Call | None,
-        report: "Callable[[Ongoing, Any], None] | None",
+        report: "Callable[[ActiveCall, Any], None] | None",
     ) -> None:
         self.service = service
         self.caller = caller
@@ -128,7 +128,7 @@ def _end(cancels: Sequence[Callable[[], object]]) -> None:
             _logger.exception("a call that was to end failed to")
 
 
-class Once:
+class CallDeduplicator:
     """Every call that runs, and the answers of those that commanded something, until they can come no more.
 
     What merely reads is forgotten when it has ended: to run it again changes nothing. A call under way is never
@@ -136,16 +136,16 @@ class Once:
     """
 
     def __init__(self) -> None:
-        self._calls: dict[Key, Ongoing] = {}
+        self._calls: dict[Key, ActiveCall] = {}
         self._until: list[tuple[int, Key]] = []
         """A heap of when which kept call may go."""
-        self._bodies: dict[Key, Ongoing] = {}
+        self._bodies: dict[Key, ActiveCall] = {}
         self._bytes = 0
         self._evicted: dict[Key, int] = {}
         """Caller and the upper bits of its ids -> the highest id let go before its time; they count upwards."""
         self._lock = threading.Lock()
 
-    def begin(self, call: Call, ongoing: Ongoing) -> Ongoing:
+    def begin(self, call: Call, ongoing: ActiveCall) -> ActiveCall:
         """Note a call; returns the earlier one if it came before, which is then not to be run again."""
         found = self._calls.setdefault((ongoing.caller, call.id), ongoing)
         if self._evicted and found is ongoing and call.id <= self._evicted.get((ongoing.caller, call.id >> 24), -1):
@@ -153,17 +153,17 @@ class Once:
             self._calls.pop((ongoing.caller, call.id), None)
         return found
 
-    def find(self, caller: str, call: Call) -> Ongoing | None:
+    def find(self, caller: str, call: Call) -> ActiveCall | None:
         return self._calls.get((caller, call.id))
 
-    def attach(self, ongoing: Ongoing, again: Call) -> Answer | None:
+    def attach(self, ongoing: ActiveCall, again: Call) -> Answer | None:
         """The answer of a call that came again; None while it runs: the answer then goes to this one, too."""
         with self._lock:
             if ongoing.answer is None:
                 ongoing.also = [*(ongoing.also or ()), again]
             return ongoing.answer
 
-    def end(self, ongoing: Ongoing, call: Call, answer: Answer, *, keep: bool) -> list[Call] | None:
+    def end(self, ongoing: ActiveCall, call: Call, answer: Answer, *, keep: bool) -> list[Call] | None:
         """Note how it ended; returns the other arrivals to answer."""
         with self._lock:
             ongoing.answer = answer
@@ -183,7 +183,7 @@ class Once:
         with self._lock:
             found = self._calls.get((caller, call_id))
             if found is None:
-                never = Ongoing(None, caller, None, None)
+                never = ActiveCall(None, caller, None, None)
                 never.answer = cancelled(service)
                 now = time.monotonic_ns()
                 self._calls[caller, call_id] = never
@@ -192,11 +192,11 @@ class Once:
         if found is not None and found.answer is None:
             found.cancel()
 
-    def made_for(self, session: str) -> list[Ongoing]:
+    def made_for(self, session: str) -> list[ActiveCall]:
         """Calls under way that are made for a session, or for a part of it: by itself, or on its behalf."""
         return [one for one in list(self._calls.values()) if one.answer is None and _is_for(one.call, session)]
 
-    def _keep_body(self, key: Key, ongoing: Ongoing, size: int, service: str) -> None:
+    def _keep_body(self, key: Key, ongoing: ActiveCall, size: int, service: str) -> None:
         ongoing.size = size
         self._bytes += size
         self._bodies[key] = ongoing
@@ -236,7 +236,7 @@ def cancelled(service: str) -> Answer:
     return Status.ERROR, Raw(encode_message(pack_error(Cancelled(service=service))))
 
 
-class Herald:
+class ProgressReporter:
     """Sends what providers say of their progress: the latest of each call, at most every 50 ms, on its own thread.
 
     What was said last goes out before the answer, whenever that comes.
@@ -244,15 +244,15 @@ class Herald:
 
     EVERY_S: Final = 0.05
 
-    def __init__(self, send: Callable[[Ongoing, Raw], None]) -> None:
+    def __init__(self, send: Callable[[ActiveCall, Raw], None]) -> None:
         self._send = send
-        self._news = set[Ongoing]()
+        self._news = set[ActiveCall]()
         self._lock = threading.Lock()
         self._some = threading.Event()
         self._ended = threading.Event()
         self._thread: threading.Thread | None = None
 
-    def tell(self, ongoing: Ongoing, body: Raw) -> None:
+    def tell(self, ongoing: ActiveCall, body: Raw) -> None:
         """Have this sent soon, unless something newer comes first."""
         with self._lock:
             ongoing.said = body
@@ -267,12 +267,12 @@ class Herald:
             self._some.wait()
             with self._lock:
                 self._some.clear()
-                news, self._news = self._news, set[Ongoing]()
+                news, self._news = self._news, set[ActiveCall]()
             for ongoing in news:
                 self.send(ongoing)
             self._ended.wait(self.EVERY_S)
 
-    def send(self, ongoing: Ongoing) -> None:
+    def send(self, ongoing: ActiveCall) -> None:
         """Send what was said last of it, unless it has been or is of no use any more."""
         body = ongoing.said
         if body is None or ongoing.answer is not None:

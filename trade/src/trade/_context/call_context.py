@@ -7,7 +7,7 @@ from typing import Any, Final, Protocol
 
 from msgspec import Struct
 
-from trade._context.active_calls import Ongoing
+from trade._context.active_calls import ActiveCall
 from trade._context.claims import Claim
 from trade._context.sessions import client_of
 from trade._protocol.keys import Address
@@ -47,7 +47,7 @@ class CallContext(Struct, frozen=True, gc=False):
     chain: tuple[str, ...] = ()
     """Services whose calls led to this one, outermost first."""
 
-    ongoing: Ongoing | None = None
+    ongoing: ActiveCall | None = None
     """The middleware's own notes on it."""
     behalf: Behalf | None = None
     """What it inherited; its own calls inherit it, too, while it runs."""

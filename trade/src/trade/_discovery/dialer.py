@@ -25,7 +25,7 @@ _REFUSED_S: Final = 3.0
 """A configured endpoint that accepts connections but is not linked by then refuses us."""
 
 
-class Reach:
+class Dialer:
     """Switches of one container; safe to use from any thread."""
 
     def __init__(self, links: Links, may_dial: Callable[[str], None], configured: Sequence[str] = ()) -> None:

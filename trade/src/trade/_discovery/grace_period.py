@@ -12,7 +12,7 @@ GRACE_S: Final = 1.0
 _LOOK_S: Final = 0.05
 
 
-class Absences:
+class GracePeriods:
     """Sessions whose sign of life fell, perhaps with a bridge; then who is not back within a second is gone."""
 
     def __init__(

@@ -14,7 +14,7 @@ from typing import Final
 from trade._paths import runtime_folder
 from trade._transport.endpoints import accepts, free_endpoint
 
-__all__ = ["Rendezvous", "free_endpoint"]
+__all__ = ["HostFolder", "free_endpoint"]
 
 _logger = logging.getLogger("trade")
 
@@ -22,7 +22,7 @@ _YOUNG_S: Final = 10.0
 """A file this young may belong to a container that does not listen yet, if its process lives."""
 
 
-class Rendezvous:
+class HostFolder:
     """One system's folder on this host; only this user can read or write it."""
 
     def __init__(self, system: str) -> None:

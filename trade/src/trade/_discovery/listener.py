@@ -7,8 +7,8 @@ import time
 from collections.abc import Callable, Iterable
 from typing import Final
 
-from trade._discovery.grace_period import Absences
-from trade._discovery.resync import Asker
+from trade._discovery.grace_period import GracePeriods
+from trade._discovery.resync import Resynchronizer
 from trade._protocol.estop_messages import decode_open_estops
 from trade._protocol.keys import ALIVE, DOMAIN, REGISTRY, TALLY, Address, is_chunk, tally_key
 from trade._protocol.messages import (
@@ -30,7 +30,7 @@ _STAYS_S: Final = 60.0
 """Who has been here for so long is no passer-by."""
 
 
-class Watch:
+class RegistryListener:
     """Feeds a registry from the network. Construction ends with the first sync: what stands now is known then."""
 
     def __init__(
@@ -53,9 +53,9 @@ class Watch:
         self.malformed = 0
         self._beat = beat
         self._stays_from = time.monotonic() + _STAYS_S
-        self._asker = Asker(transport, registry, self._answer, self._regularly)
+        self._asker = Resynchronizer(transport, registry, self._answer, self._regularly)
         self._transport = transport
-        self._absences = Absences(self._gone, transport.bridge_lost)
+        self._absences = GracePeriods(self._gone, transport.bridge_lost)
         entries, signs = transport.announcements(REGISTRY), transport.presences(ALIVE)
         for key in transport.present(ALIVE, _SYNC_S):
             self._sign(Message(key, b""))

@@ -24,7 +24,7 @@ _LONGEST_PAUSE_S: Final = 5.0
 Take = Callable[[Answer, dict[Address, ContainerState]], None]
 
 
-class Asker:
+class Resynchronizer:
     """One thread that asks; several requests for one container are one question.
 
     Those who were waited for in vain are asked by a second one, there from the first such case on: nobody waits behind

@@ -15,7 +15,7 @@ from trade._audit.events import Audit
 from trade._protocol.estop_messages import decode_estop_confirmed, decode_estop_order
 from trade._protocol.keys import ESTOPS, Address, estop_confirmed_key, estop_key, is_chunk
 from trade._protocol.messages import PROTOCOL, EstopConfirmed, EstopOrder, Malformed, encode_message
-from trade._security.authorizer import Access
+from trade._security.authorizer import Authorizer
 from trade._transport.base import ChannelClosed, Message, Transport
 
 _logger = logging.getLogger("trade")
@@ -49,10 +49,10 @@ class EstopReport(Struct, frozen=True):
         return bool(self.confirmed) and not self.missing and not self.failed
 
 
-class EstopLine:
+class EstopBroadcast:
     """Where one container hears orders and confirmations, and gives its own."""
 
-    def __init__(self, transport: Transport, own: Address, access: Access, audit: Audit) -> None:
+    def __init__(self, transport: Transport, own: Address, access: Authorizer, audit: Audit) -> None:
         self._access = access
         self._audit = audit
         self._own = own

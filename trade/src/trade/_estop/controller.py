@@ -11,16 +11,16 @@ from typing import Final, Protocol
 from msgspec import structs
 
 from trade._audit.events import Audit
-from trade._estop.broadcast import EstopLine, EstopReport, all_of
+from trade._estop.broadcast import EstopBroadcast, EstopReport, all_of
 from trade._estop.deadman import Deadman
-from trade._estop.latch import Estops
+from trade._estop.latch import EstopLatch
 from trade._estop.ledger import as_told
 from trade._estop.store import EstopStore
 from trade._protocol.keys import DOMAIN, Address, is_chunk
 from trade._protocol.messages import MOST_CLEARED, PROTOCOL, Estop, EstopOrder, ProviderInfo
 from trade._registry.registry import Change, ContainerState, Record, Registry
 from trade._resources.lock_table import LockTable
-from trade._security.authorizer import Access
+from trade._security.authorizer import Authorizer
 from trade._services.providers import Providers
 from trade._transport.base import ChannelClosed, Transport
 from trade.errors import ConfigurationError, NoSuchEstop
@@ -45,7 +45,7 @@ class LineReports(Protocol):
 Beside = Callable[[str, str, float], LineReports]
 
 
-class Estopping:
+class EstopController:
     """``container.estop`` and its kind."""
 
     def __init__(
@@ -56,16 +56,16 @@ class Estopping:
         table: LockTable,
         providers: Providers,
         folder: Path | None,
-        access: Access,
+        access: Authorizer,
         audit: Audit,
     ) -> None:
         self._own = own
         self._registry = registry
         self._providers = providers
         self._access = access
-        self._line = EstopLine(transport, own, access, audit)
+        self._line = EstopBroadcast(transport, own, access, audit)
         self.deadman: Final = Deadman(providers.stop_of, providers.stops, table.resources, audit)
-        self._estops = Estops(
+        self._estops = EstopLatch(
             table,
             self.deadman,
             EstopStore(folder, own),

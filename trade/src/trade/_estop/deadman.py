@@ -96,7 +96,7 @@ class Deadman:
             service = self._stop_of(resource)
             if service is not None:
                 stops.setdefault(service, []).append(resource)
-        together = _Together(stops, done)
+        together = _StopGroup(stops, done)
         for service in stops:
             self._begin(service, together.told_by(service))
 
@@ -122,7 +122,7 @@ class Deadman:
         tell(problem)
 
 
-class _Together:
+class _StopGroup:
     """Stops that were begun together, until the last one is over."""
 
     def __init__(self, stops: Mapping[LocalService, Sequence[Resource]], done: Callable[[list[str]], None]) -> None:

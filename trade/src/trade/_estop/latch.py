@@ -28,7 +28,7 @@ Confirm = Callable[[str, str], None]
 """Says that a request was done, and what of it failed; waits for nobody."""
 
 
-class Estops:
+class EstopLatch:
     """What is open here. Nothing that actuates begins in this container while anything is.
 
     Args:

@@ -6,7 +6,7 @@ twelfth of that of all other functions of the middleware.
 
 from trade._context.call_context import current_call
 from trade._estop.broadcast import EstopReport
-from trade._estop.controller import LIMIT_S, Estopping
+from trade._estop.controller import LIMIT_S, EstopController
 from trade._protocol.messages import Estop
 from trade._services.decorator import service
 
@@ -14,7 +14,7 @@ from trade._services.decorator import service
 class EstopServices:
     """For whoever only speaks the wire, or is no program of ours."""
 
-    def __init__(self, estopping: Estopping) -> None:
+    def __init__(self, estopping: EstopController) -> None:
         self._estopping = estopping
 
     @property

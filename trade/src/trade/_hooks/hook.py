@@ -18,8 +18,8 @@ from trade._protocol.keys import DOMAIN, ServiceKey
 from trade._registry.constraints import Constraint
 from trade._registry.registry import Change, Record
 from trade._services.local_service import LocalService
-from trade._telemetry.spans import Recorded, Spans, traceable
-from trade._threads.scheduler import Clockwork
+from trade._telemetry.spans import SpanRecorder, Spans, traceable
+from trade._threads.scheduler import Scheduler
 from trade.errors import AccessDenied, ConfigurationError, DeadlineExceeded
 
 _logger = logging.getLogger("trade")
@@ -36,7 +36,7 @@ _MOST: Final = 1000
 Side = Literal["before", "after"]
 
 
-class Called(Struct, frozen=True, kw_only=True):
+class HookEvent(Struct, frozen=True, kw_only=True):
     """What a hook is told: which service, with what, for whom; and after it, how it ended."""
 
     service: Handle
@@ -85,7 +85,7 @@ class HookInfo(Struct, frozen=True, kw_only=True):
     last_error: str
 
 
-class Home(Protocol):
+class HookHost(Protocol):
     """What hooks need of their container."""
 
     @property
@@ -98,7 +98,7 @@ Denied = Callable[[str, Record], "AccessDenied | None"]
 """Why somebody may not instrument a service; None if it may."""
 
 
-class Attached:
+class AttachedHook:
     """One hook in this container."""
 
     def __init__(
@@ -109,7 +109,7 @@ class Attached:
         call: Handle,
         owner: str,
         identity: str,
-        suspended: Callable[["Attached"], None],
+        suspended: Callable[["AttachedHook"], None],
     ) -> None:
         self.name: Final = name
         self.side: Final[Side] = side
@@ -130,7 +130,7 @@ class Attached:
             return self.target.key == record.key
         return self.target.matches(record)
 
-    def tell(self, home: Home, called: Called, chain: Sequence[str], left_s: float) -> None:
+    def tell(self, home: HookHost, called: HookEvent, chain: Sequence[str], left_s: float) -> None:
         """Call it, as long as that may take. Whatever becomes of it, the call it watches goes on."""
         if self.call.label in chain or left_s <= 0:
             self.skipped += 1
@@ -156,11 +156,11 @@ class Attached:
             self._tell_suspended(self)
 
 
-class Around:
+class HookInterceptor:
     """The hooks of one service here."""
 
     def __init__(
-        self, home: Home, codec: Codec, clockwork: Clockwork, handle: Handle, hooks: Sequence[Attached]
+        self, home: HookHost, codec: Codec, clockwork: Scheduler, handle: Handle, hooks: Sequence[AttachedHook]
     ) -> None:
         self._home = home
         self._encode = codec.encode
@@ -196,7 +196,7 @@ class Around:
                     self._tell(self._after, ended, context)
         return result
 
-    def _tell(self, hooks: Sequence[Attached], called: Called, context: CallContext) -> None:
+    def _tell(self, hooks: Sequence[AttachedHook], called: HookEvent, context: CallContext) -> None:
         chain = (*context.chain, context.service)
         until_ns = time.monotonic_ns() + int(ALL_S * 1e9)
         with _as_the_container(context):
@@ -206,9 +206,9 @@ class Around:
 
     def _called(
         self, service: LocalService, args: Sequence[Any], kwargs: Mapping[str, Any], context: CallContext
-    ) -> Called:
+    ) -> HookEvent:
         named = service.signature.named(args, kwargs)
-        return Called(
+        return HookEvent(
             service=self._handle,
             args={name: self._plain(value) for name, value in named.items()},
             caller=context.caller,
@@ -249,9 +249,9 @@ class Hooks:
 
     def __init__(
         self,
-        home: Home,
+        home: HookHost,
         codec: Codec,
-        clockwork: Clockwork,
+        clockwork: Scheduler,
         services: Callable[[ServiceKey], LocalService | None],
         records: Callable[[], list[Record]],
         denied: Denied,
@@ -263,11 +263,11 @@ class Hooks:
         self._records = records
         self._denied = denied
         self._lock = threading.RLock()
-        self._attached: dict[tuple[str, str], Attached] = {}
+        self._attached: dict[tuple[str, str], AttachedHook] = {}
         """By session and name."""
         self._spans: Spans | None = None
         """Where calls are noted while this container is traced."""
-        self.suspended: Callable[[Attached], None] = lambda _: None
+        self.suspended: Callable[[AttachedHook], None] = lambda _: None
         """Told of each that is suspended."""
 
     def attach(
@@ -279,7 +279,7 @@ class Hooks:
             AccessDenied: its owner may instrument none of those it means here.
             ConfigurationError: a stop service was named for a hook before it, or there are too many.
         """
-        hook = Attached(name, side, target, call, owner, identity, self.suspended_now)
+        hook = AttachedHook(name, side, target, call, owner, identity, self.suspended_now)
         with self._lock:
             if (owner, name) not in self._attached and len(self._attached) >= _MOST:
                 raise ConfigurationError(where=self._home.name, problem=f"{_MOST} hooks are attached here already")
@@ -295,7 +295,7 @@ class Hooks:
             self._refresh()
             return sorted(known.services.values())
 
-    def suspended_now(self, hook: Attached) -> None:
+    def suspended_now(self, hook: AttachedHook) -> None:
         self.suspended(hook)
 
     def detach(self, owner: str, name: str) -> bool:
@@ -306,7 +306,7 @@ class Hooks:
                 self._refresh()
             return gone is not None
 
-    def named(self, name: str) -> list[Attached]:
+    def named(self, name: str) -> list[AttachedHook]:
         """Those of that name."""
         return [hook for hook in list(self._attached.values()) if hook.name == name]
 
@@ -322,9 +322,9 @@ class Hooks:
     def changed(self, change: Change) -> None:
         """Told by the registry."""
         if self._in_use and any(record.local for record in (*change.joined, *change.replaced, *change.left)):
-            self.judge_anew()
+            self.recheck_access()
 
-    def judge_anew(self) -> None:
+    def recheck_access(self) -> None:
         """What is offered here, or who may instrument it, has changed."""
         with self._lock:
             if self._in_use:
@@ -353,12 +353,12 @@ class Hooks:
                 hook.services[record.key] = record.label
             around = None
             if mine:
-                around = Around(self._home, self._codec, self._clockwork, self._home.handle(record.key), mine)
+                around = HookInterceptor(self._home, self._codec, self._clockwork, self._home.handle(record.key), mine)
             traced = self._spans if traceable(record.key) else None
-            around = around if traced is None else Recorded(traced, around)
+            around = around if traced is None else SpanRecorder(traced, around)
             service.around = around if service.audited is None else service.audited.over(around)
 
-    def _concerns(self, hook: Attached, record: Record) -> bool:
+    def _concerns(self, hook: AttachedHook, record: Record) -> bool:
         return hook.means(record) and self._denied(hook.identity, record) is None
 
     def infos(self) -> list[HookInfo]:

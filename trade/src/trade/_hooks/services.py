@@ -5,11 +5,11 @@ import logging
 
 from trade._calls.handle import Handle
 from trade._context.call_context import served_call
-from trade._hooks.hook import Attached, HookInfo, Hooks, Side
-from trade._notifications.services import Home
+from trade._hooks.hook import AttachedHook, HookInfo, Hooks, Side
+from trade._notifications.services import NotificationServicesHost
 from trade._protocol.keys import DOMAIN, PROVIDER, Address, ServiceKey
 from trade._registry.constraints import Constraint
-from trade._security.authorizer import Access
+from trade._security.authorizer import Authorizer
 from trade._services.decorator import service
 from trade.errors import CallerError, CallError, ConfigurationError
 
@@ -19,7 +19,7 @@ _logger = logging.getLogger("trade")
 class HookServices:
     """The wire's side of `Hooks`."""
 
-    def __init__(self, hooks: Hooks, home: Home, access: Access) -> None:
+    def __init__(self, hooks: Hooks, home: NotificationServicesHost, access: Authorizer) -> None:
         self._hooks = hooks
         self._watched = home
         self._judge = access
@@ -57,7 +57,7 @@ class HookServices:
             "hook %s (%s), attached from here, is suspended by %s: %s", name, call, served_call().session, error
         )
 
-    def _tell_who_attached(self, hook: Attached) -> None:
+    def _tell_who_attached(self, hook: AttachedHook) -> None:
         owner = Address(*hook.owner.split("/")[:3])
         with contextlib.suppress(CallerError, CallError):  # it has gone
             told = self._watched.handle(ServiceKey(owner, DOMAIN, PROVIDER, "hook_suspended"))

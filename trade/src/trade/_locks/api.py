@@ -8,12 +8,12 @@ from typing import Final, NamedTuple, Protocol
 from trade._calls.handle import Handle
 from trade._calls.run import Run
 from trade._context.claims import Claim, Selection
-from trade._locks.lease_client import Keeper
+from trade._locks.lease_client import LeaseClient
 from trade._locks.lock import Lock, OnLost, OnRequest
 from trade._protocol.keys import DOMAIN, PROVIDER, Address, ServiceKey
 from trade._registry.constraints import Constraint, Term, under
-from trade._resources.lock_request import LockInfo, Terms
-from trade._security.authorizer import Access
+from trade._resources.lock_request import LockInfo, LockRequest
+from trade._security.authorizer import Authorizer
 from trade.errors import (
     Busy,
     ConfigurationError,
@@ -35,7 +35,7 @@ _ANSWER_S: Final = 2.0
 """So long it may take to tell what is locked."""
 
 
-class Known(NamedTuple):
+class LockOverview(NamedTuple):
     """What is known of all locks."""
 
     locks: list[LockInfo]
@@ -47,10 +47,10 @@ class Known(NamedTuple):
         return any(address.container == container for address in self.silent)
 
 
-class Home(Protocol):
+class LockHost(Protocol):
     """What locking asks of its container."""
 
-    access: Final[Access]
+    access: Final[Authorizer]
 
     @property
     def address(self) -> Address: ...
@@ -60,12 +60,12 @@ class Home(Protocol):
     def addresses(self) -> list[Address]: ...
 
 
-class Locking:
+class LockApi:
     """The locks of one container; ``container.locking``."""
 
-    def __init__(self, home: Home) -> None:
+    def __init__(self, home: LockHost) -> None:
         self._home = home
-        self.keeper: Final = Keeper(home)
+        self.keeper: Final = LeaseClient(home)
 
     def lock(
         self,
@@ -85,7 +85,9 @@ class Locking:
             raise ConfigurationError(where="lock", problem=f"wait_s must be 0 to {LONGEST_WAIT_S:g}, not {wait_s!r}")
         if not 0.1 <= lease_s <= 60:
             raise ConfigurationError(where="lock", problem=f"lease_s must be 0.1 to 60, not {lease_s!r}")
-        terms = Terms(purpose=purpose, lease_s=lease_s, wait_s=wait_s, priority=priority, delegates=tuple(delegates))
+        terms = LockRequest(
+            purpose=purpose, lease_s=lease_s, wait_s=wait_s, priority=priority, delegates=tuple(delegates)
+        )
 
         def wanted() -> Selection:
             handles = self._there(which, wait_s, partial=partial)
@@ -141,7 +143,7 @@ class Locking:
             _logger.warning("which locks there are in %s is not known: no answer within %g s", who, _ANSWER_S)
         return known.locks
 
-    def known(self) -> Known:
+    def known(self) -> LockOverview:
         """The locks of the system, and whose are not known."""
         runs: list[tuple[Address, Run]] = []
         found, silent = list[LockInfo](), list[Address]()
@@ -155,7 +157,7 @@ class Locking:
                 silent.append(address)
             except TradeError:
                 continue
-        return Known(sorted(found, key=lambda info: (info.resources, info.container)), silent)
+        return LockOverview(sorted(found, key=lambda info: (info.resources, info.container)), silent)
 
     def request_release(self, which: Constraint | Iterable[Handle], reason: str) -> list[str]:
         """See `Container.request_release`."""

@@ -15,7 +15,7 @@ from trade._calls.run import Run
 from trade._locks.lock import Lock, apart
 from trade._protocol.keys import DOMAIN, PROVIDER, Address, ServiceKey
 from trade._protocol.messages import Token
-from trade._resources.lock_request import Terms
+from trade._resources.lock_request import LockRequest
 from trade.errors import Busy, ContainerLost, LockedByOther, ServiceGone, TradeError
 
 _ANSWER_S: Final = 2.0
@@ -25,7 +25,7 @@ _BEATS: Final = 4
 """Renewals within one lease."""
 
 
-class Home(Protocol):
+class LeaseHost(Protocol):
     """What locking asks of its container."""
 
     @property
@@ -33,10 +33,10 @@ class Home(Protocol):
     def handle(self, key: ServiceKey) -> Handle: ...
 
 
-class Keeper:
+class LeaseClient:
     """Every lock of a container, and the thread that renews them while there are any."""
 
-    def __init__(self, home: Home) -> None:
+    def __init__(self, home: LeaseHost) -> None:
         self._home = home
         self._locks: list[Lock] = []
         self._changed = threading.Condition()
@@ -55,7 +55,7 @@ class Keeper:
 
     # --- taking
 
-    def acquire(self, lock: Lock, wanted: dict[Address, list[str]], terms: Terms) -> Lock:
+    def acquire(self, lock: Lock, wanted: dict[Address, list[str]], terms: LockRequest) -> Lock:
         """Take all or nothing: all containers at once first, then one after the other in the order all keep (S13).
 
         Raises:
@@ -78,7 +78,7 @@ class Keeper:
             raise
         return lock
 
-    def _try_all(self, lock: Lock, wanted: dict[Address, list[str]], terms: Terms) -> None:
+    def _try_all(self, lock: Lock, wanted: dict[Address, list[str]], terms: LockRequest) -> None:
         asked_at = time.monotonic()
         asks = [(address, self._ask(address, names, terms)) for address, names in wanted.items()]
         refused: TradeError | None = None
@@ -90,7 +90,7 @@ class Keeper:
         if refused is not None:
             raise refused
 
-    def _wait_in_order(self, lock: Lock, wanted: dict[Address, list[str]], terms: Terms, until: float) -> None:
+    def _wait_in_order(self, lock: Lock, wanted: dict[Address, list[str]], terms: LockRequest, until: float) -> None:
         for address in sorted(wanted, key=str):
             while True:
                 asked_at = time.monotonic()
@@ -104,7 +104,7 @@ class Keeper:
                         raise
                     time.sleep(_AGAIN_S)
 
-    def _ask(self, address: Address, names: Sequence[str], terms: Terms) -> Bound:
+    def _ask(self, address: Address, names: Sequence[str], terms: LockRequest) -> Bound:
         ask = self._service(address, "acquire").with_(deadline_s=terms.wait_s + _ANSWER_S)
         return ask.bind(list(names), terms)
 

@@ -17,11 +17,11 @@ from trade._context.claims import Claim, Selection
 from trade._locks.inherited import VARIABLE, passed_on
 from trade._protocol.keys import Address
 from trade._protocol.messages import Token
-from trade._resources.lock_request import Granted, Terms
+from trade._resources.lock_request import Granted, LockRequest
 from trade.errors import ConfigurationError, LockLost, TradeError
 
 if TYPE_CHECKING:
-    from trade._locks.lease_client import Keeper
+    from trade._locks.lease_client import LeaseClient
 
 _logger = logging.getLogger("trade")
 
@@ -41,8 +41,8 @@ class Lock:
 
     def __init__(
         self,
-        keeper: "Keeper",
-        terms: Terms,
+        keeper: "LeaseClient",
+        terms: LockRequest,
         wanted: Wanted,
         on_lost: OnLost | None,
         on_request: OnRequest | None,

@@ -12,7 +12,7 @@ from trade._context.call_context import CallContext
 from trade._locks.lock import Lock, OnLost, OnRequest
 from trade._protocol.keys import Address
 from trade._protocol.messages import Token
-from trade._resources.lock_request import Granted, Terms
+from trade._resources.lock_request import Granted, LockRequest
 from trade._resources.lock_table import LockTable
 from trade._resources.resource import Resource
 from trade.errors import LockLost
@@ -23,10 +23,12 @@ Wish = Callable[[int, str, str], None]
 """Told who would like to have what stands behind a grant, and why."""
 
 
-class Lender(Protocol):
+class RemoteSystem(Protocol):
     """The way to another system, for a call that was made in this one."""
 
-    def lock(self, call: CallContext, wanted: Wanted, terms: Terms, on_lost: OnLost, on_request: OnRequest) -> Lock: ...
+    def lock(
+        self, call: CallContext, wanted: Wanted, terms: LockRequest, on_lost: OnLost, on_request: OnRequest
+    ) -> Lock: ...
     def resume(self, call: CallContext, address: Address, names: Sequence[str]) -> list[str]: ...
     def request_release(self, call: CallContext, address: Address, names: Sequence[str], reason: str) -> list[str]: ...
 
@@ -36,7 +38,7 @@ class SharedResource(Resource):
 
     __slots__ = ("__weakref__", "home", "home_name", "lender")
 
-    def __init__(self, name: str, home: Address, home_name: str, lender: Lender) -> None:
+    def __init__(self, name: str, home: Address, home_name: str, lender: RemoteSystem) -> None:
         super().__init__(name)
         self.home: Final = home
         self.home_name: Final = home_name
@@ -54,10 +56,10 @@ class SharedResource(Resource):
         super().stop(by, (), reason, estop=estop)
 
 
-class Loan:
+class RemoteLock:
     """The locks in other systems behind one grant."""
 
-    def __init__(self, borrowed: "Borrowed", wish: Wish) -> None:
+    def __init__(self, borrowed: "RemoteLocks", wish: Wish) -> None:
         self._borrowed = borrowed
         self._wish = wish
         self.number = 0
@@ -86,25 +88,25 @@ class Loan:
             Context().run(lock.release)
 
 
-class Borrowed:
+class RemoteLocks:
     """The loans of one container, by its own grants."""
 
     def __init__(self, table: LockTable, epoch: str) -> None:
         self._table = table
         self._epoch = epoch
-        self._loans: dict[int, Loan] = {}
+        self._loans: dict[int, RemoteLock] = {}
         table.tell_of_losses(self._lost)
 
     @contextlib.contextmanager
     def behind(
-        self, call: CallContext, resources: Iterable[Resource], terms: Terms, wish: Wish
-    ) -> Generator[Loan, None, None]:
+        self, call: CallContext, resources: Iterable[Resource], terms: LockRequest, wish: Wish
+    ) -> Generator[RemoteLock, None, None]:
         """Take those of these that are shared where they are at home; given back unless they stand for a grant then.
 
         Raises:
             TradeError: what the home says.
         """
-        loan, begun = Loan(self, wish), time.monotonic()
+        loan, begun = RemoteLock(self, wish), time.monotonic()
         try:
             for lender, wanted in _by_lender(resources).items():
                 left = structs.replace(terms, wait_s=max(0.0, terms.wait_s - loan.waited_s))
@@ -115,7 +117,7 @@ class Borrowed:
             if not loan.number:
                 loan.release()
 
-    def keep(self, loan: Loan) -> None:
+    def keep(self, loan: RemoteLock) -> None:
         """Told by the loan: it stands for a grant now. Raises LockLost."""
         number = loan.number
         self._loans[number] = loan
@@ -177,8 +179,8 @@ def _lapsed(lock: Lock) -> str:
     return "it was given back"
 
 
-def _by_lender(resources: Iterable[Resource]) -> dict[Lender, dict[Address, list[str]]]:
-    found: dict[Lender, dict[Address, list[str]]] = {}
+def _by_lender(resources: Iterable[Resource]) -> dict[RemoteSystem, dict[Address, list[str]]]:
+    found: dict[RemoteSystem, dict[Address, list[str]]] = {}
     for one in resources:
         if isinstance(one, SharedResource):
             found.setdefault(one.lender, {}).setdefault(one.home, []).append(one.home_name)

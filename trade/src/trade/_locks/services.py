@@ -9,13 +9,13 @@ from msgspec import structs
 
 from trade._context.call_context import CallContext, served_call
 from trade._context.sessions import foreign
-from trade._locks.remote_locks import Borrowed
+from trade._locks.remote_locks import RemoteLocks
 from trade._protocol.keys import Address
 from trade._protocol.messages import Token
-from trade._resources.lock_request import Granted, LockInfo, Terms
+from trade._resources.lock_request import Granted, LockInfo, LockRequest
 from trade._resources.lock_table import LockTable
 from trade._resources.resource import Holder, Resource
-from trade._security.authorizer import Access
+from trade._security.authorizer import Authorizer
 from trade._services.decorator import service
 from trade.errors import Busy, LockedByOther, TradeError
 
@@ -39,9 +39,9 @@ class LockServices:
         own: Address,
         ask: Ask,
         asked: Asked,
-        access: Access,
+        access: Authorizer,
         groups: GroupsOf,
-        borrowed: Borrowed,
+        borrowed: RemoteLocks,
     ) -> None:
         self._table = table
         self._borrowed = borrowed
@@ -53,7 +53,7 @@ class LockServices:
         self._places = threading.BoundedSemaphore(_MOST_WAITING)
 
     @service
-    def acquire(self, resources: list[str], terms: Terms) -> Granted:
+    def acquire(self, resources: list[str], terms: LockRequest) -> Granted:
         """Take all of these and what is coupled to them for the calling session."""
         call = served_call()
         named = self._table.named(resources)

@@ -26,7 +26,7 @@ class _Made(NamedTuple):
     args: Arguments
 
 
-class Home(Protocol):
+class FactoryHost(Protocol):
     """The container they are registered in."""
 
     @property
@@ -34,10 +34,10 @@ class Home(Protocol):
     def register(self, provider: object, groups: str | Sequence[str] = ()) -> tuple[Handle, ...]: ...
 
 
-class Making:
+class ProviderFactory:
     """Owns what was made here: it is closed when somebody terminates it, or with the container."""
 
-    def __init__(self, home: Home, providers: Providers, withdrawn: Withdrawn, allowed: Sequence[str]) -> None:
+    def __init__(self, home: FactoryHost, providers: Providers, withdrawn: Withdrawn, allowed: Sequence[str]) -> None:
         self._home = home
         self._providers = providers
         self._withdrawn = withdrawn

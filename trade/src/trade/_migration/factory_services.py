@@ -22,7 +22,7 @@ class Maker(Protocol):
     def terminate_container(self, reason: str, *, only_at_rest: bool, who: str) -> list[str]: ...
 
 
-class MakingServices:
+class FactoryServices:
     """The wire's side of `Making`, and of the end of a container."""
 
     def __init__(self, system: Maker) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Generator, Mapping
 from typing import Final
 
 from trade._protocol.keys import Address
-from trade._resources.lock_request import Terms
+from trade._resources.lock_request import LockRequest
 from trade._resources.lock_table import LockTable
 from trade._resources.resource import Holder, Resource, locked
 from trade._services.local_service import LocalService
@@ -60,7 +60,7 @@ class Frozen:
         return LockedByOther(resources=names, owner=f"nobody any more: {why}", purpose="migrating")
 
 
-class Freezing:
+class Quiescer:
     """Holds providers of one container still."""
 
     def __init__(self, table: LockTable, own: Address) -> None:
@@ -96,7 +96,7 @@ class Freezing:
         require_rest(resources)
         own = self._own
         holder = Holder(own.identity, own.container, f"{own}/migration", purpose, time.time())
-        terms = Terms(purpose=purpose, lease_s=LONGEST_S, wait_s=CALLS_S)
+        terms = LockRequest(purpose=purpose, lease_s=LONGEST_S, wait_s=CALLS_S)
         granted = self._table.acquire([resource.name for resource in moved], holder, terms)
         number = 0 if granted.token is None else granted.token.number
         try:

@@ -4,15 +4,15 @@ from typing import Any
 
 from trade._calls.handle import Handle
 from trade._context.call_context import served_call
-from trade._migration.source import Departing
-from trade._migration.target import Arriving, Luggage, Prepared
+from trade._migration.source import MigrationSource
+from trade._migration.target import MigrationTarget, Prepared, ProviderSnapshot
 from trade._services.decorator import service
 
 
 class MigrationServices:
-    """The wire's side of `Departing` and `Arriving`."""
+    """The wire's side of `MigrationSource` and `MigrationTarget`."""
 
-    def __init__(self, departing: Departing, arriving: Arriving) -> None:
+    def __init__(self, departing: MigrationSource, arriving: MigrationTarget) -> None:
         self._departing = departing
         self._arriving = arriving
 
@@ -32,7 +32,7 @@ class MigrationServices:
         self._departing.restore_state(service, state, served_call().caller)
 
     @service
-    def prepare_arrival(self, luggage: Luggage) -> Prepared:
+    def prepare_arrival(self, luggage: ProviderSnapshot) -> Prepared:
         """For containers: make what is to come and give it its state; it is closed again if nobody fetches it."""
         return self._arriving.prepare(luggage, served_call().caller)
 

@@ -12,14 +12,14 @@ from typing import Any, Final, Protocol
 
 from trade._calls.handle import Handle
 from trade._context.call_context import running
-from trade._migration.factory import Arguments, Making, path_of
-from trade._migration.quiesce import Freezing, Frozen
+from trade._migration.factory import Arguments, ProviderFactory, path_of
+from trade._migration.quiesce import Frozen, Quiescer
 from trade._migration.state import is_stateful, restore, save
-from trade._migration.target import Luggage, Prepared, fingerprint
+from trade._migration.target import Prepared, ProviderSnapshot, fingerprint
 from trade._protocol.codec import Codec
 from trade._protocol.keys import DOMAIN, PROVIDER, Address, ServiceKey
 from trade._registry.constraints import Constraint, where
-from trade._security.authorizer import Access
+from trade._security.authorizer import Authorizer
 from trade._services.providers import Providers
 from trade._services.registration import Offer
 from trade._services.withdrawn import Withdrawn
@@ -43,7 +43,7 @@ _ARRIVE_S: Final = 5.0
 _ASK_S: Final = 2.0
 
 
-class Home(Protocol):
+class MigrationHost(Protocol):
     """The container it leaves."""
 
     @property
@@ -54,17 +54,17 @@ class Home(Protocol):
     def services(self, constraint: Constraint | None = ...) -> list[Handle]: ...
 
 
-class Departing:
+class MigrationSource:
     """Sends providers of one container to another one, and takes or gives their state."""
 
     def __init__(
         self,
-        home: Home,
+        home: MigrationHost,
         providers: Providers,
-        making: Making,
+        making: ProviderFactory,
         withdrawn: Withdrawn,
-        freezing: Freezing,
-        access: Access,
+        freezing: Quiescer,
+        access: Authorizer,
         codec: Codec,
     ) -> None:
         self._home = home
@@ -187,7 +187,7 @@ class Departing:
             _logger.info("container %s does not tell its load: %s", there.container, error)
             return float("inf"), 0.0
 
-    def _packed(self, service: Handle, offer: Offer, there: Handle, args: Arguments | None) -> Luggage:
+    def _packed(self, service: Handle, offer: Offer, there: Handle, args: Arguments | None) -> ProviderSnapshot:
         kind, stateful = type(offer.provider), is_stateful(type(offer.provider))
         try:
             state = save(offer.provider) if stateful else None
@@ -195,7 +195,7 @@ class Departing:
             problem = f"save_state: {type(error).__name__}: {error}"
             raise CannotMigrate(provider=service.label, to=there.container, problem=problem) from error
         given = self._making.arguments_of(offer.provider) if args is None else args
-        return Luggage(
+        return ProviderSnapshot(
             class_path=path_of(kind),
             fingerprint=fingerprint(kind, offer.implements, self._codec),
             args=dict(given) if isinstance(given, Mapping) else tuple(given),

@@ -10,20 +10,20 @@ from typing import Any, Final
 
 from msgspec import Struct, structs
 
-from trade._migration.factory import Making, end, path_of
-from trade._migration.quiesce import Freezing
+from trade._migration.factory import ProviderFactory, end, path_of
+from trade._migration.quiesce import Quiescer
 from trade._migration.state import is_stateful, restore
 from trade._protocol.codec import Codec
 from trade._protocol.keys import Address, ServiceKey, domain_of
 from trade._protocol.messages import Scalar, encode_message
 from trade._protocol.schema_types import imported
-from trade._security.authorizer import Access
+from trade._security.authorizer import Authorizer
 from trade._services.decorator import marked_methods
 from trade._services.offerable import checked_groups
 from trade._services.providers import Providers
 from trade._services.registration import Built
 from trade._services.signature import Signature
-from trade._threads.scheduler import Clockwork, Due
+from trade._threads.scheduler import ScheduledTask, Scheduler
 from trade.errors import Busy, CannotInstantiate, CannotMigrate, LockedByOther, NoSuchClass
 
 TICKET_S: Final = 20.0
@@ -33,7 +33,7 @@ MOST: Final = 8
 _REMEMBERED: Final = 256
 
 
-class Luggage(Struct, frozen=True, kw_only=True):
+class ProviderSnapshot(Struct, frozen=True, kw_only=True):
     """What is made of a provider elsewhere, and how it is offered."""
 
     class_path: str
@@ -60,13 +60,13 @@ class Prepared(Struct, frozen=True):
 class _Ready(Struct, eq=False):
     caller: str
     provider: object
-    luggage: Luggage
+    luggage: ProviderSnapshot
     built: Built
     ending: contextlib.ExitStack
     """Closes it; to be emptied if it is offered."""
     standing: contextlib.ExitStack
     """Ends all that was taken up for it, and closes it."""
-    due: Due
+    due: ScheduledTask
 
 
 def fingerprint(kind: type, implements: Sequence[type], codec: Codec) -> str:
@@ -80,18 +80,18 @@ def fingerprint(kind: type, implements: Sequence[type], codec: Codec) -> str:
     return hashlib.sha256(encode_message((path_of(kind), version, is_stateful(kind), told))).hexdigest()
 
 
-class Arriving:
+class MigrationTarget:
     """Owns what was prepared here and is not offered yet."""
 
     def __init__(
         self,
         own: Address,
         providers: Providers,
-        making: Making,
-        freezing: Freezing,
-        access: Access,
+        making: ProviderFactory,
+        freezing: Quiescer,
+        access: Authorizer,
         codec: Codec,
-        clockwork: Clockwork,
+        clockwork: Scheduler,
     ) -> None:
         self._own = own
         self._making = making
@@ -106,7 +106,7 @@ class Arriving:
         self._arrived: dict[str, None] = {}
         """The last tickets that were used."""
 
-    def prepare(self, luggage: Luggage, caller: str) -> Prepared:
+    def prepare(self, luggage: ProviderSnapshot, caller: str) -> Prepared:
         """Make it and give it its state; nobody can call it yet.
 
         Raises:
@@ -132,11 +132,11 @@ class Arriving:
         domain, _, provider = built.place.partition("/")
         return Prepared(ticket, domain, provider, tuple(built.services))
 
-    def _require(self, luggage: Luggage, caller: str) -> None:
+    def _require(self, luggage: ProviderSnapshot, caller: str) -> None:
         for group in luggage.groups or (domain_of(luggage.groups),):
             self._access.require(caller, "register", group, f"{luggage.class_path} in {group}")
 
-    def _make(self, luggage: Luggage, ending: contextlib.ExitStack) -> tuple[object, Built]:
+    def _make(self, luggage: ProviderSnapshot, ending: contextlib.ExitStack) -> tuple[object, Built]:
         kind = self._making.find(luggage.class_path)
         implements = [self._interface(path) for path in luggage.implements]
         if fingerprint(kind, implements, self._codec) != luggage.fingerprint:
@@ -156,7 +156,7 @@ class Arriving:
             raise NoSuchClass(class_path=path, container=here, reason="nothing there has imported this interface")
         return found
 
-    def _restore(self, luggage: Luggage, made: object, built: Built, undo: contextlib.ExitStack) -> None:
+    def _restore(self, luggage: ProviderSnapshot, made: object, built: Built, undo: contextlib.ExitStack) -> None:
         """Under a lock, so that whatever it commands is refused at its permit (S18)."""
         used = {resource for service in built.services.values() for resource in service.resources}
         purpose = f"{luggage.class_path} arriving"
@@ -214,7 +214,7 @@ class Arriving:
         """
         named = dict(args) if isinstance(args, Mapping) else tuple(args)
         version = fingerprint(self._making.find(class_path), (), self._codec)
-        luggage = Luggage(
+        luggage = ProviderSnapshot(
             class_path=class_path, fingerprint=version, args=named, groups=groups, has_state=True, state=state
         )
         try:
@@ -250,5 +250,5 @@ class Arriving:
         for ticket in list(self._ready):
             self._over(ticket)
 
-    def _refusal(self, luggage: Luggage, problem: str) -> CannotMigrate:
+    def _refusal(self, luggage: ProviderSnapshot, problem: str) -> CannotMigrate:
         return CannotMigrate(provider=luggage.class_path, to=self._own.container, problem=problem)

@@ -13,10 +13,10 @@ from msgspec import Struct
 
 from trade._calls.handle import Handle
 from trade._context.sessions import Session
-from trade._notifications.triggers import Deed, Target, Terms, text_of
+from trade._notifications.triggers import Action, Target, TriggerSpec, text_of
 from trade._registry.constraints import Constraint
 from trade._registry.registry import Record
-from trade._threads.scheduler import Clockwork
+from trade._threads.scheduler import Scheduler
 from trade.errors import ConfigurationError
 
 _logger = logging.getLogger("trade")
@@ -94,7 +94,7 @@ class Notification(ABC):
         return f"<Notification {self._text}>"
 
 
-class Home(Protocol):
+class NotificationHost(Protocol):
     """What a standing request needs of its container."""
 
     @property
@@ -113,20 +113,20 @@ class Owner(Struct, frozen=True):
     """Calls are made in this session."""
 
 
-class Standing(Notification):
+class ActiveNotification(Notification):
     """One that lives in this container. Done by the clockwork: never twice at once."""
 
     def __init__(
         self,
         name: str,
-        terms: Terms,
+        terms: TriggerSpec,
         call: Target,
         if_: Target | None,
         when: Target | None,
         owner: Owner,
-        home: Home,
-        ended: Callable[["Standing"], None],
-        failed: Callable[["Standing", str], None],
+        home: NotificationHost,
+        ended: Callable[["ActiveNotification"], None],
+        failed: Callable[["ActiveNotification", str], None],
     ) -> None:
         super().__init__(name, str(terms))
         self.owner: Final = owner
@@ -153,7 +153,7 @@ class Standing(Notification):
 
     # --- being
 
-    def begin(self, clockwork: Clockwork) -> Callable[[int], None]:
+    def begin(self, clockwork: Scheduler) -> Callable[[int], None]:
         """Have it done; returns what has it done once more."""
         due = clockwork.begin(self._act, time.monotonic_ns())
         self._cancel_due = due.cancel
@@ -284,7 +284,7 @@ class Standing(Notification):
     def _do(self, target: Target, *given: Handle) -> Any:
         acts_as = self.owner.acts_as
         with contextlib.nullcontext() if acts_as is None else acts_as.use():
-            if not isinstance(target, Deed):
+            if not isinstance(target, Action):
                 return target(*given)
             handle = target.handle
             if handle is None:

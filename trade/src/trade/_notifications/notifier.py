@@ -6,10 +6,10 @@ from collections.abc import Callable
 from typing import Final
 
 from trade._calls.handle import Handle
-from trade._notifications.notification import Home, NotificationInfo, Owner, Standing
-from trade._notifications.triggers import OF_SERVICES, Target, Terms
+from trade._notifications.notification import ActiveNotification, NotificationHost, NotificationInfo, Owner
+from trade._notifications.triggers import OF_SERVICES, Target, TriggerSpec
 from trade._registry.registry import Change, Record
-from trade._threads.scheduler import Clockwork
+from trade._threads.scheduler import Scheduler
 from trade.errors import ConfigurationError
 
 _MOST: Final = 10_000
@@ -19,29 +19,31 @@ _MOST: Final = 10_000
 class Notifier:
     """Owns what stands in one container, for itself and for others."""
 
-    def __init__(self, home: Home, clockwork: Clockwork, epoch: str, handle: Callable[[Record], Handle]) -> None:
+    def __init__(
+        self, home: NotificationHost, clockwork: Scheduler, epoch: str, handle: Callable[[Record], Handle]
+    ) -> None:
         self._home = home
         self._clockwork = clockwork
         self._epoch = epoch
         self._handle = handle
         self._lock = threading.Lock()
-        self._standing: dict[str, Standing] = {}
-        self._of_services: dict[str, tuple[Standing, Callable[[int], None]]] = {}
+        self._standing: dict[str, ActiveNotification] = {}
+        self._of_services: dict[str, tuple[ActiveNotification, Callable[[int], None]]] = {}
         self._count = 0
-        self.failed: Callable[[Standing, str], None] = lambda _standing, _error: None
+        self.failed: Callable[[ActiveNotification, str], None] = lambda _standing, _error: None
         """Told of failures of what stands for others."""
         self.ended: Callable[[str], None] = lambda _session: None
         """Told when nothing stands any more for a session of another container."""
 
     def add(
         self,
-        terms: Terms,
+        terms: TriggerSpec,
         call: Target,
         if_: Target | None,
         when: Target | None,
         owner: Owner,
         existing: list[Record],
-    ) -> Standing:
+    ) -> ActiveNotification:
         """Begin one; services that are there already are told of first.
 
         Raises:
@@ -54,7 +56,7 @@ class Notifier:
                 raise ConfigurationError(where=self._home.name, problem=problem)
             self._count += 1
             name = f"{self._epoch}.{self._count}"
-            standing = Standing(name, terms, call, if_, when, owner, self._home, self._forget, self._failed)
+            standing = ActiveNotification(name, terms, call, if_, when, owner, self._home, self._forget, self._failed)
             self._standing[name] = standing
             for record in existing:
                 standing.add(self._handle(record))
@@ -63,11 +65,11 @@ class Notifier:
                 self._of_services[name] = (standing, again)
         return standing
 
-    def _failed(self, standing: Standing, error: str) -> None:
+    def _failed(self, standing: ActiveNotification, error: str) -> None:
         if standing.owner.identity:
             self.failed(standing, error)
 
-    def _forget(self, standing: Standing) -> None:
+    def _forget(self, standing: ActiveNotification) -> None:
         with self._lock:
             self._standing.pop(standing.id, None)
             self._of_services.pop(standing.id, None)
@@ -101,7 +103,7 @@ class Notifier:
             standing.cancel()
         self.tidy(session)
 
-    def get(self, name: str) -> Standing | None:
+    def get(self, name: str) -> ActiveNotification | None:
         return self._standing.get(name)
 
     def infos(self) -> list[NotificationInfo]:
@@ -118,7 +120,7 @@ class Notifier:
             one.cancel()
 
 
-def _concerned(standing: Standing, change: Change) -> list[Record]:
+def _concerned(standing: ActiveNotification, change: Change) -> list[Record]:
     match standing.terms.occasion:
         case "joined":
             return [record for record in change.joined if standing.concerns(record)]

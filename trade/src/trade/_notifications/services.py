@@ -9,19 +9,19 @@ from typing import Protocol
 from trade._calls.handle import Handle
 from trade._context.call_context import served_call
 from trade._context.sessions import Session
-from trade._notifications.notification import Notification, NotificationInfo, Owner, Standing
+from trade._notifications.notification import ActiveNotification, Notification, NotificationInfo, Owner
 from trade._notifications.notifier import Notifier
-from trade._notifications.triggers import OF_SERVICES, Deed, Terms
+from trade._notifications.triggers import OF_SERVICES, Action, TriggerSpec
 from trade._protocol.keys import DOMAIN, PROVIDER, Address, ServiceKey
 from trade._registry.registry import Record, Registry
-from trade._security.authorizer import Access
+from trade._security.authorizer import Authorizer
 from trade._services.decorator import service
 from trade.errors import CallerError, CallError, NoSuchNotification
 
 _logger = logging.getLogger("trade")
 
 
-class Home(Protocol):
+class NotificationServicesHost(Protocol):
     """The container they belong to."""
 
     @property
@@ -58,7 +58,9 @@ class Guests:
 class NotificationServices:
     """The wire's side of a `Notifier`."""
 
-    def __init__(self, notifier: Notifier, registry: Registry, home: Home, access: Access) -> None:
+    def __init__(
+        self, notifier: Notifier, registry: Registry, home: NotificationServicesHost, access: Authorizer
+    ) -> None:
         self._notifier = notifier
         self._records = registry
         self._home = home
@@ -68,7 +70,7 @@ class NotificationServices:
         notifier.ended = self._guests.leave
 
     @service
-    def notify(self, terms: Terms, call: Deed, if_: Deed | None = None, when: Deed | None = None) -> str:
+    def notify(self, terms: TriggerSpec, call: Action, if_: Action | None = None, when: Action | None = None) -> str:
         """Make that call on that occasion, for who asks, who must be allowed to make it then; its id."""
         asked = served_call()
         owner = Owner(asked.session, asked.caller, self._guests.of(asked.session))
@@ -105,13 +107,13 @@ class NotificationServices:
             "the call of %s (%s), asked for here, failed at %s: %s", notification, text, served_call().caller, error
         )
 
-    def _mine_or_administered(self, notification: str) -> Standing | None:
+    def _mine_or_administered(self, notification: str) -> ActiveNotification | None:
         standing, asked = self._notifier.get(notification), served_call()
         if standing is not None and (standing.owner.identity or self._home.address.identity) != asked.caller:
             self._rights.require(asked.caller, "administer", DOMAIN, f"notification {notification}")
         return standing
 
-    def _tell_owner(self, standing: Standing, error: str) -> None:
+    def _tell_owner(self, standing: ActiveNotification, error: str) -> None:
         owner = Address(*standing.owner.session.split("/")[:3])
         with contextlib.suppress(CallerError, CallError):  # it has gone
             told = self._home.handle(ServiceKey(owner, DOMAIN, PROVIDER, "notification_failed"))
@@ -121,14 +123,14 @@ class NotificationServices:
 def placed(
     notifier: Notifier,
     registry: Registry,
-    terms: Terms,
-    call: Deed | Callable[..., object],
-    if_: Deed | Callable[..., object] | None,
-    when: Deed | Callable[..., object] | None,
+    terms: TriggerSpec,
+    call: Action | Callable[..., object],
+    if_: Action | Callable[..., object] | None,
+    when: Action | Callable[..., object] | None,
     owner: Owner,
-) -> Standing:
+) -> ActiveNotification:
     """Begin one, such that no change of the registry is missed or told of twice."""
-    made: list[Standing] = []
+    made: list[ActiveNotification] = []
 
     def add() -> None:
         existing: list[Record] = []
@@ -143,7 +145,7 @@ def placed(
 class Hosted(Notification):
     """One that lives in another container."""
 
-    def __init__(self, name: str, terms: Terms, host: Address, handle: Callable[[ServiceKey], Handle]) -> None:
+    def __init__(self, name: str, terms: TriggerSpec, host: Address, handle: Callable[[ServiceKey], Handle]) -> None:
         super().__init__(name, f"{terms}, in {host.container}")
         self._host = host
         self._handle = handle

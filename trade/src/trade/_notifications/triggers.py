@@ -12,7 +12,7 @@ from trade._calls.handle import Bound, Handle
 from trade._registry.constraints import Constraint
 from trade.errors import ConfigurationError
 
-Occasion = Literal["joined", "left", "changed", "once", "after", "at", "every"]
+Trigger = Literal["joined", "left", "changed", "once", "after", "at", "every"]
 OF_SERVICES: Final = frozenset({"joined", "left", "changed"})
 
 SHORTEST_S: Final = 0.001
@@ -21,7 +21,7 @@ _YEAR_10000_S: Final = 253_402_300_800
 LONGEST_S: Final = 10 * 366 * 86_400.0
 
 
-class Deed(Struct, frozen=True):
+class Action(Struct, frozen=True):
     """A call that can be sent: of a service, or of the only one that matches when the time has come."""
 
     handle: Handle | None = None
@@ -38,13 +38,13 @@ class Deed(Struct, frozen=True):
 
 What = Callable[..., Any] | Handle | Bound | Constraint
 """What may be called: a service, a bound call, the only service that matches, or a function of this process."""
-Target = Deed | Callable[..., Any]
+Target = Action | Callable[..., Any]
 
 
-class Terms(Struct, frozen=True, kw_only=True):
+class TriggerSpec(Struct, frozen=True, kw_only=True):
     """The occasion."""
 
-    occasion: Occasion
+    occasion: Trigger
     constraint: Constraint | None = None
     """Which services, of joined, left, changed."""
     existing: bool = False
@@ -116,11 +116,11 @@ def target_of(what: What, where: str, argument: str, given: int) -> Target:
         ConfigurationError: it cannot be called, or not with so many values.
     """
     if isinstance(what, Handle):
-        return Deed(handle=what)
+        return Action(handle=what)
     if isinstance(what, Bound):
-        return Deed(handle=what.handle, args=what.args, kwargs=dict(what.kwargs))
+        return Action(handle=what.handle, args=what.args, kwargs=dict(what.kwargs))
     if isinstance(what, Constraint):
-        return Deed(constraint=what)
+        return Action(constraint=what)
     if callable(what):
         _check_takes(what, where, argument, given)
         return what
@@ -141,9 +141,9 @@ def _check_takes(function: Callable[..., Any], where: str, argument: str, given:
         raise ConfigurationError(where=where, problem=problem) from None
 
 
-def deed_of(target: Target, host: str, where: str) -> Deed:
+def deed_of(target: Target, host: str, where: str) -> Action:
     """The same for another container. Raises ConfigurationError: that one cannot call a function of this process."""
-    if isinstance(target, Deed):
+    if isinstance(target, Action):
         return target
     problem = (
         f"{host} cannot call {target!r}, a function of this process; "
@@ -154,7 +154,7 @@ def deed_of(target: Target, host: str, where: str) -> Deed:
 
 def text_of(target: Target) -> str:
     """For people. An object of the middleware's own says of its methods what they are, as ``told_as``."""
-    if isinstance(target, Deed):
+    if isinstance(target, Action):
         return str(target)
     told_as: str = getattr(getattr(target, "__self__", None), "told_as", "")
     if told_as:

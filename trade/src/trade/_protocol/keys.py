@@ -12,7 +12,7 @@ DOMAIN: Final = "trade"
 """The domain of the middleware's own functions."""
 PROVIDER: Final = "system"
 """The provider of all of them but e-stops."""
-ESTOPS: Final = "estops"
+ESTOP_PROVIDER: Final = "estops"
 """The provider of what has to do with e-stops, in the same domain."""
 CLOCK: Final = "clock"
 GROUP: Final = re.compile(r"[A-Za-z0-9_-]{1,80}(\.[A-Za-z0-9_-]{1,80})*")

@@ -10,8 +10,8 @@ from trade._protocol.keys import Address, ServiceKey
 from trade._protocol.messages import HEALTHY, PROTOCOL, Estop, ProviderInfo, Scalar, ServiceInfo
 from trade._registry.constraints import Constraint
 from trade._registry.index import Index
-from trade._registry.revision_tracker import Heard
-from trade._threads.condition import Bell
+from trade._registry.revision_tracker import RevisionTracker
+from trade._threads.condition import InterruptibleCondition
 from trade.errors import ServiceGone
 
 __all__ = ["ContainerState", "Record", "Registry"]
@@ -84,7 +84,7 @@ class ContainerState:
     """By name."""
     removed: dict[str, str] = field(default_factory=dict)
     """Deregistered, in this order, and where they moved, if they did: a name is never used twice in one boot."""
-    heard: Heard = field(default_factory=Heard)
+    heard: RevisionTracker = field(default_factory=RevisionTracker)
     protocol: int = 0
     """The version that it speaks; 0 before it has said anything. If it is not ours, it has no providers here."""
     estops: dict[str, tuple[Estop, ...]] = field(default_factory=dict)
@@ -137,7 +137,7 @@ class Registry:
         self._containers: dict[Address, ContainerState] = {}
         self._records: Index[Record] = Index()
         self._lock = threading.RLock()
-        self._bell = Bell()
+        self._bell = InterruptibleCondition()
         self._telling = threading.RLock()
         self._listeners: list[Callable[[Change], None]] = []
         self.appear(own)
@@ -189,7 +189,7 @@ class Registry:
             if state is None or state.protocol == version:
                 return False
             state.protocol = version
-            self._bell.ring()
+            self._bell.notify_all()
             return True
 
     def tells_open(self, address: Address, domain: str, provider: str, estops: tuple[Estop, ...]) -> bool:
@@ -201,7 +201,7 @@ class Registry:
             if state is None or (provider not in state.estops and len(state.estops) >= _MOST_PROVIDERS):
                 return False
             state.estops[provider] = estops
-            self._bell.ring()
+            self._bell.notify_all()
             return True
 
     def settle(self, state: ContainerState, revision: int, offered: Mapping[str, tuple[str, ProviderInfo]]) -> None:
@@ -218,7 +218,7 @@ class Registry:
                 state.protocol = PROTOCOL
                 state.heard.all_told(revision)
                 change = self._change(state, offered, gone)
-                self._bell.ring()
+                self._bell.notify_all()
             self._tell(change)
 
     def appear(self, address: Address) -> bool:
@@ -227,7 +227,7 @@ class Registry:
             if address in self._containers or not self._has_room_for(address):
                 return False
             self._containers[address] = ContainerState(address)
-            self._bell.ring()
+            self._bell.notify_all()
             return True
 
     def _has_room_for(self, address: Address) -> bool:
@@ -271,7 +271,7 @@ class Registry:
             after += made
         return self._swap(before, after)
 
-    def judge_anew(self) -> None:
+    def recheck_access(self) -> None:
         """Who may offer what has changed: what may no longer be offered leaves, what now may be joins."""
         with self._telling:
             with self._lock:
@@ -316,7 +316,7 @@ class Registry:
         for key in old:
             if key not in new:
                 self._records.remove(key)
-        self._bell.ring()
+        self._bell.notify_all()
         return Change(
             joined=[new[key] for key in new if key not in old],
             left=[old[key] for key in old if key not in new],

@@ -1,9 +1,9 @@
 """Whether anything that a container announced was missed: its revisions, as they are heard and as it answers."""
 
-__all__ = ["Heard"]
+__all__ = ["RevisionTracker"]
 
 
-class Heard:
+class RevisionTracker:
     """What is heard of one container comes in two ways: announcements one by one, and answers that tell all at once.
 
     Nothing is missing if the newest answer reaches up to where the unbroken run of announcements begins.

@@ -6,7 +6,7 @@ from trade._protocol.messages import Token
 from trade._resources.resource import Holder
 
 
-class Terms(Struct, frozen=True):
+class LockRequest(Struct, frozen=True):
     """How somebody wants a lock."""
 
     purpose: str = ""

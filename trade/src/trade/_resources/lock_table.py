@@ -18,7 +18,7 @@ from trade._context.sessions import foreign
 from trade._protocol.messages import Token
 from trade._resources.grants import Grant, Waiter, withheld
 from trade._resources.leases import Leases
-from trade._resources.lock_request import Granted, LockInfo, Terms
+from trade._resources.lock_request import Granted, LockInfo, LockRequest
 from trade._resources.resource import Holder, Latch, Resource, locked, not_stopped
 from trade.errors import LockedByOther, NotStopped, ServiceGone, SessionEnded, TradeError
 
@@ -144,7 +144,7 @@ class LockTable:
         self,
         names: Sequence[str],
         holder: Holder,
-        terms: Terms,
+        terms: LockRequest,
         tokens: Iterable[Token] = (),
         calls: Iterable[int] = (),
     ) -> Granted:
@@ -180,7 +180,7 @@ class LockTable:
             finally:
                 self._acquiring.remove(waiter)
 
-    def _empty_and_grant(self, waiter: Waiter, terms: Terms, asked: float) -> Granted:
+    def _empty_and_grant(self, waiter: Waiter, terms: LockRequest, asked: float) -> Granted:
         try:
             self._drain(waiter, asked + terms.wait_s)
             return self._grant(waiter, terms, asked)
@@ -243,7 +243,7 @@ class LockTable:
                 return resource
         return None
 
-    def _grant(self, waiter: Waiter, terms: Terms, asked: float) -> Granted:
+    def _grant(self, waiter: Waiter, terms: LockRequest, asked: float) -> Granted:
         if waiter.gone:
             raise ServiceGone(service=", ".join(one.name for one in waiter.resources), reason=waiter.gone)
         self._count += 1

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Final
 
-from trade._protocol.keys import DOMAIN, ESTOPS, PROVIDER, domain_of
+from trade._protocol.keys import DOMAIN, ESTOP_PROVIDER, PROVIDER, domain_of
 from trade._security.policy import Decision, Policy
 from trade._security.policy_file import Seen, look_at, policy_files, read_policy
 from trade.errors import AccessDenied
@@ -73,7 +73,7 @@ SOME_HAVE: Final = {
 }
 """Likewise, of functions that only a container has which looks after others."""
 _ALL_FUNCTIONS: Final = {**FUNCTIONS, **SOME_HAVE}
-_OF_EVERYBODY: Final = (PROVIDER, ESTOPS, "supervisor")
+_OF_EVERYBODY: Final = (PROVIDER, ESTOP_PROVIDER, "supervisor")
 """The providers of these functions: who offers them needs no right, as whoever calls them is asked for one."""
 
 _NEEDS: Final = {"read": "read", "note": "call", "actuate": "call", "stop": _ALL}
@@ -91,7 +91,7 @@ def decide_call(policy: Policy, who: str, domain: str, name: str, effect: str) -
     return (verb, policy.decide(who, verb, domain)) if verb else ("call", policy.authenticated(who))
 
 
-class Access:
+class Authorizer:
     """The policy a container goes by; without one everybody may do everything."""
 
     def __init__(self, path: Path | None = None, *, certified: bool = False) -> None:

@@ -15,7 +15,7 @@ _LOOK_S: Final = 600.0
 """A computer that slept finds out by then what time it is."""
 
 
-class Ending:
+class ExpiryWatch:
     """Warns until it is closed."""
 
     def __init__(self, certificate: Certificate) -> None:

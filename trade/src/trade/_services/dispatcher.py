@@ -14,7 +14,7 @@ import msgspec
 from msgspec import Raw
 
 from trade._audit.events import Audit
-from trade._context.active_calls import Answer, Herald, Once, Ongoing, cancelled, end_calls
+from trade._context.active_calls import ActiveCall, Answer, CallDeduplicator, ProgressReporter, cancelled, end_calls
 from trade._context.call_context import CallContext, outer_of
 from trade._context.sessions import foreign
 from trade._protocol.keys import DOMAIN, PROVIDER, Address, calls_to, is_chunk, reply_key
@@ -32,11 +32,11 @@ from trade._protocol.messages import (
     encode_message,
 )
 from trade._protocol.remote_errors import pack_error
-from trade._security.authorizer import Access
+from trade._security.authorizer import Authorizer
 from trade._services.event_loop import AsyncLoop
 from trade._services.local_service import LocalService
-from trade._services.serial_queue import Serial
-from trade._threads.channel_workers import Crew
+from trade._services.serial_queue import SerialQueue
+from trade._threads.channel_workers import WorkerPool
 from trade._transport.base import ChannelClosed, Message, Publisher, Transport
 from trade.errors import (
     AccessDenied,
@@ -78,7 +78,7 @@ class Dispatcher:
         own: Address,
         lookup: Lookup,
         loop: AsyncLoop,
-        access: Access,
+        access: Authorizer,
         audit: Audit,
         callers: Sequence[str] = (),
     ) -> None:
@@ -93,12 +93,12 @@ class Dispatcher:
         self._lock = threading.Lock()
         self._leaving = False
         self._closed = False
-        self._once = Once()
-        self._herald = Herald(self._send_progress)
+        self._once = CallDeduplicator()
+        self._herald = ProgressReporter(self._send_progress)
         self.malformed = 0
         self.callers = set[str]()
         """Who is heard by channels of its own; nobody: all are heard by the same."""
-        self._crews: list[Crew] = []
+        self._crews: list[WorkerPool] = []
         if callers:
             self.hear(callers)
         else:
@@ -121,7 +121,7 @@ class Dispatcher:
         for name, stop, refuse in (("trade-call", False, self._busy), ("trade-stop", True, self._serve)):
             pattern = calls_to(self._own, stop=stop, caller=caller)
             channel = self._transport.subscribe(pattern, newest=0 if caller == ANYBODY else _MOST_WAITING)
-            self._crews.append(Crew(name, channel, self._serve, refuse))
+            self._crews.append(WorkerPool(name, channel, self._serve, refuse))
 
     @property
     def draining(self) -> bool:
@@ -152,7 +152,7 @@ class Dispatcher:
         if urgent:
             self._answer(replier, caller, call, *_run(caller, call, service, None))
             return
-        ongoing = Ongoing(service, caller, call, self._report)
+        ongoing = ActiveCall(service, caller, call, self._report)
         first = self._once.begin(call, ongoing)
         if first is not ongoing or ongoing.answer is not None:
             self._again(first, replier, caller, call)
@@ -174,7 +174,7 @@ class Dispatcher:
             service.admitted[caller] = policy
         return denied
 
-    def _perform(self, ongoing: Ongoing, service: LocalService, replier: Publisher, call: Call) -> None:
+    def _perform(self, ongoing: ActiveCall, service: LocalService, replier: Publisher, call: Call) -> None:
         if service.too_late(call.expires_ns):
             answer: Answer = (Status.EXPIRED, EMPTY)
             self._note(service.label, DeadlineExceeded(service=service.label, deadline_s=0.0), ongoing.caller, call)
@@ -184,7 +184,7 @@ class Dispatcher:
             answer = _run(ongoing.caller, call, service, ongoing)
         self._end(ongoing, service, replier, call, answer)
 
-    def _end(self, ongoing: Ongoing, service: LocalService, replier: Publisher, call: Call, answer: Answer) -> None:
+    def _end(self, ongoing: ActiveCall, service: LocalService, replier: Publisher, call: Call, answer: Answer) -> None:
         if ongoing.said is not None:
             self._herald.send(ongoing)
         also = self._once.end(ongoing, call, answer, keep=service.effect != "read")
@@ -192,7 +192,9 @@ class Dispatcher:
         for again in also or ():
             self._answer(self._replier(ongoing.caller, again.reply), ongoing.caller, again, *answer)
 
-    def _queue(self, serial: Serial, ongoing: Ongoing, service: LocalService, replier: Publisher, call: Call) -> None:
+    def _queue(
+        self, serial: SerialQueue, ongoing: ActiveCall, service: LocalService, replier: Publisher, call: Call
+    ) -> None:
         def begin() -> None:
             if not self._leaving:
                 with serial.held():
@@ -210,7 +212,7 @@ class Dispatcher:
 
     # --- calls that came before, and calls about calls
 
-    def _again(self, first: Ongoing, replier: Publisher, caller: str, call: Call) -> None:
+    def _again(self, first: ActiveCall, replier: Publisher, caller: str, call: Call) -> None:
         """It runs or has run: it gets that answer, and never runs again."""
         answer = self._once.attach(first, call)
         if answer is not None:
@@ -232,12 +234,12 @@ class Dispatcher:
         self._once.cancel(caller, asked.id, asked.service, asked.keep_s)
         return Status.OK, EMPTY
 
-    def _report(self, ongoing: Ongoing, value: Any) -> None:
+    def _report(self, ongoing: ActiveCall, value: Any) -> None:
         if ongoing.service is not None:
             service = ongoing.service
             self._herald.tell(ongoing, Raw(service.signature.encode_progress(service.label, value)))
 
-    def _send_progress(self, ongoing: Ongoing, body: Raw) -> None:
+    def _send_progress(self, ongoing: ActiveCall, body: Raw) -> None:
         call = ongoing.call
         if call is None:  # it has ended
             return
@@ -339,7 +341,7 @@ class Dispatcher:
             replier.close()
 
 
-def _run(caller: str, call: Call, service: LocalService, ongoing: Ongoing | None) -> Answer:
+def _run(caller: str, call: Call, service: LocalService, ongoing: ActiveCall | None) -> Answer:
     expires = None if service.effect == "stop" else call.expires_ns
     context = CallContext(call.id, service.label, caller, call.session, expires, call.chain, ongoing, call.behalf)
     try:

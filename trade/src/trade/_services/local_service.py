@@ -18,7 +18,7 @@ from trade._resources.resource import Resource, admitted
 from trade._security.policy import Policy
 from trade._services.decorator import ServiceMark
 from trade._services.event_loop import AsyncLoop
-from trade._services.serial_queue import Serial
+from trade._services.serial_queue import SerialQueue
 from trade._services.signature import Signature
 from trade.errors import TradeError
 
@@ -54,7 +54,7 @@ class LocalService:
         method: Callable[..., Any],
         mark: ServiceMark,
         loop: AsyncLoop,
-        serial: Serial | None,
+        serial: SerialQueue | None,
         resources: tuple[Resource, ...] = (),
     ) -> None:
         self.label = label

@@ -18,13 +18,13 @@ from trade._registry.constraints import checked_meta
 from trade._registry.registry import Registry, gone_to
 from trade._resources.lock_table import LockTable
 from trade._resources.resource import Resource
-from trade._security.authorizer import Access
+from trade._security.authorizer import Authorizer
 from trade._services.decorator import ServiceMark, kinds_of, marked_methods
 from trade._services.event_loop import AsyncLoop
 from trade._services.local_service import LocalService
 from trade._services.offerable import require_stop
 from trade._services.registration import Built, Offer, Registered
-from trade._services.serial_queue import Serial
+from trade._services.serial_queue import SerialQueue
 from trade._services.signature import Signature
 from trade.errors import ConfigurationError
 
@@ -44,7 +44,7 @@ class Providers:
         codec: Codec,
         loop: AsyncLoop,
         table: LockTable,
-        access: Access,
+        access: Authorizer,
         audit: Audit,
     ) -> None:
         self._audit = audit
@@ -335,7 +335,7 @@ class Providers:
             raise ConfigurationError(where=kind, problem=problem)
         resources = cast("tuple[Resource | str, ...]", tuple(getattr(provider, "resources", ())))
         require_stop(kind, resources, [mark for mark, _ in marked.values()])
-        serial = Serial()
+        serial = SerialQueue()
         services: dict[str, LocalService] = {}
         for name, (mark, function) in marked.items():
             label = f"{groups[0] if groups else kind}.{name}"

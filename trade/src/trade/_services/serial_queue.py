@@ -25,10 +25,10 @@ class Turn:
         self.dropped = False
 
 
-_held: "ContextVar[tuple[Serial, ...]]" = ContextVar("trade_serial", default=())
+_held: "ContextVar[tuple[SerialQueue, ...]]" = ContextVar("trade_serial", default=())
 
 
-class Serial:
+class SerialQueue:
     """The serial services of one provider, in order of arrival.
 
     Whoever finds it free runs its own call and then what has queued up meanwhile. Calls from this process run on their

@@ -6,7 +6,7 @@ from typing import Protocol
 
 from msgspec import Struct
 
-from trade._calls.handle import Handle, Home
+from trade._calls.handle import CallHost, Handle
 from trade._estop.controller import is_stop
 from trade._registry.constraints import where
 from trade._registry.registry import Record, Registry
@@ -42,7 +42,7 @@ def stops_of(registry: Registry, group: str) -> list[Record]:
     return [record for record in found if is_stop(record)]
 
 
-def stop_group(home: Home, records: Iterable[Record], group: str, limit_s: float) -> StopReport:
+def stop_group(home: CallHost, records: Iterable[Record], group: str, limit_s: float) -> StopReport:
     """Call these stop services, all at once, and wait for them.
 
     Args:

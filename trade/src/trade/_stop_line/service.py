@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Final
 
 from trade._audit.events import Audit
-from trade._estop.controller import Estopping
+from trade._estop.controller import EstopController
 from trade._protocol.keys import Address
 from trade._protocol.messages import Malformed
-from trade._security.authorizer import Access
+from trade._security.authorizer import Authorizer
 from trade._security.certificates import Certificate, line_context
 from trade._settings import Settings
 from trade._stop_line.group_stop import StopReport
@@ -47,9 +47,9 @@ class StopLineService:
         self,
         own: Address,
         settings: Settings,
-        access: Access,
+        access: Authorizer,
         audit: Audit,
-        estopping: Estopping,
+        estopping: EstopController,
         stop: Callable[[str, float], StopReport],
     ) -> None:
         self._own = own

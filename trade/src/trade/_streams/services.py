@@ -7,7 +7,7 @@ from msgspec import Meta
 from trade._calls.handle import Handle
 from trade._context.call_context import served_call
 from trade._services.decorator import service
-from trade._streams.source import LEAST_HZ, MOST_HZ, Streams, Wish
+from trade._streams.source import LEAST_HZ, MOST_HZ, RateRequest, Streams
 
 Hz = Annotated[float, Meta(ge=LEAST_HZ, le=MOST_HZ)]
 
@@ -25,7 +25,7 @@ class StreamServices:
         ``name`` is the listener's own; the samples are put on the key of the stream.
         """
         asked = served_call()
-        self._streams.listen(service, (asked.session, name), Wish(asked.caller, hz, on_change))
+        self._streams.listen(service, (asked.session, name), RateRequest(asked.caller, hz, on_change))
 
     @service(effect="read")
     def unlisten(self, name: str) -> None:

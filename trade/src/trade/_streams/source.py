@@ -21,7 +21,7 @@ from trade._registry.registry import Change
 from trade._services.local_service import LocalService
 from trade._services.serial_queue import Turn
 from trade._streams.pace import Pace
-from trade._threads.scheduler import Clockwork
+from trade._threads.scheduler import Scheduler
 from trade._transport.base import ChannelClosed, Publisher, Transport
 from trade.errors import AccessDenied, ConfigurationError, DeadlineExceeded, ServiceGone
 
@@ -44,7 +44,7 @@ Listener = tuple[str, str]
 """Session and name."""
 
 
-class Home(Protocol):
+class StreamHost(Protocol):
     """What streams need of their container."""
 
     @property
@@ -55,7 +55,7 @@ class Home(Protocol):
     def require_call(self, who: str, handle: Handle) -> None: ...
 
 
-class Wish(Struct, frozen=True):
+class RateRequest(Struct, frozen=True):
     """What one listener would like to have."""
 
     identity: str
@@ -65,7 +65,7 @@ class Wish(Struct, frozen=True):
     """When its lease ends."""
 
 
-class Wished(NamedTuple):
+class ActiveRate(NamedTuple):
     """What all who want the same rate would like to have."""
 
     always: bool
@@ -90,7 +90,7 @@ class _Rate:
         self._put: tuple[bool, bytes] | None = None
         self._put_ns = 0
 
-    def offer(self, answer: tuple[bool, bytes], at: float, at_ns: int, wished: Wished, every_ns: int) -> None:
+    def offer(self, answer: tuple[bool, bytes], at: float, at_ns: int, wished: ActiveRate, every_ns: int) -> None:
         """Put it, unless that would be too soon, or nothing new to those who want changes only.
 
         Args:
@@ -130,7 +130,7 @@ class Source:
         self._new_id = new_id
         self._shown = ExitStack()
         self._lock = threading.Lock()
-        self._wishes: dict[Listener, Wish] = {}
+        self._wishes: dict[Listener, RateRequest] = {}
         self._new: set[float] = set()
         """Rates at which somebody wants a sample at once."""
         self._rates: dict[float, _Rate] = {}
@@ -142,7 +142,7 @@ class Source:
         for hz in STEPS_HZ:
             self._shown.callback(self._transport.appear(stream_key(self._key, hz)).close)
 
-    def wish(self, listener: Listener, wish: Wish) -> bool:
+    def wish(self, listener: Listener, wish: RateRequest) -> bool:
         """Somebody listens from now on, or still does; whether it is another wish than before.
 
         Raises:
@@ -163,7 +163,7 @@ class Source:
                 self._new.add(wish.hz)
             return new
 
-    def drop(self, which: Callable[[Listener, Wish], bool]) -> None:
+    def drop(self, which: Callable[[Listener, RateRequest], bool]) -> None:
         """Those listen no more."""
         with self._lock:
             self._wishes = {who: wish for who, wish in self._wishes.items() if not which(who, wish)}
@@ -192,14 +192,14 @@ class Source:
             return None
         return self._after(now, every_ns)
 
-    def _wished(self) -> dict[float, Wished]:
+    def _wished(self) -> dict[float, ActiveRate]:
         """By rate."""
         with self._lock:
             new, self._new = self._new, set[float]()
             always = {wish.hz for wish in self._wishes.values() if not wish.on_change}
-            return {wish.hz: Wished(wish.hz in always, wish.hz in new) for wish in self._wishes.values()}
+            return {wish.hz: ActiveRate(wish.hz in always, wish.hz in new) for wish in self._wishes.values()}
 
-    def _keep_only(self, wished: dict[float, Wished]) -> None:
+    def _keep_only(self, wished: dict[float, ActiveRate]) -> None:
         """Put at these rates, and at no others any more."""
         for hz in [hz for hz in self._rates if hz not in wished]:
             self._rates.pop(hz).close()
@@ -254,10 +254,10 @@ class Streams:
 
     def __init__(
         self,
-        home: Home,
+        home: StreamHost,
         transport: Transport,
         services: Callable[[ServiceKey], LocalService | None],
-        clockwork: Clockwork,
+        clockwork: Scheduler,
         new_id: Callable[[], int],
     ) -> None:
         self._home = home
@@ -268,7 +268,7 @@ class Streams:
         self._lock = threading.Lock()
         self._sources: dict[ServiceKey, tuple[Source, Callable[[int], None]]] = {}
 
-    def listen(self, handle: Handle, listener: Listener, wish: Wish) -> None:
+    def listen(self, handle: Handle, listener: Listener, wish: RateRequest) -> None:
         """Sample a service of this container for somebody from now on, for as long as the lease.
 
         Raises:
@@ -312,7 +312,7 @@ class Streams:
         """Nobody of it is there any more."""
         self._drop(lambda who, _wish: who[0] == session)
 
-    def judge_anew(self) -> None:
+    def recheck_access(self) -> None:
         """Who may read what has changed: those who may no longer are dropped, and refused when they ask again."""
         with self._lock:
             sources = list(self._sources.items())
@@ -327,7 +327,7 @@ class Streams:
             return True
         return False
 
-    def _drop(self, which: Callable[[Listener, Wish], bool]) -> None:
+    def _drop(self, which: Callable[[Listener, RateRequest], bool]) -> None:
         with self._lock:
             sources = list(self._sources.values())
         for source, _ in sources:

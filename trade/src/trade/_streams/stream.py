@@ -14,7 +14,7 @@ from trade._context.sessions import Session
 from trade._protocol.messages import UNREADABLE, ErrorInfo
 from trade._protocol.remote_errors import unpack_error
 from trade._protocol.samples import Sample, StreamSample
-from trade._threads.condition import Bell
+from trade._threads.condition import InterruptibleCondition
 from trade.errors import ConfigurationError, InvalidResult, SessionEnded
 
 __all__ = ["Stream"]
@@ -74,7 +74,7 @@ class Stream:
         self._latest: Sample | BaseException | None = None
         self._end: BaseException | None = None
         self._closed = False
-        self._bell = Bell()
+        self._bell = InterruptibleCondition()
         self._told_of_more: set[Callable[[], None]] = set()
 
     # --- taking
@@ -269,6 +269,6 @@ class Stream:
         self._ring()
 
     def _ring(self) -> None:
-        self._bell.ring()
+        self._bell.notify_all()
         for tell in list(self._told_of_more):
             tell()

@@ -21,9 +21,9 @@ from trade._protocol.keys import DOMAIN, PROVIDER, ServiceKey
 from trade._protocol.messages import Malformed
 from trade._protocol.samples import STEPS_HZ, decode_sample, rate_of, signs_of, stream_key
 from trade._registry.registry import Change
-from trade._streams.source import Home
+from trade._streams.source import StreamHost
 from trade._streams.stream import If, Stream
-from trade._threads.scheduler import Clockwork
+from trade._threads.scheduler import Scheduler
 from trade._transport.base import Channel, ChannelClosed, Transport
 from trade.errors import AccessDenied, ServiceGone, SessionEnded, SourceLost, TradeError
 
@@ -37,16 +37,16 @@ _RING: Final = 64
 """So many messages at least are kept while a whole process stands still."""
 
 
-class _Ear:
+class _Subscription:
     """One stream's subscription, and its word to the source."""
 
     def __init__(
         self,
-        home: Home,
+        home: StreamHost,
         stream: Stream,
         transport: Transport,
         keep: int,
-        clockwork: Clockwork,
+        clockwork: Scheduler,
         malformed: Callable[[Malformed], None],
     ) -> None:
         self._home = home
@@ -153,14 +153,14 @@ class _Ear:
             self._thread.join(2)
 
 
-class Listening:
+class Subscriptions:
     """Owns the streams that one container has opened."""
 
     def __init__(
         self,
-        home: Home,
+        home: StreamHost,
         transport: Transport,
-        clockwork: Clockwork,
+        clockwork: Scheduler,
         codec: Codec,
         removed: Callable[[ServiceKey], bool],
     ) -> None:
@@ -171,7 +171,7 @@ class Listening:
         self._removed = removed
         self._numbers = itertools.count(1)
         self._lock = threading.Lock()
-        self._ears: dict[str, tuple[Stream, _Ear]] = {}
+        self._ears: dict[str, tuple[Stream, _Subscription]] = {}
         self.malformed = 0
         """Samples that were none."""
 
@@ -192,7 +192,7 @@ class Listening:
         )
         try:
             newest = max(keep, _RING)
-            ear = _Ear(self._home, stream, self._transport, newest, self._clockwork, self._note_malformed)
+            ear = _Subscription(self._home, stream, self._transport, newest, self._clockwork, self._note_malformed)
         except ChannelClosed:  # closed by another thread meanwhile
             raise container_closed(self._home.address) from None
         with self._lock:
@@ -243,6 +243,6 @@ class Listening:
         for stream, _ in self._all():
             stream.end(container_closed(self._home.address))
 
-    def _all(self) -> list[tuple[Stream, _Ear]]:
+    def _all(self) -> list[tuple[Stream, _Subscription]]:
         with self._lock:
             return list(self._ears.values())

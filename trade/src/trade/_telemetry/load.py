@@ -9,7 +9,7 @@ from typing import Final
 
 from msgspec import Struct
 
-from trade._threads.channel_workers import Crew
+from trade._threads.channel_workers import WorkerPool
 
 _WINDOW_S: Final = 1.0
 _STATUS: Final = Path("/proc/self/status")
@@ -53,13 +53,13 @@ class _Sample(Struct, frozen=True):
     calls: int
 
 
-class Load:
+class LoadMeter:
     """Measures when it is asked, and costs nothing otherwise."""
 
     def __init__(
         self,
         container: str,
-        crews: Callable[[], Sequence[Crew]],
+        crews: Callable[[], Sequence[WorkerPool]],
         queued: Callable[[], int],
         clock: Callable[[], float] = time.monotonic,
     ) -> None:

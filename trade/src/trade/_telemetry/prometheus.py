@@ -5,7 +5,7 @@ from contextlib import ExitStack
 from itertools import accumulate
 from typing import TYPE_CHECKING, Final
 
-from trade._counters import BOUNDS_S, Calls, Measure
+from trade._counters import BOUNDS_S, CallCounters, Measure
 from trade._settings import Settings
 from trade._transport.bounded_listener import BoundedListener
 from trade._transport.endpoints import Endpoint
@@ -31,7 +31,7 @@ class Metrics:
         measures: everything else.
     """
 
-    def __init__(self, container: str, calls: Calls, measures: Callable[[], Iterable[Measure]]) -> None:
+    def __init__(self, container: str, calls: CallCounters, measures: Callable[[], Iterable[Measure]]) -> None:
         self._container = container
         self._calls = calls
         self._measures = measures
@@ -72,7 +72,7 @@ class Metrics:
 
 
 def open_metrics(
-    settings: Settings, calls: Calls | None, measures: Callable[[], Iterable[Measure]], leaving: ExitStack
+    settings: Settings, calls: CallCounters | None, measures: Callable[[], Iterable[Measure]], leaving: ExitStack
 ) -> int:
     """Serve ``/metrics`` if that is wanted; what ends it goes onto the stack. Returns the port, 0 if it is not.
 

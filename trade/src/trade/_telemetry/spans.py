@@ -156,7 +156,7 @@ class Spans:
         return kept if calls is None else [span for span in kept if not frozenset(span.ids).isdisjoint(calls)]
 
 
-class Recorded:
+class SpanRecorder:
     """What is around a service while it is traced: what was there without that, and a span."""
 
     def __init__(self, spans: Spans, around: Interceptor | None) -> None:

@@ -21,7 +21,7 @@ _MOMENT_S: Final = 0.005
 """A call that takes longer is not quick."""
 
 
-class Crew:
+class WorkerPool:
     """Threads on one channel; at least one of them always waits for the next message."""
 
     def __init__(

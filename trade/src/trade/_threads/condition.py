@@ -10,13 +10,13 @@ import time
 from collections.abc import Callable
 
 
-class Bell:
+class InterruptibleCondition:
     """Rung whenever something has changed; wakes everybody who waits for it."""
 
     def __init__(self) -> None:
         self._gates: set[threading.Lock] = set()
 
-    def ring(self) -> None:
+    def notify_all(self) -> None:
         """Have those who wait look again. From any thread, never waits."""
         for gate in list(self._gates):
             with contextlib.suppress(RuntimeError):  # rung already

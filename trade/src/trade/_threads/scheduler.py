@@ -19,16 +19,16 @@ _IDLE_S: Final = 10.0
 """A thread that had nothing to do for so long ends."""
 _END_S: Final = 2.0
 
-Act = Callable[[], "int | None"]
+Callback = Callable[[], "int | None"]
 """Done when it is due; returns when it is due again (``time.monotonic_ns()``), or None."""
 
 
-class Due:
+class ScheduledTask:
     """Something to be done at its time, and again if it says so; never twice at once."""
 
     __slots__ = ("_act", "_asked_ns", "_clockwork", "_running", "_turn", "cancelled")
 
-    def __init__(self, clockwork: "Clockwork", act: Act) -> None:
+    def __init__(self, clockwork: "Scheduler", act: Callback) -> None:
         self._clockwork = clockwork
         self._act = act
         self._asked_ns: int | None = None
@@ -47,7 +47,7 @@ class Due:
         self.cancelled = True
 
 
-class Clockwork:
+class Scheduler:
     """The queue and its threads, of which there are none until something is due.
 
     Args:
@@ -59,7 +59,7 @@ class Clockwork:
         self._name = name
         self._clock = clock
         self._numbers = itertools.count(1)
-        self._queue: list[tuple[int, int, Due]] = []
+        self._queue: list[tuple[int, int, ScheduledTask]] = []
         self._lock = threading.Lock()
         self._sooner = threading.Condition(self._lock)
         """The leader waits here for the time, or for something that is due before."""
@@ -71,25 +71,25 @@ class Clockwork:
         """A thread was called to lead and has not got there yet."""
         self._closed = False
 
-    def due(self, act: Act) -> Due:
+    def due(self, act: Callback) -> ScheduledTask:
         """Something to be done once it is told when."""
-        return Due(self, act)
+        return ScheduledTask(self, act)
 
-    def begin(self, act: Act, due_ns: int) -> Due:
+    def begin(self, act: Callback, due_ns: int) -> ScheduledTask:
         """Have something done at a time of ``time.monotonic_ns()``; one that has passed means now."""
         due = self.due(act)
         due.at(due_ns)
         return due
 
-    def enter(self, due: Due, due_ns: int) -> None:
-        """What `Due.at` does."""
+    def enter(self, due: ScheduledTask, due_ns: int) -> None:
+        """What `ScheduledTask.at` does."""
         with self._lock:
             if due._running:  # pyright: ignore[reportPrivateUsage] - two halves of one thing
                 due._asked_ns = due_ns  # pyright: ignore[reportPrivateUsage]
             else:
                 self._push(due, due_ns)
 
-    def _push(self, due: Due, due_ns: int) -> None:
+    def _push(self, due: ScheduledTask, due_ns: int) -> None:
         if self._closed or due.cancelled:
             return
         due._turn = next(self._numbers)  # pyright: ignore[reportPrivateUsage]
@@ -122,7 +122,7 @@ class Clockwork:
                 self._do(due)
             self._threads.discard(threading.current_thread())
 
-    def _next(self) -> Due | None:
+    def _next(self) -> ScheduledTask | None:
         """What is due, once it is; None if this thread is not needed. Under the lock, which waiting lets go of."""
         while not self._closed:
             left_ns = self._queue[0][0] - self._clock() if self._queue else None
@@ -147,7 +147,7 @@ class Clockwork:
                     return None
         return None
 
-    def _do(self, due: Due) -> None:
+    def _do(self, due: ScheduledTask) -> None:
         """Do it without the lock, and put it where it belongs next."""
         due._running, due._asked_ns = True, None  # pyright: ignore[reportPrivateUsage]
         self._lock.release()

@@ -20,11 +20,11 @@ _PATIENCE_S: Final = 10.0
 Work = Callable[[], object]
 
 
-class Hands:
+class ThreadPool:
     """As many threads as there is work at once; a few wait for more."""
 
     def __init__(self) -> None:
-        self._idle: list[_Hand] = []
+        self._idle: list[_Worker] = []
         self._closed = False
 
     def begin(self, work: Work, name: str) -> None:
@@ -40,10 +40,10 @@ class Hands:
         try:
             hand = self._idle.pop()
         except IndexError:
-            hand = _Hand(self)
+            hand = _Worker(self)
         hand.give(work, name)
 
-    def rejoin(self, hand: "_Hand") -> bool:
+    def rejoin(self, hand: "_Worker") -> bool:
         """Whether one that has done its work is to wait for more."""
         if self._closed or len(self._idle) >= _MOST_IDLE:
             return False
@@ -52,7 +52,7 @@ class Hands:
             return not self.leave(hand)
         return True
 
-    def leave(self, hand: "_Hand") -> bool:
+    def leave(self, hand: "_Worker") -> bool:
         """Whether one that waits may end; if not, work is on its way to it."""
         try:
             self._idle.remove(hand)
@@ -68,8 +68,8 @@ class Hands:
                 hand.dismiss()
 
 
-class _Hand:
-    def __init__(self, hands: Hands) -> None:
+class _Worker:
+    def __init__(self, hands: ThreadPool) -> None:
         self._hands = hands
         self._work: Work | None = None
         self._given = threading.Lock()

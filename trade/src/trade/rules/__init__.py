@@ -1,24 +1,24 @@
 """Rules that configure a running system, from a TOML file: on this occasion, if this holds, call these services."""
 
 from trade._protocol.schema_types import publish
-from trade.rules._engine import GROUP, Rehearsal, RuleInfo, Rules, rehearse
+from trade.rules._engine import GROUP, DryRun, RuleInfo, Rules, rehearse
 from trade.rules._file import Condition, Occasion, Rule, Selection, Step, read_rules
-from trade.rules._steps import Did, Firing
+from trade.rules._steps import Firing, StepResult
 
 __all__ = [
     "GROUP",
     "Condition",
-    "Did",
+    "DryRun",
     "Firing",
     "Occasion",
-    "Rehearsal",
     "Rule",
     "RuleInfo",
     "Rules",
     "Selection",
     "Step",
+    "StepResult",
     "read_rules",
     "rehearse",
 ]
 
-publish(__name__, Did, Firing, RuleInfo)
+publish(__name__, StepResult, Firing, RuleInfo)

@@ -17,8 +17,8 @@ from trade._notifications.notification import Notification
 from trade._protocol.messages import HEALTHY
 from trade._services.decorator import service
 from trade.rules._file import Rule, read_rules
-from trade.rules._loop_detector import TURNS, Causes, Mark, Way, turns
-from trade.rules._steps import Did, Firing, done, fired, holds
+from trade.rules._loop_detector import TURNS, LoopDetector, Mark, Way, turns
+from trade.rules._steps import Firing, StepResult, done, fired, holds
 
 GROUP: Final = "rules"
 MOST: Final = 5
@@ -54,7 +54,7 @@ class RuleInfo(Struct, frozen=True, kw_only=True):
     dry_run: bool
 
 
-class _Standing:
+class _ActiveRule:
     """One rule at work. Its occasions are told of one after the other."""
 
     def __init__(self, engine: "Rules", name: str, rule: Rule) -> None:
@@ -242,12 +242,12 @@ class Rules:
         """
         self.container: Final = container
         self.dry_run: Final = dry_run
-        self.causes: Final = Causes()
+        self.causes: Final = LoopDetector()
         self._audit = audit
         self._tell = tell
         self._firings: deque[Firing] = deque(maxlen=_KEPT)
         self._numbers = itertools.count(1)
-        self._standing: dict[str, _Standing] = {}
+        self._standing: dict[str, _ActiveRule] = {}
         self._closed = False
         rules = read_rules(file)
         container.register(self, GROUP)
@@ -268,7 +268,7 @@ class Rules:
     def _go_by(self, rules: dict[str, Rule]) -> None:
         old = self._standing
         kept = {name for name, one in old.items() if one.rule == rules.get(name) and not one.why}
-        self._standing = {name: old[name] if name in kept else _Standing(self, name, rules[name]) for name in rules}
+        self._standing = {name: old[name] if name in kept else _ActiveRule(self, name, rules[name]) for name in rules}
         for name in old.keys() - kept:
             old[name].end()
         for name in (name for name in rules if name not in kept):
@@ -322,7 +322,7 @@ class Rules:
         self.close()
 
 
-class Rehearsal(Struct, frozen=True, kw_only=True):
+class DryRun(Struct, frozen=True, kw_only=True):
     """What a rule would do."""
 
     rule: str
@@ -332,15 +332,15 @@ class Rehearsal(Struct, frozen=True, kw_only=True):
     """How things stand."""
     fires: bool
     """Whether it would fire now."""
-    steps: tuple[Did, ...]
+    steps: tuple[StepResult, ...]
 
 
-def rehearse(container: Container, rules: dict[str, Rule]) -> list[Rehearsal]:
+def rehearse(container: Container, rules: dict[str, Rule]) -> list[DryRun]:
     """What the rules would do as things are now, in that container. Reads conditions, and calls nothing else."""
     return [_rehearsed(container, name, rule) for name, rule in rules.items()]
 
 
-def _rehearsed(container: Container, name: str, rule: Rule) -> Rehearsal:
+def _rehearsed(container: Container, name: str, rule: Rule) -> DryRun:
     selection = rule.when.selection
     found = container.services(selection.constraint()) if selection is not None else []
     about = found[0] if found and rule.when.of_services else None
@@ -358,7 +358,7 @@ def _rehearsed(container: Container, name: str, rule: Rule) -> Rehearsal:
         fires = fires and held
     unknown = about is None and (rule.when.of_services or rule.if_ is not None)
     steps = () if unknown else done(container, rule.do, about, dry_run=True)
-    return Rehearsal(
+    return DryRun(
         rule=name,
         occasion=str(rule.when),
         condition="" if rule.if_ is None else f"if {rule.if_}",

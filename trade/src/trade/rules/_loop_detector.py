@@ -35,7 +35,7 @@ class Past:
         self.ended_ns: int | None = None
 
 
-class Causes:
+class LoopDetector:
     """Remembers the latest firings of all rules of an engine."""
 
     def __init__(self) -> None:

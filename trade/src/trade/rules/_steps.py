@@ -16,7 +16,7 @@ from trade.rules._loop_detector import Way
 _LONGEST_RESULT: Final = 200
 
 
-class Home(Protocol):
+class RuleHost(Protocol):
     """What rules need of the container they run in."""
 
     @property
@@ -28,7 +28,7 @@ class Home(Protocol):
     def require_call(self, who: str, handle: Handle) -> None: ...
 
 
-class Did(Struct, frozen=True, kw_only=True):
+class StepResult(Struct, frozen=True, kw_only=True):
     """One step as it was done. Arguments are not repeated: they stand in the file, and may be secret."""
 
     step: str
@@ -50,7 +50,7 @@ class Firing(Struct, frozen=True, kw_only=True):
     at: float
     """Seconds since the epoch."""
     took_s: float = 0.0
-    steps: tuple[Did, ...] = ()
+    steps: tuple[StepResult, ...] = ()
     led_by: tuple[str, ...] = ()
     """Rules that may have brought it about, the first cause first."""
     dry_run: bool = False
@@ -77,13 +77,13 @@ def fired(rule: str, occasion: str, about: Handle | None, way: Way, *, dry_run: 
     )
 
 
-def done(home: Home, steps: Sequence[Step], about: Handle | None, *, dry_run: bool) -> tuple[Did, ...]:
+def done(home: RuleHost, steps: Sequence[Step], about: Handle | None, *, dry_run: bool) -> tuple[StepResult, ...]:
     """Do the steps one after the other, up to one that fails; beyond it only those that are to be done always.
 
     In a dry run each is looked at, and nothing is called.
     """
-    do: Callable[[Home, Step, Handle | None], Did] = _rehearse if dry_run else _do
-    all_done: list[Did] = []
+    do: Callable[[RuleHost, Step, Handle | None], StepResult] = _rehearse if dry_run else _do
+    all_done: list[StepResult] = []
     failed = False
     for step in steps:
         if failed and not step.always:
@@ -91,26 +91,26 @@ def done(home: Home, steps: Sequence[Step], about: Handle | None, *, dry_run: bo
         try:
             did = do(home, step, about)
         except Exception as error:  # noqa: BLE001 - whatever a service raises is noted
-            did, failed = Did(step=str(step), error=f"{type(error).__name__}: {error}"), not dry_run
+            did, failed = StepResult(step=str(step), error=f"{type(error).__name__}: {error}"), not dry_run
         all_done.append(did)
     return tuple(all_done)
 
 
-def _do(home: Home, step: Step, about: Handle | None) -> Did:
+def _do(home: RuleHost, step: Step, about: Handle | None) -> StepResult:
     if step.wait_for is not None:
         found = home.find(step.wait_for.constraint(about), wait_s=step.s)
-        return Did(step=str(step), service=found.label, container=found.container)
+        return StepResult(step=str(step), service=found.label, container=found.container)
     handle = _called(home, step, about)
     result = _call(handle.with_(deadline_s=step.deadline_s), step.args, about)
     text = repr(result)[:_LONGEST_RESULT]
-    return Did(step=str(step), service=handle.label, container=handle.container, result=text)
+    return StepResult(step=str(step), service=handle.label, container=handle.container, result=text)
 
 
-def _rehearse(home: Home, step: Step, about: Handle | None) -> Did:
+def _rehearse(home: RuleHost, step: Step, about: Handle | None) -> StepResult:
     if step.wait_for is not None:
         found = home.services(step.wait_for.constraint(about))
         there = found[0] if found else None
-        return Did(
+        return StepResult(
             step=str(step),
             service=there.label if there else "",
             container=there.container if there else "",
@@ -118,10 +118,10 @@ def _rehearse(home: Home, step: Step, about: Handle | None) -> Did:
         )
     handle = _called(home, step, about)
     home.require_call(home.address.identity, handle)
-    return Did(step=str(step), service=handle.label, container=handle.container, result="would be called")
+    return StepResult(step=str(step), service=handle.label, container=handle.container, result="would be called")
 
 
-def _called(home: Home, step: Step, about: Handle | None) -> Handle:
+def _called(home: RuleHost, step: Step, about: Handle | None) -> Handle:
     if step.call == SERVICE:
         assert about is not None  # noqa: S101 - checked with the file
         return about
@@ -134,7 +134,7 @@ def _call(handle: Handle, args: list[Any] | dict[str, Any], about: Handle | None
     return handle(**given) if isinstance(given, dict) else handle(*given)
 
 
-def holds(home: Home, condition: Condition | None, about: Handle | None) -> tuple[bool, Handle | None]:
+def holds(home: RuleHost, condition: Condition | None, about: Handle | None) -> tuple[bool, Handle | None]:
     """Whether a rule's condition holds now, and which service the steps are about: if the occasion has none, the asked.
 
     Raises what finding and asking the service does.

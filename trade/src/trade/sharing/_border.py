@@ -15,7 +15,7 @@ from msgspec import structs
 from trade._calls.handle import Handle
 from trade._calls.handle_codec import handle_codec
 from trade._container.container import Container
-from trade._container.federating import Bordering, Home, Place, inside, shown
+from trade._container.federating import Exposed, Federating, MemberSystem, inside, shown
 from trade._context.call_context import CallContext, holding, running
 from trade._context.claims import Claim, Selection
 from trade._context.sessions import speaking
@@ -26,10 +26,10 @@ from trade._locks.remote_locks import SharedResource, Wanted
 from trade._protocol.keys import Address, ServiceKey
 from trade._protocol.messages import Behalf, Estop, ProviderInfo
 from trade._registry.registry import Change
-from trade._resources.lock_request import Terms
+from trade._resources.lock_request import LockRequest
 from trade._transport.base import ChannelClosed
 from trade.errors import ConfigurationError, TradeError
-from trade.sharing._guest_sessions import Visitors
+from trade.sharing._guest_sessions import GuestSessions
 
 __all__ = ["SHARED_FROM", "Border"]
 
@@ -63,9 +63,9 @@ class Border:
             problem = "a system shares nothing with itself; name another one"
             raise ConfigurationError(where=f"share with {names[0]}", problem=problem)
         with ExitStack() as leaving:
-            self.out = Passage(ours, theirs, exported)
+            self.out = BorderDirection(ours, theirs, exported)
             leaving.callback(self.out.close)
-            self.back = Passage(theirs, ours, imported)
+            self.back = BorderDirection(theirs, ours, imported)
             leaving.callback(self.back.close)
             self.out.reverse, self.back.reverse = self.back, self.out
             self.out.begin()
@@ -88,22 +88,22 @@ class Border:
         self.close()
 
 
-class Passage:
+class BorderDirection:
     """What is at home in one system and offered in the other one."""
 
-    reverse: "Passage"
+    reverse: "BorderDirection"
 
     def __init__(self, home: Container, abroad: Container, groups: Sequence[str]) -> None:
-        self._home: Bordering = home
-        self._abroad: Bordering = abroad
+        self._home: Federating = home
+        self._abroad: Federating = abroad
         self._groups = tuple(groups)
         self._names = home.settings.system, abroad.settings.system
-        self._visitors = Visitors(abroad, home, self._names[1])
-        self._offered: dict[Place, _Offered] = {}
-        self._origins: dict[Place, Place] = {}
+        self._visitors = GuestSessions(abroad, home, self._names[1])
+        self._offered: dict[Exposed, _Offered] = {}
+        self._origins: dict[Exposed, Exposed] = {}
         """Places abroad -> at home."""
         self._resources: WeakValueDictionary[tuple[Address, str], SharedResource] = WeakValueDictionary()
-        self._refused: dict[Place, str] = {}
+        self._refused: dict[Exposed, str] = {}
         self._codec = handle_codec(self._handle_out, self._handle_in)
         self._changed = threading.Event()
         self._leaving = ExitStack()
@@ -112,8 +112,8 @@ class Passage:
 
     def begin(self) -> None:
         """Offer what is there, and what comes. Returns when what is there is offered."""
-        self._abroad.told_of_ends.append(self._visitors.ended)
-        self._leaving.callback(self._abroad.told_of_ends.remove, self._visitors.ended)
+        self._abroad.session_end_listeners.append(self._visitors.ended)
+        self._leaving.callback(self._abroad.session_end_listeners.remove, self._visitors.ended)
         self._leaving.callback(self._visitors.close)
         self._leaving.callback(self._withdraw_all)
         self._home.registry.listen(self._note)
@@ -163,7 +163,7 @@ class Passage:
                 self._complain(place, str(refused))
         self._refused = {place: why for place, why in self._refused.items() if place in there}
 
-    def _is_shared(self, place: Place, info: ProviderInfo) -> bool:
+    def _is_shared(self, place: Exposed, info: ProviderInfo) -> bool:
         return SHARED_FROM not in info.meta and inside(place.domain, self._groups)
 
     def _told(self, info: ProviderInfo) -> ProviderInfo:
@@ -173,15 +173,17 @@ class Passage:
         groups = shown(info, self._groups)
         return structs.replace(info, groups=groups, members=members, meta=meta, estops=())
 
-    def _offer(self, place: Place, info: ProviderInfo) -> None:
-        home = Home(place, self._home.handle, partial(self._speaking, what=place), self._codec, self._adopt(place))
+    def _offer(self, place: Exposed, info: ProviderInfo) -> None:
+        home = MemberSystem(
+            place, self._home.handle, partial(self._speaking, what=place), self._codec, self._adopt(place)
+        )
         offered = _Offered(info)
         offered.place = self._abroad.pass_on(offered.provider, info, home)
         self._origins[offered.place] = place
         self._offered[place] = offered
         self._refused.pop(place, None)
 
-    def _adopt(self, place: Place) -> Any:
+    def _adopt(self, place: Exposed) -> Any:
         def adopt(here: str, there: str) -> SharedResource:
             key = place.address, here
             found = self._resources.get(key)
@@ -191,7 +193,7 @@ class Passage:
 
         return adopt
 
-    def _withdraw(self, place: Place, offered: "_Offered") -> None:
+    def _withdraw(self, place: Exposed, offered: "_Offered") -> None:
         """First what it moves abroad's clients' way: nobody there could stop it afterwards."""
         del self._offered[place]
         with contextlib.suppress(ConfigurationError, ChannelClosed):  # somebody did it before, or all of it is gone
@@ -199,7 +201,7 @@ class Passage:
         self._visitors.leave(place)
         self._origins.pop(offered.place, None)
 
-    def _complain(self, place: Place, why: str) -> None:
+    def _complain(self, place: Exposed, why: str) -> None:
         if self._refused.get(place) != why:
             self._refused[place] = why
             _logger.error("%s of %s is not shared with %s: %s", place.provider, *self._names, why)
@@ -221,18 +223,18 @@ class Passage:
         return self._home.handle(key)
 
     def _abroad_of(self, key: ServiceKey) -> ServiceKey | None:
-        offered = self._offered.get(Place(key.address, key.domain, key.provider))
+        offered = self._offered.get(Exposed(key.address, key.domain, key.provider))
         return None if offered is None else offered.place.service(key.name)
 
     def home_of(self, key: ServiceKey) -> ServiceKey | None:
         """A service offered abroad, at home."""
-        place = self._origins.get(Place(key.address, key.domain, key.provider))
+        place = self._origins.get(Exposed(key.address, key.domain, key.provider))
         return None if place is None else place.service(key.name)
 
     # --- calls and locks that came abroad, and go on at home
 
     @contextlib.contextmanager
-    def _speaking(self, call: CallContext, what: Place | None) -> Generator[None]:
+    def _speaking(self, call: CallContext, what: Exposed | None) -> Generator[None]:
         """Calls at home are made on behalf of one that came abroad, under the locks it has shown."""
         if call.session == NOBODYS:  # the deadman of our own container: the stop is ours
             sessions, names = [], [str(self._home.address)]
@@ -249,9 +251,11 @@ class Passage:
             after.callback(speaking.reset, speaking.set(sessions[0] if sessions else None))
             yield
 
-    def lock(self, call: CallContext, wanted: Wanted, terms: Terms, on_lost: OnLost, on_request: OnRequest) -> Lock:
+    def lock(
+        self, call: CallContext, wanted: Wanted, terms: LockRequest, on_lost: OnLost, on_request: OnRequest
+    ) -> Lock:
         """Take what is at home for a client from abroad; we renew it as long as the client renews ours."""
-        ours = Terms(purpose=terms.purpose, lease_s=LEASE_S, wait_s=terms.wait_s)
+        ours = LockRequest(purpose=terms.purpose, lease_s=LEASE_S, wait_s=terms.wait_s)
         asked = {address: list(names) for address, names in wanted.items()}
         with self._speaking(call, None):
             return Lock(
@@ -292,7 +296,7 @@ class Passage:
 class _Offered:
     """One provider, as it is offered abroad."""
 
-    place: Place
+    place: Exposed
 
     def __init__(self, info: ProviderInfo) -> None:
         self.info = info

@@ -12,13 +12,13 @@ from trade.errors import Busy, SessionEnded
 MOST: Final = 1024
 
 
-class There(Protocol):
+class RemoteContainer(Protocol):
     """The container that acts for them."""
 
     def open_session(self, client: str, *, system: str = "") -> Session: ...
 
 
-class Here(Protocol):
+class LocalContainer(Protocol):
     """The container they come to."""
 
     def require_present(self, session: str) -> None:
@@ -26,10 +26,10 @@ class Here(Protocol):
         ...
 
 
-class Visitors:
+class GuestSessions:
     """Sessions in another system, ended with those they stand for."""
 
-    def __init__(self, here: Here, there: There, system: str) -> None:
+    def __init__(self, here: LocalContainer, there: RemoteContainer, system: str) -> None:
         self._here = here
         self._there = there
         self._system = system

@@ -3,18 +3,18 @@
 Nothing here needs a test framework; the suites are plain classes with ``test_`` methods, run in a subclass by pytest.
 """
 
-from trade._transport.memory import Clock, Kind, Network, Passage
+from trade._transport.memory import Clock, InFlightMessage, Kind, Network
 from trade.testing._losses import LossConformance, Severable
 from trade.testing._system import MemorySystem, memory_system
 from trade.testing._transports import TransportConformance
 
 __all__ = [
     "Clock",
+    "InFlightMessage",
     "Kind",
     "LossConformance",
     "MemorySystem",
     "Network",
-    "Passage",
     "Severable",
     "TransportConformance",
     "memory_system",

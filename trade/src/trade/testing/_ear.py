@@ -15,7 +15,7 @@ PATIENCE_S: Final = 10.0
 _meetings = itertools.count()
 
 
-class Ear:
+class RecordingListener:
     """Reads a channel on threads of its own, which end when the channel closes."""
 
     def __init__(self, channel: Channel, *, readers: int = 1) -> None:
@@ -75,9 +75,9 @@ class Teller:
                 question.close()
 
 
-def listen(listener: Transport, pattern: str, *, speaker: Transport) -> Ear:
+def listen(listener: Transport, pattern: str, *, speaker: Transport) -> RecordingListener:
     """Subscribe, and wait until the speaker knows."""
-    ear = Ear(listener.subscribe(pattern))
+    ear = RecordingListener(listener.subscribe(pattern))
     meet(listener=listener, speaker=speaker)
     return ear
 
@@ -85,7 +85,7 @@ def listen(listener: Transport, pattern: str, *, speaker: Transport) -> Ear:
 def meet(*, listener: Transport, speaker: Transport) -> None:
     """What the listener has subscribed, the speaker reaches from now on: it sees a sign that rose after it."""
     point = f"meeting/{next(_meetings)}"
-    ear = Ear(speaker.presences(point))
+    ear = RecordingListener(speaker.presences(point))
     sign = listener.appear(point)
     assert ear.next().key == point  # noqa: S101
     sign.close()

@@ -9,7 +9,7 @@ from contextlib import AbstractContextManager
 from typing import NamedTuple
 
 from trade._transport.base import Message, Transport
-from trade.testing._ear import PATIENCE_S, Ear, Teller, meet
+from trade.testing._ear import PATIENCE_S, RecordingListener, Teller, meet
 
 __all__ = ["LossConformance", "Severable"]
 
@@ -38,7 +38,7 @@ class LossConformance(ABC):
     def test_signs_of_life_fall_on_both_sides_and_rise_again(self) -> None:
         with self.severable() as (one, other, sever, mend):
             _signs = one.appear("alive/one"), other.appear("alive/other")
-            far = Ear(one.presences("alive/other")), Ear(other.presences("alive/one"))
+            far = RecordingListener(one.presences("alive/other")), RecordingListener(other.presences("alive/one"))
             assert [ear.next().payload for ear in far] == [b"", b""]
             sever()
             assert [ear.next().payload for ear in far] == [None, None]
@@ -70,7 +70,7 @@ class LossConformance(ABC):
 
     def test_once_a_sign_has_risen_again_announcements_are_heard_as_before(self) -> None:
         with self.severable() as (one, other, sever, mend):
-            ear = Ear(other.announcements("shop/**"))
+            ear = RecordingListener(other.announcements("shop/**"))
             lost = _Lost(one, other, sever)
             one.announce("shop/bread", b"missed")
             mend()
@@ -81,7 +81,7 @@ class LossConformance(ABC):
 
     def test_once_a_sign_has_risen_again_messages_arrive_as_before(self) -> None:
         with self.severable() as (one, other, sever, mend):
-            ear, publisher = Ear(one.subscribe("room/a")), other.publish("room/a")
+            ear, publisher = RecordingListener(one.subscribe("room/a")), other.publish("room/a")
             lost = _Lost(one, other, sever)
             mend()
             assert lost.returns()
@@ -93,7 +93,7 @@ class _Lost:
     """The first of two, lost to the second; knows when it is back."""
 
     def __init__(self, one: Transport, other: Transport, sever: Callable[[], None]) -> None:
-        self._ear = Ear(other.presences("alive/one"))
+        self._ear = RecordingListener(other.presences("alive/one"))
         self._sign = one.appear("alive/one")
         assert self._ear.next().payload == b""
         sever()

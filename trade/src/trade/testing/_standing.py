@@ -9,7 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 
 from trade._transport.base import ChannelClosed, Message, Transport
-from trade.testing._ear import PATIENCE_S, Ear, Teller, meet
+from trade.testing._ear import PATIENCE_S, RecordingListener, Teller, meet
 
 
 class StandingConformance(ABC):
@@ -34,7 +34,7 @@ class StandingConformance(ABC):
 
     def test_announcements_are_heard_in_order_whatever_their_keys(self) -> None:
         with self.pair() as (one, other):
-            ear = Ear(other.announcements("shop/**"))
+            ear = RecordingListener(other.announcements("shop/**"))
             meet(listener=other, speaker=one)
             said = [Message(f"shop/{number % 7}/{number}", str(number).encode()) for number in range(2000)]
             for message in said:
@@ -43,18 +43,18 @@ class StandingConformance(ABC):
 
     def test_who_listens_later_hears_nothing_of_what_was_announced(self) -> None:
         with self.pair() as (one, other):
-            early = Ear(other.announcements("shop/**"))
+            early = RecordingListener(other.announcements("shop/**"))
             meet(listener=other, speaker=one)
             one.announce("shop/bread", b"1")
             assert early.next().payload == b"1"
-            late = Ear(other.announcements("shop/**"))
+            late = RecordingListener(other.announcements("shop/**"))
             meet(listener=other, speaker=one)
             one.announce("shop/bread", b"2")
             assert late.next().payload == b"2"
 
     def test_nobody_hears_announcements_of_their_own(self) -> None:
         with self.pair() as (one, other):
-            ear = Ear(one.announcements("shop/**"))
+            ear = RecordingListener(one.announcements("shop/**"))
             meet(listener=one, speaker=other)
             one.announce("shop/own", b"1")
             other.announce("shop/other", b"1")
@@ -79,7 +79,7 @@ class StandingConformance(ABC):
 
     def test_once_a_sign_of_life_has_risen_its_transport_can_be_asked(self) -> None:
         with self.pair() as (one, other):
-            signs = Ear(other.presences("alive/*"))
+            signs = RecordingListener(other.presences("alive/*"))
             for turn in range(50):
                 Teller(one, f"shop-{turn}/*", {f"shop-{turn}/bread": b"fresh"})
                 sign = one.appear(f"alive/{turn}")
@@ -174,7 +174,7 @@ class StandingConformance(ABC):
 
     def test_a_sign_of_life_rises_falls_and_returns(self) -> None:
         with self.pair() as (one, other):
-            ear = Ear(other.presences("alive/**"))
+            ear = RecordingListener(other.presences("alive/**"))
             for _ in range(3):
                 sign = one.appear("alive/one")
                 assert ear.next() == Message("alive/one", b"")
@@ -183,7 +183,7 @@ class StandingConformance(ABC):
 
     def test_signs_of_life_fall_when_their_transport_closes(self) -> None:
         with self.pair() as (one, other):
-            ear = Ear(other.presences("alive/**"))
+            ear = RecordingListener(other.presences("alive/**"))
             _kept = one.appear("alive/a"), one.appear("alive/b")
             assert {ear.next().key for _ in range(2)} == {"alive/a", "alive/b"}
             one.close()
@@ -194,14 +194,14 @@ class StandingConformance(ABC):
         with self.network() as open_transport:
             one = open_transport()
             _kept = one.appear("alive/a"), one.appear("alive/b")
-            ear = Ear(open_transport().presences("alive/**"))
+            ear = RecordingListener(open_transport().presences("alive/**"))
             assert {ear.next() for _ in range(2)} == {Message("alive/a", b""), Message("alive/b", b"")}
             _more = one.appear("alive/c")
             assert ear.next() == Message("alive/c", b"")
 
     def test_signs_of_life_of_ones_own_are_heard_too(self) -> None:
         with self.pair() as (one, _):
-            ear = Ear(one.presences("alive/**"))
+            ear = RecordingListener(one.presences("alive/**"))
             sign = one.appear("alive/one")
             assert ear.next() == Message("alive/one", b"")
             assert one.present("alive/**", PATIENCE_S) == ["alive/one"]
@@ -217,7 +217,7 @@ class StandingConformance(ABC):
 
 
 def _wait_for(transport: Transport, signs: int) -> None:
-    ear = Ear(transport.presences("alive/**"))
+    ear = RecordingListener(transport.presences("alive/**"))
     for _ in range(signs):
         ear.next()
     ear.channel.close()

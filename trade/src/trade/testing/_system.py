@@ -10,7 +10,7 @@ from typing import Final
 
 from trade._container.container import Container
 from trade._settings import Settings
-from trade._transport.memory import Clock, Kind, MemoryTransport, Network, Passage
+from trade._transport.memory import Clock, InFlightMessage, Kind, MemoryTransport, Network
 from trade._transport.memory.node import Node
 
 __all__ = ["MemorySystem", "memory_system"]
@@ -99,7 +99,7 @@ class MemorySystem:
         nodes = None if between is None else (self._node(between[0]), self._node(between[1]))
         self.network.delay(least_s, jitter_s=jitter_s, between=nodes)
 
-    def lose(self, which: Callable[[Passage], bool]) -> Callable[[], None]:
+    def lose(self, which: Callable[[InFlightMessage], bool]) -> Callable[[], None]:
         """Lose messages between two containers that stay linked; see `Network.lose`. Returns what ends it."""
         return self.network.lose(which)
 
@@ -150,7 +150,7 @@ class MemorySystem:
         """How many messages went from one container to another so far, of these kinds or of all."""
         return sum(count for kind, count in self.network.sent.items() if kind in kinds or not kinds)
 
-    def tap(self, hear: Callable[[Passage], None]) -> Callable[[], None]:
+    def tap(self, hear: Callable[[InFlightMessage], None]) -> Callable[[], None]:
         """Hear of every message between two containers; see `Network.tap`. Returns what ends it."""
         return self.network.tap(hear)
 

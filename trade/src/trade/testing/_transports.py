@@ -10,7 +10,7 @@ import threading
 from collections.abc import Callable, Generator
 
 from trade._transport.base import Channel, ChannelClosed, Message, Transport
-from trade.testing._ear import Ear, listen, meet
+from trade.testing._ear import RecordingListener, listen, meet
 from trade.testing._standing import StandingConformance
 
 __all__ = ["TransportConformance"]
@@ -41,7 +41,7 @@ class TransportConformance(StandingConformance):
 
     def test_a_transport_hears_what_it_puts_itself(self) -> None:
         with self.pair() as (one, _):
-            ear = Ear(one.subscribe("room/a"))
+            ear = RecordingListener(one.subscribe("room/a"))
             one.publish("room/a").put(b"hello")
             assert ear.next() == Message("room/a", b"hello")
 
@@ -56,10 +56,10 @@ class TransportConformance(StandingConformance):
 
     def test_what_is_subscribed_before_an_announcement_hears_all_that_follows_it(self) -> None:
         with self.pair() as (one, other):
-            announced = Ear(one.announcements("here/**"))
+            announced = RecordingListener(one.announcements("here/**"))
             meet(listener=one, speaker=other)
             for turn in range(50):
-                ear = Ear(other.subscribe(f"room/{turn}"))
+                ear = RecordingListener(other.subscribe(f"room/{turn}"))
                 other.announce(f"here/{turn}", b"1")
                 announced.until(f"here/{turn}", b"1")
                 one.publish(f"room/{turn}").put(b"first")
@@ -86,7 +86,7 @@ class TransportConformance(StandingConformance):
 
     def test_several_readers_of_one_channel_share_its_messages(self) -> None:
         with self.pair() as (one, other):
-            ear = Ear(other.subscribe("room/a"), readers=4)
+            ear = RecordingListener(other.subscribe("room/a"), readers=4)
             meet(listener=other, speaker=one)
             publisher, numbers = one.publish("room/a"), {str(number).encode() for number in range(200)}
             for number in numbers:
@@ -97,7 +97,7 @@ class TransportConformance(StandingConformance):
 
     def test_every_channel_of_a_pattern_gets_every_message(self) -> None:
         with self.pair() as (one, other):
-            ears = [Ear(other.subscribe("room/**")) for _ in range(3)]
+            ears = [RecordingListener(other.subscribe("room/**")) for _ in range(3)]
             meet(listener=other, speaker=one)
             one.publish("room/a").put(b"all")
             assert [ear.next().payload for ear in ears] == [b"all"] * 3
@@ -127,7 +127,7 @@ class TransportConformance(StandingConformance):
 
     def test_urgent_messages_arrive_while_others_never_cease(self) -> None:
         with self.pair() as (one, other):
-            bulk, urgent = Ear(other.subscribe("bulk")), Ear(other.subscribe("urgent"))
+            bulk, urgent = RecordingListener(other.subscribe("bulk")), RecordingListener(other.subscribe("urgent"))
             meet(listener=other, speaker=one)
             with _flood(one, "bulk", bytes(256 * 1024)):
                 assert bulk.next()
@@ -168,7 +168,7 @@ class TransportConformance(StandingConformance):
 
     def test_waking_reaches_the_readers_of_the_same_transport_and_nobody_else(self) -> None:
         with self.pair() as (one, other):
-            own, far = Ear(one.subscribe("room/*")), listen(other, "room/*", speaker=one)
+            own, far = RecordingListener(one.subscribe("room/*")), listen(other, "room/*", speaker=one)
             one.wake("room/a", b"wake")
             assert own.next() == Message("room/a", b"wake")
             one.publish("room/a").put(b"put")
@@ -179,7 +179,7 @@ class TransportConformance(StandingConformance):
     def test_closing_a_channel_ends_every_reader(self) -> None:
         with self.pair() as (one, _):
             for channel in _channels(one):
-                ear = Ear(channel, readers=3)
+                ear = RecordingListener(channel, readers=3)
                 channel.close()
                 channel.close()
                 assert ear.ends()
@@ -193,7 +193,7 @@ class TransportConformance(StandingConformance):
 
     def test_closing_a_transport_ends_all_its_channels(self) -> None:
         with self.pair() as (one, _):
-            ears = [Ear(channel, readers=2) for channel in _channels(one)]
+            ears = [RecordingListener(channel, readers=2) for channel in _channels(one)]
             one.close()
             one.close()
             assert all(ear.ends() for ear in ears)

@@ -2,13 +2,13 @@
 
 from math import copysign, sqrt
 
-from trade_drivers.joints import Course, Sample, towards
+from trade_drivers.joints import Ramp, Sample, towards
 from trade_drivers.vendors.cia402 import _table as table
 
 __all__ = ["Following", "Turning", "interpolation_period"]
 
 
-class Following(Course):
+class Following(Ramp):
     """Positions, each reached one period after the SYNC that makes it count: cyclic synchronous position."""
 
     def __init__(self, node: int, position: int, *, speed: float, accel: float, period_s: float) -> None:

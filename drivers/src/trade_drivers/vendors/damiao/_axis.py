@@ -6,7 +6,7 @@ from struct import error as BadLength  # noqa: N812 - what unpacking raises for 
 from typing import Final
 
 from trade_drivers.interfaces._motion import MotorState
-from trade_drivers.joints import Course, Grain
+from trade_drivers.joints import Grain, Ramp
 from trade_drivers.joints.can import MotorAxis
 from trade_drivers.robotfile import Joint
 from trade_drivers.vendors.damiao import _frames as frames
@@ -54,7 +54,7 @@ class DamiaoAxis(MotorAxis):
         """Which of its registers it was asked for."""
         self.told: float | None = None
         """What it said of it."""
-        self.course: Course | None = None
+        self.course: Ramp | None = None
         """Where it is told to be, in every cycle; None: nowhere."""
         self.easing = 1.0
         """With how much of its acceleration it ends a way."""

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final, cast
 
 from trade.errors import TradeError
 from trade_drivers.bus.can import Frame
-from trade_drivers.joints import Axis, Course, Gate, Goal, Job, Manner, Motion, Steps, next_measurement
+from trade_drivers.joints import Axis, Gate, Goal, Job, Manner, Motion, Ramp, Steps, next_measurement
 from trade_drivers.joints.can._cycle import MotorExchange
 from trade_drivers.vendors.damiao import _frames as frames
 from trade_drivers.vendors.damiao import _jobs as jobs
@@ -56,7 +56,7 @@ class DamiaoExchange(MotorExchange[DamiaoAxis]):
         """From now on it is told to be where it was measured."""
         here = axis.fresh(self.clock(), self.stale_after_ns).position
         accel = float(axis.accel_counts)
-        axis.course = Course(here, fastest=axis.speed_counts, accel=accel, braking=accel)
+        axis.course = Ramp(here, fastest=axis.speed_counts, accel=accel, braking=accel)
         axis.stepped_ns = self.clock()
 
     def enable(self, axis: DamiaoAxis) -> None:
@@ -69,12 +69,12 @@ class DamiaoExchange(MotorExchange[DamiaoAxis]):
             if (course := cast("DamiaoAxis", axis).course) is not None:
                 course.fastest, course.accel = goal.speed, goal.accel
                 course.braking = goal.accel * cast("DamiaoAxis", axis).easing
-        self._aim({axis: goal.position for axis, goal in goals.items()}, gate, Course.jump)
+        self._aim({axis: goal.position for axis, goal in goals.items()}, gate, Ramp.jump)
 
     def write_positions(self, positions: Mapping[Axis, int], gate: Gate) -> None:
         self._aim(positions, gate, _go_on)
 
-    def _aim(self, positions: Mapping[Axis, int], gate: Gate, aim: Callable[[Course, int], None]) -> None:
+    def _aim(self, positions: Mapping[Axis, int], gate: Gate, aim: Callable[[Ramp, int], None]) -> None:
         gate()
         told: list[Frame] = []
         for axis, position in positions.items():
@@ -103,10 +103,10 @@ class DamiaoExchange(MotorExchange[DamiaoAxis]):
             self._brake(motor, motor.course, position)
             self.port.send_all([self._there(motor)])
 
-    def _brake(self, axis: DamiaoAxis, course: Course, position: int) -> None:
+    def _brake(self, axis: DamiaoAxis, course: Ramp, position: int) -> None:
         if abs(course.position - position) > axis.grain.near + abs(course.speed) * _LAG * self.period_ns / 1e9:
             accel = float(axis.accel_counts)
-            axis.course = Course(position, fastest=axis.speed_counts, accel=accel, braking=accel)
+            axis.course = Ramp(position, fastest=axis.speed_counts, accel=accel, braking=accel)
             return
         course.accel = course.braking = axis.accel_counts
         rests = course.position + course.speed * abs(course.speed) / (2 * axis.accel_counts)
@@ -148,5 +148,5 @@ class DamiaoExchange(MotorExchange[DamiaoAxis]):
                 self.release(motion, ending)
 
 
-def _go_on(course: Course, aim: int) -> None:
+def _go_on(course: Ramp, aim: int) -> None:
     course.aim = aim

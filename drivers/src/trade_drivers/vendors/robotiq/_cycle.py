@@ -7,7 +7,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, Final
 
 from trade.errors import MotionStopped, TradeError
-from trade_drivers.bus._cycle import HALT_NS, BusExchange, StopTicket
+from trade_drivers.bus._cycle import HALT_NS, BusCycle, StopTicket
 from trade_drivers.bus._jobs import Device, Gate
 from trade_drivers.vendors.robotiq._gripper_state import Hand
 from trade_drivers.vendors.robotiq._jobs import Motion
@@ -24,7 +24,7 @@ _TAKEN_NS: Final = 15_000_000
 """So long after a write the status may still be that of before: the device takes it over 200 times a second."""
 
 
-class Exchange(BusExchange[Hand]):
+class Exchange(BusCycle[Hand]):
     """What happens on one bus of grippers. ``stop`` is for any thread, too."""
 
     def __init__(

@@ -12,7 +12,7 @@ from trade_drivers.vendors.ur._messages import Sample
 if TYPE_CHECKING:
     from trade_drivers.vendors.ur._jobs import Motion
 
-__all__ = ["JOINTS", "Limb"]
+__all__ = ["JOINTS", "ArmStatus"]
 
 JOINTS: Final = ("base", "shoulder", "elbow", "wrist_1", "wrist_2", "wrist_3")
 IDLE: Final = 5
@@ -37,7 +37,7 @@ _STILL: Final = 3
 """Measurements in a row without motion: it is at rest."""
 
 
-class Limb:
+class ArmStatus:
     """The state of one arm. The bus thread writes it; other threads read whole values."""
 
     def __init__(self, name: str, host: str, arm: Arm) -> None:

@@ -7,10 +7,10 @@ from collections.abc import Callable, Generator
 from typing import TYPE_CHECKING, Final
 
 from trade.errors import MotionStopped, TradeError
-from trade_drivers.bus._cycle import HALT_NS, BusExchange, StopTicket
+from trade_drivers.bus._cycle import HALT_NS, BusCycle, StopTicket
 from trade_drivers.bus._jobs import Device, PortLost, Steps
 from trade_drivers.robotfile import UrBus
-from trade_drivers.vendors.ur._arm_state import Limb
+from trade_drivers.vendors.ur._arm_state import ArmStatus
 from trade_drivers.vendors.ur._child import Child
 from trade_drivers.vendors.ur._dashboard import tell
 from trade_drivers.vendors.ur._link import Link
@@ -34,10 +34,10 @@ _SERVO_NS: Final = 50_000_000
 """So late a set-point of a stream is none any more."""
 
 
-class Exchange(BusExchange[Limb]):
+class Exchange(BusCycle[ArmStatus]):
     """What happens with one controller. ``stop`` is for any thread, too."""
 
-    def __init__(self, link: Link, bus: UrBus, limb: Limb, clock: Callable[[], int] = time.monotonic_ns) -> None:
+    def __init__(self, link: Link, bus: UrBus, limb: ArmStatus, clock: Callable[[], int] = time.monotonic_ns) -> None:
         super().__init__(bus, [limb], clock)
         self.link = link
         self.limb = limb
@@ -55,7 +55,7 @@ class Exchange(BusExchange[Limb]):
 
     # --- from any thread
 
-    def stop(self, reason: str = "") -> StopTicket[Limb]:
+    def stop(self, reason: str = "") -> StopTicket[ArmStatus]:
         """Void what was admitted, and have the arm stand before anything else happens."""
         reason = reason or self.why([self.limb])
         return self.order_stop([self.limb], reason, lambda: self._stop(reason))
@@ -120,7 +120,7 @@ class Exchange(BusExchange[Limb]):
             self._brake()
         self._forget(motion, error)
 
-    def fail_motion(self, device: Limb, error_of: Callable[[Device], TradeError]) -> None:
+    def fail_motion(self, device: ArmStatus, error_of: Callable[[Device], TradeError]) -> None:
         if device.motion is not None:
             self._forget(device.motion, error_of(device))
 

@@ -18,7 +18,7 @@ from trade_drivers.interfaces._arm import Arm
 from trade_drivers.interfaces._motion import JointGroup, Motor
 from trade_drivers.plugins._driver import AttachedBus, Driver
 from trade_drivers.robotfile import Bus, Robot, UrBus
-from trade_drivers.vendors.ur._arm_state import Limb
+from trade_drivers.vendors.ur._arm_state import ArmStatus
 from trade_drivers.vendors.ur._cycle import Exchange
 from trade_drivers.vendors.ur._dashboard import DashboardError, ask, commanded
 from trade_drivers.vendors.ur._link import Link
@@ -84,7 +84,7 @@ class UrDriver(Driver):
     def check(self, robot: Robot, bus: Bus) -> None:
         self._limb_of(robot, bus, bus.name)
 
-    def _limb_of(self, robot: Robot, bus: Bus, port: str) -> tuple[Limb, UrBus]:
+    def _limb_of(self, robot: Robot, bus: Bus, port: str) -> tuple[ArmStatus, UrBus]:
         """What the file alone can tell is checked."""
         if not isinstance(bus, UrBus):
             _wrong(f"{robot.where}: bus.{bus.name}", 'driver ur needs a controller: host = "192.168.0.10"')
@@ -123,7 +123,7 @@ class UrDriver(Driver):
         return AttachedController(thread, link, lock)
 
 
-def _limb(robot: Robot, bus: UrBus, port: str) -> Limb:
+def _limb(robot: Robot, bus: UrBus, port: str) -> ArmStatus:
     arms = robot.arms_on(bus.name)
     if len(arms) != 1 or robot.joints_on(bus.name) or robot.grippers_on(bus.name):
         _wrong(f"{robot.where}: bus.{bus.name}", "a controller has one arm, and nothing else: [arm.NAME]")
@@ -136,7 +136,7 @@ def _limb(robot: Robot, bus: UrBus, port: str) -> Limb:
         _wrong(f"{robot.where}: bus.{bus.name}.rate_hz", problem)
     if bus.leave != "hold":
         _wrong(f"{robot.where}: bus.{bus.name}.leave", '"relax" is nothing an arm can: it would fall; use "hold"')
-    return Limb(f"{robot.name}.{arm.name}", port, arm)
+    return ArmStatus(f"{robot.name}.{arm.name}", port, arm)
 
 
 def _refuse_company(port: str, where: str) -> None:
@@ -148,7 +148,7 @@ def _refuse_company(port: str, where: str) -> None:
         time.sleep(_AGAIN_S)
 
 
-def _look_over(limb: Limb, where: str) -> None:
+def _look_over(limb: ArmStatus, where: str) -> None:
     """See that it is the arm of the robot file; nothing is commanded."""
     answer = ask(limb.bus, "get robot model", _ASK_S)
     if answer.rstrip("e").upper() != limb.arm.model.rstrip("e").upper():

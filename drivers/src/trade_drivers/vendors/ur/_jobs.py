@@ -7,10 +7,10 @@ from trade import Permit
 from trade.errors import DeadlineExceeded, InvalidArgument, LimitExceeded, MotionStopped, ToleranceExceeded, TradeError
 from trade_drivers.bus._jobs import Steps, Work, check_admitted
 from trade_drivers.motion._plan import Plan
-from trade_drivers.vendors.ur._arm_state import Limb
+from trade_drivers.vendors.ur._arm_state import ArmStatus
 from trade_drivers.vendors.ur._line_path import poses_on
 from trade_drivers.vendors.ur._messages import Free, MoveJoints, MoveLine, Sample, Solve
-from trade_drivers.vendors.ur._setpoint_filter import Chase
+from trade_drivers.vendors.ur._setpoint_filter import SetpointFilter
 
 if TYPE_CHECKING:
     from trade_drivers.vendors.ur._cycle import Exchange
@@ -27,7 +27,7 @@ _FOREVER_NS: Final = 2**63
 _HELD_UP_NS: Final = 200_000_000
 
 
-class Command(Work[Limb]):
+class Command(Work[ArmStatus]):
     """What needs leave: it carries an expiry, and the permit under which its call was admitted."""
 
     def __init__(self, exchange: "Exchange", *, service: str, expires_ns: int, permit: Permit) -> None:
@@ -56,7 +56,7 @@ class Command(Work[Limb]):
         return DeadlineExceeded(service=self.service, deadline_s=(self.expires_ns - self._admitted_ns) / 1e9)
 
     def usable(self) -> Sample:
-        """The newest measurement of an arm that may be commanded; raises as ``Limb.check_usable``."""
+        """The newest measurement of an arm that may be commanded; raises as ``ArmStatus.check_usable``."""
         return self.limb.check_usable(self.exchange.clock(), self.exchange.stale_after_ns)
 
 
@@ -270,7 +270,7 @@ class SetPoint(Motion):
         self._goal = list(goal)
         self._until_ns = exchange.clock() + valid_ns
         self._valid_ns = valid_ns
-        self._chase: Chase | None = None
+        self._chase: SetpointFilter | None = None
         self._sent_ns = 0
 
     def steps(self) -> Steps:
@@ -281,7 +281,7 @@ class SetPoint(Motion):
         else:
             yield from self.beginning()
             arm = self.limb.arm
-            self._chase = Chase(self.usable().positions, arm.max_speed_rad_s, arm.max_accel_rad_s2)
+            self._chase = SetpointFilter(self.usable().positions, arm.max_speed_rad_s, arm.max_accel_rad_s2)
             self._sent_ns = self.exchange.clock() - self.exchange.period_ns
             self._until_ns = self.exchange.clock() + self._valid_ns  # control had to be taken first
         self.gate()

@@ -3,10 +3,10 @@
 from collections.abc import Sequence
 from math import copysign, sqrt
 
-__all__ = ["Chase"]
+__all__ = ["SetpointFilter"]
 
 
-class Chase:
+class SetpointFilter:
     """Where several joints are told to be, cycle by cycle.
 
     Args:

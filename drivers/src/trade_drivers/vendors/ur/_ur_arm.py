@@ -11,7 +11,7 @@ from trade_drivers.bus._deadlines import expiry, span
 from trade_drivers.bus._thread import BusThread
 from trade_drivers.interfaces._arm import Arm, ArmLimits, ArmState
 from trade_drivers.motion._plan import JointLimits, Plan
-from trade_drivers.vendors.ur._arm_state import IDLE, RUNNING, Limb
+from trade_drivers.vendors.ur._arm_state import IDLE, RUNNING, ArmStatus
 from trade_drivers.vendors.ur._cycle import Exchange
 from trade_drivers.vendors.ur._dashboard import DashboardError, ask
 from trade_drivers.vendors.ur._jobs import EndFreedrive, Follow, Freedrive, LineMove, Move, Scaling, SetPoint
@@ -30,7 +30,7 @@ _LOOK_S: Final = 0.01
 class UrArm(Arm):
     """The arm of one controller."""
 
-    def __init__(self, thread: BusThread[Exchange], limb: Limb) -> None:
+    def __init__(self, thread: BusThread[Exchange], limb: ArmStatus) -> None:
         self._thread = thread
         self._exchange = thread.exchange
         self._limb = limb

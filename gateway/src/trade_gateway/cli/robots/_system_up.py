@@ -17,8 +17,8 @@ from trade.errors import CannotStart, ConfigurationError, NoSuchService, TooMany
 from trade.starting import LONGEST_S, Started, end_there, launch, missing_there
 from trade_gateway.cli.robots._detached import detached
 from trade_gateway.config._system import SystemPlan
-from trade_gateway.config._tables import Part
-from trade_gateway.process._signal_event import Asked
+from trade_gateway.config._tables import ContainerSpec
+from trade_gateway.process._signal_event import SignalEvent
 from trade_gateway.supervisor._objects import GROUP, lacking, make
 
 _LEFT_S: Final = 20.0
@@ -43,7 +43,7 @@ Tell = Callable[[Told], None]
 
 
 class _Began(NamedTuple):
-    part: Part
+    part: ContainerSpec
     started: Started
 
 
@@ -67,7 +67,7 @@ class Bringing:
         self._wait_s = wait_s
         self._tell = tell
 
-    def up(self, *, keep: bool, interrupted: threading.Event | Asked) -> None:
+    def up(self, *, keep: bool, interrupted: threading.Event | SignalEvent) -> None:
         """Start what is not up, in order; leave what is. What fails has what this began taken down again.
 
         Args:
@@ -91,7 +91,7 @@ class Bringing:
                 self._undo(began)
             raise
 
-    def _bring(self, part: Part, began: list[_Began]) -> None:
+    def _bring(self, part: ContainerSpec, began: list[_Began]) -> None:
         at, info = time.monotonic(), self._seen(part)
         was_up = info is not None
         if info is None:
@@ -102,7 +102,7 @@ class Bringing:
         took_s = time.monotonic() - at
         self._tell(Told(container=part.name, host=part.entry.host, state=state, pid=info.pid, took_s=took_s))
 
-    def _start(self, part: Part) -> Started:
+    def _start(self, part: ContainerSpec) -> Started:
         entry = part.entry
         if entry.is_local:
             settings = replace(self._plan.settings, container=part.name)
@@ -127,10 +127,10 @@ class Bringing:
             raise CannotStart(host=part.entry.host, container=part.name, reason="not seen", said=said, remedy=remedy)
         return info
 
-    def _own(self, part: Part, name: str) -> Handle:
+    def _own(self, part: ContainerSpec, name: str) -> Handle:
         return self._member.find(where(name=name, group=GROUP, container=part.name), wait_s=self._wait_s)
 
-    def _seen(self, part: Part) -> ContainerInfo | None:
+    def _seen(self, part: ContainerSpec) -> ContainerInfo | None:
         """The container of that name. Raises ConfigurationError if there are two."""
         found = [info for info in self._member.containers() if info.name == part.name]
         if len(found) > 1:
@@ -149,7 +149,7 @@ class Bringing:
             except TradeError as left:
                 self._tell(Told(container=part.name, host=part.entry.host, state=f"left up: {left}", pid=started.pid))
 
-    def _end_unseen(self, part: Part, started: Started) -> None:
+    def _end_unseen(self, part: ContainerSpec, started: Started) -> None:
         if part.entry.is_local:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(started.pid, signal.SIGTERM)
@@ -170,7 +170,7 @@ class Bringing:
             else:
                 self._end(part, only_at_rest=only_at_rest)
 
-    def _end(self, part: Part, *, only_at_rest: bool) -> None:
+    def _end(self, part: ContainerSpec, *, only_at_rest: bool) -> None:
         at, info = time.monotonic(), self._seen(part)
         terminate = self._own(part, "terminate_container").with_(deadline_s=_LEFT_S)
         problems = terminate("trade system down", only_at_rest)
@@ -196,7 +196,7 @@ class Bringing:
             yield Told(container=part.name, host=host, state=state, pid=info.pid, services=info.services)
 
 
-def check_hosts(plan: SystemPlan, parts: Sequence[Part], ssh_config: Path | None) -> None:
+def check_hosts(plan: SystemPlan, parts: Sequence[ContainerSpec], ssh_config: Path | None) -> None:
     """Ask all other hosts at once whether they are there, and have ``trade`` and the files that are named.
 
     Raises:
@@ -206,7 +206,7 @@ def check_hosts(plan: SystemPlan, parts: Sequence[Part], ssh_config: Path | None
     asked = [part for part in parts if not part.entry.is_local]
     wrong: dict[str, TradeError] = {}
 
-    def ask(part: Part) -> None:
+    def ask(part: ContainerSpec) -> None:
         try:
             missing = missing_there(part.entry.host, part.name, (part.entry.command,), part.files, ssh_config)
             if missing:

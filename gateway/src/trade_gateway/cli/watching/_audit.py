@@ -16,7 +16,7 @@ import typer
 from rich.markup import escape
 
 from trade._context.sessions import client_of
-from trade.auditing import AuditRow, Verdict, moved_aside_in, reading, records_in, verify
+from trade.auditing import AuditRow, ChainCheck, moved_aside_in, reading, records_in, verify
 from trade.errors import ConfigurationError
 from trade_gateway._usage import UsageError
 from trade_gateway.cli._default_command import FirstByDefault
@@ -165,12 +165,12 @@ def _rows(path: Path, seen: dict[Path, int]) -> Iterator[Told]:
         complain(f"{path} cannot be read: {bad}")
 
 
-def _verified(path: Path, noted: Mapping[int, bytes]) -> Verdict:
+def _verified(path: Path, noted: Mapping[int, bytes]) -> ChainCheck:
     try:
         with reading(path) as (end, links):
             return verify(links, end, noted)
     except (sqlite3.Error, TypeError) as bad:
-        return Verdict(broken_at=1, problem=f"it cannot be read: {bad}")
+        return ChainCheck(broken_at=1, problem=f"it cannot be read: {bad}")
 
 
 class _Noted(msgspec.Struct):
@@ -222,7 +222,7 @@ def _say(out: Output, told: Told) -> None:
     out.say(escape(f"{at} {row.kind:9} {told.container}: {who} {row.what}{about}{end}{why}{call}"))
 
 
-def _told(verdict: Verdict) -> dict[str, object]:
+def _told(verdict: ChainCheck) -> dict[str, object]:
     return {
         "rows": verdict.rows,
         "first": verdict.first,
@@ -235,7 +235,7 @@ def _told(verdict: Verdict) -> dict[str, object]:
     }
 
 
-def _sentence(path: Path, verdict: Verdict) -> str:
+def _sentence(path: Path, verdict: ChainCheck) -> str:
     name = escape(path.stem)
     if verdict.problem:
         return f"[bold red]{name}[/]: row {verdict.broken_at}: {escape(verdict.problem)}"

@@ -10,7 +10,7 @@ from rich.markup import escape
 from trade import Container, where
 from trade._timestamps import clock
 from trade.errors import TradeError
-from trade.rules import GROUP, Did, Firing, Rehearsal, RuleInfo, Rules, read_rules, rehearse
+from trade.rules import GROUP, DryRun, Firing, RuleInfo, Rules, StepResult, read_rules, rehearse
 from trade_gateway.cli._options import Json
 from trade_gateway.cli._output import Output, complain
 from trade_gateway.cli._system_choice import choice_of, visitor_among_others
@@ -99,7 +99,7 @@ def _say_firings(out: Output, told: "queue.SimpleQueue[Firing]") -> None:
             out.say(f"  [bold red]stopped until the file is read again: {escape(firing.stopped)}[/]")
 
 
-def _say_step(out: Output, did: Did) -> None:
+def _say_step(out: Output, did: StepResult) -> None:
     to = f": {did.service} in {did.container}" if did.service else ""
     end = f"[bold red]{escape(did.error)}[/]" if did.error else escape(did.result)
     out.say(f"  {escape(f'{did.step}{to}')}: {end}")
@@ -133,7 +133,7 @@ def test(context: typer.Context, file: File, as_json: Json = False) -> None:
         _say_rehearsal(out, rehearsal)
 
 
-def _say_rehearsal(out: Output, told: Rehearsal) -> None:
+def _say_rehearsal(out: Output, told: DryRun) -> None:
     fires = "[bold]would fire now[/]" if told.fires else "would not fire now"
     occasion = f"{told.occasion}, {told.condition}" if told.condition else told.occasion
     now = f" ({told.now})" if told.now else ""

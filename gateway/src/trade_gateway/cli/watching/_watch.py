@@ -33,7 +33,7 @@ _Value = TypeVar("_Value")
 What = Literal["came", "went", "changed", "is well", "is not well", "locked", "released", "e-stop", "cleared"]
 
 
-class Happening(Struct, frozen=True):
+class Event(Struct, frozen=True):
     """Something that has become otherwise; with ``--json`` a line."""
 
     at: float
@@ -101,7 +101,7 @@ class Watched:
     def _tell(self, what: What, handle: Handle) -> None:
         self._told.put((what, handle))
 
-    def news(self) -> Iterator[Happening]:
+    def news(self) -> Iterator[Event]:
         """What has happened since it was asked last. What stands locked or stopped at first is news, too."""
         now = time.time()
         with suppress(queue.Empty):
@@ -113,21 +113,19 @@ class Watched:
                 yield from self._of_locks(now)
             yield from self._of_estops(now)
 
-    def _of_service(self, at: float, what: What, handle: Handle) -> Happening:
+    def _of_service(self, at: float, what: What, handle: Handle) -> Event:
         before = self._health.pop(handle.key, HEALTHY)
         if what == "went":
-            return Happening(at, what, handle.label, handle.container)
+            return Event(at, what, handle.label, handle.container)
         health = handle.health
         if health != HEALTHY:
             self._health[handle.key] = health
         if health == before:
-            return Happening(at, what, handle.label, handle.container)
+            return Event(at, what, handle.label, handle.container)
         well = health == HEALTHY
-        return Happening(
-            at, "is well" if well else "is not well", handle.label, handle.container, "" if well else health
-        )
+        return Event(at, "is well" if well else "is not well", handle.label, handle.container, "" if well else health)
 
-    def _of_locks(self, at: float) -> Iterator[Happening]:
+    def _of_locks(self, at: float) -> Iterator[Event]:
         uses = {use for handle in self._container.services(self._meant) for use in handle.resources}
         known = self._container.locking.known()
         found = {(", ".join(info.resources), info.holder.owner): info for info in known.locks}
@@ -139,7 +137,7 @@ class Watched:
             yield _of_lock(at, "locked", info)
         self._locks = found
 
-    def _of_estops(self, at: float) -> Iterator[Happening]:
+    def _of_estops(self, at: float) -> Iterator[Event]:
         found = {known.id: known for known in self._container.estops()}
         for known in _new(self._estops, found):
             yield _of_estop(at, "cleared", known)
@@ -148,17 +146,17 @@ class Watched:
         self._estops = found
 
 
-def _of_lock(at: float, what: What, info: LockInfo) -> Happening:
+def _of_lock(at: float, what: What, info: LockInfo) -> Event:
     purpose = f" ({info.holder.purpose})" if info.holder.purpose else ""
-    return Happening(at, what, ", ".join(info.resources), info.container, info.holder.owner + purpose)
+    return Event(at, what, ", ".join(info.resources), info.container, info.holder.owner + purpose)
 
 
-def _of_estop(at: float, what: What, known: Estop) -> Happening:
-    return Happening(at, what, known.id, "", f"{known.giver}: {known.reason}" if known.reason else known.giver)
+def _of_estop(at: float, what: What, known: Estop) -> Event:
+    return Event(at, what, known.id, "", f"{known.giver}: {known.reason}" if known.reason else known.giver)
 
 
-def _say(out: Output, news: Iterable[Happening]) -> None:
-    kinds: dict[_Kind, list[Happening]] = {}
+def _say(out: Output, news: Iterable[Event]) -> None:
+    kinds: dict[_Kind, list[Event]] = {}
     for one in news:
         if out.as_json:
             out.data(one)

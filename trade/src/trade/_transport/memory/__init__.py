@@ -7,7 +7,7 @@ on real queues.
 
 from trade._transport.memory.clock import Clock
 from trade._transport.memory.links import Kind
-from trade._transport.memory.network import Network, Passage, Tap
+from trade._transport.memory.network import InFlightMessage, Network, Tap
 from trade._transport.memory.transport import MemoryTransport
 
-__all__ = ["Clock", "Kind", "MemoryTransport", "Network", "Passage", "Tap"]
+__all__ = ["Clock", "InFlightMessage", "Kind", "MemoryTransport", "Network", "Tap"]

@@ -19,7 +19,7 @@ from trade._transport.memory.traffic import Arrive, Traffic
 
 
 @dataclass(frozen=True, slots=True)
-class Passage:
+class InFlightMessage:
     """A message between two transports, as a tap sees it: once when it is sent, once when it has arrived."""
 
     kind: Kind
@@ -33,7 +33,7 @@ class Passage:
 
 _MOST_ROUTES: Final = 4096
 
-Tap = Callable[[Passage], None]
+Tap = Callable[[InFlightMessage], None]
 
 
 class Network:
@@ -76,7 +76,7 @@ class Network:
         self._routes: dict[str, list[Node]] = {}
         """Who hears a key, in the order in which they joined; of keys that were put on since anybody listened anew."""
         self._taps: list[Tap] = []
-        self._losing: list[Callable[[Passage], bool]] = []
+        self._losing: list[Callable[[InFlightMessage], bool]] = []
         self._numbers = itertools.count(1)
 
     def _under_lock(self, arrive: Arrive) -> None:
@@ -223,7 +223,7 @@ class Network:
     ) -> None:
         """One message over one link; the link may be gone by the time a tap has seen it."""
         self.sent[kind] += 1
-        passage = Passage(kind, source.name, target.name, message.key, message.payload, arrived=False)
+        passage = InFlightMessage(kind, source.name, target.name, message.key, message.payload, arrived=False)
         self._tell_taps(passage)
         if any(loses(passage) for loses in list(self._losing)):
             return
@@ -233,7 +233,7 @@ class Network:
 
         def arrived() -> None:
             arrive()
-            self._tell_taps(Passage(kind, source.name, target.name, message.key, message.payload, arrived=True))
+            self._tell_taps(InFlightMessage(kind, source.name, target.name, message.key, message.payload, arrived=True))
 
         arrived() if at_once else link.ways[source].send(kind, arrived)
 
@@ -249,7 +249,7 @@ class Network:
         self._taps.append(hear)
         return lambda: self._taps.remove(hear)
 
-    def lose(self, which: Callable[[Passage], bool]) -> Callable[[], None]:
+    def lose(self, which: Callable[[InFlightMessage], bool]) -> Callable[[], None]:
         """Lose messages on their way; both ends stay linked.
 
         Args:
@@ -261,7 +261,7 @@ class Network:
         self._losing.append(which)
         return lambda: self._losing.remove(which)
 
-    def _tell_taps(self, passage: Passage) -> None:
+    def _tell_taps(self, passage: InFlightMessage) -> None:
         for tap in list(self._taps):
             tap(passage)
 
