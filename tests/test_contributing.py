@@ -3,7 +3,9 @@
 import ast
 import os
 import re
+from collections import Counter
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import Final
 
@@ -30,8 +32,53 @@ def _rows() -> Iterator[str]:
     for folder, package in HOUSES.items():
         house = ROOT / folder / "src" / package
         yield f"| **`{house.relative_to(ROOT)}`** | {_first_line(house)} |\n"
-        for room in sorted(path.parent for path in house.glob("*/__init__.py")):
-            yield f"| `{room.name}` | {_first_line(room)} |\n"
+        for room in sorted(path.parent for path in house.glob("*/**/__init__.py")):
+            yield f"| `{room.relative_to(house)}` | {_first_line(room)} |\n"
+
+
+def test_no_room_has_more_than_20_modules() -> None:
+    sources = [path for folder in HOUSES for path in (ROOT / folder / "src").rglob("*.py")]
+    modules = Counter(path.parent for path in sources)
+    assert len(modules) > 50
+    assert {str(room): count for room, count in modules.items() if count > 20} == {}
+
+
+def test_no_modules_import_each_other_while_they_are_loaded() -> None:
+    """What a function imports when it runs, and what only types need, is not counted."""
+    graph = {module: set(_loaded_with(module, path)) for module, path in _modules().items()}
+    while leaves := [module for module, needs in graph.items() if not needs & graph.keys()]:
+        for module in leaves:
+            del graph[module]
+    assert sorted(graph) == []
+
+
+@cache
+def _modules() -> dict[str, Path]:
+    found: dict[str, Path] = {}
+    for folder in HOUSES:
+        source = ROOT / folder / "src"
+        for path in source.rglob("*.py"):
+            parts = path.relative_to(source).with_suffix("").parts
+            found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
+    return found
+
+
+def _loaded_with(module: str, path: Path) -> Iterator[str]:
+    """The modules of ours that a module imports at its top level; packages that name them are left out."""
+    known = _modules()
+    package = module if path.name == "__init__.py" else module.rpartition(".")[0]
+    for node in ast.parse(path.read_text(encoding="utf-8")).body:
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names if alias.name in known)
+        elif isinstance(node, ast.ImportFrom):
+            parts = package.split(".")
+            outer = parts[: len(parts) - node.level + 1] if node.level else []
+            base = ".".join([*outer, *([node.module] if node.module else [])])
+            for alias in node.names:
+                if f"{base}.{alias.name}" in known:
+                    yield f"{base}.{alias.name}"
+                elif base in known and base != module:
+                    yield base
 
 
 def _first_line(room: Path) -> str:
@@ -41,7 +88,8 @@ def _first_line(room: Path) -> str:
 
 
 def test_paths_and_targets_that_it_names_are_there() -> None:
-    text = PAGE.read_text(encoding="utf-8")
+    before, _, rest = PAGE.read_text(encoding="utf-8").partition(MARKS[0])
+    text = before + rest.partition(MARKS[1])[2]
     paths = re.findall(r"`((?:[\w.-]+/)+[\w.-]*)`", text)
     assert len(paths) > 5
     assert not [path for path in paths if not path.startswith((".venv/", ".uv/")) and not (ROOT / path).exists()]

@@ -110,12 +110,6 @@ def build(only: str | None = None) -> typer.Typer:
     return made
 
 
-def __getattr__(name: str) -> typer.Typer:
-    if name != "app":
-        raise AttributeError(name)
-    return build()
-
-
 def _asked_for(words: Sequence[str]) -> str | None:
     """The command among the words of a command line; None if it is to be found out, or help is wanted about all."""
     left = iter(words)
