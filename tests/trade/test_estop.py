@@ -412,10 +412,10 @@ def test_S09_one_that_made_room_for_others_is_not_over_while_somebody_has_it_ope
     puts = MemoryTransport(system.network, "raw-mallory-2").publish("estop/mallory")
     system.lose(lambda passage: passage.source == "raw-mallory-2" and passage.target == "other")
     puts.put(encode_message(EstopOrder(PROTOCOL, "newest", Estop("newest", "mallory/x/e", "", 0.0))))
-    assert eventually(lambda: one._parts.estopping._estops.is_open("newest"))
-    assert ids[-1] not in {estop.id for estop in one._parts.estopping.open_here()}
+    assert eventually(lambda: one._parts.estop._estops.is_open("newest"))
+    assert ids[-1] not in {estop.id for estop in one._parts.estop.open_here()}
     assert one.estop_clear([*ids[:-1], "newest"], limit_s=GENEROUS_S).complete
-    assert eventually(lambda: ids[-1] in {estop.id for estop in one._parts.estopping.open_here()})
+    assert eventually(lambda: ids[-1] in {estop.id for estop in one._parts.estop.open_here()})
     assert one.estop_clear([ids[-1]], limit_s=GENEROUS_S).complete
     assert one.estops() == []
 

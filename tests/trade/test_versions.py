@@ -179,7 +179,7 @@ def test_of_who_has_said_nothing_yet_the_version_is_not_known(memory: MemorySyst
     transport.appear(alive_key(silent))
     assert eventually(lambda: any(info.name == "silent" for info in here.containers()))
     assert {info.name: info.protocol for info in here.containers()} == {"here": PROTOCOL, "silent": 0}
-    assert here._parts.estopping._others() == []  # nobody is told that it speaks another one
+    assert here._parts.estop._others() == []  # nobody is told that it speaks another one
     transport.close()
 
 

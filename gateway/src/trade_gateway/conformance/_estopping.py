@@ -184,7 +184,7 @@ def _ordered(stage: Stage, who: Voice) -> EstopOrder:
     _order(stage, who, order)
 
     def everywhere() -> bool:
-        return any(one.id == order.request for one in stage.container._parts.estopping.open_here())
+        return any(one.id == order.request for one in stage.container._parts.estop.open_here())
 
     eventually(everywhere, "the suite's own container did not hear the e-stop")
     return order

@@ -79,108 +79,156 @@ class Components:
 
     def __init__(self, home: Host, settings: Settings, transport: Transport | None) -> None:
         self._home = home
-        address, access = home.address, home.access
-        epoch, session = address.epoch, str(address)
+        self._settings = settings
+        self._access = home.access
+        self._address = home.address
+        self._session = str(home.address)
         self.session_end_listeners: Final[list[Callable[[str], None]]] = []
         """Told of every session that ends."""
+        self.measured: Final[list[Callable[[], Iterable[Measure]]]] = []
+        """What else there is to measure, as whoever drives something tells it."""
         with contextlib.ExitStack() as leaving:  # what has begun ends again if the rest cannot begin
-            self.audit = open_audit(settings, address, leaving)
-            self.transport = transport or join(settings, leaving)
-            leaving.callback(self.transport.close)
-            self.reach: Dialer | None = None
-            """Its links; None on a transport that has no such switches."""
-            if isinstance(self.transport, ZenohTransport):
-                self.reach = Dialer(self.transport.links, settings.check_may_dial, settings.connect)
-                leaving.callback(self.reach.close)
-            self.codec = handle_codec(lambda handle: handle.key, home.handle)
-            self.registry = Registry(address, access.may_offer, access.may_have_stops)
-            self.caller = Caller(self.transport, address, session)
-            leaving.callback(self.caller.close)
-            self.clockwork = Scheduler("trade-clock")
-            leaving.callback(self.clockwork.close)
-            self.notifier = Notifier(home, self.clockwork, epoch, lambda record: Handle(home, record.key, record))
-            leaving.callback(self.notifier.close)
-            self.inherited = InheritedLock(settings.lock, address) if settings.lock else None
-            if self.inherited is not None:
-                handed_down[address] = self.inherited
-                leaving.callback(handed_down.pop, address)
-            self.coroutines = AsyncLoop()
-            leaving.callback(self.coroutines.close)
-            self.locking = LockApi(home)
-            self.locks = LockTable(epoch, home.name, audit=self.audit)
-            leaving.callback(self.locks.close)
-            self.borrowed = RemoteLocks(self.locks, epoch)
-            self.announcer = Announcer(self.transport, address)
-            leaving.callback(self.announcer.close)
-            self.providers = Providers(
-                self.announcer, self.registry, address, self.codec, self.coroutines, self.locks, access, self.audit
-            )
-            self.targets = Targets(
-                address, session, access, self.registry, self.providers, self.caller, self.codec, self.audit
-            )
-            self.registry.listen(self.targets.changed)  # before anybody is told: who is told may call
-            self.registry.listen(self.notifier.changed)
-            self.session_end_listeners.append(self.notifier.session_ended)
-            self.hooks = Hooks(
-                home,
-                self.codec,
-                self.clockwork,
-                self.providers.service,
-                lambda: self.registry.select(where.local),
-                self._denied_hook,
-            )
-            self.registry.listen(self.hooks.changed)
-            self.session_end_listeners.append(self.hooks.session_ended)
-            self.hook_numbers = itertools.count(1)
-            self.spans = new_spans(address, session, self.locks, open_export(settings, address, leaving))
-            self.trace(settings.trace)
-            self.streams = Streams(home, self.transport, self.providers.service, self.clockwork, self.caller.new_id)
-            self.registry.listen(self.streams.changed)
-            self.session_end_listeners.append(self.streams.session_ended)
-            leaving.callback(self.streams.close)
-            self.listening = Subscriptions(home, self.transport, self.clockwork, self.codec, self.registry.removed)
-            self.registry.listen(self.listening.changed)
-            self.session_end_listeners.append(self.listening.session_ended)
-            leaving.callback(self.listening.close)
-            kept = None if settings.state_dir is None else settings.state_dir / settings.system / "estop"
-            self.estopping = EstopController(
-                self.transport, address, self.registry, self.locks, self.providers, kept, access, self.audit
-            )
-            leaving.callback(self.estopping.close)
-            self.deadman = self.estopping.deadman
-            self.locks.stop_with(self.deadman.stop)
-            self.withdrawn = Withdrawn(self.providers, self.deadman.rest)
-            self.making = ProviderFactory(home, self.providers, self.withdrawn, settings.instantiable)
-            leaving.callback(self.making.close)
-            freezing = Quiescer(self.locks, address)
-            self.departing = MigrationSource(
-                home, self.providers, self.making, self.withdrawn, freezing, access, self.codec
-            )
-            self.arriving = MigrationTarget(
-                address, self.providers, self.making, freezing, access, self.codec, self.clockwork
-            )
-            leaving.callback(self.arriving.close)
-            self.dispatcher = Dispatcher(
-                self.transport, address, self.providers.lookup, self.coroutines, access, self.audit, access.callers()
-            )
-            leaving.callback(self.dispatcher.close)
-            self.lines = StopLines(settings, lambda: () if self.stop_line is None else self.stop_line.own_places)
-            self.stop_line: StopLineService | None = None
-            """Its own end of the stop line; None on a transport without a host."""
-            if self.reach is not None:
-                self.stop_line = StopLineService(address, settings, access, self.audit, self.estopping, self.stop_known)
-                leaving.callback(self.stop_line.close)
-                self.registry.listen(self._mind_stops)
-                if settings.bridge:
-                    self.stop_line.listen_on_host()
-            self.meter = LoadMeter(home.name, lambda: list(self.dispatcher._crews), self.providers.waiting)
-            self.terminating = Shutdown(
-                home.name, self.deadman.rest, self.locks.resources, lambda: self.meter.running, home.close
-            )
-            self.measured: Final[list[Callable[[], Iterable[Measure]]]] = []
-            """What else there is to measure, as whoever drives something tells it."""
-            self.metrics_port = open_metrics(settings, self.audit.calls, self._measures, leaving)
+            self._build_transport(leaving, transport)
+            self._build_calls(leaving)
+            self._build_locks(leaving)
+            self._build_services(leaving)
+            self._build_notifications_and_hooks()
+            self._build_telemetry(leaving)
+            self._build_streams(leaving)
+            self._build_estop(leaving)
+            self._build_migration(leaving)
+            self._build_dispatch(leaving)
+            self._build_stop_line(leaving)
+            self._build_measures(leaving)
             self._leaving = leaving.pop_all()
+
+    def _build_transport(self, leaving: contextlib.ExitStack, transport: Transport | None) -> None:
+        self.audit = open_audit(self._settings, self._address, leaving)
+        self.transport = transport or join(self._settings, leaving)
+        leaving.callback(self.transport.close)
+        self.dialer: Dialer | None = None
+        """Its links; None on a transport that has no such switches."""
+        if isinstance(self.transport, ZenohTransport):
+            self.dialer = Dialer(self.transport.links, self._settings.check_may_dial, self._settings.connect)
+            leaving.callback(self.dialer.close)
+
+    def _build_calls(self, leaving: contextlib.ExitStack) -> None:
+        home, address = self._home, self._address
+        self.codec = handle_codec(lambda handle: handle.key, home.handle)
+        self.registry = Registry(address, self._access.may_offer, self._access.may_have_stops)
+        self.caller = Caller(self.transport, address, self._session)
+        leaving.callback(self.caller.close)
+        self.scheduler = Scheduler("trade-clock")
+        leaving.callback(self.scheduler.close)
+        self.notifier = Notifier(home, self.scheduler, address.epoch, lambda record: Handle(home, record.key, record))
+        leaving.callback(self.notifier.close)
+
+    def _build_locks(self, leaving: contextlib.ExitStack) -> None:
+        address = self._address
+        self.inherited = InheritedLock(self._settings.lock, address) if self._settings.lock else None
+        if self.inherited is not None:
+            handed_down[address] = self.inherited
+            leaving.callback(handed_down.pop, address)
+        self.event_loop = AsyncLoop()
+        leaving.callback(self.event_loop.close)
+        self.lock_api = LockApi(self._home)
+        self.locks = LockTable(address.epoch, self._home.name, audit=self.audit)
+        leaving.callback(self.locks.close)
+        self.remote_locks = RemoteLocks(self.locks, address.epoch)
+
+    def _build_services(self, leaving: contextlib.ExitStack) -> None:
+        address, access = self._address, self._access
+        self.announcer = Announcer(self.transport, address)
+        leaving.callback(self.announcer.close)
+        self.providers = Providers(
+            self.announcer, self.registry, address, self.codec, self.event_loop, self.locks, access, self.audit
+        )
+        self.targets = Targets(
+            address, self._session, access, self.registry, self.providers, self.caller, self.codec, self.audit
+        )
+        self.registry.listen(self.targets.changed)  # before anybody is told: who is told may call
+
+    def _build_notifications_and_hooks(self) -> None:
+        self.registry.listen(self.notifier.changed)
+        self.session_end_listeners.append(self.notifier.session_ended)
+        self.hooks = Hooks(
+            self._home,
+            self.codec,
+            self.scheduler,
+            self.providers.service,
+            lambda: self.registry.select(where.local),
+            self._denied_hook,
+        )
+        self.registry.listen(self.hooks.changed)
+        self.session_end_listeners.append(self.hooks.session_ended)
+        self.hook_numbers = itertools.count(1)
+
+    def _build_telemetry(self, leaving: contextlib.ExitStack) -> None:
+        exported = open_export(self._settings, self._address, leaving)
+        self.spans = new_spans(self._address, self._session, self.locks, exported)
+        self.trace(self._settings.trace)
+
+    def _build_streams(self, leaving: contextlib.ExitStack) -> None:
+        home = self._home
+        self.streams = Streams(home, self.transport, self.providers.service, self.scheduler, self.caller.new_id)
+        self.registry.listen(self.streams.changed)
+        self.session_end_listeners.append(self.streams.session_ended)
+        leaving.callback(self.streams.close)
+        self.subscriptions = Subscriptions(home, self.transport, self.scheduler, self.codec, self.registry.removed)
+        self.registry.listen(self.subscriptions.changed)
+        self.session_end_listeners.append(self.subscriptions.session_ended)
+        leaving.callback(self.subscriptions.close)
+
+    def _build_estop(self, leaving: contextlib.ExitStack) -> None:
+        state_dir = self._settings.state_dir
+        kept = None if state_dir is None else state_dir / self._settings.system / "estop"
+        self.estop = EstopController(
+            self.transport, self._address, self.registry, self.locks, self.providers, kept, self._access, self.audit
+        )
+        leaving.callback(self.estop.close)
+        self.deadman = self.estop.deadman
+        self.locks.stop_with(self.deadman.stop)
+
+    def _build_migration(self, leaving: contextlib.ExitStack) -> None:
+        home, address, access = self._home, self._address, self._access
+        self.withdrawn = Withdrawn(self.providers, self.deadman.rest)
+        self.factory = ProviderFactory(home, self.providers, self.withdrawn, self._settings.instantiable)
+        leaving.callback(self.factory.close)
+        quiescer = Quiescer(self.locks, address)
+        self.migration_source = MigrationSource(
+            home, self.providers, self.factory, self.withdrawn, quiescer, access, self.codec
+        )
+        self.migration_target = MigrationTarget(
+            address, self.providers, self.factory, quiescer, access, self.codec, self.scheduler
+        )
+        leaving.callback(self.migration_target.close)
+
+    def _build_dispatch(self, leaving: contextlib.ExitStack) -> None:
+        access, lookup = self._access, self.providers.lookup
+        self.dispatcher = Dispatcher(
+            self.transport, self._address, lookup, self.event_loop, access, self.audit, access.callers()
+        )
+        leaving.callback(self.dispatcher.close)
+
+    def _build_stop_line(self, leaving: contextlib.ExitStack) -> None:
+        self.stop_lines = StopLines(self._settings, lambda: () if self.stop_line is None else self.stop_line.own_places)
+        self.stop_line: StopLineService | None = None
+        """Its own end of the stop line; None on a transport without a host."""
+        if self.dialer is not None:
+            self.stop_line = StopLineService(
+                self._address, self._settings, self._access, self.audit, self.estop, self.stop_known
+            )
+            leaving.callback(self.stop_line.close)
+            self.registry.listen(self._mind_stops)
+            if self._settings.bridge:
+                self.stop_line.listen_on_host()
+
+    def _build_measures(self, leaving: contextlib.ExitStack) -> None:
+        self.load_meter = LoadMeter(self._home.name, lambda: list(self.dispatcher._crews), self.providers.waiting)
+        self.shutdown = Shutdown(
+            self._home.name, self.deadman.rest, self.locks.resources, lambda: self.load_meter.running, self._home.close
+        )
+        self.metrics_port = open_metrics(self._settings, self.audit.calls, self._measures, leaving)
 
     def appear(self, own: object, estops: object) -> None:
         """Be there for others, who find these functions of the middleware's own. Ends everything if it cannot.
@@ -193,7 +241,7 @@ class Components:
             undone.callback(self.close)
             self.providers.add(own, (DOMAIN,), name=PROVIDER)
             self.providers.add(estops, (DOMAIN,), name=ESTOP_PROVIDER)
-            self.estopping.begin(estops, self.lines.estop)
+            self.estop.begin(estops, self.stop_lines.estop)
             self._leaving.callback(self.announcer.appear().close)
             self.watch = RegistryListener(
                 self.transport,
@@ -203,11 +251,11 @@ class Components:
                 self.session_ended,
                 self.locks.session_back,
                 self.announcer.beat,
-                self.estopping.learn,
+                self.estop.learn,
             )
             self._leaving.callback(self.watch.close)
             if self._home.access.path is not None:
-                begin_watching(self._home.access, self.clockwork, self.audit, self.recheck_access)
+                begin_watching(self._home.access, self.scheduler, self.audit, self.recheck_access)
             undone.pop_all()
 
     def stop_known(self, group: str, limit_s: float) -> StopReport:
@@ -219,7 +267,7 @@ class Components:
         check_limit(limit_s, "stop")
         until = time.monotonic() + limit_s
         wanted = where(group=group)
-        beside = self.lines.stop(group, reason, limit_s)
+        beside = self.stop_lines.stop(group, reason, limit_s)
         while not (self.registry.select(wanted) or beside.over()) and (left_s := until - time.monotonic()) > 0:
             self.registry.wait_for(lambda: bool(self.registry.select(wanted)), min(_LOOK_S, left_s))
         report = self.stop_known(group, max(_LOOK_S, until - time.monotonic()))
@@ -237,7 +285,7 @@ class Components:
         self.caller.lost(address, back=back)
         if back:
             return
-        self.locking.keeper.lost(address)
+        self.lock_api.keeper.lost(address)
         if self.inherited is not None:
             self.inherited.lost(address)
         self.session_ended(str(address), f"its container {address.container} has ended or cannot be reached")
@@ -268,13 +316,13 @@ class Components:
         """Asked for by the metrics, on a thread of theirs."""
         infos, record = self.locks.infos(), self.audit.record
         yield Measure("calls", "Calls from other containers.", sum(self._taken()), kind="counter")
-        yield Measure("calls_in_flight", "Those of them that have a thread now.", self.meter.running)
+        yield Measure("calls_in_flight", "Those of them that have a thread now.", self.load_meter.running)
         yield Measure("calls_queued", "Calls of serial services whose turn has not come.", self.providers.waiting())
         yield Measure("containers", "Containers that are seen, this one included.", len(self.registry.containers()))
         yield Measure("dropped_messages", "Malformed, or of another version.", self.dropped_messages, kind="counter")
         yield Measure("locks", "Locks that hold here.", len(infos))
         yield Measure("lock_waiters", "Who waits for one of them.", sum(len(info.waiting) for info in infos))
-        yield Measure("estops_open", "E-stops that are open.", len(self.estopping.open_here()))
+        yield Measure("estops_open", "E-stops that are open.", len(self.estop.open_here()))
         yield Measure("process_cpu_seconds", "Of the whole process.", time.process_time(), kind="counter")
         if (resident := resident_bytes()) is not None:
             yield Measure("process_resident_bytes", "Of the whole process.", resident)
@@ -310,7 +358,7 @@ class Components:
     @property
     def dropped_messages(self) -> int:
         """Messages that were malformed or of another protocol version."""
-        readers = (self.dispatcher, self.caller, self.watch, self.estopping, self.listening)
+        readers = (self.dispatcher, self.caller, self.watch, self.estop, self.subscriptions)
         return sum(reader.malformed for reader in readers)
 
     def close(self) -> None:

@@ -73,14 +73,14 @@ class OwnServices(
             locks,
             home.address,
             parts.ask_for_release,
-            parts.locking.keeper.asked,
+            parts.lock_api.keeper.asked,
             access,
             parts.providers.groups_of,
-            parts.borrowed,
+            parts.remote_locks,
         )
         NotificationServices.__init__(self, parts.notifier, parts.registry, home, access)
         HookServices.__init__(self, parts.hooks, home, access)
         TraceServices.__init__(self, home.name, parts.spans, parts.trace)
         FactoryServices.__init__(self, home.system)
-        MigrationServices.__init__(self, parts.departing, parts.arriving)
+        MigrationServices.__init__(self, parts.migration_source, parts.migration_target)
         StreamServices.__init__(self, parts.streams)

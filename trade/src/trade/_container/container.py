@@ -66,21 +66,21 @@ class Container(Registering, Migrating, Streaming, Tracing, MotionControl, Feder
         self._closed = False
         self._parts = Components(self, self.settings, transport)
         self._known = self._parts.targets.known
-        self.locking = self._parts.locking
+        self.locking = self._parts.lock_api
         """Its locks on what others offer, and on what it offers itself."""
-        self.borrowed = self._parts.borrowed
+        self.borrowed = self._parts.remote_locks
         """What is locked in other systems behind its grants."""
         self.withdrawn: Final = self._parts.withdrawn
         """What was taken off from elsewhere and can be offered again."""
-        self.making: Final = self._parts.making
+        self.making: Final = self._parts.factory
         """What it made for others."""
-        self.arriving: Final = self._parts.arriving
+        self.arriving: Final = self._parts.migration_target
         """What comes to it from elsewhere, or from before."""
-        self.meter: Final = self._parts.meter
+        self.meter: Final = self._parts.load_meter
         """How busy it is."""
-        self.terminating: Final = self._parts.terminating
+        self.terminating: Final = self._parts.shutdown
         """Its end, if others want it."""
-        self._parts.appear(OwnServices(self._parts, self), EstopServices(self._parts.estopping))
+        self._parts.appear(OwnServices(self._parts, self), EstopServices(self._parts.estop))
         fork_guard.live.add(self)
 
     def load_policy(self, path: Path | str) -> None:
@@ -186,9 +186,9 @@ class Container(Registering, Migrating, Streaming, Tracing, MotionControl, Feder
     def reach(self) -> Dialer:
         """Whom it is linked to; raises ConfigurationError on a transport that has no such switches."""
         self._check_open()
-        if self._parts.reach is None:
+        if self._parts.dialer is None:
             raise ConfigurationError(problem="this container's transport cannot be linked to others while it runs")
-        return self._parts.reach
+        return self._parts.dialer
 
     def handle(self, key: ServiceKey) -> Handle:
         """A handle of a service whose key is known."""

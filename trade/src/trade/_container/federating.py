@@ -82,7 +82,7 @@ class Federating(Member):
     @property
     def estopping(self) -> EstopController:
         """Its e-stops."""
-        return self._parts.estopping
+        return self._parts.estop
 
     def require_present(self, session: str) -> None:
         """Raises SessionEnded: its container is not there, or it has ended."""
@@ -127,7 +127,7 @@ class Federating(Member):
         for here, there in _lockable(place, service, home.place).items():
             adopted.append(self._parts.locks.adopt(home.adopt(here, there)))
         resources = tuple(adopted[first:])
-        return passed_on_service(label, service, handle, home.speaking, home.codec, resources, self._parts.coroutines)
+        return passed_on_service(label, service, handle, home.speaking, home.codec, resources, self._parts.event_loop)
 
     def tell_anew(self, provider: object, info: ProviderInfo) -> None:
         """Tell something else about what is passed on; its services are the same."""

@@ -66,7 +66,7 @@ class Lookup(Member):
 
     def _unanswered(self, wait_s: float) -> Sequence[str]:
         """Where nobody was found; why is only looked at for who has waited, as it takes half a second for each."""
-        reach = self._parts.reach
+        reach = self._parts.dialer
         if wait_s > 0 or reach is None:
             return self.sight(limit_s=0).unanswered
         return tuple(f"{endpoint} (TRADE_CONNECT)" for endpoint in reach.configured)
@@ -81,7 +81,7 @@ class Lookup(Member):
                 an endpoint takes up to 3 s more for each.
         """
         self._check_open()
-        return look_around(self._parts.registry, self._parts.reach, self.address, self.settings.system, limit_s)
+        return look_around(self._parts.registry, self._parts.dialer, self.address, self.settings.system, limit_s)
 
     # --- calling
 

@@ -155,12 +155,12 @@ class MotionControl(Member):
                 new one.
         """
         self._check_open()
-        return self._parts.estopping.estop(reason, limit_s, estop_id)
+        return self._parts.estop.estop(reason, limit_s, estop_id)
 
     def estops(self) -> list[Estop]:
         """The e-stops that are open anywhere in the system, oldest first."""
         self._check_open()
-        return self._parts.estopping.open()
+        return self._parts.estop.open()
 
     def estop_clear(self, ids: Sequence[str], *, limit_s: float = LIMIT_S) -> EstopReport:
         """Clear e-stops by their ids; once none is open, calls are let through again. Nothing moves by itself.
@@ -177,4 +177,4 @@ class MotionControl(Member):
             AccessDenied: the policy does not let this container administer the system.
         """
         self._check_open()
-        return self._parts.estopping.clear(ids, limit_s)
+        return self._parts.estop.clear(ids, limit_s)

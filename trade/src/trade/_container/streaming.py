@@ -70,9 +70,11 @@ class Streaming(Hooking):
         check_sampled(source)
         client = speaking.get()
         opened_by = client if client is not None and client.owner == self.address else None
-        stream = self._parts.listening.open(source, hz, on_change=on_change, if_=if_, keep=keep, opened_by=opened_by)
+        stream = self._parts.subscriptions.open(
+            source, hz, on_change=on_change, if_=if_, keep=keep, opened_by=opened_by
+        )
         if pushed is not None:
-            _Push(self, stream, pushed, self._parts.clockwork)
+            _Push(self, stream, pushed, self._parts.scheduler)
         return stream
 
 
