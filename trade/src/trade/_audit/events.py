@@ -1,6 +1,6 @@
 """What happened in a container, told to whoever writes it down: calls, locks, stops, refusals, changes of its set-up.
 
-Off, nothing of it stands in the way of a call. On, a call puts one record into a queue; `_audit_writer` does the rest.
+Off, nothing of it stands in the way of a call. On, a call puts one record into a queue; `writer` does the rest.
 """
 
 import time

@@ -1,6 +1,6 @@
 """E-stops as they hold in one container (S09): latched at once, stopped, written down, confirmed, in the end cleared.
 
-The other side, who orders one and waits for the confirmations, is `_estop_line`.
+The other side, who orders one and waits for the confirmations, is `broadcast`.
 """
 
 import logging

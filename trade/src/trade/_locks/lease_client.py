@@ -1,4 +1,4 @@
-"""Every lock a container has or wants: asked for everywhere, renewed, given back. One of them: `_lock`."""
+"""Every lock a container has or wants: asked for everywhere, renewed, given back. One of them: `lock`."""
 
 import contextlib
 import math

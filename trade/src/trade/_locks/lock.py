@@ -1,4 +1,4 @@
-"""A lock as its owner has it: what it has of its parts, and whether they still hold. Taking and keeping: `_keeper`."""
+"""A lock as its owner has it: what it has of its parts, and whether they still hold. Taking and keeping: `lease_client`."""
 
 import asyncio
 import contextlib

@@ -125,7 +125,7 @@ class ServiceInfo(Struct, frozen=True, kw_only=True, omit_defaults=True, weakref
     uses: tuple[str, ...] = ()
     parameters: tuple[Parameter, ...] = ()
     arguments_schema: Raw = NO_SCHEMA
-    """JSON Schema as it travels: few are ever looked at, see `_schemas`."""
+    """JSON Schema as it travels: few are ever looked at, see `schema`."""
     result_schema: Raw = NO_SCHEMA
     types: dict[str, str] = {}
     """Schema definition -> ``module:qualified name``, so that a process that has the type gets the type."""

@@ -1,7 +1,7 @@
 """The seam between the middleware and whatever carries its bytes.
 
 Five verbs: publish, subscribe, announce (and answer who asks what stands), be present, close. Everything above is the
-same on any implementation; ``_zenoh`` is the real one.
+same on any implementation; ``zenoh`` is the real one.
 """
 
 from abc import ABC, abstractmethod

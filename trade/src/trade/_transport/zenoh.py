@@ -58,7 +58,7 @@ def configuration(
 ) -> dict[str, Any]:
     """The settings of one session, as zenoh names them; ``bridge`` has the interfaces of each network it joins.
 
-    Whom it lets in is decided by certificates or else by credentials, and what they may send by the rules (see `_acl`).
+    Whom it lets in is decided by certificates or else by credentials, and what they may send by the rules (see `zenoh_acl`).
     """
     entry: dict[str, Any] = {} if certificate is None else {"transport/link/tls": transport_settings(certificate)}
     if credentials is not None:

@@ -1,4 +1,4 @@
-"""What every transport must do: the guarantees of ``_transport``, each a test of its own."""
+"""What every transport must do: the guarantees of `_transport.base`, each a test of its own."""
 
 # ruff: noqa: S101 - these are tests
 
