@@ -1,4 +1,4 @@
-"""A lock as its owner has it: what it has of its parts, and whether they still hold. Taking and keeping: `lease_client`."""
+"""A lock as its owner has it: its parts, and whether they still hold. `lease_client` acquires and renews them."""
 
 import asyncio
 import contextlib

@@ -58,7 +58,7 @@ def configuration(
 ) -> dict[str, Any]:
     """The settings of one session, as zenoh names them; ``bridge`` has the interfaces of each network it joins.
 
-    Whom it lets in is decided by certificates or else by credentials, and what they may send by the rules (see `zenoh_acl`).
+    Certificates, or else credentials, decide whom it lets in; rules decide what they may send (see `zenoh_acl`).
     """
     entry: dict[str, Any] = {} if certificate is None else {"transport/link/tls": transport_settings(certificate)}
     if credentials is not None:
