@@ -4,7 +4,7 @@ import concurrent.futures
 from collections.abc import Callable, Iterable, Sequence
 
 from trade._protocol.messages import Token
-from trade._resources.lock_request import Granted, LockRequest
+from trade._resources.grants import Granted, LockRequest
 from trade._resources.lock_table import LockTable
 from trade._resources.resource import Holder, Permit, Resource, admit
 from waiting import wait_until

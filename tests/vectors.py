@@ -29,7 +29,7 @@ from trade._protocol.messages import (
     Token,
 )
 from trade._protocol.samples import StreamSample
-from trade._resources.lock_request import Granted, LockInfo, LockRequest
+from trade._resources.grants import Granted, LockInfo, LockRequest
 from trade._resources.resource import Holder
 
 FILE: Final = Path(__file__).parents[1] / "docs" / "wire-vectors.json"

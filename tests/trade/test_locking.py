@@ -14,7 +14,7 @@ from jointed import WHOLE, Joint, Robot
 from trade import Container, Handle, permit, service, where
 from trade._locks import api
 from trade._protocol.keys import ServiceKey
-from trade._resources.lock_request import LockRequest
+from trade._resources.grants import LockRequest
 from trade.errors import (
     ConfigurationError,
     IncompleteGroup,

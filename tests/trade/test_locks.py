@@ -9,7 +9,7 @@ import pytest
 
 from lock_table import EPOCH, Table
 from trade._protocol.messages import Token
-from trade._resources.lock_request import Granted, LockRequest
+from trade._resources.grants import Granted, LockRequest
 from trade._resources.lock_table import LockTable
 from trade._resources.resource import Holder, Permit, Resource
 from trade.errors import LockedByOther, LockLost, MotionStopped, NotStopped, ServiceGone, Stopped

@@ -10,7 +10,7 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, 
 
 from lock_table import COUPLED, NAMES, Table
 from trade._protocol.messages import Token
-from trade._resources.lock_request import Granted
+from trade._resources.grants import Granted
 from trade._resources.resource import Permit
 from trade.errors import LockedByOther, LockLost, MotionStopped, NotStopped
 from waiting import wait_until

@@ -9,7 +9,7 @@ import pytest
 
 from migrants import MODULE, Scene, imported
 from trade import Container, Handle, where
-from trade._migration import quiesce, state, target
+from trade._migration import quiesce, target
 from trade._migration.factory import path_of
 from trade.errors import (
     AccessDenied,
@@ -187,7 +187,7 @@ def test_S18_what_is_commanded_while_state_is_restored_is_refused(scene: Scene) 
 
 
 def test_S18_who_is_given_up_may_not_command_later_either(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(state, "BUDGET_S", 0.05)
+    monkeypatch.setattr(quiesce, "BUDGET_S", 0.05)
     leave, outcomes = threading.Event(), list[Exception]()
 
     def linger(wheel: Any, _state: object) -> None:
@@ -309,7 +309,7 @@ def test_what_a_provider_raises_is_told_and_changes_nothing(scene: Scene, method
 def test_a_provider_that_takes_too_long_with_its_state_stays(
     scene: Scene, method: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(state, "BUDGET_S", 0.05)
+    monkeypatch.setattr(quiesce, "BUDGET_S", 0.05)
     count, _ = scene.counter()
     leave = threading.Event()
     scene.module.before[method] = lambda: leave.wait(30)

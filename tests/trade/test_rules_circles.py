@@ -9,8 +9,8 @@ from ruled import SOON_S, TELL, Desk, Engine, Lamp
 from trade import Container, service, where
 from trade.rules import Firing
 from trade.rules import _engine as rules_module
-from trade.rules import _loop_detector as causes
-from trade.rules._loop_detector import LoopDetector, Mark, turns
+from trade.rules import _steps as causes
+from trade.rules._steps import LoopDetector, Mark, turns
 from waiting import wait_until
 
 

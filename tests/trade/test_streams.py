@@ -10,8 +10,7 @@ from listening import FAST_HZ, PATIENCE_S, Battery, Two, is_sample, numbers, som
 from trade import Handle, Stream, where
 from trade._protocol.messages import EMPTY, PROTOCOL
 from trade._protocol.samples import STEPS_HZ, StreamSample, stream_key
-from trade._streams.pace import Pace
-from trade._streams.source import RateRequest, Source
+from trade._streams.source import Pace, RateRequest, Source
 from trade.errors import ConfigurationError
 from trade.testing import MemorySystem
 

@@ -20,7 +20,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID
 
 from certificates import Papers
 from trade import Container, Settings, service, where
-from trade._security import certificate_expiry
+from trade._security import certificates
 from trade._security.certificates import Certificate
 from trade._transport.endpoints import free_endpoint
 from trade._transport.zenoh import ZenohTransport, configuration
@@ -267,7 +267,7 @@ def test_a_container_that_runs_is_told_in_time_to_start_again_before_its_certifi
     start_container: Any, papers: Papers, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As it listens with the one it was started with, a renewed one in its folder does not help."""
-    monkeypatch.setattr(certificate_expiry, "_TOLD", (timedelta(hours=22), timedelta(hours=21)))
+    monkeypatch.setattr(certificates, "_TOLD", (timedelta(hours=22), timedelta(hours=21)))
     with caplog.at_level(logging.WARNING, "trade"):
         for name, hours in (("arm", 22), ("leg", 23)):
             start_container(name, tls=papers.of(name, lasts=timedelta(hours=hours, seconds=2)))
@@ -280,10 +280,10 @@ def test_a_container_that_runs_is_told_in_time_to_start_again_before_its_certifi
 def test_the_end_of_a_certificate_is_told_twice(
     papers: Papers, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(certificate_expiry, "_TOLD", (timedelta(hours=22), timedelta(hours=21)))
+    monkeypatch.setattr(certificates, "_TOLD", (timedelta(hours=22), timedelta(hours=21)))
     until = datetime.now(timezone.utc) + timedelta(hours=21, seconds=1)
     with caplog.at_level(logging.WARNING, "trade"):
-        ending = certificate_expiry.ExpiryWatch(Certificate(papers.of("arm"), "arm", frozenset(), until))
+        ending = certificates.ExpiryWatch(Certificate(papers.of("arm"), "arm", frozenset(), until))
         assert said_of_the_end(caplog, "arm") == 1
         wait_until(lambda: said_of_the_end(caplog, "arm") == 2, "once more")
         ending.close()

@@ -37,7 +37,7 @@ from trade._protocol.messages import HEALTHY, Estop, Scalar, Token
 from trade._protocol.samples import Sample
 from trade._protocol.schema_types import publish
 from trade._registry.constraints import Constraint, where
-from trade._resources.lock_request import Granted, LockInfo
+from trade._resources.grants import Granted, LockInfo
 from trade._resources.resource import Holder, Permit, Resource, permit
 from trade._services.decorator import service
 from trade._services.secret import Secret

@@ -18,7 +18,7 @@ import msgspec
 from trade import Container
 from trade._protocol.keys import ALIVE, Address, is_chunk, registry_key
 from trade._protocol.messages import Token
-from trade._resources.lock_request import Granted
+from trade._resources.grants import Granted
 from trade._settings import Settings
 from trade._transport.base import Answer, ChannelClosed
 from trade._transport.endpoints import free_endpoint

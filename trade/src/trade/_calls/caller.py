@@ -14,9 +14,7 @@ from typing import Any, Final
 
 from msgspec import Raw, structs
 
-from trade._calls.peer import NEVER, Peer
-from trade._calls.publishers import CallPublishers
-from trade._calls.reply_slot import OnReply, Pending, ReplySlot
+from trade._calls.peer import NEVER, CallPublishers, OnReply, Peer, Pending, ReplySlot
 from trade._protocol.keys import CLOCK, DOMAIN, PROVIDER, Address, reply_key
 from trade._protocol.messages import (
     CANCEL,

@@ -9,8 +9,7 @@ from trade._container.assembly import Components
 from trade._container.system import System, SystemServices
 from trade._hooks.services import HookServices
 from trade._locks.services import LockServices
-from trade._migration.factory_services import FactoryServices
-from trade._migration.services import MigrationServices
+from trade._migration.services import FactoryServices, MigrationServices
 from trade._notifications.services import NotificationServices
 from trade._notifications.services import NotificationServicesHost as Member
 from trade._security.authorizer import Authorizer

@@ -7,8 +7,7 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 from trade._discovery.host_folder import HostFolder
-from trade._security.certificate_expiry import ExpiryWatch
-from trade._security.certificates import Certificate
+from trade._security.certificates import Certificate, ExpiryWatch
 from trade._security.policy_file import read_policy
 from trade._security.zenoh_acl import acl, crossings
 from trade._settings import Settings

@@ -10,7 +10,7 @@ from trade._locks.api import LEASE_S, RESUME_WAIT_S, LockApi
 from trade._locks.lock import Lock, OnLost, OnRequest
 from trade._protocol.messages import Estop
 from trade._registry.constraints import Constraint
-from trade._resources.lock_request import LockInfo
+from trade._resources.grants import LockInfo
 from trade._stop_line import StopReport
 
 

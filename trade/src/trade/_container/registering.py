@@ -11,7 +11,7 @@ from trade._container.base import Member
 from trade._protocol.keys import DOMAIN
 from trade._protocol.messages import HEALTHY, ProviderInfo, Scalar
 from trade._registry.constraints import checked_meta
-from trade._services.offerable import checked_groups, checked_health
+from trade._services.registration import checked_groups, checked_health
 from trade._transport.base import ChannelClosed
 
 _logger = logging.getLogger("trade")

@@ -9,7 +9,7 @@ from typing import Any, Final, Protocol
 
 from msgspec import Raw
 
-from trade._context.ended_sessions import within
+from trade._context.sessions import within
 from trade._protocol.messages import Call, Status, encode_message
 from trade._protocol.remote_errors import pack_error
 from trade.errors import Cancelled, OutcomeUnknown

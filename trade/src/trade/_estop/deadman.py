@@ -8,7 +8,7 @@ from typing import Final
 from trade._audit.events import Audit
 from trade._context.active_calls import end_calls
 from trade._context.call_context import CallContext
-from trade._context.ended_sessions import within
+from trade._context.sessions import within
 from trade._resources.resource import Resource
 from trade._services.local_service import LocalService
 

@@ -12,7 +12,7 @@ from trade._locks.lease_client import LeaseClient
 from trade._locks.lock import Lock, OnLost, OnRequest
 from trade._protocol.keys import DOMAIN, PROVIDER, Address, ServiceKey
 from trade._registry.constraints import Constraint, Term, under
-from trade._resources.lock_request import LockInfo, LockRequest
+from trade._resources.grants import LockInfo, LockRequest
 from trade._security.authorizer import Authorizer
 from trade.errors import (
     Busy,

@@ -15,7 +15,7 @@ from trade._calls.run import Run
 from trade._locks.lock import Lock, apart
 from trade._protocol.keys import DOMAIN, PROVIDER, Address, ServiceKey
 from trade._protocol.messages import Token
-from trade._resources.lock_request import LockRequest
+from trade._resources.grants import LockRequest
 from trade.errors import Busy, ContainerLost, LockedByOther, ServiceGone, TradeError
 
 _ANSWER_S: Final = 2.0

@@ -17,7 +17,7 @@ from trade._context.claims import Claim, Selection
 from trade._locks.inherited import VARIABLE, passed_on
 from trade._protocol.keys import Address
 from trade._protocol.messages import Token
-from trade._resources.lock_request import Granted, LockRequest
+from trade._resources.grants import Granted, LockRequest
 from trade.errors import ConfigurationError, LockLost, TradeError
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ from trade._context.call_context import CallContext
 from trade._locks.lock import Lock, OnLost, OnRequest
 from trade._protocol.keys import Address
 from trade._protocol.messages import Token
-from trade._resources.lock_request import Granted, LockRequest
+from trade._resources.grants import Granted, LockRequest
 from trade._resources.lock_table import LockTable
 from trade._resources.resource import Resource
 from trade.errors import LockLost

@@ -12,7 +12,7 @@ from trade._context.sessions import foreign
 from trade._locks.remote_locks import RemoteLocks
 from trade._protocol.keys import Address
 from trade._protocol.messages import Token
-from trade._resources.lock_request import Granted, LockInfo, LockRequest
+from trade._resources.grants import Granted, LockInfo, LockRequest
 from trade._resources.lock_table import LockTable
 from trade._resources.resource import Holder, Resource
 from trade._security.authorizer import Authorizer

@@ -1,12 +1,13 @@
 """A provider held still: nobody calls what actuates, nothing moves, until its state has been taken or given."""
 
 import contextlib
+import threading
 import time
 from collections.abc import Callable, Generator, Mapping
-from typing import Final
+from typing import Any, Final
 
 from trade._protocol.keys import Address
-from trade._resources.lock_request import LockRequest
+from trade._resources.grants import LockRequest
 from trade._resources.lock_table import LockTable
 from trade._resources.resource import Holder, Resource, locked
 from trade._services.local_service import LocalService
@@ -113,3 +114,41 @@ def require_rest(resources: tuple[Resource, ...]) -> None:
         if resource.moving:
             owner, purpose = ", ".join(resource.movers) or "somebody", "a motion that has not ended"
             raise LockedByOther(resources=(resource.name,), owner=owner, purpose=purpose)
+
+
+BUDGET_S: Final = 5.0
+"""How long a provider may take to give or take its state."""
+
+
+def is_stateful(kind: type) -> bool:
+    """Whether objects of a class can give and take their state."""
+    return all(callable(getattr(kind, name, None)) for name in ("save_state", "restore_state"))
+
+
+def save(provider: Any) -> Any:
+    """The state of a provider; raises what it raises, and TimeoutError after `BUDGET_S`."""
+    return _within_budget(provider.save_state, "save_state")
+
+
+def restore(provider: Any, state: Any) -> None:
+    """Give a provider its state; raises what it raises, and TimeoutError after `BUDGET_S`."""
+    _within_budget(lambda: provider.restore_state(state), "restore_state")
+
+
+def _within_budget(ask: Callable[[], Any], what: str) -> Any:
+    """On a thread of its own: what hangs there for ever holds up nobody else."""
+    results, errors, over = list[Any](), list[BaseException](), threading.Event()
+
+    def run() -> None:
+        try:
+            results.append(ask())
+        except BaseException as error:  # noqa: BLE001 - raised where it was asked for
+            errors.append(error)
+        over.set()
+
+    threading.Thread(target=run, name=f"trade-{what}", daemon=True).start()
+    if not over.wait(BUDGET_S):
+        raise TimeoutError(f"{what} has not ended after {BUDGET_S:g} s")
+    for error in errors:
+        raise error
+    return results[0]

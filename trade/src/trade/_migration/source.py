@@ -13,8 +13,7 @@ from typing import Any, Final, Protocol
 from trade._calls.handle import Handle
 from trade._context.call_context import running
 from trade._migration.factory import Arguments, ProviderFactory, path_of
-from trade._migration.quiesce import Frozen, Quiescer
-from trade._migration.state import is_stateful, restore, save
+from trade._migration.quiesce import Frozen, Quiescer, is_stateful, restore, save
 from trade._migration.target import Prepared, ProviderSnapshot, fingerprint
 from trade._protocol.codec import Codec
 from trade._protocol.keys import DOMAIN, PROVIDER, Address, ServiceKey

@@ -11,17 +11,15 @@ from typing import Any, Final
 from msgspec import Struct, structs
 
 from trade._migration.factory import ProviderFactory, end, path_of
-from trade._migration.quiesce import Quiescer
-from trade._migration.state import is_stateful, restore
+from trade._migration.quiesce import Quiescer, is_stateful, restore
 from trade._protocol.codec import Codec
 from trade._protocol.keys import Address, ServiceKey, domain_of
 from trade._protocol.messages import Scalar, encode_message
 from trade._protocol.schema_types import imported
 from trade._security.authorizer import Authorizer
 from trade._services.decorator import marked_methods
-from trade._services.offerable import checked_groups
 from trade._services.providers import Providers
-from trade._services.registration import Built
+from trade._services.registration import Built, checked_groups
 from trade._services.signature import Signature
 from trade._threads.scheduler import ScheduledTask, Scheduler
 from trade.errors import Busy, CannotInstantiate, CannotMigrate, LockedByOther, NoSuchClass

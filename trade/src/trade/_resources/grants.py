@@ -1,12 +1,53 @@
-"""What the lock table of a container keeps of each grant and of each who waits, and how others see it."""
+"""What the lock table keeps: requests, grants, who waits, and the leases that expire."""
 
-from collections.abc import Iterable
+import math
+import threading
+from collections.abc import Callable, Iterable
 
 from msgspec import Struct
 
 from trade._protocol.messages import Token
-from trade._resources.lock_request import LockInfo
 from trade._resources.resource import Holder, Resource
+
+
+class LockRequest(Struct, frozen=True):
+    """How somebody wants a lock."""
+
+    purpose: str = ""
+    lease_s: float = 2.0
+    wait_s: float = 0.0
+    """How long to stand in the queue, and then to wait for what still runs and moves."""
+    priority: int = 0
+    """Higher ones come first; whoever has it keeps it."""
+    delegates: tuple[str, ...] = ()
+    """Identities that may use it, too."""
+
+
+class Granted(Struct, frozen=True):
+    """A lock's part in one container."""
+
+    token: Token | None
+    """None: everything asked for was locked by the asking call already."""
+    resources: tuple[str, ...]
+    waited_s: float = 0.0
+    """How long after it was asked for; the lease began then."""
+
+
+class LockInfo(Struct, frozen=True):
+    """One grant, as `trade.locks` tells it; or, with number 0 and of "nobody", what could not be stopped (S14)."""
+
+    token: Token
+    container: str
+    resources: tuple[str, ...]
+    holder: Holder
+    left_s: float
+    """What is left of the lease."""
+    uses: int
+    """Calls made under it."""
+    last_use: float
+    """``time.time()`` of the last one; 0 for none."""
+    waiting: tuple[str, ...]
+    """Who waits for any of it, next first."""
 
 
 class Waiter(Struct, eq=False):
@@ -58,3 +99,43 @@ def withheld(resource: Resource, epoch: str, container: str) -> LockInfo:
         last_use=0.0,
         waiting=(),
     )
+
+
+class Leases:
+    """Looks when the next lease may end, and earlier if it is told of one that ends before.
+
+    Args:
+        expire: takes away what is over; returns when the next may end, or infinity.
+        clock: in which these moments are, in seconds.
+    """
+
+    def __init__(self, expire: Callable[[], float], clock: Callable[[], float]) -> None:
+        self._expire = expire
+        self._clock = clock
+        self._sooner = threading.Event()
+        self._next_look = math.inf
+        self._thread: threading.Thread | None = None
+        self._closed = False
+
+    def look_by(self, until: float) -> None:
+        """There is a lease that ends then. Two threads may not say so at once."""
+        if self._thread is None:
+            self._thread = threading.Thread(target=self._run, name="trade-leases", daemon=True)
+            self._thread.start()
+        if until < self._next_look:
+            self._sooner.set()
+
+    def _run(self) -> None:
+        while not self._closed:
+            self._sooner.clear()
+            self._next_look = math.inf  # whoever is told of during the look wakes us
+            self._next_look = self._expire()
+            left_s = self._next_look - self._clock()
+            self._sooner.wait(None if left_s == math.inf else max(0.0, left_s))
+
+    def close(self) -> None:
+        """End the thread. Idempotent."""
+        self._closed = True
+        self._sooner.set()
+        if self._thread is not None and self._thread is not threading.current_thread():
+            self._thread.join(2)

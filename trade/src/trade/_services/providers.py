@@ -22,8 +22,7 @@ from trade._security.authorizer import Authorizer
 from trade._services.decorator import ServiceMark, kinds_of, marked_methods
 from trade._services.event_loop import AsyncLoop
 from trade._services.local_service import LocalService
-from trade._services.offerable import require_stop
-from trade._services.registration import Built, Offer, Registered
+from trade._services.registration import Built, Offer, Registered, require_stop
 from trade._services.serial_queue import SerialQueue
 from trade._services.signature import Signature
 from trade.errors import ConfigurationError

@@ -16,7 +16,7 @@ from msgspec.structs import astuple
 
 from trade._protocol.codec import Codec
 from trade._protocol.messages import MOST_BYTES, UNREADABLE, ErrorInfo, ServiceInfo
-from trade._protocol.schema_limits import NOT_FINITE, problem_text, value_at
+from trade._protocol.schema import NOT_FINITE, problem_text, value_at
 from trade._services.arguments import too_many
 from trade._services.decorator import ServiceMark
 from trade._services.description import describe, described, field_of

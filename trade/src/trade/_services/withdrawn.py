@@ -8,9 +8,8 @@ from msgspec import Struct
 
 from trade._protocol.keys import DOMAIN, ServiceKey
 from trade._resources.resource import Resource
-from trade._services.offerable import checked_groups
 from trade._services.providers import Providers
-from trade._services.registration import Offer
+from trade._services.registration import Offer, checked_groups
 from trade.errors import ConfigurationError, DeviceFault
 
 

@@ -20,10 +20,28 @@ from trade._protocol.samples import STEPS_HZ, StreamSample, stream_key
 from trade._registry.registry import Change
 from trade._services.local_service import LocalService
 from trade._services.serial_queue import Turn
-from trade._streams.pace import Pace
 from trade._threads.scheduler import Scheduler
 from trade._transport.base import ChannelClosed, Publisher, Transport
 from trade.errors import AccessDenied, ConfigurationError, DeadlineExceeded, ServiceGone
+
+
+class Pace:
+    """At most so many a second, by the source's clock."""
+
+    def __init__(self, hz: float) -> None:
+        self._period_ns = int(1e9 / hz)
+        self._slack_ns = self._period_ns // 2
+        """A source is never quite on time: so much too early is on time, too."""
+        self._due_ns: int | None = None
+
+    def takes(self, at_ns: int) -> bool:
+        """Whether the sample of that moment is one of those."""
+        due_ns = at_ns if self._due_ns is None else self._due_ns
+        if at_ns + self._slack_ns < due_ns:
+            return False
+        self._due_ns = max(due_ns, at_ns - self._period_ns) + self._period_ns
+        return True
+
 
 _logger = logging.getLogger("trade")
 

@@ -17,8 +17,7 @@ from trade._notifications.notification import Notification
 from trade._protocol.messages import HEALTHY
 from trade._services.decorator import service
 from trade.rules._file import Rule, read_rules
-from trade.rules._loop_detector import TURNS, LoopDetector, Mark, Way, turns
-from trade.rules._steps import Firing, StepResult, done, fired, holds
+from trade.rules._steps import TURNS, Firing, LoopDetector, Mark, StepResult, Way, done, fired, holds, turns
 
 GROUP: Final = "rules"
 MOST: Final = 5

@@ -26,7 +26,7 @@ from trade._locks.remote_locks import SharedResource, Wanted
 from trade._protocol.keys import Address, ServiceKey
 from trade._protocol.messages import Behalf, Estop, ProviderInfo
 from trade._registry.registry import Change
-from trade._resources.lock_request import LockRequest
+from trade._resources.grants import LockRequest
 from trade._transport.base import ChannelClosed
 from trade.errors import ConfigurationError, TradeError
 from trade.sharing._guest_sessions import GuestSessions

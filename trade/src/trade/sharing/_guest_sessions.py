@@ -5,8 +5,7 @@ from collections.abc import Callable, Hashable
 from typing import Final, Protocol
 
 from trade._context.call_context import CallContext
-from trade._context.ended_sessions import within
-from trade._context.sessions import Session, foreign
+from trade._context.sessions import Session, foreign, within
 from trade.errors import Busy, SessionEnded
 
 MOST: Final = 1024
