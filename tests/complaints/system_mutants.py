@@ -14,7 +14,7 @@ def the_devices_zero_is_taken_as_it_is(patch: pytest.MonkeyPatch) -> None:
 
 def one_thread_serves_all_calls(patch: pytest.MonkeyPatch) -> None:
     def main(self: WorkerPool) -> None:
-        while not self._dismissed:
+        while not self._closed:
             try:
                 self._work(self._channel.receive())
             except ChannelClosed:

@@ -17,7 +17,7 @@ HOUR_NS = 3_600_000_000_000
 
 
 class Act:
-    """Something that is begun by the clockwork, and ends when the test says so."""
+    """Something that is begun by the scheduler, and ends when the test says so."""
 
     def __init__(self, model: "Model") -> None:
         self._model = model
@@ -46,7 +46,7 @@ class Act:
         return said
 
     def end(self, again: int | Exception | None) -> None:
-        """Let it return that; the clockwork has taken note of it then."""
+        """Let it return that; the scheduler has taken note of it then."""
         times = len(self.began)
         self._ends.put(again)
         wait_until(lambda: not self.real._running or len(self.began) > times)
@@ -58,19 +58,19 @@ class Model(RuleBasedStateMachine):
     def __init__(self) -> None:
         super().__init__()
         self.now = 0
-        self.clockwork = Scheduler("model-clock", lambda: self.now)
+        self.scheduler = Scheduler("model-clock", lambda: self.now)
         self.turns = itertools.count()
         self.acts: list[Act] = []
 
     def teardown(self) -> None:
         """Closed, it begins nothing more, and what runs ends."""
-        closing = threading.Thread(target=self.clockwork.close)
+        closing = threading.Thread(target=self.scheduler.close)
         closing.start()
-        wait_until(lambda: self.clockwork._closed)
+        wait_until(lambda: self.scheduler._closed)
         for act in self._running():
             act.end(self.now)
         closing.join(PATIENCE_S)
-        assert not self.clockwork._threads
+        assert not self.scheduler._threads
         assert [len(act.began) for act in self.acts] == [len(act.begins) for act in self.acts]
 
     # what the model thinks
@@ -105,7 +105,7 @@ class Model(RuleBasedStateMachine):
             act = Act(self)
             self.acts.append(act)
             self._put(act, self.now + hours * HOUR_NS)
-            act.real = self.clockwork.begin(act, self.now + hours * HOUR_NS)
+            act.real = self.scheduler.begin(act, self.now + hours * HOUR_NS)
         self._settle()
 
     @precondition(lambda self: self.acts)
@@ -143,8 +143,8 @@ class Model(RuleBasedStateMachine):
     def advance(self, hours: int) -> None:
         self.now += hours * HOUR_NS
         self._settle()
-        with self.clockwork._lock:
-            self.clockwork._sooner.notify_all()
+        with self.scheduler._lock:
+            self.scheduler._sooner.notify_all()
 
     # what must hold
 
@@ -175,24 +175,24 @@ def _refuse(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_what_is_due_while_there_can_be_no_thread_is_done_with_the_next_thing(monkeypatch: pytest.MonkeyPatch) -> None:
-    clockwork, first, second = Scheduler("few-clock"), threading.Event(), threading.Event()
+    scheduler, first, second = Scheduler("few-clock"), threading.Event(), threading.Event()
     with monkeypatch.context() as few:
         _refuse(few)
-        clockwork.begin(first.set, 0)
+        scheduler.begin(first.set, 0)
         assert not first.is_set()
-    clockwork.begin(second.set, 0)
+    scheduler.begin(second.set, 0)
     assert first.wait(PATIENCE_S)
     assert second.wait(PATIENCE_S)
-    clockwork.close()
+    scheduler.close()
 
 
 def test_a_thread_that_can_have_none_beside_it_does_one_thing_after_the_other(monkeypatch: pytest.MonkeyPatch) -> None:
-    clockwork = Scheduler("few-clock")
-    clockwork.begin(lambda: None, 2**62)
-    wait_until(lambda: clockwork._leading)
+    scheduler = Scheduler("few-clock")
+    scheduler.begin(lambda: None, 2**62)
+    wait_until(lambda: scheduler._leading)
     _refuse(monkeypatch)
     for _ in range(2):
         done = threading.Event()
-        clockwork.begin(done.set, 0)
+        scheduler.begin(done.set, 0)
         assert done.wait(PATIENCE_S)
-    clockwork.close()
+    scheduler.close()

@@ -49,8 +49,8 @@ def test_S14_a_member_that_dies_loses_the_whole_and_the_rest_stops(robot: Robot,
 
 def test_S14_a_dead_owner_is_noticed_and_what_it_moved_stops(robot: Robot) -> None:
     robot.me.lock(WHOLE, lease_s=60).acquire()
-    with robot.me.locking.keeper._changed:
-        locks = list(robot.me.locking.keeper._locks)
+    with robot.me.locking.lease_client._changed:
+        locks = list(robot.me.locking.lease_client._locks)
     with locks[0].use():
         robot.find("a", "go_on")(0.1)
     robot.system.kill("me")
@@ -95,7 +95,7 @@ def test_S12_a_short_lease_is_renewed_in_time_beside_a_long_one(robot: Robot) ->
 
 
 def test_renewals_go_on_after_one_to_a_container_that_left(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
-    keeper, gone = robot.me.locking.keeper, []
+    keeper, gone = robot.me.locking.lease_client, []
     real = keeper._service
 
     def service_of(address: Address, name: str) -> Handle:
@@ -115,7 +115,7 @@ def test_renewals_go_on_after_one_to_a_container_that_left(robot: Robot, monkeyp
 
 def test_a_renewal_that_was_under_way_says_nothing_of_what_was_taken_since(robot: Robot) -> None:
     """It asks for the number of a part that was given back, and taken again under another one."""
-    keeper, lock = robot.me.locking.keeper, robot.me.lock([robot.find("a")], lease_s=60).acquire()
+    keeper, lock = robot.me.locking.lease_client, robot.me.lock([robot.find("a")], lease_s=60).acquire()
     [(address, token)] = lock.granted.items()
     keeper._renewed(address, [(lock, token.number - 1)], 0.0, _Answered([]))
     assert lock.held

@@ -10,7 +10,7 @@ from trade import Container, NotificationInfo, service
 from waiting import wait_until
 
 POLICY = """
-[roles.keeper]
+[roles.lease_client]
 register = ["rosie"]
 call = ["rosie"]
 administer = ["trade"]

@@ -244,9 +244,9 @@ class Caller:
         try:
             return self._free.pop()
         except IndexError:
-            return self._new_box()
+            return self._new_reply_slot()
 
-    def _new_box(self) -> ReplySlot:
+    def _new_reply_slot(self) -> ReplySlot:
         with self._lock:
             index = f"{self._own.epoch}-{len(self._every)}"  # another container may have our name: answers never cross
             key = reply_key("*", self._own.identity, self._own.container, index)
@@ -257,7 +257,7 @@ class Caller:
 
     def _shared_box(self) -> ReplySlot:
         if self._shared is None:
-            box = self._new_box()
+            box = self._new_reply_slot()
             with self._lock:
                 if self._shared is None:
                     self._shared = box

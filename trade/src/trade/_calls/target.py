@@ -65,7 +65,7 @@ class LocalTarget:
     ) -> None:
         self._service = service
         self._record = record
-        self._hands = hands
+        self._thread_pool = hands
         self._thread_name = f"trade-run-{service.label}"
         self._codec = codec
         self._label = service.label
@@ -112,7 +112,7 @@ class LocalTarget:
         if here:
             run.end(outcome)
         else:
-            self._hands.begin(partial(run.end, outcome), self._thread_name)
+            self._thread_pool.begin(partial(run.end, outcome), self._thread_name)
 
     def _taken(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> bytes:
         """The arguments as they are now, whatever becomes of them."""

@@ -44,7 +44,7 @@ class Targets:
         self._providers = providers
         self._caller = caller
         self._codec = codec
-        self._hands = ThreadPool()
+        self._thread_pool = ThreadPool()
         self._closed = False
         self.known: Final[dict[ServiceKey, Target]] = {}
         """Looked up already, and allowed."""
@@ -90,7 +90,9 @@ class Targets:
         service = self._providers.lookup(f"{record.key.domain}/{record.key.provider}", record.key.name)
         if service is None:  # deregistered since we looked
             return None
-        return LocalTarget(service, record, self._codec, self._own, self._session, self._caller.new_id, self._hands)
+        return LocalTarget(
+            service, record, self._codec, self._own, self._session, self._caller.new_id, self._thread_pool
+        )
 
     def _our_own(self, record: Record) -> ServiceInfo | None:
         """How this container describes a function of the middleware that another one has, too.
@@ -130,5 +132,5 @@ class Targets:
     def close(self) -> None:
         """Keep none from now on."""
         self._closed = True
-        self._hands.close()
+        self._thread_pool.close()
         self.known.clear()

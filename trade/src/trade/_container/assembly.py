@@ -224,7 +224,9 @@ class Components:
                 self.stop_line.listen_on_host()
 
     def _build_measures(self, leaving: contextlib.ExitStack) -> None:
-        self.load_meter = LoadMeter(self._home.name, lambda: list(self.dispatcher._crews), self.providers.waiting)
+        self.load_meter = LoadMeter(
+            self._home.name, lambda: list(self.dispatcher._worker_pools), self.providers.waiting
+        )
         self.shutdown = Shutdown(
             self._home.name, self.deadman.rest, self.locks.resources, lambda: self.load_meter.running, self._home.close
         )
@@ -285,7 +287,7 @@ class Components:
         self.caller.lost(address, back=back)
         if back:
             return
-        self.lock_api.keeper.lost(address)
+        self.lock_api.lease_client.lost(address)
         if self.inherited is not None:
             self.inherited.lost(address)
         self.session_ended(str(address), f"its container {address.container} has ended or cannot be reached")
@@ -334,7 +336,7 @@ class Components:
             yield from tell()
 
     def _taken(self) -> list[int]:
-        return [crew.taken for crew in list(self.dispatcher._crews)]
+        return [crew.taken for crew in list(self.dispatcher._worker_pools)]
 
     def _denied_hook(self, who: str, record: Record) -> AccessDenied | None:
         return self._home.access.denied(who, "instrument", record.key.domain, record.label)

@@ -72,7 +72,7 @@ class OwnServices(
             locks,
             home.address,
             parts.ask_for_release,
-            parts.lock_api.keeper.asked,
+            parts.lock_api.lease_client.asked,
             access,
             parts.providers.groups_of,
             parts.remote_locks,

@@ -316,7 +316,7 @@ class Container(Registering, Migrating, Streaming, Tracing, MotionControl, Feder
         with self._closing:  # who comes second waits until it is done
             if self._closed:
                 return
-            self.locking.keeper.close()  # gives back what it holds, while it can still be heard
+            self.locking.lease_client.close()  # gives back what it holds, while it can still be heard
             self._parts.caller.finish_stops(_STOPPING_S)
             self._closed = True
             self._parts.close()

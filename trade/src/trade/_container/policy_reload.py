@@ -23,21 +23,21 @@ class _Audit(Protocol):
     def changed(self, what: str, about: str, call: None) -> None: ...
 
 
-def begin_watching(access: Authorizer, clockwork: Scheduler, audit: _Audit, recheck_access: Callable[[], None]) -> None:
+def begin_watching(access: Authorizer, scheduler: Scheduler, audit: _Audit, recheck_access: Callable[[], None]) -> None:
     """Have a container go by its policy as the files are; those that are wrong are refused, and the old one stays.
 
     Args:
         access: what it goes by.
-        clockwork: does it, once a second.
+        scheduler: does it, once a second.
         audit: told of what has changed.
         recheck_access: applies another policy.
     """
-    _Watching(access, clockwork, audit, recheck_access)
+    _Watching(access, scheduler, audit, recheck_access)
 
 
 class _Watching:
     def __init__(
-        self, access: Authorizer, clockwork: Scheduler, audit: _Audit, recheck_access: Callable[[], None]
+        self, access: Authorizer, scheduler: Scheduler, audit: _Audit, recheck_access: Callable[[], None]
     ) -> None:
         self._access, self._audit, self._judge_anew = access, audit, recheck_access
         self._last: Seen = access.seen
@@ -45,7 +45,7 @@ class _Watching:
         self._refused: Seen | None = None
         """Files that were wrong, which is said once."""
         self._again_ns = 0
-        clockwork.begin(self._look, time.monotonic_ns() + _EVERY_NS)
+        scheduler.begin(self._look, time.monotonic_ns() + _EVERY_NS)
 
     def _look(self) -> int:
         now = self._access.look()

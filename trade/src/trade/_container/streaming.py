@@ -81,12 +81,12 @@ class Streaming(Hooking):
 class _Push:
     """Calls something with each value of a stream, one at a time."""
 
-    def __init__(self, home: Streaming, stream: Stream, target: Target, clockwork: Scheduler) -> None:
+    def __init__(self, home: Streaming, stream: Stream, target: Target, scheduler: Scheduler) -> None:
         self._home = home
         self._stream = stream
         self._target = target
         self._problem = ""
-        due = clockwork.due(self._act)
+        due = scheduler.due(self._act)
         stream.tell(lambda: due.at(time.monotonic_ns()))
         due.at(time.monotonic_ns())  # some may have come already
 

@@ -160,12 +160,12 @@ class HookInterceptor:
     """The hooks of one service here."""
 
     def __init__(
-        self, home: HookHost, codec: Codec, clockwork: Scheduler, handle: Handle, hooks: Sequence[AttachedHook]
+        self, home: HookHost, codec: Codec, scheduler: Scheduler, handle: Handle, hooks: Sequence[AttachedHook]
     ) -> None:
         self._home = home
         self._encode = codec.encode
         self._decode = codec.decoder(Any)
-        self._clockwork = clockwork
+        self._scheduler = scheduler
         self._handle = handle
         self._before = [hook for hook in hooks if hook.side == "before"]
         self._after = [hook for hook in hooks if hook.side == "after"]
@@ -191,7 +191,7 @@ class HookInterceptor:
                     called, ended=True, result=self._plain(result), error=error, took_s=took_s
                 )
                 if service.effect == "stop":  # nothing holds up the answer to a stop
-                    self._clockwork.begin(lambda: self._tell(self._after, ended, context), time.monotonic_ns())
+                    self._scheduler.begin(lambda: self._tell(self._after, ended, context), time.monotonic_ns())
                 else:
                     self._tell(self._after, ended, context)
         return result
@@ -251,14 +251,14 @@ class Hooks:
         self,
         home: HookHost,
         codec: Codec,
-        clockwork: Scheduler,
+        scheduler: Scheduler,
         services: Callable[[ServiceKey], LocalService | None],
         records: Callable[[], list[Record]],
         denied: Denied,
     ) -> None:
         self._home = home
         self._codec = codec
-        self._clockwork = clockwork
+        self._scheduler = scheduler
         self._services = services
         self._records = records
         self._denied = denied
@@ -353,7 +353,7 @@ class Hooks:
                 hook.services[record.key] = record.label
             around = None
             if mine:
-                around = HookInterceptor(self._home, self._codec, self._clockwork, self._home.handle(record.key), mine)
+                around = HookInterceptor(self._home, self._codec, self._scheduler, self._home.handle(record.key), mine)
             traced = self._spans if traceable(record.key) else None
             around = around if traced is None else SpanRecorder(traced, around)
             service.around = around if service.audited is None else service.audited.over(around)

@@ -65,7 +65,7 @@ class LockApi:
 
     def __init__(self, home: LockHost) -> None:
         self._home = home
-        self.keeper: Final = LeaseClient(home)
+        self.lease_client: Final = LeaseClient(home)
 
     def lock(
         self,
@@ -95,7 +95,7 @@ class LockApi:
             return Selection(resources_of(handles), tuple(absent(which, handles)))
 
         claim = Claim(which if isinstance(which, Constraint) else None)
-        return Lock(self.keeper, terms, wanted, on_lost, on_request, claim)
+        return Lock(self.lease_client, terms, wanted, on_lost, on_request, claim)
 
     def _there(self, which: Constraint | Iterable[Handle], wait_s: float, *, partial: bool) -> list[Handle]:
         """The services to lock. If nothing matches yet, that is waited for until it is there as a whole.

@@ -48,7 +48,7 @@ class Lock:
         on_request: OnRequest | None,
         claim: Claim,
     ) -> None:
-        self._keeper = keeper
+        self._lease_client = keeper
         self._terms = terms
         self._wanted = wanted
         self._on_lost = on_lost
@@ -93,7 +93,7 @@ class Lock:
         left_s = max(0.0, until - time.monotonic())
         for address, names in wanted.items():
             self.claim = self.claim.with_held(address, names)
-        self._keeper.acquire(self, wanted, structs.replace(self._terms, wait_s=left_s))
+        self._lease_client.acquire(self, wanted, structs.replace(self._terms, wait_s=left_s))
         self._whole = True
         if self.missing:
             told = self.purpose, ", ".join(self.resources), ", ".join(self.missing)
@@ -103,7 +103,7 @@ class Lock:
     @property
     def owner(self) -> Address:
         """The container whose lock it is."""
-        return self._keeper.owner
+        return self._lease_client.owner
 
     @property
     def held(self) -> bool:
@@ -145,7 +145,7 @@ class Lock:
                 return
             self._ended = True
         resources = self.resources
-        if not self._keeper.let_go(self) and self._lost is None:
+        if not self._lease_client.let_go(self) and self._lost is None:
             self._lost = LockLost(resources=resources, reason="it was not held any more when it was given back")
 
     def __enter__(self) -> "Lock":
@@ -167,7 +167,7 @@ class Lock:
         try:
             await asyncio.shield(taking)
         except asyncio.CancelledError:
-            taking.add_done_callback(lambda _: apart(self._keeper.over, self.release))
+            taking.add_done_callback(lambda _: apart(self._lease_client.over, self.release))
             raise
         return self._enter()
 
@@ -246,9 +246,9 @@ class Lock:
                 return
             self._lost = LockLost(resources=self.resources, reason=reason)
         _logger.warning("%s", self._lost)
-        apart(self._keeper.over, self._keeper.let_go, self, reason)
+        apart(self._lease_client.over, self._lease_client.let_go, self, reason)
         if self._on_lost is not None:
-            apart(self._keeper.over, self._on_lost, _again(self._lost))
+            apart(self._lease_client.over, self._on_lost, _again(self._lost))
 
 
 def _again(lost: LockLost) -> LockLost:

@@ -89,7 +89,7 @@ class MigrationTarget:
         freezing: Quiescer,
         access: Authorizer,
         codec: Codec,
-        clockwork: Scheduler,
+        scheduler: Scheduler,
     ) -> None:
         self._own = own
         self._making = making
@@ -97,7 +97,7 @@ class MigrationTarget:
         self._freezing = freezing
         self._access = access
         self._codec = codec
-        self._clockwork = clockwork
+        self._scheduler = scheduler
         self._lock = threading.Lock()
         self._places = threading.BoundedSemaphore(MOST)
         self._ready: dict[str, _Ready] = {}
@@ -123,7 +123,7 @@ class MigrationTarget:
             ending = undo.enter_context(contextlib.ExitStack())
             made, built = self._make(luggage, ending)
             self._restore(luggage, made, built, undo)
-            due = self._clockwork.due(lambda: self._over(ticket))
+            due = self._scheduler.due(lambda: self._over(ticket))
             with self._lock:
                 self._ready[ticket] = _Ready(caller, made, luggage, built, ending, undo.pop_all(), due)
         due.at(time.monotonic_ns() + int(TICKET_S * 1e9))

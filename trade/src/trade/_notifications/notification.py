@@ -114,7 +114,7 @@ class Owner(Struct, frozen=True):
 
 
 class ActiveNotification(Notification):
-    """One that lives in this container. Done by the clockwork: never twice at once."""
+    """One that lives in this container. Done by the scheduler: never twice at once."""
 
     def __init__(
         self,
@@ -153,9 +153,9 @@ class ActiveNotification(Notification):
 
     # --- being
 
-    def begin(self, clockwork: Scheduler) -> Callable[[int], None]:
+    def begin(self, scheduler: Scheduler) -> Callable[[int], None]:
         """Have it done; returns what has it done once more."""
-        due = clockwork.begin(self._act, time.monotonic_ns())
+        due = scheduler.begin(self._act, time.monotonic_ns())
         self._cancel_due = due.cancel
         return due.at
 

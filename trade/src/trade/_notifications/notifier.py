@@ -20,10 +20,10 @@ class Notifier:
     """Owns what stands in one container, for itself and for others."""
 
     def __init__(
-        self, home: NotificationHost, clockwork: Scheduler, epoch: str, handle: Callable[[Record], Handle]
+        self, home: NotificationHost, scheduler: Scheduler, epoch: str, handle: Callable[[Record], Handle]
     ) -> None:
         self._home = home
-        self._clockwork = clockwork
+        self._scheduler = scheduler
         self._epoch = epoch
         self._handle = handle
         self._lock = threading.Lock()
@@ -60,7 +60,7 @@ class Notifier:
             self._standing[name] = standing
             for record in existing:
                 standing.add(self._handle(record))
-            again = standing.begin(self._clockwork)
+            again = standing.begin(self._scheduler)
             if terms.occasion in OF_SERVICES:
                 self._of_services[name] = (standing, again)
         return standing

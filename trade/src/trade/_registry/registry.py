@@ -137,7 +137,7 @@ class Registry:
         self._containers: dict[Address, ContainerState] = {}
         self._records: Index[Record] = Index()
         self._lock = threading.RLock()
-        self._bell = InterruptibleCondition()
+        self._changed = InterruptibleCondition()
         self._telling = threading.RLock()
         self._listeners: list[Callable[[Change], None]] = []
         self.appear(own)
@@ -189,7 +189,7 @@ class Registry:
             if state is None or state.protocol == version:
                 return False
             state.protocol = version
-            self._bell.notify_all()
+            self._changed.notify_all()
             return True
 
     def tells_open(self, address: Address, domain: str, provider: str, estops: tuple[Estop, ...]) -> bool:
@@ -201,7 +201,7 @@ class Registry:
             if state is None or (provider not in state.estops and len(state.estops) >= _MOST_PROVIDERS):
                 return False
             state.estops[provider] = estops
-            self._bell.notify_all()
+            self._changed.notify_all()
             return True
 
     def settle(self, state: ContainerState, revision: int, offered: Mapping[str, tuple[str, ProviderInfo]]) -> None:
@@ -218,7 +218,7 @@ class Registry:
                 state.protocol = PROTOCOL
                 state.heard.all_told(revision)
                 change = self._change(state, offered, gone)
-                self._bell.notify_all()
+                self._changed.notify_all()
             self._tell(change)
 
     def appear(self, address: Address) -> bool:
@@ -227,7 +227,7 @@ class Registry:
             if address in self._containers or not self._has_room_for(address):
                 return False
             self._containers[address] = ContainerState(address)
-            self._bell.notify_all()
+            self._changed.notify_all()
             return True
 
     def _has_room_for(self, address: Address) -> bool:
@@ -316,7 +316,7 @@ class Registry:
         for key in old:
             if key not in new:
                 self._records.remove(key)
-        self._bell.notify_all()
+        self._changed.notify_all()
         return Change(
             joined=[new[key] for key in new if key not in old],
             left=[old[key] for key in old if key not in new],
@@ -348,7 +348,7 @@ class Registry:
             with self._lock:
                 return ready()
 
-        return self._bell.wait_for(holds, timeout_s)
+        return self._changed.wait_for(holds, timeout_s)
 
     def is_alive(self, address: Address) -> bool:
         return address in self._containers

@@ -93,16 +93,16 @@ class Dispatcher:
         self._lock = threading.Lock()
         self._leaving = False
         self._closed = False
-        self._once = CallDeduplicator()
-        self._herald = ProgressReporter(self._send_progress)
+        self._deduplicator = CallDeduplicator()
+        self._progress_reporter = ProgressReporter(self._send_progress)
         self.malformed = 0
         self.callers = set[str]()
         """Who is heard by channels of its own; nobody: all are heard by the same."""
-        self._crews: list[WorkerPool] = []
+        self._worker_pools: list[WorkerPool] = []
         if callers:
             self.hear(callers)
         else:
-            self._hire(ANYBODY)
+            self._add_worker_pools(ANYBODY)
 
     def hear(self, callers: Iterable[str]) -> None:
         """Take calls of these from now on, too: each by channels of its own, so that who floods fills only those."""
@@ -110,9 +110,9 @@ class Dispatcher:
             new = [caller for caller in dict.fromkeys(callers) if caller not in self.callers]
             self.callers.update(new)
             for caller in () if self._closed else new:
-                self._hire(caller)
+                self._add_worker_pools(caller)
 
-    def _hire(self, caller: str) -> None:
+    def _add_worker_pools(self, caller: str) -> None:
         """Threads for the calls of one caller and for its stops.
 
         Who can be told from others loses what it sends faster than it is taken: made to wait, it would hold up all who
@@ -121,12 +121,12 @@ class Dispatcher:
         for name, stop, refuse in (("trade-call", False, self._busy), ("trade-stop", True, self._serve)):
             pattern = calls_to(self._own, stop=stop, caller=caller)
             channel = self._transport.subscribe(pattern, newest=0 if caller == ANYBODY else _MOST_WAITING)
-            self._crews.append(WorkerPool(name, channel, self._serve, refuse))
+            self._worker_pools.append(WorkerPool(name, channel, self._serve, refuse))
 
     @property
     def draining(self) -> bool:
         """Whether some thread stands ready to take the next call."""
-        return all(crew.draining for crew in self._crews)
+        return all(pool.draining for pool in self._worker_pools)
 
     def _serve(self, message: Message) -> None:
         taken = self._take(message)
@@ -153,7 +153,7 @@ class Dispatcher:
             self._answer(replier, caller, call, *_run(caller, call, service, None))
             return
         ongoing = ActiveCall(service, caller, call, self._report)
-        first = self._once.begin(call, ongoing)
+        first = self._deduplicator.begin(call, ongoing)
         if first is not ongoing or ongoing.answer is not None:
             self._again(first, replier, caller, call)
         elif service.serial is None:
@@ -186,8 +186,8 @@ class Dispatcher:
 
     def _end(self, ongoing: ActiveCall, service: LocalService, replier: Publisher, call: Call, answer: Answer) -> None:
         if ongoing.said is not None:
-            self._herald.send(ongoing)
-        also = self._once.end(ongoing, call, answer, keep=service.effect != "read")
+            self._progress_reporter.send(ongoing)
+        also = self._deduplicator.end(ongoing, call, answer, keep=service.effect != "read")
         self._answer(replier, ongoing.caller, call, *answer)
         for again in also or ():
             self._answer(self._replier(ongoing.caller, again.reply), ongoing.caller, again, *answer)
@@ -214,13 +214,13 @@ class Dispatcher:
 
     def _again(self, first: ActiveCall, replier: Publisher, caller: str, call: Call) -> None:
         """It runs or has run: it gets that answer, and never runs again."""
-        answer = self._once.attach(first, call)
+        answer = self._deduplicator.attach(first, call)
         if answer is not None:
             self._answer(replier, caller, call, *answer)
 
     def _refuse(self, replier: Publisher, caller: str, call: Call, status: int, body: Raw = EMPTY) -> None:
         """It does not run now; but it may have before."""
-        first = self._once.find(caller, call)
+        first = self._deduplicator.find(caller, call)
         if first is not None:
             self._again(first, replier, caller, call)
         else:
@@ -231,13 +231,13 @@ class Dispatcher:
             asked = _decode_cancel(call.args)
         except UNREADABLE as bad:
             return Status.ERROR, Raw(encode_message(pack_error(bad)))
-        self._once.cancel(caller, asked.id, asked.service, asked.keep_s)
+        self._deduplicator.cancel(caller, asked.id, asked.service, asked.keep_s)
         return Status.OK, EMPTY
 
     def _report(self, ongoing: ActiveCall, value: Any) -> None:
         if ongoing.service is not None:
             service = ongoing.service
-            self._herald.tell(ongoing, Raw(service.signature.encode_progress(service.label, value)))
+            self._progress_reporter.tell(ongoing, Raw(service.signature.encode_progress(service.label, value)))
 
     def _send_progress(self, ongoing: ActiveCall, body: Raw) -> None:
         call = ongoing.call
@@ -318,7 +318,7 @@ class Dispatcher:
 
     def session_ended(self, session: str) -> None:
         """Nobody of it is there any more: what runs for it is asked to end, and with it what that has called."""
-        end_calls([one.cancel for one in self._once.made_for(session)])
+        end_calls([one.cancel for one in self._deduplicator.made_for(session)])
 
     def leave(self) -> None:
         """Start no call that waits for its turn: its caller is about to hear that this container has left."""
@@ -329,14 +329,14 @@ class Dispatcher:
         self.leave()
         with self._lock:
             self._closed = True
-        for crew in self._crews:
-            crew.dismiss()
-        for crew in self._crews:
-            crew.wait(_PARTING_S)
+        for pool in self._worker_pools:
+            pool.close()
+        for pool in self._worker_pools:
+            pool.wait(_PARTING_S)
         self._loop.close()  # whoever still waits for a coroutine ends with it
-        for crew in self._crews:
-            crew.wait(_PARTING_S)
-        self._herald.close()
+        for pool in self._worker_pools:
+            pool.wait(_PARTING_S)
+        self._progress_reporter.close()
         for replier in list(self._repliers.values()):
             replier.close()
 

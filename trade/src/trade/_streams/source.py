@@ -98,7 +98,7 @@ def period_ns(hz: float) -> int:
 
 
 class _Rate:
-    """What is put for all who want so many samples a second. Used by the clockwork only."""
+    """What is put for all who want so many samples a second. Used by the scheduler only."""
 
     def __init__(self, hz: float, publisher: Publisher) -> None:
         self._pace = Pace(hz)
@@ -133,7 +133,7 @@ class _Rate:
 
 
 class Source:
-    """A service of this container that is listened to, or once was. Done by the clockwork: never twice at once."""
+    """A service of this container that is listened to, or once was. Done by the scheduler: never twice at once."""
 
     def __init__(
         self,
@@ -275,13 +275,13 @@ class Streams:
         home: StreamHost,
         transport: Transport,
         services: Callable[[ServiceKey], LocalService | None],
-        clockwork: Scheduler,
+        scheduler: Scheduler,
         new_id: Callable[[], int],
     ) -> None:
         self._home = home
         self._transport = transport
         self._services = services
-        self._clockwork = clockwork
+        self._scheduler = scheduler
         self._new_id = new_id
         self._lock = threading.Lock()
         self._sources: dict[ServiceKey, tuple[Source, Callable[[int], None]]] = {}
@@ -316,7 +316,7 @@ class Streams:
         with self._lock:
             known = self._sources.get(key)
             if known is None:
-                due = self._clockwork.due(made.tick)
+                due = self._scheduler.due(made.tick)
                 known = self._sources[key] = (made, due.at)
         if known[0] is made:
             made.show()

@@ -74,7 +74,7 @@ class Stream:
         self._latest: Sample | BaseException | None = None
         self._end: BaseException | None = None
         self._closed = False
-        self._bell = InterruptibleCondition()
+        self._changed = InterruptibleCondition()
         self._told_of_more: set[Callable[[], None]] = set()
 
     # --- taking
@@ -101,7 +101,7 @@ class Stream:
             taken.extend([] if sample is None else [sample])
             return bool(taken)
 
-        if not self._bell.wait_for(came, timeout_s):
+        if not self._changed.wait_for(came, timeout_s):
             raise TimeoutError(f"no sample of {self.source.label} came within {timeout_s} s")
         return taken[0]
 
@@ -269,6 +269,6 @@ class Stream:
         self._ring()
 
     def _ring(self) -> None:
-        self._bell.notify_all()
+        self._changed.notify_all()
         for tell in list(self._told_of_more):
             tell()

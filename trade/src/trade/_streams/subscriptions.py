@@ -46,7 +46,7 @@ class _Subscription:
         stream: Stream,
         transport: Transport,
         keep: int,
-        clockwork: Scheduler,
+        scheduler: Scheduler,
         malformed: Callable[[Malformed], None],
     ) -> None:
         self._home = home
@@ -58,7 +58,7 @@ class _Subscription:
         self._lock = threading.Lock()
         self._closed = False
         self._malformed = malformed
-        self._due = clockwork.due(self._again)
+        self._due = scheduler.due(self._again)
         self._thread = threading.Thread(target=self._read, name="trade-stream", daemon=True)
 
     def _subscribe(self, hz: float) -> Channel:
@@ -160,18 +160,18 @@ class Subscriptions:
         self,
         home: StreamHost,
         transport: Transport,
-        clockwork: Scheduler,
+        scheduler: Scheduler,
         codec: Codec,
         removed: Callable[[ServiceKey], bool],
     ) -> None:
         self._home = home
         self._transport = transport
-        self._clockwork = clockwork
+        self._scheduler = scheduler
         self._codec = codec
         self._removed = removed
         self._numbers = itertools.count(1)
         self._lock = threading.Lock()
-        self._ears: dict[str, tuple[Stream, _Subscription]] = {}
+        self._subscriptions: dict[str, tuple[Stream, _Subscription]] = {}
         self.malformed = 0
         """Samples that were none."""
 
@@ -192,16 +192,16 @@ class Subscriptions:
         )
         try:
             newest = max(keep, _RING)
-            ear = _Subscription(self._home, stream, self._transport, newest, self._clockwork, self._note_malformed)
+            ear = _Subscription(self._home, stream, self._transport, newest, self._scheduler, self._note_malformed)
         except ChannelClosed:  # closed by another thread meanwhile
             raise container_closed(self._home.address) from None
         with self._lock:
-            self._ears[stream.name] = (stream, ear)
+            self._subscriptions[stream.name] = (stream, ear)
         try:
             ear.begin()
         except BaseException as error:
             with self._lock:
-                self._ears.pop(stream.name, None)
+                self._subscriptions.pop(stream.name, None)
             if isinstance(error, ChannelClosed):
                 raise container_closed(self._home.address) from None
             raise
@@ -210,7 +210,7 @@ class Subscriptions:
     def _ended(self, stream: Stream) -> None:
         """Told by a stream."""
         with self._lock:
-            _, ear = self._ears.pop(stream.name, (stream, None))
+            _, ear = self._subscriptions.pop(stream.name, (stream, None))
         if ear is not None:
             ear.close()
 
@@ -221,7 +221,7 @@ class Subscriptions:
 
     def changed(self, change: Change) -> None:
         """Told by the registry."""
-        if not self._ears:
+        if not self._subscriptions:
             return
         came, went = {record.key for record in change.joined}, {record.key for record in change.left}
         for stream, ear in self._all():
@@ -245,4 +245,4 @@ class Subscriptions:
 
     def _all(self) -> list[tuple[Stream, _Subscription]]:
         with self._lock:
-            return list(self._ears.values())
+            return list(self._subscriptions.values())

@@ -64,7 +64,7 @@ class LoadMeter:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._container = container
-        self._crews = crews
+        self._worker_pools = crews
         self._queued = queued
         self._clock = clock
         self._lock = threading.Lock()
@@ -72,12 +72,14 @@ class LoadMeter:
 
     def _sample(self) -> _Sample:
         busy, ticks = _host_ticks()
-        return _Sample(self._clock(), time.process_time(), busy, ticks, sum(crew.taken for crew in self._crews()))
+        return _Sample(
+            self._clock(), time.process_time(), busy, ticks, sum(crew.taken for crew in self._worker_pools())
+        )
 
     @property
     def running(self) -> int:
         """Calls of other containers that have a thread now."""
-        return sum(crew.working for crew in self._crews())
+        return sum(crew.working for crew in self._worker_pools())
 
     def read(self) -> LoadInfo:
         """As it is now."""

@@ -36,13 +36,13 @@ class WorkerPool:
         self._expecting = 0
         """Threads that wait for another one to come back."""
         self._threads: list[threading.Thread] = []
-        self._hired = 0
+        self._spawned = 0
         self._idle = 0
         self.taken = 0
         """Messages it has begun to work at, refused ones left out."""
-        self._dismissed = False
+        self._closed = False
         with self._lock:
-            self._hire()
+            self._spawn()
 
     @property
     def draining(self) -> bool:
@@ -54,15 +54,15 @@ class WorkerPool:
         with self._lock:
             return len(self._threads) - self._idle
 
-    def _hire(self) -> None:
-        thread = threading.Thread(target=self._main, name=f"{self._name}-{self._hired}", daemon=True)
+    def _spawn(self) -> None:
+        thread = threading.Thread(target=self._main, name=f"{self._name}-{self._spawned}", daemon=True)
         thread.start()
         self._threads.append(thread)
-        self._hired += 1
+        self._spawned += 1
         self._idle += 1
 
     def _main(self) -> None:
-        while not self._dismissed:
+        while not self._closed:
             try:
                 message = self._channel.receive()
             except ChannelClosed:
@@ -87,14 +87,14 @@ class WorkerPool:
             return True
 
     def _get_another(self) -> bool:
-        """Whether somebody comes back in a moment, or can be hired; with the lock held."""
+        """Whether somebody comes back in a moment, or can be spawned; with the lock held."""
         if _FEW <= len(self._threads) < MOST_THREADS:
             self._expecting += 1
-            self._back.wait_for(lambda: self._idle > 1 or self._dismissed, _MOMENT_S)
+            self._back.wait_for(lambda: self._idle > 1 or self._closed, _MOMENT_S)
             self._expecting -= 1
-        if self._idle == 1 and len(self._threads) < MOST_THREADS and not self._dismissed:
+        if self._idle == 1 and len(self._threads) < MOST_THREADS and not self._closed:
             try:
-                self._hire()
+                self._spawn()
             except RuntimeError:  # the process may have no more threads
                 _logger.exception("%s cannot have another thread", self._name)
         return self._idle > 1
@@ -110,10 +110,10 @@ class WorkerPool:
                 self._back.notify()
             return True
 
-    def dismiss(self) -> None:
+    def close(self) -> None:
         """Take no more calls. No thread goes back into the transport, where the end of the process would abort it."""
         with self._lock:
-            self._dismissed = True
+            self._closed = True
             self._back.notify_all()
         self._channel.close()
 

@@ -26,10 +26,10 @@ Callback = Callable[[], "int | None"]
 class ScheduledTask:
     """Something to be done at its time, and again if it says so; never twice at once."""
 
-    __slots__ = ("_act", "_asked_ns", "_clockwork", "_running", "_turn", "cancelled")
+    __slots__ = ("_act", "_asked_ns", "_running", "_scheduler", "_turn", "cancelled")
 
-    def __init__(self, clockwork: "Scheduler", act: Callback) -> None:
-        self._clockwork = clockwork
+    def __init__(self, scheduler: "Scheduler", act: Callback) -> None:
+        self._scheduler = scheduler
         self._act = act
         self._asked_ns: int | None = None
         """When it was wanted again while it ran."""
@@ -40,7 +40,7 @@ class ScheduledTask:
 
     def at(self, due_ns: int) -> None:
         """Have it done then, and no more when it was due before; while it runs: once more, then."""
-        self._clockwork.enter(self, due_ns)
+        self._scheduler.enter(self, due_ns)
 
     def cancel(self) -> None:
         """Do it no more; what runs finishes. Idempotent."""

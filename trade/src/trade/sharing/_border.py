@@ -259,7 +259,7 @@ class BorderDirection:
         asked = {address: list(names) for address, names in wanted.items()}
         with self._speaking(call, None):
             return Lock(
-                self._home.locking.keeper, ours, lambda: Selection(asked), on_lost, on_request, Claim()
+                self._home.locking.lease_client, ours, lambda: Selection(asked), on_lost, on_request, Claim()
             ).acquire()
 
     def resume(self, call: CallContext, address: Address, names: Sequence[str]) -> list[str]:
