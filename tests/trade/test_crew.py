@@ -50,7 +50,7 @@ def test_very_many_quick_calls_are_taken_by_few_threads(channel: Queue) -> None:
     for _ in range(3000):
         assert done.acquire(timeout=60)
     assert median(at_once) < MOST_THREADS // 2
-    crew.dismiss()
+    crew.close()
     crew.wait(20)
 
 
@@ -73,5 +73,5 @@ def test_slow_calls_get_a_thread_each_which_ends_with_them(
     assert crew.draining
     leave.set()
     assert eventually(lambda: sum(thread.name.startswith("slow-") for thread in threading.enumerate()) == 4)
-    crew.dismiss()
+    crew.close()
     crew.wait(20)
