@@ -19,7 +19,7 @@ def test_it_wakes_everybody_who_waits() -> None:
     for thread in threads:
         thread.start()
     rung.set()
-    bell.ring()
+    bell.notify_all()
     for thread in threads:
         thread.join(20)
     assert sum(woken.acquire(blocking=False) for _ in range(6)) == 5
@@ -38,7 +38,7 @@ def test_a_ring_between_looking_and_waiting_is_not_missed() -> None:
     def ready() -> bool:
         looks.append(time.monotonic())
         if len(looks) == 1:
-            bell.ring()
+            bell.notify_all()
             return False
         return True
 

@@ -111,7 +111,7 @@ def test_a_container_that_cannot_start_leaves_nothing(system: str, monkeypatch: 
     def fail(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(assembly, "Watch", fail)
+    monkeypatch.setattr(assembly, "RegistryListener", fail)
     with pytest.raises(KeyboardInterrupt):
         Container(Settings.read(container="interrupted"))
     monkeypatch.undo()

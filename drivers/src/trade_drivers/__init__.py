@@ -1,6 +1,6 @@
 """Motors, grippers, arms, cameras and sensors as TRADE services: interfaces in SI units, robot file, drivers."""
 
-from trade._protocol.schema_types import publish
+from trade._protocol.schema_types import publish as _publish
 from trade_drivers._attach import AttachedRobot, attach
 from trade_drivers.bus._jobs import WireError
 from trade_drivers.bus.can._monitor import CanBusState, CanMonitor
@@ -79,7 +79,7 @@ __all__ = [
     "without",
 ]
 
-publish(
+_publish(
     __name__, ArmLimits, ArmState, CameraInfo, CanBusState, Fault, FaultInfo, FaultSample, GripperLimits, GripperState
 )
-publish(__name__, Image, JointLimits, MotorState, Reading, SensorInfo)
+_publish(__name__, Image, JointLimits, MotorState, Reading, SensorInfo)

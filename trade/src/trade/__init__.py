@@ -12,6 +12,7 @@ from typing import Any
 from msgspec import Meta
 
 from trade import errors
+from trade import records as _records
 from trade._calls.batch import Outcome
 from trade._calls.handle import Bound, Handle
 from trade._calls.run import Run
@@ -29,19 +30,17 @@ from trade._estop.controller import LIMIT_S
 from trade._hooks.hook import HookEvent, HookInfo
 from trade._locks.api import LEASE_S, RESUME_WAIT_S
 from trade._locks.lock import Lock, OnLost, OnRequest
-from trade._migration.target import Prepared
 from trade._notifications.notification import Notification, NotificationInfo
 from trade._notifications.triggers import What
 from trade._protocol.container_info import ContainerInfo
-from trade._protocol.messages import HEALTHY, Estop, Scalar, Token
+from trade._protocol.messages import HEALTHY, Estop, Scalar
 from trade._protocol.samples import Sample
-from trade._protocol.schema_types import publish
+from trade._protocol.schema_types import publish as _publish
 from trade._registry.constraints import Constraint, where
-from trade._resources.grants import Granted, LockInfo
-from trade._resources.resource import Holder, Permit, Resource, permit
+from trade._resources.grants import LockInfo
+from trade._resources.resource import Permit, Resource, permit
 from trade._services.decorator import service
 from trade._services.secret import Secret
-from trade._services.withdrawn import WithdrawnInfo
 from trade._settings import Settings
 from trade._stop_line import StopReport
 from trade._streams.stream import If, Stream
@@ -497,7 +496,7 @@ for _name in __all__:  # `help(trade.lock)` says all that there is to say
     if f"see `Container.{_name}`" in (_said := getattr(globals()[_name], "__doc__", None) or "").replace("See", "see"):
         globals()[_name].__doc__ = getattr(Container, _name).__doc__
 
-publish(
+_publish(
     __name__, ContainerInfo, Estop, EstopReport, Handle, HookInfo, LoadInfo, LockInfo, LogLine, NotificationInfo, Span
 )
-publish(__name__, Granted, Holder, Prepared, Token, WithdrawnInfo)
+_publish(_records.__name__, *(getattr(_records, _name) for _name in _records.__all__))

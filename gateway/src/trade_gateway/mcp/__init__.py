@@ -1,6 +1,6 @@
 """A system for agents: tools of the Model Context Protocol, guarded by rights, locks and, where marked, a person."""
 
-from trade._protocol.schema_types import publish
+from trade._protocol.schema_types import publish as _publish
 from trade_gateway.mcp._approvals import Approvals, Request
 from trade_gateway.mcp._server import serve
 from trade_gateway.mcp._simulation_twin import Twin
@@ -8,4 +8,4 @@ from trade_gateway.mcp._tools import Tools
 
 __all__ = ["Approvals", "Tools", "Twin", "serve"]
 
-publish(__name__, Request)
+_publish(__name__, Request)

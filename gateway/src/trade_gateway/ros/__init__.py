@@ -1,6 +1,6 @@
 """ROS beside TRADE: topics, services, actions and joints of either, for the other."""
 
-from trade._protocol.schema_types import publish
+from trade._protocol.schema_types import publish as _publish
 from trade_gateway.ros._bridge import Bridge, Bridged
 from trade_gateway.ros._connect import join, planned
 from trade_gateway.ros._file import RosFile, read_ros_file
@@ -8,4 +8,4 @@ from trade_gateway.ros._from_ros_joints import RosJoint
 
 __all__ = ["Bridge", "Bridged", "RosFile", "join", "planned", "read_ros_file"]
 
-publish(__name__, Bridged, RosJoint)
+_publish(__name__, Bridged, RosJoint)

@@ -1,6 +1,6 @@
 """Containers as child processes: started in order, asked whether they answer, started again, their state kept."""
 
-from trade._protocol.schema_types import publish
+from trade._protocol.schema_types import publish as _publish
 from trade_gateway.config._children import Child, read_children
 from trade_gateway.supervisor._child import ChildInfo, News
 from trade_gateway.supervisor._lease import Lease
@@ -9,4 +9,4 @@ from trade_gateway.supervisor._supervisor import Supervisor
 
 __all__ = ["Child", "ChildInfo", "ChildServices", "News", "Supervisor", "read_children"]
 
-publish(__name__, ChildInfo, Lease)
+_publish(__name__, ChildInfo, Lease)

@@ -1,6 +1,6 @@
 """Rules that configure a running system, from a TOML file: on this occasion, if this holds, call these services."""
 
-from trade._protocol.schema_types import publish
+from trade._protocol.schema_types import publish as _publish
 from trade.rules._engine import GROUP, DryRun, RuleInfo, Rules, rehearse
 from trade.rules._file import Condition, Occasion, Rule, Selection, Step, read_rules
 from trade.rules._steps import Firing, StepResult
@@ -21,4 +21,4 @@ __all__ = [
     "rehearse",
 ]
 
-publish(__name__, StepResult, Firing, RuleInfo)
+_publish(__name__, StepResult, Firing, RuleInfo)
