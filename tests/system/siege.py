@@ -137,8 +137,8 @@ class Kept:
         self._complaints = (site.folder / f"{identity}.complaints").open("ab")
         self._process: subprocess.Popen[bytes] | None = None
         self._closed = threading.Event()
-        self._lease_client = threading.Thread(target=self._keep)
-        self._lease_client.start()
+        self._keeper = threading.Thread(target=self._keep)
+        self._keeper.start()
 
     @property
     def pid(self) -> int:
@@ -161,7 +161,7 @@ class Kept:
 
     def close(self) -> None:
         self._closed.set()
-        self._lease_client.join()
+        self._keeper.join()
         if self._process is not None:
             self._process.kill()
             self._process.wait(20)

@@ -434,7 +434,7 @@ def test_S16_a_lock_waits_until_what_it_is_for_is_there_as_a_whole(robot: Robot)
     lock = robot.me.lock(where(group="rosie.head"), wait_s=20)
     with ThreadPoolExecutor(1) as waiting:
         taken = waiting.submit(lock.acquire)
-        wait_until(lambda: bool(robot.me._parts.registry._bell._gates), "it waits")
+        wait_until(lambda: bool(robot.me._parts.registry._changed._gates), "it waits")
         head.register(_Eye(), "rosie.head")
         head.register(joints[0], "rosie.head")
         robot.me.find(where(group="rosie.head", name="move"), wait_s=20)  # a part of it is seen, and not taken
@@ -452,7 +452,7 @@ def test_S16_what_came_in_part_is_told_when_the_wait_is_over(robot: Robot) -> No
     lock = robot.me.lock(where(group="rosie.head"), wait_s=1)
     with ThreadPoolExecutor(1) as waiting:
         taken = waiting.submit(lock.acquire)
-        wait_until(lambda: bool(robot.me._parts.registry._bell._gates), "it waits")
+        wait_until(lambda: bool(robot.me._parts.registry._changed._gates), "it waits")
         head.register(joint, "rosie.head")
         with pytest.raises(IncompleteGroup, match="tilt"):
             taken.result(20)
@@ -475,7 +475,7 @@ def test_S16_a_lock_taken_while_its_driver_leaves_waits_for_the_next_one(robot: 
     lock = robot.me.lock(where(group="rosie.head"), wait_s=20)
     with ThreadPoolExecutor(1) as waiting:
         taken = waiting.submit(lock.acquire)
-        wait_until(lambda: bool(robot.me._parts.registry._bell._gates), "it waits")
+        wait_until(lambda: bool(robot.me._parts.registry._changed._gates), "it waits")
         old.deregister(leaving[1])
         wait_until(lambda: not robot.me.services(where(group="rosie.head")), "nothing is left")
         for joint in joints():

@@ -10,7 +10,7 @@ from trade import Container, NotificationInfo, service
 from waiting import wait_until
 
 POLICY = """
-[roles.lease_client]
+[roles.keeper]
 register = ["rosie"]
 call = ["rosie"]
 administer = ["trade"]

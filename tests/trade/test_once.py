@@ -130,7 +130,7 @@ def test_what_expired_is_said_to_have_expired_however_often_it_comes(line: Line,
 def test_answers_of_what_reads_are_not_kept(here: Container, line: Line) -> None:
     line.put(call(name="look"))
     line.answer()
-    assert here._parts.dispatcher._once._calls == {}
+    assert here._parts.dispatcher._deduplicator._calls == {}
 
 
 # --- the bounds
@@ -202,7 +202,7 @@ def test_S02_what_waits_is_sent_again_when_the_link_to_the_same_epoch_is_back(
     thread.start()
     assert motor.entered.wait(20)
     sent: list[Call] = []
-    once = there._parts.dispatcher._once
+    once = there._parts.dispatcher._deduplicator
     attach = once.attach
     again = threading.Event()
 
