@@ -1,8 +1,12 @@
 """Gateway files: what is right is taken as it stands, what is wrong is named with its remedy before anything starts."""
 
+import os
+import queue
 import shutil
+import signal
 from datetime import timedelta
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from typer.testing import CliRunner
@@ -75,6 +79,34 @@ def test_a_gateway_that_its_policy_does_not_name_is_told_of(file: Path) -> None:
     assert read_gateway_file(file).settings  # it goes on, as it did before
     with pytest.raises(ConfigurationError, match=r'door.*gateways = \["other", "door"\]'):
         CliRunner().invoke(app, ["gateway", str(file), "--check"], catch_exceptions=False)
+
+
+def test_a_policy_that_is_being_written_when_the_gateway_is_up_does_not_end_it(
+    file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Up:
+        """A gateway on interfaces that this host does not have."""
+
+        news: "queue.SimpleQueue[object]" = queue.SimpleQueue()
+        healthy = True
+        container = SimpleNamespace(settings=SimpleNamespace(container="gateway", system="lab", identity="door"))
+
+        def __init__(self, *_: object) -> None: ...
+
+        def reload(self, *_: object, **__: object) -> bool:
+            return True
+
+        def close(self) -> None: ...
+
+    def say_ready(*_: object) -> None:
+        (file.parent / "policy.toml").write_text("")
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    monkeypatch.setattr(_gateway, "Gateway", Up)
+    monkeypatch.setattr(_gateway, "_say_ready", say_ready)
+    told = CliRunner().invoke(app, ["gateway", str(file)])
+    assert (told.exit_code, told.exception) == (0, None), told.output
+    assert "leaving" in told.stdout
 
 
 def test_without_any_list_everything_crosses_and_with_one_the_rest_does(file: Path) -> None:

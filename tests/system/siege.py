@@ -51,6 +51,7 @@ _RESCUE_S: Final = 10.0
 _ESTOPS: Final = 200
 """Of one flood."""
 _CLEARED_S: Final = 10.0
+_HELD_BACK_S: Final = 15.0
 _CLEARED_AGAIN_S: Final = 2.0
 _LONG_S: Final = 60.0
 """Of a siege: one in which there is time to come to rest between troubles."""
@@ -416,16 +417,30 @@ class Stand:
         """What clients say is held back, what they are told, or both."""
         most_s = self._dice.choice((0.5, 1.0, 1.5))
         up, down = self._dice.choice([(most_s, 0.0), (0.0, most_s), (most_s, most_s)])
-        self._slow(up, down)
-        return self._noted("delay", "net2", lambda: self._slow(0.0, 0.0))
+        before = self._slow(up, down)
+
+        def end() -> None:
+            """Something is to be held back first, for a while: others may have had nothing to say."""
+            until = time.monotonic() + _HELD_BACK_S
+            while self._slow(up, down) <= before and time.monotonic() < until:
+                self._rest(0.5)
+            self._slow(0.0, 0.0)
+
+        return self._noted("delay", "net2", end)
 
     def _slow(self, up: float, down: float) -> int:
         return self._wire.ask(json.dumps({"up": up, "down": down}))
 
     def policy(self) -> Callable[[], None]:
         """The gateway lets nobody lock dora, for a while. Others read their policy once, and keep it."""
-        self.site.policy.write_text(_POLICY.replace('lock = ["rosie", "dora"]', 'lock = ["rosie"]'))
-        return self._noted("policy", "door", lambda: self.site.policy.write_text(_POLICY))
+        self._write_policy(_POLICY.replace('lock = ["rosie", "dora"]', 'lock = ["rosie"]'))
+        return self._noted("policy", "door", lambda: self._write_policy(_POLICY))
+
+    def _write_policy(self, text: str) -> None:
+        """Whole at once: a gateway that starts may read it at any moment."""
+        fresh = self.site.policy.with_suffix(".new")
+        fresh.write_text(text)
+        fresh.replace(self.site.policy)
 
     def clock(self) -> Callable[[], None]:
         """The wall clock of a robot's driver jumps, and back."""

@@ -45,9 +45,10 @@ def gateway(
     out, notifier = Output(as_json=as_json), Notifier()
     plan = read_gateway_file(file)
     plan.check_here(file)
+    unnamed = plan.unnamed  # once: when the gateway is up, the policy may be half written
     _warn_of_forwarding(plan)
     if check:
-        if unnamed := plan.unnamed:
+        if unnamed:
             raise ConfigurationError(where=str(plan.settings.policy), problem=unnamed)
         out.say(f"{file} is right")
         _say_what_crosses(out, plan)
@@ -62,7 +63,7 @@ def gateway(
         try:
             settle()
             _say_ready(out, running, plan)
-            if unnamed := plan.unnamed:
+            if unnamed:
                 complain(f"{plan.settings.policy}: {unnamed}")
             notifier.ready(_status(running))
             while not asked_to_leave.wait(_LOOK_EVERY_S):
