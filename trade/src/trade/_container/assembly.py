@@ -336,7 +336,7 @@ class Components:
             yield from tell()
 
     def _taken(self) -> list[int]:
-        return [crew.taken for crew in list(self.dispatcher._worker_pools)]
+        return [pool.taken for pool in list(self.dispatcher._worker_pools)]
 
     def _denied_hook(self, who: str, record: Record) -> AccessDenied | None:
         return self._home.access.denied(who, "instrument", record.key.domain, record.label)

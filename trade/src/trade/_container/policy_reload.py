@@ -39,7 +39,7 @@ class _Watching:
     def __init__(
         self, access: Authorizer, scheduler: Scheduler, audit: _Audit, recheck_access: Callable[[], None]
     ) -> None:
-        self._access, self._audit, self._judge_anew = access, audit, recheck_access
+        self._access, self._audit, self._recheck_access = access, audit, recheck_access
         self._last: Seen = access.seen
         """At the look before: what is being written is let come to rest."""
         self._refused: Seen | None = None
@@ -72,7 +72,7 @@ class _Watching:
         _logger.warning("read again: %s", said)
         self._audit.changed("policy read again", said, None)
         try:
-            self._judge_anew()
+            self._recheck_access()
         except Exception:
             _logger.exception("not all could be judged anew by %s", path)
 

@@ -1,7 +1,7 @@
 """The lock table of a container: who has which of its resources, for how long, and who comes next.
 
 All of it is this container's own: grants are made here, leases run on this clock, fences fall here. The other side of a
-lock, who asks and renews, is `_locks.api`.
+lock, who asks and renews, is `_locks.lease_client`.
 """
 
 import math

@@ -73,13 +73,13 @@ class LoadMeter:
     def _sample(self) -> _Sample:
         busy, ticks = _host_ticks()
         return _Sample(
-            self._clock(), time.process_time(), busy, ticks, sum(crew.taken for crew in self._worker_pools())
+            self._clock(), time.process_time(), busy, ticks, sum(pool.taken for pool in self._worker_pools())
         )
 
     @property
     def running(self) -> int:
         """Calls of other containers that have a thread now."""
-        return sum(crew.working for crew in self._worker_pools())
+        return sum(pool.working for pool in self._worker_pools())
 
     def read(self) -> LoadInfo:
         """As it is now."""
