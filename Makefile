@@ -40,42 +40,42 @@ test: $(UV) ## the whole test suite; in parts; the others run also when one fail
 	@mkdir -p build; rm -f build/failures; export TEST_FAILURES=build/failures; \
 	failed=; part() { code=0; $(RUN) pytest "$$@" $(ARGS) || code=$$?; \
 	  case $$code in 0|5) ;; 1) failed=1 ;; *) exit $$code ;; esac; }; \
-	part -n 2 --dist loadfile --ignore tests/drivers --ignore tests/complaints --ignore tests/system --ignore tests/bench --ignore tests/chaos --ignore tests/soak --ignore tests/browser --ignore tests/peers; \
-	part -n 2 --dist loadfile tests/system tests/bench tests/chaos tests/soak --ignore tests/system/test_demo.py; \
-	part -n 2 --dist loadfile tests/drivers tests/complaints; \
-	part -n 2 --dist loadfile tests/browser tests/peers/test_conformance.py; \
-	part tests/peers/test_rust.py tests/system/test_demo.py; \
+	part -n 2 --dist loadfile --ignore tests/unit/drivers --ignore tests/contract --ignore tests/system --ignore tests/bench --ignore tests/endurance/chaos --ignore tests/endurance/soak; \
+	part -n 2 --dist loadfile tests/system tests/bench tests/endurance/chaos tests/endurance/soak --ignore tests/system/test_demo.py --ignore tests/system/browser --ignore tests/system/peers; \
+	part -n 2 --dist loadfile tests/unit/drivers tests/contract; \
+	part -n 2 --dist loadfile tests/system/browser tests/system/peers/test_conformance.py; \
+	part tests/system/peers/test_rust.py tests/system/test_demo.py; \
 	test -z "$$failed" || { echo "failed, of all parts:"; cat build/failures; exit 1; }
 
 test-socketcan: $(UV) ## the CAN suites on kernel interfaces; where the kernel has none, inside User-Mode Linux
-	@$(RUN) tests/socketcan/run pytest tests/socketcan $(ARGS)
+	@$(RUN) tests/system/socketcan/run pytest tests/system/socketcan $(ARGS)
 
 chaos: chaos-locks siege ## the whole proof: the next two, one after the other (SEED=.. MINUTES=.. of each)
 
 chaos-locks: $(UV) ## locks under kill -9, freezes, cuts and delays; 240 clients (SEED=.. MINUTES=..; exits 1 on a violation)
-	@$(RUN) python -m tests.chaos --seed $(SEED) --minutes $(MINUTES) --clients 8 --threads 30 --drivers 3 $(ARGS)
+	@$(RUN) python -m tests.endurance.chaos --seed $(SEED) --minutes $(MINUTES) --clients 8 --threads 30 --drivers 3 $(ARGS)
 
 siege: export SIEGE_MINUTES := $(MINUTES)
 siege: export SIEGE_MUTANT := $(MUTANT)
 siege: export SEED := $(SEED)
 siege: $(UV) ## robots, gateway, door, clients under every trouble (SEED=.. MINUTES=.. MUTANT=.. MINIMISE=1; root, iproute2)
-	@$(RUN) pytest -s -n 0 tests/system/test_siege.py -p no:again $(ARGS) || { \
-	  test -z "$(MINIMISE)" || PYTHONPATH=tests:. $(RUN) python -m system.siege_minimised; exit 1; }
+	@$(RUN) pytest -s -n 0 tests/system/test_siege.py -p no:tests.support.rerun $(ARGS) || { \
+	  test -z "$(MINIMISE)" || $(RUN) python -m tests.system.siege_minimised; exit 1; }
 
 chaos-robots: $(UV) ## a lock over two robots while a driver is killed and started again, 50 times
 	@CHAOS_ROUNDS=50 $(RUN) pytest tests/system/test_two_robots.py $(ARGS)
 
 fuzz: $(UV) ## every reader of bytes, guided by coverage where Atheris has a wheel (MINUTES=..; exits 1 if something breaks)
-	@$(RUN) --group fuzz python -m tests.fuzz --minutes $(MINUTES) $(ARGS)
+	@$(RUN) --group fuzz python -m tests.endurance.fuzz --minutes $(MINUTES) $(ARGS)
 
 soak: $(UV) ## a robot, a gateway, a page and planners for hours; nothing may grow or fail (HOURS=..; leaves build/soak.svg)
-	@$(RUN) python -m tests.soak --hours $(HOURS) $(ARGS)
+	@$(RUN) python -m tests.endurance.soak --hours $(HOURS) $(ARGS)
 
 soak-registry: $(UV) ## three containers on two hosts register at the same moment, 200 times (root, iproute2)
 	@SOAK_ROUNDS=200 $(RUN) pytest tests/system/test_namespaces.py -k same_moment $(ARGS)
 
 soak-relocation: $(UV) ## a host is lost 100 times, with random trouble between; never two (SEED=..; root, iproute2; 45 min)
-	@SOAK_ROUNDS=100 SEED=$(SEED) $(RUN) pytest -s tests/system/test_relocation.py -k never_two -p no:again $(ARGS)
+	@SOAK_ROUNDS=100 SEED=$(SEED) $(RUN) pytest -s tests/system/test_relocation.py -k never_two -p no:tests.support.rerun $(ARGS)
 
 check: $(UV) ## lint, formatting, types, import rules, isolated install of the core
 	@$(RUN) ruff check

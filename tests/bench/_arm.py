@@ -11,7 +11,6 @@ from pathlib import Path
 from statistics import median
 
 from tests.bench._report import keep_point, print_skipped, print_target
-
 from trade_drivers import Arm, Trajectory, TrajectoryPoint, attach, load
 from trade_hil_sim import Entry, SimProcess, instructions
 

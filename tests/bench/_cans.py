@@ -16,7 +16,6 @@ from pathlib import Path
 from statistics import median
 
 from tests.bench._report import keep_point, print_target
-
 from trade.errors import DeviceError, TradeError
 from trade_drivers import Motor, Tolerances, Trajectory, TrajectoryPoint
 from trade_drivers.bus.can import frame_bits

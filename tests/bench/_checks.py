@@ -16,7 +16,7 @@ from tests.bench._children import Job
 from tests.bench._links import Link
 from tests.bench._ours import Trade
 from tests.bench._peers import BarePair, bare_link, serve_bare
-from tests.certificates import Papers
+from tests.support.certificates import Papers
 
 _SIZE: Final = 64
 _HOOKS: Final = (1, 10)

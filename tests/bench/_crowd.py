@@ -13,6 +13,7 @@ from statistics import median
 from typing import Final
 
 import psutil
+
 from tests.bench._children import child, hear
 from tests.bench._offering import fill
 from tests.bench._places import own_folder

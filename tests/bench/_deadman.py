@@ -15,9 +15,8 @@ from contextlib import ExitStack
 from pathlib import Path
 from statistics import quantiles
 
-from tests.bench._report import keep_point, print_target
-
 import trade
+from tests.bench._report import keep_point, print_target
 from trade_hil_sim import SimProcess, events
 
 _ROOT = Path(__file__).parents[2]

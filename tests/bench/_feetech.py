@@ -14,9 +14,9 @@ from pathlib import Path
 from statistics import median
 
 import serial
+
 from tests.bench._report import keep_point, print_target
 from tests.bench._servo import Answers, Cycle, _cycles_per_s, _load, _measure, _range
-
 from trade_drivers.robotfile import parse
 from trade_drivers.vendors.feetech import open_exchange
 from trade_hil_sim import SimProcess

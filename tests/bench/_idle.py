@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Final
 
 import psutil
+
 from tests.bench._children import child, hear
 from tests.bench._report import keep_point, print_target
 from tests.bench._site import ADDRESSES, SECURE, SYSTEM, Site

@@ -26,7 +26,6 @@ from tests.bench._children import child, hear
 from tests.bench._fifo import fifo, threads_below, threads_of, why_no_fifo
 from tests.bench._record import Histogram
 from tests.bench._report import keep_point, print_skipped
-
 from trade_drivers import load_driver
 from trade_drivers.plugins._driver import Driver
 from trade_hil_sim import Entry, SimProcess, SimulationError, read_log

@@ -8,7 +8,6 @@ from multiprocessing.connection import Connection
 
 from tests.bench._children import _requests
 from tests.bench._rosie import _WIDE, _through
-
 from trade.errors import TradeError
 from trade_drivers import Arm, AttachedRobot, JointGroup, attach
 from trade_drivers.robotfile import Robot, parse

@@ -14,6 +14,7 @@ from statistics import median
 from typing import Final
 
 import psutil
+
 from tests.bench._alone import alone
 from tests.bench._children import child, hear
 from tests.bench._offering import kind_of_arm

@@ -13,8 +13,8 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import psutil
-from tests.bench._report import keep_point, print_skipped, print_target
 
+from tests.bench._report import keep_point, print_skipped, print_target
 from trade.errors import TradeError
 from trade_drivers import Arm, AttachedRobot, JointGroup, Tolerances, Trajectory, TrajectoryPoint, attach
 from trade_drivers.robotfile import parse

@@ -128,7 +128,6 @@ def measure(size: int, whole: int | None = None) -> Seen:
         whole: how many are whole containers; by default as many as there is memory for.
     """
     from tests.bench._stand_in import StandIn, offer_of
-
     from trade import where
     from trade.testing import memory_system
 

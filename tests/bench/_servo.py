@@ -16,8 +16,8 @@ from pathlib import Path
 from statistics import median
 
 import serial
-from tests.bench._report import keep_point, print_target
 
+from tests.bench._report import keep_point, print_target
 from trade_drivers.robotfile import parse
 from trade_drivers.vendors.dynamixel import open_exchange
 from trade_hil_sim import SimProcess

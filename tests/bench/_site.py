@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Final
 
 from tests.bench._report import print_skipped
-from tests.certificates import Papers
+from tests.support.certificates import Papers
 from tests.system.networks import Networks, why_not
 
 ADDRESSES: Final = {

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any, Final
 
 import psutil
-from tests.bench._report import keep_point, print_target
 
+from tests.bench._report import keep_point, print_target
 from trade import Container, Settings, where
 
 _HEAD: Final = Path(__file__).parents[2] / "examples" / "head.toml"

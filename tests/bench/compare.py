@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Final
 
 from msgspec import Struct
+
 from tests.bench._record import Run, Spread
 
 _FEWEST_ROUNDS: Final = 3

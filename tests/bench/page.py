@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Final
 
 from msgspec import Struct, convert
+
 from tests.bench._plots import PICTURES, about, figure, pictures, with_spread
 from tests.bench._record import Point, Run, Target
 

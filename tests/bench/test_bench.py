@@ -9,6 +9,7 @@ from pathlib import Path
 
 import psutil
 import pytest
+
 import tests.bench.__main__ as bench_main
 from tests.bench._calls import up
 from tests.bench._children import Job
@@ -19,7 +20,7 @@ from tests.bench._report import print_target, this_run
 from tests.bench._ros1 import Rospy
 from tests.bench._scale import measure
 from tests.bench._viam import Viam
-from tests.ros1_stand import need_ros1
+from tests.support.ros1_system import need_ros1
 from tests.system.networks import why_not
 
 ROOT = Path(__file__).parents[2]

@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 
 import pytest
+
 from tests.bench import compare
 from tests.bench._record import NEVER, Machine, Point, Run, Spread, Target
 

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+
 from tests.bench import _jitter, page
 from tests.bench._fifo import fifo, threads_of, why_no_fifo
 from tests.bench._histograms import histograms
@@ -16,7 +17,6 @@ from tests.bench._jitter_driver import busy_with
 from tests.bench._record import Histogram, Point, Run, Spread
 from tests.bench._report import begin_part, this_run
 from tests.bench.test_page import a_run
-
 from trade_drivers import AttachedRobot, attach, load_driver
 from trade_drivers.plugins._driver import Driver
 from trade_drivers.robotfile import parse

@@ -5,6 +5,7 @@ import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import pytest
+
 from tests.bench import page
 from tests.bench._plots import figure
 from tests.bench._plots import page as html

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 import psutil
+
 from tests.bench._calls import up
 from tests.bench._children import Job, Running
 from tests.bench._ours import Trade, TradeThreads

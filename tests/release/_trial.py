@@ -38,12 +38,12 @@ _EXTRAS: Final = {
     "trade_gateway": "export,foxglove,http,mcp,record,ros",
 }
 QUICK: Final = (
-    "tests/test_docs.py::test_the_readme_program_does_what_it_says",
-    "tests/trade/test_wire_vectors.py",
-    "tests/trade/test_calls.py",
-    "tests/hil_sim/test_bus_sdk.py",
-    "tests/drivers/test_robotfile.py",
-    "tests/gateway/test_help.py",
+    "tests/docs/test_docs.py::test_the_readme_program_does_what_it_says",
+    "tests/unit/trade/test_wire_vectors.py",
+    "tests/unit/trade/test_calls.py",
+    "tests/unit/hil_sim/test_bus_sdk.py",
+    "tests/unit/drivers/test_robotfile.py",
+    "tests/unit/gateway/test_help.py",
     "tests/system/test_transcript.py",
 )
 """What shows in a minute that the parts are whole: calls, bytes, simulated servos, robot files, the command line."""

@@ -7,9 +7,9 @@ from typing import Any, Final
 
 from msgspec import Raw
 
-from system.sites import DOOR, Site
+from tests.support.waiting import wait_until
+from tests.system.sites import DOOR, Site
 from trade._protocol.messages import PROTOCOL, Call, encode_message
-from waiting import wait_until
 
 POLICY: Final = """
 gateways = ["door"]

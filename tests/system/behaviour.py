@@ -12,10 +12,9 @@ import threading
 import time
 from typing import Any
 
-from tests.holds import Ask, Done, Held, Log, Seen
-
-from system.careless import CENTRE_COUNTS, STEP, rad
-from system.siege_records import Answer, Order
+from tests.support.lock_log import Ask, Done, Held, Log, Seen
+from tests.system.careless import CENTRE_COUNTS, STEP, rad
+from tests.system.siege_records import Answer, Order
 from trade import Container, Handle, Settings, where
 from trade.errors import TradeError
 

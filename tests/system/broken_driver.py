@@ -2,7 +2,7 @@
 
 import sys
 
-from mutants import HOW
+from tests.support.mutants import HOW
 from trade_gateway.cli import main
 
 if __name__ == "__main__":

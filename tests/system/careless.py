@@ -16,9 +16,8 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
-from tests.holds import Ask, Done, Held, Log, Seen, now
-
-from system.siege_records import Answer, Order, of_robot
+from tests.support.lock_log import Ask, Done, Held, Log, Seen, now
+from tests.system.siege_records import Answer, Order, of_robot
 from trade import errors
 
 ROBOTS = ("rosie", "dora")

@@ -15,10 +15,10 @@ from typing import Any
 
 import pytest
 
-from system.networks import Networks, why_not
-from system.sshd import Sshd, why_no_sshd
+from tests.support.waiting import PATIENCE_S, wait_until
+from tests.system.networks import Networks, why_not
+from tests.system.sshd import Sshd, why_no_sshd
 from trade_hil_sim import SimProcess, events, writes
-from waiting import PATIENCE_S, wait_until
 
 ROOT = Path(__file__).parents[2]
 ROSIES_HEAD = ROOT / "examples" / "head.toml"

@@ -16,12 +16,12 @@ from collections.abc import Sequence
 from contextlib import ExitStack, suppress
 from typing import Any
 
-from tests.holds import now
 from websockets.exceptions import WebSocketException
 from websockets.sync.client import ClientConnection, connect
 
-from system.careless import CENTRE_COUNTS, Careless, Refused
-from system.siege_records import CAN_BUS
+from tests.support.lock_log import now
+from tests.system.careless import CENTRE_COUNTS, Careless, Refused
+from tests.system.siege_records import CAN_BUS
 
 _LATER_S = 0.5
 """What a busy computer may take to pass an order on."""

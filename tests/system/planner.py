@@ -10,7 +10,7 @@ from collections.abc import Generator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from typing import Any
 
-from system.careless import Careless, Refused
+from tests.system.careless import Careless, Refused
 from trade import Container, Handle, Lock, Settings, where
 from trade.errors import TradeError
 

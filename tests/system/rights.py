@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from system.attack import ARM, Attack
+from tests.system.attack import ARM, Attack
 from trade import Container, Resource, service, where
 from trade.errors import AccessDenied
 from trade.testing import MemorySystem, memory_system

@@ -21,12 +21,12 @@ from typing import Final
 from unittest import mock
 
 import psutil
-from tests.holds import Log
 
-from system import wall_clock
-from system.networks import Member, Networks, ip
-from system.siege_records import CAN_BUS, Alarm, Fault, Rescue
-from system.sites import DOOR, SYSTEM, Site
+from tests.support.lock_log import Log
+from tests.system import wall_clock
+from tests.system.networks import Member, Networks, ip
+from tests.system.siege_records import CAN_BUS, Alarm, Fault, Rescue
+from tests.system.sites import DOOR, SYSTEM, Site
 from trade_gateway.http import add_token
 from trade_hil_sim import BusOff, SimProcess
 
@@ -606,7 +606,7 @@ def stand(networks: Networks, folder: Path, seed: int, mutant: str = "") -> Gene
     """All of it, ended after use; ``mutant``: how its drivers are broken, see `broken_driver`."""
     disk = Disk(folder / "disk")
     settings = {
-        "PYTHONPATH": os.pathsep.join(map(str, _HERE.parents[:2])),
+        "PYTHONPATH": str(_HERE.parents[1]),
         "TRADE_STATE_DIR": str(folder / "disk" / "gateway"),
     }
     try:

@@ -6,9 +6,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from math import inf
 from typing import Any, NamedTuple
 
-from tests.holds import Owned, Verdict, asks_without_end, by_kind, owned, two_owners
-
-from system.siege_records import CAN_BUS, Alarm, Answer, AnyRecord, Fault, Order, Rescue, whole
+from tests.support.lock_log import Owned, Verdict, asks_without_end, by_kind, owned, two_owners
+from tests.system.siege_records import CAN_BUS, Alarm, Answer, AnyRecord, Fault, Order, Rescue, whole
 from trade_hil_sim import Entry
 
 STOPS_S = 6.0

@@ -30,7 +30,8 @@ def fewest(kinds: Sequence[str], fails: Callable[[Sequence[str]], bool]) -> list
 def _fails(kinds: Sequence[str]) -> bool:
     minutes = min(_MOST_MINUTES, float(os.environ.get("SIEGE_MINUTES", "1")))
     settings = {"SIEGE_KINDS": ",".join(kinds), "SIEGE_MINUTES": str(minutes)}
-    command = [sys.executable, "-m", "pytest", "-q", "-n", "0", "-p", "no:again", str(_TEST), "-k", "befalls"]
+    options = ("-q", "-n", "0", "-p", "no:tests.support.rerun", "-k", "befalls")
+    command = [sys.executable, "-m", "pytest", *options, str(_TEST)]
     print(f"with {', '.join(kinds)}: ", end="", flush=True)
     done = subprocess.run(
         command,
@@ -44,7 +45,7 @@ def _fails(kinds: Sequence[str]) -> bool:
 
 
 def main() -> None:
-    from system.siege import TROUBLES
+    from tests.system.siege import TROUBLES
 
     print(f"fails at least with: {', '.join(fewest([*TROUBLES], _fails))}")
 

@@ -2,7 +2,7 @@
 
 from typing import Final
 
-from tests.holds import Ask, Done, Held, Record, Seen
+from tests.support.lock_log import Ask, Done, Held, Record, Seen
 
 CAN_BUS: Final = "leg"
 """The bus with a drive; joints of all others are servos."""

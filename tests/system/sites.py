@@ -8,8 +8,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from certificates import Papers
-from system.networks import MEMBER, Member, Networks
+from tests.support.certificates import Papers
+from tests.system.networks import MEMBER, Member, Networks
 
 SYSTEM = "lab-0"
 """The one that the gateway is of; ``member.py`` appends its turn."""

@@ -8,8 +8,8 @@ import subprocess
 from collections.abc import Mapping
 from pathlib import Path
 
+from tests.support.waiting import wait_until
 from trade._transport.endpoints import Endpoint, free_endpoint
-from waiting import wait_until
 
 _PLACES = os.pathsep.join((os.environ.get("PATH", os.defpath), "/usr/local/sbin", "/usr/sbin", "/sbin"))
 

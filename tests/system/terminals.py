@@ -12,7 +12,7 @@ from pathlib import Path
 
 import psutil
 
-from waiting import PATIENCE_S, wait_until
+from tests.support.waiting import PATIENCE_S, wait_until
 
 
 class Shell:

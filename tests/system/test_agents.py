@@ -13,11 +13,11 @@ from anyio.to_thread import run_sync
 from mcp import ClientSession, StdioServerParameters
 from mcp.client.stdio import stdio_client
 
-from system.conftest import ROOT, ROSIES_HEAD, Bench
+from tests.support.waiting import wait_until
+from tests.system.conftest import ROOT, ROSIES_HEAD, Bench
 from trade import service, where
 from trade.testing import memory_system
 from trade_gateway.mcp import Twin
-from waiting import wait_until
 
 FAR = [1.0, 0.0]
 

@@ -5,10 +5,10 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from system.conftest import Program, Rosie
+from tests.support.waiting import wait_until
+from tests.system.conftest import Program, Rosie
 from trade import Container, where
 from trade_hil_sim import events, read_log
-from waiting import wait_until
 
 BEHAVIOURS = Path(__file__).parents[2] / "examples" / "who_has_the_head.py"
 HEAD = where(group="rosie.head")

@@ -14,11 +14,12 @@ from pathlib import Path
 
 import pytest
 
-from certificates import Papers
-from system import rights
-from system.attack import ARM, POLICY, Attack, numbers
-from system.conftest import ROOT, networks_of_ones_own
-from system.sites import DOOR, Site
+from tests.support.certificates import Papers
+from tests.support.waiting import wait_until
+from tests.system import rights
+from tests.system.attack import ARM, POLICY, Attack, numbers
+from tests.system.conftest import ROOT, networks_of_ones_own
+from tests.system.sites import DOOR, Site
 from trade._protocol.messages import (
     EMPTY,
     PROTOCOL,
@@ -32,7 +33,6 @@ from trade._protocol.messages import (
     encode_message,
 )
 from trade._security.authorizer import FUNCTIONS
-from waiting import wait_until
 
 pytestmark = pytest.mark.timeout(300)
 

@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 
-from system.conftest import Rosie
+from tests.support.waiting import wait_until
+from tests.system.conftest import Rosie
 from trade import Container, where
 from trade.errors import AccessDenied, InvalidArgument, LockedByOther, Stopped
-from waiting import wait_until
 
 Command = Callable[..., "subprocess.CompletedProcess[str]"]
 

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from certificates import Papers
-from system.member import PROVIDERS
-from system.networks import Member, Networks
+from tests.support.certificates import Papers
+from tests.system.member import PROVIDERS
+from tests.system.networks import Member, Networks
 
 StartMember = Callable[..., Member]
 pytestmark = pytest.mark.timeout(300)

@@ -13,11 +13,11 @@ from typing import Any
 
 import pytest
 
-from compiling import library
-from system.conftest import Program, Rosie
+from tests.support.c_compiler import library
+from tests.support.waiting import wait_until
+from tests.system.conftest import Program, Rosie
 from trade import Container, where
 from trade.errors import LockedByOther
-from waiting import wait_until
 
 HERE = Path(__file__).parent
 HOUR_S = 3600

@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 
 import trade
-from system.conftest import DORA, ROOT, ROSIES_HEAD
+from tests.support.waiting import PATIENCE_S, wait_until
+from tests.system.conftest import DORA, ROOT, ROSIES_HEAD
 from trade import where
 from trade_hil_sim import SimControl, SimProcess, events, motion_writes, read_log
-from waiting import PATIENCE_S, wait_until
 
 Command = Callable[..., subprocess.CompletedProcess[str]]
 

@@ -13,9 +13,9 @@ from typing import Final, NamedTuple
 
 import pytest
 
-from system.conftest import ROOT
+from tests.support.waiting import PATIENCE_S, wait_until
+from tests.system.conftest import ROOT
 from trade_hil_sim import SimControl, read_log
-from waiting import PATIENCE_S, wait_until
 
 PAGE: Final = ROOT / "docs" / "commissioning.md"
 MARKS: Final = ("<!-- transcript: made by test_new_devices_become_a_robot -->\n", "<!-- end of transcript -->\n")

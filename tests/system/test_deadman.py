@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 
 import trade
-from system.conftest import Bench, Program
+from tests.support.waiting import wait_until
+from tests.system.conftest import Bench, Program
 from trade import where
 from trade_hil_sim import events, writes
-from waiting import wait_until
 
 MOVER = Path(__file__).with_name("mover.py")
 HALFWAY_RAD = 0.65

@@ -15,13 +15,13 @@ import jsonschema_rs
 import pytest
 from mcap.reader import make_reader
 
-from doors import Client
-from system.conftest import ROOT, Program
-from system.networks import ip, why_not
+from tests.support.http_clients import Client
+from tests.support.waiting import wait_until
+from tests.system.conftest import ROOT, Program
+from tests.system.networks import ip, why_not
 from trade_drivers import load
 from trade_gateway.recording._motion import Motion, Track, deviation, motion_of, motions, moving
 from trade_hil_sim import frames, motion_writes, read_log
-from waiting import wait_until
 
 pytestmark = pytest.mark.timeout(300)
 

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from doors import Client
-from system.conftest import Bench, Program
+from tests.support.http_clients import Client
+from tests.support.waiting import PATIENCE_S, wait_until
+from tests.system.conftest import Bench, Program
 from trade_hil_sim import events, writes
-from waiting import PATIENCE_S, wait_until
 
 PAGE = Path(__file__).with_name("page.py")
 HALFWAY_RAD = 0.65

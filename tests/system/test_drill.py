@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from system.conftest import ROSIES_HEAD
+from tests.system.conftest import ROSIES_HEAD
 
 _SECONDS = 500
 """A drill starts a dozen processes, one after the other."""

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from certificates import Papers
+from tests.support.certificates import Papers
 from trade import Container, Settings, service, where
 from trade._threads import channel_workers
 from trade._transport.endpoints import free_endpoint

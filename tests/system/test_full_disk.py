@@ -7,8 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from disks import SmallDisk, small_disk
-from system.conftest import Rosie
+from tests.support.full_disks import SmallDisk, small_disk
+from tests.support.waiting import wait_until
+from tests.system.conftest import Rosie
 from trade import Container, where
 from trade.errors import ConfigurationError, MotionStopped, Stopped
 from trade_gateway.cli._output import Output
@@ -17,7 +18,6 @@ from trade_gateway.cli.watching._call_model import Model, read, write
 from trade_gateway.http import add_token
 from trade_gateway.pki._authority import Authority
 from trade_hil_sim import events, read_log
-from waiting import wait_until
 
 Command = Callable[..., "subprocess.CompletedProcess[str]"]
 PAN = where(group="rosie.neck.pan", name="move_to")

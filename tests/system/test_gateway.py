@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from system.networks import Member, Networks
-from system.sites import Site
-from waiting import wait_until
+from tests.support.waiting import wait_until
+from tests.system.networks import Member, Networks
+from tests.system.sites import Site
 
 pytestmark = pytest.mark.timeout(300)
 

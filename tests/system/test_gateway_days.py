@@ -9,12 +9,12 @@ from signal import SIGKILL
 
 import pytest
 
-import robots
-from system.conftest import Bench
-from system.networks import Member, Networks, ip
-from system.sites import DOOR, SYSTEM, Site
+from tests.support import simulated_robots as robots
+from tests.support.waiting import wait_until
+from tests.system.conftest import Bench
+from tests.system.networks import Member, Networks, ip
+from tests.system.sites import DOOR, SYSTEM, Site
 from trade_hil_sim import events
-from waiting import wait_until
 
 pytestmark = pytest.mark.timeout(300)
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from system.conftest import ROOT
+from tests.system.conftest import ROOT
 from trade import Container, where
 from trade.errors import DeviceFault
 from trade_hil_sim import SimControl, motion_writes, read_log

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from system.test_supervisor import COUNTER, Keeping, call
+from tests.support.waiting import wait_until
+from tests.system.test_supervisor import COUNTER, Keeping, call
 from trade import Container
 from trade.errors import AccessDenied, ConfigurationError
 from trade_gateway.supervisor import ChildServices
-from waiting import wait_until
 
 STANDS_IN = '[container.a]\nstands_in_for = "rover"\nlease_s = 2.0\nsave_every_s = 1\n'
 LEASED = '[container.a]\nlease_from = "base"\nsave_every_s = 1\nrestarts = 1\n'

@@ -11,11 +11,11 @@ from pathlib import Path
 import pytest
 
 import trade
-from system.conftest import ROSIES_HEAD, Program, Rosie
+from tests.support.waiting import PATIENCE_S, wait_until
+from tests.system.conftest import ROSIES_HEAD, Program, Rosie
 from trade import Container, where
 from trade._transport.endpoints import free_endpoint
 from trade.errors import LockedByOther, Stopped
-from waiting import PATIENCE_S, wait_until
 
 Command = Callable[..., subprocess.CompletedProcess[str]]
 

@@ -11,9 +11,9 @@ from typing import Any
 import pytest
 
 import trade
+from tests.support.waiting import wait_until
 from trade import where
 from trade.errors import TradeError
-from waiting import wait_until
 
 COUNTER = '''
 import os, pathlib, signal, threading, time

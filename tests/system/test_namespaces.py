@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from certificates import Papers
-from system.conftest import ROSIES_HEAD, Bench, Program
-from system.member import PROVIDERS
-from system.networks import Member, Networks, ip
+from tests.support.certificates import Papers
+from tests.support.waiting import wait_until
+from tests.system.conftest import ROSIES_HEAD, Bench, Program
+from tests.system.member import PROVIDERS
+from tests.system.networks import Member, Networks, ip
 from trade_hil_sim import events
-from waiting import wait_until
 
 ROUNDS = int(os.environ.get("SOAK_ROUNDS", "20"))
 MOVER = Path(__file__).with_name("mover.py")

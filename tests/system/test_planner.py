@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from system.conftest import Program
+from tests.system.conftest import Program
 from trade import Container, where
 from trade._transport.endpoints import free_endpoint
 

@@ -14,13 +14,13 @@ from pathlib import Path
 import pytest
 
 import trade
-from system.conftest import ROOT, ROSIES_HEAD, Bench, Program, Rosie
+from tests.support.foxglove_viewer import viewer
+from tests.support.waiting import PATIENCE_S, wait_until
+from tests.system.conftest import ROOT, ROSIES_HEAD, Bench, Program, Rosie
 from trade import where
 from trade_gateway.recording._motion import Motion, Track, deviation, motion_of, motions, moving
 from trade_gateway.recording._reader import entries
 from trade_hil_sim import SimControl, events, motion_writes, read_log
-from viewers import viewer
-from waiting import PATIENCE_S, wait_until
 
 
 def test_a_recording_whose_program_was_killed_is_readable_to_its_last_second(

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from system.networks import Networks
-from system.two_hosts import LEASE_S, Life, TwoHosts, now, overlaps, two_hosts
+from tests.system.networks import Networks
+from tests.system.two_hosts import LEASE_S, Life, TwoHosts, now, overlaps, two_hosts
 
 ROUNDS = int(os.environ.get("SOAK_ROUNDS", "4"))
 SEED = int(os.environ.get("SEED", "1"))

@@ -14,14 +14,14 @@ from typing import Any, Protocol
 import pytest
 
 import trade
-from compiling import library
-from ros1_stand import Peer, need_ros1
-from ros1_stand import Stand as Ros1Stand
-from ros2_peers import Process, Router, free_port
-from system.conftest import Bench, Program
+from tests.support.c_compiler import library
+from tests.support.ros1_system import Peer, need_ros1
+from tests.support.ros1_system import Stand as Ros1Stand
+from tests.support.ros2_processes import Process, Router, free_port
+from tests.support.waiting import wait_until
+from tests.system.conftest import Bench, Program
 from trade import Handle, errors, where
 from trade_hil_sim import events, writes
-from waiting import wait_until
 
 FAR_RAD = 1.2
 EXAMPLE = Path(__file__).parents[2] / "examples" / "c_gripper"
@@ -131,7 +131,7 @@ class Ros2Node:
 
 
 class Ros2System:
-    script = "ros2_graph_node.py"
+    script = "ros2_graph_node"
 
     def __init__(self, folder: Path) -> None:
         self._port = free_port()
@@ -155,7 +155,7 @@ class Ros2System:
 
 
 class Ros2OfOthers(Ros2System):
-    script = "ros2_sdk_node.py"
+    script = "ros2_sdk_node"
 
 
 def _system(kind: Any, folder: Path) -> Iterator[Ros]:

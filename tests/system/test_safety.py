@@ -10,11 +10,11 @@ import psutil
 import pytest
 
 import trade
-from system.conftest import Bench, Program
+from tests.support.waiting import wait_until
+from tests.system.conftest import Bench, Program
 from trade import Handle, where
 from trade.errors import ContainerLost, DeadlineExceeded, DeviceSilent, MotionStopped, OutcomeUnknown
 from trade_hil_sim import events, motion_writes, received, writes
-from waiting import wait_until
 
 
 @pytest.fixture

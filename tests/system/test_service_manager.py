@@ -12,10 +12,10 @@ import psutil
 import pytest
 
 import trade
-from system.conftest import ROSIES_HEAD, at_ports
+from tests.support.waiting import wait_until
+from tests.system.conftest import ROSIES_HEAD, at_ports
 from trade import where
 from trade_hil_sim import SimProcess, events
-from waiting import wait_until
 
 ROOT = Path(__file__).parents[2]
 FILE = """

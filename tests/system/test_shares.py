@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from certificates import Papers
-from system.networks import Member, Networks
-from waiting import wait_until
+from tests.support.certificates import Papers
+from tests.support.waiting import wait_until
+from tests.system.networks import Member, Networks
 
 pytestmark = pytest.mark.timeout(300)
 

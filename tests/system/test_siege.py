@@ -11,13 +11,13 @@ from typing import Any
 import msgspec
 import pytest
 from msgspec import structs
-from tests.holds import Ask, Done, Held, Record, Seen, read
 
-from system.networks import Networks
-from system.siege import TROUBLES, Stand, stand
-from system.siege_judge import judge, motions_of
-from system.siege_minimised import fewest
-from system.siege_records import Alarm, Answer, AnyRecord, Fault, Order, Rescue
+from tests.support.lock_log import Ask, Done, Held, Record, Seen, read
+from tests.system.networks import Networks
+from tests.system.siege import TROUBLES, Stand, stand
+from tests.system.siege_judge import judge, motions_of
+from tests.system.siege_minimised import fewest
+from tests.system.siege_records import Alarm, Answer, AnyRecord, Fault, Order, Rescue
 from trade_hil_sim import Entry
 
 SECONDS = 60 * float(os.environ.get("SIEGE_MINUTES", "0.4"))

@@ -13,11 +13,11 @@ import psutil
 import pytest
 
 import trade
-from system.sshd import Sshd
+from tests.support.waiting import wait_until
+from tests.system.sshd import Sshd
 from trade import where
 from trade._remote import ssh
 from trade.errors import CannotStart, ConfigurationError
-from waiting import wait_until
 
 Command = Callable[..., subprocess.CompletedProcess[str]]
 HERE = (sys.executable, "-m", "trade_gateway")

@@ -6,11 +6,11 @@ from collections.abc import Callable
 
 import pytest
 
-from system.conftest import Rosie
+from tests.support.waiting import wait_until
+from tests.system.conftest import Rosie
 from trade import Container, where
 from trade.errors import MotionStopped
 from trade_hil_sim import events, read_log
-from waiting import wait_until
 
 Command = Callable[..., "subprocess.CompletedProcess[str]"]
 PAN = where(group="rosie.neck.pan", name="move_to")

@@ -11,10 +11,10 @@ from typing import Any
 
 import pytest
 
-from certificates import Papers
-from system.networks import Member, Networks, ip
-from system.sites import DOOR, Site
-from waiting import wait_until
+from tests.support.certificates import Papers
+from tests.support.waiting import wait_until
+from tests.system.networks import Member, Networks, ip
+from tests.system.sites import DOOR, Site
 
 FLOOD = Path(__file__).with_name("stranger_flood.py")
 NEWCOMER = Path(__file__).with_name("newcomer.py")

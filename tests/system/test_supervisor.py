@@ -13,16 +13,16 @@ import psutil
 import pytest
 
 import trade
-from certificates import Papers
-from doors import Client
-from system.conftest import ROSIES_HEAD, Program, at_ports
+from tests.support.certificates import Papers
+from tests.support.http_clients import Client
+from tests.support.waiting import wait_until
+from tests.system.conftest import ROSIES_HEAD, Program, at_ports
 from trade import Container, where
 from trade.errors import ConfigurationError
 from trade_gateway.config._gateway import read_gateway_file
 from trade_gateway.http import add_token
 from trade_gateway.supervisor import ChildInfo, News, Supervisor
 from trade_hil_sim import SimProcess, events, writes
-from waiting import wait_until
 
 MODULE = '''
 import ctypes, os, signal, threading

@@ -12,11 +12,11 @@ import psutil
 import pytest
 
 import trade
-from system.conftest import ROOT, Program
-from system.sshd import Sshd
+from tests.support.waiting import wait_until
+from tests.system.conftest import ROOT, Program
+from tests.system.sshd import Sshd
 from trade import where
 from trade.errors import LockLost
-from waiting import wait_until
 
 Command = Callable[..., subprocess.CompletedProcess[str]]
 Run = Callable[..., Program]

@@ -10,10 +10,10 @@ from typing import Any, NamedTuple
 import pytest
 
 import trade
-from system.conftest import ROOT, Bench, Program
+from tests.support.waiting import PATIENCE_S, wait_until
+from tests.system.conftest import ROOT, Bench, Program
 from trade import where
 from trade_hil_sim import Entry, events, motion_writes
-from waiting import PATIENCE_S, wait_until
 
 TELEOP = ROOT / "examples" / "teleop.py"
 ROBOT = ROOT / "examples" / "teleop.toml"

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from system.conftest import Program, Rosie
+from tests.system.conftest import Program, Rosie
 from trade import Container, HookEvent, Trace, service, where
 from trade_gateway.cli import app
 from trade_hil_sim import read_log, writes

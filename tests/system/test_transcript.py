@@ -11,8 +11,8 @@ from typing import Final, NamedTuple
 import psutil
 import pytest
 
-from system.conftest import ROOT, Program
-from system.terminals import end_all_but, in_words, normalised
+from tests.system.conftest import ROOT, Program
+from tests.system.terminals import end_all_but, in_words, normalised
 
 PAGE: Final = ROOT / "docs" / "transcript.md"
 MARKS: Final = ("<!-- transcript: made by test_the_transcript_is_what_happens -->\n", "<!-- end of transcript -->\n")

@@ -17,8 +17,8 @@ from typing import Final
 import psutil
 import pytest
 
-from system.conftest import ROOT
-from system.terminals import Shell, end_all_but, normalised
+from tests.system.conftest import ROOT
+from tests.system.terminals import Shell, end_all_but, normalised
 
 PAGES: Final = sorted((ROOT / "docs" / "tutorials").glob("*.md"))
 _TYPED: Final = r"console\n(?P<typed>.*?)"

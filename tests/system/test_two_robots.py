@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from system.conftest import DORA, ROSIES_HEAD, Bench
+from tests.support.waiting import wait_until
+from tests.system.conftest import DORA, ROSIES_HEAD, Bench
 from trade import Container, where
 from trade.errors import ContainerLost, IncompleteGroup, LockedByOther, LockLost, ServiceGone, TradeError
 from trade_hil_sim import events, writes
-from waiting import wait_until
 
 ROUNDS = int(os.environ.get("CHAOS_ROUNDS", "5"))
 BOTH = where(group="rosie") | where(group="dora")

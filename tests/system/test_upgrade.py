@@ -12,15 +12,15 @@ from typing import Any, Final
 from unittest import mock
 
 import pytest
-from tests.holds import Done, Log, read
 
-from system.networks import Member, Networks
-from system.siege import Driver
-from system.siege_judge import judge
-from system.siege_records import Answer, AnyRecord, Fault
-from system.sites import DOOR, SYSTEM, Site
+from tests.support.lock_log import Done, Log, read
+from tests.support.waiting import wait_until
+from tests.system.networks import Member, Networks
+from tests.system.siege import Driver
+from tests.system.siege_judge import judge
+from tests.system.siege_records import Answer, AnyRecord, Fault
+from tests.system.sites import DOOR, SYSTEM, Site
 from trade._protocol.messages import PROTOCOL
-from waiting import wait_until
 
 NOW, NEXT = PROTOCOL, PROTOCOL + 1
 _THROUGH: Final = Path(__file__).with_name("other_version.py")
@@ -177,7 +177,7 @@ class Stand:
 
 @pytest.fixture
 def stand(networks: Networks, tmp_path: Path) -> Iterator[Stand]:
-    with mock.patch.dict(os.environ, PYTHONPATH=os.pathsep.join(map(str, _BEHAVIOUR.parents[1:3]))):
+    with mock.patch.dict(os.environ, PYTHONPATH=str(_BEHAVIOUR.parents[2])):
         made = Stand(networks, tmp_path)
         try:
             yield made

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from system.conftest import Program
+from tests.system.conftest import Program
 from trade import Container, service, where
 
 StartContainer = Callable[..., Container]

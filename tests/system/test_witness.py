@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from system.conftest import DORA, ROOT, Program
+from tests.system.conftest import DORA, ROOT, Program
 from trade import Container, where
 from trade_hil_sim import Entry, SimControl, events, read_log
 

@@ -15,9 +15,9 @@ from typing import Final
 
 import msgspec
 
-from certificates import Papers
-from system.networks import PATIENCE_S, Networks, ip
-from waiting import wait_until
+from tests.support.certificates import Papers
+from tests.support.waiting import wait_until
+from tests.system.networks import PATIENCE_S, Networks, ip
 
 LEASE_S: Final = 3.0
 ADDRESSES: Final = {"rover": "10.231.8.1", "base": "10.231.8.2"}

@@ -1,0 +1,51 @@
+"""The page of complaints and the tests say the same, both ways."""
+
+import importlib
+import re
+from pathlib import Path
+
+from tests.contract.complaints.table import COMPLAINTS
+
+HERE = Path(__file__).parent
+PAGE = (HERE.parents[2] / "docs" / "complaints.md").read_text(encoding="utf-8")
+ROWS = [[cell.strip() for cell in line.strip("|").split("|")] for line in PAGE.splitlines() if line.startswith("| ")][
+    1:
+]
+
+
+def shown() -> dict[str, set[str]]:
+    for module in HERE.glob("test_*.py"):
+        importlib.import_module(f"tests.contract.complaints.{module.stem}")
+    return {name: {row.mutant.__name__ for row in rows} for name, rows in COMPLAINTS.items()}
+
+
+def names(cell: str) -> list[str]:
+    return re.findall(r"`(\w+)`", cell)
+
+
+def test_there_are_fifteen_complaints_each_of_somebody() -> None:
+    assert len({row[0] for row in ROWS}) == len(ROWS) == 15
+    assert all("](https://github.com/" in row[1] for row in ROWS)
+
+
+def test_each_complaint_has_tests_of_its_name_and_each_test_is_a_complaints() -> None:
+    told = {name: row[0] for row in ROWS for name in names(row[3])}
+    assert set(told) == set(shown())
+    for test, words in told.items():
+        assert test.startswith("test_" + re.sub(r"\W+", "_", words.lower().replace("wi-fi", "wifi")))
+
+
+def test_each_complaint_names_the_mutants_of_its_tests() -> None:
+    made = shown()
+    for row in ROWS:
+        assert set(names(row[4])) == set().union(*(made[test] for test in names(row[3]))), row[0]
+
+
+def test_no_mutant_is_left_over() -> None:
+    used = set().union(*shown().values())
+    defined = {
+        name
+        for module in HERE.glob("*_mutants.py")
+        for name in re.findall(r"^def ([a-z]\w*)\(", module.read_text(encoding="utf-8"), re.MULTILINE)
+    }
+    assert defined == used

@@ -1,0 +1,76 @@
+"""What the page of the wire protocol says of defaults, types and folders is what the codec and the folders are."""
+
+import re
+import tempfile
+from pathlib import Path
+from types import UnionType
+from typing import Any, get_args, get_origin
+
+import msgspec
+import pytest
+from msgspec import Struct, structs
+
+from tests.docs.blocks import DOCS
+from trade._paths import runtime_folder
+from trade._protocol.messages import ProviderInfo, ServiceInfo, decode_provider
+from trade._transport.credentials import user_secret
+
+PAGE = (DOCS / "wire-protocol.md").read_text(encoding="utf-8")
+PROVIDER = {"revision": 1, "groups": ["a"], "kind": "Arm", "host": "rosie", "pid": 1}
+
+
+def rows(after: str) -> list[list[str]]:
+    """The first table after a text."""
+    table = re.search(r"(?:^\|.*\n)+", PAGE[PAGE.index(after) :], re.MULTILINE)
+    assert table is not None
+    return [[cell.strip() for cell in line.strip("|").split(" | ")] for line in table.group().splitlines()[2:]]
+
+
+def said(kind: Any) -> str:
+    if isinstance(kind, UnionType) or type(None) in get_args(kind):
+        return " or ".join("nil" if one is type(None) else said(one) for one in get_args(kind))
+    if hasattr(kind, "__metadata__"):
+        return said(get_args(kind)[0])
+    if get_origin(kind) is tuple:
+        return f"array of {said(get_args(kind)[0])}"
+    return {str: "text", int: "int", msgspec.Raw: "map"}.get(kind) or ("map" if get_origin(kind) else kind.__name__)
+
+
+def left_out(field: structs.FieldInfo) -> str:
+    if field.required:
+        return "malformed"
+    value = field.default if field.default_factory is msgspec.NODEFAULT else field.default_factory()
+    if isinstance(value, msgspec.Raw):
+        value = msgspec.msgpack.decode(value)
+    return "nil" if value is None else "empty" if value in ("", (), {}) else f"{value}" if value == 1 else f"`{value}`"
+
+
+@pytest.mark.parametrize("kind", [ProviderInfo, ServiceInfo])
+def test_fields_have_the_types_and_defaults_of_the_page(kind: type[Struct]) -> None:
+    told = [row[:3] for row in rows(f"**{kind.__name__}** map:")]
+    assert told == [[f"`{one.encode_name}`", said(one.type), left_out(one)] for one in structs.fields(kind)]
+
+
+def test_what_a_service_leaves_out_is_understood_as_the_page_says() -> None:
+    data = msgspec.msgpack.encode({**PROVIDER, "services": [{"name": "turn", "signature": "turn()"}]})
+    [service] = decode_provider(data).services
+    assert (service.effect, service.cancel, service.uses) == ("actuate", None, ())
+    for cancel in (None, "halt"):
+        told = {**PROVIDER, "services": [{"name": "turn", "signature": "turn()", "cancel": cancel}]}
+        assert decode_provider(msgspec.msgpack.encode(told)).services[0].cancel == cancel
+
+
+@pytest.mark.parametrize("named", ["TRADE_RUNTIME_DIR", "XDG_RUNTIME_DIR", "neither"])
+def test_the_runtime_folder_is_where_the_page_says(named: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    told = {row[0].strip("`"): row[1] for row in rows("The runtime folder is")}
+    assert set(told) == {"TRADE_RUNTIME_DIR", "XDG_RUNTIME_DIR", "neither"}
+    monkeypatch.delenv("TRADE_RUNTIME_DIR", raising=False)
+    monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    if named != "neither":
+        monkeypatch.setenv(named, str(tmp_path))
+    folder = runtime_folder()
+    expected = told[named].split("`")[1].replace(f"${named}", str(tmp_path)).replace("<uid>", f"{folder.stat().st_uid}")
+    assert folder == tmp_path / expected
+    user, password = user_secret()
+    assert (user, password) == ("host", (folder / "@secret").read_text(encoding="ascii").strip())

@@ -1,0 +1,49 @@
+"""What clients of a door and agents say."""
+
+from typing import Any, Final
+
+import msgspec
+
+from tests.endurance.fuzz._target import Target
+from trade_gateway.clients import _schemas as messages
+from trade_gateway.mcp._tools import TOOLS
+
+_BODIES: Final = [
+    messages.CallBody,
+    messages.LockBody,
+    messages.GroupBody,
+    messages.RequestBody,
+    messages.EstopBody,
+    messages.ClearBody,
+    messages.TracingBody,
+    messages.SessionBody,
+]
+_REFUSED: Final = (msgspec.DecodeError, ValueError, RecursionError)
+"""What the door answers with BadMessage."""
+
+
+def _frame(data: bytes) -> Any:
+    """A message of the WebSocket, as the door takes it."""
+    asked = messages.read_asked(data)
+    messages.numbers(getattr(asked, "args", None))
+    return asked
+
+
+def _body(data: bytes) -> Any:
+    """The first byte says of which request."""
+    kind = _BODIES[data[0] % len(_BODIES)] if data else _BODIES[0]
+    return msgspec.json.decode(data[1:] or b"{}", type=kind)
+
+
+def _tool(data: bytes) -> Any:
+    """The first byte says of which tool; its arguments have come as JSON."""
+    tool = list(TOOLS.values())[data[0] % len(TOOLS)] if data else next(iter(TOOLS.values()))
+    given = msgspec.json.decode(data[1:])
+    return msgspec.convert(messages.numbers(given), tool.asked)
+
+
+TARGETS: Final = [
+    Target("door-frame", _frame, _REFUSED, messages.encoder.encode),
+    Target("door-body", _body, _REFUSED),
+    Target("agent-tool", _tool, _REFUSED),
+]

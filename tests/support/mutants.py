@@ -1,0 +1,151 @@
+"""The product broken on purpose, each in one way; as a plugin (``-p tests.support.mutants``) tests are run on one.
+
+``MUTANT`` in the environment says which. Broken locks have a place of their own: `tests.endurance.chaos._mutants`.
+"""
+
+import os
+import sys
+from collections.abc import Callable
+from typing import Any, Final
+
+from tests.support import waiting
+
+Patch = Callable[[Any, str, Any], object]
+"""As `setattr`."""
+_IMPATIENCE_S: Final = 6.0
+"""How long a test waits for what a mutant never does."""
+
+
+def _nothing_stops(patch: Patch) -> None:
+    """Who is gone, and what he has lost, is of no concern."""
+    from trade._estop.deadman import Deadman
+    from trade._resources.resource import Permit
+
+    patch(Deadman, "stop", lambda self, resources, reason, done: [done(resource, "") for resource in resources])
+    patch(Permit, "gate", lambda self: None)
+
+
+def _anybody_may(patch: Patch) -> None:
+    """No lock is looked at."""
+    from trade._resources.resource import Permit, Resource
+
+    patch(Resource, "check", lambda self, *_: None)
+    patch(Permit, "gate", lambda self: None)
+
+
+def _never_late(patch: Patch) -> None:
+    """Calls and commands run however late they come."""
+    from trade._services.local_service import LocalService
+    from trade_drivers.bus import _jobs as _work
+    from trade_drivers.joints import _jobs
+
+    patch(LocalService, "too_late", lambda self, _: False)
+    check = _work.check_admitted
+
+    def lenient(*args: Any, expires_ns: int, **more: int) -> None:
+        check(*args, expires_ns=sys.maxsize, **more)
+
+    patch(_jobs, "check_admitted", lenient)
+
+
+def _no_dedupe(patch: Patch) -> None:
+    """A call that comes again runs again."""
+    from trade._context.active_calls import CallDeduplicator
+
+    patch(CallDeduplicator, "begin", lambda self, call, ongoing: ongoing)
+    patch(CallDeduplicator, "find", lambda self, caller, call: None)
+
+
+def _stop_loses(patch: Patch) -> None:
+    """What was asked for before a stop is done after it."""
+    from trade._resources.resource import Resource
+
+    patch(Resource, "stop", lambda self, *_, **__: None)
+
+
+def _watchdog_off(patch: Patch) -> None:
+    """Servos are not told to look after themselves."""
+    from trade_drivers.vendors.dynamixel._cycle import DynamixelExchange
+
+    begin = DynamixelExchange.__init__
+
+    def unwatched(self: Any, *args: Any, **options: Any) -> None:
+        begin(self, *args, **options)
+        self.watchdog_counts = 0
+
+    patch(DynamixelExchange, "__init__", unwatched)
+
+
+def _discovery_stays_on(patch: Patch) -> None:
+    """Who looks for containers once looks for ever."""
+    from trade._discovery.dialer import Dialer
+
+    switch = Dialer.set_discovery
+    patch(Dialer, "set_discovery", lambda self, on: switch(self, on or self.discovers))
+
+
+def _uses_uncounted(patch: Patch) -> None:
+    """Calls under a lock are not counted."""
+    from trade._resources.resource import Resource
+
+    check = Resource.check_lock
+
+    def uncounted(self: Any, *args: Any) -> None:
+        before = self.uses, self.used_at
+        check(self, *args)
+        self.uses, self.used_at = before
+
+    patch(Resource, "check_lock", uncounted)
+
+
+def _no_priority(patch: Patch) -> None:
+    """Whoever locks waits like everybody else, whatever priority it was given."""
+    from trade._locks.api import LockApi
+
+    lock = LockApi.lock
+    patch(LockApi, "lock", lambda self, which, **terms: lock(self, which, **{**terms, "priority": 0}))
+
+
+def _busiest(patch: Patch) -> None:
+    """What is moved goes where there is most to do."""
+    from trade._migration import source as _departing
+
+    busyness = _departing.busyness
+    patch(_departing, "busyness", lambda load: tuple(-each for each in busyness(load)))
+
+
+def _twin_unplaced(patch: Patch) -> None:
+    """The twin stays where it came up, and says that it is where the robot is."""
+    from trade_gateway.mcp import Twin
+
+    patch(Twin, "_place", lambda self, *_: True)
+
+
+def _no_stop_line(patch: Patch) -> None:
+    """Nobody listens on the stop line."""
+    from trade._stop_line import service
+
+    patch(service, "host_door", lambda _: None)
+    patch(service, "_network_doors", lambda *_: [])
+
+
+HOW: Final[dict[str, Callable[[Patch], None]]] = {
+    "nothing-stops": _nothing_stops,
+    "anybody-may": _anybody_may,
+    "never-late": _never_late,
+    "no-dedupe": _no_dedupe,
+    "stop-loses": _stop_loses,
+    "watchdog-off": _watchdog_off,
+    "discovery-stays-on": _discovery_stays_on,
+    "uses-uncounted": _uses_uncounted,
+    "no-priority": _no_priority,
+    "busiest": _busiest,
+    "twin-unplaced": _twin_unplaced,
+    "no-stop-line": _no_stop_line,
+}
+
+
+def pytest_configure() -> None:
+    """Called for a module that is named as a plugin."""
+    HOW[os.environ["MUTANT"]](setattr)
+    waiting.PATIENCE_S = _IMPATIENCE_S

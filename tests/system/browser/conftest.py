@@ -1,0 +1,173 @@
+"""The dashboard in a real Chromium, of a simulated robot behind a door in a process of its own."""
+
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+from playwright.sync_api import Browser, Page, expect, sync_playwright
+
+from tests.support.http_clients import Client
+from tests.support.waiting import PATIENCE_S, wait_until
+from tests.system.conftest import Bench, Program, bench, benches, run
+from trade import Settings
+from trade_gateway.http import add_token
+
+__all__ = ["bench", "benches", "run"]
+
+POLICY = """
+[roles.all]
+call = ["*"]
+read = ["*"]
+register = ["*"]
+lock = ["*"]
+administer = ["*"]
+instrument = ["*"]
+
+[roles.operator]
+read = ["*"]
+call = ["rosie"]
+lock = ["rosie"]
+
+[roles.viewer]
+read = ["rosie"]
+
+[identities]
+"{own}" = ["all"]
+chief = ["all"]
+anna = ["operator"]
+bert = ["operator"]
+vera = ["viewer"]
+"""
+PAN = "rosie.neck.pan"
+PATIENCE_MS = PATIENCE_S * 1000
+
+
+def chromium() -> str:
+    """Where it is; skips where there is none, and fails there in CI."""
+    found = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    if found is None and os.environ.get("CI") == "true":
+        pytest.fail("no chromium (Debian: apt-get install chromium); in CI this is part of what must hold")
+    if found is None:
+        pytest.skip("no chromium (Debian: apt-get install chromium)")
+    return found
+
+
+class Doorway:
+    """``trade door`` with a policy, that can be killed and started again at the same address."""
+
+    def __init__(self, run: Callable[..., Program], folder: Path) -> None:
+        self._run, self._tokens = run, folder / "tokens.toml"
+        self.token("nobody")
+        self.url = ""
+        self.start("127.0.0.1:0")
+
+    def start(self, listen: str = "") -> None:
+        words = ("--listen", listen or self.url.removeprefix("http://"), "--tokens", self._tokens, "--json")
+        self.program = self._run("-m", "trade_gateway", "door", *words)
+        self.url = self.program.json()["url"]
+
+    def token(self, identity: str) -> str:
+        return add_token(self._tokens, identity)
+
+
+@pytest.fixture
+def doorway(
+    bench: Bench,
+    run: Callable[..., Program],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> Doorway:
+    (tmp_path / "policy.toml").write_text(POLICY.format(own=Settings.read().identity))
+    monkeypatch.setenv("TRADE_POLICY", str(tmp_path / "policy.toml"))
+    monkeypatch.setenv("TRADE_AUDIT", str(tmp_path / "audit"))
+    made = Doorway(run, tmp_path)
+    client = Client(made.url, made.token("chief"))
+    wait_until(lambda: client.ask("GET", f"/services?group={PAN}&name=state").body, "it is known")
+    return made
+
+
+class View:
+    """Somebody's page: what can be seen and done there."""
+
+    def __init__(self, page: Page) -> None:
+        self.page = page
+        self.link = page.locator("#link")
+        self.stopped = page.locator("#stopped")
+        self.estop = page.get_by_role("button", name="E-STOP")
+        self.pan = page.locator(f'[id="at-{PAN}"]')
+        self.plus = self.pan.get_by_role("button", name="in the positive direction")
+        self.minus = self.pan.get_by_role("button", name="in the negative direction")
+        self.message = self.pan.get_by_role("status")
+
+    def hold(self, what: Any) -> None:
+        """Press with the mouse and do not let go."""
+        expect(what).to_be_enabled()
+        what.scroll_into_view_if_needed()
+        what.hover()
+        self.page.mouse.down()
+        expect(what).to_be_focused()
+
+    def sign_in(self, token: str) -> None:
+        self.page.get_by_label("Token").fill(token)
+        self.page.keyboard.press("Enter")
+
+    def service(self, group: str, name: str) -> Any:
+        """The card of a service, open."""
+        self.page.get_by_label("Search").fill(f"{group}.{name}")
+        card = self.page.locator(f'[data-service="{group}.{name}"]')
+        card.locator("summary").click()
+        return card
+
+
+class Browsers:
+    """Chromium, once or several times."""
+
+    def __init__(self, start: Callable[[], Browser], doorway: Doorway) -> None:
+        self._start = start
+        self._doorway = doorway
+        self._first: Browser | None = None
+
+    def view(self, who: str, *, alone: bool = False, **options: Any) -> View:
+        """A page of somebody who has signed in; ``alone``: in a browser of its own."""
+        if alone or self._first is None:
+            browser = self._start()
+            self._first = self._first or browser
+        else:
+            browser = self._first
+        page = browser.new_context(viewport={"width": 1280, "height": 900}, **options).new_page()
+        page.set_default_timeout(PATIENCE_MS)
+        page.goto(self._doorway.url)
+        view = View(page)
+        view.sign_in(self._doorway.token(who))
+        expect(view.link).to_have_text("● Connected")
+        return view
+
+
+@pytest.fixture
+def browsers(doorway: Doorway) -> Iterator[Browsers]:
+    executable = chromium()
+    expect.set_options(timeout=PATIENCE_MS)
+    with sync_playwright() as playwright:
+        started: list[Browser] = []
+
+        def start() -> Browser:
+            # the sandbox needs user namespaces, which containers of CI seldom have; only our own page is shown
+            browser = playwright.chromium.launch(executable_path=executable, args=["--no-sandbox"])
+            started.append(browser)
+            return browser
+
+        yield Browsers(start, doorway)
+        for browser in started:
+            with suppress(Exception):  # it was killed by its test
+                browser.close()
+
+
+def renderers() -> list[psutil.Process]:
+    """The processes that run pages, of all browsers of this one."""
+    found = psutil.Process().children(recursive=True)
+    return [one for one in found if "--type=renderer" in one.cmdline()]

@@ -1,0 +1,152 @@
+"""Attaching drives: every mistake of wiring, setting and installation is named with what would be right."""
+
+import builtins
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.unit.drivers.conftest import Outcome, written_now
+from tests.unit.drivers.legs import HIP, KNEE, Leg, leg, rig
+from trade.errors import ConfigurationError
+from trade_drivers import load
+from trade_hil_sim import Absent, Mute, Unplug
+from trade_hil_sim.cia402 import Cia402Bus
+
+__all__ = ["leg", "rig"]
+
+
+def refused(leg: Leg, **options: Any) -> str:
+    with pytest.raises(ConfigurationError) as error:
+        leg.attach(**options)
+    assert not leg.announced
+    return str(error.value)
+
+
+def objects(**values: int) -> Callable[[Cia402Bus], None]:
+    """The hip's drive with other values in its dictionary than it was shipped with; a reset would undo them."""
+
+    def change(bus: Cia402Bus) -> None:
+        for name, value in values.items():
+            next(device for device in bus.devices if device.device_id == HIP).store.set(name, value)  # type: ignore[attr-defined]
+
+    return change
+
+
+def test_an_absent_drive_is_named_with_what_to_check(leg: Leg) -> None:
+    leg.sim.do(Absent(ids=(HIP,)))
+    text = refused(leg)
+    for part in ('leg.toml: joint."leg.hip"', "node 1", leg.sim.port, "power", "bit rate", "terminations"):
+        assert part in text
+
+
+def test_a_drive_that_answers_but_sends_no_heartbeat_is_not_taken_on(leg: Leg) -> None:
+    leg.sim.do(Mute(ids=(KNEE,), instruction="heartbeat"))
+    text = refused(leg)
+    assert 'leg.toml: joint."leg.knee": node 2 answers, but sends no heartbeat (1017h)' in text
+    assert not leg.frames("rpdo1")
+
+
+def test_a_single_lost_answer_is_forgiven(leg: Leg) -> None:
+    leg.sim.do(Mute(ids=(HIP,), instruction="sdo_reply", count=2))
+    leg.attach()
+
+
+def test_another_model_is_named_beside_the_one_expected(leg: Leg) -> None:
+    leg.configure(("ACME-EC60", "ACME-EC45"))
+    text = refused(leg)
+    assert "joint.\"leg.hip\".model: is 'ACME-EC45', but node 1 says it is 'ACME-EC60' (1008h)" in text
+
+
+@pytest.mark.parametrize(
+    ("values", "complaint"),
+    [
+        ({"device_type": 0x000F_0191}, "node 1 is no CiA 402 drive: its device type (1000h) names profile 401"),
+        ({"supported_modes": 0x3AC}, "it has no profile position mode (6502h)"),
+        ({"position_limit_min": -1000}, "is more than the drive's own range (607Dh)"),
+        ({"max_profile_velocity": 1000}, "max_speed_rad_s: 2 is above the drive's own limit 0.03068 (607Fh)"),
+    ],
+    ids=str,
+)
+def test_a_setting_that_is_wrong_for_us_is_named(rig: Leg, values: dict[str, int], complaint: str) -> None:
+    rig.plug()
+    objects(**values)(rig.sim)
+    assert complaint in refused(rig)
+    assert not rig.frames("rpdo1")
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "complaint"),
+    [
+        ("counts_per_rev = 4096\ngear = 50\nmin", "gear = 50\nmin", 'joint."leg.hip": missing; a CiA 402 drive'),
+        ("id = 2", "id = 127", 'joint."leg.knee".id: 127 is no node of a drive; 1 to 126 are'),
+        (
+            "max_accel_rad_s2 = 20.0",
+            "max_accel_rad_s2 = 1.0",
+            "max_accel_rad_s2: a stop from max_speed_rad_s takes",
+        ),
+        ("gear = 50", "gear = 5e6", "max_rad: the range does not fit into 32 bits"),
+        ("gear = 50", "gear = 1e-9", "max_speed_rad_s: 2 is below"),
+        ('channel = "can0"', 'channel = "can0"\nrate_hz = 5', "bus.legs.rate_hz: 5 is too slow for watchdog_s"),
+        (
+            'channel = "can0"',
+            'channel = "can0"\nbitrate = 20000',
+            "2 drives at 20000 bit/s need 42.2 ms a cycle",
+        ),
+        ('interface = "socketcan"\nchannel = "can0"', 'port = "/dev/tty"', "driver cia402 needs a CAN bus: interface"),
+    ],
+)
+def test_what_the_file_alone_tells(leg: Leg, before: str, after: str, complaint: str) -> None:
+    leg.configure((before, after))
+    assert complaint in refused(leg)
+
+
+def test_a_channel_that_is_not_there_is_named(leg: Leg) -> None:
+    leg.sim.do(Unplug())
+    text = refused(leg)
+    assert "leg.toml: bus.legs.channel" in text
+    assert leg.sim.port in text
+
+
+def test_S20_a_bus_that_has_a_driver_is_not_taken_by_a_second(leg: Leg) -> None:
+    hip = leg.attach().motor("leg.hip")
+    hip.enable()
+    mark = written_now()
+    moving = Outcome(lambda: hip.move_to(0.3, 0.5))
+    leg.wait_for("motion_started", HIP, mark)
+    first = len(leg.announced)
+    with pytest.raises(ConfigurationError, match=f"another driver has this bus: process {os.getpid()} "):
+        leg.attach()
+    assert len(leg.announced) == first
+    assert not [name for name in ("nmt", "sdo_request") if leg.frames(name, since=mark)]
+    assert moving.wait().result == pytest.approx(0.3, abs=0.01)
+
+
+def test_a_missing_library_is_named_with_its_remedy(leg: Leg, monkeypatch: pytest.MonkeyPatch) -> None:
+    real = builtins.__import__
+
+    def without_canopen(name: str, *rest: Any) -> Any:
+        if name.partition(".")[0] == "canopen":
+            raise ImportError(f"No module named {name!r}")
+        return real(name, *rest)
+
+    for module in [name for name in sys.modules if name.startswith(("trade_drivers.vendors.cia402._", "canopen"))]:
+        if module != "trade_drivers.vendors.cia402._driver":
+            monkeypatch.delitem(sys.modules, module)
+    monkeypatch.setattr(builtins, "__import__", without_canopen)
+    assert 'pip install "trade-drivers[cia402]"' in refused(leg)
+
+
+def test_the_legs_of_the_examples_attach_and_move(rig: Leg) -> None:
+    rig.robot = load(Path(__file__).parents[3] / "examples" / "legs.toml")
+    rig.plug(paced=True)
+    goal = [0.3, 0.6, -0.2, -0.3, 0.4, 0.2]
+    assert rig.attach().group("legs").move_to(goal) == pytest.approx(goal, abs=0.01)
+
+
+def test_on_a_virtual_bus_without_anybody_the_drive_is_absent(rig: Leg) -> None:
+    with pytest.raises(ConfigurationError, match="no drive answers as node 1 on virtual:nobody"):
+        rig.attach(ports={"legs": "virtual:nobody"})

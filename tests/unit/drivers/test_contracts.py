@@ -1,0 +1,182 @@
+"""The contracts of all kinds of devices, on the simulations of robot files. A new device only names its file here."""
+
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from importlib.metadata import entry_points
+from pathlib import Path
+
+import pytest
+
+from tests.support.simulated_robots import HAND, HEAD
+from tests.unit.drivers.legs import LEG
+from tests.unit.drivers.test_across import LEGS
+from trade import where
+from trade_drivers import AttachedRobot, JointGroup, Motor, Robot, attach, parse
+from trade_drivers.robotfile import Bus
+from trade_drivers.testing import JointGroupContract, MotorContract
+from trade_hil_sim import ByteLog, SimProcess, events
+from trade_hil_sim.robot._robot import buses_of
+
+FILES = {
+    "head": HEAD,
+    "fast": HEAD.replace('driver = "dynamixel"', 'driver = "dynamixel"\nfast_sync = true'),
+    "legs": LEGS,
+    "body": HEAD
+    + "".join(text[text.index("[bus.") :] for text in (LEG, HAND))
+    + '\n[group.body]\njoints = ["neck.tilt", "leg.hip", "neck.pan", "leg.knee"]\n',
+}
+"""Robot files by name."""
+MOTORS = [("head", "neck.pan"), ("head", "neck.tilt"), ("fast", "neck.pan"), ("body", "leg.hip"), ("body", "leg.knee")]
+ELSEWHERE = {
+    "damiao": "test_motor_contracts.py",
+    "feetech": "test_feetech_contracts.py",
+    "odrive": "test_motor_contracts.py",
+    "robotiq": "test_robotiq_gripper.py",
+    "snapshot": "test_senses.py",
+    "ur": "test_ur_contract.py",
+}
+"""Drivers whose contracts are run in modules of their own."""
+GROUPS = [("head", "head"), ("legs", "legs"), ("body", "leg"), ("body", "body")]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def robots(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, AttachedRobot]]:
+    """The robots of the files, on simulated buses in this process: a starved one of its own looks like silence."""
+    with ExitStack() as undo:
+        made: dict[str, AttachedRobot] = {}
+        for name, text in FILES.items():
+            # a computer that stands still for a moment is no silence
+            robot = parse(re.sub("(?m)^driver = .*", r"\g<0>\nstale_after_s = 1", text), f"{name}.toml")
+            buses = buses_of(robot, tmp_path_factory.mktemp(name), log=ByteLog(keep=False), paced=False)
+            for bus in buses:
+                undo.callback(bus.close)
+                bus.open()
+            ports = {bus.name: str(bus.port) for bus in buses}
+            made[name] = undo.enter_context(
+                attach(robot, register=lambda *_: None, deregister=lambda _: None, ports=ports)
+            )
+        yield made
+
+
+def _ids(cases: list[tuple[str, str]]) -> list[str]:
+    return [" ".join(case) for case in cases]
+
+
+class TestMotor(MotorContract):
+    @pytest.fixture(params=MOTORS, ids=_ids(MOTORS))
+    def motor(self, request: pytest.FixtureRequest, robots: dict[str, AttachedRobot]) -> Iterator[Motor]:
+        file, joint = request.param
+        motor = robots[file].motor(joint)
+        yield motor
+        motor.relax()
+
+
+class TestJointGroup(JointGroupContract):
+    @pytest.fixture(params=GROUPS, ids=_ids(GROUPS))
+    def group(self, request: pytest.FixtureRequest, robots: dict[str, AttachedRobot]) -> Iterator[JointGroup]:
+        file, name = request.param
+        group = robots[file].group(name)
+        yield group
+        group.relax()
+
+
+def test_every_simulator_has_its_contracts() -> None:
+    files = {name: parse(text, f"{name}.toml") for name, text in FILES.items()}
+    drivers = {bus.driver for file, joint in MOTORS for bus in files[file].buses if _is_on(files[file], bus, joint)}
+    assert drivers | ELSEWHERE.keys() == {simulator.name for simulator in entry_points(group="trade.sims")}
+    for module in ELSEWHERE.values():
+        assert "Contract):" in Path(__file__).with_name(module).read_text(), module
+
+
+def _is_on(robot: Robot, bus: Bus, joint: str) -> bool:
+    return any(record.name == joint for record in robot.joints_on(bus.name))
+
+
+def test_servos_drives_and_grippers_are_one_robot(robots: dict[str, AttachedRobot]) -> None:
+    body = robots["body"]
+    assert body.group("body").joints() == ["rosie.neck.tilt", "rosie.leg.hip", "rosie.neck.pan", "rosie.leg.knee"]
+    assert [state.enabled for state in body.group("body").state()] == 4 * [False]
+    assert body.gripper("left.hand").state().fault == ""
+
+
+# --- on hardware
+
+
+@pytest.fixture
+def head_file(tmp_path: Path) -> Path:
+    file = tmp_path / "head.toml"
+    file.write_text(HEAD)
+    return file
+
+
+def hil(file: Path, sim: SimProcess, *words: str, says: str = "") -> "subprocess.CompletedProcess[str]":
+    ports = [f"--port={bus}={port}" for bus, port in sim.ports.items()]
+    command = [sys.executable, "-m", "trade_drivers.testing", "--hil", str(file), *ports, *words]
+    return subprocess.run(command, input=says, capture_output=True, text=True, timeout=100, check=False, env=os.environ)
+
+
+def test_the_contracts_run_on_every_joint_and_group_of_a_robot_file(system: str, head_file: Path) -> None:
+    with SimProcess(head_file, paced=False) as sim:
+        ended = hil(head_file, sim, "--yes", "-k", "state_tells or order_of or enable_holds")
+        assert ended.returncode == 0, ended.stdout + ended.stderr
+        for device in ("rosie.neck.pan", "rosie.neck.tilt", "rosie.head"):
+            assert f"[{device}] PASSED" in ended.stdout
+        assert len(events(sim.entries(), "torque_on")) == len(events(sim.entries(), "torque_off")) > 0
+
+
+def test_grippers_are_opened_and_closed_only_after_a_word_of_their_own(system: str, tmp_path: Path) -> None:
+    file = tmp_path / "hand.toml"
+    file.write_text(HAND)
+    with SimProcess(file, paced=False) as sim:
+        refused = hil(file, sim, says="no\n")
+        assert refused.returncode == 2
+        assert "CLOSED" in refused.stderr
+        assert "RELAXED" not in refused.stderr
+        ended = hil(file, sim, "-k", "go_to_the_ends or no_number", says="yes\n")
+        assert ended.returncode == 0, ended.stdout + ended.stderr
+        assert ended.stdout.count("[rosie.left.hand] PASSED") == 2
+
+
+def test_a_contract_that_is_broken_is_told_of(system: str, head_file: Path) -> None:
+    head_file.write_text(HEAD.replace("min_rad = -1.4", "min_rad = 0.2"))  # it is found outside of its range
+    with SimProcess(head_file, paced=False) as sim:
+        ended = hil(head_file, sim, "--yes", "-k", "state_tells")
+        assert ended.returncode == 1
+        assert "[rosie.neck.pan] FAILED" in ended.stdout
+
+
+@pytest.mark.parametrize("answer", ["", "no\n", "y\n"])
+def test_nothing_moves_unless_somebody_says_yes(system: str, head_file: Path, answer: str) -> None:
+    with SimProcess(head_file, paced=False) as sim:
+        ended = hil(head_file, sim, says=answer)
+        assert ended.returncode == 2
+        assert "RELAXED" in ended.stderr
+        assert not sim.entries()
+
+
+def test_a_robot_that_is_in_use_is_left_alone(
+    system: str, head_file: Path, start_container: Callable[..., object]
+) -> None:
+    class Pan:
+        """Stands for a driver on any host."""
+
+        from trade import service
+
+        @service(effect="actuate", cancel="stop", uses=["rosie.neck.pan"])
+        def move_to(self, position_rad: float) -> None: ...
+
+        @service(effect="stop")
+        def stop(self) -> None: ...
+
+    driver, walker = start_container("driver"), start_container("walker")
+    driver.register(Pan(), "rosie.neck.pan")  # type: ignore[attr-defined]
+    with SimProcess(head_file, paced=False) as sim, walker.lock(where(group="rosie"), purpose="a walk"):  # type: ignore[attr-defined]
+        ended = hil(head_file, sim, "--yes")
+        assert ended.returncode == 2
+        assert "driver on" in ended.stderr
+        assert "a walk" in ended.stderr
+        assert not sim.entries()

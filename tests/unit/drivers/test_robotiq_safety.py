@@ -1,0 +1,392 @@
+"""The motion rules on a gripper, by their numbers; the judge is what the simulated gripper received and did."""
+
+import math
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.support.simulated_robots import HAND
+from tests.support.waiting import wait_until
+from tests.unit.drivers.conftest import Outcome, call, sleep_past, written_now
+from tests.unit.drivers.gate import Gate
+from tests.unit.drivers.gripper_rig import HandRig, made_rig, silent
+from trade import Container, Handle, where
+from trade.errors import (
+    ConfigurationError,
+    DeadlineExceeded,
+    DeviceError,
+    DeviceSilent,
+    InvalidArgument,
+    LimitExceeded,
+    LockedByOther,
+    LockLost,
+    MotionStopped,
+    OutcomeUnknown,
+    Stopped,
+)
+from trade_drivers import Gripper
+from trade_hil_sim import Heal, Mute, Put, instructions, received
+
+SLOW_M_S = 0.02
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> Iterator[HandRig]:
+    with made_rig(tmp_path) as made:
+        yield made
+
+
+@pytest.fixture
+def hand(rig: HandRig) -> HandRig:
+    rig.plug()
+    return rig
+
+
+# --- S01
+
+
+@pytest.mark.parametrize("command", ["move_to", "close", "open", "activate", "clear_fault"])
+def test_S01_a_command_that_expires_while_the_bus_is_held_up_is_never_written(
+    hand: HandRig, gate: Gate, command: str
+) -> None:
+    gripper = hand.active(healthy=gate) if command in {"move_to", "close", "open"} else hand.gripper(healthy=gate)
+    gate.hold_up()
+    mark = written_now()
+    late = Outcome((lambda: gripper.move_to(0.02)) if command == "move_to" else getattr(gripper, command), 0.05)
+    with call(0.05) as expires_ns:
+        sleep_past(expires_ns)
+    gate.let_go()
+    assert isinstance(late.wait().error, DeadlineExceeded)
+    assert not hand.writes(mark)
+
+
+def test_S01_a_command_is_not_repeated_after_its_deadline_and_its_fingers_are_stopped(hand: HandRig) -> None:
+    gripper = hand.active()
+    hand.sim.do(Mute(instruction="read_write"))
+    mark = written_now()
+    late = Outcome(lambda: gripper.close(SLOW_M_S), deadline_s=0.1).wait()
+    assert isinstance(late.error, OutcomeUnknown | DeviceSilent | MotionStopped)
+    moves = hand.moves(mark)
+    assert moves
+    assert max(entry.t for entry in moves) - min(entry.t for entry in moves) < 0.1
+    hand.sim.do(Heal())
+    wait_until(lambda: not hand.truth.moving, "it stands")
+    assert hand.truth.width_m > 0.03
+    assert len(hand.moves(mark)) == len(moves)
+
+
+# --- S06: the device has no watchdog
+
+
+class Child:
+    """A driver in a process of its own that closes the hand slowly."""
+
+    def __init__(self, rig: HandRig, tmp_path: Path) -> None:
+        file = tmp_path / "hand.toml"
+        file.write_text(HAND)
+        program = Path(__file__).with_name("gripper_process.py")
+        self.process = subprocess.Popen([sys.executable, str(program), str(file), str(rig.sim.port)])
+
+    def close(self) -> None:
+        self.process.kill()
+        self.process.wait()
+
+
+@pytest.fixture
+def child(hand: HandRig, tmp_path: Path) -> Iterator[Child]:
+    made = Child(hand, tmp_path)
+    yield made
+    made.close()
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP], ids=["kill -9", "SIGSTOP"])
+def test_S06_without_its_driver_a_gripper_ends_the_move_it_was_told_and_no_other(
+    hand: HandRig, child: Child, number: int
+) -> None:
+    began = hand.wait_for("motion_started", hand.wait_for("activated").t)
+    os.kill(child.process.pid, number)
+    mark = written_now() + 0.1
+    hand.wait_for("at_rest", began.t)
+    assert hand.truth.width_m == pytest.approx(0.05, abs=0.001)
+    assert not hand.moves(mark)
+
+
+def test_S06_that_a_2F85_has_no_watchdog_is_in_the_documentation() -> None:
+    page = Path(__file__).parents[3].joinpath("docs", "drivers.md").read_text(encoding="utf-8")
+    assert "no watchdog" in page[page.index("## Robotiq") :]
+
+
+def test_S06_an_unhealthy_process_stops_the_fingers_once_and_falls_silent(hand: HandRig, gate: Gate) -> None:
+    gripper = hand.active(healthy=gate)
+    moving = Outcome(lambda: gripper.close(SLOW_M_S))
+    hand.under_way()
+    mark = written_now()
+    gate.says = False
+    assert moving.wait().error is not None
+    wait_until(lambda: not hand.truth.moving, "it stands")
+    [stop] = [entry for entry in hand.writes(mark) if not entry.moves]
+    assert hand.truth.width_m > 0.03
+    wait_until(lambda: silent(gripper), "what was measured is too old")
+    assert not received(hand.log, since=stop.t + 0.1)
+    for act in (gripper.close, gripper.activate, gripper.state):
+        with pytest.raises(DeviceError, match="not healthy"):
+            act()
+
+
+def test_S06_a_defect_in_the_bus_thread_is_silence_and_an_error_for_everybody(
+    hand: HandRig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gripper = hand.active()
+    moving = Outcome(lambda: gripper.close(SLOW_M_S))
+    hand.under_way()
+
+    def defect(_: object) -> None:
+        raise RuntimeError("a defect")
+
+    monkeypatch.setattr(gripper._exchange, "_measure", defect)  # type: ignore[attr-defined]
+    assert "a defect" in str(moving.wait().error)
+    for act in (gripper.activate, gripper.stop, gripper.close):
+        with pytest.raises(DeviceError):
+            act()
+
+
+# --- S07
+
+
+def test_S07_a_stop_is_the_first_thing_on_a_bus_that_was_held_up(hand: HandRig, gate: Gate) -> None:
+    gripper = hand.active(healthy=gate)
+    moving = Outcome(lambda: gripper.close(SLOW_M_S))
+    hand.under_way()
+    gate.hold_up()
+    mark = written_now()
+    stop = Outcome(gripper.stop)
+    wait_until(lambda: gripper._exchange._stops, "the stop is there")  # type: ignore[attr-defined]
+    gate.let_go()
+    assert stop.wait().error is None
+    assert isinstance(moving.wait().error, MotionStopped)
+    first = instructions(hand.log, since=mark)[0]
+    assert (first.name, first.moves) == ("read_write", False)
+    assert not hand.truth.moving
+
+
+# --- S08
+
+
+def test_S08_a_stop_drops_what_waits_on_the_bus(hand: HandRig, gate: Gate) -> None:
+    gripper = hand.active(healthy=gate)
+    gate.hold_up()
+    mark = written_now()
+    waiting = Outcome(gripper.close)
+    wait_until(lambda: gripper._exchange._inbox, "it is admitted")  # type: ignore[attr-defined]
+    stop = Outcome(gripper.stop)
+    wait_until(lambda: gripper._exchange._stops, "the stop is there")  # type: ignore[attr-defined]
+    gate.let_go()
+    stop.wait()
+    assert isinstance(waiting.wait().error, MotionStopped)
+    assert not hand.moves(mark)
+
+
+def test_S08_a_stop_ends_activation_and_leaves_it_not_activated(hand: HandRig) -> None:
+    gripper = hand.gripper()
+    activating = Outcome(gripper.activate)
+    wait_until(lambda: hand.truth.moving, "its fingers move")
+    mark = written_now()
+    gripper.stop()
+    assert isinstance(activating.wait().error, MotionStopped)
+    assert not hand.truth.moving
+    assert not gripper.state().activated
+    assert not hand.moves(mark)
+
+
+def test_S08_a_stop_that_is_not_answered_is_written_again_until_it_is_heard(hand: HandRig) -> None:
+    gripper = hand.active()
+    moving = Outcome(lambda: gripper.close(SLOW_M_S))
+    hand.under_way()
+    hand.sim.do(Mute(instruction="read_write", count=1))
+    gripper.stop()
+    assert isinstance(moving.wait().error, MotionStopped)
+    assert not hand.truth.moving
+    assert hand.truth.width_m > 0.03
+
+
+def test_S08_a_stop_of_a_silent_gripper_is_sent_blind_and_cannot_activate_it(hand: HandRig) -> None:
+    gripper = hand.active()
+    moving = Outcome(lambda: gripper.close(SLOW_M_S))
+    hand.under_way()
+    hand.sim.do(Mute())
+    assert isinstance(moving.wait().error, DeviceSilent)
+    wait_until(lambda: not hand.truth.moving, "it stands")
+    mark = written_now()
+    with pytest.raises(DeviceSilent):
+        gripper.stop()
+    assert {entry.hex for entry in hand.writes(mark)} == {"00" * 6}
+    assert hand.truth.width_m > 0.03
+
+
+# --- S11 and S08 through the middleware
+
+
+HAND_SERVICES = where(group="rosie.left.hand")
+
+
+@pytest.fixture
+def driver(start_container: Callable[..., Container]) -> Container:
+    return start_container("driver")
+
+
+@pytest.fixture
+def gripper(hand: HandRig, gate: Gate, driver: Container) -> Gripper:
+    return hand.active(register=driver.register, deregister=driver.deregister, healthy=gate)
+
+
+@pytest.fixture
+def planner(start_container: Callable[..., Container], gripper: Gripper) -> Container:
+    return start_container("planner")
+
+
+@pytest.fixture
+def operator(start_container: Callable[..., Container], gripper: Gripper) -> Container:
+    return start_container("operator")
+
+
+def service(container: Container, name: str) -> Handle:
+    return container.find(where(name=name, group="rosie.left.hand"), wait_s=20).with_(deadline_s=60)
+
+
+def test_S11_a_command_admitted_under_a_lock_that_is_lost_never_reaches_the_wire(
+    hand: HandRig, gate: Gate, gripper: Gripper, planner: Container, operator: Container
+) -> None:
+    close = service(planner, "close")
+    lock = planner.lock(HAND_SERVICES).acquire()
+    with lock.use():
+        gate.hold_up()
+        mark = written_now()
+        run = close.start()
+        wait_until(lambda: gripper._exchange._inbox, "it is admitted")  # type: ignore[attr-defined]
+        assert operator.locking.break_lock(HAND_SERVICES, "it is mine")
+        gate.let_go()
+        with pytest.raises((LockLost, MotionStopped)):
+            run.result()
+    lock.release()
+    assert not hand.moves(mark)
+
+
+def test_S11_who_has_no_lock_writes_nothing(
+    hand: HandRig, gripper: Gripper, planner: Container, operator: Container
+) -> None:
+    with planner.lock(HAND_SERVICES):
+        mark = written_now()
+        for act in (
+            service(operator, "close"),
+            service(operator, "open"),
+            lambda: service(operator, "move_to")(0.05),
+            service(operator, "activate"),
+            service(operator, "clear_fault"),
+            gripper.close,  # a plain call of the method, without the middleware (S15)
+        ):
+            with pytest.raises(LockedByOther):
+                act()
+        assert service(operator, "state")().name == "rosie.left.hand"
+    assert not hand.writes(mark)
+
+
+def test_S09_what_an_estop_ended_tells_of_the_estop_and_after_it_a_plain_stop_does_not(
+    hand: HandRig, gripper: Gripper, planner: Container, operator: Container
+) -> None:
+    run = service(planner, "close").start(SLOW_M_S)
+    hand.under_way()
+    report = operator.estop("smoke")
+    with pytest.raises(MotionStopped, match=f"before its goal: e-stop {report.id}: smoke") as ended:
+        run.result()
+    assert "until it is moved again" not in str(ended.value)
+    operator.estop_clear([report.id])
+    operator.locking.resume(HAND_SERVICES)
+    run = service(planner, "open").start(SLOW_M_S)
+    hand.under_way()
+    gripper.stop()
+    with pytest.raises(MotionStopped, match=r"before its goal: stop\(\) was called\."):
+        run.result()
+
+
+def test_S14_what_is_withdrawn_while_it_moves_says_so(
+    hand: HandRig, gripper: Gripper, planner: Container, driver: Container
+) -> None:
+    run = service(planner, "close").start(SLOW_M_S)
+    hand.under_way()
+    driver.deregister(gripper)
+    with pytest.raises(MotionStopped, match="before its goal: its services are withdrawn"):
+        run.result()
+
+
+def test_S08_a_foreign_stop_holds_until_somebody_resumes(
+    hand: HandRig, gripper: Gripper, planner: Container, operator: Container
+) -> None:
+    run = service(planner, "close").start(SLOW_M_S)
+    hand.under_way()
+    service(operator, "stop")()
+    with pytest.raises(MotionStopped):
+        run.result()
+    mark = written_now()
+    for act in (service(planner, "close"), service(operator, "activate"), gripper.open):
+        with pytest.raises(Stopped):
+            act()
+    assert not hand.moves(mark)
+    assert operator.locking.resume(HAND_SERVICES) == ["rosie.left.hand"]
+    assert service(planner, "open")().width_m == pytest.approx(0.085, abs=0.001)
+
+
+def test_S05_a_move_ends_with_its_session_and_what_is_held_stays_held(
+    hand: HandRig, gripper: Gripper, planner: Container, operator: Container
+) -> None:
+    service(planner, "close").start(SLOW_M_S)
+    hand.under_way()
+    planner.close()
+    wait_until(lambda: not hand.truth.moving, "it stands")
+    assert hand.truth.width_m > 0.03
+    hand.sim.do(Put(width_m=0.02))
+    service(operator, "close")()
+    mark = written_now()
+    operator.close()
+    first = gripper.state()
+    wait_until(lambda: gripper.state().measured_at > first.measured_at + 0.3, "it had time")
+    assert not hand.writes(mark)
+    assert hand.truth.holding
+
+
+# --- S22
+
+
+def test_S22_what_is_refused_is_not_written(hand: HandRig) -> None:
+    gripper = hand.active()
+    mark = written_now()
+    for width, speed, force in (
+        *((value, None, None) for value in (-0.001, 0.0851, math.nan, math.inf)),
+        *((0.04, value, None) for value in (0.019, 0.151, 0.0, math.nan)),
+        *((0.04, None, value) for value in (19.9, 200.1, 0.0, math.inf)),
+    ):
+        with pytest.raises((LimitExceeded, InvalidArgument)):
+            gripper.move_to(width, speed, force)
+    assert not hand.writes(mark)
+
+
+# --- S20
+
+
+def test_S20_a_second_driver_on_the_port_is_refused_and_sends_not_one_byte(hand: HandRig, gate: Gate) -> None:
+    gripper = hand.active(healthy=gate)
+    gate.hold_up()
+    mark = written_now()
+    with pytest.raises(ConfigurationError, match="another driver owns this port"):
+        hand.attach()
+    assert not received(hand.log, since=mark)
+    gate.let_go()
+    moving = Outcome(lambda: gripper.move_to(0.02, SLOW_M_S))
+    hand.under_way()
+    with pytest.raises(ConfigurationError, match="another driver owns this port"):
+        hand.attach()
+    assert moving.wait().result.width_m == pytest.approx(0.02, abs=0.001)

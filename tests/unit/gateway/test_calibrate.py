@@ -1,0 +1,210 @@
+"""Zero and range out of readings, and into a robot file whose comments stay; the hand is simulated."""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
+from math import inf, pi
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from tests.support.simulated_robots import HAND, HEAD
+from trade.errors import ConfigurationError, WrongDevice
+from trade_drivers import Joint, WireError, parse
+from trade_gateway._usage import UsageError
+from trade_gateway.cli import app
+from trade_gateway.cli._output import Output
+from trade_gateway.cli.hardware._calibrate import Ends, Sweep, _measure, homed, measured, with_values
+from trade_hil_sim import DynamixelBus, writes
+
+
+def joint(**changes: Any) -> Joint:
+    values: dict[str, Any] = {"min_rad": -1.0, "max_rad": 1.0, "max_speed_rad_s": 1.0, "max_accel_rad_s2": 10.0}
+    return Joint(name="neck.pan", bus="neck", id=1, model="XL430-W250", **values | changes)
+
+
+def test_the_zero_becomes_the_offset_and_the_range_ends_inside_of_what_was_reached() -> None:
+    assert measured(joint(), 0.5, Ends(-1.0, 1.5, 0.0)) == {"offset_rad": -0.5, "min_rad": -1.48, "max_rad": 0.98}
+
+
+def test_a_joint_that_turns_against_its_device_keeps_its_sense() -> None:
+    assert measured(joint(reversed=True), 0.5, Ends(-1.0, 1.5, 0.0)) == {
+        "offset_rad": 0.5,
+        "min_rad": -0.98,
+        "max_rad": 1.48,
+    }
+
+
+def test_a_range_alone_is_measured_from_the_zero_that_the_file_has() -> None:
+    assert measured(joint(offset_rad=0.25), None, Ends(-1.0, 1.0, 0.0)) == {"min_rad": -0.73, "max_rad": 1.23}
+    assert measured(joint(), 0.0, None) == {"offset_rad": 0.0}
+
+
+def test_what_was_hardly_moved_has_no_range() -> None:
+    with pytest.raises(ConfigurationError, match="from one end to the other"):
+        measured(joint(), None, Ends(0.0, 0.05, 0.0))
+
+
+PLACE = "neck.pan (id 1 on /dev/ttyUSB0)"
+
+
+class Hand:
+    """A bench whose device is where a hand has moved it."""
+
+    def __init__(self, angles: Sequence[float]) -> None:
+        self._angles = iter(angles)
+
+    def angle_rad(self, device_id: int) -> float:
+        return next(self._angles)
+
+
+class Loose(Hand):
+    """Its plug is loose: some questions are not answered."""
+
+    def __init__(self, angles: Sequence[float], missed: float) -> None:
+        super().__init__(angles)
+        self._missed = missed
+
+    def angle_rad(self, device_id: int) -> float:
+        self._missed -= 1
+        if self._missed >= 0:
+            raise WireError(f"id {device_id} did not answer within 51 ms")
+        return super().angle_rad(device_id)
+
+
+def done_after(looks: int) -> Callable[[], bool]:
+    left = iter([False] * looks)
+    return lambda: next(left, True)
+
+
+def test_a_sweep_knows_both_ends_and_where_it_stopped() -> None:
+    ends = Sweep(Hand([0.0, 1.0, -2.0, 0.5]), 1, PLACE).until(done_after(3), 60.0)  # type: ignore[arg-type]
+    assert ends == Ends(-2.0, 1.0, 0.5)
+
+
+def test_answers_that_are_missed_for_a_moment_throw_nothing_away() -> None:
+    ends = Sweep(Loose([0.0, 1.0, -2.0], 10), 1, PLACE).until(done_after(2), 60.0)  # type: ignore[arg-type]
+    assert ends == Ends(-2.0, 1.0, -2.0)
+
+
+def test_who_answers_no_more_is_named_with_its_port_and_once() -> None:
+    with pytest.raises(ConfigurationError) as gone:
+        Sweep(Loose([], inf), 1, PLACE, patience_s=0.05).read()  # type: ignore[arg-type]
+    said = f"{PLACE}: did not answer within 51 ms, asked for 0.05 s; check its cable. Nothing was written"
+    assert str(gone.value) == said
+
+
+@pytest.mark.parametrize("beyond", [[3.0, -3.0], [3.0, pi + 0.1]])
+def test_a_joint_that_turns_past_the_end_of_its_encoder_is_refused(beyond: list[float]) -> None:
+    with pytest.raises(ConfigurationError, match="mount its horn"):
+        Sweep(Hand(beyond), 1, PLACE).until(done_after(1), 60.0)  # type: ignore[arg-type]
+
+
+def test_nobody_is_waited_for_without_an_end() -> None:
+    with pytest.raises(ConfigurationError, match="nobody went on"):
+        Sweep(Hand([0.0, 0.0, 0.0]), 1, PLACE).until(lambda: False, 0.0)  # type: ignore[arg-type]
+
+
+def test_the_zero_of_a_joint_that_moves_is_refused() -> None:
+    def zero(*angles: float) -> dict[str, float]:
+        hand: Any = Hand(angles)
+        return _measure(Output(as_json=False), joint(), Sweep(hand, 1, PLACE), zero_here=True, seconds=None)
+
+    with pytest.raises(ConfigurationError, match=r"it moves \(by 0\.030 rad in .* s\); hold it still"):
+        zero(0.5, 0.53)
+    assert zero(0.5, 0.502) == {"offset_rad": -0.502}  # a hand is never quite still
+
+
+COMMENTED = HEAD.replace("min_rad = -1.4", "min_rad = -1.4   # the left shoulder").replace(
+    '[joint."neck.tilt"]', '# nods\n[joint."neck.tilt"]'
+)
+
+
+def test_only_the_values_change_and_a_new_key_stands_above_the_range() -> None:
+    changed = with_values(COMMENTED, "neck.pan", {"offset_rad": 0.2, "min_rad": -0.5})
+    expected = COMMENTED.replace("min_rad = -1.4 ", "offset_rad = 0.2\nmin_rad = -0.5 ")
+    assert changed == expected
+    assert parse(changed, "head.toml").joints[0].offset_rad == 0.2
+
+
+class Rosie:
+    """A robot file whose line is simulated, and its command."""
+
+    def __init__(self, folder: Path, undo: ExitStack) -> None:
+        robot = parse(COMMENTED, "head.toml")
+        bus = robot.buses[0]
+        self.sim = undo.enter_context(
+            DynamixelBus.from_robot(bus, robot.joints_on(bus.name), folder / "neck", paced=False)  # type: ignore[arg-type]
+        )
+        self.file = folder / "head.toml"
+        self.text = COMMENTED.replace("/dev/ttyNOWHERE", str(self.sim.port))
+        self.file.write_text(self.text, encoding="utf-8")
+
+    def calibrate(self, *words: str, says: str = "") -> Result:
+        return CliRunner().invoke(app, ["calibrate", str(self.file), *words], input=says)
+
+
+@pytest.fixture
+def rosie(tmp_path: Path) -> Iterator[Rosie]:
+    with ExitStack() as undo:
+        yield Rosie(tmp_path, undo)
+
+
+def test_the_zero_is_where_it_stands_and_nothing_is_written_to_the_device(rosie: Rosie) -> None:
+    rosie.sim.devices[0].place(2148, 0.0)
+    said = rosie.calibrate("neck.pan", "--zero-here", "--yes")
+    assert said.exit_code == 0, said.output
+    assert "+offset_rad = -0.1534" in said.output
+    assert rosie.file.read_text(encoding="utf-8") == rosie.text.replace(
+        "min_rad = -1.4 ", "offset_rad = -0.1534\nmin_rad = -1.4 "
+    )
+    assert not writes(list(rosie.sim.log.entries))
+
+
+def test_who_says_no_keeps_the_file_as_it_was(rosie: Rosie) -> None:
+    rosie.sim.devices[0].place(2148, 0.0)
+    said = rosie.calibrate("neck.pan", "--zero-here", says="n\n")
+    assert said.exit_code == 1
+    assert rosie.file.read_text(encoding="utf-8") == rosie.text
+
+
+def test_a_joint_under_torque_is_not_calibrated(rosie: Rosie) -> None:
+    rosie.sim.devices[0].write(64, b"\x01", 0.0)
+    error = rosie.calibrate("neck.pan", "--zero-here", "--yes").exception
+    assert isinstance(error, ConfigurationError)
+    assert "torque is on" in str(error)
+
+
+def test_another_model_is_not_calibrated(rosie: Rosie) -> None:
+    rosie.file.write_text(rosie.text.replace("XL430-W250", "XM430-W350"), encoding="utf-8")
+    assert isinstance(rosie.calibrate("neck.pan", "--zero-here", "--yes").exception, WrongDevice)
+
+
+def test_a_joint_that_is_not_there_is_told_from_those_that_are(rosie: Rosie) -> None:
+    error = rosie.calibrate("neck.roll", "--zero-here").exception
+    assert isinstance(error, UsageError)
+    assert "there is neck.pan, neck.tilt" in str(error)
+
+
+def test_a_gripper_is_activated_and_not_calibrated(rosie: Rosie) -> None:
+    hand = HAND.partition("[bus.hand]")
+    rosie.file.write_text(f"{rosie.text}\n{hand[1]}{hand[2]}", encoding="utf-8")
+    error = rosie.calibrate("left.hand", "--zero-here").exception
+    assert isinstance(error, UsageError)
+    assert "a gripper is not calibrated; activate it: `trade call rosie.left.hand.activate`" in str(error)
+
+
+def test_a_homing_offset_that_the_file_does_not_know_is_written_with_the_new_zero(rosie: Rosie) -> None:
+    rosie.sim.devices[0].write(20, (100).to_bytes(4, "little"), 0.0)
+    said = rosie.calibrate("neck.pan", "--zero-here", "--yes")
+    assert said.exit_code == 0, said.output
+    made = parse(rosie.file.read_text(encoding="utf-8"), "head.toml").joints[0]
+    assert (made.homing_counts, made.offset_rad) == (100, -0.1534)
+    assert "# the left shoulder" in rosie.file.read_text(encoding="utf-8")
+
+
+def test_a_range_is_not_measured_from_a_zero_that_has_moved() -> None:
+    with pytest.raises(WrongDevice, match="the robot file says 0, but the device says 100"):
+        homed(joint(), 100, zero_measured=False)
+    assert homed(joint(homing_counts=100), 100, zero_measured=False) == {}

@@ -1,0 +1,294 @@
+"""What ``trade doctor`` finds, and the fix that comes with it."""
+
+import json
+import sys
+from collections.abc import Iterable
+from datetime import datetime, timedelta, timezone
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from tests.support.simulated_robots import HAND, HEAD, TAIL
+from trade._transport.endpoints import free_endpoint
+from trade_drivers import CanBus, Found, parse
+from trade_drivers.bus.can import ErrorState, Link
+from trade_gateway.cli import app
+from trade_gateway.cli.hardware import _doctor_host as host
+from trade_gateway.cli.hardware import _doctor_robot as robots
+from trade_gateway.cli.hardware._doctor import _of_robot
+from trade_gateway.cli.hardware._doctor_host import Finding
+from trade_gateway.cli.hardware._robot_file_template import first_file
+from trade_gateway.pki._authority import Authority
+from trade_hil_sim import DynamixelBus, Mute, writes
+
+
+def only(found: Iterable[Finding]) -> Finding:
+    [one] = found
+    assert one.level == "ok" or one.fix
+    return one
+
+
+def test_a_port_that_may_not_be_opened_names_the_group_to_join(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    port = tmp_path / "ttyUSB0"
+    port.touch()
+    assert only(host.ports([str(port)])).level == "ok"
+    monkeypatch.setattr("os.access", lambda *_: False)
+    found = only(host.ports([str(port)]))
+    assert (found.level, found.about) == ("error", str(port))
+    assert "usermod -aG" in found.fix
+
+
+def test_ports_that_the_system_does_not_list_are_not_said_to_be_missing() -> None:
+    assert only(host.ports([])).text == "no adapter is plugged in"
+    assert only(host.ports([], ["/x/neck", "/x/hand"])).text.endswith("the robot file names 2, looked at below")
+
+
+def test_a_joint_that_nobody_has_measured_is_told_with_what_measures_it() -> None:
+    text = first_file(
+        [("/dev/ttyUSB0", Found(driver="dynamixel", baud=57600, id=1, model="XL430-W250"))], Path("new.toml")
+    )
+    found = only(robots.unmeasured(parse(text, "new.toml"), Path("new.toml")))
+    assert (found.level, found.about, found.fix) == ("warning", "joint1_1", "trade calibrate new.toml joint1_1")
+    assert not list(robots.unmeasured(parse(HEAD, "head.toml"), Path("head.toml")))
+
+
+@pytest.mark.parametrize(("ms", "level"), [(16, "warning"), (1, "ok")])
+def test_an_adapter_that_waits_long_is_told_of(tmp_path: Path, ms: int, level: str) -> None:
+    timer = tmp_path / "ttyUSB0" / "latency_timer"
+    timer.parent.mkdir()
+    timer.write_text(f"{ms}\n", encoding="ascii")
+    found = only(host.latencies(tmp_path))
+    assert (found.level, found.about) == (level, "ttyUSB0")
+    assert str(timer) in found.fix or level == "ok"
+
+
+@pytest.mark.parametrize(("needed", "level"), [(True, "error"), (False, "warning")])
+def test_a_library_that_is_missing_is_named_with_what_installs_it(
+    monkeypatch: pytest.MonkeyPatch, needed: bool, level: str
+) -> None:
+    assert only(host.libraries(["dynamixel"], needed=needed)).level == "ok"
+    monkeypatch.setattr(
+        "trade_drivers.plugins._driver.find_spec", lambda name: None if name == "dynamixel_sdk" else object()
+    )
+    found = only(host.libraries(["dynamixel"], needed=needed))
+    assert (found.level, found.text) == (level, "needs dynamixel_sdk")
+    assert found.fix == 'pip install "trade-drivers[dynamixel]"'
+
+
+@pytest.mark.parametrize(
+    ("said", "level", "text"), [("yes", "ok", "is sync"), ("no", "warning", "is not"), ("", "warning", "nobody")]
+)
+def test_the_clock_is_synchronised_or_not_or_nobody_knows(said: str, level: str, text: str) -> None:
+    found = only(host.clock([sys.executable, "-c", f"print({said!r})"]))
+    assert (found.level, found.text.startswith(text)) == (level, True)
+
+
+def test_a_host_without_the_tool_does_not_know() -> None:
+    assert only(host.clock(["/no/such/tool"])).text.startswith("nobody")
+
+
+@pytest.mark.parametrize(("symbol", "level"), [(b"sem_clockwait", "ok"), (b"sem_timedwait", "warning")])
+def test_a_python_whose_waits_go_by_the_clock_on_the_wall_is_told_of(tmp_path: Path, symbol: bytes, level: str) -> None:
+    python, other, maps = tmp_path / "libpython3.11.so.1.0", tmp_path / "libc.so.6", tmp_path / "maps"
+    python.write_bytes(b"\0sem_post\0" + symbol + b"\0")
+    other.write_bytes(b"\0sem_clockwait\0")
+    there = [f"7f00-7f{at}0 r-xp 0000 08:01 123    {path}" for at, path in enumerate((python, other, "[heap]"))]
+    maps.write_text("\n".join([*there, "7f00-7f01 rw-p 0000 00:00 0"]))
+    assert only(host.waits(maps)).level == level
+
+
+@pytest.mark.parametrize(
+    ("later", "level", "text"),
+    [
+        (timedelta(hours=1), "ok", "is valid until"),
+        (timedelta(days=6), "warning", "expires on"),
+        (timedelta(days=8), "error", "has expired"),
+        (timedelta(days=-2), "error", "is valid only from"),
+    ],
+)
+def test_a_certificate_is_told_of_before_it_ends(tmp_path: Path, later: timedelta, level: str, text: str) -> None:
+    issued = Authority.create(tmp_path / "pki").issue("arm")
+    found = only(host.certificate(issued.folder, datetime.now(timezone.utc) + later))
+    assert (found.level, found.text.startswith(text)) == (level, True), found
+
+
+def test_a_certificate_that_is_not_there_is_an_error(tmp_path: Path) -> None:
+    assert only(host.certificate(tmp_path)).level == "error"
+
+
+def test_devices_without_a_watchdog_are_named_and_those_with_one_are_not() -> None:
+    found = only(robots.unwatched(parse(HAND, "hand.toml")))
+    assert (found.level, "hand" in found.about) == ("warning", True)
+    assert not list(robots.unwatched(parse(HEAD, "head.toml")))
+
+
+LEGS = CanBus(name="legs", driver="cia402", interface="socketcan", channel="can0", bitrate=500_000)
+
+
+@pytest.mark.parametrize(
+    ("link", "level", "fix"),
+    [
+        (Link(False, None), "error", "ip link set can0 up type can bitrate 500000"),
+        (Link(True, ErrorState.ACTIVE, 1_000_000), "error", "ip link set can0 down"),
+        (Link(True, ErrorState.PASSIVE, 500_000), "error", "120 ohm"),
+        (Link(True, ErrorState.ACTIVE, 500_000), "ok", ""),
+        (Link(True, None), "ok", ""),
+    ],
+)
+def test_a_can_interface_is_up_at_the_rate_of_the_file_and_well(link: Link, level: str, fix: str) -> None:
+    found = robots.judged(LEGS, link)
+    assert (found.level, fix in found.fix) == (level, True)
+
+
+@pytest.fixture
+def robot_file(tmp_path: Path) -> Path:
+    path = tmp_path / "head.toml"
+    path.write_text(HEAD.replace("/dev/ttyNOWHERE", str(tmp_path / "neck")), encoding="utf-8")
+    return path
+
+
+def simulated(robot_file: Path) -> DynamixelBus:
+    robot = parse(robot_file.read_text(encoding="utf-8"), "head.toml")
+    [bus] = robot.buses
+    return DynamixelBus.from_robot(bus, robot.joints, robot_file.with_name("neck"), paced=False)  # type: ignore[arg-type]
+
+
+def of_devices(robot_file: Path) -> list[Finding]:
+    return list(robots.devices(parse(robot_file.read_text(encoding="utf-8"), "head.toml")))
+
+
+def test_a_port_that_is_not_there_is_told_of(robot_file: Path) -> None:
+    found = only(of_devices(robot_file))
+    assert (found.level, found.about) == ("error", "bus neck")
+
+
+def test_devices_that_answer_are_named(robot_file: Path) -> None:
+    with simulated(robot_file):
+        assert [found.level for found in of_devices(robot_file)] == ["ok", "ok"]
+
+
+def test_who_does_not_answer_is_an_error(robot_file: Path) -> None:
+    with simulated(robot_file) as sim:
+        sim.devices[0].absent = True
+        pan, tilt = of_devices(robot_file)
+    assert (pan.level, pan.text, tilt.level) == ("error", "does not answer at 1000000 baud", "ok")
+
+
+def test_who_answers_now_and_then_has_a_bad_line(robot_file: Path) -> None:
+    with simulated(robot_file) as sim:
+        sim.do(Mute(ids=(1,), instruction="ping", skip=3, count=2))
+        pan, _ = of_devices(robot_file)
+    assert (pan.level, pan.text) == ("error", "answered 8 of 10 questions as it should")
+    assert "termination" in pan.fix
+
+
+def test_another_device_than_the_file_says_is_an_error(robot_file: Path) -> None:
+    with simulated(robot_file):
+        text = robot_file.read_text(encoding="utf-8").replace("id = 1\n", 'id = 1\nfirmware = "44"\n')
+        robot_file.write_text(text, encoding="utf-8")
+        pan, tilt = of_devices(robot_file)
+    assert (pan.level, tilt.level) == ("error", "ok")
+    assert pan.text == "its firmware is 45, and the robot file says 44"
+
+
+def test_a_line_in_use_is_left_alone(robot_file: Path) -> None:
+    with simulated(robot_file) as sim:
+        from trade_drivers.vendors.dynamixel import DynamixelDriver
+
+        bench = DynamixelDriver.commissioner().open(str(sim.port), 1_000_000)
+        try:
+            found = only(of_devices(robot_file))
+        finally:
+            bench.close()
+    assert (found.level, "another driver owns this port" in found.text) == ("warning", True)
+
+
+def test_a_range_that_is_more_than_the_device_is_set_to_is_told_as_trade_up_tells_it(robot_file: Path) -> None:
+    with simulated(robot_file) as sim:
+        sim.devices[0].table.set("max_position_limit", 2500)
+        pan, tilt = of_devices(robot_file)
+        assert not writes(list(sim.log.entries))
+    assert (pan.level, tilt.level) == ("error", "ok")
+    assert (
+        'joint."neck.pan": min_rad -1.4 to max_rad 1.4 is more than the device\'s own range (registers 52' in pan.text
+    )
+
+
+def test_a_port_that_is_no_line_is_an_error_that_names_file_and_key(robot_file: Path, tmp_path: Path) -> None:
+    (tmp_path / "neck").write_text("a file\n")
+    found = only(of_devices(robot_file))
+    assert (found.level, "head.toml: bus.neck.port" in found.text) == ("error", True)
+    assert "is no serial port" in found.text and "end what uses it" not in found.fix
+
+
+WRONG = TAIL.replace("feetech", "feetek") + HAND.replace("0.085", "85").split('"rosie"')[1] + HEAD.split('"rosie"')[1]
+
+
+def test_what_drivers_refuse_of_a_file_is_told_of_all_its_parts_and_ends_nothing(system: str, tmp_path: Path) -> None:
+    path = tmp_path / "wrong.toml"
+    path.write_text(WRONG)
+    said = CliRunner().invoke(app, ["doctor", str(path), "--json"])
+    assert said.exit_code == 1
+    errors = {one["about"]: one["text"] for one in json.loads(said.stdout) if one["level"] == "error"}
+    assert errors.keys() == {"bus tail", "bus hand", "bus neck"}
+    assert f"{path}: bus.tail.driver: there is no driver 'feetek'" in errors["bus tail"]
+    assert f'{path}: gripper."left.hand".max_width_m: 85 is outside' in errors["bus hand"]
+
+
+def test_the_exit_code_tells_of_errors(system: str, robot_file: Path) -> None:
+    said = CliRunner().invoke(app, ["doctor", str(robot_file), "--json"])
+    assert said.exit_code == 1
+    found = json.loads(said.stdout)
+    assert [one["about"] for one in found if one["level"] == "error"] == ["bus neck"]
+    with simulated(robot_file):
+        well = CliRunner().invoke(app, ["doctor", str(robot_file)])
+    assert well.exit_code == 0, well.output
+    assert "0 errors" in well.output
+
+
+def test_where_it_is_to_connect_and_nobody_answers_is_an_error(system: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    nowhere = free_endpoint()
+    monkeypatch.setenv("TRADE_CONNECT", nowhere)
+    said = CliRunner().invoke(app, ["doctor", "--json"])
+    assert said.exit_code == 1
+    [error] = [one for one in json.loads(said.stdout) if one["about"] == nowhere]
+    assert error["level"] == "error"
+    assert "nothing accepts connections there" in error["text"]
+    assert "no container is in sight" not in said.stdout
+
+
+def test_who_has_bad_papers_is_not_told_to_do_without(
+    system: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, where, fix in (
+        ("TRADE_TLS", str(tmp_path), "the message says what helps"),
+        ("TRADE_CONNECT", "nonsense", "correct that variable, or leave it out"),
+    ):
+        with monkeypatch.context() as changed:
+            changed.setenv(name, where)
+            found = json.loads(CliRunner().invoke(app, ["doctor", "--json"]).stdout)
+        [error] = [one for one in found if one["about"] == "settings"]
+        assert error["fix"] == fix, error
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [('system = "lab"', "trade gateway {} --check"), ('[system]\nname = "home"', "trade system up {} --check")],
+)
+def test_a_file_of_another_kind_is_told_by_its_name(system: str, tmp_path: Path, text: str, said: str) -> None:
+    path = tmp_path / "some.toml"
+    path.write_text(text)
+    found = json.loads(CliRunner().invoke(app, ["doctor", str(path), "--json"]).stdout)
+    [error] = [one for one in found if one["about"] == str(path)]
+    assert error["fix"] == said.format(path)
+    assert "robot file" in error["text"] and "unknown table" not in error["text"]
+
+
+@pytest.mark.parametrize("text", ["[robot", "[robot]\nname = 3\n"], ids=["no TOML", "a wrong key"])
+def test_a_file_that_is_wrong_is_named_once(tmp_path: Path, text: str) -> None:
+    wrong = tmp_path / "wrong.toml"
+    wrong.write_text(text, encoding="utf-8")
+    [finding] = _of_robot(wrong)
+    assert finding.about == str(wrong)
+    assert str(wrong) not in finding.text

@@ -1,0 +1,93 @@
+"""What is told at once."""
+
+import threading
+
+import pytest
+
+from tests.support.waiting import wait_until
+from trade_gateway.ros.ros2._at_once import AtOnce
+
+
+class Hanging:
+    """Is told any number of things at a time; those that are to hang do so until the test lets them."""
+
+    def __init__(self, *hang: str) -> None:
+        self.told: list[str] = []
+        self.go_on = threading.Event()
+        self._hang = hang
+
+    def __call__(self, item: str) -> None:
+        self.told.append(item)
+        if item in self._hang:
+            assert self.go_on.wait(60)
+
+
+def test_S07_one_that_hangs_delays_no_other() -> None:
+    hanging = Hanging("first", "second")
+    at_once = AtOnce[str]("test", hanging, most=3, drop=lambda _: None)
+    for item in ("first", "second", "third", "fourth"):
+        at_once.put(item)
+        wait_until(lambda item=item: item in hanging.told, f"the {item} is told")
+    hanging.go_on.set()
+    at_once.close()
+
+
+def test_there_are_only_so_many_threads_and_who_waits_is_told_after_all() -> None:
+    hanging, dropped = Hanging("first", "second"), []
+    at_once = AtOnce[str]("test", hanging, most=2, drop=dropped.append)
+    for item in ("first", "second", "third", "fourth"):
+        at_once.put(item)
+    wait_until(lambda: len(hanging.told) == 2, "as many are told as there are threads")
+    assert (len(at_once._threads), list(at_once._waiting)) == (2, ["third", "fourth"])
+    hanging.go_on.set()
+    wait_until(lambda: len(hanging.told) == 4, "the others are told")
+    wait_until(lambda: not at_once._threads, "the threads have ended")
+    at_once.close()
+    assert not dropped
+
+
+def test_what_waits_at_the_end_and_what_comes_after_it_is_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("trade_gateway.ros.ros2._at_once._END_S", 0.0)
+    hanging, dropped = Hanging("first"), []
+    at_once = AtOnce[str]("test", hanging, most=1, drop=dropped.append)
+    at_once.put("first")
+    at_once.put("waits")
+    at_once.close()
+    at_once.close()
+    at_once.put("too late")
+    hanging.go_on.set()
+    wait_until(lambda: not at_once._threads, "the thread has ended")
+    assert (hanging.told, dropped) == (["first"], ["waits", "too late"])
+
+
+def test_who_is_told_may_end_it() -> None:
+    told: list[str] = []
+    at_once = AtOnce[str]("test", lambda item: (at_once.close(), told.append(item)), most=1, drop=lambda _: None)
+    at_once.put("end")
+    wait_until(lambda: told, "it is told")
+
+
+def test_a_failure_is_logged_and_the_next_is_told(caplog: pytest.LogCaptureFixture) -> None:
+    def fail(item: str) -> None:
+        raise ValueError(item)
+
+    at_once = AtOnce[str]("its name", fail, most=1, drop=lambda _: None)
+    at_once.put("bad")
+    at_once.put("also bad")
+    at_once.close()
+    wait_until(lambda: not at_once._threads, "the thread has ended")
+    assert "its name failed" in caplog.text
+
+
+def test_without_a_thread_it_is_dropped(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    def refuse(_thread: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    told, dropped = [], []
+    at_once = AtOnce[str]("test", told.append, most=1, drop=dropped.append)
+    with monkeypatch.context() as patched:
+        patched.setattr(threading.Thread, "start", refuse)
+        at_once.put("in vain")
+    at_once.put("told")
+    wait_until(lambda: told, "the next is told")
+    assert (told, dropped) == (["told"], ["in vain"])

@@ -1,0 +1,84 @@
+"""What waits to be told."""
+
+import threading
+import time
+
+import pytest
+
+from tests.support.waiting import wait_until
+from trade_gateway.ros.ros2._mailbox import Mailbox
+
+
+class Slow:
+    """Is told one thing at a time, when the test lets it."""
+
+    def __init__(self) -> None:
+        self.told: list[str] = []
+        self.busy = threading.Event()
+        self.go_on = threading.Event()
+
+    def __call__(self, item: str) -> None:
+        self.told.append(item)
+        self.busy.set()
+        assert self.go_on.wait(60)
+
+
+def test_the_oldest_goes_when_there_are_too_many() -> None:
+    slow, dropped = Slow(), []
+    mailbox = Mailbox[str]("test", slow, most=2, drop=dropped.append)
+    mailbox.put("first")
+    assert slow.busy.wait(60)
+    for item in ("old", "newer", "newest"):
+        mailbox.put(item)
+    slow.go_on.set()
+    wait_until(lambda: len(slow.told) == 3, "all is told")
+    mailbox.close()
+    assert (slow.told, dropped) == (["first", "newer", "newest"], ["old"])
+
+
+def test_S01_what_waited_too_long_is_not_told() -> None:
+    slow, dropped = Slow(), []
+    mailbox = Mailbox[str]("test", slow, longest_s=0.05, drop=dropped.append)
+    mailbox.put("first")
+    assert slow.busy.wait(60)
+    mailbox.put("late")
+    put_at = time.monotonic()
+    wait_until(lambda: time.monotonic() > put_at + 0.1, "it is late")
+    slow.go_on.set()
+    wait_until(lambda: dropped, "it is dropped")
+    mailbox.close()
+    assert (slow.told, dropped) == (["first"], ["late"])
+
+
+def test_what_comes_after_the_end_is_dropped() -> None:
+    told, dropped = [], []
+    mailbox = Mailbox[str]("test", told.append, drop=dropped.append)
+    mailbox.close()
+    mailbox.close()
+    mailbox.put("too late")
+    assert (told, dropped) == ([], ["too late"])
+
+
+def test_who_is_told_may_end_it() -> None:
+    told = []
+    mailbox = Mailbox[str]("test", lambda item: (told.append(item), mailbox.close()))
+    mailbox.put("end")
+    wait_until(lambda: told, "it is told")
+    mailbox.close()
+    assert told == ["end"]
+
+
+def test_a_failure_is_logged_and_the_next_is_told(caplog: pytest.LogCaptureFixture) -> None:
+    told = []
+
+    def tell(item: str) -> None:
+        if item == "bad":
+            raise ValueError(item)
+        told.append(item)
+
+    mailbox = Mailbox[str]("its name", tell)
+    mailbox.put("bad")
+    mailbox.put("good")
+    wait_until(lambda: told, "the next is told")
+    mailbox.close()
+    assert "its name failed" in caplog.text

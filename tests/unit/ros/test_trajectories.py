@@ -1,0 +1,217 @@
+"""Goals of FollowJointTrajectory move joints of ours, under a lock, and end as their clients are told."""
+
+import time
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import pytest
+
+from tests.support.waiting import wait_until
+from tests.unit.ros.arms import FakeJoints
+from tests.unit.ros.memory_graph import MemoryGraph, MemoryRos
+from tests.unit.ros.robots import PATIENCE_S, Stand
+from trade import where
+from trade.errors import DeviceFault, ToleranceExceeded
+from trade_gateway.ros._conversion import ros_stamp
+from trade_gateway.ros._graph import Ended, Outcome
+
+ACTION = "control_msgs/action/FollowJointTrajectory"
+ARM = '[[to_ros.trajectory]]\ngroup = "rosie.arm"\naction = "/arm/follow"\n'
+
+
+class Limb(FakeJoints):
+    def __init__(self, stand: Stand) -> None:
+        super().__init__("rosie.arm.a", "rosie.arm.b")
+        stand.robot.container.register(self, "rosie.arm")
+        stand.memory.settle()
+
+
+@pytest.fixture
+def arm(stand: Stand) -> Any:
+    made = Limb(stand)
+    yield made
+    made.stopped.set()
+
+
+def goal(
+    *points: tuple[float, Sequence[float]], names: Sequence[str] = ("a", "b"), stamp_s: float = 0.0, **more: Any
+) -> dict[str, Any]:
+    told = [{"time_from_start": ros_stamp(at), "positions": list(angles)} for at, angles in points]
+    return {
+        "trajectory": {"header": {"stamp": ros_stamp(stamp_s)}, "joint_names": list(names), "points": told},
+        **more,
+    }
+
+
+TO_THERE = goal((0.0, [0.0, 0.0]), (2.0, [0.5, -0.5]))
+
+
+def ended(node: MemoryGraph, asked: dict[str, Any]) -> Outcome:
+    return node.pursue("/arm/follow", ACTION, asked).wait(PATIENCE_S)
+
+
+def test_a_goal_is_followed_to_its_end(stand: Stand, arm: Limb) -> None:
+    stand.up(ARM)
+    outcome = ended(stand.node(), TO_THERE)
+    assert (outcome.how, outcome.result["error_code"]) == (Ended.SUCCEEDED, 0)
+    [plan] = arm.plans
+    assert [track.limits.name for track in plan.tracks] == ["rosie.arm.a", "rosie.arm.b"]
+    assert [track.curve.duration_s for track in plan.tracks] == [2.0, 2.0]
+    assert arm.at == pytest.approx([0.5, -0.5])
+    assert stand.container.locks() == []
+
+
+def test_the_first_point_is_where_the_joints_are_if_the_goal_begins_later(stand: Stand, arm: Limb) -> None:
+    arm.at = [0.25, 0.0]
+    stand.up(ARM)
+    assert ended(stand.node(), goal((1.0, [0.5, 0.5]))).how is Ended.SUCCEEDED
+    assert [track.curve.at(0.0)[0] for track in arm.plans[0].tracks] == [0.25, 0.0]
+
+
+def test_joints_may_be_in_any_order_and_have_names_of_their_own(stand: Stand, arm: Limb) -> None:
+    stand.up(ARM + 'joints = { shoulder = "rosie.arm.a" }\n')
+    asked = goal((0.0, [0.0, 0.0]), (2.0, [-0.5, 0.5]), names=("b", "shoulder"))
+    assert ended(stand.node(), asked).how is Ended.SUCCEEDED
+    assert arm.at == pytest.approx([0.5, -0.5])
+
+
+@pytest.mark.parametrize(
+    ("asked", "code", "says"),
+    [
+        (goal((0, [0.0]), (1, [0.1]), names=("a",)), -2, "all of a, b belong in it"),
+        (goal((0, [0, 0]), (1, [0.1, 0]), names=("a", "c")), -2, "it is for a, c"),
+        (goal(), -1, "it has no points"),
+        (goal((0, [0, 0]), (1, [0.1])), -1, "a point has 1 positions for 2 joints"),
+        (goal((0, [0, 0]), (1, [9.0, 0])), -1, "LimitExceeded"),
+        (goal((0, [0, 0]), (1, [float("nan"), 0])), -1, "InvalidArgument"),
+        (goal((0, [0, 0]), (1, [0.1, 0]), stamp_s=1000.0), -3, "it was to begin"),
+        (goal((0, [0, 0]), (1, [0.1, 0]), stamp_s=4_000_000_000.0 // 2), -1, "nothing is kept until later"),
+    ],
+)
+def test_a_goal_that_is_wrong_is_refused_as_published_and_nothing_moves(
+    stand: Stand, arm: Limb, asked: dict[str, Any], code: int, says: str
+) -> None:
+    stand.up(ARM)
+    outcome = ended(stand.node(), asked)
+    assert (outcome.how, outcome.result["error_code"]) == (Ended.ABORTED, code)
+    assert says in outcome.result["error_string"]
+    assert arm.plans == []
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [
+        (ToleranceExceeded(device="a", bus="can0", what="path", error_rad=1, tolerance_rad=0.1), -4),
+        (ToleranceExceeded(device="a", bus="can0", what="goal", error_rad=1, tolerance_rad=0.1), -5),
+        (DeviceFault(device="a", bus="can0", fault="hot"), -1),
+    ],
+)
+def test_what_fails_on_the_way_is_told_as_published(stand: Stand, arm: Limb, error: Exception, code: int) -> None:
+    arm.error = error
+    stand.up(ARM)
+    outcome = ended(stand.node(), TO_THERE)
+    assert (outcome.how, outcome.result["error_code"]) == (Ended.ABORTED, code)
+    assert type(error).__name__ in outcome.result["error_string"]
+
+
+def test_the_tightest_tolerance_holds_for_all(stand: Stand, arm: Limb) -> None:
+    stand.up(ARM)
+    tolerance = [{"name": "a", "position": 0.1}, {"name": "b", "position": 0.05, "velocity": 1.0}]
+    off = [{"name": "a", "position": -1.0}]
+    asked = {**TO_THERE, "path_tolerance": tolerance, "goal_tolerance": off, "goal_time_tolerance": ros_stamp(2.5)}
+    assert ended(stand.node(), asked).how is Ended.SUCCEEDED
+    told = arm.plans[0].tolerances
+    assert (told.path_rad, told.goal_rad, told.goal_time_s) == (0.05, 0.03, 2.5)
+
+
+def test_canceling_a_goal_stops_and_gives_the_lock_back(stand: Stand, arm: Limb) -> None:
+    arm.hold = True
+    stand.up(ARM)
+    pursuit = stand.node().pursue("/arm/follow", ACTION, TO_THERE)
+    assert arm.goes.wait(PATIENCE_S)
+    [lock] = stand.container.locks()
+    assert lock.holder.purpose == "a trajectory of /teleop"
+    pursuit.cancel()
+    assert pursuit.wait(PATIENCE_S).how is Ended.CANCELED
+    assert arm.stopped.is_set()
+    assert stand.container.locks() == []
+
+
+def test_a_goal_that_takes_the_place_of_another_one_is_not_stopped_with_it(stand: Stand, arm: Limb) -> None:
+    arm.hold = True
+    stand.up(ARM)
+    node = stand.node()
+    first = node.pursue("/arm/follow", ACTION, TO_THERE)
+    assert arm.goes.wait(PATIENCE_S)
+    arm.hold = False
+    second = node.pursue("/arm/follow", ACTION, goal((1.0, [0.3, 0.3])))
+    assert first.wait(PATIENCE_S).how is Ended.CANCELED
+    assert second.wait(PATIENCE_S).how is Ended.SUCCEEDED
+    assert arm.at == pytest.approx([0.3, 0.3])
+
+
+def test_S03_a_goal_ends_with_its_node(stand: Stand, arm: Limb) -> None:
+    arm.hold = True
+    stand.up(ARM)
+    stand.node("/planner").pursue("/arm/follow", ACTION, TO_THERE)
+    assert arm.goes.wait(PATIENCE_S)
+    stand.ros.kill("/planner")
+    assert arm.stopped.wait(PATIENCE_S)
+    wait_until(lambda: stand.container.locks() == [])
+
+
+def test_what_others_have_locked_no_goal_moves(stand: Stand, arm: Limb) -> None:
+    stand.up(ARM)
+    person = stand.memory.container("person")
+    stand.memory.settle()
+    with person.lock(where(group="rosie.arm"), purpose="to repair it"):
+        outcome = ended(stand.node(), TO_THERE)
+    assert outcome.how is Ended.ABORTED
+    assert "LockedByOther" in outcome.result["error_string"]
+    assert "to repair it" in outcome.result["error_string"]
+    assert arm.plans == []
+
+
+def test_S09_an_e_stop_ends_a_goal(stand: Stand, arm: Limb) -> None:
+    arm.hold = True
+    stand.up(ARM)
+    pursuit = stand.node().pursue("/arm/follow", ACTION, TO_THERE)
+    assert arm.goes.wait(PATIENCE_S)
+    report = stand.robot.container.estop("smoke")
+    assert pursuit.wait(PATIENCE_S).how is not Ended.CANCELED
+    assert arm.stopped.is_set()
+    assert "Stopped" in ended(stand.node("/again"), TO_THERE).result["error_string"]
+    stand.robot.container.estop_clear([report.id])
+
+
+def test_what_is_said_of_the_way_is_feedback(stand: Stand, arm: Limb) -> None:
+    heard: list[Any] = []
+
+    def told(plan: Any) -> list[float]:
+        plan.course.note("rosie.arm.a", 0.125)
+        plan.course.ready(time.monotonic_ns())
+        wait_until(lambda: plan.course.report(time.monotonic_ns()) or heard)
+        return arm.at
+
+    arm.stream = told  # type: ignore[method-assign]
+    stand.up(ARM)
+    pursuit = stand.node().pursue("/arm/follow", ACTION, TO_THERE, heard.append)
+    assert pursuit.wait(PATIENCE_S).how is Ended.SUCCEEDED
+    assert heard[0]["joint_names"] == ["a", "b"]
+    assert heard[0]["error"]["positions"] == [-0.125, 0.0]
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_the_action_has_the_fields_published_for_each_ros(version: Literal[1, 2]) -> None:
+    types = MemoryRos(version).types
+    asked, result, feedback = types.parts(ACTION)
+    assert {field.name for field in types.fields(result)} == {"error_code", "error_string"}
+    assert {"header", "joint_names", "desired", "actual", "error"} <= {one.name for one in types.fields(feedback)}
+    assert types.from_bytes(asked, types.to_bytes(asked, TO_THERE))["trajectory"]["joint_names"] == ["a", "b"]
+    if version == 1:  # as `rosmsg md5` tells of Noetic's
+        sums = [types.definition(part)[1] for part in (asked, result, feedback)]
+        assert sums == [
+            "69636787b6ecbde4d61d711979bc7ecb",
+            "493383b18409bfb604b4e26c676401d2",
+            "10817c60c2486ef6b33e97dcd87f4474",
+        ]

@@ -1,0 +1,381 @@
+"""The lock table by itself, on a clock of the test's."""
+
+import concurrent.futures
+import math
+import threading
+from collections.abc import Iterator
+
+import pytest
+
+from tests.support.waiting import wait_until
+from tests.unit.trade.lock_table_rig import EPOCH, Table
+from trade._protocol.messages import Token
+from trade._resources.grants import Granted, LockRequest
+from trade._resources.lock_table import LockTable
+from trade._resources.resource import Holder, Permit, Resource
+from trade.errors import LockedByOther, LockLost, MotionStopped, NotStopped, ServiceGone, Stopped
+
+
+@pytest.fixture
+def table() -> Iterator[Table]:
+    made = Table()
+    yield made
+    made.close()
+
+
+# --- turns
+
+
+def test_who_waits_is_served_in_order_of_arrival(table: Table) -> None:
+    token = table.take("ab")
+    waiting = [table.ask(names, f"s{index}") for index, names in enumerate(["a", "ab", "b", "a"])]
+    table.table.release(token.number, "tester")
+    first = waiting[0].result(60).token
+    assert [asking.done() for asking in waiting[1:]] == [False] * 3  # b is free, but the second one stands before it
+    assert first is not None
+    table.table.release(first.number, "tester")
+    second = waiting[1].result(60).token
+    assert second is not None
+    table.table.release(second.number, "tester")
+    concurrent.futures.wait(waiting, 60)
+    assert all(asking.done() for asking in waiting)
+
+
+def test_a_higher_priority_comes_first_and_takes_nothing_away(table: Table) -> None:
+    token = table.take("a")
+    low, high = table.ask("a", "low"), table.ask("a", "high", priority=1)
+    assert table.resources["a"].live == token.number
+    table.table.release(token.number, "tester")
+    assert high.result(60).token is not None
+    assert not low.done()
+
+
+def test_what_is_coupled_is_locked_together(table: Table) -> None:
+    assert table.acquire("c").resources == ("c", "d")
+    with pytest.raises(LockedByOther):
+        table.acquire("d", "other")
+
+
+def test_nothing_is_held_or_pending_after_a_refusal(table: Table) -> None:
+    table.take("b")
+    with pytest.raises(LockedByOther):
+        table.acquire("ab", "other")
+    table.call("a").gate()
+
+
+def test_re_entry_asks_only_for_what_is_not_held_under_the_calls_own_tokens(table: Table) -> None:
+    token = table.take("a")
+    assert table.acquire("a", tokens=(token,)) == Granted(None, ())
+    assert table.acquire("ab", tokens=(token,)).resources == ("b",)
+
+
+def test_turn_and_emptying_together_last_no_longer_than_was_asked(table: Table) -> None:
+    token = table.take("a")
+    table.call("a", [token])
+    asking = table.ask("a", "other", wait_s=10.0)
+    table.now = 6.0
+    table.table.release(token.number, "tester")
+    wait_until(lambda: table.resources["a"].pending is not None)
+    assert not asking.done()
+    table.advance(5.0)
+    with pytest.raises(LockedByOther, match="a call or a motion that has not ended"):
+        asking.result(60)
+
+
+def test_since_is_the_time_of_the_grant_not_of_the_question(table: Table, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("time.time", lambda: 1000.0)
+    token = table.take("a")
+    asking = table.ask("a", "other")
+    monkeypatch.setattr("time.time", lambda: 2000.0)
+    table.table.release(token.number, "tester")
+    asking.result(60)
+    assert [info.holder.since for info in table.table.infos()] == [2000.0]
+
+
+# --- leases
+
+
+@pytest.mark.parametrize("use", ["renew", "call", "gate"])
+def test_S12_what_outlived_its_lease_is_over_even_before_anybody_looked(table: Table, use: str) -> None:
+    """A provider that was frozen wakes: whoever is first must not find a lock that holds."""
+    token = table.take("a", lease_s=2.0)
+    permitted = table.call("a", [token])
+    table.now = 2.0
+    if use == "renew":
+        assert table.table.renew([token.number], "tester") == []
+    else:
+        with pytest.raises(LockLost):
+            permitted.gate() if use == "gate" else table.call("a", [token], call_id=1)
+
+
+def test_S12_a_renewed_lease_begins_anew_and_a_lost_one_never_does(table: Table) -> None:
+    token = table.take("a", lease_s=2.0)
+    table.advance(1.5)
+    assert table.table.renew([token.number], "tester") == [token.number]
+    table.advance(1.5)
+    assert table.table.renew([token.number], "tester") == [token.number]
+    table.advance(2.0)
+    assert table.table.renew([token.number], "tester") == []
+    assert table.table.infos() == []
+
+
+def test_a_lease_ends_on_its_own_thread_too() -> None:
+    real = LockTable(EPOCH, "home")
+    real.adopt("a")
+    real.acquire(["a"], Holder("tester", "one", "one", "", 0.0), LockRequest(lease_s=0.1))
+    wait_until(lambda: real.infos() == [])
+    real.close()
+
+
+def test_a_short_lease_ends_in_its_time_although_the_thread_sleeps_until_a_longer_one_ends() -> None:
+    real = LockTable(EPOCH, "home")
+    for name in "ab":
+        real.adopt(name)
+    holder = Holder("tester", "one", "one", "", 0.0)
+    real.acquire(["a"], holder, LockRequest(lease_s=3600))
+    wait_until(lambda: real._leases._next_look < math.inf)
+    real.acquire(["b"], holder, LockRequest(lease_s=0.1))
+    wait_until(lambda: [info.resources for info in real.infos()] == [("a",)])
+    real.close()
+
+
+def test_leases_go_on_ending_after_a_stop_that_raised(table: Table) -> None:
+    def fail(*_: object) -> None:
+        raise RuntimeError("can't start new thread")
+
+    table.table.stop_with(fail)
+    table.take("a", lease_s=2.0)
+    table.take("b", lease_s=2.0)
+    for name in "ab":
+        table.resources[name].moving = True
+    table.advance(2.0)
+    assert table.table.infos() == []
+    with pytest.raises(NotStopped):
+        table.acquire("a")
+
+
+def test_only_its_owner_renews_and_releases(table: Table) -> None:
+    token = table.take("a")
+    assert table.table.renew([token.number], "stranger") == []
+    assert not table.table.release(token.number, "stranger")
+    assert table.table.release(token.number, "tester")
+
+
+# --- loss
+
+
+def test_S14_what_moves_under_a_lost_lock_stops_before_it_is_given_on(table: Table) -> None:
+    token = table.take("ab")
+    table.resources["a"].moving = True
+    asking = table.ask("a", "other")
+    table.table.lose(token.number, "gone")
+    [(resource, done)] = table.stopping
+    assert (resource.name, asking.done()) == ("a", False)
+    with pytest.raises(LockedByOther, match="stopping what moved"):
+        table.call("a")
+    table.call("b").close()
+    table.resources["a"].moving = False
+    done(resource, "")
+    assert asking.result(60).resources == ("a",)
+
+
+def test_S14_who_waits_for_what_could_not_be_stopped_is_told_at_once_until_it_is_resumed(table: Table) -> None:
+    token = table.take("ab")
+    table.resources["a"].moving = True
+    waiting = [table.ask(names, names) for names in ("a", "ab")]
+    table.table.lose(token.number, "gone")
+    [(resource, done)] = table.stopping
+    done(resource, "no answer")
+    for asking in waiting:
+        with pytest.raises(NotStopped):
+            asking.result(60)
+    resource.moving = False
+    with pytest.raises(NotStopped):
+        table.acquire("ab")
+    resource.resume()
+    table.acquire("ab")
+
+
+def test_S14_who_waits_for_rest_does_not_get_what_could_not_be_stopped_meanwhile(table: Table) -> None:
+    resource = table.resources["a"]
+    resource.moving = True  # for somebody without a lock, who is gone then
+    asking = table.ask("a", "other")
+    wait_until(lambda: resource.pending is not None, "it is being emptied")
+    resource.stop_ended("no answer")
+    resource.moving = False
+    with pytest.raises(NotStopped):
+        asking.result(60)
+    assert table.table.infos() == []
+
+
+def _could_not_be_stopped(table: Table, names: str) -> Resource:
+    """The first of these: their lock was lost while it moved, and its driver did not hear the stop; it rests by now."""
+    token, resource = table.take(names), table.resources[names[0]]
+    resource.moving = True
+    table.table.lose(token.number, "gone")
+    [(_, done)] = table.stopping
+    done(resource, "no answer")
+    resource.moving = False
+    return resource
+
+
+def test_S14_a_later_stop_that_goes_well_gives_nothing_free(table: Table) -> None:
+    resource = _could_not_be_stopped(table, "a")
+    resource.stop_ended("")
+    with pytest.raises(NotStopped):
+        table.acquire("a")
+    resource.resume()
+    table.acquire("a")
+
+
+def test_S14_a_refusal_says_what_could_not_be_stopped_when_why_and_what_to_do_and_it_is_listed(table: Table) -> None:
+    resource = _could_not_be_stopped(table, "ab")
+    with pytest.raises(
+        NotStopped, match=r"a on .*: could not be stopped at \d\d:\d\d:\d\d \(no answer\), so nobody gets a"
+    ):
+        table.acquire("a")
+    with pytest.raises(NotStopped, match="look at it, then `trade resume a`"):
+        table.acquire("a")
+    [info] = table.table.withheld()
+    assert (info.resources, info.holder.owner) == (("a",), "nobody")
+    assert "no answer" in info.holder.purpose
+    table.call("a").close()  # calls without a lock are not refused
+    resource.resume()
+    assert table.table.withheld() == []
+
+
+def test_a_lock_of_what_is_no_longer_offered_is_lost_and_who_waits_for_it_is_refused(table: Table) -> None:
+    token = table.take("ab")
+    asking = table.ask("a", "other")
+    table.table.drop(table.resources["a"])
+    with pytest.raises(ServiceGone, match="a is no longer offered"):
+        asking.result(60)
+    assert table.table.renew([token.number], "tester") == []
+    table.acquire("b")
+    with pytest.raises(ServiceGone):
+        table.acquire("a")
+
+
+def test_a_session_that_ends_while_it_waits_for_a_call_to_end_gets_nothing(table: Table) -> None:
+    running = table.call("a")
+    asking = table.ask("a", "dead/x")
+    table.table.session_ended("dead", "killed")
+    running.close()
+    with pytest.raises((LockedByOther, ServiceGone)):
+        asking.result(60)
+    assert table.table.infos() == []
+
+
+def test_who_had_it_is_told_why_not_anymore_even_while_it_is_being_stopped_or_another_has_it(table: Table) -> None:
+    token = table.take("a")
+    table.resources["a"].moving = True
+    table.table.lose(token.number, "broken by an operator: my turn")
+    [(resource, done)] = table.stopping
+    with pytest.raises(LockLost, match="my turn"):
+        table.call("a", [token])
+    resource.moving = False
+    done(resource, "")
+    table.take("a", "other")
+    with pytest.raises(LockLost, match="my turn"):
+        table.call("a", [token])
+    with pytest.raises(LockedByOther):
+        table.call("a")
+
+
+def test_why_grants_ended_is_known_of_the_last_few_and_never_of_more(table: Table) -> None:
+    numbers: list[int] = []
+    for _ in range(300):
+        numbers.append(table.take("a").number)
+        table.table.release(numbers[-1], "tester")
+    assert table.table.over(numbers[-1]) == "it was given back"
+    assert table.table.over(numbers[0]) == "it ended long ago"
+
+
+# --- emptying
+
+
+def test_S13_no_call_is_admitted_and_all_are_waited_for_but_the_asking_chain(table: Table) -> None:
+    own, other = table.call("a", call_id=1), table.call("a", call_id=2)
+    asking = table.ask("a", "asking", calls=[1])
+    with pytest.raises(LockedByOther):
+        table.call("a", call_id=3)
+    other.gate()  # what was admitted goes on
+    assert not asking.done()
+    other.close()
+    asking.result(60)
+    with pytest.raises(LockedByOther):
+        own.gate()  # its call goes on, but without the lock
+
+
+def test_S13_a_motion_that_a_call_left_running_is_waited_for(table: Table) -> None:
+    table.resources["a"].moving = True
+    asking = table.ask("a")
+    assert not asking.done()
+    table.resources["a"].moving = False
+    asking.result(60)
+
+
+def test_S11_equal_is_asked_for_not_at_least(table: Table) -> None:
+    old = table.take("a")
+    admitted = table.call("a", [old])
+    table.table.release(old.number, "tester")
+    admitted.close()
+    new = table.take("a", "other")
+    with pytest.raises(LockLost):
+        admitted.gate()
+    for number in (old.number, new.number + 1):
+        with pytest.raises(LockLost):
+            table.call("a", [Token(EPOCH, number)])
+    with pytest.raises(LockedByOther):
+        table.call("a", [Token("another epoch", new.number)])
+
+
+def test_S08_a_stop_voids_what_was_admitted_before_it_however_the_lock_stands(table: Table) -> None:
+    token = table.take("a")
+    admitted = table.call("a", [token])
+    table.resources["a"].stop("owner", ["s"])
+    with pytest.raises(MotionStopped):
+        admitted.gate()
+    table.call("a", [token], call_id=1).gate()
+    table.resources["a"].stop("stranger", ["else"])
+    with pytest.raises(Stopped):
+        table.call("a", [token], call_id=2)
+
+
+def test_S08_what_is_let_in_while_a_strangers_stop_is_under_way_is_void(table: Table) -> None:
+    let_in: list[Permit] = []
+
+    def asking() -> Iterator[str]:
+        let_in.append(table.call("a", session="mover"))
+        yield "stranger"
+
+    table.resources["a"].stop("stranger", asking())
+    with pytest.raises(MotionStopped):
+        let_in[0].gate()
+
+
+def test_admitting_and_emptying_at_the_same_moment_never_both_succeed(table: Table) -> None:
+    """A call that passes while a lock is granted is either waited for or refused."""
+    rounds, both = 300, 0
+    ready = threading.Barrier(2)
+
+    def call(number: int) -> bool:
+        ready.wait()
+        try:
+            permitted = table.call("a", call_id=number)
+        except LockedByOther:
+            return False
+        return bool(permitted)
+
+    for number in range(1, rounds):
+        calling = table.pool.submit(call, number)
+        ready.wait()
+        try:
+            granted = table.acquire("a")
+        except LockedByOther:
+            granted = None
+        both += calling.result(60) and granted is not None
+        table.resources["a"].calls.clear()
+        if granted is not None and granted.token is not None:
+            table.table.release(granted.token.number, "tester")
+    assert both == 0

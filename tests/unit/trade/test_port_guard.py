@@ -1,0 +1,107 @@
+"""While too many strangers are at the port of a transport, the kernel lets nobody else in."""
+
+import logging
+import socket
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.support.certificates import Papers
+from tests.support.waiting import wait_until
+from trade import Container, Settings
+from trade._transport.endpoints import Endpoint, free_endpoint
+from trade._transport.port_guard import MOST_STRANGERS, PortGuard
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="there are such filters on Linux only")
+
+
+@pytest.fixture
+def door() -> Iterator[socket.socket]:
+    with socket.socket() as listening:
+        listening.bind(("127.0.0.1", 0))
+        listening.listen(1024)
+        yield listening
+
+
+@pytest.fixture
+def dial() -> Iterator[Callable[[int], bool]]:
+    """Connect to a port of this host, and stay; whether that succeeds at once."""
+    there: list[socket.socket] = []
+
+    def connect(port: int) -> bool:
+        sock = socket.socket()
+        there.append(sock)
+        sock.settimeout(0.2)
+        try:
+            sock.connect(("127.0.0.1", port))
+        except TimeoutError:
+            return False
+        return True
+
+    yield connect
+    for sock in there:
+        sock.close()
+
+
+def test_who_comes_after_too_many_is_dropped_until_they_have_gone(
+    door: socket.socket, dial: Callable[[int], bool], caplog: pytest.LogCaptureFixture
+) -> None:
+    port, links = door.getsockname()[1], [0]
+    guard = PortGuard([port], lambda: links[0])
+    try:
+        # Both ends of a connection on this host are connections, and one of them is at the port.
+        assert all(dial(port) for _ in range(MOST_STRANGERS + 2))
+        wait_until(lambda: not dial(port))
+        assert f"no links at port {port}" in caplog.text
+        links[0] = 10 * MOST_STRANGERS
+        wait_until(lambda: dial(port))
+    finally:
+        guard.close()
+
+
+def test_links_are_no_strangers(door: socket.socket, dial: Callable[[int], bool]) -> None:
+    port, looked = door.getsockname()[1], [0]
+
+    def links() -> int:
+        looked[0] += 1
+        return MOST_STRANGERS + 2
+
+    guard = PortGuard([port], links)
+    try:
+        assert all(dial(port) for _ in range(MOST_STRANGERS + 2))
+        before = looked[0]
+        wait_until(lambda: looked[0] > before + 2)
+        assert dial(port)
+    finally:
+        guard.close()
+
+
+def test_a_guard_that_is_closed_lets_all_in(door: socket.socket, dial: Callable[[int], bool]) -> None:
+    port = door.getsockname()[1]
+    guard = PortGuard([port], lambda: 0)
+    assert all(dial(port) for _ in range(MOST_STRANGERS + 2))
+    wait_until(lambda: not dial(port))
+    guard.close()
+    assert dial(port)
+
+
+def test_the_port_of_a_container_is_guarded_and_newcomers_are_linked_again(
+    system: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    papers = Papers(tmp_path / "pki")
+    endpoint = free_endpoint().replace("tcp/", "tls/")
+    port = Endpoint.read(endpoint).port
+
+    def settings(name: str, **how: list[str]) -> Settings:
+        return Settings.read(system=system, container=name, tls=papers.of(name), environment={}, **how)  # type: ignore[arg-type]
+
+    with Container(settings("driver", listen=[endpoint])) as driver:
+        crowd = [socket.create_connection(("127.0.0.1", port), timeout=20) for _ in range(2 * MOST_STRANGERS)]
+        wait_until(lambda: "that are no links" in caplog.text)
+        for one in crowd:
+            one.close()
+        with caplog.at_level(logging.INFO), Container(settings("mind", connect=[endpoint])) as mind:
+            wait_until(lambda: len(mind.addresses()) == 2)
+            assert len(driver.addresses()) == 2

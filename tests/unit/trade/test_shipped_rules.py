@@ -1,0 +1,223 @@
+"""The rules of ``examples/rules.toml``, each at work in a system as it describes."""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.support.waiting import wait_until
+from trade import Container, service, where
+from trade._migration import source as _departing
+from trade._transport.endpoints import free_endpoint
+from trade.errors import NoSuchService
+from trade.rules import Firing, Rules, read_rules, rehearse
+from trade.rules import _engine as rules_module
+
+EXAMPLES = Path(__file__).parents[3] / "examples"
+SHIPPED, CARE = EXAMPLES / "rules.toml", EXAMPLES / "care.toml"
+StartContainer = Callable[..., Container]
+Only = Callable[..., Rules]
+
+
+class Camera:
+    @service(effect="read", achieves=["see(?object)"])
+    def check_for(self, object_type: str) -> bool:
+        return object_type == "mug"
+
+
+class Planner:
+    load = 0.2
+
+    @service(effect="read")
+    def busy(self) -> float:
+        return self.load
+
+    @service(achieves=["plan(?goal)"])
+    def plan(self, goal: str) -> str:
+        return goal
+
+    def save_state(self) -> float:
+        return self.load
+
+    def restore_state(self, state: float) -> None:
+        self.load = state
+
+
+@pytest.fixture
+def only(here: Container, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Only]:
+    """Runs one of the rules, as it stands in the file but for how long it waits."""
+    monkeypatch.setattr(rules_module, "LOOK_S", 0.02)
+    begun: list[Rules] = []
+
+    def begin(name: str, shipped: Path = SHIPPED, **instead: str) -> Rules:
+        text = shipped.read_text(encoding="utf-8")
+        [part] = [part for part in text.split("\n\n") if part.startswith(f"[rule.{name}]")]
+        for old, new in instead.items():
+            assert old in part
+            part = part.replace(f"{old} = 10\n", f"{old} = {new}\n").replace(f"{old} = 10 ", f"{old} = {new} ")
+        file = tmp_path / "rules.toml"
+        file.write_text(part, encoding="utf-8")
+        begun.append(Rules(here, file))
+        return begun[-1]
+
+    yield begin
+    for rules in begun:
+        rules.close()
+
+
+def first(rules: Rules) -> Firing:
+    wait_until(rules.rule_firings)
+    return rules.rule_firings()[0]
+
+
+def stand_by(container: Container, provider: object, group: str) -> None:
+    """Registered once and withdrawn: anybody may have it offered by its name."""
+    [handle, *_] = container.register(provider, group)
+    container.system.deregister(handle)
+
+
+def seers(looking: Container) -> list[str]:
+    return [handle.container for handle in looking.services(where(name="check_for", group="rosie.eyes"))]
+
+
+def test_the_file_is_right_and_is_rehearsed_in_an_empty_system(here: Container) -> None:
+    told = {rehearsal.rule: rehearsal.fires for rehearsal in rehearse(here, read_rules(SHIPPED))}
+    assert told == {"bootstrap": True, "elsewhere": True, "degraded": False, "balance": False, "relocate": False}
+
+
+def test_bootstrap_lets_itself_be_found_until_somebody_who_can_see_has_joined(
+    start_container: StartContainer, only: Only, here: Container
+) -> None:
+    at = free_endpoint()
+    far = start_container("far", listen=[at], connect=[at])
+    far.register(Camera(), "rosie.eyes")
+    far.system.set_discovery(True)
+    assert here.services(where(name="check_for")) == []
+    firing = first(only("bootstrap"))
+    assert firing.ok
+    assert [did.service for did in firing.steps] == [
+        "trade.set_broadcast",
+        "rosie.eyes.check_for",
+        "trade.set_broadcast",
+    ]
+    assert seers(here) == ["far"]
+    at = free_endpoint()
+    late = start_container("late", listen=[at], connect=[at])
+    late.system.set_discovery(True)
+    with pytest.raises(NoSuchService):
+        late.find(where(name="clock", container=here.name), wait_s=1.5)
+
+
+def test_a_camera_whose_container_dies_is_offered_elsewhere(
+    start_container: StartContainer, only: Only, here: Container
+) -> None:
+    eyes, spare = start_container("eyes"), start_container("spare")
+    eyes.register(Camera(), "rosie.eyes")
+    stand_by(spare, Camera(), "rosie.eyes")
+    wait_until(lambda: seers(here) == ["eyes"])
+    rules = only("elsewhere")
+    eyes.close()
+    assert first(rules).ok
+    wait_until(lambda: seers(here) == ["spare"])
+    assert here.call(where(name="check_for"), "mug")
+
+
+def test_a_degraded_camera_is_replaced_and_withdrawn(
+    start_container: StartContainer, only: Only, here: Container
+) -> None:
+    eyes, spare, camera = start_container("eyes"), start_container("spare"), Camera()
+    eyes.register(camera, "rosie.eyes")
+    stand_by(spare, Camera(), "rosie.eyes")
+    wait_until(lambda: seers(here) == ["eyes"])
+    rules = only("degraded")
+    eyes.set_health(camera, "degraded: fogged up")
+    firing = first(rules)
+    assert (firing.service, firing.ok) == ("rosie.eyes.check_for", True)
+    wait_until(lambda: seers(here) == ["spare"])
+    assert [info.provider for info in eyes.system.withdrawn()] == ["Camera-1"]
+
+
+def test_a_lamp_that_is_missing_is_made(
+    start_container: StartContainer, only: Only, here: Container, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    lamps = start_container("lamps", instantiable=("lamp:Lamp",))
+    wait_until(lambda: here.services(where(name="instantiate", container="lamps")))
+    firing = first(only("porch", CARE))
+    assert (firing.ok, [did.service for did in firing.steps]) == (True, ["trade.instantiate"])
+    wait_until(lambda: here.services(where(name="shine")))
+    [shine] = here.services(where(name="shine"))
+    assert (shine.container, shine.groups) == (lamps.name, ("home.porch",))
+    shine(0.5)
+
+
+def test_who_has_too_much_to_do_goes_on_elsewhere_and_whoever_looks_finds_one(
+    start_container: StartContainer, only: Only, here: Container
+) -> None:
+    mind, planner = start_container("mind"), Planner()
+    start_container("worker-1", instantiable=[f"{__name__}:Planner"])
+    mind.register(planner, "mind.planner")
+    for constraint in (where(name="migrate", container="mind"), where(name="clock", container="worker-1")):
+        here.find(constraint, wait_s=30)
+    wait_until(lambda: here.services(where(name="plan")))
+    rules = only("balance", every_s="0.02")
+    wait_until(lambda: any(info.fired for info in here.notifications()))
+    assert rules.rule_firings() == []
+    planner.load = 0.9
+    firing = first(rules)
+    assert (firing.ok, firing.service) == (True, "mind.planner.busy")
+    wait_until(lambda: [one.container for one in here.services(where(name="plan"))] == ["worker-1"])
+    for looking in (where(name="plan"), where(name="plan", group="mind.planner"), where(achieves="plan(?goal)")):
+        assert here.find(looking)("tea") == "tea"
+    assert here.call(where(name="busy")) == 0.9
+
+
+def test_all_of_them_together_do_not_run_in_circles_when_a_camera_is_replaced(
+    start_container: StartContainer, here: Container, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(rules_module, "LOOK_S", 0.02)
+    eyes, spare, camera = start_container("eyes"), start_container("spare"), Camera()
+    eyes.register(camera, "rosie.eyes")
+    stand_by(spare, Camera(), "rosie.eyes")
+    wait_until(lambda: seers(here) == ["eyes"])
+    with Rules(here, SHIPPED) as rules:
+        eyes.set_health(camera, "degraded: fogged up")
+        wait_until(lambda: seers(here) == ["spare"])
+        wait_until(rules.rule_firings)
+        assert [(firing.rule, firing.ok) for firing in rules.rule_firings()] == [("degraded", True)]
+        assert {info.state for info in rules.rules()} == {"standing"}
+
+
+def test_a_planner_that_is_not_well_goes_on_elsewhere_with_what_it_knows(
+    start_container: StartContainer, only: Only, here: Container, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    busy = {"worker-1": 70.0, "worker-2": 20.0}
+    monkeypatch.setattr(_departing, "busyness", lambda load: (busy[load.container], 0.0))
+    mind, planner = start_container("mind"), Planner()
+    for name in busy:
+        start_container(name, instantiable=[f"{__name__}:Planner"])
+    planner.load = 0.75
+    mind.register(planner, "mind.planner")
+    for name in (*busy, "mind"):
+        here.find(where(name="migrate", container=name), wait_s=30)
+    here.find(where(name="plan"), wait_s=30)
+    rules = only("relocate")
+    mind.set_health(planner, "degraded: the host is too hot")
+    firing = first(rules)
+    assert firing.ok
+    assert [did.service for did in firing.steps] == ["trade.migrate"]
+    wait_until(lambda: [one.container for one in here.services(where(name="plan"))] == ["worker-2"])
+    assert here.call(where(name="busy")) == 0.75
+
+
+def test_a_dry_run_of_relocating_says_whom_it_would_ask_and_moves_nothing(
+    start_container: StartContainer, here: Container
+) -> None:
+    mind, planner = start_container("mind"), Planner()
+    mind.register(planner, "mind.planner")
+    mind.set_health(planner, "degraded: the host is too hot")
+    wait_until(lambda: here.services(where(name="plan", healthy=False)))
+    [rehearsal] = rehearse(here, {"relocate": read_rules(SHIPPED)["relocate"]})
+    [step] = rehearsal.steps
+    assert (step.service, step.container, step.result) == ("trade.migrate", "mind", "would be called")
+    assert here.find(where(name="plan")).container == "mind"
