@@ -105,7 +105,7 @@ def test_find_and_call(play: Play, printed: Said) -> None:
     assert "overload" in printed.text
 
 
-@of(PAGE, "Call without a handle, call many")
+@of(PAGE, "Call several services")
 def test_call_many(play: Play, printed: Said) -> None:
     oven, timer = Oven(), Timer()
     play.offer("kitchen", oven, "kitchen.oven")
@@ -115,7 +115,7 @@ def test_call_many(play: Play, printed: Said) -> None:
     assert [line.rpartition(" ")[2] for line in printed.lines] == ["180.0", "None"]
 
 
-@of(PAGE, "Change what is offered")
+@of(PAGE, "Change a registered provider")
 def test_change_what_is_offered(play: Play) -> None:
     play.run(arm=Eye())
     [look] = trade.services(where(group="rosie.left") & where(group="lab.bench"))
@@ -167,7 +167,7 @@ class Knowledge:
         return "cups"
 
 
-@of(PAGE, "Be told")
+@of(PAGE, "Notifications")
 def test_be_told(play: Play, printed: Said) -> None:
     listener, eye = Listener(), Eye()
     play.offer("library", Knowledge(), "library")
@@ -186,7 +186,7 @@ def test_be_told(play: Play, printed: Said) -> None:
     assert [next(one for one in occasions if one.startswith(word)) for word in ("every", "after", "at")]
 
 
-@of(PAGE, "Watch calls")
+@of(PAGE, "Hooks")
 def test_watch_calls(play: Play, printed: Said) -> None:
     play.offer("mind", Eye(), "mind")
     play.run()
@@ -214,7 +214,7 @@ class Joints:
         return [JointNow(0.1 * self.looks, self.looks < 3)]
 
 
-@of(PAGE, "Listen")
+@of(PAGE, "Streams")
 def test_listen(play: Play, printed: Said) -> None:
     listener = Listener()
     play.offer("robot", Joints(), "rosie.head")
@@ -250,7 +250,7 @@ def test_locks_and_stops(play: Play, printed: Said) -> None:
     assert printed.lines == expected
 
 
-@of(PAGE, "See what happens")
+@of(PAGE, "Observe a system")
 def test_see_what_happens(play: Play) -> None:
     play.offer("robot", Eye(), "rosie.eye")
     play.run()
@@ -266,7 +266,7 @@ def test_while_it_runs(play: Play) -> None:
         wait_until(lambda: "robot" in {info.name for info in trade.system.containers()})
 
 
-@of(PAGE, "Objects made elsewhere")
+@of(PAGE, "Create objects in other containers")
 def test_objects_made_elsewhere(play: Play, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "mypkg").mkdir()
     (tmp_path / "mypkg" / "__init__.py").touch()
@@ -324,7 +324,7 @@ class Planner:
 """
 
 
-@of(PAGE, "Providers that move")
+@of(PAGE, "Migrate providers")
 def test_providers_that_move(play: Play, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, start_container: Any) -> None:
     (tmp_path / "mind_that_moves.py").write_text(MIND)
     monkeypatch.syspath_prepend(tmp_path)
@@ -344,7 +344,7 @@ def test_providers_that_move(play: Play, tmp_path: Path, monkeypatch: pytest.Mon
     assert play.module.Planner.state_version == 2
 
 
-@of(PAGE, "How busy it is")
+@of(PAGE, "Load")
 def test_how_busy_it_is(play: Play) -> None:
     play.container("arm")
     play.run()
