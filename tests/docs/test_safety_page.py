@@ -1,57 +1,114 @@
-"""The rules of motion, wire by wire: each cell of the table names tests of that very kind of wire."""
+"""The rules of motion and their tests: each rule has some, and ten have some on each kind of wire."""
 
+import os
 import re
+from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 
 ROOT = Path(__file__).parents[2]
-PAGE = (ROOT / "docs" / "safety.md").read_text(encoding="utf-8")
-TABLE = PAGE.split("## On each kind of wire")[1]
-ROWS = [[cell.strip() for cell in line.strip("|").split("|")] for line in TABLE.splitlines() if line.startswith("| S")]
-REQUIRED = {"S01", "S06", "S08", "S11", "S18"}
+RULES = re.findall(r"^### (S\d\d) (.+)$", (ROOT / "docs" / "safety.md").read_text(encoding="utf-8"), re.MULTILINE)
+APPENDIX = ROOT / "docs" / "safety-tests.md"
+MODULES = sorted((ROOT / "tests").rglob("test_*.py"), key=lambda path: (path.name, path))
+ON_EACH_WIRE = ["S01", "S05", "S06", "S07", "S08", "S11", "S18", "S19", "S20", "S22"]
+ON_SOCKETCAN = {"S01", "S06", "S08", "S11", "S18"}
 RIGS = {
     "Dynamixel": "Rig",
-    "CAN": "(?:Leg|CanRig)",
-    "Modbus": "HandRig",
+    "CiA 402": "(?:Leg|CanRig)",
+    "2F-85": "HandRig",
     "Feetech": "TailRig",
-    "ODrive and Damiao": "(?:MotorRig|CanRig)",
+    "ODrive, Damiao": "(?:MotorRig|CanRig)",
     "UR": "ArmRig",
 }
-"""What a test of the wire is done with: the parameters of a test say which wire it is about."""
+"""The parameter of a driver's test that says which wire it is about."""
+UNNUMBERED = {
+    "test_ctrl_c_on_a_call_stops_the_motion": "S05",
+    "test_a_damiao_is_watched_from_attaching_on": "S06",
+    "test_an_odrive_without_a_watchdog_is_not_enabled": "S06",
+    "test_an_e_stop_is_not_cleared_by_who_may_not": "S09",
+    "test_a_fault_while_moving_ends_the_move_and_nothing_moves_on_recovery": "S18",
+    "test_closing_the_driver_keeps_what_is_held": "S19",
+    "test_closing_the_driver_stops_moving_fingers": "S19",
+}
+"""Tests of a rule whose names do not have its number."""
+HEAD = """# Tests of the safety rules
+
+For reviewers who want to check how a rule of motion is tested.
+After reading, you can find and run the tests of each of the [safety rules](safety.md).
+
+`WRITE_TABLES=1 pytest tests/docs/test_safety_page.py` writes this page. The column *wire* names the device whose
+bytes or frames the test checks. Tests marked SocketCAN also run on a kernel interface (`make test-socketcan`).
+"""
 
 
-def judged_on(wire: str) -> set[str]:
-    """The tests of drivers that have that wire's simulated bus in their hands."""
-    given = re.compile(rf"def (test_\w+)\((?=[^)]*\b\w+: {RIGS[wire]}\b)")
-    modules = (ROOT / "tests" / "unit" / "drivers").glob("test_*.py")
-    return {name for module in modules for name in given.findall(module.read_text(encoding="utf-8"))}
+class Shown(NamedTuple):
+    """A test of a rule."""
+
+    rule: str
+    name: str
+    module: str
+    wires: tuple[str, ...]
 
 
-def test_every_rule_that_a_wire_can_judge_has_one_row() -> None:
-    rules = [row[0] for row in ROWS]
-    assert rules == sorted(set(rules))
-    assert set(rules) >= REQUIRED
-    assert set(rules) <= set(re.findall(r"^\| \*\*(S\d\d) ", PAGE, re.MULTILINE))
+def _tests() -> Iterator[Shown]:
+    on_socketcan = _imported_on_socketcan()
+    for path in MODULES:
+        text, of_driver = path.read_text(encoding="utf-8"), "drivers" in path.parts
+        for name, given in re.findall(r"^ *(?:async )?def (test_\w+)\(([^)]*)\)", text, re.MULTILINE):
+            rules = re.findall(r"_(S\d\d)(?=_)", name) or UNNUMBERED.get(name, "").split()
+            wires = [wire for wire, rig in RIGS.items() if of_driver and re.search(rf"\b\w+: {rig}\b", given)]
+            wires += ["SocketCAN"] * ("CiA 402" in wires and (path.stem, name) in on_socketcan)
+            yield from (Shown(rule, name, path.name, tuple(wires)) for rule in rules)
 
 
-@pytest.mark.parametrize("row", ROWS, ids=lambda row: row[0])
-@pytest.mark.parametrize(("column", "wire"), list(enumerate(RIGS, 1)), ids=list(RIGS))
-def test_a_cell_names_tests_of_its_wire(row: list[str], column: int, wire: str) -> None:
-    named = set(re.findall(r"`(test_\w+)`", row[column]))
-    assert named
-    assert named <= judged_on(wire)
+def _imported_on_socketcan() -> set[tuple[str, str]]:
+    [module] = (path for path in MODULES if path.match("socketcan/test_rules.py"))
+    imports = re.findall(
+        r"^from [\w.]*?(\w+) import ([^(\n]+|\([^)]+\))", module.read_text(encoding="utf-8"), re.MULTILINE
+    )
+    return {(stem, name) for stem, names in imports for name in re.findall(r"test_\w+", names)}
 
 
-def test_what_is_marked_runs_on_socketcan_too() -> None:
-    marked = set(re.findall(r"`(test_\w+)`\*", TABLE))
-    module = (ROOT / "tests" / "system" / "socketcan" / "test_rules.py").read_text(encoding="utf-8")
-    imported = set(re.findall(r"\b(test_S\w+)", module))
-    assert marked
-    assert marked <= imported
-    assert {name[5:8] for name in marked} >= REQUIRED
+TESTS = list(_tests())
+
+
+def test_the_rules_are_numbered_in_order_and_each_has_tests() -> None:
+    assert [rule for rule, _ in RULES] == [f"S{number:02}" for number in range(1, 23)]
+    assert {shown.rule for shown in TESTS} == {rule for rule, _ in RULES}
+
+
+@pytest.mark.parametrize("rule", ON_EACH_WIRE)
+@pytest.mark.parametrize("wire", RIGS)
+def test_each_kind_of_wire_has_tests_of_the_rule(rule: str, wire: str) -> None:
+    assert [shown for shown in TESTS if shown.rule == rule and wire in shown.wires]
+
+
+def test_the_main_rules_run_on_socketcan_too() -> None:
+    assert {shown.rule for shown in TESTS if "SocketCAN" in shown.wires} >= ON_SOCKETCAN
 
 
 def test_a_test_of_one_wire_is_none_of_another() -> None:
-    assert not judged_on("CAN") & {"test_S11_who_has_no_lock_writes_nothing"}
-    assert "test_S11_who_has_no_lock_sends_nothing" in judged_on("CAN")
+    on_can = {shown.name for shown in TESTS if "CiA 402" in shown.wires}
+    assert "test_S11_who_has_no_lock_writes_nothing" not in on_can
+    assert "test_S11_who_has_no_lock_sends_nothing" in on_can
+
+
+def test_tests_without_a_number_exist() -> None:
+    assert UNNUMBERED.keys() <= {shown.name for shown in TESTS}
+
+
+def test_the_appendix_lists_the_tests_of_each_rule() -> None:
+    """With WRITE_TABLES=1 in the environment it is written again."""
+    text = HEAD + "".join(f"\n## {rule} {title}\n\n{_table(rule)}" for rule, title in RULES)
+    if os.environ.get("WRITE_TABLES"):
+        APPENDIX.write_text(text, encoding="utf-8")
+    assert APPENDIX.read_text(encoding="utf-8") == text
+
+
+def _table(rule: str) -> str:
+    rows = sorted({shown[1:] for shown in TESTS if shown.rule == rule})
+    return "| test | file | wire |\n|---|---|---|\n" + "".join(
+        f"| `{name}` | {module} | {', '.join(wires)} |\n" for name, module, wires in rows
+    )
