@@ -37,45 +37,45 @@ class Step(NamedTuple):
 
 STEPS: Final = (
     Step(
-        "No hardware at hand? This is a box of new devices: two servos on one line, a gripper on another.",
+        "This command simulates a box of new devices: two servos on one line, a gripper on another. Skip it if you have hardware.",
         "trade-hil-sim --fresh neck=dynamixel:XL430-W250,XL430-W250 --fresh hand=robotiq:2F-85 --dir lines &",
         "up",
     ),
-    Step("Who is on the line of the servos?", "trade scan --port lines/neck", code=1),
+    Step("Scan the line of the servos.", "trade scan --port lines/neck", code=1),
     Step(
-        "Both have id 1, as all that come from the factory. Unplug the second one (the simulated one: by this line).",
+        "Both have the factory setting, id 1. Unplug the second one. This command unplugs the simulated one.",
         "trade-hil-sim --do lines/_control absent nth=2 bus=neck",
     ),
-    Step("The one that is left gets an id of its own.", "trade set-id --port lines/neck --from 1 --to 2"),
+    Step("Give the remaining one another id.", "trade set-id --port lines/neck --from 1 --to 2"),
     Step(
-        "Plug the other one in again.",
+        "Plug the second one in again.",
         "trade-hil-sim --do lines/_control absent nth=2 on=false bus=neck",
     ),
     Step(
-        "At 57600 baud there is no time for a hundred cycles a second, so both are to speak faster.",
+        "57600 baud is too slow for a hundred cycles a second, so set both to a higher rate.",
         "trade set-baud --port lines/neck --id 1 --to 1000000",
     ),
     Step("", "trade set-baud --port lines/neck --id 2 --to 1000000"),
     Step(
-        "All that is there becomes a robot file to begin with. Ids that are known make it quick.",
+        "Generate a first robot file of all devices. `--ids` limits the scan and makes it faster.",
         "trade scan --port lines/neck --port lines/hand --ids 1-9 --write rosie.toml",
     ),
     Step(
-        "Devices get names, by an editor or by this line: `joint1_2` is the joint with id 2 on the first line.",
+        "Name the devices, in an editor or with this command: `joint1_2` is the joint with id 2 on the first line.",
         """sed -i 's/joint1_1/"neck.pan"/; s/joint1_2/"neck.tilt"/; s/gripper2_9/"left.hand"/; s/"robot"/"rosie"/' """
         "rosie.toml",
     ),
     Step(
-        "Where are zero and ends of each joint? It is moved by hand; its torque stays off. In another terminal, this "
-        "line is the hand that moves a simulated one, to a position in counts: `trade-hil-sim --do lines/_control "
-        "place counts=2100 ids=1 bus=neck`.",
+        "Measure zero and range of each joint. Move it by hand; its torque stays off. To move a simulated joint to a "
+        "position in counts, type in another terminal: `trade-hil-sim --do lines/_control place counts=2100 ids=1 "
+        "bus=neck`.",
         "trade calibrate rosie.toml neck.pan",
         "calibrate",
         (2100, 1500, 2700),
     ),
     Step("", "trade calibrate rosie.toml neck.tilt", "calibrate", (2048, 1800, 2300)),
-    Step("Is all of it well?", "trade doctor rosie.toml | grep 'neck\\|hand'"),
-    Step("She comes up, and looks to the left.", "trade up rosie.toml &", "up"),
+    Step("Check the whole robot.", "trade doctor rosie.toml | grep 'neck\\|hand'"),
+    Step("Start the robot, and let it look to the left.", "trade up rosie.toml &", "up"),
     Step("", "trade call rosie.neck.pan.enable"),
     Step("", "trade call rosie.neck.pan.move_to 0.3"),
 )
