@@ -205,7 +205,7 @@ def test_the_same_where_deployment_begins(tmp_path: Path, text: str) -> None:
     assert [child.name for child in gateway(tmp_path, text).children] == ["rosie"]
 
 
-@of("drill.md", "A drill: does it stop when what it hangs on is gone?")
+@of("drill.md", "Drills: does the robot stop when a part fails?")
 def test_limits_of_a_drill(text: str) -> None:
     assert robot(HEAD + text).drill
 

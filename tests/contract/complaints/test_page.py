@@ -8,9 +8,15 @@ from tests.contract.complaints.table import COMPLAINTS
 
 HERE = Path(__file__).parent
 PAGE = (HERE.parents[2] / "docs" / "complaints.md").read_text(encoding="utf-8")
-ROWS = [[cell.strip() for cell in line.strip("|").split("|")] for line in PAGE.splitlines() if line.startswith("| ")][
-    1:
-]
+TOP, _, END = PAGE.partition("## Tests and mutants")
+
+
+def rows(part: str) -> list[list[str]]:
+    """The cells of the table in a part of the page, without its heading."""
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in part.splitlines() if line[:2] == "| "][1:]
+
+
+ROWS, PROVEN = rows(TOP), rows(END)
 
 
 def shown() -> dict[str, set[str]]:
@@ -25,11 +31,15 @@ def names(cell: str) -> list[str]:
 
 def test_there_are_fifteen_complaints_each_of_somebody() -> None:
     assert len({row[0] for row in ROWS}) == len(ROWS) == 15
-    assert all("](https://github.com/" in row[1] for row in ROWS)
+    linked = dict(re.findall(r"^\[(.+)\]: (https://github\.com/.+)$", PAGE, re.MULTILINE))
+    named = [re.findall(r"\[([^]]+)\]", row[1]) for row in ROWS]
+    assert all(named)
+    assert sorted(linked) == sorted(name for names_ in named for name in names_)
+    assert [row[0] for row in PROVEN] == [row[0] for row in ROWS]
 
 
 def test_each_complaint_has_tests_of_its_name_and_each_test_is_a_complaints() -> None:
-    told = {name: row[0] for row in ROWS for name in names(row[3])}
+    told = {name: row[0] for row in PROVEN for name in names(row[1])}
     assert set(told) == set(shown())
     for test, words in told.items():
         assert test.startswith("test_" + re.sub(r"\W+", "_", words.lower().replace("wi-fi", "wifi")))
@@ -37,8 +47,8 @@ def test_each_complaint_has_tests_of_its_name_and_each_test_is_a_complaints() ->
 
 def test_each_complaint_names_the_mutants_of_its_tests() -> None:
     made = shown()
-    for row in ROWS:
-        assert set(names(row[4])) == set().union(*(made[test] for test in names(row[3]))), row[0]
+    for row in PROVEN:
+        assert set(names(row[2])) == set().union(*(made[test] for test in names(row[1]))), row[0]
 
 
 def test_no_mutant_is_left_over() -> None:
