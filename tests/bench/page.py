@@ -28,32 +28,35 @@ _HIDDEN: Final = ("p99 / bare",)
 
 _HEAD: Final = """# Performance
 
-Made by `make bench-page` of [performance.json](performance.json), which is a run of `make bench`. It says what things
-took on one machine in one hour; the ratios carry further than the times do. How to run it, and how to compare two runs:
-[testing](testing.md#speed).
+For people who choose middleware or tune a system, and for contributors.
+After reading, you know the speed of TRADE next to other software and next to its targets, and the reasons for misses.
+
+`make bench-page` generates this page from [performance.json](performance.json), a run of `make bench` on one computer.
+The ratios are more general than the times. [Testing](testing.md#speed) describes how to run it, and how to compare two
+runs.
 
 ## The run
 
 {about}
 It took {minutes:.0f} minutes: `{command}`. Versions: {versions}.
 
-- A remote call goes from one process to another on this machine, over loopback; between hosts it is between network
-  namespaces with a cable between them.
-- All that stand in one table had their turns in one run, round by round, in an order that changes. A ratio ("/ bare")
-  divides two turns of the same round.
-- A figure is the median over the rounds; in brackets is the middle half of them. p50 and p99 are of the calls of one
-  round. n is how many there were in all rounds together.
+- A remote call goes from one process to another on this computer, over loopback. "Between hosts" means between network
+  namespaces that a virtual cable connects.
+- The rows of a table took turns in one run, round by round, in a changing order. A ratio ("/ bare") divides two turns
+  of the same round.
+- A figure is the median of the rounds, with the middle half of them in brackets. p50 and p99 are of the calls of one
+  round. n is the number of calls in all rounds.
 - CPU is the processor time of both ends together, for each call.
-- "bare" is the bare zenoh pair: a put to the other process and a put back, with nothing of ours around it.
-- In the pictures a dot is the median, the line through it the middle half of the rounds, a ring the p99.
+- "bare" is the bare zenoh pair: a put to the other process and a put back, without any code of TRADE.
+- In the pictures, a dot is the median, the line through it the middle half of the rounds, and a ring the p99.
 """
 _PARTS: Final = {
     "calls": "Remote calls, one at a time",
-    "in-flight": "Remote calls, 32 under way",
-    "checks": "What certificates, hooks and locks add to a call",
+    "in-flight": "Remote calls, 32 in flight",
+    "checks": "The cost of certificates, hooks and locks",
     "local": "Calls in the same container",
-    "registry": "A late joiner among many services",
-    "deadman": "From the end of a client to the rest of what it moved",
+    "registry": "A container that joins many services",
+    "deadman": "From the end of a client to the end of its motion",
     "locks": "Locks",
     "watching": "Notifications and hooks",
     "audit": "Audit records",
@@ -68,12 +71,13 @@ _PARTS: Final = {
     "jitter": "Jitter of bus loops",
 }
 _NOTES: Final = {
-    "jitter": """By how much the time between the first questions of two cycles was longer than the period, in us: less
-than zero follows a cycle that was late. They are taken from the wire, where a simulator in a process of its own reads
-them. In the pictures the edges of the bins are 1, 2 and 5 times powers of ten on either side of zero, and bars grow
-with the logarithm of their count. "load" is one busy process for each processor. Where the system allows SCHED_FIFO,
-the simulator has it in all cases; where a case is named so, the driver has it, too. "nothing" is a loop that only
-sleeps until its next turn. A mean that is not zero is a period that was not kept.""",
+    "jitter": """The figure is the time between the first requests of two cycles minus the period, in us. A negative one
+follows a late cycle. A simulator in a separate process reads the requests from the wire. The edges of the pictures'
+bins are 1, 2 and 5 times powers of ten on either side of zero. Bars grow with the logarithm of their count.
+
+"load" is one busy process for each processor. Where the operating system allows SCHED_FIFO, the simulator has it in all
+cases. In cases with that name, the driver has it, too. "nothing" is a loop that only sleeps until its next turn. If a
+mean is not zero, the loop did not keep its period.""",
 }
 """What has to be said of a part."""
 
@@ -109,8 +113,8 @@ def _again(run: Run) -> Iterator[str]:
     for one in run.again:
         others = "an unknown part" if one.others_cores is None else f"{one.others_cores:g} cores"
         command = " ".join(["python -m tests.bench", *one.arguments])
-        yield f"- **Measured anew**: {', '.join(one.parts)}; {one.began}, commit {one.commit or 'unknown'}, while other"
-        yield f"  programs took {others} of the machine: `{command}`."
+        yield f"- **Measured again**: {', '.join(one.parts)}; {one.began}, commit {one.commit or 'unknown'}, while"
+        yield f"  other programs took {others} of the machine: `{command}`."
 
 
 def _targets(run: Run, reasons: Mapping[str, Reason]) -> Iterator[str]:

@@ -151,7 +151,7 @@ def test_parts_that_are_measured_anew_take_the_place_of_those_before_and_the_pag
     assert [one.met for one in both.targets] == [True, False, False, True]
     assert Skipped("servo", "servo", "it failed") in both.skipped
     text = files(both, {})["performance.md"]
-    assert "**Measured anew**: can, servo; 2026-11-22 10:00 UTC, commit fedcba, while other" in text
+    assert "**Measured again**: can, servo; 2026-11-22 10:00 UTC, commit fedcba, while" in text
     once_more = both.amended(
         a_run(arguments=["servo"], points=[], targets=[], skipped=[Skipped("servo", "servo", "x")])
     )
