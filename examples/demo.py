@@ -1,7 +1,7 @@
 """The main job, on simulated hardware: behaviours on one network use a robot on another one, through a gateway.
 
-Processes: the simulated devices, the driver container, the gateway, the behaviours. What these say is checked against
-the simulator's own log of what the devices did; the demo fails if they disagree.
+Processes: the simulated devices, the driver container, the gateway, the behaviours. The demo compares what they
+print with the simulator's own log of what the devices did, and fails if they disagree.
 
     make demo                    the story, then everything ends
     make demo ARGS=--stay        and the robot stays up for you to play with
@@ -38,7 +38,7 @@ HEAD = where(group="rosie.head")
 
 
 class Options(argparse.Namespace):
-    """The words of the command line."""
+    """The options of the command line."""
 
     stay: bool
     loopback: bool
@@ -59,7 +59,7 @@ def look_around(scene: Stage, judge: Judge) -> None:
 
 
 def visit(scene: Stage) -> None:
-    title(2, "A visitor may look, but not touch", "The policy is a file; certificates tell who is who.")
+    title(2, "A visitor may read, but not move", "The policy is a file; certificates prove identities.")
     for words in (("call", "rosie.head.joints"), ("call", "rosie.head.move_to", "[0.3, 0.0]")):
         print(f"  visitor$ trade {' '.join(words)}")
         said = scene.command("visitor", *words)
@@ -69,7 +69,11 @@ def visit(scene: Stage) -> None:
 
 
 def arbitrate(scene: Stage, judge: Judge) -> None:
-    title(3, "Two behaviours want the same head", "One asks, the other lets go. Who dies loses it, and motion ends.")
+    title(
+        3,
+        "Two behaviours want the same head",
+        "One asks, one releases. A dead client loses its lock.",
+    )
     with scene.behaviour("who_has_the_head.py", "find-target") as finding:
         finding.hear("I have the head")
         with scene.behaviour("who_has_the_head.py", "navigate") as navigating:
@@ -86,7 +90,7 @@ def arbitrate(scene: Stage, judge: Judge) -> None:
 
 
 def walk(scene: Stage, judge: Judge) -> None:
-    title(4, "Rosie walks", "One lock over both legs, one over the head; a third who wants the legs is told.")
+    title(4, "Rosie walks", "One lock over both legs, one over the head. A third behaviour learns who has the legs.")
     with scene.behaviour("walk.py", "watch") as watching:
         watching.hear("I have the head")
         began_s = time.monotonic()
@@ -142,13 +146,17 @@ def stop_everything(judge: Judge) -> None:
 
 
 def come_back(scene: Stage, look: trade.Handle) -> None:
-    title(8, "What is killed comes back", "With what it knew, but nothing moves by itself; a handle is of one boot.")
+    title(
+        8,
+        "Killed programs restart",
+        "They restore their state. Nothing moves by itself.",
+    )
     expect((errors.ServiceGone, errors.ContainerLost), lambda: look([0.0, 0.0]))
     expect((errors.ServiceGone, errors.ContainerLost), kill_and_see(scene))
 
 
 def expect(kind: type[Exception] | tuple[type[Exception], ...], act: Callable[[], object]) -> None:
-    """Do what must not succeed."""
+    """Check that an action is refused."""
     try:
         act()
     except kind as refused:
@@ -214,7 +222,7 @@ def main() -> int:
             tempfile.TemporaryDirectory(prefix="trade-demo-") as folder,
             stage(Path(folder), loopback=options.loopback) as scene,
         ):
-            print("\n".join(scene.places.told()))
+            print("\n".join(scene.places.description()))
             try:
                 with contextlib.ExitStack() as recording:
                     tell(scene, recording, options)
@@ -230,9 +238,9 @@ def main() -> int:
         return 1
     except KeyboardInterrupt:
         return 130
-    print(f"\nDone in {time.monotonic() - began_s:.0f} s. All that was said agrees with what the devices did.")
-    print("Next: make demo ARGS=--stay and play with it; examples/walk.py and who_has_the_head.py are what you saw;")
-    print("docs/guide.md is how to write such programs, docs/access-control.md how the gateway and the policy work.")
+    print(f"\nDone in {time.monotonic() - began_s:.0f} s. The log of the devices confirms every line above.")
+    print("Next: make demo ARGS=--stay and play with it; you saw examples/walk.py and who_has_the_head.py;")
+    print("docs/guide.md shows how to write such programs, docs/access-control.md how to set up gateway and policy.")
     return 0
 
 

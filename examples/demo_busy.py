@@ -1,4 +1,4 @@
-"""Why a demo may have failed though nothing is wrong with it: the computer had other things to do."""
+"""Detects a computer too busy for the demo."""
 
 import os
 from typing import Final
@@ -24,5 +24,5 @@ def busy_here() -> str:
     """The same of this computer, now."""
     try:
         return busy(os.getloadavg()[0], os.cpu_count() or 1)
-    except OSError:  # nobody counts here
+    except OSError:  # this system has no load average
         return ""

@@ -1,4 +1,4 @@
-"""The judge of the demo: what the simulated devices say that happened, against what was claimed."""
+"""Compares what the behaviours print with the log of the simulated devices."""
 
 import math
 import time
@@ -75,7 +75,7 @@ class Judge:
             raise DemoFailed("the refused command reached the wire")
 
     def walked(self, began_s: float, stood_s: float) -> None:
-        """Three steps, by nobody but who had the legs, while the head moved, too."""
+        """Checks three steps: only the owner of the legs moved them, and the head moved at the same time."""
         stands = walk.STAND[0]
         ends = [walk.FORWARD[0] if leg == "left" else walk.BACK[0] for leg in walk.STEPS]
         expected = {"legs.left.hip": [*ends, stands], "legs.right.hip": [*(-end for end in ends), stands]}
@@ -86,11 +86,11 @@ class Judge:
                 raise DemoFailed(f"{joint} should have come to rest at {through}, but was at {angles}")
             print(f"    {joint:<15} came to rest at {', '.join(f'{angle:+.2f}' for angle in through)} rad")
         highest = max(self._knee_targets(began_s))
-        print(f"    legs.left.knee  was told to go to {highest:.2f} rad at most; the kick wanted {walk.KICK_RAD:.2f}")
+        print(f"    legs.left.knee  was commanded to {highest:.2f} rad at most; the kick wanted {walk.KICK_RAD:.2f}")
         if not _near(highest, walk.LIFTED[1]):
-            raise DemoFailed("somebody else's goal is among those of the walk, or the walk's own are not there")
+            raise DemoFailed("another client's goal is among those of the walk, or goals of the walk are missing")
         if late := motion_writes(read_log(self._log), since=stood_s, bus="legs"):
-            raise DemoFailed(f"the legs were told {len(late)} things after the walk had ended")
+            raise DemoFailed(f"the legs received {len(late)} commands after the walk had ended")
         meanwhile = [entry for entry in self.rests(PAN, began_s) if entry.t < stood_s]
         print(f"    neck.pan        came to rest {len(meanwhile)} times meanwhile: the head's lock is another one")
         if not meanwhile:

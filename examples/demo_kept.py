@@ -1,4 +1,4 @@
-"""The part of the demo in which programs are killed, and a gateway brings them back."""
+"""The part of the demo in which the gateway restarts programs that were killed."""
 
 import os
 import re
@@ -22,9 +22,9 @@ LEVEL = 0.7
 
 
 def kill_and_see(scene: Stage) -> Handle:
-    """Kill a driver and a program with state, and have them back; returns a handle of the driver that was killed.
+    """Kill a driver and a program with state, and wait for both; returns a handle of the killed driver.
 
-    The simulator outlives its driver, as servos do: it alone can tell what was done to them meanwhile.
+    The simulator outlives its driver, as servos do, so its log shows every command in between.
     """
     with SimProcess(HERE / "head.toml", log=scene.folder / "kept.jsonl") as sim, scene.keeper(_at_ports(scene, sim)):
         judge = Judge(sim.log_path)
@@ -43,12 +43,12 @@ def kill_and_see(scene: Stage) -> Handle:
         _came_back(judge, sim, stood, killed_s)
         again = trade.find(HEAD & where(name="move_to"))
         trade.call(where(name="enable", kind="JointGroup") & HEAD)  # their own watchdogs had stopped the servos
-        print(f"  enabled and told to move, it does: it looks at {again([0.0, 0.0])[0]:+.3f} rad")
+        print(f"  enabled and commanded again, the head moves to {again([0.0, 0.0])[0]:+.3f} rad")
         return killed["head"]
 
 
 def _set(judge: Judge) -> None:
-    """Give both something to remember, and wait until the lamp's is saved."""
+    """Give both a state, and wait until the gateway has saved the lamp's."""
     began_s = time.monotonic()
     trade.find(HEAD & where(name="move_to"))(list(POSE_RAD))
     judge.wait_for(lambda: judge.rests(PAN, began_s))
@@ -59,11 +59,11 @@ def _set(judge: Judge) -> None:
 
 
 def _away(shown: Mapping[str, Constraint], killed: Mapping[str, Handle], since_s: float) -> dict[str, float]:
-    """After how many seconds each answered again, in another boot; in the order in which they did."""
+    """Seconds until each answered again, in another boot, in order of their answers."""
     away_s: dict[str, float] = {}
     while len(away_s) < len(shown):
         if time.monotonic() - since_s > PATIENCE_S:
-            raise DemoFailed(f"of {', '.join(shown)} only {', '.join(away_s) or 'nobody'} came back")
+            raise DemoFailed(f"of {', '.join(shown)} only {', '.join(away_s) or 'none'} came back")
         for name in shown.keys() - away_s.keys():
             for service in trade.services(shown[name]):
                 if service.key.address != killed[name].key.address:
@@ -74,28 +74,28 @@ def _away(shown: Mapping[str, Constraint], killed: Mapping[str, Handle], since_s
 
 
 def _came_back(judge: Judge, sim: SimProcess, stood: dict[str, float], killed_s: float) -> None:
-    """Nothing was moved by itself, and both know what they knew."""
+    """Check that nothing moved by itself and that both have their state."""
     say("since the kill:")
     commands = motion_writes(sim.entries(), since=killed_s, bus="neck")
     stands = _truth(sim)
-    told = ", ".join(f"{joint} at {angle:+.3f} rad" for joint, angle in stands.items())
-    print(f"    {len(commands)} writes that could move it; {told}, as before")
+    angles_now = ", ".join(f"{joint} at {angle:+.3f} rad" for joint, angle in stands.items())
+    print(f"    {len(commands)} writes that could move it; {angles_now}, as before")
     if commands or judge.moves(PAN, killed_s) or stands != stood:
         raise DemoFailed(f"something moved by itself: it was at {stood}")
     angles = [state.position_rad for state in trade.call(where(name="state", kind="JointGroup") & HEAD)]
     level = trade.call(where(name="level") & LAMP)
     print(f"  the new driver reads {angles[0]:+.3f} rad off the servo; the new lamp shines at {level}, as it was saved")
     if level != LEVEL or abs(angles[0] - stood[PAN]) > AGREE_RAD:
-        raise DemoFailed(f"what came back is not what there was: {LEVEL} and {stood[PAN]:+.3f} rad")
+        raise DemoFailed(f"the restored state differs from the saved one: {LEVEL} and {stood[PAN]:+.3f} rad")
 
 
 def _truth(sim: SimProcess) -> dict[str, float]:
-    """Where the joints are, whatever anybody says of them."""
+    """The joints' true positions, by the simulator."""
     return {device.joint: device.position_rad for bus in sim.control.state() for device in bus.devices}
 
 
 def _child(name: str) -> Any:
-    """How the gateway says that one of its programs fares."""
+    """The gateway's report on one of its programs."""
     children = trade.find(where(name="children", container="keeper"))
     return next(child for child in children() if child.name == name)
 

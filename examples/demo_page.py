@@ -1,4 +1,4 @@
-"""The dashboard of a demo that stays: a door on the laboratory's network, and a way to it from this host's browser."""
+"""The dashboard of `--stay`: an HTTP gateway on the laboratory's network, forwarded to this host's browser."""
 
 import contextlib
 import socket
@@ -35,7 +35,7 @@ def dashboard(scene: Stage) -> Generator[tuple[str, str]]:
 
 
 def _let_through(window: socket.socket, port: int) -> None:
-    """Whoever connects at the window, which is this host's, comes out at a port of the network that we are on."""
+    """Forward connections from a port of this host to a port of the laboratory's network."""
     while True:
         try:
             outside, _ = window.accept()

@@ -1,7 +1,7 @@
-"""Where the demo plays: a robot's own network, a laboratory's, and a gateway between them. At its end nothing is left.
+"""The demo's networks: the robot's, the laboratory's and a gateway between them. They are removed at the end.
 
-With root and `ip` the two are network namespaces that have no way to each other but the gateway, which has a foot in
-both. Else all is on loopback addresses: each side has a gateway of its own, and the two are linked.
+With root and `ip`, they are network namespaces that only the gateway connects. Otherwise everything uses loopback
+addresses, and each side has its own gateway, linked to the other one.
 """
 
 import contextlib
@@ -30,7 +30,7 @@ _NEW_NETWORK = 0x40000000
 """CLONE_NEWNET of setns(2)."""
 
 POLICY = """
-gateways = ["door", "lab-door"]        # what they pass on they have checked
+gateways = ["door", "lab-door"]        # they check what they forward
 
 [roles.driver]
 register = ["rosie"]
@@ -45,7 +45,7 @@ lock = ["rosie"]
 
 [roles.recorder]
 includes = ["viewer"]
-instrument = ["trade"]                 # to have containers note their calls
+instrument = ["trade"]                 # to trace calls
 
 [roles.chief]
 administer = ["*"]
@@ -54,9 +54,9 @@ administer = ["*"]
 rosie = ["driver"]
 planner = ["operator"]                 # the behaviours
 visitor = ["viewer"]
-keeper = ["chief", "operator"]         # makes objects in what it keeps up, and saves them
+keeper = ["chief", "operator"]         # creates and saves objects in its children
 anna = ["operator", "chief"]           # the demo itself
-archive = ["recorder"]                 # who records what happens, if that is asked for
+archive = ["recorder"]                 # records, with --record
 """
 
 
@@ -92,7 +92,7 @@ class Stage:
         """Buses of the robot whose driver lacks a library, and which; not every vendor has one for every platform."""
 
     def complaints(self) -> list[str]:
-        """What the robot and the gateway warned of last."""
+        """The latest warnings of the robot and the gateway."""
         return self._complaints.read_text().splitlines(keepends=True)[-_LAST:]
 
     def environment(self, side: str, who: str) -> dict[str, str]:
@@ -128,11 +128,11 @@ class Stage:
         return self._started(" ".join((program, *role)), words, self.environment("lab", "planner"))
 
     def trade(self, who: str, *words: str | Path) -> contextlib.AbstractContextManager[Actor]:
-        """A command that stays, of somebody of the laboratory."""
+        """A long-running command of a user in the laboratory."""
         return self._started(f"trade {words[0]}", [*_TRADE, *words], self.environment("lab", who))
 
     def command(self, who: str, *words: str) -> str:
-        """What `trade WORDS` says when somebody of the laboratory types it, complaints included."""
+        """The output of `trade WORDS` as a user in the laboratory sees it, with its errors."""
         environment = {**os.environ, **self.environment("lab", who)}
         ended = subprocess.run(
             [*_TRADE, *words],
@@ -154,7 +154,7 @@ class Stage:
 
     @contextlib.contextmanager
     def keeper(self, head: Path) -> Generator[None]:
-        """A gateway on the robot's network that keeps a driver and a lamp up; what it remembers lies in its folder."""
+        """A gateway on the robot's network that supervises a driver and a lamp; its state is in its folder."""
         door = self.places.door["robot"]
         (self.folder / "keeper.toml").write_text(KEEPER.format(system=self.system, door=door, head=head))
         known = self.environment("robot", "keeper")
@@ -214,7 +214,7 @@ def _restore(environment: Mapping[str, str]) -> None:
 
 
 class Loopback:
-    """Two networks by agreement: nobody dials the other side, and only what the gateways let across is seen."""
+    """Two networks by convention: only the gateways connect to the other side."""
 
     addresses = ("127.0.0.1",)
     window: socket.socket | None = None
@@ -225,7 +225,7 @@ class Loopback:
         robot, lab = _free_ports(2)
         self.door = {"robot": f"tls/127.0.0.1:{robot}", "lab": f"tls/127.0.0.1:{lab}"}
 
-    def told(self) -> list[str]:
+    def description(self) -> list[str]:
         return [
             f"The networks are loopback addresses of this host, {self.why}.",
             f"  {self.door['robot']}  the robot's gateway, named door: it lets the others see rosie",
@@ -244,14 +244,14 @@ class Loopback:
         return []
 
     def step_into_the_lab(self) -> None:
-        """We are there."""
+        """Nothing to do: all networks are this host."""
 
     def way_in(self) -> str:
         return ""
 
 
 class Namespaces:
-    """Two networks that have no way to each other, and a gateway with a foot in each."""
+    """Two network namespaces, connected only by a gateway."""
 
     addresses = ("192.168.7.1", "10.0.0.7")
 
@@ -276,7 +276,7 @@ class Namespaces:
             _ip("-n", name, "addr", "add", f"{own}/24", "dev", link)
             _ip("-n", name, "link", "set", link, "up")
 
-    def told(self) -> list[str]:
+    def description(self) -> list[str]:
         return [
             "The networks are network namespaces: they have no way to each other but the gateway.",
             f"  {self._names['robot']:<27} 192.168.7.2  rosie",
@@ -322,7 +322,7 @@ def _ip(*words: str) -> None:
 
 
 def _free_ports(count: int) -> list[int]:
-    """Ports of 127.0.0.1 nobody listens on, and of which the system gives no two programs the same one soon."""
+    """Free ports of 127.0.0.1; the system does not hand out the same one again soon."""
     with contextlib.ExitStack() as held:
         found = [held.enter_context(socket.socket()) for _ in range(count)]
         for each in found:

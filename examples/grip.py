@@ -1,4 +1,4 @@
-"""A behaviour: activate a hand, grip what is there, and say whether it is held.
+"""A behaviour: activate a gripper, close it, and report whether it holds an object.
 
 Run it while a robot with a hand is up (`trade up examples/rosie.toml --sim`):
 

@@ -28,5 +28,5 @@ class Lamp:
         return self._level
 
     def restore_state(self, level: float) -> None:
-        """It has moved, and goes on as bright as it was."""
+        """Restore the brightness after a migration or restart."""
         self._level = level

@@ -1,6 +1,6 @@
-"""A planner that lacks an ability: it needs to see a mug, nobody it knows can, so it looks for somebody who can.
+"""A planner that lacks an ability: no service that it knows can see a mug, so it searches for one that can.
 
-Run each in a process of its own. The camera dials nobody, so the others do not know of it:
+Run each in a process of its own. The camera connects to no other container, so the others do not know it:
 
     python examples/planner.py arm
     TRADE_LISTEN=tcp/127.0.0.1:7461 TRADE_CONNECT=tcp/127.0.0.1:7461 python examples/planner.py camera
@@ -25,7 +25,7 @@ class Place(Struct, frozen=True):
 
 
 class Camera:
-    """Stands in for one with a recogniser behind it."""
+    """A stand-in for a camera with object recognition."""
 
     @service(effect="read", achieves=["see(?object)"])
     def check_for(self, object_type: str) -> Place:
@@ -34,7 +34,7 @@ class Camera:
 
 
 class Arm:
-    """Stands in for one that moves."""
+    """A stand-in for an arm."""
 
     @service(achieves=["holding(?object)"])
     def pick_up(self, place: Place) -> None:
@@ -42,7 +42,7 @@ class Arm:
 
 
 def offer(provider: object, group: str) -> None:
-    """Offer it until this process is ended; let others of the system find us."""
+    """Register the provider until this process ends, and let others find it."""
     handles = trade.register(provider, group)
     trade.system.set_broadcast(True)
     print(f"{sys.argv[1]}: {', '.join(handle.label for handle in handles)}", flush=True)
@@ -50,19 +50,19 @@ def offer(provider: object, group: str) -> None:
 
 
 def able_to(goal: str) -> Handle:
-    """A service of rosie that brings that about; looks for containers that are not linked yet if need be."""
+    """A service of rosie that achieves the goal; searches unlinked containers if none is known."""
     able = where(achieves=goal, group="rosie")
     known = trade.services(able)
     if known:
         return known[0]
-    print(f"planner: nobody of rosie achieves {goal}; looking around", flush=True)
+    print(f"planner: no service of rosie achieves {goal}; searching", flush=True)
     came: queue.SimpleQueue[Handle] = queue.SimpleQueue()
     waiting = trade.joined(able, came.put, existing=True)
     trade.system.set_discovery(True)
     try:
         return came.get(timeout=WAIT_S)
     except queue.Empty:
-        sys.exit(f"planner: nobody came within {WAIT_S:.0f} s who achieves {goal}")
+        sys.exit(f"planner: found no service within {WAIT_S:.0f} s that achieves {goal}")
     finally:
         trade.system.set_discovery(False)
         waiting.cancel()

@@ -19,9 +19,9 @@ from trade import Handle, Settings, errors, where
 LEADER, FOLLOWER = where(group="pair.leader"), where(group="pair.follower")
 HZ = 50.0
 VALID_S = 0.2
-"""A place holds for so long; if no other one follows, the follower's driver stops it, whatever becomes of us."""
+"""Validity of a set-point. Without a new one the driver stops the follower, even if this process dies."""
 STALE_S = 1.0
-"""Who could not tell the follower anything new for so long gives up."""
+"""Teleoperation ends after this time without a new set-point."""
 NEAR_RAD = 0.05
 SLOWLY_RAD_S = 0.3
 TRIES = 3
@@ -53,20 +53,20 @@ class Teleoperation:
         """Follow until something ends it; then hold."""
         with trade.lock(LEADER | FOLLOWER, purpose="teleoperation"):
             if holding := [joint.name for joint in self.leader() if joint.enabled]:
-                sys.exit(f"teleop: nobody can move {', '.join(holding)} by hand: trade call pair.leader.arm.relax")
+                sys.exit(f"teleop: {', '.join(holding)} cannot be moved by hand: trade call pair.leader.arm.relax")
             try:
                 self.approach()
                 say("following; move the leader")
                 self.follow()
             except (errors.LockLost, errors.MotionStopped, errors.Stopped):
-                raise  # it stands already, and a stop from here might strike whoever has it now
+                raise  # the follower has stopped; a stop now could hit its new owner
             except BaseException:
                 self.stop()
                 say("the follower holds")
                 raise
 
     def approach(self) -> None:
-        """Go to the leader slowly, and say so before, unless the follower is there already."""
+        """Announce and make a slow move to the leader's pose, unless the follower is near it."""
         for _ in range(TRIES):
             place = self.place(self.leader())
             offs = {joint.name: there - joint.position_rad for joint, there in zip(self.state(), place, strict=True)}
@@ -79,18 +79,18 @@ class Teleoperation:
         sys.exit("teleop: the leader does not keep still")
 
     def follow(self) -> None:
-        """Hand on where the leader is, the newest place only.
+        """Send the leader's newest position as a set-point.
 
-        What is silent or late for a moment has the follower stand meanwhile; for longer than ``STALE_S``, it is over.
+        A short gap stops the follower until the next sample. A gap longer than ``STALE_S`` ends teleoperation.
         """
         with trade.stream(self.leader, hz=HZ, keep=1) as states:
-            told = time.monotonic()
+            sent_s = time.monotonic()
             while True:
                 try:
                     self.servo(self.place(states.next(VALID_S).value), VALID_S)
-                    told = time.monotonic()
+                    sent_s = time.monotonic()
                 except TimeoutError:
-                    if time.monotonic() - told > STALE_S:
+                    if time.monotonic() - sent_s > STALE_S:
                         raise
 
 

@@ -4,7 +4,7 @@ Run each in a process of its own, while rosie is up (`trade up examples/rosie.to
 
     python examples/walk.py walk      three steps
     python examples/walk.py watch     looks around under a lock of its own, until it is ended
-    python examples/walk.py kick      wants a leg, and is told who has it
+    python examples/walk.py kick      wants a leg, and learns who has it
 """
 
 import sys
@@ -58,7 +58,7 @@ def watch() -> None:
     look = service("move_to", HEAD)
     with trade.lock(HEAD, purpose="watch the way"):
         print("watch: I have the head", flush=True)
-        while True:  # until somebody ends this process
+        while True:  # until this process is killed
             for pan_rad in (0.5, -0.5):
                 look([pan_rad, -0.2])
                 print(f"watch: looked to {pan_rad:+.1f} rad", flush=True)
@@ -69,7 +69,7 @@ def kick() -> None:
     knee = service("move_to", where(group="rosie.legs.left.knee"))
     try:
         with trade.lock(LEGS, purpose="kick a ball", wait_s=0):
-            print("kick: nobody had the legs", flush=True)
+            print("kick: the legs were free", flush=True)
     except errors.LockedByOther as taken:
         print(f"kick: {taken.owner} has the legs, for {taken.purpose!r}", flush=True)
     try:

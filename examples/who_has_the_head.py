@@ -21,14 +21,14 @@ def service(name: str) -> Handle:
 
 
 def find_target() -> None:
-    """Sweep the head from side to side until somebody asks for it, with a reason."""
+    """Sweep the head from side to side until another client requests it."""
     asked, stopped = threading.Event(), threading.Event()
     sweep, stop = service("move_to"), service("stop")
 
     def give_way(who: str, why: str) -> None:
         print(f"find-target: {who} asks for the head: {why}; I stop and let go", flush=True)
         asked.set()
-        stop()  # one's own stop: it holds nobody up afterwards
+        stop()  # a stop by the owner needs no resume
         stopped.set()
 
     with trade.lock(HEAD, purpose="finding a target", on_request=give_way):
@@ -44,16 +44,16 @@ def find_target() -> None:
 
 
 def navigate() -> None:
-    """Look where one goes; who has the head is asked to give way."""
+    """Look ahead; ask the current owner of the head to release it."""
     try:
         with trade.lock(HEAD, wait_s=0):
-            print("navigate: nobody had the head", flush=True)
+            print("navigate: the head was free", flush=True)
     except errors.LockedByOther as taken:
         print(f"navigate: {taken.owner} has the head, for {taken.purpose!r}", flush=True)
         trade.request_release(HEAD, "there is something ahead of me")
     with trade.lock(HEAD, purpose="navigation", wait_s=10):
         print("navigate: I have the head", flush=True)
-        while True:  # until somebody ends this process, however rudely
+        while True:  # until this process is killed
             for pan_rad in (1.3, -1.3):
                 service("move_to").with_(deadline_s=30)([pan_rad, 0.0], speed_rad_s=SLOWLY_RAD_S)
 

@@ -1,4 +1,4 @@
-"""A witness: when something is wrong with one robot, it looks with another one's camera, and tells the fault so.
+"""A witness: when one robot has a fault, it takes a picture with another one's camera as evidence.
 
 Each in a terminal of its own; the rule in witness.toml says when:
 
@@ -24,7 +24,7 @@ class Witness:
 
     @service(effect="note")
     def look_into(self, about: Handle) -> str:
-        """Have another robot's camera take a picture of what a service's device suffers from; where it was written."""
+        """Take a picture of a faulty device with another robot's camera; returns the picture's path."""
         device = about.groups[0]
         robot = device.partition(".")[0]
         fault = self._newest(robot, device)
@@ -47,7 +47,7 @@ class Witness:
     def _camera_beside(self, robot: str) -> Handle:
         cameras = trade.services(where(name="image", kind="Camera", healthy=True) & ~where(group=robot))
         if not cameras:
-            raise errors.ConfigurationError(where=robot, problem="no other robot has a camera that is well")
+            raise errors.ConfigurationError(where=robot, problem="no other robot has a healthy camera")
         return cameras[0]
 
 

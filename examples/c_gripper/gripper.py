@@ -44,7 +44,7 @@ class State:
 
 
 class CGripper:
-    """What the library does, as services; ``...`` stands where it does all of it."""
+    """The library's functions as services; a body of ``...`` means that the library does all of it."""
 
     def __init__(self, port: str) -> None:
         self.device = lib.c.gripper_open(port.encode())
@@ -57,7 +57,7 @@ class CGripper:
     @service(uses="hand", cancel="stop")
     @lib.function("gripper_move", handle="device")
     def move_to(self, width_m: Width, speed_m_s: Speed = 0.05) -> None:
-        """Open or close to a width; returns when it is there."""
+        """Open or close to a width; returns when the gripper has reached it."""
 
     @service(effect="stop", uses="hand")
     @lib.function("gripper_stop", handle="device")
@@ -91,7 +91,7 @@ class CGripper:
 def main() -> None:
     gripper = CGripper(port=str(Path(__file__).with_name("gripper.log")))
     trade.register(gripper, "rosie.hand")
-    print("rosie.hand is there; Ctrl-C ends it", flush=True)
+    print("rosie.hand is registered; Ctrl-C ends it", flush=True)
     try:
         threading.Event().wait()
     except KeyboardInterrupt:

@@ -29,7 +29,7 @@ def test_a_planner_that_cannot_see_finds_somebody_who_can(
     planner = run(PLANNER, "planner")
     assert planner.lines() == [
         "planner: rosie.arm.pick_up achieves holding(mug), and needs see(mug)\n",
-        "planner: nobody of rosie achieves see(mug); looking around\n",
+        "planner: no service of rosie achieves see(mug); searching\n",
         "planner: rosie.eyes.check_for has joined in container camera\n",
         "planner: the mug is at +0.4 m, -0.1 m\n",
         "planner: holding(mug)\n",

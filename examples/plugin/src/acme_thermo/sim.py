@@ -23,7 +23,7 @@ from trade_hil_sim import (
 
 
 class ThermoSim:
-    """A TC-4 behind a port; its probes have 21.5 degC until somebody says otherwise."""
+    """A TC-4 behind a port; its probes read 21.5 degC until a test sets another value."""
 
     def __init__(self, name: str, port: Path, probes: int, log: ByteLog | None = None) -> None:
         self.name, self.port = name, port

@@ -1,0 +1,104 @@
+"""A style checker: reports words that this project avoids, in pages, docstrings, comments, messages and help.
+
+`python -m tests.docs.plain_english [PATH...]` prints `file:line: "word": use ...` and exits with 1 if it found one.
+A line that needs the word (a quotation, the name of a book) ends in `plain: WORD`, as a comment.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+import sys
+import tokenize
+from collections.abc import Iterator
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+SEARCHED = (
+    "trade/src", "drivers/src", "gateway/src", "hil-sim/src", "examples", "docs",
+    "README.md", "CONTRIBUTING.md", "CHANGELOG.md", "tests/README.md",
+)  # fmt: skip
+AVOIDED = {
+    r"told|tells|telling": "notify, report, inform, say",
+    r"nobody|no one": "no client, no container, none",
+    r"somebody|someone|everybody|everyone": "a client, a user, each container, all",
+    r"whoever|whosoever": "the client, the caller, anyone who",
+    r"anew": "again",
+    r"stands(?! for)": "is",
+    r"goes on|went on|going on": "continues",
+    r"bears|borne": "handles, carries",
+    r"mend|mends|mended|mending": "fix, repair",
+    r"of (?:ours|yours|theirs)": "our, your, their",
+    r"for ever|forever": "permanently, without end",
+    r"is there(?! an?\b)": "exists, is present",
+    r"what is missed": "what is missing",
+    r"himself|herself": "itself",
+    r"abroad": "in another system",
+    r"passers?-by|passes by": "a short-lived container",
+}
+_WORDS = [(re.compile(rf"\b(?:{words})\b", re.IGNORECASE), advice) for words, advice in AVOIDED.items()]
+_PROSE_TOKENS = {tokenize.COMMENT, tokenize.STRING, getattr(tokenize, "FSTRING_MIDDLE", tokenize.STRING)}
+_CODE_IN_STRING = re.compile(r"(?<!\{)\{[^{}]*\}")
+_CODE_IN_PAGE = re.compile(r"`[^`]*`|\]\([^)]*\)|<[^>]*>|https?://\S+")
+
+
+def avoided(text: str) -> Iterator[tuple[str, str]]:
+    """The avoided words in a piece of prose, each with what to use instead."""
+    for pattern, advice in _WORDS:
+        for match in pattern.finditer(text):
+            if f"plain: {match[0]}" not in text:
+                yield match[0], advice
+
+
+def prose(path: Path) -> Iterator[tuple[int, str]]:
+    """Numbered lines of prose: comments and strings of a module, and a page without its code."""
+    yield from (_of_module if path.suffix == ".py" else _of_page)(path.read_text(encoding="utf-8"))
+
+
+def _of_module(source: str) -> Iterator[tuple[int, str]]:
+    lines = source.splitlines()
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        if token.type in _PROSE_TOKENS:
+            text = _CODE_IN_STRING.sub("", token.string) if re.match("[rR]?[fF]", token.string) else token.string
+            for offset, line in enumerate(text.splitlines()):
+                number = token.start[0] + offset
+                escape = re.search(r"plain: .*", lines[number - 1])
+                yield number, f"{line} {escape[0] if escape else ''}"
+
+
+def _of_page(text: str) -> Iterator[tuple[int, str]]:
+    fenced = False
+    for number, line in enumerate(text.splitlines(), 1):
+        if line.lstrip().startswith("```"):
+            fenced = not fenced
+        elif not fenced:
+            escape = re.search(r"plain: .*(?=-->)", line)
+            yield number, f"{_CODE_IN_PAGE.sub('', line)} {escape[0] if escape else ''}"
+
+
+def findings(paths: list[Path]) -> Iterator[str]:
+    """One line of report for each avoided word."""
+    for path in paths:
+        for number, line in prose(path):
+            for word, advice in avoided(line):
+                yield f'{path}:{number}: "{word}": use {advice}'
+
+
+def files(roots: list[Path]) -> list[Path]:
+    """The modules and pages below some folders; a file is taken as it is."""
+    return sorted(
+        path
+        for root in roots
+        for path in ([root] if root.is_file() else root.rglob("*"))
+        if path.suffix in (".py", ".md")
+    )
+
+
+def main(arguments: list[str]) -> int:
+    found = list(findings(files([Path(name) for name in arguments] or [ROOT / name for name in SEARCHED])))
+    print("\n".join(found))
+    return 1 if found else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
