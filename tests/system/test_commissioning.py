@@ -37,7 +37,8 @@ class Step(NamedTuple):
 
 STEPS: Final = (
     Step(
-        "This command simulates a box of new devices: two servos on one line, a gripper on another. Skip it if you have hardware.",
+        "This command simulates a box of new devices: two servos on one line, a gripper on another. Skip it if you "
+        "have hardware.",
         "trade-hil-sim --fresh neck=dynamixel:XL430-W250,XL430-W250 --fresh hand=robotiq:2F-85 --dir lines &",
         "up",
     ),
