@@ -31,7 +31,7 @@ def test_torque_drops_at_exit(body: Body) -> None:
     ("cia402", mutants.enabling_wants_no_fault, "enable.. ended with DeviceFault.*over-current"),
     ("cia402", mutants.enabling_resets_no_fault_of_a_drive, "enable.. ended with DeviceFault.*over-current"),
 )
-def test_overload_latched_for_ever(body: Body) -> None:
+def test_overload_latched_until_a_power_cycle(body: Body) -> None:
     motor = body.motor()
     motor.move_to(0.2)
     body.strike(body.ways.overload)
