@@ -8,6 +8,9 @@ from typing import NamedTuple
 
 import pytest
 
+from tests.contract.rigs.vendors import RIGS as VENDORS
+from tests.contract.rigs.vendors import rules_of
+
 ROOT = Path(__file__).parents[2]
 RULES = re.findall(r"^### (S\d\d) (.+)$", (ROOT / "docs" / "safety.md").read_text(encoding="utf-8"), re.MULTILINE)
 APPENDIX = ROOT / "docs" / "safety-tests.md"
@@ -59,8 +62,13 @@ def _tests() -> Iterator[Shown]:
         for name, given in re.findall(r"^ *(?:async )?def (test_\w+)\(([^)]*)\)", text, re.MULTILINE):
             rules = re.findall(r"_(S\d\d)(?=_)", name) or UNNUMBERED.get(name, "").split()
             wires = [wire for wire, rig in RIGS.items() if of_driver and re.search(rf"\b\w+: {rig}\b", given)]
+            wires += _judged_by_the_contract(name) if path.parent.name == "contract" else []
             wires += ["SocketCAN"] * ("CiA 402" in wires and (path.stem, name) in on_socketcan)
             yield from (Shown(rule, name, path.name, tuple(wires)) for rule in rules)
+
+
+def _judged_by_the_contract(rule: str) -> list[str]:
+    return list(dict.fromkeys(made.column for made in VENDORS.values() if rule in rules_of(made)))
 
 
 def _imported_on_socketcan() -> set[tuple[str, str]]:

@@ -26,7 +26,7 @@ def test_the_page_names_a_test_for_each_of_them() -> None:
 def test_what_is_broken_is_found_by_the_test_of_its_rule(mutant: str) -> None:
     file, test = ROWS[mutant]
     plugins = ("-p", "tests.support.mutants", "-p", "no:tests.support.rerun")
-    command = [sys.executable, "-m", "pytest", "-q", "-n", "0", *plugins, f"{file}::{test}"]
+    command = [sys.executable, "-m", "pytest", "-q", "-x", "-n", "0", *plugins, f"{file}::{test}"]
     done = subprocess.run(
         command,
         cwd=ROOT,

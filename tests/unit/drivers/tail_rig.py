@@ -12,10 +12,13 @@ from trade_drivers import AttachedRobot, Motor, Robot, attach, parse
 from trade_hil_sim import DeviceState, Entry, events, motion_writes, writes
 from trade_hil_sim.feetech import FeetechBus, Servo
 
-__all__ = ["COUNTS_PER_RAD", "TailRig", "goal_of", "tail_rig"]
+__all__ = ["COUNTS_PER_RAD", "LEAD_S", "TailRig", "goal_of", "lead_counts", "measured_before", "tail_rig"]
 
 COUNTS_PER_RAD = 651.8986
 _GOAL = 42
+LEAD_S = 0.3
+_NEAR = 20
+"""Counts that a joint is sent ahead at least."""
 
 
 class TailRig:
@@ -94,6 +97,18 @@ def goal_of(entry: Entry) -> int:
     assert entry.address is not None
     at = _GOAL - entry.address
     return int.from_bytes(entry.data[at : at + 2], "little")
+
+
+def lead_counts(speed_rad_s: float, accel_rad_s2: float = 20.0) -> float:
+    """How far ahead of a measurement a joint may be sent: what it takes until it has to be heard again, and braking."""
+    return max(_NEAR, (speed_rad_s * LEAD_S + speed_rad_s**2 / (2 * accel_rad_s2)) * COUNTS_PER_RAD) + 2
+
+
+def measured_before(log: list[Entry], write: Entry) -> int:
+    """The position that the servo had last told of when this write came."""
+    told = [entry for entry in log if entry.kind == "sent" and entry.device_id == write.device_id]
+    told = [entry for entry in told if entry.name == "sync_read" and entry.t <= write.t]
+    return int.from_bytes(told[-1].data[5:7], "little")
 
 
 @contextmanager

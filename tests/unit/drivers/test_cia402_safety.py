@@ -15,8 +15,8 @@ import pytest
 
 from tests.support.waiting import PATIENCE_S, wait_until
 from tests.unit.drivers.conftest import Outcome, sleep_past, written_now
-from tests.unit.drivers.legs import GO, HALT, HIP, KNEE, Leg, leg, rig
-from trade.errors import DeadlineExceeded, DeviceFault, LimitExceeded, LockedByOther, MotionStopped
+from tests.unit.drivers.legs import HALT, HIP, KNEE, Leg, leg, rig
+from trade.errors import DeadlineExceeded, DeviceFault, LockedByOther, MotionStopped
 from trade_drivers.joints._motion import Move
 from trade_hil_sim import Entry, Mute
 
@@ -241,18 +241,6 @@ def test_S11_a_command_whose_lock_is_gone_is_kept_off_the_wire(leg: Leg, looks: 
     assert "operation_enabled" not in states(leg, HIP, mark)
 
 
-def test_S22_the_bus_thread_looks_at_the_limits_itself(leg: Leg) -> None:
-    hip = leg.attach().motor("leg.hip")
-    exchange, axes = hip._exchange, hip._axes  # type: ignore[attr-defined]
-    expires_ns = exchange.clock() + 10**10
-    move = Move(exchange, axes, [40_000], [500], service="x", expires_ns=expires_ns, until_ns=None, permit=Lost(99))  # type: ignore[arg-type]
-    mark = written_now()
-    exchange.submit(move)
-    with pytest.raises(LimitExceeded):
-        move.wait(lambda: True)
-    assert not leg.goals(HIP, mark)
-
-
 # --- attaching and leaving
 
 
@@ -301,17 +289,6 @@ def test_S19_leaving_while_moving_stops_first_and_disarms_what_holds(leg: Leg) -
     assert not leg.events("torque_off", HIP, started.t)
     sleep_past(time.monotonic_ns() + 600_000_000)
     assert not states(leg, HIP, disarmed[-1].t)
-
-
-def test_S19_leaving_relaxed_switches_torque_off(rig: Leg) -> None:
-    rig.configure(('channel = "can0"', 'channel = "can0"\nleave = "relax"'))
-    rig.plug()
-    robot = rig.attach()
-    robot.motor("leg.hip").enable()
-    mark = written_now()
-    robot.close()
-    rig.wait_for("torque_off", HIP, mark)
-    assert not any(word & GO for word in rig.controlwords(HIP, mark))
 
 
 def test_S08_a_joint_with_a_fault_has_stopped_when_it_rests_and_not_before(rig: Leg) -> None:

@@ -1,0 +1,159 @@
+"""What a safety rule needs of a vendor: a simulator, the driver attached to it, commands, and the simulator's log."""
+
+import os
+import subprocess
+import sys
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any, ClassVar
+
+from tests.support.waiting import wait_until
+from tests.unit import drivers
+from tests.unit.drivers.conftest import Outcome
+from trade_hil_sim import Entry, received
+
+PROCESSES = Path(next(iter(drivers.__path__)))
+
+
+class DriverProcess:
+    """A driver in a process of its own that moves its device slowly."""
+
+    def __init__(self, program: str, *words: str) -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, str(PROCESSES / program), *words],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+
+    def line(self) -> str:
+        assert self.process.stdout is not None
+        return self.process.stdout.readline().strip()
+
+    def signal(self, number: int) -> None:
+        os.kill(self.process.pid, number)
+
+    def close(self) -> None:
+        self.process.kill()
+        self.process.communicate()
+
+
+class SafetyRig(ABC):
+    """A simulated device of one vendor and its driver."""
+
+    column: ClassVar[str]
+    """The column of docs/safety.md that this device belongs to."""
+    lacks: ClassVar[Mapping[str, str]] = {}
+    """Rules that do not apply to this device, each with the reason."""
+    says_on_waking: ClassVar[Sequence[str]] = ()
+    """Parts of the error of a driver that was frozen."""
+    stops_without_driver: ClassVar[bool] = True
+    """Whether the device stops when its driver falls silent; if not, it ends the move that it was sent last."""
+    robot: Any
+    device: Any
+
+    def __init__(self, undo: ExitStack, folder: Path) -> None:
+        self.undo, self.folder, self._plugged = undo, folder, False
+        self.bench = self.on_the_bench()
+
+    @abstractmethod
+    def on_the_bench(self) -> Any:
+        """The simulator that the other tests of this driver use, too."""
+
+    def configure(self, *changes: tuple[str, str]) -> None:
+        """Change the robot file before the device is plugged in."""
+        self.bench.configure(*changes)
+
+    patience: ClassVar[Sequence[tuple[str, str]]] = ()
+    """Changes of the robot file that give the watchdog more time than a test holds the bus up."""
+
+    def patient(self) -> None:
+        if self.patience:
+            self.configure(*self.patience)
+
+    def plug(self) -> None:
+        if not self._plugged:
+            self.bench.plug()
+            self._plugged = True
+
+    @abstractmethod
+    def attach(self, **options: Any) -> None:
+        """Attach the driver; it is closed with the test."""
+
+    @abstractmethod
+    def ready(self) -> None:
+        """Make the device able to move."""
+
+    def attach_to_command(self, **options: Any) -> None:
+        """Attach, and make the device able to take each of its `commands`."""
+        self.attach(**options)
+
+    @property
+    def exchange(self) -> Any:
+        return self.device._exchange
+
+    @abstractmethod
+    def commands(self) -> Iterable[Callable[[], object]]:
+        """Every command that moves the device, or switches its torque."""
+
+    @abstractmethod
+    def move(self) -> object:
+        """Move far."""
+
+    @abstractmethod
+    def set_off(self) -> Outcome:
+        """Start a slow and long move; return once the device is under way."""
+
+    @abstractmethod
+    def outside(self) -> Iterable[Callable[[], object]]:
+        """Commands beyond the limits, or with values that are not numbers."""
+
+    @abstractmethod
+    def commanded(self, since: float = 0.0) -> Sequence[object]:
+        """Everything sent that moves the device, or switches its torque."""
+
+    @abstractmethod
+    def sent_away(self, since: float, within_rad: float = 0.002) -> Sequence[object]:
+        """Everything sent that leads the device away from where it is, farther than joints brake."""
+
+    @abstractmethod
+    def events(self, name: str, since: float) -> Sequence[Entry]:
+        """What the simulator noted of the device."""
+
+    @property
+    @abstractmethod
+    def moving(self) -> bool: ...
+
+    @abstractmethod
+    def travelled(self) -> float:
+        """How much of the long move is done, from 0 to 1."""
+
+    def queued(self) -> Iterable[Callable[[], object]]:
+        """The commands that the bus thread takes up, once the device is able to take them."""
+        return self.commands()
+
+    def at_rest(self) -> bool:
+        return not self.moving
+
+    def rests(self) -> None:
+        """Wait until the device rests, short of the goal."""
+        wait_until(lambda: not self.moving, "it rests")
+        assert self.travelled() < 0.9
+
+    @abstractmethod
+    def driver_process(self) -> DriverProcess:
+        """A driver process that moves the device slowly."""
+
+    @abstractmethod
+    def last_resort(self, lost: float) -> None:
+        """Judge what the device does after its driver is lost at a moment."""
+
+    def falls_silent(self) -> float:
+        """Wait until the device is left alone; since when nothing may be sent."""
+        raise NotImplementedError
+
+    def heard(self, since: float) -> Sequence[Entry]:
+        """Everything that the device received."""
+        return received(self.bench.log, since=since)

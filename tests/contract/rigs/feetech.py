@@ -1,0 +1,39 @@
+"""Feetech servos on a serial line."""
+
+from typing import Any, ClassVar
+
+from tests.contract.rigs.dynamixel import SerialJointRig
+from tests.contract.rigs.joints import FIRST
+from tests.support.simulated_robots import TAIL
+from tests.unit.drivers.tail_rig import COUNTS_PER_RAD, TailRig, goal_of, lead_counts, measured_before
+from trade_hil_sim import Entry
+
+
+class FeetechRig(SerialJointRig):
+    """A tail of two servos that have no watchdog: no goal is far ahead of where the joint is."""
+
+    column = "Feetech"
+    lacks: ClassVar = {
+        "test_S06_every_enabled_joint_has_its_watchdog_armed": "the servo has no watchdog",
+    }
+    bus, joint, group = "tail", "tail.root", "tail"
+    max_rad, too_slow_rad_s = 1.4, 0.01
+    robot_file_driver = "feetech"
+    counts_per_rad = COUNTS_PER_RAD
+    text = TAIL
+
+    def on_the_bench(self) -> Any:
+        return TailRig(self.folder, self.undo)
+
+    def goal_of(self, entry: Entry) -> int:
+        return goal_of(entry)
+
+    def stopped_by_itself(self, since: float) -> float:
+        return float(self.bench.wait_for("at_rest", FIRST, since).t)
+
+    def last_resort(self, lost: float) -> None:
+        """The servo ends at the goal that it was sent last, and that goal is near."""
+        self.bench.wait_for("at_rest", FIRST)
+        log, last = self.bench.log, self.bench.goals(FIRST)[-1]
+        assert self.truth().position_counts == goal_of(last)
+        assert goal_of(last) - measured_before(log, last) <= lead_counts(0.1)
