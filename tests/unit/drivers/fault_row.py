@@ -50,17 +50,21 @@ Order = Command | Sick | Process | Dashboard
 class Stop(Enum):
     """What ends the motion that was under way."""
 
-    NOTHING = "it does not stop: the move ends as asked"
-    HOLD = "the driver has it hold"
-    WATCHDOG = "its own watchdog"
-    BOTH = "the driver has it hold and falls silent; then its own watchdog"
+    NOTHING = "it does not stop: the move ends normally"
+    HOLD = "the driver makes it hold"
+    WATCHDOG = "the device's watchdog"
+    BOTH = "the driver makes it hold and falls silent; then the device's watchdog"
     ITSELF = "the device itself"
-    HOLD_OR_PROGRAM = "the driver has it hold and gets no answer; then it has the controller end the program"
-    PROGRAM = "the driver has the controller end the program, by its dashboard; else its own watchdog"
-    BLOCKED = "what blocks it; the driver has it hold, or its own overload protection lets go, whichever is first"
-    UNTOLD = "nothing is sent: a hold could switch torque on; it ends at its last goal, which is never far ahead"
-    NEAR = "nothing can reach it, and it has no watchdog: its last goal, which is never far ahead"
-    GOAL = "nothing can reach it, and it has no watchdog: it ends the move it was told"
+    HOLD_OR_PROGRAM = "the driver makes it hold, gets no answer, and then makes the controller end the program"
+    PROGRAM = (
+        "the driver makes the controller end the program, through the dashboard; otherwise the controller's watchdog"
+    )
+    BLOCKED = "the obstacle; the driver makes it hold, or its overload protection releases it, whichever is first"
+    UNTOLD = (
+        "the driver sends nothing, as a hold could switch torque on; the joint ends at its last goal, never far ahead"
+    )
+    NEAR = "nothing can reach it, and it has no watchdog; it ends at its last goal, never far ahead"
+    GOAL = "nothing can reach it, and it has no watchdog; it completes its last move"
 
 
 class Recovery(Enum):

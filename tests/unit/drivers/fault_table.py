@@ -260,7 +260,7 @@ _UR: Final = (
     _forgiven("ur", "dashboard lost", Mute(instruction="dashboard")),
     _arm_let_go("control process killed", Process("KILL")),
     _arm_let_go("control process hung", Process("STOP")),
-    _arm_let_go("its program is ended by others", Dashboard("stop"), stop=Stop.ITSELF),
+    _arm_let_go("program ended by another client", Dashboard("stop"), stop=Stop.ITSELF),
     _arm_let_go("remote control off, then killed", Local(), Process("KILL"), stop=Stop.WATCHDOG)._replace(
         refuses=True, cure=(Local(on=False),)
     ),
@@ -271,7 +271,7 @@ _UR: Final = (
     _arm_stopped("emergency stop", HardwareFault(bits=7), "emergency stop", Recovery.START, _MADE_NORMAL),
     _arm_stopped("emergency stop of its system", HardwareFault(bits=6), "emergency stop", Recovery.START, _MADE_NORMAL),
     _arm_stopped("safety fault", HardwareFault(bits=9), "fault", Recovery.START, _MADE_NORMAL),
-    _arm_stopped("power off meanwhile", Dashboard("power off"), "its power is off", Recovery.START),
+    _arm_stopped("power switched off", Dashboard("power off"), "its power is off", Recovery.START),
     _arm_stopped("restart", BrownOut(), "", Recovery.START)._replace(
         error=DeviceError, state="its power is off", reopens=True
     ),
@@ -290,28 +290,36 @@ _TITLES: Final = {
 }
 _HEAD: Final = """# Faults
 
-What is to come of a fault that strikes a device in the middle of a move. This page is written by
-`python -m tests.unit.drivers.fault_table > docs/faults.md` out of the table that
-`test_a_fault_while_moving_ends_the_move_and_nothing_moves_on_recovery` and `test_a_small_fault_goes_unnoticed` run
-through, row by row, with the simulator's log as the judge.
+For operators and technicians whose robot reports a fault.
+After reading, you know what happens when a device fails during a move, and what to do before it moves again.
 
-- *Struck by*: orders for the [simulator](simulators.md#faults), for the device that moves; `sick` is
-  `attach(healthy=...)` that says no. Of arms, `process signal` is sent to the process of the driver that commands,
-  and `dashboard` is a line that somebody else says to the controller.
-- *The move ends with* this error. While the fault lasts, further moves end in an error, too, unless it is
-  "over at once".
-- *state()* and *stop()*: what they tell while it lasts. A stop that raises was tried, or could not be: nobody saw
-  the device come to rest.
-- *Stopped by*: what ends the motion that was under way.
-- *Then*: what somebody has to call when the cause is gone. Until then **nothing moves**, in every row: what is heard
-  again is neither enabled nor sent anywhere, and at most told to hold where it stands.
+In every row, **nothing moves** until you have fixed the cause and made the calls in the last column. When a device
+answers again, the driver does not enable it and sends it no goal. At most, it makes the device hold its position.
 
-What strikes one joint leaves the others of its bus alone, but for those that move in one group with it: they stop.
-In the registry a device with a fault is `degraded: ` and what is wrong, one that cannot be heard `degraded: silent` or
-`degraded: bus gone`, and so is a group that it belongs to. Where a CAN bus is not well, that is said of all that hangs
-on it. Each fault is kept, with what was measured before ([drivers](drivers.md#what-was-wrong)).
+| column | meaning |
+|---|---|
+| *caused by* | the orders for the [simulator](simulators.md#faults) that cause the fault in the device that moves |
+| *the move ends with* | the error of the call. Until the fault ends, new moves fail, too, unless "over at once" |
+| *state()*, *stop()* | their results while the fault lasts. If `stop()` raises an error, no rest was measured |
+| *stopped by* | what ends the motion in progress |
+| *then* | the services to call once the cause is fixed |
+
+Three orders are not from the simulator:
+
+- `sick`: `attach(healthy=...)` returns False.
+- `process signal`: a signal to the control process of an arm's driver.
+- `dashboard`: a line that another client sends to the arm's controller.
+
+A fault of one joint does not affect other joints on its bus. The exception is a group that moves: all its joints stop.
+
+In the registry, a device with a fault is `degraded: ` followed by the fault. A device that is offline is
+`degraded: silent` or `degraded: bus gone`. A group with such a member is degraded, too. If a CAN bus is not healthy,
+all its devices report that. TRADE keeps each fault with its measurements ([drivers](drivers.md#what-was-wrong)).
+
+`fault_table.py`, beside the tests of the drivers, writes this page. Two tests check each row against the simulator's
+log: `test_a_fault_while_moving_ends_the_move_and_nothing_moves_on_recovery` and `test_a_small_fault_goes_unnoticed`.
 """
-_COLUMNS: Final = ("fault", "struck by", "the move ends with", "state()", "stop()", "stopped by", "then")
+_COLUMNS: Final = ("fault", "caused by", "the move ends with", "state()", "stop()", "stopped by", "then")
 
 
 def page() -> str:
@@ -328,14 +336,14 @@ def _section(device: str) -> Iterator[str]:
 
 
 def _cells(row: Row) -> tuple[str, ...]:
-    then = f'; when it is noticed, {_orders(row, row.then)}: fault "{row.found}"' if row.then else ""
+    then = f'; when it is detected, {_orders(row, row.then)}: fault "{row.found}"' if row.then else ""
     health = "" if row.bus_health == "healthy" else f'; in the registry "{row.bus_health}"'
     if row.error is None:
-        return row.fault, _orders(row, row.strike), "nothing: it arrives", "no fault", "nothing", *_end(row)
+        return row.fault, _orders(row, row.strike), "no error: it reaches its goal", "no fault", "no error", *_end(row)
     error = (
         f"`{row.error.__name__}`" + (f': "{row.says}"' if row.says else "") + ("" if row.refuses else "; over at once")
     )
-    stop = "nothing" if row.stop_error is None else f"`{row.stop_error.__name__}`"
+    stop = "no error" if row.stop_error is None else f"`{row.stop_error.__name__}`"
     return row.fault, _orders(row, row.strike) + then, error, _state(row) + health, stop, *_end(row)
 
 
