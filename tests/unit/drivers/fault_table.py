@@ -300,7 +300,7 @@ answers again, the driver does not enable it and sends it no goal. At most, it m
 |---|---|
 | *caused by* | the orders for the [simulator](simulators.md#faults) that cause the fault in the device that moves |
 | *the move ends with* | the error of the call. Until the fault ends, new moves fail, too, unless "over at once" |
-| *state()*, *stop()* | their results while the fault lasts. If `stop()` raises an error, no rest was measured |
+| *state()*, *stop()* | results while the fault lasts. If `stop()` raises an error, the device may still move |
 | *stopped by* | what ends the motion in progress |
 | *then* | the services to call once the cause is fixed |
 
