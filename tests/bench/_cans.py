@@ -20,10 +20,11 @@ from trade.errors import DeviceError, TradeError
 from trade_drivers import Motor, Tolerances, Trajectory, TrajectoryPoint
 from trade_drivers.bus.can import frame_bits
 from trade_drivers.joints import BusThread
+from trade_drivers.joints.can._driver import AttachedMotors
 from trade_drivers.robotfile import CanBus, parse
+from trade_drivers.vendors.cia402 import Cia402Driver
 from trade_drivers.vendors.cia402 import _table as table
-from trade_drivers.vendors.cia402 import open_exchange
-from trade_drivers.vendors.cia402._motor import AttachedDrives
+from trade_drivers.vendors.cia402._motor import Drive
 from trade_hil_sim import SimProcess
 
 _COUNT = 6
@@ -99,9 +100,9 @@ def _drives(rate_hz: int, tpdos: int, seconds: float) -> tuple[list[float], list
         [bus] = robot.buses
         assert isinstance(bus, CanBus)
         with SimProcess(file, logged=False) as sim:
-            exchange = open_exchange(robot, bus, sim.ports["legs"])
+            exchange = Cia402Driver().open_exchange(robot, bus, sim.ports["legs"])
             if tpdos == 2:
-                for axis in exchange.drives:
+                for axis in exchange.devices:
                     every_sync = table.Entry(table.MOTION.communication, "u1", 2)
                     for _ in exchange.net.write(axis.id, every_sync, table.AT_NEXT_SYNC):
                         exchange.net.take_in(_WAIT_S)
@@ -113,13 +114,13 @@ def _drives(rate_hz: int, tpdos: int, seconds: float) -> tuple[list[float], list
                 took.append(time.monotonic() - began[-1])
 
             thread = BusThread(exchange, exchange.port, bus, lambda: True, name="bus bench")
-            attached = AttachedDrives(thread, exchange.port)
+            attached = AttachedMotors(thread, exchange.port, Drive)
             thread.start()
             try:
                 for joint in robot.joints:
                     _enable(attached.motor(joint.name))
                 exchange.cycle = timed
-                names = [axis.name for axis in exchange.drives]
+                names = [axis.name for axis in exchange.devices]
                 ways = [(0.0, 0.0), (seconds / 2, 0.3), (seconds, 0.0)]
                 points = [TrajectoryPoint(time_from_start_s=at, positions_rad=_COUNT * [rad]) for at, rad in ways]
                 group = attached.group("leg", [joint.name for joint in robot.joints])

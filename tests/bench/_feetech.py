@@ -18,7 +18,7 @@ import serial
 from tests.bench._report import keep_point, print_target
 from tests.bench._servo import Answers, Cycle, _cycles_per_s, _load, _measure, _range
 from trade_drivers.robotfile import parse
-from trade_drivers.vendors.feetech import open_exchange
+from trade_drivers.vendors.feetech import FeetechDriver
 from trade_hil_sim import SimProcess
 from trade_hil_sim.feetech import encode
 
@@ -86,13 +86,13 @@ def run(cycles: int, rounds: int, seconds: float) -> None:
 def _driver(robot_file: Path, port: str) -> Iterator[Cycle]:
     """The driver's whole cycle, and goals for all joints behind it. Torque is off: nothing moves."""
     robot = parse(robot_file.read_text(), robot_file.name)
-    exchange = open_exchange(robot, robot.buses[0], port)
+    exchange = FeetechDriver().open_exchange(robot, robot.buses[0], port)
     goals = dict.fromkeys(_IDS, _GOAL)
 
     def cycle() -> None:
         exchange.cycle()
         exchange.wire.sync_write(_WRITE, goals)
-        answers.count(all_there=not any(axis.silent or axis.doubted for axis in exchange.axes))
+        answers.count(all_there=not any(axis.silent or axis.doubted for axis in exchange.devices))
 
     answers = Answers()
     try:

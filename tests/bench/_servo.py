@@ -19,7 +19,7 @@ import serial
 
 from tests.bench._report import keep_point, print_target
 from trade_drivers.robotfile import parse
-from trade_drivers.vendors.dynamixel import open_exchange
+from trade_drivers.vendors.dynamixel import DynamixelDriver
 from trade_hil_sim import SimProcess
 from trade_hil_sim.dynamixel import encode
 
@@ -137,7 +137,7 @@ class Answers:
 def _driver(robot_file: Path, port: str, fast: bool) -> Iterator[Cycle]:
     """The driver's whole cycle, and goals for all joints behind it. Torque is off: nothing moves."""
     robot = parse(robot_file.read_text(), robot_file.name)
-    exchange = open_exchange(robot, robot.buses[0], port)
+    exchange = DynamixelDriver().open_exchange(robot, robot.buses[0], port)
     for device_id in _IDS:
         exchange.wire.write(device_id, _RETURN_DELAY, b"\0")
     goals = {device_id: _CENTRE.to_bytes(_GOAL_SIZE, "little") for device_id in _IDS}
@@ -145,7 +145,7 @@ def _driver(robot_file: Path, port: str, fast: bool) -> Iterator[Cycle]:
     def cycle() -> None:
         exchange.cycle()
         exchange.wire.sync_write(_GOAL, goals)
-        answers.count(all_there=not any(axis.silent or axis.doubted for axis in exchange.axes))
+        answers.count(all_there=not any(axis.silent or axis.doubted for axis in exchange.devices))
 
     answers = Answers()
     try:

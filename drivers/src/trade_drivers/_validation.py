@@ -1,12 +1,12 @@
-"""What every driver asks of the numbers it is given, before anything is sent."""
+"""What every driver checks before anything is sent: the numbers it is given, and that its library is installed."""
 
 from collections.abc import Sequence
 from math import isfinite
 from typing import Final
 
-from trade.errors import InvalidArgument, LimitExceeded
+from trade.errors import ConfigurationError, InvalidArgument, LimitExceeded
 
-__all__ = ["LONGEST_VALID_S", "finite", "one_each", "valid", "within"]
+__all__ = ["LONGEST_VALID_S", "finite", "not_installed", "one_each", "valid", "within"]
 
 LONGEST_VALID_S: Final = 1.0
 """No set-point holds longer without being renewed."""
@@ -40,3 +40,9 @@ def within(value: float, lower: float, upper: float, what: str, unit: str) -> fl
     if not lower <= value <= upper:
         raise LimitExceeded(what=what, value=value, lower=lower, upper=upper, unit=unit)
     return value
+
+
+def not_installed(driver: str, library: str, missing: ImportError) -> ConfigurationError:
+    """The error of a driver whose library is missing, with its remedy."""
+    problem = f'needs {library} ({missing}); pip install "trade-drivers[{driver}]"'
+    return ConfigurationError(where=f"driver {driver}", problem=problem)

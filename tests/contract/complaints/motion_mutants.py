@@ -26,7 +26,7 @@ def enabling_wants_no_fault(patch: pytest.MonkeyPatch) -> None:
     steps = Enable.steps
 
     def strict(self: Enable) -> Iterator[None]:
-        for axis in self.axes:
+        for axis in self.devices:
             if axis.fault:
                 raise axis.faulty()
         yield from steps(self)
@@ -54,20 +54,20 @@ def the_last_speed_holds_for_ever(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(SetPoint, "watch", lambda self, now_ns: None)
 
 
-def _torque_alone(address: int) -> Callable[..., Iterator[None]]:
+def _torque_alone(register: Any) -> Callable[..., Iterator[None]]:
     def enabling(bus: Any, job: Any, axis: Any) -> Iterator[None]:
-        yield from told(bus, job, axis, address, b"\x01")
+        yield from told(bus, job, axis, register, 1)
         axis.fault, axis.ready = "", True
 
     return enabling
 
 
 def enabling_a_dynamixel_writes_torque_alone(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr("trade_drivers.vendors.dynamixel._jobs.enabling", _torque_alone(dynamixel.TORQUE_ENABLE.address))
+    patch.setattr("trade_drivers.vendors.dynamixel._jobs.enabling", _torque_alone(dynamixel.TORQUE_ENABLE))
 
 
 def enabling_a_feetech_writes_torque_alone(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr("trade_drivers.vendors.feetech._jobs.enabling", _torque_alone(feetech.TORQUE.address))
+    patch.setattr("trade_drivers.vendors.feetech._jobs.enabling", _torque_alone(feetech.TORQUE))
 
 
 def a_course_begins_at_zero(patch: pytest.MonkeyPatch) -> None:
@@ -85,7 +85,7 @@ def a_port_that_was_lost_is_not_opened_again(patch: pytest.MonkeyPatch) -> None:
 def two_motions_have_one_joint(patch: pytest.MonkeyPatch) -> None:
     def take_over(self: Exchange, motion: Motion) -> None:
         motion.attended_ns = self.lasting_clock()
-        for axis in motion.axes:
+        for axis in motion.devices:
             axis.motion, axis.still, axis.halting_since_ns = motion, 0, 0
 
     patch.setattr(Exchange, "take_over", take_over)

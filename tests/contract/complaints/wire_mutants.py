@@ -20,7 +20,7 @@ from trade_drivers.vendors.cia402._table import Entry
 from trade_drivers.vendors.damiao._axis import DamiaoAxis
 from trade_drivers.vendors.damiao._frames import Feedback
 from trade_drivers.vendors.dynamixel import _table as dynamixel
-from trade_drivers.vendors.dynamixel._sdk import Wire as DynamixelWire
+from trade_drivers.vendors.dynamixel._wire import Wire as DynamixelWire
 from trade_drivers.vendors.feetech._wire import Wire as FeetechWire
 
 
@@ -52,7 +52,7 @@ def a_motors_frame_is_unpacked_unseen(patch: pytest.MonkeyPatch) -> None:
 
 
 def nobody_compares_the_model(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr("trade_drivers.vendors.feetech._inspect.check_model", lambda *_: None)
+    patch.setattr("trade_drivers.joints.serial._inspect.check_model", lambda *_: None)
 
 
 def nobody_compares_the_serial_number(patch: pytest.MonkeyPatch) -> None:

@@ -117,7 +117,7 @@ def _pieces(data: bytes) -> Iterator[bytes]:
 def _cia402_axis(data: bytes) -> DriveAxis:
     axis = DriveAxis("rosie.leg", "can0", _LEG, 100.0)
     for number, piece in enumerate(_pieces(data), 1):
-        axis.awaited_ns = number
+        axis.asked_ns = number
         axis.silent = bool(number % 5 == 0)
         for take in (axis.take_status, axis.take_motion, axis.take_emergency):
             take(piece)

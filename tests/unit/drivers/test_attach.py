@@ -208,7 +208,7 @@ def test_a_missing_vendor_library_is_named_with_the_command_that_installs_it(
             raise ModuleNotFoundError("No module named 'dynamixel_sdk'")
         return real(name, *args, **kwargs)
 
-    monkeypatch.delitem(sys.modules, "trade_drivers.vendors.dynamixel._sdk", raising=False)
+    monkeypatch.delitem(sys.modules, "trade_drivers.vendors.dynamixel._wire", raising=False)
     monkeypatch.setattr(builtins, "__import__", without)
     assert "needs dynamixel-sdk" in (text := refused(head))
     assert 'pip install "trade-drivers[dynamixel]"' in text

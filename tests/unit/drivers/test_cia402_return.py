@@ -134,7 +134,7 @@ def test_a_driver_that_was_held_up_does_not_take_its_drives_for_silent(
 
     monkeypatch.setattr(exchange, "cycle", late_cycle)
     wait_until(held_up.is_set, "the cycle was late")
-    assert not any(axis.silent for axis in exchange.drives)
+    assert not any(axis.silent for axis in exchange.devices)
     wait_until(lambda: not is_silent(robot.motor("leg.hip")), "it was measured")
     assert robot.group("leg").move_to([0.1, 0.1]) == pytest.approx([0.1, 0.1], abs=0.01)
     assert len(rig.frames("nmt")) == attached

@@ -15,7 +15,7 @@ from trade import permit
 from trade.errors import BusGone, DeviceFault, DeviceSilent
 from trade_drivers import AttachedRobot, MotorState
 from trade_drivers.joints._jobs import Enable, Relax
-from trade_drivers.vendors.dynamixel import open_exchange
+from trade_drivers.vendors.dynamixel import DynamixelDriver
 
 COUNT_RAD = 6.283185 / 4096
 
@@ -255,20 +255,20 @@ def test_a_hardware_error_ends_the_move_and_is_named(head: Rig, robot: AttachedR
 
 
 def test_health_that_is_read_while_a_joint_is_being_relaxed_is_no_fault(head: Rig) -> None:
-    exchange = open_exchange(head.robot, head.robot.buses[0], str(head.sim.port))
+    exchange = DynamixelDriver().open_exchange(head.robot, head.robot.buses[0], str(head.sim.port))
     exchange.period_ns = 0  # one step of its work in each cycle
     try:
         for kind in (Enable, Relax):
-            with permit([axis.resource for axis in exchange.axes]) as permitted:
-                job = kind(exchange, exchange.axes, service="test", expires_ns=2**63, permit=permitted)
+            with permit([axis.resource for axis in exchange.devices]) as permitted:
+                job = kind(exchange, exchange.devices, service="test", expires_ns=2**63, permit=permitted)
                 exchange.submit(job)
                 while not job.ended:
-                    for axis in exchange.servos:
+                    for axis in exchange.devices:
                         axis.health_due_ns = 2**63
-                    exchange.servos[0].health_due_ns = 0  # it is looked at in every cycle
+                    exchange.devices[0].health_due_ns = 0  # it is looked at in every cycle
                     exchange.cycle()
             job.wait(lambda: True)
-        assert not any(axis.fault for axis in exchange.axes)
+        assert not any(axis.fault for axis in exchange.devices)
     finally:
         exchange.wire.close()
 

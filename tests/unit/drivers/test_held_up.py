@@ -23,7 +23,7 @@ from tests.unit.drivers.tail_rig import COUNTS_PER_RAD as TAIL_COUNTS
 from tests.unit.drivers.tail_rig import TailRig, goal_of
 from trade.errors import DeviceFault, MotionStopped
 from trade_drivers import JointGroup, Motor, Tolerances, Trajectory, TrajectoryPoint
-from trade_drivers.joints import Job, Steps
+from trade_drivers.joints import Steps, Work
 
 SPEED_RAD_S = 0.5
 WATCHDOG_S = 0.4
@@ -33,11 +33,12 @@ MOST_RAD = SPEED_RAD_S * WATCHDOG_S + 0.06
 """As far as a joint gets until its watchdog stops it, and while it brakes; at its speed it would get 0.7 rad."""
 
 
-class _HoldUp(Job):
+class _HoldUp(Work[Any]):
     """Work in the middle of a cycle, after its measurements, that does not come back until it is let go."""
 
     def __init__(self, motor: Any) -> None:
-        super().__init__(motor._exchange, motor._axes)
+        super().__init__(motor._axes)
+        self.exchange = motor._exchange
         self.reached, self.go = threading.Event(), threading.Event()
 
     def steps(self) -> Steps:

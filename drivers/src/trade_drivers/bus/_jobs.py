@@ -3,13 +3,17 @@
 import threading
 from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
-from typing import Final, Generic, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Final, Generic, Protocol, TypeVar
 
 from trade import Permit, current_call
 from trade.errors import DeadlineExceeded, DeviceFault, TradeError
 
+if TYPE_CHECKING:
+    from trade_drivers.bus._cycle import BusCycle
+
 __all__ = [
     "TAKEN",
+    "Command",
     "Device",
     "Gate",
     "NoAnswer",
@@ -18,7 +22,6 @@ __all__ = [
     "Steps",
     "WireError",
     "Work",
-    "check_admitted",
     "losing",
 ]
 
@@ -80,6 +83,7 @@ class Device(Protocol):
 
 
 _Device_co = TypeVar("_Device_co", bound=Device, covariant=True)
+_Cycle_co = TypeVar("_Cycle_co", bound="BusCycle[Any]", covariant=True)
 
 
 class Work(Generic[_Device_co]):
@@ -148,14 +152,42 @@ class Work(Generic[_Device_co]):
             raise self._error
 
 
-def check_admitted(service: str, permit: Permit, *, admitted_ns: int, expires_ns: int, now_ns: int) -> None:
-    """The last look at a command before its bytes go out.
+class Command(Work[_Device_co], Generic[_Device_co, _Cycle_co]):
+    """A command that may start motion: it expires, and its call was admitted under a permit."""
 
-    Raises:
-        DeadlineExceeded: it is late, and late is never.
-        MotionStopped, LockLost, LockedByOther: a stop, or another owner, came after it was admitted.
-    """
-    if now_ns >= expires_ns:
-        patience_s = (expires_ns - admitted_ns) / 1e9
-        raise DeadlineExceeded(service=service, deadline_s=max(0.0, patience_s))
-    permit.gate()
+    def __init__(
+        self,
+        exchange: _Cycle_co,
+        devices: Sequence[_Device_co],
+        *,
+        service: str,
+        expires_ns: int,
+        permit: Permit,
+    ) -> None:
+        super().__init__(devices)
+        self._exchange = exchange
+        self.service = service
+        self.expires_ns = expires_ns
+        self.permit = permit
+        self._admitted_ns = exchange.clock()
+
+    @property
+    def exchange(self) -> _Cycle_co:
+        """The bus it is carried out on."""
+        return self._exchange
+
+    def gate(self) -> None:
+        """The last look before its bytes go out.
+
+        Raises:
+            DeadlineExceeded: it is late, and late is never.
+            MotionStopped, LockLost, LockedByOther: a stop, or another owner, came after it was admitted.
+        """
+        if self._exchange.clock() >= self.expires_ns:
+            raise self.expired()
+        self.permit.gate()
+
+    def expired(self) -> DeadlineExceeded:
+        """The error of a command that came too late to be carried out."""
+        patience_s = max(0.0, (self.expires_ns - self._admitted_ns) / 1e9)
+        return DeadlineExceeded(service=self.service, deadline_s=patience_s)

@@ -4,6 +4,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from functools import partial
 from typing import Any, Final, Generic, Protocol, TypeVar
 
@@ -15,7 +16,7 @@ from trade_drivers.bus._jobs import Device, PortLost, PortOpening
 from trade_drivers.faults import Tell
 from trade_drivers.robotfile import Bus
 
-__all__ = ["BusThread", "Port"]
+__all__ = ["BusThread", "Port", "start_thread"]
 
 _log = logging.getLogger("trade")
 _REOPEN_FIRST_S: Final = 0.1
@@ -220,3 +221,18 @@ class BusThread(Generic[_Exchange_co]):
 
     def _unhealthy(self, device: Device) -> TradeError:
         return device.faulty("its driver's process is not healthy")
+
+
+_Exchange = TypeVar("_Exchange", bound=BusCycle[Any])
+
+
+def start_thread(
+    exchange: _Exchange, wire: Port, robot: str, bus: Bus, healthy: Callable[[], bool]
+) -> BusThread[_Exchange]:
+    """Start the owner thread of a bus whose port is open; the port is closed if that fails."""
+    with ExitStack() as undo:
+        undo.callback(wire.close)
+        thread = BusThread(exchange, wire, bus, healthy, name=f"bus {robot}.{bus.name}")
+        thread.start()
+        undo.pop_all()
+    return thread

@@ -1,10 +1,11 @@
 """Joints with a position drive on a bus: what drivers of every vendor have in common, one owner thread a bus."""
 
-from trade_drivers.bus._jobs import Gate, PortLost, Steps
-from trade_drivers.bus._thread import BusThread, Port
-from trade_drivers.joints._axis import Axis, Goal, Grain, Sample
+from trade_drivers.bus._jobs import Gate, PortLost, Steps, Work
+from trade_drivers.bus._thread import BusThread, Port, start_thread
+from trade_drivers.joints._axis import Axis, AxisT, Goal, Grain, Sample
 from trade_drivers.joints._cycle import Exchange
-from trade_drivers.joints._jobs import Job, Manner
+from trade_drivers.joints._inspect import Unfit, check_joints, check_least, check_rate
+from trade_drivers.joints._jobs import Manner
 from trade_drivers.joints._motion import Motion
 from trade_drivers.joints._motor import AttachedJoints, BusMotor
 from trade_drivers.joints._ramp import Ramp, towards
@@ -13,13 +14,13 @@ from trade_drivers.joints._waiting import next_measurement, until
 __all__ = [
     "AttachedJoints",
     "Axis",
+    "AxisT",
     "BusMotor",
     "BusThread",
     "Exchange",
     "Gate",
     "Goal",
     "Grain",
-    "Job",
     "Manner",
     "Motion",
     "Port",
@@ -27,7 +28,13 @@ __all__ = [
     "Ramp",
     "Sample",
     "Steps",
+    "Unfit",
+    "Work",
+    "check_joints",
+    "check_least",
+    "check_rate",
     "next_measurement",
+    "start_thread",
     "towards",
     "until",
 ]

@@ -4,7 +4,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from math import ceil, floor
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from msgspec import Struct
 
@@ -16,7 +16,10 @@ from trade_drivers.robotfile import Joint
 if TYPE_CHECKING:
     from trade_drivers.joints._motion import Motion
 
-__all__ = ["Axis", "Goal", "Grain", "Sample", "Scale"]
+__all__ = ["Axis", "AxisT", "Goal", "Grain", "Sample", "Scale"]
+
+AxisT = TypeVar("AxisT", bound="Axis")
+"""The axis type of one vendor."""
 
 _AT_REST: Final = 2
 
@@ -108,7 +111,7 @@ class Axis(ABC):
         """What helps against a fault the device itself has latched."""
         self.ready = False
         """Enabled by this driver, which has checked and armed it since."""
-        self.motion: Motion | None = None
+        self.motion: Motion[Any] | None = None
         self.halting_since_ns = 0
         """When it was told to hold; 0 once it was seen at rest."""
         self.held_ns = 0

@@ -4,19 +4,18 @@ from collections.abc import Sequence
 from enum import Enum
 from typing import TYPE_CHECKING
 
-from trade import Permit
 from trade.errors import TradeError
-from trade_drivers.bus._jobs import Steps, Work, check_admitted
-from trade_drivers.joints._axis import Axis
+from trade_drivers.bus._jobs import Command, Steps, Work
+from trade_drivers.joints._axis import AxisT
 
 if TYPE_CHECKING:
     from trade_drivers.joints._cycle import Exchange
 
-__all__ = ["Command", "Enable", "Halt", "Job", "Leave", "Manner", "Relax", "Steps"]
+__all__ = ["Enable", "Halt", "Leave", "Manner", "Relax"]
 
 
 class Manner(Enum):
-    """What a job is going to tell its joints, for devices that have a mode for each."""
+    """What a motion is going to tell its joints, for devices that have a mode for each."""
 
     GOALS = "goals"
     """Where to go, now and then."""
@@ -26,47 +25,11 @@ class Manner(Enum):
     """How fast to turn, and where to end at the latest."""
 
 
-class Job(Work[Axis]):
-    """Something that is waited for. As it stands it needs no leave: it ends motion."""
-
-    manner = Manner.GOALS
-
-    def __init__(self, exchange: "Exchange", axes: Sequence[Axis]) -> None:
-        super().__init__(axes)
-        self.exchange = exchange
-        self.axes = tuple(axes)
-
-
-class Command(Job):
-    """What may set something moving: it carries an expiry, and the permit under which its call was admitted."""
-
-    def __init__(
-        self, exchange: "Exchange", axes: Sequence[Axis], *, service: str, expires_ns: int, permit: Permit
-    ) -> None:
-        super().__init__(exchange, axes)
-        self.service = service
-        self.expires_ns = expires_ns
-        self.permit = permit
-        self._admitted_ns = exchange.clock()
-
-    def gate(self) -> None:
-        """The last look before its bytes go out.
-
-        Raises:
-            DeadlineExceeded: it is late, and late is never.
-            MotionStopped, LockLost, LockedByOther: a stop, or another owner, came after it was admitted.
-        """
-        now_ns = self.exchange.clock()
-        check_admitted(
-            self.service, self.permit, admitted_ns=self._admitted_ns, expires_ns=self.expires_ns, now_ns=now_ns
-        )
-
-
-class Enable(Command):
+class Enable(Command[AxisT, "Exchange[AxisT]"]):
     """Torque on, holding where the joints are. A joint that is enabled already is only looked at, not disturbed."""
 
     def steps(self) -> Steps:
-        for axis in self.axes:
+        for axis in self.devices:
             if axis.ready:
                 yield from self.exchange.looking(axis)
             if not axis.ready:
@@ -74,22 +37,22 @@ class Enable(Command):
         self.note("torque on, read back")
 
 
-class Halt(Command):
+class Halt(Command[AxisT, "Exchange[AxisT]"]):
     """Whatever moves the joints ends, and they hold; unlike a stop it needs leave and makes nothing void."""
 
     def steps(self) -> Steps:
         self.gate()
-        self.exchange.halt(self.axes, f"{self.service} said so")
+        self.exchange.halt(self.devices, f"{self.service} said so")
         yield
-        for axis in self.axes:
+        for axis in self.devices:
             self.exchange.require_answering(axis)
 
 
-class Relax(Command):
+class Relax(Command[AxisT, "Exchange[AxisT]"]):
     """Torque off."""
 
     def steps(self) -> Steps:
-        for axis in self.axes:
+        for axis in self.devices:
             self.exchange.require_answering(axis)
             self.gate()
             self.exchange.end_motion(axis, f"{axis.name} was relaxed")
@@ -97,22 +60,23 @@ class Relax(Command):
         self.note("torque off")
 
 
-class Leave(Job):
+class Leave(Work[AxisT]):
     """The driver goes, after it has stopped everything: hold or relax, as the robot file says.
 
     A joint that holds is disarmed once it was seen at rest: silence on the bus is then what is wanted, and an expired
     watchdog would only hinder whoever comes next. Not seen at rest, or silent: its watchdog stays armed.
     """
 
-    def __init__(self, exchange: "Exchange", axes: Sequence[Axis], *, relax: bool) -> None:
-        super().__init__(exchange, axes)
+    def __init__(self, exchange: "Exchange[AxisT]", axes: Sequence[AxisT], *, relax: bool) -> None:
+        super().__init__(axes)
+        self._exchange = exchange
         self._relax = relax
 
     def steps(self) -> Steps:
-        for axis in self.axes:
+        for axis in self.devices:
             if axis.silent:
                 continue
             try:
-                yield from self.exchange.leaving(self, axis, relax=self._relax)
+                yield from self._exchange.leaving(self, axis, relax=self._relax)
             except TradeError as problem:
                 self.finish(problem)

@@ -1,17 +1,19 @@
 """Motor and JointGroup on a bus: they check, hand over to the bus thread, wait, and never touch the port."""
 
 from collections.abc import Sequence
+from typing import Any, Generic, TypeVar
 
 from trade import Measure, Resource, permit
 from trade.errors import DeviceError, DeviceSilent, LimitExceeded
 from trade_drivers._validation import finite, one_each, valid, within
 from trade_drivers.bus._deadlines import expiry, span
+from trade_drivers.bus._jobs import Command
 from trade_drivers.bus._thread import BusThread
 from trade_drivers.faults import Tell
 from trade_drivers.interfaces._motion import JointGroup, JointLimits, Motor, MotorState
-from trade_drivers.joints._axis import Axis
+from trade_drivers.joints._axis import Axis, AxisT
 from trade_drivers.joints._cycle import Exchange
-from trade_drivers.joints._jobs import Command, Enable, Halt, Manner, Relax
+from trade_drivers.joints._jobs import Enable, Halt, Manner, Relax
 from trade_drivers.joints._motion import Move
 from trade_drivers.joints._setpoint import SetPoint
 from trade_drivers.joints._trajectory_run import Follow
@@ -21,10 +23,13 @@ from trade_drivers.plugins._driver import AttachedBus
 __all__ = ["AttachedJoints", "BusGroup", "BusMotor"]
 
 
-class _Joints:
+_Exchange = TypeVar("_Exchange", bound=Exchange[Any])
+
+
+class _Joints(Generic[AxisT, _Exchange]):
     """What one motor and a group have in common: a bus and some of its joints."""
 
-    def __init__(self, name: str, thread: BusThread[Exchange], axes: Sequence[Axis]) -> None:
+    def __init__(self, name: str, thread: BusThread[_Exchange], axes: Sequence[AxisT]) -> None:
         self._name = name
         self._thread = thread
         self._exchange = thread.exchange
@@ -43,13 +48,13 @@ class _Joints:
     def relax(self) -> None:
         self._do(Relax, "relax")
 
-    def _do(self, kind: type[Enable | Relax | Halt], name: str) -> None:
+    def _do(self, kind: type[Enable[AxisT] | Relax[AxisT] | Halt[AxisT]], name: str) -> None:
         expires_ns, _ = expiry(self._exchange.clock)
         service = f"{self._name}.{name}"
         with permit(self.resources) as permitted:
             self._finish(kind(self._exchange, self._axes, service=service, expires_ns=expires_ns, permit=permitted))
 
-    def _finish(self, job: Command) -> None:
+    def _finish(self, job: Command[AxisT, Any]) -> None:
         self._exchange.submit(job)
         job.wait(self._thread.alive)
 
@@ -123,7 +128,7 @@ class _Joints:
         ]
 
 
-class BusMotor(_Joints, Motor):
+class BusMotor(_Joints[AxisT, _Exchange], Motor):
     """One joint as a motor."""
 
     def state(self) -> MotorState:
@@ -146,7 +151,7 @@ class BusMotor(_Joints, Motor):
         self._set(ends, speeds, service, valid_s, Manner.SPEEDS)
 
 
-class BusGroup(_Joints, JointGroup):
+class BusGroup(_Joints[Axis, Exchange[Any]], JointGroup):
     """Joints of one bus as a group."""
 
     def joints(self) -> list[str]:
@@ -181,9 +186,9 @@ class BusGroup(_Joints, JointGroup):
 class AttachedJoints(AttachedBus):
     """A bus with its joints, and the thread that owns it."""
 
-    def __init__(self, thread: BusThread[Exchange], motor: type[BusMotor] = BusMotor) -> None:
+    def __init__(self, thread: BusThread[Exchange[Any]], motor: type[BusMotor[Any, Any]] = BusMotor) -> None:
         self._thread, self._motor = thread, motor
-        self._axes = {axis.joint.name: axis for axis in thread.exchange.axes}
+        self._axes = {axis.joint.name: axis for axis in thread.exchange.devices}
 
     def motor(self, joint: str) -> Motor:
         axis = self._axes[joint]

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 from trade import Permit
 from trade.errors import TradeError
-from trade_drivers.joints._axis import Axis, Goal
+from trade_drivers.joints._axis import AxisT, Goal
 from trade_drivers.joints._jobs import Manner
 from trade_drivers.joints._motion import Motion
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 __all__ = ["SetPoint"]
 
 
-class SetPoint(Motion):
+class SetPoint(Motion[AxisT]):
     """Goals in counts and the speed to go there; whoever waits for it is let go as soon as it is on the wire.
 
     Each renewal is a set-point of its own, admitted anew, that takes over from the one before.
@@ -23,8 +23,8 @@ class SetPoint(Motion):
 
     def __init__(
         self,
-        exchange: "Exchange",
-        axes: Sequence[Axis],
+        exchange: "Exchange[AxisT]",
+        axes: Sequence[AxisT],
         goals: Sequence[int],
         speeds: Sequence[int],
         *,
@@ -40,13 +40,13 @@ class SetPoint(Motion):
         self._until_ns = until_ns
         self.manner = manner
 
-    def goal_of(self, axis: Axis) -> int:
+    def goal_of(self, axis: AxisT) -> int:
         return self._goals[axis]
 
     def launch(self) -> None:
         now_ns = self.exchange.clock()
-        goals: dict[Axis, Goal] = {}
-        for axis in self.axes:
+        goals: dict[AxisT, Goal] = {}
+        for axis in self.devices:
             axis.check_usable(now_ns, self.exchange.stale_after_ns)
             axis.check_goal(self._goals[axis])
             goals[axis] = Goal(self._goals[axis], axis.accel_counts, self._speeds[axis])

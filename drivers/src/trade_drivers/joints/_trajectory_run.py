@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Final
 from trade import Permit
 from trade.errors import ConfigurationError, MotionStopped, ToleranceExceeded, TradeError
 from trade_drivers.bus._jobs import Steps
-from trade_drivers.joints._axis import Axis, Goal
+from trade_drivers.joints._axis import AxisT, Goal
 from trade_drivers.joints._jobs import Manner
 from trade_drivers.joints._motion import Motion
 from trade_drivers.motion._plan import Plan
@@ -21,7 +21,7 @@ _VALID_NS: Final = 200_000_000
 _FOREVER_NS: Final = 2**63
 
 
-class Follow(Motion):
+class Follow(Motion[AxisT]):
     """A plan for some joints of this bus.
 
     A device that goes from position to position is sent where it should be when it gets there. Any other brakes in
@@ -33,8 +33,8 @@ class Follow(Motion):
 
     def __init__(
         self,
-        exchange: "Exchange",
-        axes: Sequence[Axis],
+        exchange: "Exchange[AxisT]",
+        axes: Sequence[AxisT],
         plan: Plan,
         *,
         service: str,
@@ -46,18 +46,20 @@ class Follow(Motion):
         self._plan = plan
         self._curves = {axis: track.curve for axis, track in zip(axes, plan.tracks, strict=True)}
         self._until_ns = until_ns
-        self._goals: dict[Axis, int] = {}
+        self._goals: dict[AxisT, int] = {}
         self._told_ns = 0
         """When the joints' goals were last what was due."""
         self.final_rad: list[float] = []
 
-    def goal_of(self, axis: Axis) -> int:
+    def goal_of(self, axis: AxisT) -> int:
         return self._goals[axis]
 
     def gate(self) -> None:
         super().gate()
         if (failed := self._plan.course.failed) is not None:
-            raise MotionStopped(device=self.axes[0].name, reason=f"another bus of its group could not go on: {failed}")
+            raise MotionStopped(
+                device=self.devices[0].name, reason=f"another bus of its group could not go on: {failed}"
+            )
 
     def steps(self) -> Steps:
         self._check_rate()
@@ -65,7 +67,7 @@ class Follow(Motion):
 
     def launch(self) -> None:
         exchange, now_ns = self.exchange, self.exchange.clock()
-        for axis in self.axes:
+        for axis in self.devices:
             axis.check_usable(now_ns, exchange.stale_after_ns)
             if problem := self._astray(axis, "start", self._plan.tolerances.start_rad):
                 raise problem
@@ -84,7 +86,7 @@ class Follow(Motion):
             if ending := self.trouble(now_ns, self._until_ns) or self._trouble(now_ns):
                 raise ending
             if self._over():
-                self.final_rad = [axis.scale.angle_rad(axis.sample.position) for axis in self.axes if axis.sample]
+                self.final_rad = [axis.scale.angle_rad(axis.sample.position) for axis in self.devices if axis.sample]
                 self.exchange.release(self, None)
                 return
             self._send(now_ns)
@@ -94,26 +96,26 @@ class Follow(Motion):
 
     def _check_rate(self) -> None:
         """Raises ``ConfigurationError`` where goals cannot follow each other as fast as they must."""
-        exchange, cycles = self.exchange, self.exchange.cycles_a_goal(self.axes)
+        exchange, cycles = self.exchange, self.exchange.cycles_a_goal(self.devices)
         if (every_ns := cycles * exchange.period_ns) > _VALID_NS:
             problem = f"its joints take a goal every {every_ns / 1e9:.2g} s; a trajectory needs one every 0.2 s"
             needed = f"give the bus a rate_hz of {cycles * 1e9 / _VALID_NS:g} or more"
-            raise ConfigurationError(where=f"bus {self.axes[0].bus}", problem=f"{problem}; {needed}")
+            raise ConfigurationError(where=f"bus {self.devices[0].bus}", problem=f"{problem}; {needed}")
 
     def _send(self, now_ns: int) -> None:
         goals = self._due(now_ns)
         if goals != self._goals:
-            if not self.exchange.can_take_goals(self.axes):
+            if not self.exchange.can_take_goals(self.devices):
                 return
             self.exchange.write_positions(goals, self.gate)
             self._goals = goals
         self._told_ns = now_ns
 
-    def _due(self, now_ns: int) -> dict[Axis, int]:
+    def _due(self, now_ns: int) -> dict[AxisT, int]:
         """The goals of this moment, in counts; within the range of each joint, or of where it comes in from."""
-        reached_ns = self.exchange.reached_ns(self.axes)
+        reached_ns = self.exchange.reached_ns(self.devices)
         elapsed_s = self._plan.course.elapsed_s(now_ns if reached_ns is None else reached_ns)
-        goals: dict[Axis, int] = {}
+        goals: dict[AxisT, int] = {}
         for axis, curve in self._curves.items():
             position, velocity = curve.at(elapsed_s)
             braking = velocity * abs(velocity) / (2 * axis.joint.max_accel_rad_s2) if reached_ns is None else 0.0
@@ -125,24 +127,24 @@ class Follow(Motion):
     def _trouble(self, now_ns: int) -> TradeError | None:
         if (held_up_ns := now_ns - self._told_ns) > _VALID_NS:
             reason = f"its bus was held up, or took no goal: for {held_up_ns / 1e9:.2g} s nothing told it where to go"
-            return MotionStopped(device=self.axes[0].name, reason=reason)
+            return MotionStopped(device=self.devices[0].name, reason=reason)
         tolerance_rad = self._plan.tolerances.path_rad
-        return next((problem for axis in self.axes if (problem := self._astray(axis, "path", tolerance_rad))), None)
+        return next((problem for axis in self.devices if (problem := self._astray(axis, "path", tolerance_rad))), None)
 
     def _over(self) -> bool:
         """Whether all were measured at rest at the end; raises if they had the time to be and were not."""
-        seen_ns = min(axis.sample.at_ns if axis.sample else 0 for axis in self.axes)
+        seen_ns = min(axis.sample.at_ns if axis.sample else 0 for axis in self.devices)
         late_s = self._plan.course.elapsed_s(seen_ns) - self._plan.course.duration_s
         if late_s < 0:
             return False
         tolerances = self._plan.tolerances
-        off = [problem for axis in self.axes if (problem := self._astray(axis, "goal", tolerances.goal_rad))]
-        moving = [axis for axis in self.axes if axis.still < 2]
+        off = [problem for axis in self.devices if (problem := self._astray(axis, "goal", tolerances.goal_rad))]
+        moving = [axis for axis in self.devices if axis.still < 2]
         if late_s > tolerances.goal_time_s and (off or moving):
             raise off[0] if off else moving[0].faulty("it does not come to rest at the end of its trajectory")
         return not off and not moving
 
-    def _astray(self, axis: Axis, what: str, tolerance_rad: float) -> ToleranceExceeded | None:
+    def _astray(self, axis: AxisT, what: str, tolerance_rad: float) -> ToleranceExceeded | None:
         """How far the newest measurement is from where the joint should have been then, if that is too far."""
         if (sample := axis.sample) is None:
             return None

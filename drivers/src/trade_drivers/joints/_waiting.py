@@ -4,7 +4,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Final
 
 from trade_drivers.bus._jobs import Steps
-from trade_drivers.joints._axis import Axis
+from trade_drivers.joints._axis import AxisT
 
 if TYPE_CHECKING:
     from trade_drivers.joints._cycle import Exchange
@@ -16,15 +16,15 @@ _CHANGE_NS: Final = 600_000_000
 _WAIT_S: Final = 0.001
 
 
-def next_measurement(bus: "Exchange", axis: Axis) -> Steps:
+def next_measurement(bus: "Exchange[AxisT]", axis: AxisT) -> Steps:
     """Wait for one that was asked for from now on."""
     since_ns = bus.clock()
     yield from until(bus, axis, lambda: axis.sample is not None and axis.sample.at_ns > since_ns, "it says nothing")
 
 
 def until(
-    bus: "Exchange",
-    axis: Axis,
+    bus: "Exchange[AxisT]",
+    axis: AxisT,
     condition: Callable[[], bool],
     otherwise: str,
     patience_ns: int = _CHANGE_NS,

@@ -1,26 +1,39 @@
 """One motor as the bus thread knows it: whether it is here, what was asked of it, what speaks against moving on."""
 
 from abc import abstractmethod
-from math import isfinite
+from math import isfinite, tau
+from typing import Final
 
-from trade_drivers.joints import Axis, Sample
+from trade_drivers.joints import Axis, Grain, Sample, Unfit
+from trade_drivers.robotfile import Joint
 
-__all__ = ["Another", "MotorAxis", "Unfit"]
+__all__ = ["Another", "MotorAxis", "grain_of"]
+
+_STILL_RAD_S: Final = 0.01
+_ARRIVED_RAD: Final = 0.004
+_NEAR_RAD: Final = 0.03
 
 
-class Unfit(Exception):
-    """A motor cannot be used as it is; what is wrong, and of which key of the joint."""
-
-    def __init__(self, problem: str, key: str = "") -> None:
-        super().__init__(problem)
-        self.key = key
+def grain_of(joint: Joint, rate_hz: float, counts_per_rev: float) -> Grain:
+    """What counts of a motor mean: positions in counts, speeds in counts a second, and so on."""
+    rad = tau / (counts_per_rev * joint.gear)
+    return Grain(
+        rad=rad,
+        rad_s=rad,
+        rad_s2=rad,
+        centre=0,
+        still_velocity=max(1, round(_STILL_RAD_S / rad)),
+        still_counts=max(1, round(_STILL_RAD_S / rate_hz / rad)),
+        arrived=max(2, round(_ARRIVED_RAD / rad)),
+        near=max(4, round(_NEAR_RAD / rad)),
+    )
 
 
 class Another(Unfit):
     """Another motor than the one the robot file names."""
 
-    def __init__(self, key: str, expected: str, found: str) -> None:
-        super().__init__(f"its {key} is {found}, not {expected}: it is another motor", f".{key}")
+    def __init__(self, key: str, expected: str, found: str, kind: str = "motor") -> None:
+        super().__init__(f"its {key} is {found}, not {expected}: it is another {kind}", f".{key}")
         self.expected, self.found = expected, found
 
 

@@ -1,9 +1,9 @@
 """Who is on a CAN bus of motors; their numbers are set by the vendor's tool, not from here."""
 
 from abc import abstractmethod
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
-from trade.errors import ConfigurationError
+from trade_drivers._validation import not_installed
 from trade_drivers.commissioning._commissioner import Bench, Commissioner
 
 if TYPE_CHECKING:
@@ -18,16 +18,16 @@ class CanMotorCommissioner(Commissioner):
     wire = "can"
     bauds = (1_000_000,)
     """The system sets the rate of an interface; frames at another one would disturb who talks there."""
+    libraries: ClassVar[str] = "python-can"
     ports = "is the interface up? `ip link show type can` shows those there are"
 
     @abstractmethod
     def bench(self) -> "type[CanBench]":
-        """Raises ImportError where python-can is missing."""
+        """Raises ImportError where a library is missing."""
 
     def open(self, port: str, baud: int) -> Bench:
         try:
             bench = self.bench()
         except ImportError as missing:
-            problem = f'needs python-can ({missing}); pip install "trade-drivers[{self.driver}]"'
-            raise ConfigurationError(where=f"driver {self.driver}", problem=problem) from None
+            raise not_installed(self.driver, self.libraries, missing) from None
         return bench.open(port, baud)

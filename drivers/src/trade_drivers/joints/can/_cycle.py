@@ -2,15 +2,14 @@
 
 import logging
 import time
-from abc import abstractmethod
 from collections.abc import Callable, Generator, Sequence
-from typing import TYPE_CHECKING, Final, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Final, TypeVar
 
 from trade_drivers.bus._cycle import silences
 from trade_drivers.bus._jobs import NoAnswer
 from trade_drivers.bus.can import Frame, Listeners
-from trade_drivers.joints import Exchange, Steps
-from trade_drivers.joints.can._axis import MotorAxis, Unfit
+from trade_drivers.joints import Exchange, Steps, Unfit
+from trade_drivers.joints.can._axis import MotorAxis
 
 if TYPE_CHECKING:
     from trade_drivers.bus.can import CanPort
@@ -29,7 +28,7 @@ _FIRST: Final = 3
 _Axis = TypeVar("_Axis", bound=MotorAxis)
 
 
-def asked(bus: "MotorExchange[_Axis]", axis: MotorAxis, frames: Sequence[Frame], there: Callable[[], bool]) -> Steps:
+def asked(bus: "MotorExchange[Any]", axis: MotorAxis, frames: Sequence[Frame], there: Callable[[], bool]) -> Steps:
     """Send a question, and wait until the answer is there.
 
     Raises:
@@ -43,19 +42,20 @@ def asked(bus: "MotorExchange[_Axis]", axis: MotorAxis, frames: Sequence[Frame],
         yield
 
 
-class MotorExchange(Exchange, Generic[_Axis]):
+class MotorExchange(Exchange[_Axis]):
     """What happens on one bus of such motors."""
 
     deaf_ns: int
     """A motor of which nothing was heard for so long is left out."""
+    again_ns: ClassVar[int] = _AGAIN_NS
+    """How long a motor that is left out is not asked."""
 
     def __init__(
         self, port: "CanPort", bus: "CanBus", axes: Sequence[_Axis], clock: Callable[[], int] = time.monotonic_ns
     ) -> None:
         super().__init__(bus, axes, clock)
         self.port = port
-        self.motors = tuple(axes)
-        self.net = Listeners(port, between=self.serve_stops, meanwhile=self._admit)
+        self.net = Listeners(port, between=self.serve_stops, meanwhile=self.admit)
         self.problems: dict[_Axis, Exception] = {}
         """Why those that are away were not taken on when they were last looked over."""
         self._looks: dict[_Axis, Generator[None, None, None]] = {}
@@ -67,11 +67,10 @@ class MotorExchange(Exchange, Generic[_Axis]):
 
     # --- what a motor of this kind is asked, and how
 
-    @abstractmethod
     def question(self, axis: _Axis) -> Frame:
         """What makes it tell where it is; feeds its watchdog."""
+        raise NotImplementedError
 
-    @abstractmethod
     def look_over(self, axis: _Axis) -> Steps:
         """Find out who it is and whether it is fit; yields while an answer is awaited. Enables and moves nothing.
 
@@ -79,9 +78,13 @@ class MotorExchange(Exchange, Generic[_Axis]):
             Unfit: it cannot be used.
             NoAnswer: it does not answer.
         """
+        raise NotImplementedError
 
     def look_after(self, axis: _Axis) -> None:
         """What else is asked of it, and seen to, once in a cycle."""
+
+    def opened(self) -> None:
+        """Its port was opened for the first time, after listening to who talks there."""
 
     # --- from the bus thread
 
@@ -95,15 +98,16 @@ class MotorExchange(Exchange, Generic[_Axis]):
             self._listening_ns = began_ns
         self._began_ns = began_ns
         self.net.take_in(0.0)  # what came late is no answer to the next question
-        self._measure(began_ns)
+        self.measure(began_ns)
         self._listen(began_ns)
-        self._quieten(began_ns)
-        self._admit()
+        self.settle(began_ns)
+        self.admit()
         self.work(began_ns + self.period_ns // 2)
         self.watch()
 
-    def _measure(self, began_ns: int) -> None:
-        here = [axis for axis in self.motors if not axis.silent and not axis.hushed]
+    def measure(self, began_ns: int) -> None:
+        """Ask every motor where it is, and take in what they say."""
+        here = [axis for axis in self.devices if not axis.silent and not axis.hushed]
         for axis in here:
             axis.asked_ns = began_ns
         if here:
@@ -117,26 +121,26 @@ class MotorExchange(Exchange, Generic[_Axis]):
         """Who has not been heard for too long is left out, and looked over now and then whether it is back."""
         if now_ns - self._listening_ns <= self.stale_after_ns:
             return  # on a busy host it was this thread that was silent
-        for axis in self.motors:
+        for axis in self.devices:
             old = not axis.hushed and axis.age_ns(now_ns) > self.stale_after_ns
             if not axis.silent and (old or now_ns - axis.beat_ns > self.deaf_ns):
                 silences.warning("%s is not heard on %s", axis.name, axis.bus)
                 axis.forget(now_ns)
-                axis.probe_at_ns = now_ns + _AGAIN_NS
+                axis.probe_at_ns = now_ns + self.again_ns
 
-    def _quieten(self, now_ns: int) -> None:
+    def settle(self, now_ns: int) -> None:
         """What was moving when it was taken on is told to hold: nobody owns that motion."""
-        for axis in self.motors:
+        for axis in self.devices:
             if axis.stranger and not axis.silent and now_ns - axis.since_ns > _FIRST * self.period_ns:
                 axis.stranger = False
                 if axis.motion is None and axis.still == 0 and axis.may_hold_torque:
                     self.hold([axis], now_ns)
 
-    def _admit(self) -> None:
+    def admit(self) -> None:
         """Go on with those that are away; it never waits for them. An unhealthy process admits nobody (S06)."""
         if self.refusing is not None:
             return
-        for axis in self.motors:
+        for axis in self.devices:
             if axis.silent and self.clock() >= axis.probe_at_ns and not self.worked_on(axis):
                 self._look(axis)
 
@@ -160,6 +164,6 @@ class MotorExchange(Exchange, Generic[_Axis]):
     def forget_measurements(self) -> None:
         now_ns = self.clock()
         self._looks.clear()
-        for axis in self.motors:
+        for axis in self.devices:
             axis.forget(now_ns)
             axis.probe_at_ns = now_ns

@@ -2,16 +2,17 @@
 
 import time
 from abc import abstractmethod
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from contextlib import ExitStack
 from functools import partial
-from typing import TYPE_CHECKING, Any, ClassVar, Final
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, TypeVar
 
 from trade.errors import ConfigurationError, WrongDevice
+from trade_drivers._validation import not_installed
 from trade_drivers.bus._jobs import NoAnswer
 from trade_drivers.bus.can._monitor import CanMonitor
-from trade_drivers.joints import AttachedJoints, BusThread, PortLost
-from trade_drivers.joints.can._axis import Another, MotorAxis, Unfit
+from trade_drivers.joints import AttachedJoints, AxisT, BusMotor, BusThread, PortLost, Unfit, start_thread
+from trade_drivers.joints.can._axis import Another, MotorAxis
 from trade_drivers.plugins._driver import AttachedBus, Driver
 from trade_drivers.robotfile import Bus, CanBus, Joint, Robot
 
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
     from trade_drivers.bus.can import CanPort, Talk
     from trade_drivers.joints.can._cycle import MotorExchange
 
-__all__ = ["CanMotorDriver"]
+__all__ = ["AttachedMotors", "CanMotorDriver", "axes_of"]
 
 _PATIENCE_S: Final = 1.0
 """A motor that has just been switched on needs a moment before it answers."""
@@ -27,21 +28,27 @@ _FIRST_CYCLES: Final = 5
 """As many measurements as it takes to see whether a joint moves."""
 
 
-class CanMotorDriver(Driver):
+_Motor = TypeVar("_Motor", bound=MotorAxis)
+_Exchange = TypeVar("_Exchange", bound="MotorExchange[Any]")
+
+
+class CanMotorDriver(Driver, Generic[_Motor, _Exchange]):
     """One vendor's motors on a CAN bus, through python-can."""
 
     modules = ("can",)
     devices = (Joint,)
     name: ClassVar[str]
     models: ClassVar[Collection[str]]
-    """What it knows, as printed on them."""
+    """What it knows, as printed on them; empty: any."""
+    libraries: ClassVar[str] = "python-can"
 
     @abstractmethod
-    def exchange(self, robot: Robot, bus: CanBus, wire: "CanPort", port: str) -> "MotorExchange[Any]":
+    def exchange(self, robot: Robot, bus: CanBus, wire: "CanPort", port: str) -> _Exchange:
         """What the file alone can tell is checked; the port is not open yet. Raises ``ConfigurationError``."""
 
+    @staticmethod
     @abstractmethod
-    def orders(self, talk: "Talk", nodes: Collection[int]) -> Collection[int]:
+    def orders(talk: "Talk", nodes: Collection[int]) -> Collection[int]:
         """Identifiers among what was heard that only another driver sends, to these nodes or any."""
 
     def check(self, robot: Robot, bus: Bus) -> None:
@@ -49,13 +56,13 @@ class CanMotorDriver(Driver):
         self._built(robot, can, can.port)
 
     def attach(self, robot: Robot, bus: Bus, port: str, healthy: Callable[[], bool]) -> AttachedBus:
-        with ExitStack() as undo:
-            exchange = self.open_exchange(robot, bus := self._can(robot, bus), port)
-            undo.callback(exchange.port.close)
-            thread = BusThread(exchange, exchange.port, bus, healthy, name=f"bus {robot.name}.{bus.name}")
-            thread.start()
-            undo.pop_all()
-        return _AttachedMotors(thread, exchange.port)
+        exchange = self.open_exchange(robot, self._can(robot, bus), port)
+        thread = start_thread(exchange, exchange.port, robot.name, bus, healthy)
+        return AttachedMotors(thread, exchange.port, self.motor())
+
+    def motor(self) -> type[BusMotor[Any, Any]]:
+        """What its joints are handed out as."""
+        return BusMotor
 
     def _can(self, robot: Robot, bus: Bus) -> CanBus:
         if not isinstance(bus, CanBus):
@@ -63,19 +70,26 @@ class CanMotorDriver(Driver):
             raise ConfigurationError(where=f"{robot.where}: bus.{bus.name}", problem=problem)
         return bus
 
-    def _built(self, robot: Robot, bus: CanBus, port: str) -> "MotorExchange[Any]":
+    def _built(self, robot: Robot, bus: CanBus, port: str) -> _Exchange:
         """What it is driven by, out of the file; not open yet."""
         self._check_models(robot, bus)
         nodes = [joint.id for joint in robot.joints_on(bus.name)]
-        return self.exchange(robot, bus, self._wire(port, bus, f"{robot.where}: bus.{bus.name}", nodes), port)
+        try:
+            from trade_drivers.bus.can import CanPort  # noqa: PLC0415 - the libraries are optional
+
+            where = f"{robot.where}: bus.{bus.name}"
+            wire = CanPort.of(port, bus, where, partial(self.orders, nodes=nodes))
+            return self.exchange(robot, bus, wire, port)
+        except ImportError as missing:
+            raise not_installed(self.name, self.libraries, missing) from None
 
     def _check_models(self, robot: Robot, bus: CanBus) -> None:
         for joint in robot.joints_on(bus.name):
-            if joint.model not in self.models:
+            if self.models and joint.model not in self.models:
                 problem = f"{joint.model!r} is none of {', '.join(self.models)}"
                 raise ConfigurationError(where=f'{robot.where}: joint."{joint.name}".model', problem=problem)
 
-    def open_exchange(self, robot: Robot, bus: CanBus, port: str) -> "MotorExchange[Any]":
+    def open_exchange(self, robot: Robot, bus: CanBus, port: str) -> _Exchange:
         """Open the port and look every motor over, without a thread: ``cycle()`` is the caller's to call.
 
         Raises:
@@ -88,6 +102,7 @@ class CanMotorDriver(Driver):
             undo.callback(wire.close)
             try:
                 wire.open()
+                exchange.opened()
                 self._bring_in(exchange, robot.where)
             except PortLost as lost:
                 problem = f"{port}: {lost}; is the interface up? `ip link` shows those there are"
@@ -95,27 +110,24 @@ class CanMotorDriver(Driver):
             undo.pop_all()
         return exchange
 
-    def _wire(self, port: str, bus: CanBus, where: str, nodes: Collection[int]) -> "CanPort":
-        try:
-            from trade_drivers.bus.can import CanPort  # noqa: PLC0415 - python-can is optional
-        except ImportError as missing:
-            problem = f'needs python-can ({missing}); pip install "trade-drivers[{self.name}]"'
-            raise ConfigurationError(where=f"driver {self.name}", problem=problem) from None
-        return CanPort.of(port, bus, where, partial(self.orders, nodes=nodes))
-
-    def _bring_in(self, exchange: "MotorExchange[Any]", where: str) -> None:
+    def _bring_in(self, exchange: _Exchange, where: str) -> None:
         """Cycle until every motor is taken on and measured."""
         until = time.monotonic() + _PATIENCE_S
-        while away := [axis for axis in exchange.motors if axis.silent]:
+        while away := [axis for axis in exchange.devices if axis.silent]:
             for axis in away:
-                self._check(exchange, axis, where, last=time.monotonic() > until)
+                self.check_away(exchange, axis, where, last=time.monotonic() > until)
             exchange.cycle()
             exchange.idle(exchange.period_ns / 1e9)
+        self.first_look(exchange)
+
+    def first_look(self, exchange: _Exchange) -> None:
+        """Cycle until it is seen whether motors move."""
         for _ in range(_FIRST_CYCLES):
             exchange.cycle()
             exchange.idle(exchange.period_ns / 1e9)
 
-    def _check(self, exchange: "MotorExchange[Any]", axis: MotorAxis, where: str, *, last: bool) -> None:
+    def check_away(self, exchange: _Exchange, axis: _Motor, where: str, *, last: bool) -> None:
+        """Raises ``ConfigurationError`` for one that cannot be taken on; ``last``: also if it does not answer."""
         key = f'{where}: joint."{axis.joint.name}"'
         match exchange.problems.get(axis):
             case Another() as other:
@@ -135,12 +147,27 @@ class CanMotorDriver(Driver):
                 pass
 
 
-class _AttachedMotors(AttachedJoints):
+class AttachedMotors(AttachedJoints):
     """A bus of motors."""
 
-    def __init__(self, thread: "BusThread[MotorExchange[Any]]", port: "CanPort") -> None:
-        super().__init__(thread)
+    def __init__(
+        self,
+        thread: "BusThread[MotorExchange[Any]]",
+        port: "CanPort",
+        motor: type[BusMotor[Any, Any]] = BusMotor,
+    ) -> None:
+        super().__init__(thread, motor)
         self._port = port
 
     def monitor(self, name: str) -> CanMonitor:
         return CanMonitor(partial(self._port.look, name))
+
+
+def axes_of(
+    kind: Callable[[str, str, Joint, float, Sequence[str]], AxisT], robot: Robot, bus: CanBus, port: str
+) -> list[AxisT]:
+    """The axes of a bus, as far as the file tells."""
+    return [
+        kind(f"{robot.name}.{joint.name}", port, joint, bus.rate_hz, robot.coupled_to(joint.name))
+        for joint in robot.joints_on(bus.name)
+    ]

@@ -8,33 +8,24 @@ from trade_drivers.joints.serial._asking import health_of, told, tried
 from trade_drivers.joints.serial._axis import Health, ServoAxis
 from trade_drivers.joints.serial._cycle import ServoExchange
 from trade_drivers.joints.serial._driver import ServoDriver
-from trade_drivers.joints.serial._homing import check_homing, still_homed
-from trade_drivers.joints.serial._inspect import (
-    again,
-    check_firmware,
-    check_model,
-    check_ranges,
-    check_rate,
-    first_ping,
-)
+from trade_drivers.joints.serial._homing import still_homed
+from trade_drivers.joints.serial._inspect import Kept, check_cycle, check_own_range, check_ranges, first_look
 
 __all__ = [
     "Answer",
     "BadAnswer",
     "Health",
+    "Kept",
     "NoAnswer",
     "Refused",
     "ServoAxis",
     "ServoDriver",
     "ServoExchange",
     "WireError",
-    "again",
-    "check_firmware",
-    "check_homing",
-    "check_model",
+    "check_cycle",
+    "check_own_range",
     "check_ranges",
-    "check_rate",
-    "first_ping",
+    "first_look",
     "health_of",
     "still_homed",
     "told",

@@ -1,12 +1,12 @@
 """Exchanges with one servo within a retry budget, one after the other: what its jobs are made of."""
 
 from collections.abc import Callable, Generator
-from typing import Final, TypeVar
+from typing import Any, Final, TypeVar
 
 from trade.errors import DeadlineExceeded, DeviceSilent, OutcomeUnknown
-from trade_drivers.joints import Job, Steps
+from trade_drivers.joints import Steps, Work
 from trade_drivers.joints.serial._answers import NoAnswer, Refused
-from trade_drivers.joints.serial._axis import Health, ServoAxis
+from trade_drivers.joints.serial._axis import Health, Register, ServoAxis
 from trade_drivers.joints.serial._cycle import ServoExchange
 
 __all__ = ["health_of", "told", "tried"]
@@ -14,14 +14,16 @@ __all__ = ["health_of", "told", "tried"]
 _Result = TypeVar("_Result")
 _Health = TypeVar("_Health", bound=Health)
 _ATTEMPTS: Final = 3
+AnyExchange = ServoExchange[Any, Any]
 
 
-def told(bus: ServoExchange, job: Job, axis: ServoAxis[_Health], address: int, data: bytes) -> Steps:
-    """Registers written, and confirmed."""
-    yield from tried(bus, axis, lambda: bus.wire.write(axis.id, address, data, job.gate))
+def told(bus: AnyExchange, job: Work[Any], axis: ServoAxis[Any], register: Register, value: int) -> Steps:
+    """A register written, and confirmed."""
+    data = register.encode(value)
+    yield from tried(bus, axis, lambda: bus.wire.write(axis.id, register.address, data, job.gate))
 
 
-def health_of(bus: ServoExchange, axis: ServoAxis[_Health]) -> Generator[None, None, _Health]:
+def health_of(bus: AnyExchange, axis: ServoAxis[_Health]) -> Generator[None, None, _Health]:
     """How it is, asked now."""
 
     def look() -> _Health:
@@ -31,7 +33,7 @@ def health_of(bus: ServoExchange, axis: ServoAxis[_Health]) -> Generator[None, N
     return (yield from tried(bus, axis, look))
 
 
-def tried(bus: ServoExchange, axis: ServoAxis[_Health], act: Callable[[], _Result]) -> Generator[None, None, _Result]:
+def tried(bus: AnyExchange, axis: ServoAxis[Any], act: Callable[[], _Result]) -> Generator[None, None, _Result]:
     """One exchange within the retry budget; a ping before each retry keeps late answers from being taken for new."""
     asked, waited_s = False, 0.0
     for _ in range(_ATTEMPTS):

@@ -10,7 +10,7 @@ from trade_drivers.interfaces._motion import MotorState
 from trade_drivers.joints import Axis, Grain, Sample
 from trade_drivers.robotfile import Joint
 
-__all__ = ["Health", "ServoAxis"]
+__all__ = ["Health", "Register", "ServoAxis"]
 
 _HEALTH_STALE_NS: Final = 2_000_000_000
 
@@ -24,6 +24,10 @@ class Register(Protocol):
     def size(self) -> int: ...
     def decode(self, data: bytes, start: int = 0) -> int:
         """Counts, out of a block of bytes read from address ``start``."""
+        ...
+
+    def encode(self, counts: int) -> bytes:
+        """The bytes of a number of counts."""
         ...
 
 

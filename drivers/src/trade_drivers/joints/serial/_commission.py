@@ -2,10 +2,12 @@
 
 from abc import abstractmethod
 from contextlib import suppress
-from typing import TYPE_CHECKING, ClassVar, Final
+from typing import TYPE_CHECKING, ClassVar, Final, Generic, TypeVar
 
 from trade_drivers.commissioning._commissioner import Bench, Found
+from trade_drivers.joints import Grain
 from trade_drivers.joints.serial._answers import BadAnswer, NoAnswer, Refused
+from trade_drivers.joints.serial._axis import Register
 
 if TYPE_CHECKING:
     from trade_drivers.joints.serial._wire import ServoWire
@@ -19,9 +21,10 @@ _SHARED: Final = (
 )
 
 _UNKNOWN: Final = "this driver does not know that model; look at it with the vendor's tool"
+_Wire = TypeVar("_Wire", bound="ServoWire")
 
 
-class ServoBench(Bench):
+class ServoBench(Bench, Generic[_Wire]):
     """An open line of servos."""
 
     driver: ClassVar[str]
@@ -29,8 +32,12 @@ class ServoBench(Bench):
     """Address and size of what is hardly the same in two servos: two that answer alike would look like one."""
     mute: ClassVar[str]
     """What is wrong with a servo that tells its model and nothing else."""
+    grain: ClassVar[Grain]
+    torque: ClassVar[Register]
+    position: ClassVar[Register]
+    homing: ClassVar[Register]
 
-    def __init__(self, wire: "ServoWire", baud: int) -> None:
+    def __init__(self, wire: _Wire, baud: int) -> None:
         self.wire = wire
         self._baud = baud
 
@@ -41,10 +48,6 @@ class ServoBench(Bench):
     @abstractmethod
     def firmware_of(self, device_id: int) -> str:
         """The version of its program."""
-
-    @abstractmethod
-    def torque_of(self, device_id: int) -> bool:
-        """Whether its torque is on."""
 
     def anybody(self) -> bool:
         return True
@@ -72,7 +75,7 @@ class ServoBench(Bench):
             for _ in range(_LOOKS):
                 self.wire.read(device_id, *self.restless)
                 shared = shared or self.wire.answers_twice()
-            firmware, torque = self.firmware_of(device_id), self.torque_of(device_id)
+            firmware, torque = self.firmware_of(device_id), self.read(device_id, self.torque) != 0
         except BadAnswer:
             return self._found(device_id, problem=_SHARED)
         except NoAnswer:
@@ -95,10 +98,20 @@ class ServoBench(Bench):
             problem=problem,
         )
 
-    def told(self, device_id: int, address: int, data: bytes) -> None:
+    def angle_rad(self, device_id: int) -> float:
+        return (self.read(device_id, self.position) - self.grain.centre) * self.grain.rad
+
+    def homing_counts(self, device_id: int) -> int:
+        return self.read(device_id, self.homing)
+
+    def read(self, device_id: int, register: Register) -> int:
+        """What a register holds, in counts."""
+        return register.decode(self.wire.read(device_id, register.address, register.size).data, register.address)
+
+    def write(self, device_id: int, register: Register, value: int) -> None:
         """Write once; its answer may come under another id or at another rate, so nobody waits for it twice."""
         with suppress(NoAnswer):
-            self.wire.write(device_id, address, data)
+            self.wire.write(device_id, register.address, register.encode(value))
 
     def close(self) -> None:
         self.wire.close()

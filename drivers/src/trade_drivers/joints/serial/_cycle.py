@@ -4,10 +4,10 @@ import logging
 import time
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Final, cast
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, TypeVar
 
 from trade_drivers.bus._cycle import PROBE_NS
-from trade_drivers.joints import Axis, Exchange, Motion, Steps
+from trade_drivers.joints import Exchange, Motion, Steps
 from trade_drivers.joints.serial._answers import NoAnswer, Refused
 from trade_drivers.joints.serial._axis import ServoAxis
 
@@ -25,7 +25,11 @@ _CHUNK_S: Final = 0.014
 """A group is read in pieces that take no longer than this on the wire, so that a stop can come in between."""
 
 
-class ServoExchange(Exchange):
+_Servo = TypeVar("_Servo", bound=ServoAxis[Any])
+_Wire_co = TypeVar("_Wire_co", bound="ServoWire", covariant=True)
+
+
+class ServoExchange(Exchange[_Servo], Generic[_Servo, _Wire_co]):
     """What happens on one bus of servos."""
 
     sizes: ClassVar[tuple[int, ...]]
@@ -35,41 +39,45 @@ class ServoExchange(Exchange):
 
     def __init__(
         self,
-        wire: "ServoWire",
+        wire: _Wire_co,
         bus: "SerialBus",
-        axes: Sequence[ServoAxis[Any]],
+        axes: Sequence[_Servo],
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         super().__init__(bus, axes, clock)
-        self.wire = wire
-        self.servos = tuple(axes)
+        self._wire = wire
         self._chunk = max(1, int(_CHUNK_S * bus.baud / 10 / (self.answer_overhead + self.sizes[0])))
         self._attended_ns = self.lasting_clock()
         self._size = 0
         self._failed_ns = 0
         wire.pause = self.pause
 
+    @property
+    def wire(self) -> _Wire_co:
+        """The line, for the bus thread alone."""
+        return self._wire
+
     # --- what differs
 
     @abstractmethod
-    def admit(self, axis: ServoAxis[Any]) -> None:
+    def admit(self, axis: _Servo) -> None:
         """Take a joint on that was looked over: found moving, it is stopped."""
 
     def name_of(self, model_number: int) -> str:
         """What a model is called, or its number."""
         return str(model_number)
 
-    def look_after(self, axis: ServoAxis[Any]) -> None:
+    def look_after(self, axis: _Servo) -> None:
         """Do at once what the health just read asks for. Raises ``NoAnswer``."""
 
     # --- who missed an exchange may have restarted without torque: it is sent no goal before that was read
 
-    def can_take_goals(self, axes: Sequence[Axis]) -> bool:
-        return not any(cast("ServoAxis[Any]", axis).in_doubt for axis in axes)
+    def can_take_goals(self, axes: Sequence[_Servo]) -> bool:
+        return not any(axis.in_doubt for axis in axes)
 
-    def making_way(self, job: Motion) -> Steps:
-        while not self.can_take_goals(job.axes):
-            for axis in job.axes:
+    def making_way(self, job: Motion[_Servo]) -> Steps:
+        while not self.can_take_goals(job.devices):
+            for axis in job.devices:
                 self.require_answering(axis)
             self.idle(_WAIT_S)
             yield
@@ -89,7 +97,7 @@ class ServoExchange(Exchange):
         self.watch()
         self._read_health()
 
-    def readmit(self, axis: ServoAxis[Any]) -> None:
+    def readmit(self, axis: _Servo) -> None:
         """Look a joint over that was away, or missed an exchange: its model, its health.
 
         Never enables, never moves; found moving and owned by nobody, it is stopped.
@@ -113,7 +121,7 @@ class ServoExchange(Exchange):
         if axis.motion is None:
             self.stop_found_moving(axis)
 
-    def stop_found_moving(self, axis: ServoAxis[Any]) -> None:
+    def stop_found_moving(self, axis: _Servo) -> None:
         """Have a joint hold that moves and is owned by nobody."""
         if axis.health is not None and axis.health.torque and axis.health.moving:
             axis.take_sample(self.wire.read(axis.id, *axis.cyclic).data, self.clock())
@@ -123,13 +131,13 @@ class ServoExchange(Exchange):
 
     def _look_after_a_gap(self) -> None:
         """The process was frozen: what became of the joints comes before anything else."""
-        for axis in self.servos:
+        for axis in self.devices:
             axis.health_due_ns = 0
             if not axis.silent and not axis.doubted and not self._try_health(axis):
                 return
 
     def _read(self) -> None:
-        asked = [axis for axis in self.servos if not axis.silent and not axis.doubted]
+        asked = [axis for axis in self.devices if not axis.silent and not axis.doubted]
         if self._size and self.clock() - self._failed_ns > _CLEAN_NS:
             self._size = 0
         size = self.sizes[self._size]
@@ -146,7 +154,7 @@ class ServoExchange(Exchange):
                 self.missed(axis)
             self.serve_stops()
 
-    def missed(self, device: Axis) -> None:
+    def missed(self, device: _Servo) -> None:
         self._failed_ns = self.clock()
         self._size = (self._size + 1) % len(self.sizes)
         super().missed(device)
@@ -154,7 +162,7 @@ class ServoExchange(Exchange):
     def _recover(self) -> None:
         """Look over those in doubt, and those silent when it is their turn; the first that fails ends the round."""
         now_ns = self.clock()
-        for axis in self.servos:
+        for axis in self.devices:
             due = axis.silent and now_ns >= axis.probe_at_ns
             if not due and (axis.silent or not axis.doubted):
                 continue
@@ -170,11 +178,11 @@ class ServoExchange(Exchange):
 
     def _read_health(self) -> None:
         now_ns = self.clock()
-        due = [axis for axis in self.servos if axis.health_due_ns <= now_ns and not axis.silent and not axis.doubted]
+        due = [axis for axis in self.devices if axis.health_due_ns <= now_ns and not axis.silent and not axis.doubted]
         if due:
             self._try_health(min(due, key=lambda axis: axis.health_due_ns))
 
-    def _try_health(self, axis: ServoAxis[Any]) -> bool:
+    def _try_health(self, axis: _Servo) -> bool:
         try:
             self._refresh_health(axis)
         except NoAnswer:
@@ -184,7 +192,7 @@ class ServoExchange(Exchange):
             axis.fault = f"it refuses to be read: {refused}"
         return True
 
-    def _refresh_health(self, axis: ServoAxis[Any]) -> None:
+    def _refresh_health(self, axis: _Servo) -> None:
         asked_ns = self.clock()
         axis.take_health(self.wire.read(axis.id, *axis.slow).data, asked_ns)
         axis.health_due_ns = asked_ns + _HEALTH_NS

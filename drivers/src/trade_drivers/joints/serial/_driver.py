@@ -4,25 +4,29 @@ import time
 from abc import abstractmethod
 from collections.abc import Callable, Collection, Mapping
 from contextlib import ExitStack
-from typing import TYPE_CHECKING, Any, ClassVar, cast
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar, cast
 
 from trade.errors import ConfigurationError
 from trade_drivers.commissioning._commissioner import Bench
-from trade_drivers.joints import AttachedJoints, BusThread, PortLost
+from trade_drivers.joints import AttachedJoints, PortLost, start_thread
 from trade_drivers.joints.serial._answers import WireError
+from trade_drivers.joints.serial._axis import ServoAxis
 from trade_drivers.joints.serial._commission import ServoBench
 from trade_drivers.joints.serial._cycle import ServoExchange
 from trade_drivers.plugins._driver import AttachedBus, Driver
 from trade_drivers.robotfile import Bus, Gripper, Joint, Robot, SerialBus
 
 if TYPE_CHECKING:
-    from trade_drivers.joints.serial._axis import ServoAxis
     from trade_drivers.joints.serial._wire import ServoWire
 
 __all__ = ["ServoDriver"]
 
 
-class ServoDriver(Driver):
+_Servo = TypeVar("_Servo", bound=ServoAxis[Any])
+_Wire = TypeVar("_Wire", bound="ServoWire")
+
+
+class ServoDriver(Driver, Generic[_Servo, _Wire]):
     """One vendor's servos in position control on a serial bus."""
 
     devices = (Joint,)
@@ -33,13 +37,11 @@ class ServoDriver(Driver):
     """Rates they can be set to."""
 
     @abstractmethod
-    def exchange(self, robot: Robot, bus: SerialBus, port: str, joints: list[Joint]) -> ServoExchange:
+    def exchange(self, robot: Robot, bus: SerialBus, port: str, joints: list[Joint]) -> ServoExchange[_Servo, _Wire]:
         """What the file alone can tell is checked; the port is not open yet. Raises ``ConfigurationError``."""
 
     @abstractmethod
-    def look_over(
-        self, wire: "ServoWire", bus: SerialBus, axis: "ServoAxis[Any]", clock_ns: Callable[[], int], where: str
-    ) -> None:
+    def look_over(self, wire: _Wire, bus: SerialBus, axis: _Servo, clock_ns: Callable[[], int], where: str) -> None:
         """Check one joint's device and take its first measurements. Raises ``ConfigurationError``."""
 
     def check(self, robot: Robot, bus: Bus) -> None:
@@ -47,20 +49,15 @@ class ServoDriver(Driver):
         self.exchange(robot, serial, serial.port, self._known(robot, serial))
 
     def fits(self, bench: Bench, robot: Robot, bus: Bus, device: Joint | Gripper) -> None:
-        serial, wire = self._serial(robot, bus), cast("ServoBench", bench).wire
-        [axis] = self.exchange(robot, serial, serial.port, [cast("Joint", device)]).servos
+        serial, wire = self._serial(robot, bus), cast("ServoBench[_Wire]", bench).wire
+        [axis] = self.exchange(robot, serial, serial.port, [cast("Joint", device)]).devices
         self.look_over(wire, serial, axis, time.monotonic_ns, robot.where)
 
     def attach(self, robot: Robot, bus: Bus, port: str, healthy: Callable[[], bool]) -> AttachedBus:
-        with ExitStack() as undo:
-            exchange = self.open_exchange(robot, self._serial(robot, bus), port)
-            undo.callback(exchange.wire.close)
-            thread = BusThread(exchange, exchange.wire, bus, healthy, name=f"bus {robot.name}.{bus.name}")
-            thread.start()
-            undo.pop_all()
-        return AttachedJoints(thread)
+        exchange = self.open_exchange(robot, self._serial(robot, bus), port)
+        return AttachedJoints(start_thread(exchange, exchange.wire, robot.name, bus, healthy))
 
-    def open_exchange(self, robot: Robot, bus: SerialBus, port: str) -> ServoExchange:
+    def open_exchange(self, robot: Robot, bus: SerialBus, port: str) -> ServoExchange[_Servo, _Wire]:
         """Open the port and look every joint over, without a thread: ``cycle()`` is the caller's to call.
 
         Raises:
@@ -72,9 +69,9 @@ class ServoDriver(Driver):
             undo.callback(exchange.wire.close)
             try:
                 exchange.wire.open()
-                for axis in exchange.servos:
+                for axis in exchange.devices:
                     self.look_over(exchange.wire, bus, axis, exchange.clock, robot.where)
-                for axis in exchange.servos:
+                for axis in exchange.devices:
                     exchange.admit(axis)
                 exchange.cycle()
             except PortLost as lost:

@@ -30,7 +30,7 @@ def check_homing(axis: "ServoAxis[Any]", settings: bytes, key: str) -> None:
         raise WrongDevice(where=key, key="homing_counts", expected=expected, found=str(found), problem=problem)
 
 
-def still_homed(bus: "ServoExchange", axis: "ServoAxis[Any]") -> "Steps":
+def still_homed(bus: "ServoExchange[Any, Any]", axis: "ServoAxis[Any]") -> "Steps":
     """The same, asked now: a servo may have lost with its power what was not kept, or be another one by now.
 
     Raises:

@@ -2,87 +2,70 @@
 
 from collections.abc import Callable, Sequence
 from math import tau
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar
 
 from trade.errors import ConfigurationError, WrongDevice
+from trade_drivers.joints import Unfit, check_least, check_rate
 from trade_drivers.joints.serial._answers import BadAnswer, NoAnswer, Refused
 from trade_drivers.joints.serial._axis import ServoAxis
+from trade_drivers.joints.serial._homing import check_homing
 
 if TYPE_CHECKING:
     from trade_drivers.joints.serial._wire import ServoWire
     from trade_drivers.robotfile import SerialBus
 
-__all__ = ["again", "check_firmware", "check_model", "check_ranges", "check_rate", "first_ping"]
+__all__ = ["Kept", "check_cycle", "check_own_range", "check_ranges", "first_look"]
 
 _ATTEMPTS: Final = 3
-_BRAKING_S: Final = 1.5
 
 _Result = TypeVar("_Result")
 
 
-def check_ranges(axis: ServoAxis[Any], where: str) -> None:
-    """Whether a joint's range is one of its device, and its speed and acceleration can be set and brake it in time.
+class Kept(NamedTuple):
+    """What servos of one vendor keep without power, and what it says of them."""
 
-    Raises:
-        ConfigurationError: names the key and what would be right.
-    """
-    joint, grain = axis.joint, axis.grain
-    _check_turn(axis, where)
-    for key, value, least in (
-        ("max_speed_rad_s", joint.max_speed_rad_s, grain.rad_s),
-        ("max_accel_rad_s2", joint.max_accel_rad_s2, grain.rad_s2),
-    ):
-        if value < least:
-            problem = f"{value:.3g} is below {least:.3g}, the least an {joint.model} can be set to"
-            raise ConfigurationError(where=f'{where}: joint."{joint.name}".{key}', problem=problem)
-    braking_s = joint.max_speed_rad_s / joint.max_accel_rad_s2
-    if braking_s > _BRAKING_S:
-        problem = f"a stop from max_speed_rad_s takes {braking_s:.2g} s with it; it must take {_BRAKING_S} s at most"
-        raise ConfigurationError(where=f'{where}: joint."{joint.name}".max_accel_rad_s2', problem=problem)
+    size: int
+    """Bytes, from address 0 on."""
+    registers: tuple[int, int]
+    """Those of the id and of the baud rate."""
+    name_of: Callable[[int, str], str]
+    """What a model number means, or else."""
+    firmware: Callable[[bytes], str]
 
 
-def _check_turn(axis: ServoAxis[Any], where: str) -> None:
+def check_ranges(axis: ServoAxis[Any]) -> None:
+    """Raises ``Unfit`` for a range that is not one of its device, or a limit that cannot be set."""
+    _check_turn(axis)
+    check_least(axis, f"the least an {axis.joint.model} can be set to")
+
+
+def _check_turn(axis: ServoAxis[Any]) -> None:
     """In position control a servo has one turn."""
     joint, last = axis.joint, int(2 * axis.grain.centre) - 1
     if axis.low >= 0 and axis.high <= last:
         return
     low, high = sorted((axis.scale.angle_rad(0), axis.scale.angle_rad(last)))
-    key, value = ("min_rad", joint.min_rad) if joint.min_rad < low else ("max_rad", joint.max_rad)
+    key, value = (".min_rad", joint.min_rad) if joint.min_rad < low else (".max_rad", joint.max_rad)
     degrees = "; degrees? radians are meant" if max(abs(joint.min_rad), abs(joint.max_rad)) > tau else ""
     problem = f"{value:.6g} is outside of what an {joint.model} can: {low:.6g} to {high:.6g} rad{degrees}"
-    raise ConfigurationError(where=f'{where}: joint."{joint.name}".{key}', problem=problem)
+    raise Unfit(problem, key)
 
 
-def check_rate(bus: "SerialBus", count: int, cycle_bytes: int, where: str) -> None:
+def check_cycle(bus: "SerialBus", count: int, cycle_bytes: int, where: str) -> None:
     """Whether a cycle comes often enough, and its bytes fit into it.
 
     Raises:
         ConfigurationError: names the key and what would be right.
     """
-    key = f"{where}: bus.{bus.name}.rate_hz"
-    least_hz = 3 / min(bus.watchdog_s, bus.stale_after_s)
-    if bus.rate_hz < least_hz:
-        problem = f"{bus.rate_hz:g} is too slow for watchdog_s and stale_after_s; at least {least_hz:.3g}"
-        raise ConfigurationError(where=key, problem=problem)
+    check_rate(bus, where, 3)
     cycle_s = cycle_bytes * 10 / bus.baud
     if cycle_s * bus.rate_hz > 1:
         problem = f"{count} joints at {bus.baud} baud need {cycle_s * 1e3:.1f} ms a cycle: at most {1 / cycle_s:.0f} Hz"
-        raise ConfigurationError(where=key, problem=problem)
+        raise ConfigurationError(where=f"{where}: bus.{bus.name}.rate_hz", problem=problem)
 
 
 def first_ping(wire: "ServoWire", bus: "SerialBus", axis: ServoAxis[Any], key: str, registers: Sequence[int]) -> int:
-    """The model number of a joint's device, which is alone under its id.
-
-    Args:
-        wire: the line.
-        bus: its record.
-        axis: the joint.
-        key: of the robot file, for messages.
-        registers: where a device of this vendor keeps its id and its baud rate.
-
-    Raises:
-        ConfigurationError: it is absent, or not alone.
-    """
+    """The model number of a joint's device; raises ``ConfigurationError`` if it is absent, or not alone."""
     problem = (
         f"no device answers to id {axis.id} on bus {bus.name!r} ({wire.path}, {bus.baud} baud); check its power and "
         f"cable, its id (register {registers[0]}) and its baud rate (register {registers[1]})"
@@ -133,3 +116,39 @@ def check_firmware(axis: ServoAxis[Any], firmware: str, key: str) -> None:
     expected = axis.joint.firmware
     if expected is not None and firmware != expected:
         raise WrongDevice(where=key, key="firmware", expected=expected, found=firmware)
+
+
+def first_look(
+    wire: "ServoWire", bus: "SerialBus", axis: ServoAxis[Any], kept: Kept, clock_ns: Callable[[], int], key: str
+) -> bytes:
+    """Check that a joint's device is that of the robot file, and take its first measurements.
+
+    Returns:
+        The bytes that it keeps without power, from address 0 on.
+
+    Raises:
+        ConfigurationError: it is absent, another model, or not alone under its id.
+        NoAnswer: it answers a ping, and no read.
+    """
+    number = first_ping(wire, bus, axis, key, kept.registers)
+    check_model(axis, number, kept.name_of(number, "a model this driver does not know"), key)
+    asked_ns = clock_ns()
+    settings = again(wire, axis, lambda: wire.read(axis.id, 0, kept.size).data)
+    health = again(wire, axis, lambda: wire.read(axis.id, *axis.slow).data)
+    sample = again(wire, axis, lambda: wire.read(axis.id, *axis.cyclic).data)
+    check_firmware(axis, kept.firmware(settings), key)
+    check_homing(axis, settings, key)
+    axis.take_health(health, asked_ns)
+    axis.take_sample(sample, asked_ns)
+    return settings
+
+
+def check_own_range(axis: ServoAxis[Any], low: int, high: int, registers: str, key: str) -> None:
+    """Raises ``ConfigurationError`` for a joint whose range is wider than the one set in its device."""
+    if axis.low < low or axis.high > high:
+        joint, ends = axis.joint, sorted((axis.scale.angle_rad(low), axis.scale.angle_rad(high)))
+        raise ConfigurationError(
+            where=key,
+            problem=f"min_rad {joint.min_rad:.6g} to max_rad {joint.max_rad:.6g} is more than the device's own range "
+            f"({registers}), {ends[0]:.6g} to {ends[1]:.6g} rad; narrow the one or widen the other",
+        )

@@ -1,5 +1,5 @@
 """CiA 402 drives on a CAN bus, in profile position mode."""
 
-from trade_drivers.vendors.cia402._driver import Cia402Driver, open_exchange
+from trade_drivers.vendors.cia402._driver import Cia402Driver
 
-__all__ = ["Cia402Driver", "open_exchange"]
+__all__ = ["Cia402Driver"]

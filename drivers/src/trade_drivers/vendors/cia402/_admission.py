@@ -4,9 +4,10 @@ import logging
 from typing import TYPE_CHECKING, Final
 
 from trade_drivers.bus._cycle import PROBE_NS
+from trade_drivers.joints import Unfit
 from trade_drivers.vendors.cia402 import _table as table
 from trade_drivers.vendors.cia402._axis import DriveAxis, Stage
-from trade_drivers.vendors.cia402._inspect import Unfit, set_up
+from trade_drivers.vendors.cia402._inspect import set_up
 from trade_drivers.vendors.cia402._net import NoAnswer, Refused
 
 if TYPE_CHECKING:
@@ -35,12 +36,10 @@ class Admission:
 
     def __init__(self, exchange: "DriveExchange", axis: DriveAxis, bus: "CanBus") -> None:
         self.axis = axis
-        self.problem: Exception | None = None
-        """Why it was not taken on when it was last tried."""
         self._exchange = exchange
         self._bus = bus
         self._recall_at_ns = 0
-        self._steps = set_up(exchange.net, axis, bus)
+        self._steps = set_up(exchange.nodes, axis, bus)
 
     def advance(self) -> None:
         """Go on as far as it goes without waiting."""
@@ -59,14 +58,14 @@ class Admission:
         axis, now_ns = self.axis, self._exchange.clock()
         if axis.stopped and now_ns >= self._recall_at_ns:
             _log.warning("%s: network management has stopped it; it is put to pre-operational and set up", axis.name)
-            self._exchange.net.command(axis.id, table.NMT_PREOPERATIONAL)
+            self._exchange.nodes.command(axis.id, table.NMT_PREOPERATIONAL)
             self._recall_at_ns, axis.probe_at_ns = now_ns + PROBE_NS, now_ns
 
     def _begin(self) -> None:
         axis, exchange = self.axis, self._exchange
         busy = exchange.worked_on(axis) and not axis.recalled  # who is asked twice answers one
         if exchange.clock() >= axis.probe_at_ns and not busy:
-            axis.stage, self._steps = Stage.LOOKED_OVER, set_up(exchange.net, axis, self._bus)
+            axis.stage, self._steps = Stage.LOOKED_OVER, set_up(exchange.nodes, axis, self._bus)
             self._look_over()
 
     def _look_over(self) -> None:
@@ -85,17 +84,18 @@ class Admission:
         axis, now_ns = self.axis, self._exchange.clock()
         if axis.to_start:
             axis.to_start = False
-            self._exchange.net.command(axis.id, table.NMT_START)
+            self._exchange.nodes.command(axis.id, table.NMT_START)
         if not axis.unheard:
             _log.info("%s is heard on %s", axis.name, axis.bus)
             axis.welcome(now_ns)
         elif now_ns - axis.set_up_ns > max(_UNHEARD_NS, 2 * self._exchange.deaf_ns):
-            self.problem = Unfit(f"node {axis.id} answers, but sends {axis.unheard}; a drive without it cannot be used")
-            axis.fault, axis.ready = str(self.problem), False
+            problem = Unfit(f"node {axis.id} answers, but sends {axis.unheard}; a drive without it cannot be used")
+            self._exchange.problems[axis] = problem
+            axis.fault, axis.ready = str(problem), False
             axis.forget(now_ns)
 
     def _try_later(self, problem: Exception) -> None:
-        self.problem = problem
+        self._exchange.problems[self.axis] = problem
         now_ns = self._exchange.clock()
         self.axis.forget(now_ns)
         self.axis.probe_at_ns = now_ns + PROBE_NS

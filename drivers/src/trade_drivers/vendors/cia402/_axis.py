@@ -2,13 +2,13 @@
 
 from collections.abc import Sequence
 from enum import Enum, auto
-from math import tau
 from struct import error as BadLength  # noqa: N812 - what unpacking raises for another number of bytes
 from typing import Final
 
 from trade.errors import DeviceError
 from trade_drivers.interfaces._motion import MotorState
-from trade_drivers.joints import Axis, Grain, Sample
+from trade_drivers.joints import Sample
+from trade_drivers.joints.can import MotorAxis, grain_of
 from trade_drivers.robotfile import Joint
 from trade_drivers.vendors.cia402 import _machine as machine
 from trade_drivers.vendors.cia402 import _table as table
@@ -18,29 +18,11 @@ from trade_drivers.vendors.cia402._stream import Following, Turning
 
 __all__ = ["DriveAxis", "Stage"]
 
-_STILL_RAD_S: Final = 0.01
-_ARRIVED_RAD: Final = 0.004
-_NEAR_RAD: Final = 0.03
 _FAULTS: Final = (State.FAULT, State.FAULT_REACTION)
 _SOME_FAULT: Final = "it reports a fault"
 _STOPPED: Final = "network management has stopped it: it answers nothing until it is taken back"
 _ACKNOWLEDGE_NS: Final = 250_000_000
 """How long a drive may take to take a set-point."""
-
-
-def grain_of(joint: Joint, rate_hz: float) -> Grain:
-    """What counts of this joint's drive mean: positions in counts, speeds in counts a second, and so on."""
-    rad = tau / ((joint.counts_per_rev or 1.0) * joint.gear)
-    return Grain(
-        rad=rad,
-        rad_s=rad,
-        rad_s2=rad,
-        centre=0,
-        still_velocity=max(1, round(_STILL_RAD_S / rad)),
-        still_counts=max(1, round(_STILL_RAD_S / rate_hz / rad)),
-        arrived=max(2, round(_ARRIVED_RAD / rad)),
-        near=max(4, round(_NEAR_RAD / rad)),
-    )
 
 
 class Stage(Enum):
@@ -52,11 +34,11 @@ class Stage(Enum):
     HERE = auto()
 
 
-class DriveAxis(Axis):
+class DriveAxis(MotorAxis):
     """One drive."""
 
     def __init__(self, name: str, bus: str, joint: Joint, rate_hz: float, coupled: Sequence[str] = ()) -> None:
-        super().__init__(name, bus, joint, grain_of(joint, rate_hz), coupled)
+        super().__init__(name, bus, joint, grain_of(joint, rate_hz, joint.counts_per_rev or 1.0), coupled)
         self.identity: tuple[int, ...] = ()
         """What it said of itself when it was attached."""
         self.state_now: State | None = None
@@ -72,12 +54,8 @@ class DriveAxis(Axis):
         self.controlword = 0
         """What was commanded last."""
         self.target = 0
-        self.asked_ns = 0
+        self.raised_ns = 0
         """When its set-point was raised; 0 once it was taken."""
-        self.beat_ns = 0
-        """When its heartbeat came last."""
-        self.awaited_ns = 0
-        """When it was last asked for a measurement; 0 once that has come."""
         self.stage = Stage.AWAY
         """Only in the last one it is not ``silent``."""
         self.set_up_ns = 0
@@ -95,7 +73,7 @@ class DriveAxis(Axis):
 
     def take_status(self, data: bytes) -> None:
         """Its first TPDO. Only the first after a SYNC counts: what comes later is too late to be believed."""
-        asked_ns, self.awaited_ns = self.awaited_ns, 0
+        asked_ns, self.asked_ns = self.asked_ns, 0
         if not asked_ns:
             return
         try:
@@ -146,10 +124,9 @@ class DriveAxis(Axis):
 
     def forget(self, now_ns: int) -> None:
         """Leave it out until it was looked over again, which may be at once."""
-        if not self.silent:
-            self.silent, self.silent_since_ns = True, now_ns
+        super().forget(now_ns)
         self.stage, self.probe_at_ns = Stage.AWAY, now_ns
-        self.controlword = self.asked_ns = self.awaited_ns = 0
+        self.controlword = self.raised_ns = 0
         self.entered, self.stream = 0, None
 
     def be_awaited(self, now_ns: int) -> None:
@@ -163,7 +140,7 @@ class DriveAxis(Axis):
         """It is heard."""
         self.stage = Stage.HERE
         self.silent, self.silent_since_ns, self.sample = False, now_ns, None
-        self.controlword = self.asked_ns = self.awaited_ns = 0
+        self.controlword = self.raised_ns = self.asked_ns = 0
 
     def latch(self, fault: str) -> None:
         """Note what speaks against moving on, until it is enabled again; the first that says something is kept."""
@@ -179,7 +156,7 @@ class DriveAxis(Axis):
             self.latch("it has made a quick stop by itself: it heard nothing for too long, or a switch told it to")
         elif self.ready and state is not State.ENABLED:
             self.latch("its torque went off: it lost power, or its protection switched it off")
-        elif self.ready and self.asked_ns and now_ns - self.asked_ns > _ACKNOWLEDGE_NS and not self.acknowledged:
+        elif self.ready and self.raised_ns and now_ns - self.raised_ns > _ACKNOWLEDGE_NS and not self.acknowledged:
             self.latch("it does not take its goal (statusword bit 12)")
         if self.ready and not self.statusword & machine.REMOTE:
             self.latch("it does not obey the bus (statusword bit 9); is it operated from its panel?")
@@ -220,8 +197,8 @@ class DriveAxis(Axis):
         )
 
     @property
-    def may_hold_torque(self) -> bool:
-        return self.state_now is None or self.state_now.torque
+    def torque(self) -> bool | None:
+        return None if self.state_now is None else self.state_now.torque
 
     def fresh(self, now_ns: int, stale_after_ns: int) -> Sample:
         if self.silent:  # also if it was measured a moment ago: it is not taken on again yet

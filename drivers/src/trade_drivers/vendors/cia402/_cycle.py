@@ -3,11 +3,12 @@
 import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Final, cast
+from typing import TYPE_CHECKING, Final
 
-from trade_drivers.bus._cycle import PROBE_NS, silences
+from trade_drivers.bus._cycle import PROBE_NS
 from trade_drivers.bus.can import Frame
-from trade_drivers.joints import Axis, Exchange, Gate, Goal, Job, Manner, Motion, Steps, until
+from trade_drivers.joints import Gate, Goal, Manner, Motion, Steps, Work, until
+from trade_drivers.joints.can._cycle import MotorExchange
 from trade_drivers.vendors.cia402 import _jobs as jobs
 from trade_drivers.vendors.cia402 import _machine as machine
 from trade_drivers.vendors.cia402 import _table as table
@@ -31,29 +32,26 @@ _HANDSHAKE: Final = 3
 """Cycles of a set-point in profile position: raised, acknowledged, taken back."""
 
 
-class DriveExchange(Exchange):
+class DriveExchange(MotorExchange[DriveAxis]):
     """What happens on one bus of drives."""
+
+    again_ns = PROBE_NS
 
     def __init__(
         self, port: "CanPort", bus: "CanBus", axes: Sequence[DriveAxis], clock: Callable[[], int] = time.monotonic_ns
     ) -> None:
-        super().__init__(bus, axes, clock)
-        self.port = port
-        self.drives = tuple(axes)
-        self.net = Net(port, between=self.serve_stops, meanwhile=self._admit)
+        super().__init__(port, bus, axes, clock)
+        self.nodes = Net(self.net)
         self.admissions = tuple(Admission(self, axis, bus) for axis in axes)
         self._bus = bus
         self._beat_ns = int(bus.watchdog_s * 1e9 / 5)
         self._beaten_ns = 0
-        self._began_ns = self._listening_ns = self._synced_ns = clock()
-        """When the last cycle began, and since when they have followed each other in time."""
+        self._synced_ns = clock()
         self.deaf_ns = _BEATS_MISSED * heartbeat_ms(bus) * 1_000_000
-        """A drive whose heartbeat has not come for so long is left out."""
         self.rival = False
         """Somebody else sends heartbeats as this driver does."""
         self.net.hear(table.HEARTBEAT + table.OUR_NODE, self._hear_rival)
         for axis in axes:
-            axis.forget(clock())
             self._listen_to(axis)
 
     def _hear_rival(self, _: bytes) -> None:
@@ -75,54 +73,50 @@ class DriveExchange(Exchange):
         axis.target = axis.target if target is None else target
         self.port.send(table.COMMAND.base + axis.id, table.COMMAND.layout.pack(controlword, axis.target))
 
-    def write_goals(self, goals: Mapping[Axis, Goal], gate: Gate) -> None:
+    def write_goals(self, goals: Mapping[DriveAxis, Goal], gate: Gate) -> None:
         """Ramps first, which move nothing; then the gate, and all joints start in one go."""
         for axis, goal in goals.items():
-            drive = cast("DriveAxis", axis)
-            if drive.stream is None:
+            if axis.stream is None:
                 self.port.send(table.PROFILE.base + axis.id, table.PROFILE.layout.pack(goal.speed, goal.accel))
-                self.port.send(table.BRAKING.base + axis.id, drive.braking(goal.accel))
-            elif isinstance(drive.stream, Turning):
-                drive.stream.fastest = goal.speed
+                self.port.send(table.BRAKING.base + axis.id, axis.braking(goal.accel))
+            elif isinstance(axis.stream, Turning):
+                axis.stream.fastest = goal.speed
         self.write_positions({axis: goal.position for axis, goal in goals.items()}, gate)
 
-    def write_positions(self, positions: Mapping[Axis, int], gate: Gate) -> None:
+    def write_positions(self, positions: Mapping[DriveAxis, int], gate: Gate) -> None:
         gate()
         for axis, position in positions.items():
-            drive = cast("DriveAxis", axis)
-            match drive.stream:
+            match axis.stream:
                 case None:
-                    drive.asked_ns = self.clock()
-                    self.command(drive, machine.GO, position)
+                    axis.raised_ns = self.clock()
+                    self.command(axis, machine.GO, position)
                 case Following() as following:
                     following.aim = position
                 case Turning() as turning:
                     turning.end = position
 
-    def cycles_a_goal(self, axes: Sequence[Axis]) -> int:
+    def cycles_a_goal(self, axes: Sequence[DriveAxis]) -> int:
         return 1 if _all_follow(axes) else _HANDSHAKE
 
-    def reached_ns(self, axes: Sequence[Axis]) -> int | None:
+    def reached_ns(self, axes: Sequence[DriveAxis]) -> int | None:
         """It counts from the next SYNC on, and is reached a period later."""
         return self._synced_ns + 2 * self.period_ns if _all_follow(axes) else None
 
-    def can_take_goals(self, axes: Sequence[Axis]) -> bool:
-        drives = [cast("DriveAxis", axis) for axis in axes]
-        return all((drive.stream or drive.can_take_goal) and not self.worked_on(drive) for drive in drives)
+    def can_take_goals(self, axes: Sequence[DriveAxis]) -> bool:
+        return all((axis.stream or axis.can_take_goal) and not self.worked_on(axis) for axis in axes)
 
-    def write_holds(self, positions: Mapping[Axis, int]) -> None:
+    def write_holds(self, positions: Mapping[DriveAxis, int]) -> None:
         """Halt, on the joint's own ramp; what is not known to be enabled is not told, lest that enable it.
 
         In a mode without a goal it is a quick stop, which is the drive's own business, too, and stands under torque.
         """
         for axis, position in positions.items():
-            drive = cast("DriveAxis", axis)
-            drive.asked_ns = 0
-            if drive.stream is not None or drive.controlword == machine.QUICK_STOP:
-                self._quick_stop(drive)
-            elif drive.state_now is State.ENABLED:
-                self.port.send(table.BRAKING.base + axis.id, drive.braking(axis.accel_counts))
-                self.command(drive, machine.HOLD, position)
+            axis.raised_ns = 0
+            if axis.stream is not None or axis.controlword == machine.QUICK_STOP:
+                self._quick_stop(axis)
+            elif axis.state_now is State.ENABLED:
+                self.port.send(table.BRAKING.base + axis.id, axis.braking(axis.accel_counts))
+                self.command(axis, machine.HOLD, position)
 
     def _quick_stop(self, axis: DriveAxis) -> None:
         """It has to be enabled anew, then; a target that is not where it was sent last would be a jump for it."""
@@ -131,21 +125,21 @@ class DriveExchange(Exchange):
         if axis.state_now is State.ENABLED:
             self.command(axis, machine.QUICK_STOP, target)
 
-    def enabling(self, job: Job, axis: Axis) -> Steps:
-        return jobs.enabling(self, job, cast("DriveAxis", axis), self.mode_for(job, cast("DriveAxis", axis)))
+    def enabling(self, job: Work[DriveAxis], axis: DriveAxis) -> Steps:
+        return jobs.enabling(self, job, axis, self.mode_for(job, axis))
 
-    def require_answering(self, axis: Axis) -> None:
+    def require_answering(self, axis: DriveAxis) -> None:
         if axis.silent:
-            raise cast("DriveAxis", axis).absence(self.clock())
+            raise axis.absence(self.clock())
 
     def recall(self, axis: DriveAxis) -> None:
         """Take it back if network management has stopped it."""
-        self.admissions[self.drives.index(axis)].recall()
+        self.admissions[self.devices.index(axis)].recall()
 
-    def mode_for(self, job: Job, axis: DriveAxis) -> int:
+    def mode_for(self, job: Work[DriveAxis], axis: DriveAxis) -> int:
         """The mode of operation for what a job is going to tell this drive."""
-        match job.manner:
-            case Manner.POSITIONS if _all_follow(job.axes):
+        match job.manner if isinstance(job, Motion) else Manner.GOALS:
+            case Manner.POSITIONS if _all_follow(job.devices):
                 return table.CYCLIC_POSITION
             case Manner.SPEEDS:
                 return axis.turning_mode
@@ -168,43 +162,33 @@ class DriveExchange(Exchange):
             case _:
                 return None
 
-    def relaxing(self, job: Job, axis: Axis) -> Steps:
-        return jobs.relaxing(self, job, cast("DriveAxis", axis))
+    def relaxing(self, job: Work[DriveAxis], axis: DriveAxis) -> Steps:
+        return jobs.relaxing(self, job, axis)
 
-    def looking(self, axis: Axis) -> Steps:
-        return jobs.looking(self, cast("DriveAxis", axis))
+    def looking(self, axis: DriveAxis) -> Steps:
+        return jobs.looking(self, axis)
 
-    def making_way(self, job: Motion) -> Steps:
-        for axis in job.axes:
-            drive = cast("DriveAxis", axis)
-            if drive.entered != self.mode_for(job, drive):
-                yield from jobs.resting(self, job, drive)
-                yield from self.enabling(job, drive)
-            elif drive.stream is None:
-                yield from until(self, drive, lambda: drive.can_take_goal, "it does not end its last handshake")  # noqa: B023 - over before the next
+    def making_way(self, job: Motion[DriveAxis]) -> Steps:
+        for axis in job.devices:
+            if axis.entered != self.mode_for(job, axis):
+                yield from jobs.resting(self, job, axis)
+                yield from self.enabling(job, axis)
+            elif axis.stream is None:
+                yield from until(self, axis, lambda: axis.can_take_goal, "it does not end its last handshake")  # noqa: B023 - over before the next
 
-    def leaving(self, job: Job, axis: Axis, *, relax: bool) -> Steps:
-        return jobs.leaving(self, job, cast("DriveAxis", axis), relax=relax)
+    def leaving(self, job: Work[DriveAxis], axis: DriveAxis, *, relax: bool) -> Steps:
+        return jobs.leaving(self, job, axis, relax=relax)
 
     # --- from the bus thread
 
-    def idle(self, seconds: float) -> None:
-        self.net.take_in(seconds)
+    def opened(self) -> None:
+        for axis in self.devices:
+            for data in self.port.talk.frames.get(table.HEARTBEAT + axis.id, ()):
+                axis.take_heartbeat(data, self.clock())
 
     def cycle(self) -> None:
         """One round: stops, heartbeat, measurements, handshakes, work, motions, streams."""
-        began_ns = self.clock()
-        if began_ns - self._began_ns > self.stale_after_ns // 2:
-            self._listening_ns = began_ns
-        self._began_ns = began_ns
-        self.net.take_in(0.0)  # what came late is no answer to the next SYNC
-        self._beat(began_ns)
-        self._measure(began_ns)
-        self._listen(began_ns)
-        self._shake_hands()
-        self._admit()
-        self.work(began_ns + self.period_ns // 2)
-        self.watch()
+        super().cycle()
         self._stream()
 
     def _stream(self) -> None:
@@ -212,7 +196,7 @@ class DriveExchange(Exchange):
         now_ns = self.clock()
         frames = [
             Frame(axis.stream.can_id, axis.stream.next(axis.sample, now_ns))
-            for axis in self.drives
+            for axis in self.devices
             if axis.stream is not None and axis.ready and axis.sample is not None and not axis.silent
         ]
         if frames:
@@ -228,35 +212,24 @@ class DriveExchange(Exchange):
         """Send a heartbeat in the next cycle: a drive watches for them only once it has heard one (CiA 301, 1016h)."""
         self._beaten_ns = 0
 
-    def _measure(self, began_ns: int) -> None:
+    def measure(self, began_ns: int) -> None:
+        self._beat(began_ns)
         self._synced_ns = began_ns
-        asked = [axis for axis in self.drives if not axis.silent]
-        for axis in self.drives:
+        asked = [axis for axis in self.devices if not axis.silent]
+        for axis in self.devices:
             if axis.stage in _MEASURED:
-                axis.awaited_ns = began_ns  # not when it came: a frozen process would take old values for new
+                axis.asked_ns = began_ns  # not when it came: a frozen process would take old values for new
         self.port.send(table.SYNC, b"")
-        self.net.take_in(self.period_ns / 2e9, lambda: not any(axis.awaited_ns for axis in asked))
+        self.net.take_in(self.period_ns / 2e9, lambda: not any(axis.asked_ns for axis in asked))
 
-    def _listen(self, now_ns: int) -> None:
-        """Who has not been heard for too long is left out, and asked now and then whether it is back."""
-        if now_ns - self._listening_ns <= self.stale_after_ns:
-            return  # on a busy host it was this thread that was silent
-        for axis in self.drives:
-            if axis.silent:
-                continue
-            if axis.age_ns(now_ns) > self.stale_after_ns or now_ns - axis.beat_ns > self.deaf_ns:
-                silences.warning("%s is not heard on %s", axis.name, axis.bus)
-                axis.forget(now_ns)
-                axis.probe_at_ns = now_ns + PROBE_NS
-
-    def _shake_hands(self) -> None:
+    def settle(self, now_ns: int) -> None:  # noqa: ARG002 - the same at any time
         """A set-point that was taken is taken back, so that the next one has an edge."""
-        for axis in self.drives:
-            if axis.asked_ns and axis.acknowledged and axis.state_now is State.ENABLED:
-                axis.asked_ns = 0
+        for axis in self.devices:
+            if axis.raised_ns and axis.acknowledged and axis.state_now is State.ENABLED:
+                axis.raised_ns = 0
                 self.command(axis, axis.controlword & ~machine.NEW_SET_POINT)
 
-    def _admit(self) -> None:
+    def admit(self) -> None:
         """Go on with those that are not here; it never waits for them. An unhealthy process admits nobody (S06)."""
         if self.refusing is not None:
             return
@@ -264,11 +237,6 @@ class DriveExchange(Exchange):
             if admission.axis.stage is not Stage.HERE:
                 admission.advance()
 
-    def forget_measurements(self) -> None:
-        now_ns = self.clock()
-        for axis in self.drives:
-            axis.forget(now_ns)
 
-
-def _all_follow(axes: Sequence[Axis]) -> bool:
-    return all(table.CYCLIC_POSITION in cast("DriveAxis", axis).modes for axis in axes)
+def _all_follow(axes: Sequence[DriveAxis]) -> bool:
+    return all(table.CYCLIC_POSITION in axis.modes for axis in axes)

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Final
 
 from trade import Permit
 from trade.errors import TradeError
-from trade_drivers.joints import Axis, Motion, Steps
+from trade_drivers.joints import Motion, Steps
 from trade_drivers.vendors.cia402 import _jobs as jobs
 from trade_drivers.vendors.cia402 import _machine as machine
 from trade_drivers.vendors.cia402 import _table as table
@@ -18,7 +18,7 @@ __all__ = ["Homing"]
 _LONGEST_NS: Final = 30_000_000_000
 
 
-class Homing(Motion):
+class Homing(Motion[DriveAxis]):
     """The drive goes and looks for its zero by itself; afterwards it has to be enabled anew, in its usual mode."""
 
     def __init__(
@@ -62,7 +62,7 @@ class Homing(Motion):
         self.exchange.take_over(self)
         self._began_ns = self.exchange.clock()
 
-    def goal_of(self, axis: Axis) -> int:
+    def goal_of(self, axis: DriveAxis) -> int:
         return axis.sample.position if axis.sample is not None else 0
 
     def watch(self, now_ns: int) -> None:

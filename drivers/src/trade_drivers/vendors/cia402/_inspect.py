@@ -5,7 +5,8 @@ from typing import TYPE_CHECKING, Final
 
 from trade.errors import ConfigurationError
 from trade_drivers.bus.can import frame_bits
-from trade_drivers.joints import Steps
+from trade_drivers.joints import Steps, Unfit, check_joints, check_least, check_rate
+from trade_drivers.joints.can import Another
 from trade_drivers.vendors.cia402 import _machine as machine
 from trade_drivers.vendors.cia402 import _table as table
 from trade_drivers.vendors.cia402._axis import DriveAxis
@@ -17,9 +18,8 @@ from trade_drivers.vendors.cia402._table import Entry, Pdo
 if TYPE_CHECKING:
     from trade_drivers.robotfile import CanBus
 
-__all__ = ["Another", "Unfit", "check_bus", "heartbeat_ms", "motion_every", "set_up"]
+__all__ = ["check_bus", "heartbeat_ms", "motion_every", "set_up"]
 
-_BRAKING_S: Final = 1.5
 _QUICK_STOP: Final = 3
 """Of 6007h: a lost heartbeat is answered with a quick stop."""
 _BRAKE_AND_STAY: Final = 6
@@ -29,37 +29,14 @@ _BRAKE: Final = 1
 _LARGEST: Final = 2**31 - 1
 
 
-class Unfit(Exception):
-    """A drive cannot be used as it is; what is wrong, and of which key of the joint."""
-
-    def __init__(self, problem: str, key: str = "") -> None:
-        super().__init__(problem)
-        self.key = key
-
-
-class Another(Unfit):
-    """Another drive than the one the robot file names."""
-
-    def __init__(self, key: str, expected: str, found: str) -> None:
-        super().__init__(f"its {key} is {found}, not {expected}: it is another drive", f".{key}")
-        self.expected, self.found = expected, found
-
-
 def check_bus(bus: "CanBus", axes: Sequence[DriveAxis], where: str) -> None:
     """What the file alone can tell: numbers of nodes, counts, speeds, and whether the frames of a cycle fit into it.
 
     Raises:
         ConfigurationError: names the key and what would be right.
     """
-    for axis in axes:
-        try:
-            _check_joint(axis)
-        except Unfit as bad:
-            raise ConfigurationError(where=f'{where}: joint."{axis.joint.name}"{bad.key}', problem=str(bad)) from None
-    least_hz = 3 / min(bus.watchdog_s, bus.stale_after_s)
-    if bus.rate_hz < least_hz:
-        problem = f"{bus.rate_hz:g} is too slow for watchdog_s and stale_after_s; at least {least_hz:.3g}"
-        raise ConfigurationError(where=f"{where}: bus.{bus.name}.rate_hz", problem=problem)
+    check_joints(axes, where, _check_joint)
+    check_rate(bus, where, 3)
     frames = frame_bits(table.STATUS.layout.size) + frame_bits(table.TURNING.layout.size)
     slower = frame_bits(table.MOTION.layout.size) / motion_every(bus)
     cycle_s = (frame_bits(0) + len(axes) * (frames + slower)) / bus.bitrate
@@ -79,16 +56,7 @@ def _check_joint(axis: DriveAxis) -> None:
         raise Unfit(f"{joint.id} is no node of a drive; 1 to 126 are (127 is the driver's own)", ".id")
     if max(abs(axis.low), abs(axis.high)) > _LARGEST:
         raise Unfit("the range does not fit into 32 bits of counts; check counts_per_rev and gear", ".max_rad")
-    for key, value, least in (
-        (".max_speed_rad_s", joint.max_speed_rad_s, axis.grain.rad_s),
-        (".max_accel_rad_s2", joint.max_accel_rad_s2, axis.grain.rad_s2),
-    ):
-        if value < least:
-            raise Unfit(f"{value:.3g} is below {least:.3g}, one count of its encoder", key)
-    braking_s = joint.max_speed_rad_s / joint.max_accel_rad_s2
-    if braking_s > _BRAKING_S:
-        problem = f"a stop from max_speed_rad_s takes {braking_s:.2g} s with it; it must take {_BRAKING_S} s at most"
-        raise Unfit(problem, ".max_accel_rad_s2")
+    check_least(axis, "one count of its encoder")
 
 
 def motion_every(bus: "CanBus") -> int:
@@ -145,7 +113,7 @@ def _check_fingerprint(net: Net, axis: DriveAxis, identity: Sequence[int]) -> St
     """Whether it is the very drive that the robot file names, as far as it names one."""
     joint, (_, _, _, serial_number) = axis.joint, identity
     if joint.serial_number is not None and serial_number != joint.serial_number:
-        raise Another("serial_number", str(joint.serial_number), str(serial_number))
+        raise Another("serial_number", str(joint.serial_number), str(serial_number), "drive")
     if joint.firmware is None:
         return
     try:
@@ -153,7 +121,7 @@ def _check_fingerprint(net: Net, axis: DriveAxis, identity: Sequence[int]) -> St
     except Refused:
         raise Unfit("it tells no firmware version (100Ah); leave this key out", ".firmware") from None
     if firmware != joint.firmware:
-        raise Another("firmware", joint.firmware, firmware)
+        raise Another("firmware", joint.firmware, firmware, "drive")
 
 
 def _named(identity: Sequence[int]) -> str:

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Final
 
 from trade.errors import DeviceSilent
 from trade_drivers.bus._cycle import HALT_NS
-from trade_drivers.joints import Job, Steps, next_measurement, until
+from trade_drivers.joints import Steps, Work, next_measurement, until
 from trade_drivers.vendors.cia402 import _machine as machine
 from trade_drivers.vendors.cia402 import _table as table
 from trade_drivers.vendors.cia402._axis import DriveAxis
@@ -24,7 +24,7 @@ _AT_REST: Final = 2
 """Measurements in a row in which it did not move."""
 
 
-def enabling(bus: "DriveExchange", job: Job, axis: DriveAxis, mode: int) -> Steps:
+def enabling(bus: "DriveExchange", job: Work[DriveAxis], axis: DriveAxis, mode: int) -> Steps:
     """Torque on where it was measured to be, halted or told to stay there, with its own ramps; all of it confirmed.
 
     A drive that is enabled already must be at rest: then only its mode changes. A search for its zero ends.
@@ -51,7 +51,7 @@ def enabling(bus: "DriveExchange", job: Job, axis: DriveAxis, mode: int) -> Step
     axis.stream = bus.stream_for(axis, mode, axis.target)
 
 
-def _take_back(bus: "DriveExchange", job: Job, axis: DriveAxis) -> Steps:
+def _take_back(bus: "DriveExchange", job: Work[DriveAxis], axis: DriveAxis) -> Steps:
     """Out of a stop by network management, and set up like one that has come back."""
     give_up_ns = bus.clock() + _TAKEN_BACK_NS
     axis.recalled = True
@@ -68,7 +68,7 @@ def _take_back(bus: "DriveExchange", job: Job, axis: DriveAxis) -> Steps:
     job.note("taken back from network management's stop: pre-operational, and set up")
 
 
-def _begin_at_rest(bus: "DriveExchange", job: Job, axis: DriveAxis) -> Steps:
+def _begin_at_rest(bus: "DriveExchange", job: Work[DriveAxis], axis: DriveAxis) -> Steps:
     """No target that is left from before may move it in another mode."""
     if axis.may_hold_torque:
         yield from until(
@@ -83,14 +83,14 @@ def _begin_at_rest(bus: "DriveExchange", job: Job, axis: DriveAxis) -> Steps:
     axis.entered, axis.stream = 0, None
 
 
-def resting(bus: "DriveExchange", job: Job, axis: DriveAxis) -> Steps:
+def resting(bus: "DriveExchange", job: Work[DriveAxis], axis: DriveAxis) -> Steps:
     """End what moves it, by its drive's own ramp."""
     job.gate()
     bus.halt([axis], "another kind of motion took over")
     yield from until(bus, axis, lambda: axis.still >= _AT_REST, "told to halt, but it is still moving", HALT_NS)
 
 
-def _climb(bus: "DriveExchange", job: Job, axis: DriveAxis, mode: int) -> Steps:
+def _climb(bus: "DriveExchange", job: Work[DriveAxis], axis: DriveAxis, mode: int) -> Steps:
     """Up to where it is enabled, a state at a time; the goal is where it is.
 
     It ends halted, but in a mode without a goal, in which not every drive knows that.
@@ -116,7 +116,7 @@ def _stays(axis: DriveAxis) -> str:
     return f"it cannot be enabled: it stays at {state}; is its power stage supplied, and its safe torque off released?"
 
 
-def _reset(bus: "DriveExchange", job: Job, axis: DriveAxis) -> Steps:
+def _reset(bus: "DriveExchange", job: Work[DriveAxis], axis: DriveAxis) -> Steps:
     """Clear the drive's own fault. Nothing else happens: that it can be enabled again is another matter."""
     for word in (machine.DISABLE_VOLTAGE, machine.RESET_FAULT):
         job.gate()
@@ -127,13 +127,13 @@ def _reset(bus: "DriveExchange", job: Job, axis: DriveAxis) -> Steps:
     )
 
 
-def set_mode(bus: "DriveExchange", job: Job, axis: DriveAxis, mode: int) -> Steps:
+def set_mode(bus: "DriveExchange", job: Work[DriveAxis], axis: DriveAxis, mode: int) -> Steps:
     """Another mode of operation; in it only when the drive says so itself."""
     yield from write(bus, job, axis, table.MODE, mode)
     yield from until(bus, axis, lambda: axis.mode == mode, f"it does not go into mode {mode} (6061h)")
 
 
-def relaxing(bus: "DriveExchange", job: Job, axis: DriveAxis) -> Steps:
+def relaxing(bus: "DriveExchange", job: Work[DriveAxis], axis: DriveAxis) -> Steps:
     """Torque off; its watchdog lives on."""
     axis.ready = False
     if axis.may_hold_torque:
@@ -142,7 +142,7 @@ def relaxing(bus: "DriveExchange", job: Job, axis: DriveAxis) -> Steps:
     yield from until(bus, axis, lambda: not axis.may_hold_torque, "told to relax, but its torque is still on")
 
 
-def leaving(bus: "DriveExchange", job: Job, axis: DriveAxis, *, relax: bool) -> Steps:
+def leaving(bus: "DriveExchange", job: Work[DriveAxis], axis: DriveAxis, *, relax: bool) -> Steps:
     """Torque off, or left on where it was seen at rest; only then its watchdog is disarmed."""
     if relax:
         yield from relaxing(bus, job, axis)
@@ -158,7 +158,7 @@ def looking(bus: "DriveExchange", axis: DriveAxis) -> Steps:
     yield from next_measurement(bus, axis)
 
 
-def write(bus: "DriveExchange", job: Job, axis: DriveAxis, entry: Entry, value: int) -> Steps:
+def write(bus: "DriveExchange", job: Work[DriveAxis], axis: DriveAxis, entry: Entry, value: int) -> Steps:
     """Change its dictionary, and hear that it did.
 
     Raises:
@@ -168,7 +168,7 @@ def write(bus: "DriveExchange", job: Job, axis: DriveAxis, entry: Entry, value: 
     began_ns = bus.clock()
     bus.require_answering(axis)
     try:
-        for _ in bus.net.write(axis.id, entry, value, job.gate):
+        for _ in bus.nodes.write(axis.id, entry, value, job.gate):
             bus.net.take_in(_WAIT_S)
             yield
             bus.require_answering(axis)

@@ -1,27 +1,22 @@
-"""A motor with what only a drive can: finding its zero. And a bus of drives, with how it is itself."""
+"""A motor with what only a drive can: finding its zero."""
 
-from functools import partial
-from typing import TYPE_CHECKING, Annotated, cast
+from typing import Annotated
 
 from trade import Meta, permit, service
 from trade_drivers._validation import within
 from trade_drivers.bus._deadlines import span
-from trade_drivers.bus.can._monitor import CanMonitor
-from trade_drivers.joints import AttachedJoints, BusMotor, BusThread
+from trade_drivers.joints import BusMotor
 from trade_drivers.vendors.cia402._axis import DriveAxis
 from trade_drivers.vendors.cia402._cycle import DriveExchange
 from trade_drivers.vendors.cia402._homing import Homing
 
-if TYPE_CHECKING:
-    from trade_drivers.bus.can import CanPort
-
-__all__ = ["AttachedDrives", "Drive"]
+__all__ = ["Drive"]
 
 Method = Annotated[int, Meta(ge=-128, le=37, description="homing method of CiA 402-2; 37: where it is now is its zero")]
 Slow = Annotated[float, Meta(gt=0, description="speed of the search in rad/s; by default a tenth of the joint's limit")]
 
 
-class Drive(BusMotor):
+class Drive(BusMotor[DriveAxis, DriveExchange]):
     """One CiA 402 drive as a motor."""
 
     @service(effect="actuate", cancel="stop")
@@ -36,14 +31,14 @@ class Drive(BusMotor):
             LimitExceeded: faster than limits().
             MotionStopped, DeviceSilent, DeadlineExceeded: as with move_to().
         """
-        axis = cast("DriveAxis", self._axes[0])
+        axis = self._axes[0]
         fastest = axis.joint.max_speed_rad_s
         speed = fastest / 10 if speed_rad_s is None else speed_rad_s
         within(speed, axis.grain.rad_s, fastest, f"{axis.name} speed", "rad/s")
         expires_ns, until_ns = span(self._exchange.clock)
         with permit(self.resources) as permitted:
             homing = Homing(
-                cast("DriveExchange", self._exchange),
+                self._exchange,
                 axis,
                 method=method,
                 speed_counts=int(speed / axis.grain.rad_s),
@@ -54,14 +49,3 @@ class Drive(BusMotor):
             )
             self._finish(homing)
         return axis.scale.angle_rad(axis.fresh(self._exchange.clock(), self._exchange.stale_after_ns).position)
-
-
-class AttachedDrives(AttachedJoints):
-    """A bus of drives."""
-
-    def __init__(self, thread: BusThread[DriveExchange], port: "CanPort") -> None:
-        super().__init__(thread, Drive)
-        self._port = port
-
-    def monitor(self, name: str) -> CanMonitor:
-        return CanMonitor(partial(self._port.look, name))

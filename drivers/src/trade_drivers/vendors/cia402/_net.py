@@ -8,7 +8,7 @@ from typing import Final, TypeVar
 from canopen.emcy import EmcyError
 from canopen.sdo.exceptions import SdoAbortedError
 
-from trade_drivers.bus.can import CanPort, Listeners
+from trade_drivers.bus.can import Listeners
 from trade_drivers.joints import Gate
 from trade_drivers.vendors.cia402 import _sdo as sdo
 from trade_drivers.vendors.cia402 import _table as table
@@ -61,17 +61,18 @@ _CODES: Final = {
 }
 
 
-class Net(Listeners):
-    """One CAN bus with its nodes."""
+class Net:
+    """The nodes of one CAN bus."""
 
-    def __init__(self, port: CanPort, between: Callable[[], None], meanwhile: Callable[[], None]) -> None:
-        super().__init__(port, between, meanwhile)
+    def __init__(self, listeners: Listeners) -> None:
+        self._listeners = listeners
+        self._port = listeners.port
         self._answers: dict[int, deque[bytes]] = {}
         """What came from the SDO server of a node."""
 
     def command(self, node: int, word: int) -> None:
         """Network management: start a node, and so on. Nobody confirms it."""
-        self.port.send(table.NMT, bytes((word, node)))
+        self._port.send(table.NMT, bytes((word, node)))
 
     def read(self, node: int, entry: Entry) -> Answer[int]:
         """A number out of a drive's dictionary.
@@ -114,11 +115,11 @@ class Net(Listeners):
         request = next(transfer)
         while True:
             answers.clear()
-            self.port.send(table.SDO_REQUEST + node, request.data)
+            self._port.send(table.SDO_REQUEST + node, request.data)
             give_up_at = time.monotonic() + _ANSWER_S
             while (answer := next(filter(request.is_answered_by, answers), None)) is None:
-                if self.heard_until(give_up_at):
-                    self.port.send(table.SDO_REQUEST + node, sdo.abort(request, sdo.TIMED_OUT))
+                if self._listeners.heard_until(give_up_at):
+                    self._port.send(table.SDO_REQUEST + node, sdo.abort(request, sdo.TIMED_OUT))
                     return None
                 yield
             try:
@@ -129,5 +130,5 @@ class Net(Listeners):
     def _answers_of(self, node: int) -> deque[bytes]:
         if node not in self._answers:
             self._answers[node] = deque(maxlen=_KEPT)
-            self.hear(table.SDO_ANSWER + node, self._answers[node].append)
+            self._listeners.hear(table.SDO_ANSWER + node, self._answers[node].append)
         return self._answers[node]

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from itertools import islice
 from typing import Final
 
-from trade_drivers.bus.can import CanPort
+from trade_drivers.bus.can import CanPort, Listeners
 from trade_drivers.commissioning._can_scan import CanBench
 from trade_drivers.commissioning._commissioner import Found
 from trade_drivers.vendors.cia402 import _table as table
@@ -30,7 +30,8 @@ class DriveBench(CanBench):
 
     def __init__(self, port: CanPort, bitrate: int) -> None:
         super().__init__(port, bitrate)
-        self._net = Net(port, _nothing, _nothing)
+        self._listeners = Listeners(port, _nothing, _nothing)
+        self._net = Net(self._listeners)
         self._known: dict[int, Found | None] = {}
 
     def anybody(self) -> bool:
@@ -54,7 +55,7 @@ class DriveBench(CanBench):
                 except StopIteration as done:
                     self._known[node] = done.value
                     del asking[node]
-            self._net.take_in(_SLICE_S)
+            self._listeners.take_in(_SLICE_S)
 
     def _looking(self, node: int) -> Answer[Found | None]:
         try:

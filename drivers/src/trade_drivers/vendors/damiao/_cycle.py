@@ -6,11 +6,11 @@ further on its way, and any other is asked. It has no ramps that could be relied
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Final, cast
+from typing import TYPE_CHECKING, Final
 
 from trade.errors import TradeError
 from trade_drivers.bus.can import Frame
-from trade_drivers.joints import Axis, Gate, Goal, Job, Manner, Motion, Ramp, Steps, next_measurement
+from trade_drivers.joints import Gate, Goal, Manner, Motion, Ramp, Steps, Work, next_measurement
 from trade_drivers.joints.can._cycle import MotorExchange
 from trade_drivers.vendors.damiao import _frames as frames
 from trade_drivers.vendors.damiao import _jobs as jobs
@@ -64,44 +64,42 @@ class DamiaoExchange(MotorExchange[DamiaoAxis]):
         there = self._there(axis)
         self.port.send_all([there, Frame(axis.id, frames.ENABLE), there])
 
-    def write_goals(self, goals: Mapping[Axis, Goal], gate: Gate) -> None:
+    def write_goals(self, goals: Mapping[DamiaoAxis, Goal], gate: Gate) -> None:
         for axis, goal in goals.items():
-            if (course := cast("DamiaoAxis", axis).course) is not None:
+            if (course := axis.course) is not None:
                 course.fastest, course.accel = goal.speed, goal.accel
-                course.braking = goal.accel * cast("DamiaoAxis", axis).easing
+                course.braking = goal.accel * axis.easing
         self._aim({axis: goal.position for axis, goal in goals.items()}, gate, Ramp.jump)
 
-    def write_positions(self, positions: Mapping[Axis, int], gate: Gate) -> None:
+    def write_positions(self, positions: Mapping[DamiaoAxis, int], gate: Gate) -> None:
         self._aim(positions, gate, _go_on)
 
-    def _aim(self, positions: Mapping[Axis, int], gate: Gate, aim: Callable[[Ramp, int], None]) -> None:
+    def _aim(self, positions: Mapping[DamiaoAxis, int], gate: Gate, aim: Callable[[Ramp, int], None]) -> None:
         gate()
         told: list[Frame] = []
         for axis, position in positions.items():
-            motor = cast("DamiaoAxis", axis)
-            if motor.course is None:
-                raise motor.faulty("it was enabled, but has let go since")
-            aim(motor.course, position)
-            told.append(self._there(motor))
+            if axis.course is None:
+                raise axis.faulty("it was enabled, but has let go since")
+            aim(axis.course, position)
+            told.append(self._there(axis))
         self.port.send_all(told)
 
-    def reached_ns(self, axes: Sequence[Axis]) -> int | None:  # noqa: ARG002 - the same for all
+    def reached_ns(self, axes: Sequence[DamiaoAxis]) -> int | None:  # noqa: ARG002 - the same for all
         """A step on its way is made within the period that begins with it."""
         return self.clock() + self.period_ns
 
-    def write_holds(self, positions: Mapping[Axis, int]) -> None:
+    def write_holds(self, positions: Mapping[DamiaoAxis, int]) -> None:
         """Brake as hard as the joint may; one held off its course stands where it is.
 
         One under torque that this driver has not enabled lets go: what it would make of a position, nobody knows.
         """
         for axis, position in positions.items():
-            motor = cast("DamiaoAxis", axis)
-            if motor.course is None:
-                if motor.torque:
-                    self.port.send(motor.id, frames.DISABLE)
+            if axis.course is None:
+                if axis.torque:
+                    self.port.send(axis.id, frames.DISABLE)
                 continue
-            self._brake(motor, motor.course, position)
-            self.port.send_all([self._there(motor)])
+            self._brake(axis, axis.course, position)
+            self.port.send_all([self._there(axis)])
 
     def _brake(self, axis: DamiaoAxis, course: Ramp, position: int) -> None:
         if abs(course.position - position) > axis.grain.near + abs(course.speed) * _LAG * self.period_ns / 1e9:
@@ -112,23 +110,23 @@ class DamiaoExchange(MotorExchange[DamiaoAxis]):
         rests = course.position + course.speed * abs(course.speed) / (2 * axis.accel_counts)
         course.jump(round(max(min(axis.low, course.position), min(max(axis.high, course.position), rests))))
 
-    def making_way(self, job: Motion) -> Steps:
-        for axis in job.axes:
-            cast("DamiaoAxis", axis).easing = 0.5 if job.manner is Manner.POSITIONS else 1.0
+    def making_way(self, job: Motion[DamiaoAxis]) -> Steps:
+        for axis in job.devices:
+            axis.easing = 0.5 if job.manner is Manner.POSITIONS else 1.0
         yield from ()
 
-    def enabling(self, job: Job, axis: Axis) -> Steps:
-        return jobs.enabling(self, job, cast("DamiaoAxis", axis))
+    def enabling(self, job: Work[DamiaoAxis], axis: DamiaoAxis) -> Steps:
+        return jobs.enabling(self, job, axis)
 
-    def relaxing(self, job: Job, axis: Axis) -> Steps:
-        return jobs.relaxing(self, job, cast("DamiaoAxis", axis))
+    def relaxing(self, job: Work[DamiaoAxis], axis: DamiaoAxis) -> Steps:
+        return jobs.relaxing(self, job, axis)
 
-    def looking(self, axis: Axis) -> Steps:
+    def looking(self, axis: DamiaoAxis) -> Steps:
         self.require_answering(axis)
         yield from next_measurement(self, axis)
 
-    def leaving(self, job: Job, axis: Axis, *, relax: bool) -> Steps:
-        return jobs.leaving(self, job, cast("DamiaoAxis", axis), relax=relax)
+    def leaving(self, job: Work[DamiaoAxis], axis: DamiaoAxis, *, relax: bool) -> Steps:
+        return jobs.leaving(self, job, axis, relax=relax)
 
     # --- what it is asked
 
@@ -141,7 +139,7 @@ class DamiaoExchange(MotorExchange[DamiaoAxis]):
     def watch(self) -> None:
         """What is sent on its way step by step goes on only while its call may."""
         super().watch()
-        for motion in dict.fromkeys(axis.motion for axis in self.axes if axis.motion is not None):
+        for motion in dict.fromkeys(axis.motion for axis in self.devices if axis.motion is not None):
             try:
                 motion.permit.gate()
             except TradeError as ending:

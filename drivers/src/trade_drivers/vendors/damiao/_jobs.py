@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Final
 
 from trade_drivers.bus._cycle import HALT_NS
 from trade_drivers.bus._jobs import NoAnswer
-from trade_drivers.joints import Job, Steps, next_measurement, until
+from trade_drivers.joints import Steps, Work, next_measurement, until
 from trade_drivers.vendors.damiao import _frames as frames
 from trade_drivers.vendors.damiao._axis import DamiaoAxis
 from trade_drivers.vendors.damiao._frames import Register
@@ -18,7 +18,7 @@ __all__ = ["enabling", "leaving", "relaxing"]
 _WAIT_S: Final = 0.001
 
 
-def enabling(bus: "DamiaoExchange", job: Job, axis: DamiaoAxis) -> Steps:
+def enabling(bus: "DamiaoExchange", job: Work[DamiaoAxis], axis: DamiaoAxis) -> Steps:
     """Torque on where it was measured to be, in position-velocity mode; all of it confirmed."""
     bus.require_answering(axis)
     yield from next_measurement(bus, axis)
@@ -40,7 +40,7 @@ def enabling(bus: "DamiaoExchange", job: Job, axis: DamiaoAxis) -> Steps:
     axis.fault, axis.ready = "", True
 
 
-def _set_up(bus: "DamiaoExchange", job: Job, axis: DamiaoAxis) -> Steps:
+def _set_up(bus: "DamiaoExchange", job: Work[DamiaoAxis], axis: DamiaoAxis) -> Steps:
     """Its time-out and its mode, every time: both are gone when it has restarted, which it does not tell."""
     job.gate()
     yield from _written(bus, axis, Register.TIMEOUT, bus.timeout)
@@ -53,7 +53,7 @@ def _set_up(bus: "DamiaoExchange", job: Job, axis: DamiaoAxis) -> Steps:
     yield from _written(bus, axis, Register.CONTROL_MODE, frames.IN_POSITION_VELOCITY)
 
 
-def relaxing(bus: "DamiaoExchange", job: Job, axis: DamiaoAxis) -> Steps:
+def relaxing(bus: "DamiaoExchange", job: Work[DamiaoAxis], axis: DamiaoAxis) -> Steps:
     """Torque off; its watchdog has nothing to watch then."""
     axis.ready = False
     job.gate()
@@ -63,7 +63,7 @@ def relaxing(bus: "DamiaoExchange", job: Job, axis: DamiaoAxis) -> Steps:
     yield from until(bus, axis, lambda: not axis.may_hold_torque, "told to relax, but its torque is still on")
 
 
-def leaving(bus: "DamiaoExchange", job: Job, axis: DamiaoAxis, *, relax: bool) -> Steps:
+def leaving(bus: "DamiaoExchange", job: Work[DamiaoAxis], axis: DamiaoAxis, *, relax: bool) -> Steps:
     """Torque off, or left on where it was seen at rest; only then its watchdog is disarmed."""
     if relax:
         yield from relaxing(bus, job, axis)

@@ -2,17 +2,17 @@
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Final, cast
+from typing import TYPE_CHECKING, Final
 
-from trade_drivers.joints import Axis, Gate, Goal, Job, Steps
-from trade_drivers.joints.serial import ServoAxis, ServoExchange, health_of
+from trade_drivers.joints import Gate, Goal, Steps, Work
+from trade_drivers.joints.serial import ServoExchange, health_of
 from trade_drivers.vendors.dynamixel import _jobs as jobs
 from trade_drivers.vendors.dynamixel import _table as table
 from trade_drivers.vendors.dynamixel._axis import CYCLIC, DynamixelAxis
 
 if TYPE_CHECKING:
     from trade_drivers.robotfile import SerialBus
-    from trade_drivers.vendors.dynamixel._sdk import Wire
+    from trade_drivers.vendors.dynamixel._wire import Wire
 
 __all__ = ["DynamixelExchange"]
 
@@ -22,7 +22,7 @@ _SIZES: Final = tuple(
 )
 
 
-class DynamixelExchange(ServoExchange):
+class DynamixelExchange(ServoExchange[DynamixelAxis, "Wire"]):
     """What happens on one bus of servos."""
 
     sizes = _SIZES
@@ -38,15 +38,15 @@ class DynamixelExchange(ServoExchange):
         super().__init__(wire, bus, axes, clock)
         self.watchdog_counts = max(1, min(127, round(bus.watchdog_s / table.BUS_WATCHDOG.si_per_count)))
 
-    def write_goals(self, goals: Mapping[Axis, Goal], gate: Gate) -> None:
+    def write_goals(self, goals: Mapping[DynamixelAxis, Goal], gate: Gate) -> None:
         data = {axis.id: jobs.goal_block(goal) for axis, goal in goals.items()}
         self.wire.sync_write(table.PROFILE_ACCELERATION.address, data, gate)
 
-    def write_positions(self, positions: Mapping[Axis, int], gate: Gate) -> None:
+    def write_positions(self, positions: Mapping[DynamixelAxis, int], gate: Gate) -> None:
         data = {axis.id: table.GOAL_POSITION.encode(position) for axis, position in positions.items()}
         self.wire.sync_write(table.GOAL_POSITION.address, data, gate)
 
-    def write_holds(self, positions: Mapping[Axis, int]) -> None:
+    def write_holds(self, positions: Mapping[DynamixelAxis, int]) -> None:
         ours: dict[int, bytes] = {}
         others: dict[int, bytes] = {}
         for axis, position in positions.items():
@@ -59,24 +59,24 @@ class DynamixelExchange(ServoExchange):
         if others:
             self.wire.sync_write(table.GOAL_POSITION.address, others)
 
-    def enabling(self, job: Job, axis: Axis) -> Steps:
-        return jobs.enabling(self, job, cast("DynamixelAxis", axis))
+    def enabling(self, job: Work[DynamixelAxis], axis: DynamixelAxis) -> Steps:
+        return jobs.enabling(self, job, axis)
 
-    def relaxing(self, job: Job, axis: Axis) -> Steps:
-        return jobs.relaxing(self, job, cast("DynamixelAxis", axis))
+    def relaxing(self, job: Work[DynamixelAxis], axis: DynamixelAxis) -> Steps:
+        return jobs.relaxing(self, job, axis)
 
-    def looking(self, axis: Axis) -> Steps:
-        yield from health_of(self, cast("DynamixelAxis", axis))
+    def looking(self, axis: DynamixelAxis) -> Steps:
+        yield from health_of(self, axis)
 
-    def leaving(self, job: Job, axis: Axis, *, relax: bool) -> Steps:
-        return jobs.leaving(self, job, cast("DynamixelAxis", axis), relax=relax)
+    def leaving(self, job: Work[DynamixelAxis], axis: DynamixelAxis, *, relax: bool) -> Steps:
+        return jobs.leaving(self, job, axis, relax=relax)
 
     def name_of(self, model_number: int) -> str:
         return table.name_of(model_number, str(model_number))
 
-    def admit(self, axis: ServoAxis[Any]) -> None:
+    def admit(self, axis: DynamixelAxis) -> None:
         """Found enabled, its watchdog is armed; found moving, it is stopped."""
-        health = cast("DynamixelAxis", axis).health
+        health = axis.health
         if health is None or not health.torque or health.watchdog == table.WATCHDOG_EXPIRED:
             return
         self.wire.write(axis.id, table.BUS_WATCHDOG.address, table.BUS_WATCHDOG.encode(self.watchdog_counts))

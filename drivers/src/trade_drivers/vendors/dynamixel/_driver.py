@@ -2,10 +2,10 @@
 
 import logging
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Final, cast
+from typing import TYPE_CHECKING, Final
 
-from trade.errors import ConfigurationError
-from trade_drivers.joints.serial import ServoAxis, ServoDriver, ServoExchange
+from trade_drivers._validation import not_installed
+from trade_drivers.joints.serial import ServoDriver
 from trade_drivers.robotfile import Joint, Robot, SerialBus
 from trade_drivers.vendors.dynamixel import _table as table
 from trade_drivers.vendors.dynamixel._axis import DynamixelAxis
@@ -14,16 +14,15 @@ from trade_drivers.vendors.dynamixel._cycle import DynamixelExchange
 from trade_drivers.vendors.dynamixel._inspect import check_bus, look_over
 
 if TYPE_CHECKING:
-    from trade_drivers.joints.serial._wire import ServoWire
-    from trade_drivers.vendors.dynamixel._sdk import Wire
+    from trade_drivers.vendors.dynamixel._wire import Wire
 
-__all__ = ["DynamixelDriver", "open_exchange"]
+__all__ = ["DynamixelDriver"]
 
 _log = logging.getLogger("trade")
 _SLOW_ANSWER_S: Final = 100e-6
 
 
-class DynamixelDriver(ServoDriver):
+class DynamixelDriver(ServoDriver[DynamixelAxis, "Wire"]):
     """X-series servos in position control on a serial bus, through dynamixel-sdk."""
 
     name = "dynamixel"
@@ -32,7 +31,7 @@ class DynamixelDriver(ServoDriver):
     modules = ("dynamixel_sdk", "serial")
     commissioner = DynamixelCommissioner
 
-    def exchange(self, robot: Robot, bus: SerialBus, port: str, joints: list[Joint]) -> ServoExchange:
+    def exchange(self, robot: Robot, bus: SerialBus, port: str, joints: list[Joint]) -> DynamixelExchange:
         axes = [
             DynamixelAxis(f"{robot.name}.{joint.name}", port, joint, robot.coupled_to(joint.name)) for joint in joints
         ]
@@ -41,27 +40,17 @@ class DynamixelDriver(ServoDriver):
         return DynamixelExchange(wire, bus, axes)
 
     def look_over(
-        self, wire: "ServoWire", bus: SerialBus, axis: ServoAxis[Any], clock_ns: Callable[[], int], where: str
+        self, wire: "Wire", bus: SerialBus, axis: DynamixelAxis, clock_ns: Callable[[], int], where: str
     ) -> None:
-        delay_s = look_over(cast("Wire", wire), bus, cast("DynamixelAxis", axis), clock_ns, where)
+        delay_s = look_over(wire, bus, axis, clock_ns, where)
         if delay_s > _SLOW_ANSWER_S:
             _log.info("%s waits %.0f us before it answers (register 9); 0 is faster", axis.name, delay_s * 1e6)
-
-
-def open_exchange(robot: Robot, bus: SerialBus, port: str) -> ServoExchange:
-    """Open the port and look every joint over, without a thread: ``cycle()`` is the caller's to call.
-
-    Raises:
-        ConfigurationError: the port cannot be had, or a device is absent, another, or set wrongly.
-    """
-    return DynamixelDriver().open_exchange(robot, bus, port)
 
 
 def wire_at(port: str, baud: int, where: str, *, fast: bool = False) -> "Wire":
     """A line, not open yet. Raises ``ConfigurationError`` without the vendor library."""
     try:
-        from trade_drivers.vendors.dynamixel._sdk import Wire  # noqa: PLC0415 - the vendor library is optional
+        from trade_drivers.vendors.dynamixel._wire import Wire  # noqa: PLC0415 - the vendor library is optional
     except ImportError as missing:
-        problem = f'needs dynamixel-sdk ({missing}); pip install "trade-drivers[dynamixel]"'
-        raise ConfigurationError(where="driver dynamixel", problem=problem) from None
+        raise not_installed("dynamixel", "dynamixel-sdk", missing) from None
     return Wire(port, baud, where, fast=fast)

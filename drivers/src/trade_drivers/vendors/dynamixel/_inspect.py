@@ -4,26 +4,18 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Final, NoReturn
 
 from trade.errors import ConfigurationError
-from trade_drivers.joints.serial import (
-    NoAnswer,
-    again,
-    check_firmware,
-    check_homing,
-    check_model,
-    check_ranges,
-    check_rate,
-    first_ping,
-)
+from trade_drivers.joints import check_joints
+from trade_drivers.joints.serial import Kept, NoAnswer, check_cycle, check_own_range, check_ranges, first_look
 from trade_drivers.vendors.dynamixel import _table as table
-from trade_drivers.vendors.dynamixel._axis import CYCLIC, SLOW, DynamixelAxis
+from trade_drivers.vendors.dynamixel._axis import CYCLIC, DynamixelAxis
 
 if TYPE_CHECKING:
     from trade_drivers.robotfile import SerialBus
-    from trade_drivers.vendors.dynamixel._sdk import Wire
+    from trade_drivers.vendors.dynamixel._wire import Wire
 
 __all__ = ["check_bus", "look_over"]
 
-_EEPROM: Final = (table.MODEL_NUMBER.address, table.MIN_POSITION.end)
+_KEPT: Final = Kept(table.MIN_POSITION.end, (7, 8), table.name_of, table.firmware)
 _OTHER_THAN_REVERSED: Final = 0xFE
 _SHADOWS: Final = 252
 _ALL_ANSWER: Final = 2
@@ -35,11 +27,10 @@ def check_bus(bus: "SerialBus", axes: Sequence[DynamixelAxis], where: str) -> No
     Raises:
         ConfigurationError: names the key and what would be right.
     """
-    for axis in axes:
-        check_ranges(axis, where)
+    check_joints(axes, where, check_ranges)
     count = len(axes)
     read = 14 + count + (8 + count * 14 if bus.fast_sync else count * (11 + CYCLIC[1]))
-    check_rate(bus, count, read + 14 + count * 5, where)
+    check_cycle(bus, count, read + 14 + count * 5, where)
 
 
 def look_over(wire: "Wire", bus: "SerialBus", axis: DynamixelAxis, clock_ns: Callable[[], int], where: str) -> float:
@@ -52,20 +43,11 @@ def look_over(wire: "Wire", bus: "SerialBus", axis: DynamixelAxis, clock_ns: Cal
         ConfigurationError: it is absent, another model, set wrongly, or not alone under its id.
     """
     key = f'{where}: joint."{axis.joint.name}"'
-    number = first_ping(wire, bus, axis, key, (7, 8))
-    check_model(axis, number, table.name_of(number, "a model this driver does not know"), key)
-    silent = "it answers a ping but no read: its status return level (68) is 0 or 1; set it to 2"
     try:
-        asked_ns = clock_ns()
-        settings = again(wire, axis, lambda: wire.read(axis.id, *_EEPROM).data)
-        health = again(wire, axis, lambda: wire.read(axis.id, *SLOW).data)
-        sample = again(wire, axis, lambda: wire.read(axis.id, *CYCLIC).data)
+        settings = first_look(wire, bus, axis, _KEPT, clock_ns, key)
     except NoAnswer:
+        silent = "it answers a ping but no read: its status return level (68) is 0 or 1; set it to 2"
         raise ConfigurationError(where=key, problem=silent) from None
-    check_firmware(axis, str(table.FIRMWARE.decode(settings)), key)
-    check_homing(axis, settings, key)
-    axis.take_health(health, asked_ns)
-    axis.take_sample(sample, asked_ns)
     _check_settings(axis, settings, key)
     return table.RETURN_DELAY.decode(settings) * table.RETURN_DELAY.si_per_count
 
@@ -85,13 +67,7 @@ def _check_settings(axis: DynamixelAxis, settings: bytes, key: str) -> None:
     if (shadow := table.SHADOW_ID.decode(settings)) <= _SHADOWS:
         _wrong(key, f"it also obeys what is sent to id {shadow} (register 12); set it to 255, with torque off")
     low, high = table.MIN_POSITION.decode(settings), table.MAX_POSITION.decode(settings)
-    if axis.low < low or axis.high > high:
-        ends = sorted((axis.scale.angle_rad(low), axis.scale.angle_rad(high)))
-        _wrong(
-            key,
-            f"min_rad {joint.min_rad:.6g} to max_rad {joint.max_rad:.6g} is more than the device's own range "
-            f"(registers 52 and 48), {ends[0]:.6g} to {ends[1]:.6g} rad; narrow the one or widen the other",
-        )
+    check_own_range(axis, low, high, "registers 52 and 48", key)
     fastest = table.VELOCITY_LIMIT.decode(settings)
     if axis.speed_counts > fastest:
         limit = fastest * table.RAD_S_PER_COUNT

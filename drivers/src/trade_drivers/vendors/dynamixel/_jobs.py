@@ -2,16 +2,15 @@
 
 from collections.abc import Generator
 from contextlib import suppress
-from typing import TYPE_CHECKING, Final, cast
+from typing import TYPE_CHECKING, Final
 
-from trade_drivers.joints import Goal, Job, Steps
+from trade_drivers.joints import Goal, Steps, Work
 from trade_drivers.joints.serial import NoAnswer, health_of, still_homed, told, tried
 from trade_drivers.vendors.dynamixel import _table as table
 from trade_drivers.vendors.dynamixel._axis import DynamixelAxis, DynamixelHealth
 
 if TYPE_CHECKING:
     from trade_drivers.vendors.dynamixel._cycle import DynamixelExchange
-    from trade_drivers.vendors.dynamixel._sdk import Wire
 
 __all__ = ["enabling", "goal_block", "leaving", "relaxing"]
 
@@ -35,30 +34,30 @@ def goal_block(goal: Goal) -> bytes:
     )
 
 
-def relaxing(bus: "DynamixelExchange", job: Job, axis: DynamixelAxis) -> Steps:
+def relaxing(bus: "DynamixelExchange", job: Work[DynamixelAxis], axis: DynamixelAxis) -> Steps:
     """Torque off, and its watchdog disarmed."""
     axis.ready = False  # before: its health may be read in between, and torque that is off would be a fault
-    yield from _write(bus, job, axis, table.TORQUE_ENABLE, 0)
-    yield from _write(bus, job, axis, table.BUS_WATCHDOG, 0)
+    yield from told(bus, job, axis, table.TORQUE_ENABLE, 0)
+    yield from told(bus, job, axis, table.BUS_WATCHDOG, 0)
     health = yield from health_of(bus, axis)
     if health.torque:
         raise axis.faulty("told to relax, but its torque is still on")
 
 
-def leaving(bus: "DynamixelExchange", job: Job, axis: DynamixelAxis, *, relax: bool) -> Steps:
+def leaving(bus: "DynamixelExchange", job: Work[DynamixelAxis], axis: DynamixelAxis, *, relax: bool) -> Steps:
     """Torque off or left on, and its watchdog disarmed where it may be."""
     health = yield from health_of(bus, axis)
     if relax and health.torque:
         axis.ready = False
-        yield from _write(bus, job, axis, table.TORQUE_ENABLE, 0)
+        yield from told(bus, job, axis, table.TORQUE_ENABLE, 0)
     elif health.watchdog == table.WATCHDOG_EXPIRED or axis.still == 0:
         return
     if health.watchdog:
-        yield from _write(bus, job, axis, table.BUS_WATCHDOG, 0)
+        yield from told(bus, job, axis, table.BUS_WATCHDOG, 0)
     axis.ready = False
 
 
-def enabling(bus: "DynamixelExchange", job: Job, axis: DynamixelAxis) -> Steps:
+def enabling(bus: "DynamixelExchange", job: Work[DynamixelAxis], axis: DynamixelAxis) -> Steps:
     """Torque on at the measured position, with the joint's own profile and its watchdog armed; all of it read back."""
     bus.require_answering(axis)
     health = yield from health_of(bus, axis)
@@ -70,11 +69,11 @@ def enabling(bus: "DynamixelExchange", job: Job, axis: DynamixelAxis) -> Steps:
         raise axis.faulty()
     yield from still_homed(bus, axis)
     if health.watchdog:
-        yield from _write(bus, job, axis, table.BUS_WATCHDOG, 0)
+        yield from told(bus, job, axis, table.BUS_WATCHDOG, 0)
     block = yield from tried(bus, axis, lambda: _seeded(bus, job, axis))
     armed = bus.watchdog_counts
-    yield from _write(bus, job, axis, table.BUS_WATCHDOG, armed)
-    yield from _write(bus, job, axis, table.TORQUE_ENABLE, 1)
+    yield from told(bus, job, axis, table.BUS_WATCHDOG, armed)
+    yield from told(bus, job, axis, table.TORQUE_ENABLE, 1)
     axis.ready = False
     health = yield from health_of(bus, axis)
     kept = yield from tried(bus, axis, lambda: bus.wire.read(axis.id, *_GOAL_BLOCK).data)
@@ -83,7 +82,7 @@ def enabling(bus: "DynamixelExchange", job: Job, axis: DynamixelAxis) -> Steps:
     axis.fault, axis.ready = "", True
 
 
-def _seeded(bus: "DynamixelExchange", job: Job, axis: DynamixelAxis) -> bytes:
+def _seeded(bus: "DynamixelExchange", job: Work[DynamixelAxis], axis: DynamixelAxis) -> bytes:
     """Its goal is where it is; tried again, it is measured again, as it may have sagged."""
     register = table.PRESENT_POSITION
     answer = bus.wire.read(axis.id, register.address, register.size)
@@ -93,12 +92,14 @@ def _seeded(bus: "DynamixelExchange", job: Job, axis: DynamixelAxis) -> bytes:
     return block
 
 
-def _restarted(bus: "DynamixelExchange", job: Job, axis: DynamixelAxis) -> Generator[None, None, DynamixelHealth]:
+def _restarted(
+    bus: "DynamixelExchange", job: Work[DynamixelAxis], axis: DynamixelAxis
+) -> Generator[None, None, DynamixelHealth]:
     """How a servo is that has shut down, once it was started anew: nothing but that, or its power, has it go on."""
     axis.ready = False
     began_ns = bus.clock()
     with suppress(NoAnswer):  # whether it has heard that is seen by what it says next
-        cast("Wire", bus.wire).reboot(axis.id, job.gate)
+        bus.wire.reboot(axis.id, job.gate)
     while True:
         bus.idle(_WAIT_S)
         yield
@@ -108,7 +109,3 @@ def _restarted(bus: "DynamixelExchange", job: Job, axis: DynamixelAxis) -> Gener
             return heard
         if now_ns - began_ns > 2 * _BOOT_NS:
             raise axis.deaf(now_ns)
-
-
-def _write(bus: "DynamixelExchange", job: Job, axis: DynamixelAxis, register: table.Register, value: int) -> Steps:
-    yield from told(bus, job, axis, register.address, register.encode(value))

@@ -19,6 +19,7 @@ __all__ = [
     "Access",
     "Model",
     "Register",
+    "firmware",
     "name_of",
 ]
 
@@ -200,3 +201,8 @@ def name_of(model_number: int, otherwise: str) -> str:
     """What a model is called."""
     model = BY_MODEL_NUMBER.get(model_number)
     return model.name if model else otherwise
+
+
+def firmware(data: bytes) -> str:
+    """The version of its program, out of the bytes from address 0 on."""
+    return str(FIRMWARE.decode(data))

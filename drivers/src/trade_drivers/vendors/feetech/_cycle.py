@@ -5,24 +5,24 @@ after the cycles end: that is all a driver that dies or freezes leaves behind.
 """
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, Final, cast
+from typing import TYPE_CHECKING, Final
 
 from trade.errors import TradeError
-from trade_drivers.joints import Axis, Gate, Goal, Job, Motion, Steps
-from trade_drivers.joints.serial import ServoAxis, ServoExchange, health_of
+from trade_drivers.joints import Gate, Goal, Motion, Steps, Work
+from trade_drivers.joints.serial import ServoExchange, health_of
 from trade_drivers.vendors.feetech import _jobs as jobs
 from trade_drivers.vendors.feetech import _table as table
 from trade_drivers.vendors.feetech._axis import CYCLIC, FeetechAxis
 
 if TYPE_CHECKING:
-    pass
+    from trade_drivers.vendors.feetech._wire import Wire  # noqa: F401 - a parameter of the base class
 
 __all__ = ["FeetechExchange"]
 
 _SIZES: Final = tuple(register.end - CYCLIC[0] for register in (table.PRESENT_LOAD, table.TEMPERATURE, table.STATUS))
 
 
-class FeetechExchange(ServoExchange):
+class FeetechExchange(ServoExchange[FeetechAxis, "Wire"]):
     """What happens on one bus of servos."""
 
     sizes = _SIZES
@@ -30,54 +30,52 @@ class FeetechExchange(ServoExchange):
 
     # --- what a servo is told
 
-    def write_goals(self, goals: Mapping[Axis, Goal], gate: Gate) -> None:
-        aims = {cast("FeetechAxis", axis): goal for axis, goal in goals.items()}
+    def write_goals(self, goals: Mapping[FeetechAxis, Goal], gate: Gate) -> None:
         now_ns = self.clock()
-        self._send({axis: axis.step(aim, now_ns) for axis, aim in aims.items()}, gate)
-        for axis, aim in aims.items():
+        self._send({axis: axis.step(aim, now_ns) for axis, aim in goals.items()}, gate)
+        for axis, aim in goals.items():
             axis.aim = aim
 
-    def write_positions(self, positions: Mapping[Axis, int], gate: Gate) -> None:
-        goals: dict[Axis, Goal] = {}
+    def write_positions(self, positions: Mapping[FeetechAxis, int], gate: Gate) -> None:
+        goals: dict[FeetechAxis, Goal] = {}
         for axis, position in positions.items():
-            aim = cast("FeetechAxis", axis).aim
+            aim = axis.aim
             accel, speed = (aim.accel, aim.speed) if aim else (axis.accel_counts, axis.speed_counts)
             goals[axis] = Goal(position, accel, speed)
         self.write_goals(goals, gate)
 
-    def write_holds(self, positions: Mapping[Axis, int]) -> None:
+    def write_holds(self, positions: Mapping[FeetechAxis, int]) -> None:
         # it brakes at its full acceleration, however gentle the move was
         goals = {axis: Goal(position, axis.accel_counts, axis.speed_counts) for axis, position in positions.items()}
-        self._send({cast("FeetechAxis", axis): goal for axis, goal in goals.items()})
+        self._send(goals)
         for axis in positions:
-            cast("FeetechAxis", axis).aim = None
+            axis.aim = None
 
-    def enabling(self, job: Job, axis: Axis) -> Steps:
-        return jobs.enabling(self, job, cast("FeetechAxis", axis))
+    def enabling(self, job: Work[FeetechAxis], axis: FeetechAxis) -> Steps:
+        return jobs.enabling(self, job, axis)
 
-    def relaxing(self, job: Job, axis: Axis) -> Steps:
-        return jobs.relaxing(self, job, cast("FeetechAxis", axis))
+    def relaxing(self, job: Work[FeetechAxis], axis: FeetechAxis) -> Steps:
+        return jobs.relaxing(self, job, axis)
 
-    def looking(self, axis: Axis) -> Steps:
-        yield from health_of(self, cast("FeetechAxis", axis))
+    def looking(self, axis: FeetechAxis) -> Steps:
+        yield from health_of(self, axis)
 
-    def leaving(self, job: Job, axis: Axis, *, relax: bool) -> Steps:
-        return jobs.leaving(self, job, cast("FeetechAxis", axis), relax=relax)
+    def leaving(self, job: Work[FeetechAxis], axis: FeetechAxis, *, relax: bool) -> Steps:
+        return jobs.leaving(self, job, axis, relax=relax)
 
     # --- from the bus thread
 
     def name_of(self, model_number: int) -> str:
         return table.name_of(model_number, str(model_number))
 
-    def admit(self, axis: ServoAxis[Any]) -> None:
+    def admit(self, axis: FeetechAxis) -> None:
         self.stop_found_moving(axis)
 
-    def look_after(self, axis: ServoAxis[Any]) -> None:
+    def look_after(self, axis: FeetechAxis) -> None:
         """Cut off by its own protection, it is switched off: else it would go on by itself once the cause is gone."""
-        servo = cast("FeetechAxis", axis)
-        if servo.health is not None and servo.health.torque and servo.health.error & servo.unload:
-            self.wire.write(servo.id, table.TORQUE.address, table.TORQUE.encode(0))
-            servo.take_health(self.wire.read(servo.id, *servo.slow).data, self.clock())
+        if axis.health is not None and axis.health.torque and axis.health.error & axis.unload:
+            self.wire.write(axis.id, table.TORQUE.address, table.TORQUE.encode(0))
+            axis.take_health(self.wire.read(axis.id, *axis.slow).data, self.clock())
 
     def watch(self) -> None:
         super().watch()
@@ -87,7 +85,7 @@ class FeetechExchange(ServoExchange):
         """Send joints on that are on their way, as far ahead of where they were measured as they may be."""
         steps: dict[FeetechAxis, Goal] = {}
         now_ns = self.clock()
-        for motion in dict.fromkeys(axis.motion for axis in self.axes if axis.motion is not None):
+        for motion in dict.fromkeys(axis.motion for axis in self.devices if axis.motion is not None):
             try:
                 if due := _due(motion, now_ns):
                     motion.permit.gate()
@@ -105,13 +103,12 @@ class FeetechExchange(ServoExchange):
             axis.sent, axis.sent_ns = goal.position, sent_ns
 
 
-def _due(motion: Motion, now_ns: int) -> dict[FeetechAxis, Goal]:
+def _due(motion: Motion[FeetechAxis], now_ns: int) -> dict[FeetechAxis, Goal]:
     """Where its joints are to be sent now, if that is not where they were sent last."""
     due: dict[FeetechAxis, Goal] = {}
-    for axis in motion.axes:
-        servo = cast("FeetechAxis", axis)
-        if servo.aim is None or servo.in_doubt:
+    for axis in motion.devices:
+        if axis.aim is None or axis.in_doubt:
             continue
-        if (step := servo.step(servo.aim, now_ns)).position != servo.sent:
-            due[servo] = step
+        if (step := axis.step(axis.aim, now_ns)).position != axis.sent:
+            due[axis] = step
     return due

@@ -1,10 +1,10 @@
 """Bringing a Feetech bus up."""
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING
 
-from trade.errors import ConfigurationError
-from trade_drivers.joints.serial import ServoAxis, ServoDriver, ServoExchange
+from trade_drivers._validation import not_installed
+from trade_drivers.joints.serial import ServoDriver
 from trade_drivers.robotfile import Joint, Robot, SerialBus
 from trade_drivers.vendors.feetech import _table as table
 from trade_drivers.vendors.feetech._axis import FeetechAxis
@@ -13,13 +13,12 @@ from trade_drivers.vendors.feetech._cycle import FeetechExchange
 from trade_drivers.vendors.feetech._inspect import check_bus, look_over
 
 if TYPE_CHECKING:
-    from trade_drivers.joints.serial._wire import ServoWire
     from trade_drivers.vendors.feetech._wire import Wire
 
-__all__ = ["FeetechDriver", "open_exchange"]
+__all__ = ["FeetechDriver"]
 
 
-class FeetechDriver(ServoDriver):
+class FeetechDriver(ServoDriver[FeetechAxis, "Wire"]):
     """STS servos in position control on a serial bus."""
 
     name = "feetech"
@@ -29,7 +28,7 @@ class FeetechDriver(ServoDriver):
     without_watchdog = "no watchdog: without its driver it goes on to the goal it has, which is never far ahead"
     commissioner = FeetechCommissioner
 
-    def exchange(self, robot: Robot, bus: SerialBus, port: str, joints: list[Joint]) -> ServoExchange:
+    def exchange(self, robot: Robot, bus: SerialBus, port: str, joints: list[Joint]) -> FeetechExchange:
         axes = [
             FeetechAxis(f"{robot.name}.{joint.name}", port, joint, bus.watchdog_s, robot.coupled_to(joint.name))
             for joint in joints
@@ -38,18 +37,9 @@ class FeetechDriver(ServoDriver):
         return FeetechExchange(wire_at(port, bus.baud, f"{robot.where}: bus.{bus.name}"), bus, axes)
 
     def look_over(
-        self, wire: "ServoWire", bus: SerialBus, axis: ServoAxis[Any], clock_ns: Callable[[], int], where: str
+        self, wire: "Wire", bus: SerialBus, axis: FeetechAxis, clock_ns: Callable[[], int], where: str
     ) -> None:
-        look_over(wire, bus, cast("FeetechAxis", axis), clock_ns, where)
-
-
-def open_exchange(robot: Robot, bus: SerialBus, port: str) -> ServoExchange:
-    """Open the port and look every joint over, without a thread: ``cycle()`` is the caller's to call.
-
-    Raises:
-        ConfigurationError: the port cannot be had, or a device is absent, another, or set wrongly.
-    """
-    return FeetechDriver().open_exchange(robot, bus, port)
+        look_over(wire, bus, axis, clock_ns, where)
 
 
 def wire_at(port: str, baud: int, where: str) -> "Wire":
@@ -57,6 +47,5 @@ def wire_at(port: str, baud: int, where: str) -> "Wire":
     try:
         from trade_drivers.vendors.feetech._wire import Wire  # noqa: PLC0415 - pyserial is optional
     except ImportError as missing:
-        problem = f'needs pyserial ({missing}); pip install "trade-drivers[feetech]"'
-        raise ConfigurationError(where="driver feetech", problem=problem) from None
+        raise not_installed("feetech", "pyserial", missing) from None
     return Wire(port, baud, where)

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING, Final
 
-from trade_drivers.joints import Goal, Job, Steps
+from trade_drivers.joints import Goal, Steps, Work
 from trade_drivers.joints.serial import health_of, still_homed, told, tried
 from trade_drivers.vendors.feetech import _table as table
 from trade_drivers.vendors.feetech._axis import FeetechAxis
@@ -28,38 +28,38 @@ def goal_block(goal: Goal) -> bytes:
     )
 
 
-def relaxing(bus: "FeetechExchange", job: Job, axis: FeetechAxis) -> Steps:
+def relaxing(bus: "FeetechExchange", job: Work[FeetechAxis], axis: FeetechAxis) -> Steps:
     """Torque off."""
     axis.ready = False  # before: its health may be read in between, and torque that is off would be a fault
-    yield from _write(bus, job, axis, table.TORQUE, 0)
+    yield from told(bus, job, axis, table.TORQUE, 0)
     health = yield from health_of(bus, axis)
     if health.torque:
         raise axis.faulty("told to relax, but its torque is still on")
 
 
-def leaving(bus: "FeetechExchange", job: Job, axis: FeetechAxis, *, relax: bool) -> Steps:
+def leaving(bus: "FeetechExchange", job: Work[FeetechAxis], axis: FeetechAxis, *, relax: bool) -> Steps:
     """Torque off or left on: there is no watchdog to be disarmed."""
     axis.ready = False
     if relax:
         yield from relaxing(bus, job, axis)
 
 
-def enabling(bus: "FeetechExchange", job: Job, axis: FeetechAxis) -> Steps:
+def enabling(bus: "FeetechExchange", job: Work[FeetechAxis], axis: FeetechAxis) -> Steps:
     """Torque on at the measured position, with the joint's own acceleration and speed; all of it read back."""
     bus.require_answering(axis)
     health = yield from health_of(bus, axis)
     if health.error and health.torque:  # off and on again is what ends an overload
         axis.ready = False
-        yield from _write(bus, job, axis, table.TORQUE, 0)
+        yield from told(bus, job, axis, table.TORQUE, 0)
         health = yield from health_of(bus, axis)
     if health.error:
         raise axis.faulty()
     yield from still_homed(bus, axis)
     if not health.locked:
-        yield from _write(bus, job, axis, table.LOCK, 1)
+        yield from told(bus, job, axis, table.LOCK, 1)
         health = yield from health_of(bus, axis)
     block = yield from tried(bus, axis, lambda: _seeded(bus, job, axis))
-    yield from _write(bus, job, axis, table.TORQUE, table.TORQUE_ON)
+    yield from told(bus, job, axis, table.TORQUE, table.TORQUE_ON)
     axis.ready = False
     health = yield from health_of(bus, axis)
     kept = yield from tried(bus, axis, lambda: bus.wire.read(axis.id, *GOAL_BLOCK).data)
@@ -68,7 +68,7 @@ def enabling(bus: "FeetechExchange", job: Job, axis: FeetechAxis) -> Steps:
     axis.fault, axis.ready = "", True
 
 
-def _seeded(bus: "FeetechExchange", job: Job, axis: FeetechAxis) -> bytes:
+def _seeded(bus: "FeetechExchange", job: Work[FeetechAxis], axis: FeetechAxis) -> bytes:
     """Its goal is where it is. It may switch torque on: tried again, it is measured again, as it may have sagged."""
     asked_ns = bus.clock()
     health = axis.take_health(bus.wire.read(axis.id, *axis.slow).data, asked_ns)
@@ -76,7 +76,3 @@ def _seeded(bus: "FeetechExchange", job: Job, axis: FeetechAxis) -> bytes:
     axis.aim, axis.sent = None, health.position
     bus.wire.write(axis.id, GOAL_BLOCK[0], block, job.gate)
     return block
-
-
-def _write(bus: "FeetechExchange", job: Job, axis: FeetechAxis, register: table.Register, value: int) -> Steps:
-    yield from told(bus, job, axis, register.address, register.encode(value))

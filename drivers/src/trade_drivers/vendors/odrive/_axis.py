@@ -1,13 +1,12 @@
 """One axis as the bus thread knows it: what its frames said last, and what speaks against moving on."""
 
 from collections.abc import Callable, Sequence
-from math import isfinite, tau
+from math import isfinite
 from struct import error as BadLength  # noqa: N812 - what unpacking raises for another number of bytes
 from typing import Final, NamedTuple
 
 from trade_drivers.interfaces._motion import MotorState
-from trade_drivers.joints import Grain
-from trade_drivers.joints.can import MotorAxis
+from trade_drivers.joints.can import MotorAxis, grain_of
 from trade_drivers.robotfile import Joint
 from trade_drivers.vendors.odrive._frames import Command, Errors, Health, Heartbeat, Result, State, Version, two_floats
 
@@ -15,9 +14,6 @@ __all__ = ["COUNTS_PER_TURN", "MODELS", "Model", "OdriveAxis"]
 
 COUNTS_PER_TURN: Final = 1 << 16
 """Of the motor: this driver's own, finer than any encoder; on the wire there are turns."""
-_STILL_RAD_S: Final = 0.01
-_ARRIVED_RAD: Final = 0.004
-_NEAR_RAD: Final = 0.03
 
 
 class Model(NamedTuple):
@@ -36,26 +32,11 @@ MODELS: Final = {
 }
 
 
-def grain_of(joint: Joint, rate_hz: float) -> Grain:
-    """What counts mean: positions in counts, speeds in counts a second, and so on."""
-    rad = tau / (COUNTS_PER_TURN * joint.gear)
-    return Grain(
-        rad=rad,
-        rad_s=rad,
-        rad_s2=rad,
-        centre=0,
-        still_velocity=max(1, round(_STILL_RAD_S / rad)),
-        still_counts=max(1, round(_STILL_RAD_S / rate_hz / rad)),
-        arrived=max(2, round(_ARRIVED_RAD / rad)),
-        near=max(4, round(_NEAR_RAD / rad)),
-    )
-
-
 class OdriveAxis(MotorAxis):
     """One axis."""
 
     def __init__(self, name: str, bus: str, joint: Joint, rate_hz: float, coupled: Sequence[str] = ()) -> None:
-        super().__init__(name, bus, joint, grain_of(joint, rate_hz), coupled)
+        super().__init__(name, bus, joint, grain_of(joint, rate_hz, COUNTS_PER_TURN), coupled)
         self.model = MODELS[joint.model]
         self.version: Version | None = None
         """What it says of itself; None until it has answered."""

@@ -3,11 +3,11 @@
 import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Final, cast
+from typing import TYPE_CHECKING, Final
 
 from trade_drivers.bus._cycle import HALT_NS
 from trade_drivers.bus.can import Frame
-from trade_drivers.joints import Axis, Gate, Goal, Job, Steps, next_measurement
+from trade_drivers.joints import Gate, Goal, Steps, Work, next_measurement
 from trade_drivers.joints.can._cycle import MotorExchange
 from trade_drivers.vendors.odrive import _frames as frames
 from trade_drivers.vendors.odrive import _jobs as jobs
@@ -73,13 +73,13 @@ class OdriveExchange(MotorExchange[OdriveAxis]):
         """Have it go there, and stand."""
         self.tell(axis, Command.SET_POSITION, frames.set_position(position / COUNTS_PER_TURN))
 
-    def write_goals(self, goals: Mapping[Axis, Goal], gate: Gate) -> None:
+    def write_goals(self, goals: Mapping[OdriveAxis, Goal], gate: Gate) -> None:
         """Limits first, which move nothing; then the gate, and all joints start in one go."""
         for axis, goal in goals.items():
-            self.limit(cast("OdriveAxis", axis), goal.speed, goal.accel)
+            self.limit(axis, goal.speed, goal.accel)
         self.write_positions({axis: goal.position for axis, goal in goals.items()}, gate)
 
-    def write_positions(self, positions: Mapping[Axis, int], gate: Gate) -> None:
+    def write_positions(self, positions: Mapping[OdriveAxis, int], gate: Gate) -> None:
         told = [
             Frame(frame_id(axis.id, Command.SET_POSITION), frames.set_position(position / COUNTS_PER_TURN))
             for axis, position in positions.items()
@@ -87,26 +87,25 @@ class OdriveExchange(MotorExchange[OdriveAxis]):
         gate()
         self.port.send_all(told)
 
-    def write_holds(self, positions: Mapping[Axis, int]) -> None:
+    def write_holds(self, positions: Mapping[OdriveAxis, int]) -> None:
         """A trajectory to where it is, as steep as the joint may; one that has no torque yet is not told."""
         for axis, position in positions.items():
-            drive = cast("OdriveAxis", axis)
-            if drive.armed and not drive.hushed:
-                self.limit(drive, axis.speed_counts, axis.accel_counts)
-                self.send_to(drive, position)
+            if axis.armed and not axis.hushed:
+                self.limit(axis, axis.speed_counts, axis.accel_counts)
+                self.send_to(axis, position)
 
-    def enabling(self, job: Job, axis: Axis) -> Steps:
-        return jobs.enabling(self, job, cast("OdriveAxis", axis))
+    def enabling(self, job: Work[OdriveAxis], axis: OdriveAxis) -> Steps:
+        return jobs.enabling(self, job, axis)
 
-    def relaxing(self, job: Job, axis: Axis) -> Steps:
-        return jobs.relaxing(self, job, cast("OdriveAxis", axis))
+    def relaxing(self, job: Work[OdriveAxis], axis: OdriveAxis) -> Steps:
+        return jobs.relaxing(self, job, axis)
 
-    def looking(self, axis: Axis) -> Steps:
+    def looking(self, axis: OdriveAxis) -> Steps:
         self.require_answering(axis)
         yield from next_measurement(self, axis)
 
-    def leaving(self, job: Job, axis: Axis, *, relax: bool) -> Steps:  # noqa: ARG002 - it can only relax
-        return jobs.relaxing(self, job, cast("OdriveAxis", axis))
+    def leaving(self, job: Work[OdriveAxis], axis: OdriveAxis, *, relax: bool) -> Steps:  # noqa: ARG002 - it can only relax
+        return jobs.relaxing(self, job, axis)
 
     # --- what it is asked
 

@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING, Final
 
 from trade.errors import ConfigurationError
 from trade_drivers.bus.can import Frame, frame_bits
-from trade_drivers.joints import Steps
-from trade_drivers.joints.can import Another, Unfit
+from trade_drivers.joints import Steps, Unfit, check_joints, check_rate
+from trade_drivers.joints.can import Another
 from trade_drivers.joints.can._cycle import asked
 from trade_drivers.vendors.odrive import _frames as frames
 from trade_drivers.vendors.odrive._axis import OdriveAxis
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 __all__ = ["check_bus", "look_over"]
 
 _FIRMWARE: Final = (0, 6)
-_BRAKING_S: Final = 1.5
 _LONGEST_S: Final = 0.5
 _BEATS_HZ: Final = 10
 """Heartbeats as an ODrive sends them if nobody has changed that."""
@@ -33,11 +32,7 @@ def check_bus(bus: "CanBus", axes: Sequence[OdriveAxis], where: str) -> None:
     Raises:
         ConfigurationError: names the key and what would be right.
     """
-    for axis in axes:
-        try:
-            _check_joint(axis)
-        except Unfit as bad:
-            raise ConfigurationError(where=f'{where}: joint."{axis.joint.name}"{bad.key}', problem=str(bad)) from None
+    check_joints(axes, where, _check_joint)
     key = f"{where}: bus.{bus.name}"
     if bus.leave != "relax":
         problem = 'an ODrive lets go when nobody feeds its watchdog; write leave = "relax", and brake what would fall'
@@ -45,10 +40,7 @@ def check_bus(bus: "CanBus", axes: Sequence[OdriveAxis], where: str) -> None:
     if bus.watchdog_s > _LONGEST_S:
         problem = f"{bus.watchdog_s:g} is above {_LONGEST_S:g}: enable() waits once for it, to see that it works"
         raise ConfigurationError(where=f"{key}.watchdog_s", problem=problem)
-    least_hz = 4 / min(bus.watchdog_s, bus.stale_after_s)
-    if bus.rate_hz < least_hz:
-        problem = f"{bus.rate_hz:g} is too slow for watchdog_s and stale_after_s; at least {least_hz:.3g}"
-        raise ConfigurationError(where=f"{key}.rate_hz", problem=problem)
+    check_rate(bus, where, 4)
     spoken = len(axes) * (_BEATS_HZ + _STREAM_HZ) * frame_bits(8)
     cycle = len(axes) * (2 * frame_bits(0) + 3 * frame_bits(8))
     if cycle * bus.rate_hz > bus.bitrate - spoken:
@@ -67,10 +59,6 @@ def _check_joint(axis: OdriveAxis) -> None:
         raise Unfit("is for servos; leave this key out", ".homing_counts")
     if joint.serial_number is not None:
         raise Unfit("an ODrive tells no serial number here; leave this key out", ".serial_number")
-    braking_s = joint.max_speed_rad_s / joint.max_accel_rad_s2
-    if braking_s > _BRAKING_S:
-        problem = f"a stop from max_speed_rad_s takes {braking_s:.2g} s with it; it must take {_BRAKING_S} s at most"
-        raise Unfit(problem, ".max_accel_rad_s2")
 
 
 def look_over(bus: "OdriveExchange", axis: OdriveAxis, *, first: bool) -> Steps:

@@ -1,11 +1,11 @@
 """What enabling, relaxing and leaving an axis are made of: one exchange on the wire after the other."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Final, cast
+from typing import TYPE_CHECKING, Final
 
 from trade.errors import TradeError
 from trade_drivers.bus._cycle import HALT_NS
-from trade_drivers.joints import Job, Steps, next_measurement, until
+from trade_drivers.joints import Steps, Work, next_measurement, until
 from trade_drivers.vendors.odrive import _frames as frames
 from trade_drivers.vendors.odrive._axis import OdriveAxis
 from trade_drivers.vendors.odrive._frames import Command, Control, Errors, Input, State
@@ -21,7 +21,7 @@ _AT_REST: Final = 2
 _WAIT_S: Final = 0.001
 
 
-def enabling(bus: "OdriveExchange", job: Job, axis: OdriveAxis) -> Steps:
+def enabling(bus: "OdriveExchange", job: Work[OdriveAxis], axis: OdriveAxis) -> Steps:
     """Torque on where it was measured to be, its watchdog tried once; each change of state confirmed by its heartbeat.
 
     An axis under torque already must be at rest: it goes on holding.
@@ -33,7 +33,7 @@ def enabling(bus: "OdriveExchange", job: Job, axis: OdriveAxis) -> Steps:
     if axis.errors:
         yield from _clear(bus, job, axis)
     if not axis.armed and not axis.proven:
-        others = [cast("OdriveAxis", other) for other in job.axes if other is not axis]
+        others = [other for other in job.devices if other is not axis]
         idle = [other for other in others if not (other.proven or other.torque or other.errors or other.silent)]
         yield from _try_watchdogs(bus, job, [axis, *idle])
         yield from next_measurement(bus, axis)
@@ -49,7 +49,7 @@ def enabling(bus: "OdriveExchange", job: Job, axis: OdriveAxis) -> Steps:
     axis.fault, axis.ready = "", True
 
 
-def _arm(bus: "OdriveExchange", job: Job, axis: OdriveAxis) -> Steps:
+def _arm(bus: "OdriveExchange", job: Work[OdriveAxis], axis: OdriveAxis) -> Steps:
     job.gate()
     bus.tell(axis, Command.SET_STATE, frames.set_state(State.CLOSED_LOOP))
     since_ns = bus.clock()
@@ -63,7 +63,7 @@ def _told_since(axis: OdriveAxis, since_ns: int) -> bool:
     return axis.beat_ns - since_ns > _SLACK_NS // 2
 
 
-def _clear(bus: "OdriveExchange", job: Job, axis: OdriveAxis) -> Steps:
+def _clear(bus: "OdriveExchange", job: Work[OdriveAxis], axis: OdriveAxis) -> Steps:
     """Clear its errors. Nothing else happens: that it can be armed again is another matter."""
     job.gate()
     bus.tell(axis, Command.CLEAR_ERRORS, b"\0")
@@ -73,7 +73,7 @@ def _clear(bus: "OdriveExchange", job: Job, axis: OdriveAxis) -> Steps:
     axis.disarmed_by = Errors(0)
 
 
-def _try_watchdogs(bus: "OdriveExchange", job: Job, axes: Sequence[OdriveAxis]) -> Steps:
+def _try_watchdogs(bus: "OdriveExchange", job: Work[OdriveAxis], axes: Sequence[OdriveAxis]) -> Steps:
     """Arm them without any torque, say nothing, and see them let go: nothing else tells whether watchdogs are on."""
     job.gate()
     for axis in axes:
@@ -98,7 +98,7 @@ def _try_watchdogs(bus: "OdriveExchange", job: Job, axes: Sequence[OdriveAxis]) 
         axis.proven = True
 
 
-def _see_it_let_go(bus: "OdriveExchange", job: Job, axis: OdriveAxis, give_up_ns: int) -> Steps:
+def _see_it_let_go(bus: "OdriveExchange", job: Work[OdriveAxis], axis: OdriveAxis, give_up_ns: int) -> Steps:
     while not axis.errors:
         job.gate()
         bus.require_answering(axis)
@@ -116,7 +116,7 @@ def _see_it_let_go(bus: "OdriveExchange", job: Job, axis: OdriveAxis, give_up_ns
         raise axis.faulty(f"it cannot be enabled: {axis.refusal}")
 
 
-def relaxing(bus: "OdriveExchange", job: Job, axis: OdriveAxis) -> Steps:
+def relaxing(bus: "OdriveExchange", job: Work[OdriveAxis], axis: OdriveAxis) -> Steps:
     """Torque off; its watchdog has nothing to watch then."""
     axis.ready = False
     if axis.may_hold_torque:

@@ -9,7 +9,7 @@ from trade_drivers.interfaces._motion import Gripper, GripperLimits, GripperStat
 from trade_drivers.vendors.robotiq import _table as table
 from trade_drivers.vendors.robotiq._cycle import Exchange
 from trade_drivers.vendors.robotiq._gripper_state import Hand
-from trade_drivers.vendors.robotiq._jobs import Activate, ClearFault, Command, Move
+from trade_drivers.vendors.robotiq._jobs import Activate, ClearFault, GripperCommand, Move
 
 __all__ = ["RobotiqGripper"]
 
@@ -55,7 +55,7 @@ class RobotiqGripper(Gripper):
             self._finish(
                 Activate(
                     self._exchange,
-                    self._hand,
+                    [self._hand],
                     service=f"{self._name}.activate",
                     expires_ns=expires_ns,
                     until_ns=until_ns,
@@ -81,7 +81,7 @@ class RobotiqGripper(Gripper):
         expires_ns, _ = expiry(self._exchange.clock)
         with permit(self.resources) as permitted:
             self._finish(
-                ClearFault(self._exchange, self._hand, service=service, expires_ns=expires_ns, permit=permitted)
+                ClearFault(self._exchange, [self._hand], service=service, expires_ns=expires_ns, permit=permitted)
             )
 
     def _move(self, name: str, width_m: float, speed_m_s: float | None, force_n: float | None) -> GripperState:
@@ -98,7 +98,7 @@ class RobotiqGripper(Gripper):
             self._finish(
                 Move(
                     self._exchange,
-                    self._hand,
+                    [self._hand],
                     registers,
                     service=service,
                     expires_ns=expires_ns,
@@ -108,6 +108,6 @@ class RobotiqGripper(Gripper):
             )
         return self.state()
 
-    def _finish(self, job: Command) -> None:
+    def _finish(self, job: GripperCommand) -> None:
         self._exchange.submit(job)
         job.wait(self._thread.alive)

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Final
 
 from trade import Permit
 from trade.errors import DeadlineExceeded, DeviceSilent, MotionStopped, OutcomeUnknown, TradeError
-from trade_drivers.bus._jobs import Gate, Steps, Work, check_admitted
+from trade_drivers.bus._jobs import Command, Gate, Steps
 from trade_drivers.vendors.robotiq import _table as table
 from trade_drivers.vendors.robotiq._gripper_state import Hand
 from trade_drivers.vendors.robotiq._table import Contact, Status
@@ -14,7 +14,7 @@ from trade_drivers.vendors.robotiq._wire import NoAnswer, Refused
 if TYPE_CHECKING:
     from trade_drivers.vendors.robotiq._cycle import Exchange
 
-__all__ = ["Activate", "ClearFault", "Command", "Motion", "Move"]
+__all__ = ["Activate", "ClearFault", "GripperCommand", "Motion", "Move"]
 
 _ATTEMPTS: Final = 3
 _RESET_NS: Final = 1_000_000_000
@@ -25,29 +25,13 @@ _NEAR_COUNTS: Final = 8
 _MOST_PER_CYCLE_S: Final = 0.1
 
 
-class Command(Work[Hand]):
-    """What needs leave: it carries an expiry, and the permit under which its call was admitted."""
+class GripperCommand(Command[Hand, "Exchange"]):
+    """A command with exchanges within a retry budget."""
 
-    def __init__(self, exchange: "Exchange", hand: Hand, *, service: str, expires_ns: int, permit: Permit) -> None:
-        super().__init__([hand])
-        self.exchange = exchange
-        self.hand = hand
-        self.service = service
-        self._expires_ns = expires_ns
-        self._permit = permit
-        self._admitted_ns = exchange.clock()
-
-    def gate(self) -> None:
-        """The last look before its bytes go out.
-
-        Raises:
-            DeadlineExceeded: it is late, and late is never.
-            MotionStopped, LockLost, LockedByOther: a stop, or another owner, came after it was admitted.
-        """
-        now_ns = self.exchange.clock()
-        check_admitted(
-            self.service, self._permit, admitted_ns=self._admitted_ns, expires_ns=self._expires_ns, now_ns=now_ns
-        )
+    @property
+    def hand(self) -> Hand:
+        """The gripper."""
+        return self.devices[0]
 
     def tell(self, values: Sequence[int], *, out: Gate | None = None) -> Steps:
         """Write the command registers, within the retry budget.
@@ -82,7 +66,7 @@ class Command(Work[Hand]):
         hand.fault = ""
 
 
-class ClearFault(Command):
+class ClearFault(GripperCommand):
     """Reset the device: nothing moves."""
 
     def steps(self) -> Steps:
@@ -90,20 +74,20 @@ class ClearFault(Command):
         yield from self.resetting()
 
 
-class Motion(Command):
+class Motion(GripperCommand):
     """What sets the fingers moving, and is watched until something ends it."""
 
     def __init__(
         self,
         exchange: "Exchange",
-        hand: Hand,
+        hands: Sequence[Hand],
         *,
         service: str,
         expires_ns: int,
         until_ns: int | None,
         permit: Permit,
     ) -> None:
-        super().__init__(exchange, hand, service=service, expires_ns=expires_ns, permit=permit)
+        super().__init__(exchange, hands, service=service, expires_ns=expires_ns, permit=permit)
         self._until_ns = until_ns
         self._began_ns = self._watched_ns = 0
         self._position = -1
@@ -196,7 +180,7 @@ class Move(Motion):
     def __init__(
         self,
         exchange: "Exchange",
-        hand: Hand,
+        hands: Sequence[Hand],
         registers: tuple[int, int, int],
         *,
         service: str,
@@ -204,7 +188,7 @@ class Move(Motion):
         until_ns: int | None,
         permit: Permit,
     ) -> None:
-        super().__init__(exchange, hand, service=service, expires_ns=expires_ns, until_ns=until_ns, permit=permit)
+        super().__init__(exchange, hands, service=service, expires_ns=expires_ns, until_ns=until_ns, permit=permit)
         self._registers = registers
         self._goal = registers[1]
 
@@ -232,12 +216,12 @@ class Move(Motion):
         return super().stuck(sample, now_ns)
 
 
-def _require_answering(job: Command) -> None:
+def _require_answering(job: GripperCommand) -> None:
     if job.hand.silent:
         raise job.hand.deaf(job.exchange.clock())
 
 
-def _try(job: Command, act: Callable[[], None]) -> Steps:
+def _try(job: GripperCommand, act: Callable[[], None]) -> Steps:
     """One exchange within the retry budget; a probe before each retry keeps late answers from being taken for new."""
     waited_s = 0.0
     for attempt in range(_ATTEMPTS):

@@ -17,7 +17,7 @@ from trade_drivers.vendors.ur._link import Link
 from trade_drivers.vendors.ur._messages import Beat, Done, Gone, Halt, Order, Scale, Servo, Take
 
 if TYPE_CHECKING:
-    from trade_drivers.vendors.ur._jobs import Command, Motion
+    from trade_drivers.vendors.ur._jobs import ArmCommand, Motion
 
 __all__ = ["Exchange"]
 
@@ -147,7 +147,7 @@ class Exchange(BusCycle[ArmStatus]):
 
     # --- orders
 
-    def taking_control(self, job: "Command") -> Steps:
+    def taking_control(self, job: "ArmCommand") -> Steps:
         """Have the control script run; what runs on the controller is stopped by that."""
         if self.taken:
             return
@@ -179,7 +179,7 @@ class Exchange(BusCycle[ArmStatus]):
                 raise self.limb.faulty("told to stop, but it is still moving")
             yield
 
-    def carrying_out(self, job: "Command", make: Callable[[int], Order]) -> Generator[None, None, Done]:
+    def carrying_out(self, job: "ArmCommand", make: Callable[[int], Order]) -> Generator[None, None, Done]:
         """Give an order that is answered at once.
 
         Raises:
@@ -194,7 +194,7 @@ class Exchange(BusCycle[ArmStatus]):
             raise self.limb.faulty("" if self.limb.fault else done.problem)
         return done
 
-    def scaling(self, job: "Command", fraction: float, expires_ns: int) -> Steps:
+    def scaling(self, job: "ArmCommand", fraction: float, expires_ns: int) -> Steps:
         """Set the speed slider, which needs no control."""
         states = self.link.states
         if states is None:
@@ -221,7 +221,7 @@ class Exchange(BusCycle[ArmStatus]):
             raise self.limb.deaf(self.clock())
         return self.link.control
 
-    def _answered(self, job: "Command", make: Callable[[int], Order], until_ns: int) -> Generator[None, None, Done]:
+    def _answered(self, job: "ArmCommand", make: Callable[[int], Order], until_ns: int) -> Generator[None, None, Done]:
         control = self._control
         job.gate()
         number = control.number()

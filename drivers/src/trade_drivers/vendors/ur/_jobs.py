@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
 
 from trade import Permit
-from trade.errors import DeadlineExceeded, InvalidArgument, LimitExceeded, MotionStopped, ToleranceExceeded, TradeError
-from trade_drivers.bus._jobs import Steps, Work, check_admitted
+from trade.errors import InvalidArgument, LimitExceeded, MotionStopped, ToleranceExceeded, TradeError
+from trade_drivers.bus._jobs import Command, Steps
 from trade_drivers.motion._plan import Plan
 from trade_drivers.vendors.ur._arm_state import ArmStatus
 from trade_drivers.vendors.ur._line_path import poses_on
@@ -15,7 +15,7 @@ from trade_drivers.vendors.ur._setpoint_filter import SetpointFilter
 if TYPE_CHECKING:
     from trade_drivers.vendors.ur._cycle import Exchange
 
-__all__ = ["Command", "EndFreedrive", "Follow", "Freedrive", "LineMove", "Motion", "Move", "Scaling", "SetPoint"]
+__all__ = ["ArmCommand", "EndFreedrive", "Follow", "Freedrive", "LineMove", "Motion", "Move", "Scaling", "SetPoint"]
 
 _NEAR: Final = 0.01
 """rad or m: closer to its goal, a move has arrived."""
@@ -27,40 +27,19 @@ _FOREVER_NS: Final = 2**63
 _HELD_UP_NS: Final = 200_000_000
 
 
-class Command(Work[ArmStatus]):
-    """What needs leave: it carries an expiry, and the permit under which its call was admitted."""
+class ArmCommand(Command[ArmStatus, "Exchange"]):
+    """A command to the arm of a controller."""
 
     def __init__(self, exchange: "Exchange", *, service: str, expires_ns: int, permit: Permit) -> None:
-        super().__init__([exchange.limb])
-        self.exchange = exchange
+        super().__init__(exchange, [exchange.limb], service=service, expires_ns=expires_ns, permit=permit)
         self.limb = exchange.limb
-        self.service = service
-        self.expires_ns = expires_ns
-        self._permit = permit
-        self._admitted_ns = exchange.clock()
-
-    def gate(self) -> None:
-        """The last look before its bytes go out.
-
-        Raises:
-            DeadlineExceeded: it is late, and late is never.
-            MotionStopped, LockLost, LockedByOther: a stop, or another owner, came after it was admitted.
-        """
-        now_ns = self.exchange.clock()
-        check_admitted(
-            self.service, self._permit, admitted_ns=self._admitted_ns, expires_ns=self.expires_ns, now_ns=now_ns
-        )
-
-    def expired(self) -> DeadlineExceeded:
-        """The error of a command that came too late to be carried out."""
-        return DeadlineExceeded(service=self.service, deadline_s=(self.expires_ns - self._admitted_ns) / 1e9)
 
     def usable(self) -> Sample:
         """The newest measurement of an arm that may be commanded; raises as ``ArmStatus.check_usable``."""
         return self.limb.check_usable(self.exchange.clock(), self.exchange.stale_after_ns)
 
 
-class Scaling(Command):
+class Scaling(ArmCommand):
     """Set the speed slider."""
 
     def __init__(self, exchange: "Exchange", fraction: float, *, service: str, expires_ns: int, permit: Permit) -> None:
@@ -72,7 +51,7 @@ class Scaling(Command):
         yield from self.exchange.scaling(self, self._fraction, self.expires_ns)
 
 
-class EndFreedrive(Command):
+class EndFreedrive(ArmCommand):
     """The arm holds itself again."""
 
     def steps(self) -> Steps:
@@ -81,7 +60,7 @@ class EndFreedrive(Command):
             yield from self.exchange.making_way()
 
 
-class Motion(Command):
+class Motion(ArmCommand):
     """What sets the arm moving, and is watched until something ends it."""
 
     streams = False
