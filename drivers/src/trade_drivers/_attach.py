@@ -14,7 +14,7 @@ from trade.errors import ConfigurationError, TradeError
 from trade_drivers import robotfile
 from trade_drivers._metrics import measures_of
 from trade_drivers.bus.can._monitor import CanMonitor
-from trade_drivers.faults import FaultLog, FaultRecorder, FaultStore
+from trade_drivers.faults import FaultLog, FaultPoller, FaultStore
 from trade_drivers.faults._health import HEALTHY, HealthTeller
 from trade_drivers.interfaces._arm import Arm
 from trade_drivers.interfaces._motion import Gripper, JointGroup, Motor
@@ -164,12 +164,12 @@ def attach(
         _check_ports(robot, ports or {})
         check(robot)
         faults = _fault_log(robot, state_dir if register is not None else state_dir or _default_state_dir(), undo)
-        recorder = FaultRecorder(faults, f"faults of {robot.name}")
-        undo.callback(recorder.close)  # after the devices: what befalls them while they are left is noted, too
+        poller = FaultPoller(faults, f"faults of {robot.name}")
+        undo.callback(poller.close)  # after the devices: what befalls them while they are left is noted, too
         senses = _attach_senses(robot, ports or {}, undo)  # first: if one is missing, what moves is not even touched
         buses = _attach_buses(robot, ports or {}, healthy, undo)
         providers = _providers(robot, buses, senses)
-        recorder.start(providers, _unwatched(robot, buses, recorder))
+        poller.start(providers, _unwatched(robot, buses, poller))
         for name, provider in {**providers, f"{robot.name}.{_FAULTS}": faults}.items():
             (register or trade.register)(provider, (name,))
             undo.callback(_withdraw, deregister or trade.deregister, provider)
@@ -190,9 +190,9 @@ def _fault_log(robot: Robot, state_dir: Path | None, undo: ExitStack) -> FaultLo
     return log
 
 
-def _unwatched(robot: Robot, buses: Mapping[str, AttachedBus], recorder: FaultRecorder) -> set[str]:
+def _unwatched(robot: Robot, buses: Mapping[str, AttachedBus], poller: FaultPoller) -> set[str]:
     """Have buses tell what is wrong with their devices; the names of the devices of which nobody does."""
-    deaf = {name for name, bus in buses.items() if not bus.watched(recorder.tell)}
+    deaf = {name for name, bus in buses.items() if not bus.watched(poller.tell)}
     moving = (*robot.joints, *robot.grippers, *robot.arms)
     names = [*(device.name for device in moving if device.bus in deaf), *(sensor.name for sensor in robot.sensors)]
     return {f"{robot.name}.{name}" for name in names}

@@ -18,7 +18,7 @@ from trade_drivers.vendors.damiao._axis import DamiaoAxis
 from trade_drivers.vendors.dynamixel import _frames as dynamixel
 from trade_drivers.vendors.feetech import _frames as feetech
 from trade_drivers.vendors.odrive._axis import OdriveAxis
-from trade_drivers.vendors.robotiq._modbus import _QuietClient as ModbusClient
+from trade_drivers.vendors.robotiq._wire import _QuietClient as ModbusClient
 from trade_drivers.vendors.snapshot._picture import picture
 from trade_drivers.vendors.ur import _dashboard as dashboard
 from trade_hil_sim import SimulationError, UrBus

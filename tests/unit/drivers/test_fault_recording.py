@@ -15,7 +15,7 @@ from tests.unit.drivers.gripper_rig import HandRig, made_rig
 from trade import Container, where
 from trade.errors import DeviceSilent
 from trade_drivers import AttachedRobot, Camera, FaultInfo, FaultLog, Motor, MotorState, Reading, Sensor
-from trade_drivers.faults import FaultRecorder
+from trade_drivers.faults import FaultPoller
 
 
 @pytest.fixture
@@ -220,8 +220,8 @@ def test_to_look_costs_the_bus_thread_a_small_part_of_its_cycle(head: Rig) -> No
 # --- devices of which nobody tells
 
 
-def asked(log: FaultLog, name: str, device: object) -> FaultRecorder:
-    recorder = FaultRecorder(log, "faults of a test")
+def asked(log: FaultLog, name: str, device: object) -> FaultPoller:
+    recorder = FaultPoller(log, "faults of a test")
     recorder.start({name: device}, {name})
     return recorder
 
@@ -284,7 +284,7 @@ def test_a_camera_is_not_asked_for_pictures_to_see_whether_it_is_well() -> None:
         FaultLog("rosie"),
     )
     motor.state.side_effect = DeviceSilent(device="rosie.pan", bus="/dev/ttyUSB0", waited_s=0.3)
-    recorder = FaultRecorder(log, "faults of a test")
+    recorder = FaultPoller(log, "faults of a test")
     recorder.start({"rosie.eye": camera, "rosie.pan": motor}, {"rosie.eye", "rosie.pan"})
     wait_until(lambda: log.health("rosie.pan") == "silent", "the others are asked")
     recorder.close()

@@ -12,7 +12,7 @@ from trade.errors import ConfigurationError, DeadlineExceeded
 from trade_drivers.bus._jobs import PortLost
 from trade_drivers.bus._serial_port import LONGEST_WAIT_S, SerialLine, SerialWire
 from trade_drivers.vendors.dynamixel._wire import Wire as ServoWire
-from trade_drivers.vendors.robotiq._modbus import Wire as GripperWire
+from trade_drivers.vendors.robotiq._wire import Wire as GripperWire
 
 WIRES = pytest.mark.parametrize("kind", [ServoWire, GripperWire], ids=["dynamixel", "robotiq"])
 

@@ -19,6 +19,7 @@ __all__ = [
     "NoAnswer",
     "PortLost",
     "PortOpening",
+    "Refused",
     "Steps",
     "WireError",
     "Work",
@@ -67,6 +68,14 @@ class NoAnswer(WireError):
         super().__init__(f"id {device_id} did not answer within {waited_s * 1e3:.0f} ms")
         self.device_id = device_id
         self.waited_s = waited_s
+
+
+class Refused(WireError):
+    """The device answered that it would not, and why."""
+
+    def __init__(self, device_id: int, reason: str) -> None:
+        super().__init__(reason)
+        self.device_id = device_id
 
 
 class Device(Protocol):

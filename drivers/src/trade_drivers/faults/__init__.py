@@ -1,8 +1,8 @@
 """What has been wrong with the devices of a robot: noticed by bus threads, kept by one log, told as services."""
 
+from trade_drivers.faults._fault_poller import FaultPoller
 from trade_drivers.faults._log import FaultLog
 from trade_drivers.faults._record import Fault, FaultInfo, FaultSample
-from trade_drivers.faults._recorder import FaultRecorder
 from trade_drivers.faults._store import FaultStore
 from trade_drivers.faults._trouble import Tell, Trouble
 
@@ -10,7 +10,7 @@ __all__ = [
     "Fault",
     "FaultInfo",
     "FaultLog",
-    "FaultRecorder",
+    "FaultPoller",
     "FaultSample",
     "FaultStore",
     "Tell",

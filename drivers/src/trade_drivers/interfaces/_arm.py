@@ -1,13 +1,12 @@
 """What an arm of six joints with a controller of its own can do, in SI units, whoever built it."""
 
-from abc import ABC, abstractmethod
-from types import MappingProxyType
+from abc import abstractmethod
 from typing import Annotated, Literal
 
 from msgspec import Struct
 
-from trade import Meta, Resource, service
-from trade_drivers.interfaces._motion import Members, Speed, Valid
+from trade import Meta, service
+from trade_drivers.interfaces._motion import Lockable, Speed, Valid
 from trade_drivers.interfaces._trajectory import Trajectory, planned
 from trade_drivers.motion._plan import JointLimits, Plan, Tolerances
 
@@ -64,20 +63,12 @@ ToolSpeed = Annotated[float, Meta(gt=0, description="of the tool in m/s; by defa
 Fraction = Annotated[float, Meta(gt=0, le=1, description="of the speed motions are told")]
 
 
-class Arm(ABC):
+class Arm(Lockable):
     """One arm. It is one thing to lock and to stop: its joints are not commanded one by one.
 
     Everything raises ``DeviceSilent`` when the controller has not sent anything new for too long: an old value is no
     value. Power and brakes are switched by the services of that name, and by nothing else.
     """
-
-    members: Members = MappingProxyType({})
-    """As of a ``Motor``."""
-
-    @property
-    @abstractmethod
-    def resources(self) -> tuple[Resource, ...]:
-        """The arm, as what locks, fences and stops attach to: one, named ``rosie.right``."""
 
     @service(effect="read")
     @abstractmethod

@@ -12,7 +12,7 @@ from trade_drivers._validation import LONGEST_VALID_S
 from trade_drivers.interfaces._trajectory import Trajectory, planned
 from trade_drivers.motion._plan import JointLimits, Plan, Tolerances
 
-__all__ = ["Gripper", "GripperLimits", "GripperState", "JointGroup", "JointLimits", "Motor", "MotorState"]
+__all__ = ["Gripper", "GripperLimits", "GripperState", "JointGroup", "JointLimits", "Lockable", "Motor", "MotorState"]
 
 
 class MotorState(Struct, frozen=True, kw_only=True):
@@ -84,11 +84,8 @@ Valid = Annotated[float, Meta(gt=0, le=LONGEST_VALID_S, description="seconds aft
 Speed = Annotated[float, Meta(gt=0, description="greatest speed in rad/s; by default the joint's limit")]
 
 
-class Motor(ABC):
-    """One joint with a position drive.
-
-    Everything raises ``DeviceSilent`` when the device has not answered for too long: an old value is no value.
-    """
+class Lockable(ABC):
+    """A device that locks, fences and stops attach to."""
 
     members: Members = MappingProxyType({})
     """Who belongs to the groups of its robot, from the robot file; a lock over a group is one over all of them."""
@@ -96,7 +93,14 @@ class Motor(ABC):
     @property
     @abstractmethod
     def resources(self) -> tuple[Resource, ...]:
-        """The joint, as what locks, fences and stops attach to: one, named ``rosie.neck.pan``."""
+        """One, with the name of the device; a group has those of its joints, each the same object as its motor's."""
+
+
+class Motor(Lockable):
+    """One joint with a position drive.
+
+    Everything raises ``DeviceSilent`` when the device has not answered for too long: an old value is no value.
+    """
 
     @service(effect="read")
     @abstractmethod
@@ -173,16 +177,8 @@ class Motor(ABC):
         """
 
 
-class JointGroup(ABC):
+class JointGroup(Lockable):
     """Joints that are commanded together; values are in the order of ``joints()``. Errors are those of ``Motor``."""
-
-    members: Members = MappingProxyType({})
-    """As of a ``Motor``."""
-
-    @property
-    @abstractmethod
-    def resources(self) -> tuple[Resource, ...]:
-        """The joints, each the same object as its motor's."""
 
     @service(effect="read")
     @abstractmethod
@@ -279,19 +275,11 @@ FingerSpeed = Annotated[
 Force = Annotated[float, Meta(gt=0, description="to grip with in N, within limits(); by default the greatest")]
 
 
-class Gripper(ABC):
+class Gripper(Lockable):
     """One gripper with two fingers that move together.
 
     Everything raises ``DeviceSilent`` when the device has not answered for too long: an old value is no value.
     """
-
-    members: Members = MappingProxyType({})
-    """As of a ``Motor``."""
-
-    @property
-    @abstractmethod
-    def resources(self) -> tuple[Resource, ...]:
-        """The gripper, as what locks, fences and stops attach to: one, named ``rosie.left.hand``."""
 
     @service(effect="read")
     @abstractmethod

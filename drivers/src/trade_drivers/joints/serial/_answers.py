@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from trade_drivers.bus._jobs import NoAnswer, WireError
+from trade_drivers.bus._jobs import NoAnswer, Refused, WireError
 
 __all__ = ["Answer", "BadAnswer", "NoAnswer", "Refused", "WireError"]
 
@@ -17,11 +17,3 @@ class Answer(NamedTuple):
 
 class BadAnswer(NoAnswer):
     """Something came, but it was damaged or cut short."""
-
-
-class Refused(WireError):
-    """The device answered that it would not, and why."""
-
-    def __init__(self, device_id: int, reason: str) -> None:
-        super().__init__(reason)
-        self.device_id = device_id

@@ -3,12 +3,12 @@
 from typing import TYPE_CHECKING, NoReturn
 
 from trade.errors import ConfigurationError
+from trade_drivers.bus._jobs import NoAnswer, Refused
 from trade_drivers.commissioning._commissioner import Bench, Commissioner, Found
 from trade_drivers.vendors.robotiq import _table as table
-from trade_drivers.vendors.robotiq._wire import NoAnswer, Refused
 
 if TYPE_CHECKING:
-    from trade_drivers.vendors.robotiq._modbus import Wire
+    from trade_drivers.vendors.robotiq._wire import Wire
 
 __all__ = ["RobotiqCommissioner"]
 

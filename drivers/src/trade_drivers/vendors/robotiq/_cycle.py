@@ -8,14 +8,13 @@ from typing import TYPE_CHECKING, Final
 
 from trade.errors import MotionStopped, TradeError
 from trade_drivers.bus._cycle import HALT_NS, BusCycle, StopTicket
-from trade_drivers.bus._jobs import Device, Gate
+from trade_drivers.bus._jobs import Device, Gate, NoAnswer, Refused
 from trade_drivers.vendors.robotiq._gripper_state import Hand
 from trade_drivers.vendors.robotiq._jobs import Motion
-from trade_drivers.vendors.robotiq._wire import NoAnswer, Refused
 
 if TYPE_CHECKING:
     from trade_drivers.robotfile import SerialBus
-    from trade_drivers.vendors.robotiq._modbus import Wire
+    from trade_drivers.vendors.robotiq._wire import Wire
 
 __all__ = ["Exchange"]
 

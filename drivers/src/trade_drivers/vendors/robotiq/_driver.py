@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final, NoReturn
 from trade import Measure
 from trade.errors import ConfigurationError
 from trade_drivers import robotfile
-from trade_drivers.bus._jobs import PortLost
+from trade_drivers.bus._jobs import NoAnswer, PortLost, Refused, WireError
 from trade_drivers.bus._thread import BusThread
 from trade_drivers.faults import Tell
 from trade_drivers.interfaces._motion import Gripper, JointGroup, Motor
@@ -18,10 +18,9 @@ from trade_drivers.vendors.robotiq._commission import RobotiqCommissioner
 from trade_drivers.vendors.robotiq._cycle import Exchange
 from trade_drivers.vendors.robotiq._gripper import RobotiqGripper
 from trade_drivers.vendors.robotiq._gripper_state import Hand
-from trade_drivers.vendors.robotiq._wire import NoAnswer, Refused, WireError
 
 if TYPE_CHECKING:
-    from trade_drivers.vendors.robotiq._modbus import Wire
+    from trade_drivers.vendors.robotiq._wire import Wire
 
 __all__ = ["RobotiqDriver", "open_exchange"]
 
@@ -186,7 +185,7 @@ def _look_over(exchange: Exchange, hand: Hand, bus: SerialBus, where: str) -> No
 def wire_at(port: str, baud: int, where: str) -> "Wire":
     """A line, not open yet. Raises ``ConfigurationError`` without the vendor library."""
     try:
-        from trade_drivers.vendors.robotiq._modbus import Wire  # noqa: PLC0415 - the vendor library is optional
+        from trade_drivers.vendors.robotiq._wire import Wire  # noqa: PLC0415 - the vendor library is optional
     except ImportError as missing:
         problem = f'needs pymodbus ({missing}); pip install "trade-drivers[robotiq]"'
         raise ConfigurationError(where="driver robotiq", problem=problem) from None

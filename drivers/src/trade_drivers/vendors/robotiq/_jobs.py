@@ -5,11 +5,10 @@ from typing import TYPE_CHECKING, Final
 
 from trade import Permit
 from trade.errors import DeadlineExceeded, DeviceSilent, MotionStopped, OutcomeUnknown, TradeError
-from trade_drivers.bus._jobs import Command, Gate, Steps
+from trade_drivers.bus._jobs import Command, Gate, NoAnswer, Refused, Steps
 from trade_drivers.vendors.robotiq import _table as table
 from trade_drivers.vendors.robotiq._gripper_state import Hand
 from trade_drivers.vendors.robotiq._table import Contact, Status
-from trade_drivers.vendors.robotiq._wire import NoAnswer, Refused
 
 if TYPE_CHECKING:
     from trade_drivers.vendors.robotiq._cycle import Exchange

@@ -1,13 +1,156 @@
-"""What can go wrong on the wire: all that the rest of this folder knows of the library."""
+"""The only place that touches pymodbus: its synchronous client on a port that sleeps while it waits.
 
-from trade_drivers.bus._jobs import NoAnswer, WireError
+The library polls, waits the full time for what came damaged, and takes a late answer for that of the next question.
+Mended by overriding how it sends and receives; what it sends, and what it makes of an answer, is its own.
+"""
 
-__all__ = ["NoAnswer", "Refused", "WireError"]
+import errno
+import logging
+import time
+from collections.abc import Callable, Sequence
+from typing import Final
+
+from pymodbus import ModbusException
+from pymodbus.client import ModbusSerialClient
+from pymodbus.framer import FramerRTU
+from pymodbus.pdu import ModbusPDU
+
+from trade_drivers.bus._jobs import Gate, NoAnswer, Refused
+from trade_drivers.bus._serial_port import DRAIN_S, LONGEST_WAIT_S, SerialLine, SerialWire
+from trade_drivers.vendors.robotiq import _table as table
+
+__all__ = ["Wire"]
+
+_READ_WRITE: Final = 23
+_EXCEPTION: Final = 0x80
+_OVERHEAD: Final = 5
+"""Bytes of an answer beyond its registers."""
+_EXCEPTION_SIZE: Final = 5
+_CLEAN_S: Final = 1.0
+_LONGEST_DRAIN_S: Final = 0.120
+"""Silence from the third failure in a row on."""
+_OFTEN: Final = 2
+_PROBES: Final = ((3, 1), (4, 1), (3, 2), (4, 2))
+"""Function and number of registers: a late answer to one of them is no answer to the next."""
+
+logging.getLogger("pymodbus").setLevel(logging.CRITICAL)  # it reports every time-out as an error; ours are counted
 
 
-class Refused(WireError):
-    """The device answered with an exception, which a 2F-85 never does."""
+class _QuietClient(ModbusSerialClient):
+    """The library's client on our line; it sleeps until the answer to its question has come."""
 
-    def __init__(self, device_id: int, code: int) -> None:
-        super().__init__(f"id {device_id} answered with exception {code}, which a 2F-85 never does")
-        self.device_id = device_id
+    def __init__(self, line: SerialLine, path: str, baud: int) -> None:
+        super().__init__(path, baudrate=baud, timeout=LONGEST_WAIT_S, retries=0)
+        self._line = line
+        self._head = b""
+        self._size = 0
+
+    def connect(self) -> bool:
+        """The line is opened and closed by its owner."""
+        return self._line.is_open
+
+    def expect(self, device_id: int, function: int, registers: int) -> None:
+        """What the answer to the next request looks like; anything else that comes is not it."""
+        self._head = bytes((device_id, function, 2 * registers))
+        self._size = _OVERHEAD + 2 * registers
+
+    def send(self, request: bytes, addr: tuple[object, ...] | None = None) -> int:  # noqa: ARG002
+        self._line.flush()
+        sent = self._line.write(request)
+        if sent < len(request):
+            raise OSError(errno.EIO, "the request could not be written as a whole")
+        self._line.expect(self._size)
+        return sent
+
+    def recv(self, size: int | None) -> bytes:  # noqa: ARG002
+        """The answer, freed of all that is not it; empty if it does not come in time."""
+        while (frame := self._take()) is None:
+            if not self._line.more():
+                return b""
+        return frame
+
+    def _take(self) -> bytes | None:
+        received = self._line.received
+        refusal = bytes((self._head[0], self._head[1] | _EXCEPTION))
+        for head, size in ((self._head, self._size), (refusal, _EXCEPTION_SIZE)):
+            at = received.find(head)
+            while at >= 0 and len(received) >= at + size:
+                frame = bytes(received[at : at + size])
+                if FramerRTU.compute_CRC(frame[:-2]) == int.from_bytes(frame[-2:], "big"):
+                    return frame
+                at = received.find(head, at + 1)
+        return None
+
+
+class Wire(SerialWire):
+    """One serial port and the requests on it. All but a stop may wait until the line is settled."""
+
+    def __init__(self, path: str, baud: int, where: str = "bus") -> None:
+        super().__init__(path, baud, where)
+        self._client = _QuietClient(self._line, path, baud)
+        self._in_a_row = 0
+        self._failed_at = -_CLEAN_S
+        self._failures = 0
+
+    def read(self, device_id: int) -> list[int]:
+        """The status registers. For a second after a failure, by the other function that reads them."""
+        self._settle()
+        recently = time.monotonic() - self._failed_at < _CLEAN_S
+        function = 3 if recently and self._failures % 2 else 4
+        return self._ask(device_id, function, table.COUNT, lambda: self._reading(device_id, function, table.COUNT))
+
+    def probe(self, device_id: int) -> None:
+        """Hear from a device in a way that no late answer to an earlier question can be taken for."""
+        self._settle()
+        function, count = _PROBES[self._failures % len(_PROBES)]
+        self._ask(device_id, function, count, lambda: self._reading(device_id, function, count))
+
+    def write(self, device_id: int, values: Sequence[int], gate: Gate | None = None, *, wait: bool = True) -> list[int]:
+        """Write the command registers and read the status registers, in one exchange (function 23).
+
+        Args:
+            device_id: whose.
+            values: three registers.
+            gate: asked right before the bytes go out.
+            wait: False for a stop: it does not keep silent after a failure.
+        """
+        if wait:
+            self._settle()
+
+        def ask() -> ModbusPDU:
+            return self._client.readwrite_registers(
+                read_address=table.STATUS,
+                read_count=table.COUNT,
+                write_address=table.COMMAND,
+                values=list(values),
+                device_id=device_id,
+            )
+
+        return self._ask(device_id, _READ_WRITE, table.COUNT, ask, gate)
+
+    def _reading(self, device_id: int, function: int, count: int) -> ModbusPDU:
+        reading = self._client.read_holding_registers if function == 3 else self._client.read_input_registers
+        return reading(table.STATUS, count=count, device_id=device_id)
+
+    def _ask(
+        self, device_id: int, function: int, count: int, ask: Callable[[], ModbusPDU], gate: Gate | None = None
+    ) -> list[int]:
+        began = time.monotonic()
+        self._client.expect(device_id, function, count)
+        with self._use(gate):
+            try:
+                answer = ask()
+            except ModbusException:
+                self._failed()
+                raise NoAnswer(device_id, time.monotonic() - began) from None
+        if answer.isError():
+            reason = f"id {device_id} answered with exception {answer.exception_code}, which a 2F-85 never does"
+            raise Refused(device_id, reason)
+        self._in_a_row = 0
+        return list(answer.registers)
+
+    def _failed(self) -> None:
+        self._unsettle(DRAIN_S if self._in_a_row < _OFTEN else _LONGEST_DRAIN_S)
+        self._failed_at = time.monotonic()
+        self._failures += 1
+        self._in_a_row += 1

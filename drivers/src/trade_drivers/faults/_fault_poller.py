@@ -15,7 +15,7 @@ from trade_drivers.interfaces._arm import Arm, ArmState
 from trade_drivers.interfaces._motion import Gripper, Motor
 from trade_drivers.interfaces._sensing import Sensor
 
-__all__ = ["FaultRecorder"]
+__all__ = ["FaultPoller"]
 
 _EVERY_S: Final = 0.04
 _KEPT: Final = 50
@@ -26,7 +26,7 @@ _END: Final = Trouble("", "fault", 0.0, 0.0)
 _MEASURING: Final = (Motor, Gripper, Arm, Sensor)
 
 
-class FaultRecorder:
+class FaultPoller:
     """A thread for the devices of one robot; it has the time to wait that bus threads have not.
 
     Args:
