@@ -7,10 +7,10 @@ import time
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Sequence
-from typing import Final, Generic, Protocol, TypeVar
+from typing import Any, Final, Generic, Protocol, TypeVar
 
 from trade import Resource
-from trade.errors import DeviceSilent, TradeError
+from trade.errors import DeviceError, DeviceFault, DeviceSilent, TradeError
 from trade_drivers.bus._jobs import Device, Work
 from trade_drivers.robotfile import Bus
 
@@ -30,38 +30,71 @@ def _lasting_ns() -> int:
     return time.clock_gettime_ns(time.CLOCK_BOOTTIME) if sys.platform == "linux" else time.monotonic_ns()
 
 
-class BusDevice(Device, Protocol):
-    """What the bus thread knows of each device."""
-
-    resource: Resource
-    bus: str
-    """The port, for messages."""
-    halting_since_ns: int
-    """When it was told to stop; 0 once it was seen at rest."""
-    misses: int
-    """Exchanges in a row that it did not answer."""
-    doubted: bool
-    """It missed an exchange and has not been heard properly since."""
-    silent: bool
-    """It used up its retries: it is left out and asked now and then whether it is back."""
-    silent_since_ns: int
-    probe_at_ns: int
+class Measured(Protocol):
+    """One measurement."""
 
     @property
-    def fault(self) -> str:
-        """Why it refuses to move; empty if it does not."""
+    def at_ns(self) -> int:
+        """When it was asked for."""
         ...
+
+
+_Sample = TypeVar("_Sample", bound=Measured)
+
+
+class BusDevice(ABC, Generic[_Sample]):
+    """The state of one device. The bus thread writes it; other threads read whole values."""
+
+    fault: str = ""
+    """Why it refuses to move; empty if it does not."""
+
+    def __init__(self, name: str, bus: str, resource: Resource) -> None:
+        self.name = name
+        self.resource = resource
+        """What locks and stops attach to."""
+        self.bus = bus
+        """The port, for messages."""
+        self.sample: _Sample | None = None
+        """The newest measurement."""
+        self.halting_since_ns = 0
+        """When it was told to stop; 0 once it was seen at rest."""
+        self.held_ns = 0
+        """When it was last told to."""
+        self.still = 0
+        """Measurements in a row in which it did not move."""
+        self.misses = 0
+        """Exchanges in a row that it did not answer."""
+        self.doubted = False
+        """It missed an exchange and has not been heard properly since: what it sends may be an answer of before."""
+        self.silent = False
+        """It used up its retries: it is left out and asked now and then whether it is back."""
+        self.silent_since_ns = 0
+        self.probe_at_ns = 0
+
+    @abstractmethod
+    def faulty(self, fault: str = "") -> DeviceFault:
+        """The error of a device with a fault; by default the latched one."""
 
     def age_ns(self, now_ns: int) -> int:
         """Age of the newest measurement, or the time it has been silent if there is none."""
-        ...
+        return now_ns - (self.sample.at_ns if self.sample else self.silent_since_ns)
+
+    def fresh(self, now_ns: int, stale_after_ns: int) -> _Sample:
+        """The newest measurement.
+
+        Raises:
+            DeviceSilent: it is too old, or there is none.
+        """
+        if self.sample is None or self.silent or self.age_ns(now_ns) > stale_after_ns:
+            raise self.deaf(now_ns)
+        return self.sample
 
     def deaf(self, now_ns: int) -> DeviceSilent:
         """The error of a device that does not answer."""
-        ...
+        return DeviceSilent(device=self.name, bus=self.bus, waited_s=self.age_ns(now_ns) / 1e9)
 
 
-_Device = TypeVar("_Device", bound=BusDevice)
+_Device = TypeVar("_Device", bound=BusDevice[Any])
 
 
 class StopTicket(Work[_Device]):
@@ -139,6 +172,11 @@ class BusCycle(ABC, Generic[_Device]):
     def unseen(self) -> list[str]:
         """The names of the devices that nobody sees at rest: silent, or told to stop and still moving."""
         return [device.name for device in self._devices if device.silent or device.halting_since_ns]
+
+    def absence(self, device: _Device, silent: DeviceSilent) -> DeviceError:
+        """The error of a device that was not measured: why nothing is taken on at present, else its silence."""
+        reason = self.refusing(device) if self.refusing is not None else None
+        return reason if isinstance(reason, DeviceError) else silent
 
     def why(self, devices: Sequence[_Device]) -> str:
         """Why their ``stop()`` is called: an e-stop, a session that ended, services withdrawn, or just so."""

@@ -18,7 +18,7 @@ class _Seen:
 
     __slots__ = ("device", "fault", "link", "refusing")
 
-    def __init__(self, device: BusDevice) -> None:
+    def __init__(self, device: BusDevice[Any]) -> None:
         self.device = device
         self.fault = ""
         self.link = False
@@ -53,6 +53,6 @@ class FaultDetector:
                 )  # until it is heard, it is as it was: it was not silent besides
                 self._say(device, "link", device.deaf(now_ns) if refusing is None else refusing(device))
 
-    def _say(self, device: BusDevice, respect: Respect, error: TradeError | None) -> None:
+    def _say(self, device: BusDevice[Any], respect: Respect, error: TradeError | None) -> None:
         found = () if error is None else found_in(device.name, error)
         self._tell(Trouble(device.name, respect, time.time(), time.monotonic(), found))

@@ -3,20 +3,20 @@
 import logging
 import threading
 import time
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Generator
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from typing import Any, Final, Generic, Protocol, TypeVar
 
 from trade import Measure
-from trade.errors import BusGone, TradeError
+from trade.errors import BusGone, ConfigurationError, TradeError
 from trade_drivers.bus._cycle import BusCycle
 from trade_drivers.bus._fault_detector import FaultDetector
-from trade_drivers.bus._jobs import Device, PortLost, PortOpening
+from trade_drivers.bus._jobs import Device, PortLost, PortOpening, WireError
 from trade_drivers.faults import Tell
 from trade_drivers.robotfile import Bus
 
-__all__ = ["BusThread", "Port", "start_thread"]
+__all__ = ["BusThread", "Port", "opening", "start_thread"]
 
 _log = logging.getLogger("trade")
 _REOPEN_FIRST_S: Final = 0.1
@@ -221,6 +221,27 @@ class BusThread(Generic[_Exchange_co]):
 
     def _unhealthy(self, device: Device) -> TradeError:
         return device.faulty("its driver's process is not healthy")
+
+
+@contextmanager
+def opening(wire: Port, port: str, where: str) -> Generator[None, None, None]:
+    """Open a serial line for what is inside, which looks its devices over; it is closed if that fails.
+
+    Raises:
+        ConfigurationError: the port cannot be had, or exchanges fail.
+    """
+    with ExitStack() as undo:
+        undo.callback(wire.close)
+        try:
+            wire.open()
+            yield
+        except PortLost as lost:
+            problem = f"{port}: {lost}; `ls -l /dev/serial/by-id` shows those that are"
+            raise ConfigurationError(where=f"{where}.port", problem=problem) from None
+        except WireError as bad:
+            problem = f"the bus does not work reliably: {bad}; check cable and power"
+            raise ConfigurationError(where=f"{where}.port", problem=problem) from bad
+        undo.pop_all()
 
 
 _Exchange = TypeVar("_Exchange", bound=BusCycle[Any])

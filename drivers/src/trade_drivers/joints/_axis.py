@@ -1,7 +1,7 @@
 """One joint as its bus thread knows it: what was measured last, how it is, and how counts become radians."""
 
 import time
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Sequence
 from math import ceil, floor
 from typing import TYPE_CHECKING, Any, Final, TypeVar
@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 from msgspec import Struct
 
 from trade import Resource
-from trade.errors import DeviceFault, DeviceSilent, LimitExceeded
+from trade.errors import DeviceFault, LimitExceeded
+from trade_drivers.bus._cycle import BusDevice
 from trade_drivers.interfaces._motion import MotorState
 from trade_drivers.robotfile import Joint
 
@@ -87,15 +88,11 @@ class Scale:
         return max(-1.0, min(1.0, counts * self._sign / full))
 
 
-class Axis(ABC):
-    """The state of one joint. The bus thread writes it; other threads read whole values."""
+class Axis(BusDevice[Sample]):
+    """The state of one joint."""
 
     def __init__(self, name: str, bus: str, joint: Joint, grain: Grain, coupled: Sequence[str] = ()) -> None:
-        self.name = name
-        self.resource = Resource(name, coupled=coupled)
-        """What locks and stops attach to."""
-        self.bus = bus
-        """The port, for messages."""
+        super().__init__(name, bus, Resource(name, coupled=coupled))
         self.joint = joint
         self.id = joint.id
         self.grain = grain
@@ -105,29 +102,13 @@ class Axis(ABC):
         self.speed_counts = max(1, floor(joint.max_speed_rad_s / grain.rad_s))
         self.accel_counts = max(1, floor(joint.max_accel_rad_s2 / grain.rad_s2))
 
-        self.sample: Sample | None = None
-        self.fault = ""
         self.remedy = ""
         """What helps against a fault the device itself has latched."""
         self.ready = False
         """Enabled by this driver, which has checked and armed it since."""
         self.motion: Motion[Any] | None = None
-        self.halting_since_ns = 0
-        """When it was told to hold; 0 once it was seen at rest."""
-        self.held_ns = 0
-        """When it was last told to."""
         self.held_counts: int | None = None
-        """Where that was."""
-        self.still = 0
-        """Measurements in a row in which it did not move."""
-
-        self.misses = 0
-        self.doubted = False
-        """It missed an exchange and has not been heard properly since."""
-        self.silent = False
-        """It used up its retries: it is left out and asked now and then whether it is back."""
-        self.probe_at_ns = 0
-        self.silent_since_ns = 0
+        """Where it was last told to hold."""
 
     def note(self, sample: Sample) -> None:
         """Keep a cyclic measurement."""
@@ -161,10 +142,6 @@ class Axis(ABC):
     def moved_since_held(self) -> bool:
         """Whether it was measured, since it was last told to hold, and found moving."""
         return not self.silent and not self.still and self.sample is not None and self.sample.at_ns > self.held_ns
-
-    def age_ns(self, now_ns: int) -> int:
-        """Age of the newest measurement, or the time it has been silent if there is none."""
-        return now_ns - (self.sample.at_ns if self.sample else self.silent_since_ns)
 
     def hold_counts(self, now_ns: int, blind_ns: int) -> int | None:
         """Where to hold: where it was measured, or, if that is old, where it must have got to since on its way.
@@ -207,21 +184,11 @@ class Axis(ABC):
         return self.fresh(now_ns, stale_after_ns)
 
     def fresh(self, now_ns: int, stale_after_ns: int) -> Sample:
-        """The newest measurement.
-
-        Raises:
-            DeviceSilent: it is too old, or there is none.
-        """
         if self.sample is None or self.age_ns(now_ns) > stale_after_ns:
             raise self.deaf(now_ns)
         return self.sample
 
-    def deaf(self, now_ns: int) -> DeviceSilent:
-        """The error of a joint that does not answer."""
-        return DeviceSilent(device=self.name, bus=self.bus, waited_s=self.age_ns(now_ns) / 1e9)
-
     def faulty(self, fault: str = "") -> DeviceFault:
-        """The error of a joint with a fault; by default the latched one."""
         remedy = "remove the cause, then call enable()"
         if not fault and self.remedy:
             remedy = self.remedy

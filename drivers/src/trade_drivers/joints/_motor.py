@@ -3,13 +3,12 @@
 from collections.abc import Sequence
 from typing import Any, Generic, TypeVar
 
-from trade import Measure, Resource, permit
-from trade.errors import DeviceError, DeviceSilent, LimitExceeded
+from trade import Resource, permit
+from trade.errors import DeviceSilent, LimitExceeded
 from trade_drivers._validation import finite, one_each, valid, within
 from trade_drivers.bus._deadlines import expiry, span
 from trade_drivers.bus._jobs import Command
 from trade_drivers.bus._thread import BusThread
-from trade_drivers.faults import Tell
 from trade_drivers.interfaces._motion import JointGroup, JointLimits, Motor, MotorState
 from trade_drivers.joints._axis import Axis, AxisT
 from trade_drivers.joints._cycle import Exchange
@@ -18,7 +17,7 @@ from trade_drivers.joints._motion import Move
 from trade_drivers.joints._setpoint import SetPoint
 from trade_drivers.joints._trajectory_run import Follow
 from trade_drivers.motion._plan import Plan
-from trade_drivers.plugins._driver import AttachedBus
+from trade_drivers.plugins._driver import ThreadedBus
 
 __all__ = ["AttachedJoints", "BusGroup", "BusMotor"]
 
@@ -109,11 +108,8 @@ class _Joints(Generic[AxisT, _Exchange]):
     def _state(self, axis: Axis) -> MotorState:
         try:
             return axis.state(self._exchange.clock(), self._exchange.stale_after_ns)
-        except DeviceSilent:
-            reason = self._exchange.refusing(axis) if self._exchange.refusing is not None else None
-            if isinstance(reason, DeviceError):
-                raise reason from None
-            raise
+        except DeviceSilent as silent:
+            raise self._exchange.absence(axis, silent) from None
 
     def _limits(self) -> list[JointLimits]:
         return [
@@ -183,11 +179,12 @@ class BusGroup(_Joints[Axis, Exchange[Any]], JointGroup):
         return job.final_rad
 
 
-class AttachedJoints(AttachedBus):
+class AttachedJoints(ThreadedBus[Exchange[Any]]):
     """A bus with its joints, and the thread that owns it."""
 
     def __init__(self, thread: BusThread[Exchange[Any]], motor: type[BusMotor[Any, Any]] = BusMotor) -> None:
-        self._thread, self._motor = thread, motor
+        super().__init__(thread)
+        self._motor = motor
         self._axes = {axis.joint.name: axis for axis in thread.exchange.devices}
 
     def motor(self, joint: str) -> Motor:
@@ -196,19 +193,6 @@ class AttachedJoints(AttachedBus):
 
     def group(self, name: str, joints: Sequence[str]) -> JointGroup:
         return BusGroup(name, self._thread, [self._axes[joint] for joint in joints])
-
-    def measures(self, bus: str) -> list[Measure]:
-        return self._thread.measures(bus)
-
-    def watched(self, tell: Tell) -> bool:
-        self._thread.watched(tell)
-        return True
-
-    def unseen(self) -> list[str]:
-        return self._thread.unseen
-
-    def close(self) -> None:
-        self._thread.close()
 
 
 def _end_counts(axis: Axis, velocity_rad_s: float) -> int:

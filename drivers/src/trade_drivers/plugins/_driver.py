@@ -4,13 +4,15 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
 from importlib.metadata import EntryPoint, entry_points
 from importlib.util import find_spec
-from typing import ClassVar, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 from msgspec import Struct
 
 from trade import Measure
 from trade.errors import ConfigurationError
 from trade_drivers import robotfile
+from trade_drivers.bus._cycle import BusCycle
+from trade_drivers.bus._thread import BusThread
 from trade_drivers.bus.can._monitor import CanMonitor
 from trade_drivers.commissioning._commissioner import Bench, Commissioner
 from trade_drivers.faults import Tell
@@ -19,7 +21,7 @@ from trade_drivers.interfaces._motion import Gripper, JointGroup, Motor
 from trade_drivers.interfaces._sensing import Camera, Sensor
 from trade_drivers.robotfile import Bus, Robot
 
-__all__ = ["AnyDriver", "AttachedBus", "Driver", "SenseDriver", "drivers", "load_driver"]
+__all__ = ["AnyDriver", "AttachedBus", "Driver", "SenseDriver", "ThreadedBus", "drivers", "load_driver"]
 
 _GROUP = "trade.drivers"
 
@@ -78,6 +80,29 @@ class AttachedBus(ABC):
         Raises:
             TradeError: something could not be left as asked; the port is let go all the same.
         """
+
+
+_Exchange_co = TypeVar("_Exchange_co", bound=BusCycle[Any], covariant=True)
+
+
+class ThreadedBus(AttachedBus, Generic[_Exchange_co]):
+    """An attached bus that a thread owns."""
+
+    def __init__(self, thread: BusThread[_Exchange_co]) -> None:
+        self._thread = thread
+
+    def measures(self, bus: str) -> Iterable[Measure]:
+        return self._thread.measures(bus)
+
+    def watched(self, tell: Tell) -> bool:
+        self._thread.watched(tell)
+        return True
+
+    def unseen(self) -> Sequence[str]:
+        return self._thread.unseen
+
+    def close(self) -> None:
+        self._thread.close()
 
 
 class AnyDriver:

@@ -3,13 +3,12 @@
 import time
 from abc import abstractmethod
 from collections.abc import Callable, Collection, Mapping
-from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar, cast
 
 from trade.errors import ConfigurationError
+from trade_drivers.bus._thread import opening
 from trade_drivers.commissioning._commissioner import Bench
-from trade_drivers.joints import AttachedJoints, PortLost, start_thread
-from trade_drivers.joints.serial._answers import WireError
+from trade_drivers.joints import AttachedJoints, start_thread
 from trade_drivers.joints.serial._axis import ServoAxis
 from trade_drivers.joints.serial._commission import ServoBench
 from trade_drivers.joints.serial._cycle import ServoExchange
@@ -64,23 +63,12 @@ class ServoDriver(Driver, Generic[_Servo, _Wire]):
             ConfigurationError: the port cannot be had, or a device is absent, another, or set wrongly.
         """
         exchange = self.exchange(robot, bus, port, self._known(robot, bus))
-        where = f"{robot.where}: bus.{bus.name}.port"
-        with ExitStack() as undo:
-            undo.callback(exchange.wire.close)
-            try:
-                exchange.wire.open()
-                for axis in exchange.devices:
-                    self.look_over(exchange.wire, bus, axis, exchange.clock, robot.where)
-                for axis in exchange.devices:
-                    exchange.admit(axis)
-                exchange.cycle()
-            except PortLost as lost:
-                problem = f"{port}: {lost}; `ls -l /dev/serial/by-id` shows those that are"
-                raise ConfigurationError(where=where, problem=problem) from None
-            except WireError as bad:
-                problem = f"the bus does not work reliably: {bad}; check cable and power"
-                raise ConfigurationError(where=where, problem=problem) from bad
-            undo.pop_all()
+        with opening(exchange.wire, port, f"{robot.where}: bus.{bus.name}"):
+            for axis in exchange.devices:
+                self.look_over(exchange.wire, bus, axis, exchange.clock, robot.where)
+            for axis in exchange.devices:
+                exchange.admit(axis)
+            exchange.cycle()
         return exchange
 
     def _serial(self, robot: Robot, bus: Bus) -> SerialBus:

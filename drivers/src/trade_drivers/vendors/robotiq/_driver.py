@@ -1,17 +1,15 @@
 """Bringing a bus with grippers up, and handing them out."""
 
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
 from typing import TYPE_CHECKING, Final, NoReturn
 
-from trade import Measure
 from trade.errors import ConfigurationError
 from trade_drivers import robotfile
-from trade_drivers.bus._jobs import NoAnswer, PortLost, Refused, WireError
-from trade_drivers.bus._thread import BusThread
-from trade_drivers.faults import Tell
+from trade_drivers._validation import not_installed
+from trade_drivers.bus._jobs import NoAnswer, Refused
+from trade_drivers.bus._thread import BusThread, opening, start_thread
 from trade_drivers.interfaces._motion import Gripper, JointGroup, Motor
-from trade_drivers.plugins._driver import AttachedBus, Driver
+from trade_drivers.plugins._driver import AttachedBus, Driver, ThreadedBus
 from trade_drivers.robotfile import Bus, Robot, SerialBus
 from trade_drivers.vendors.robotiq import _table as table
 from trade_drivers.vendors.robotiq._commission import RobotiqCommissioner
@@ -22,7 +20,7 @@ from trade_drivers.vendors.robotiq._gripper_state import Hand
 if TYPE_CHECKING:
     from trade_drivers.vendors.robotiq._wire import Wire
 
-__all__ = ["RobotiqDriver", "open_exchange"]
+__all__ = ["RobotiqDriver"]
 
 _ATTEMPTS: Final = 3
 _BITS_A_READ: Final = (8 + 11) * 10 + 35
@@ -35,11 +33,11 @@ _MEANINGLESS: Final = {
 """Keys of a serial bus that no gripper keeps, and why."""
 
 
-class AttachedGrippers(AttachedBus):
+class AttachedGrippers(ThreadedBus[Exchange]):
     """A bus with its grippers, and the thread that owns it."""
 
     def __init__(self, thread: BusThread[Exchange]) -> None:
-        self._thread = thread
+        super().__init__(thread)
         self._hands = {hand.gripper.name: hand for hand in thread.exchange.hands}
 
     def motor(self, joint: str) -> Motor:
@@ -50,19 +48,6 @@ class AttachedGrippers(AttachedBus):
 
     def gripper(self, name: str) -> Gripper:
         return RobotiqGripper(self._thread, self._hands[name])
-
-    def measures(self, bus: str) -> list[Measure]:
-        return self._thread.measures(bus)
-
-    def watched(self, tell: Tell) -> bool:
-        self._thread.watched(tell)
-        return True
-
-    def unseen(self) -> list[str]:
-        return self._thread.unseen
-
-    def close(self) -> None:
-        self._thread.close()
 
 
 class RobotiqDriver(Driver):
@@ -79,13 +64,8 @@ class RobotiqDriver(Driver):
         wire_at(serial.port, serial.baud, f"{robot.where}: bus.{bus.name}")
 
     def attach(self, robot: Robot, bus: Bus, port: str, healthy: Callable[[], bool]) -> AttachedBus:
-        with ExitStack() as undo:
-            exchange = open_exchange(robot, _serial(robot, bus), port)
-            undo.callback(exchange.wire.close)
-            thread = BusThread(exchange, exchange.wire, bus, healthy, name=f"bus {robot.name}.{bus.name}")
-            thread.start()
-            undo.pop_all()
-        return AttachedGrippers(thread)
+        exchange = open_exchange(robot, _serial(robot, bus), port)
+        return AttachedGrippers(start_thread(exchange, exchange.wire, robot.name, bus, healthy))
 
 
 def _serial(robot: Robot, bus: Bus) -> SerialBus:
@@ -104,25 +84,13 @@ def open_exchange(robot: Robot, bus: SerialBus, port: str) -> Exchange:
     hands = [Hand(f"{robot.name}.{gripper.name}", port, gripper) for gripper in robot.grippers_on(bus.name)]
     where = f"{robot.where}: bus.{bus.name}"
     wire = wire_at(port, bus.baud, where)
-    try:
-        wire.open()
-        exchange = Exchange(wire, bus, hands)
+    exchange = Exchange(wire, bus, hands)
+    with opening(wire, port, where):
         for hand in hands:
             _look_over(exchange, hand, bus, robot.where)
         for hand in hands:
             exchange.admit(hand)
         exchange.cycle()
-    except PortLost as lost:
-        wire.close()
-        problem = f"{port}: {lost}; `ls -l /dev/serial/by-id` shows those that are"
-        raise ConfigurationError(where=f"{where}.port", problem=problem) from None
-    except WireError as bad:
-        wire.close()
-        problem = f"the bus does not work reliably: {bad}; check cable and power"
-        raise ConfigurationError(where=f"{where}.port", problem=problem) from bad
-    except BaseException:
-        wire.close()
-        raise
     return exchange
 
 
@@ -187,8 +155,7 @@ def wire_at(port: str, baud: int, where: str) -> "Wire":
     try:
         from trade_drivers.vendors.robotiq._wire import Wire  # noqa: PLC0415 - the vendor library is optional
     except ImportError as missing:
-        problem = f'needs pymodbus ({missing}); pip install "trade-drivers[robotiq]"'
-        raise ConfigurationError(where="driver robotiq", problem=problem) from None
+        raise not_installed("robotiq", "pymodbus", missing) from None
     return Wire(port, baud, where)
 
 

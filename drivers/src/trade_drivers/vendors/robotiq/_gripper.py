@@ -1,7 +1,7 @@
 """A 2F-85 as a Gripper: it checks, hands over to the bus thread, waits, and never touches the port."""
 
 from trade import Resource, permit
-from trade.errors import DeviceError, DeviceSilent
+from trade.errors import DeviceSilent
 from trade_drivers._validation import finite, within
 from trade_drivers.bus._deadlines import expiry, span
 from trade_drivers.bus._thread import BusThread
@@ -31,11 +31,8 @@ class RobotiqGripper(Gripper):
         exchange = self._exchange
         try:
             return self._hand.state(exchange.clock(), exchange.stale_after_ns)
-        except DeviceSilent:
-            reason = exchange.refusing(self._hand) if exchange.refusing is not None else None
-            if isinstance(reason, DeviceError):
-                raise reason from None
-            raise
+        except DeviceSilent as silent:
+            raise exchange.absence(self._hand, silent) from None
 
     def limits(self) -> GripperLimits:
         gripper, model = self._hand.gripper, self._hand.model

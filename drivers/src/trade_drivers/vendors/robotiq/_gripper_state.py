@@ -4,7 +4,8 @@ import time
 from typing import TYPE_CHECKING, Final, Literal
 
 from trade import Resource
-from trade.errors import DeviceFault, DeviceSilent
+from trade.errors import DeviceFault
+from trade_drivers.bus._cycle import BusDevice
 from trade_drivers.interfaces._motion import GripperState
 from trade_drivers.robotfile import Gripper
 from trade_drivers.vendors.robotiq import _table as table
@@ -21,37 +22,19 @@ _REMEDY: Final = "remove the cause, then call activate(): it moves the fingers a
 _NOT_ACTIVATED: Final = "it is not activated"
 
 
-class Hand:
-    """The state of one gripper. The bus thread writes it; other threads read whole values."""
+class Hand(BusDevice[Status]):
+    """The state of one gripper."""
 
     def __init__(self, name: str, bus: str, gripper: Gripper) -> None:
-        self.name = name
-        self.resource = Resource(name)
-        """What locks and stops attach to."""
-        self.bus = bus
-        """The port, for messages."""
+        super().__init__(name, bus, Resource(name))
         self.gripper = gripper
         self.id = gripper.id
         self.model = table.BY_MODEL_NAME[gripper.model]
-        self.sample: Status | None = None
         self.force_counts = 0
         """The force it was last told."""
         self.fault = ""
         """Why it refuses to move, reported by the gripper or found by this driver: kept until somebody clears it."""
         self.motion: Motion | None = None
-        self.halting_since_ns = 0
-        """When it was told to stop; 0 once it was seen at rest."""
-        self.held_ns = 0
-        """When it was last told to."""
-        self.still = 0
-        """Measurements in a row in which it did not move."""
-        self.misses = 0
-        self.doubted = False
-        """It missed an exchange and has not answered a probe since: what it sends may be the answer of before."""
-        self.silent = False
-        """It used up its retries: it is left out and asked now and then whether it is back."""
-        self.probe_at_ns = 0
-        self.silent_since_ns = 0
         self._holding: Literal["", "outside", "inside"] = ""
         self._held_at = 0
         self._speed_m_s = 0.0
@@ -104,20 +87,6 @@ class Hand:
         if under_way or not (self.silent or self.doubted):
             self.resource.moving = under_way or self.still == 0
 
-    def age_ns(self, now_ns: int) -> int:
-        """Age of the newest measurement, or the time it has been silent if there is none."""
-        return now_ns - (self.sample.at_ns if self.sample else self.silent_since_ns)
-
-    def fresh(self, now_ns: int, stale_after_ns: int) -> Status:
-        """The newest measurement.
-
-        Raises:
-            DeviceSilent: it is too old, or there is none.
-        """
-        if self.sample is None or self.silent or self.age_ns(now_ns) > stale_after_ns:
-            raise self.deaf(now_ns)
-        return self.sample
-
     def check_usable(self, now_ns: int, stale_after_ns: int) -> Status:
         """The newest measurement, if the fingers may be commanded.
 
@@ -137,12 +106,7 @@ class Hand:
         remedy = "call activate(): it moves the fingers all the way, and what they hold falls"
         return DeviceFault(device=self.name, bus=self.bus, fault=fault, remedy=remedy)
 
-    def deaf(self, now_ns: int) -> DeviceSilent:
-        """The error of a gripper that does not answer."""
-        return DeviceSilent(device=self.name, bus=self.bus, waited_s=self.age_ns(now_ns) / 1e9)
-
     def faulty(self, fault: str = "") -> DeviceFault:
-        """The error of a gripper with a fault; by default the one it has."""
         return DeviceFault(device=self.name, bus=self.bus, fault=fault or self.fault, remedy=_REMEDY)
 
     def state(self, now_ns: int, stale_after_ns: int) -> GripperState:

@@ -4,7 +4,8 @@ import time
 from typing import TYPE_CHECKING, Final
 
 from trade import Resource
-from trade.errors import DeviceFault, DeviceSilent
+from trade.errors import DeviceFault
+from trade_drivers.bus._cycle import BusDevice
 from trade_drivers.interfaces._arm import ArmState, Safety
 from trade_drivers.robotfile import Arm
 from trade_drivers.vendors.ur._messages import Sample
@@ -37,27 +38,14 @@ _STILL: Final = 3
 """Measurements in a row without motion: it is at rest."""
 
 
-class ArmStatus:
-    """The state of one arm. The bus thread writes it; other threads read whole values."""
+class ArmStatus(BusDevice[Sample]):
+    """The state of one arm."""
 
     def __init__(self, name: str, host: str, arm: Arm) -> None:
-        self.name = name
-        self.resource = Resource(name)
-        """What locks and stops attach to."""
-        self.bus = host
+        super().__init__(name, host, Resource(name))
         self.arm = arm
         self.joints = [f"{name}.{joint}" for joint in JOINTS]
-        self.sample: Sample | None = None
         self.motion: Motion | None = None
-        self.halting_since_ns = 0
-        """When it was told to stop; 0 once it was seen at rest."""
-        self.still = 0
-        """Measurements in a row in which it did not move."""
-        self.misses = 0
-        self.doubted = False
-        self.silent = False
-        self.silent_since_ns = 0
-        self.probe_at_ns = 0
 
     def take(self, sample: Sample) -> None:
         """Note a measurement."""
@@ -76,20 +64,6 @@ class ArmStatus:
     def at_rest(self, now_ns: int, stale_after_ns: int) -> bool:
         """Seen at rest, now, with nothing of ours under way."""
         return self.motion is None and self.still >= _STILL and self.age_ns(now_ns) <= stale_after_ns
-
-    def age_ns(self, now_ns: int) -> int:
-        """Age of the newest measurement, or the time it has been silent if there is none."""
-        return now_ns - (self.sample.at_ns if self.sample else self.silent_since_ns)
-
-    def fresh(self, now_ns: int, stale_after_ns: int) -> Sample:
-        """The newest measurement.
-
-        Raises:
-            DeviceSilent: it is too old, or there is none.
-        """
-        if self.sample is None or self.silent or self.age_ns(now_ns) > stale_after_ns:
-            raise self.deaf(now_ns)
-        return self.sample
 
     def check_usable(self, now_ns: int, stale_after_ns: int) -> Sample:
         """The newest measurement, if the arm may be commanded.
@@ -119,7 +93,7 @@ class ArmStatus:
         return self.sample is not None and bool(self.sample.robot_status & _POWERED)
 
     @property
-    def fault(self) -> str:
+    def fault(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride] - nothing latches it
         """Why it cannot be moved; empty if it can."""
         if self.safety not in {"normal", "reduced"}:
             return f"its safety system says: {self.safety}"
@@ -137,10 +111,6 @@ class ArmStatus:
         if not self.powered:
             return "call power_on() and release_brakes()"
         return "try again, or look at the controller's log" if self.enabled else "call release_brakes()"
-
-    def deaf(self, now_ns: int) -> DeviceSilent:
-        """The error of a controller that sends nothing new."""
-        return DeviceSilent(device=self.name, bus=self.bus, waited_s=self.age_ns(now_ns) / 1e9)
 
     def faulty(self, fault: str = "") -> DeviceFault:
         """The error of an arm that does not do what it was told; by default for the reason it has."""

@@ -7,16 +7,14 @@ from typing import Final, NoReturn
 
 from msgspec import structs
 
-from trade import Measure
 from trade.errors import ConfigurationError
 from trade_drivers import robotfile
 from trade_drivers.bus._host_lock import HostLock, Taken
 from trade_drivers.bus._jobs import PortLost
 from trade_drivers.bus._thread import BusThread
-from trade_drivers.faults import Tell
 from trade_drivers.interfaces._arm import Arm
 from trade_drivers.interfaces._motion import JointGroup, Motor
-from trade_drivers.plugins._driver import AttachedBus, Driver
+from trade_drivers.plugins._driver import AttachedBus, Driver, ThreadedBus
 from trade_drivers.robotfile import Bus, Robot, UrBus
 from trade_drivers.vendors.ur._arm_state import ArmStatus
 from trade_drivers.vendors.ur._cycle import Exchange
@@ -41,11 +39,12 @@ _LET_GO_S: Final = 2.0
 _AGAIN_S: Final = 0.1
 
 
-class AttachedController(AttachedBus):
+class AttachedController(ThreadedBus[Exchange]):
     """A controller with its arm, and the thread that owns it."""
 
     def __init__(self, thread: BusThread[Exchange], link: Link, lock: HostLock) -> None:
-        self._thread, self._link, self._lock = thread, link, lock
+        super().__init__(thread)
+        self._link, self._lock = link, lock
 
     def motor(self, joint: str) -> Motor:
         raise ConfigurationError(where=f'joint."{joint}"', problem="driver ur has no joints, only an arm: [arm.NAME]")
@@ -56,19 +55,9 @@ class AttachedController(AttachedBus):
     def arm(self, name: str) -> Arm:  # noqa: ARG002 - there is one
         return UrArm(self._thread, self._thread.exchange.limb)
 
-    def measures(self, bus: str) -> list[Measure]:
-        return self._thread.measures(bus)
-
-    def watched(self, tell: Tell) -> bool:
-        self._thread.watched(tell)
-        return True
-
-    def unseen(self) -> list[str]:
-        return self._thread.unseen
-
     def close(self) -> None:
         try:
-            self._thread.close()
+            super().close()
         finally:
             self._link.wait_closed()
             self._lock.release()

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from typing import Final
 
 from trade import Permit, Resource, permit
-from trade.errors import DeadlineExceeded, DeviceError, DeviceSilent, InvalidArgument
+from trade.errors import DeadlineExceeded, DeviceSilent, InvalidArgument
 from trade_drivers._validation import finite, one_each, valid, within
 from trade_drivers.bus._deadlines import expiry, span
 from trade_drivers.bus._thread import BusThread
@@ -45,11 +45,8 @@ class UrArm(Arm):
         free = isinstance(self._limb.motion, Freedrive)
         try:
             return self._limb.state(exchange.clock(), exchange.stale_after_ns, freedrive=free)
-        except DeviceSilent:
-            reason = exchange.refusing(self._limb) if exchange.refusing is not None else None
-            if isinstance(reason, DeviceError):
-                raise reason from None
-            raise
+        except DeviceSilent as silent:
+            raise exchange.absence(self._limb, silent) from None
 
     def limits(self) -> ArmLimits:
         arm = self._limb.arm
