@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 from tests.contract.rigs.base import DriverProcess, SafetyRig
 from tests.support.waiting import wait_until
 from tests.unit.drivers.conftest import Outcome
+from trade_drivers.bus._deadlines import Terms
 from trade_drivers.joints._motion import Move
 from trade_hil_sim import Entry, Place
 
@@ -67,7 +68,7 @@ class JointRig(SafetyRig):
         """A move at the bus thread that no service has checked."""
         exchange, axes = self.exchange, self.device._axes
         goals, expires_ns = [round(axes[0].scale.counts(goal_rad))], exchange.clock() + 10**10
-        move = Move(exchange, axes, goals, [50], service="x", expires_ns=expires_ns, until_ns=None, permit=permit)
+        move = Move(exchange, axes, goals, [50], Terms("x", expires_ns, None, permit))
         exchange.submit(move)
         return move
 

@@ -17,6 +17,7 @@ from tests.support.waiting import PATIENCE_S, wait_until
 from tests.unit.drivers.conftest import Outcome, sleep_past, written_now
 from tests.unit.drivers.legs import HALT, HIP, KNEE, Leg, leg, rig
 from trade.errors import DeadlineExceeded, DeviceFault, LockedByOther, MotionStopped
+from trade_drivers.bus._deadlines import Terms
 from trade_drivers.joints._motion import Move
 from trade_hil_sim import Entry, Mute
 
@@ -233,7 +234,7 @@ def test_S11_a_command_whose_lock_is_gone_is_kept_off_the_wire(leg: Leg, looks: 
     mark = written_now()
     permit: Any = Lost(looks)
     expires_ns = exchange.clock() + 10**10
-    move = Move(exchange, axes, [4000], [500], service="x", expires_ns=expires_ns, until_ns=None, permit=permit)
+    move = Move(exchange, axes, [4000], [500], Terms("x", expires_ns, None, permit))
     exchange.submit(move)
     with pytest.raises(LockedByOther):
         move.wait(lambda: True)

@@ -14,6 +14,7 @@ from tests.unit.drivers.conftest import Outcome, Rig, goal_counts, written_now
 from trade import permit
 from trade.errors import BusGone, DeviceFault, DeviceSilent
 from trade_drivers import AttachedRobot, MotorState
+from trade_drivers.bus._deadlines import Terms
 from trade_drivers.joints._jobs import Enable, Relax
 from trade_drivers.vendors.dynamixel import DynamixelDriver
 
@@ -260,7 +261,7 @@ def test_health_that_is_read_while_a_joint_is_being_relaxed_is_no_fault(head: Ri
     try:
         for kind in (Enable, Relax):
             with permit([axis.resource for axis in exchange.devices]) as permitted:
-                job = kind(exchange, exchange.devices, service="test", expires_ns=2**63, permit=permitted)
+                job = kind(exchange, exchange.devices, Terms("test", 2**63, None, permitted))
                 exchange.submit(job)
                 while not job.ended:
                     for axis in exchange.devices:

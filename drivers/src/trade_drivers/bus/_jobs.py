@@ -5,11 +5,12 @@ from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Final, Generic, Protocol, TypeVar
 
-from trade import Permit, current_call
+from trade import current_call
 from trade.errors import DeadlineExceeded, DeviceFault, TradeError
 
 if TYPE_CHECKING:
     from trade_drivers.bus._cycle import BusCycle
+    from trade_drivers.bus._deadlines import Terms
 
 __all__ = [
     "TAKEN",
@@ -164,20 +165,10 @@ class Work(Generic[_Device_co]):
 class Command(Work[_Device_co], Generic[_Device_co, _Cycle_co]):
     """A command that may start motion: it expires, and its call was admitted under a permit."""
 
-    def __init__(
-        self,
-        exchange: _Cycle_co,
-        devices: Sequence[_Device_co],
-        *,
-        service: str,
-        expires_ns: int,
-        permit: Permit,
-    ) -> None:
+    def __init__(self, exchange: _Cycle_co, devices: Sequence[_Device_co], terms: "Terms") -> None:
         super().__init__(devices)
         self._exchange = exchange
-        self.service = service
-        self.expires_ns = expires_ns
-        self.permit = permit
+        self.service, self.expires_ns, self.until_ns, self.permit = terms
         self._admitted_ns = exchange.clock()
 
     @property

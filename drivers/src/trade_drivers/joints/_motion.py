@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING, Final
 
 from msgspec import Struct
 
-from trade import Permit
 from trade.errors import MotionStopped, TradeError
+from trade_drivers.bus._deadlines import Terms
 from trade_drivers.bus._jobs import Command, Steps
 from trade_drivers.joints._axis import AxisT, Goal
 from trade_drivers.joints._jobs import Manner
@@ -93,16 +93,11 @@ class Move(Motion[AxisT]):
         axes: Sequence[AxisT],
         goals: Sequence[int],
         speeds: Sequence[int],
-        *,
-        service: str,
-        expires_ns: int,
-        until_ns: int | None,
-        permit: Permit,
+        terms: Terms,
     ) -> None:
-        super().__init__(exchange, axes, service=service, expires_ns=expires_ns, permit=permit)
+        super().__init__(exchange, axes, terms)
         self._goals = dict(zip(axes, goals, strict=True))
         self._speeds = tuple(speeds)
-        self._until_ns = until_ns
         self._progress: dict[AxisT, _Progress] = {}
         self._began_ns = 0
         self._patience_s = 0.0
@@ -136,7 +131,7 @@ class Move(Motion[AxisT]):
         self._patience_s = 1.0 + 2 * max(profile.duration_s for profile in profiles)
 
     def watch(self, now_ns: int) -> None:
-        ending = self.trouble(now_ns, self._until_ns)
+        ending = self.trouble(now_ns, self.until_ns)
         if ending is None:
             arrived = [self._arrived(axis) for axis in self.devices]
             if all(arrived):

@@ -3,10 +3,10 @@
 from collections.abc import Sequence
 from typing import Any, Generic, TypeVar
 
-from trade import Resource, permit
+from trade import Resource
 from trade.errors import DeviceSilent, LimitExceeded
 from trade_drivers._validation import finite, one_each, valid, within
-from trade_drivers.bus._deadlines import expiry, span
+from trade_drivers.bus._deadlines import admitted, at_once, span
 from trade_drivers.bus._jobs import Command
 from trade_drivers.bus._thread import BusThread
 from trade_drivers.interfaces._motion import JointGroup, JointLimits, Motor, MotorState
@@ -48,10 +48,8 @@ class _Joints(Generic[AxisT, _Exchange]):
         self._do(Relax, "relax")
 
     def _do(self, kind: type[Enable[AxisT] | Relax[AxisT] | Halt[AxisT]], name: str) -> None:
-        expires_ns, _ = expiry(self._exchange.clock)
-        service = f"{self._name}.{name}"
-        with permit(self.resources) as permitted:
-            self._finish(kind(self._exchange, self._axes, service=service, expires_ns=expires_ns, permit=permitted))
+        with admitted(f"{self._name}.{name}", self.resources, at_once(self._exchange.clock)) as terms:
+            self._finish(kind(self._exchange, self._axes, terms))
 
     def _finish(self, job: Command[AxisT, Any]) -> None:
         self._exchange.submit(job)
@@ -62,18 +60,8 @@ class _Joints(Generic[AxisT, _Exchange]):
         goals = self._goals(positions_rad, service, argument)
         speed = None if speed_rad_s is None else finite(speed_rad_s, service, "speed_rad_s")
         speeds = [_speed_counts(axis, speed) for axis in self._axes]
-        expires_ns, until_ns = span(self._exchange.clock)
-        with permit(self.resources) as permitted:
-            move = Move(
-                self._exchange,
-                self._axes,
-                goals,
-                speeds,
-                service=service,
-                expires_ns=expires_ns,
-                until_ns=until_ns,
-                permit=permitted,
-            )
+        with admitted(service, self.resources, span(self._exchange.clock)) as terms:
+            move = Move(self._exchange, self._axes, goals, speeds, terms)
             self._finish(move)
         return [axis.scale.angle_rad(counts) for axis, counts in zip(self._axes, move.final_counts, strict=True)]
 
@@ -82,21 +70,8 @@ class _Joints(Generic[AxisT, _Exchange]):
     ) -> None:
         """Begin a set-point, or take over from the one before; returns once it is on the wire."""
         until_ns = self._exchange.clock() + int(valid_s * 1e9)
-        expires_ns, _ = expiry(self._exchange.clock)
-        with permit(self.resources) as permitted:
-            self._finish(
-                SetPoint(
-                    self._exchange,
-                    self._axes,
-                    goals,
-                    speeds,
-                    service=service,
-                    expires_ns=expires_ns,
-                    until_ns=until_ns,
-                    permit=permitted,
-                    manner=manner,
-                )
-            )
+        with admitted(service, self.resources, at_once(self._exchange.clock)) as terms:
+            self._finish(SetPoint(self._exchange, self._axes, goals, speeds, terms, until_ns, manner))
 
     def _goals(self, positions_rad: Sequence[float], service: str, argument: str) -> list[int]:
         values = one_each(positions_rad, [axis.name for axis in self._axes], service, argument)
@@ -169,11 +144,8 @@ class BusGroup(_Joints[Axis, Exchange[Any]], JointGroup):
 
     def stream(self, plan: Plan) -> list[float]:
         exchange, service = self._exchange, f"{self._name}.follow"
-        expires_ns, until_ns = span(exchange.clock)
-        with permit(self.resources) as permitted:
-            job = Follow(
-                exchange, self._axes, plan, service=service, expires_ns=expires_ns, until_ns=until_ns, permit=permitted
-            )
+        with admitted(service, self.resources, span(exchange.clock)) as terms:
+            job = Follow(exchange, self._axes, plan, terms)
             exchange.submit(job)
             job.wait(self._thread.alive, lambda: plan.course.report(exchange.clock()))
         return job.final_rad

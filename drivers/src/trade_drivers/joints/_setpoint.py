@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from trade import Permit
 from trade.errors import TradeError
+from trade_drivers.bus._deadlines import Terms
 from trade_drivers.joints._axis import AxisT, Goal
 from trade_drivers.joints._jobs import Manner
 from trade_drivers.joints._motion import Motion
@@ -27,14 +27,11 @@ class SetPoint(Motion[AxisT]):
         axes: Sequence[AxisT],
         goals: Sequence[int],
         speeds: Sequence[int],
-        *,
-        service: str,
-        expires_ns: int,
+        terms: Terms,
         until_ns: int,
-        permit: Permit,
         manner: Manner = Manner.GOALS,
     ) -> None:
-        super().__init__(exchange, axes, service=service, expires_ns=min(expires_ns, until_ns), permit=permit)
+        super().__init__(exchange, axes, terms._replace(expires_ns=min(terms.expires_ns, until_ns)))
         self._goals = dict(zip(axes, goals, strict=True))
         self._speeds = dict(zip(axes, speeds, strict=True))
         self._until_ns = until_ns

@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
 
-from trade import Permit
 from trade.errors import ConfigurationError, MotionStopped, ToleranceExceeded, TradeError
+from trade_drivers.bus._deadlines import Terms
 from trade_drivers.bus._jobs import Steps
 from trade_drivers.joints._axis import AxisT, Goal
 from trade_drivers.joints._jobs import Manner
@@ -36,16 +36,11 @@ class Follow(Motion[AxisT]):
         exchange: "Exchange[AxisT]",
         axes: Sequence[AxisT],
         plan: Plan,
-        *,
-        service: str,
-        expires_ns: int,
-        until_ns: int | None,
-        permit: Permit,
+        terms: Terms,
     ) -> None:
-        super().__init__(exchange, axes, service=service, expires_ns=expires_ns, permit=permit)
+        super().__init__(exchange, axes, terms)
         self._plan = plan
         self._curves = {axis: track.curve for axis, track in zip(axes, plan.tracks, strict=True)}
-        self._until_ns = until_ns
         self._goals: dict[AxisT, int] = {}
         self._told_ns = 0
         """When the joints' goals were last what was due."""
@@ -83,7 +78,7 @@ class Follow(Motion[AxisT]):
     def watch(self, now_ns: int) -> None:
         try:
             self.gate()
-            if ending := self.trouble(now_ns, self._until_ns) or self._trouble(now_ns):
+            if ending := self.trouble(now_ns, self.until_ns) or self._trouble(now_ns):
                 raise ending
             if self._over():
                 self.final_rad = [axis.scale.angle_rad(axis.sample.position) for axis in self.devices if axis.sample]

@@ -2,8 +2,8 @@
 
 from typing import TYPE_CHECKING, Final
 
-from trade import Permit
 from trade.errors import TradeError
+from trade_drivers.bus._deadlines import Terms
 from trade_drivers.joints import Motion, Steps
 from trade_drivers.vendors.cia402 import _jobs as jobs
 from trade_drivers.vendors.cia402 import _machine as machine
@@ -25,18 +25,14 @@ class Homing(Motion[DriveAxis]):
         self,
         exchange: "DriveExchange",
         axis: DriveAxis,
+        terms: Terms,
         *,
         method: int,
         speed_counts: int,
-        service: str,
-        expires_ns: int,
-        until_ns: int | None,
-        permit: Permit,
     ) -> None:
-        super().__init__(exchange, [axis], service=service, expires_ns=expires_ns, permit=permit)
+        super().__init__(exchange, [axis], terms)
         self._bus, self._axis = exchange, axis
         self._method, self._speed = method, speed_counts
-        self._until_ns = until_ns
         self._began_ns = 0
 
     def steps(self) -> Steps:
@@ -82,6 +78,6 @@ class Homing(Motion[DriveAxis]):
         axis = self._axis
         if axis.statusword & machine.HOMING_ERROR:
             return axis.faulty("it has not found its home (statusword bit 13)")
-        if now_ns >= min(self._until_ns or now_ns + 1, self._began_ns + _LONGEST_NS):
+        if now_ns >= min(self.until_ns or now_ns + 1, self._began_ns + _LONGEST_NS):
             return axis.faulty("it has not found its home in time")
         return None

@@ -2,9 +2,9 @@
 
 from typing import Annotated
 
-from trade import Meta, permit, service
+from trade import Meta, service
 from trade_drivers._validation import within
-from trade_drivers.bus._deadlines import span
+from trade_drivers.bus._deadlines import admitted, span
 from trade_drivers.joints import BusMotor
 from trade_drivers.vendors.cia402._axis import DriveAxis
 from trade_drivers.vendors.cia402._cycle import DriveExchange
@@ -35,17 +35,6 @@ class Drive(BusMotor[DriveAxis, DriveExchange]):
         fastest = axis.joint.max_speed_rad_s
         speed = fastest / 10 if speed_rad_s is None else speed_rad_s
         within(speed, axis.grain.rad_s, fastest, f"{axis.name} speed", "rad/s")
-        expires_ns, until_ns = span(self._exchange.clock)
-        with permit(self.resources) as permitted:
-            homing = Homing(
-                self._exchange,
-                axis,
-                method=method,
-                speed_counts=int(speed / axis.grain.rad_s),
-                service=f"{self._name}.home",
-                expires_ns=expires_ns,
-                until_ns=until_ns,
-                permit=permitted,
-            )
-            self._finish(homing)
+        with admitted(f"{self._name}.home", self.resources, span(self._exchange.clock)) as terms:
+            self._finish(Homing(self._exchange, axis, terms, method=method, speed_counts=int(speed / axis.grain.rad_s)))
         return axis.scale.angle_rad(axis.fresh(self._exchange.clock(), self._exchange.stale_after_ns).position)

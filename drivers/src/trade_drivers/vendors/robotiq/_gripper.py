@@ -1,9 +1,9 @@
 """A 2F-85 as a Gripper: it checks, hands over to the bus thread, waits, and never touches the port."""
 
-from trade import Resource, permit
+from trade import Resource
 from trade.errors import DeviceSilent
 from trade_drivers._validation import finite, within
-from trade_drivers.bus._deadlines import expiry, span
+from trade_drivers.bus._deadlines import admitted, at_once, span
 from trade_drivers.bus._thread import BusThread
 from trade_drivers.interfaces._motion import Gripper, GripperLimits, GripperState
 from trade_drivers.vendors.robotiq import _table as table
@@ -47,18 +47,8 @@ class RobotiqGripper(Gripper):
         )
 
     def activate(self) -> GripperState:
-        expires_ns, until_ns = span(self._exchange.clock)
-        with permit(self.resources) as permitted:
-            self._finish(
-                Activate(
-                    self._exchange,
-                    [self._hand],
-                    service=f"{self._name}.activate",
-                    expires_ns=expires_ns,
-                    until_ns=until_ns,
-                    permit=permitted,
-                )
-            )
+        with admitted(f"{self._name}.activate", self.resources, span(self._exchange.clock)) as terms:
+            self._finish(Activate(self._exchange, [self._hand], terms))
         return self.state()
 
     def move_to(self, width_m: float, speed_m_s: float | None = None, force_n: float | None = None) -> GripperState:
@@ -74,12 +64,8 @@ class RobotiqGripper(Gripper):
         self._exchange.stop([self._hand]).wait(self._thread.alive)
 
     def clear_fault(self) -> None:
-        service = f"{self._name}.clear_fault"
-        expires_ns, _ = expiry(self._exchange.clock)
-        with permit(self.resources) as permitted:
-            self._finish(
-                ClearFault(self._exchange, [self._hand], service=service, expires_ns=expires_ns, permit=permitted)
-            )
+        with admitted(f"{self._name}.clear_fault", self.resources, at_once(self._exchange.clock)) as terms:
+            self._finish(ClearFault(self._exchange, [self._hand], terms))
 
     def _move(self, name: str, width_m: float, speed_m_s: float | None, force_n: float | None) -> GripperState:
         service, limits, model = f"{self._name}.{name}", self.limits(), self._hand.model
@@ -90,19 +76,8 @@ class RobotiqGripper(Gripper):
         force = limits.max_force_n if force_n is None else finite(force_n, service, "force_n")
         within(force, limits.min_force_n, limits.max_force_n, f"{self._name} force", "N")
         registers = table.command(model.counts(width), model.speed_counts(speed), model.force_counts(force))
-        expires_ns, until_ns = span(self._exchange.clock)
-        with permit(self.resources) as permitted:
-            self._finish(
-                Move(
-                    self._exchange,
-                    [self._hand],
-                    registers,
-                    service=service,
-                    expires_ns=expires_ns,
-                    until_ns=until_ns,
-                    permit=permitted,
-                )
-            )
+        with admitted(service, self.resources, span(self._exchange.clock)) as terms:
+            self._finish(Move(self._exchange, [self._hand], registers, terms))
         return self.state()
 
     def _finish(self, job: GripperCommand) -> None:

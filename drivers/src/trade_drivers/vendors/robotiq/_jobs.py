@@ -3,8 +3,8 @@
 from collections.abc import Callable, Generator, Sequence
 from typing import TYPE_CHECKING, Final
 
-from trade import Permit
 from trade.errors import DeadlineExceeded, DeviceSilent, MotionStopped, OutcomeUnknown, TradeError
+from trade_drivers.bus._deadlines import Terms
 from trade_drivers.bus._jobs import Command, Gate, NoAnswer, Refused, Steps
 from trade_drivers.vendors.robotiq import _table as table
 from trade_drivers.vendors.robotiq._gripper_state import Hand
@@ -76,18 +76,8 @@ class ClearFault(GripperCommand):
 class Motion(GripperCommand):
     """What sets the fingers moving, and is watched until something ends it."""
 
-    def __init__(
-        self,
-        exchange: "Exchange",
-        hands: Sequence[Hand],
-        *,
-        service: str,
-        expires_ns: int,
-        until_ns: int | None,
-        permit: Permit,
-    ) -> None:
-        super().__init__(exchange, hands, service=service, expires_ns=expires_ns, permit=permit)
-        self._until_ns = until_ns
+    def __init__(self, exchange: "Exchange", hands: Sequence[Hand], terms: Terms) -> None:
+        super().__init__(exchange, hands, terms)
         self._began_ns = self._watched_ns = 0
         self._position = -1
         self._waiting_s = 0.0
@@ -143,7 +133,7 @@ class Motion(GripperCommand):
             return hand.deaf(now_ns)
         if hand.fault:
             return hand.faulty()
-        if self._until_ns is not None and now_ns >= self._until_ns:
+        if self.until_ns is not None and now_ns >= self.until_ns:
             return MotionStopped(device=hand.name, reason="the deadline of its call came; give it a longer one")
         return None
 
@@ -177,17 +167,9 @@ class Move(Motion):
     """The fingers go to a width, or until they meet something."""
 
     def __init__(
-        self,
-        exchange: "Exchange",
-        hands: Sequence[Hand],
-        registers: tuple[int, int, int],
-        *,
-        service: str,
-        expires_ns: int,
-        until_ns: int | None,
-        permit: Permit,
+        self, exchange: "Exchange", hands: Sequence[Hand], registers: tuple[int, int, int], terms: Terms
     ) -> None:
-        super().__init__(exchange, hands, service=service, expires_ns=expires_ns, until_ns=until_ns, permit=permit)
+        super().__init__(exchange, hands, terms)
         self._registers = registers
         self._goal = registers[1]
 

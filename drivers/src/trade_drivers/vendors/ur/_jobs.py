@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
 
-from trade import Permit
 from trade.errors import InvalidArgument, LimitExceeded, MotionStopped, ToleranceExceeded, TradeError
+from trade_drivers.bus._deadlines import Terms
 from trade_drivers.bus._jobs import Command, Steps
 from trade_drivers.motion._plan import Plan
 from trade_drivers.vendors.ur._arm_state import ArmStatus
@@ -30,8 +30,8 @@ _HELD_UP_NS: Final = 200_000_000
 class ArmCommand(Command[ArmStatus, "Exchange"]):
     """A command to the arm of a controller."""
 
-    def __init__(self, exchange: "Exchange", *, service: str, expires_ns: int, permit: Permit) -> None:
-        super().__init__(exchange, [exchange.limb], service=service, expires_ns=expires_ns, permit=permit)
+    def __init__(self, exchange: "Exchange", terms: Terms) -> None:
+        super().__init__(exchange, [exchange.limb], terms)
         self.limb = exchange.limb
 
     def usable(self) -> Sample:
@@ -42,8 +42,8 @@ class ArmCommand(Command[ArmStatus, "Exchange"]):
 class Scaling(ArmCommand):
     """Set the speed slider."""
 
-    def __init__(self, exchange: "Exchange", fraction: float, *, service: str, expires_ns: int, permit: Permit) -> None:
-        super().__init__(exchange, service=service, expires_ns=expires_ns, permit=permit)
+    def __init__(self, exchange: "Exchange", fraction: float, terms: Terms) -> None:
+        super().__init__(exchange, terms)
         self._fraction = fraction
 
     def steps(self) -> Steps:
@@ -136,16 +136,11 @@ class Move(Motion):
         exchange: "Exchange",
         goal: Sequence[float],
         speed: float,
-        *,
-        service: str,
-        expires_ns: int,
-        until_ns: int | None,
-        permit: Permit,
+        terms: Terms,
     ) -> None:
-        super().__init__(exchange, service=service, expires_ns=expires_ns, permit=permit)
+        super().__init__(exchange, terms)
         self.goal = list(goal)
         self.speed = speed
-        self._until_ns = until_ns
         self._pulses = -1
         """How many words there were of its process when it began."""
         self._place: list[float] = []
@@ -177,7 +172,7 @@ class Move(Motion):
         control, sample = self.exchange.link.control, self.limb.sample
         if self._pulses < 0 or control is None or sample is None:
             return
-        ending = self.trouble(now_ns, self._until_ns) or self.astray(sample) or self._stuck(sample)
+        ending = self.trouble(now_ns, self.until_ns) or self.astray(sample) or self._stuck(sample)
         over = ending is None and control.pulses > self._pulses + 1 and not control.running and self.limb.still > 2
         if over and self.off(sample) > _NEAR:
             ending = self.limb.faulty("its move ended before it was there")
@@ -239,13 +234,10 @@ class SetPoint(Motion):
         self,
         exchange: "Exchange",
         goal: Sequence[float],
-        *,
-        service: str,
-        expires_ns: int,
+        terms: Terms,
         valid_ns: int,
-        permit: Permit,
     ) -> None:
-        super().__init__(exchange, service=service, expires_ns=expires_ns, permit=permit)
+        super().__init__(exchange, terms)
         self._goal = list(goal)
         self._until_ns = exchange.clock() + valid_ns
         self._valid_ns = valid_ns
@@ -295,15 +287,10 @@ class Follow(Motion):
         self,
         exchange: "Exchange",
         plan: Plan,
-        *,
-        service: str,
-        expires_ns: int,
-        until_ns: int | None,
-        permit: Permit,
+        terms: Terms,
     ) -> None:
-        super().__init__(exchange, service=service, expires_ns=expires_ns, permit=permit)
+        super().__init__(exchange, terms)
         self._plan = plan
-        self._until_ns = until_ns
         self._told_ns = 0
 
     def steps(self) -> Steps:
@@ -326,7 +313,7 @@ class Follow(Motion):
             self.exchange.release(self, ending)
 
     def _go_on(self, now_ns: int) -> None:
-        if (ending := self.trouble(now_ns, self._until_ns)) is not None:
+        if (ending := self.trouble(now_ns, self.until_ns)) is not None:
             raise ending
         if now_ns - self._told_ns > _HELD_UP_NS:
             raise MotionStopped(device=self.limb.name, reason="its bus was held up: nothing told it where to go")

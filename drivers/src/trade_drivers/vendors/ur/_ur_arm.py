@@ -7,14 +7,23 @@ from typing import Final
 from trade import Permit, Resource, permit
 from trade.errors import DeadlineExceeded, DeviceSilent, InvalidArgument
 from trade_drivers._validation import finite, one_each, valid, within
-from trade_drivers.bus._deadlines import expiry, span
+from trade_drivers.bus._deadlines import admitted, expiry, span
 from trade_drivers.bus._thread import BusThread
 from trade_drivers.interfaces._arm import Arm, ArmLimits, ArmState
 from trade_drivers.motion._plan import JointLimits, Plan
 from trade_drivers.vendors.ur._arm_state import IDLE, RUNNING, ArmStatus
 from trade_drivers.vendors.ur._cycle import Exchange
 from trade_drivers.vendors.ur._dashboard import DashboardError, ask
-from trade_drivers.vendors.ur._jobs import EndFreedrive, Follow, Freedrive, LineMove, Move, Scaling, SetPoint
+from trade_drivers.vendors.ur._jobs import (
+    ArmCommand,
+    EndFreedrive,
+    Follow,
+    Freedrive,
+    LineMove,
+    Move,
+    Scaling,
+    SetPoint,
+)
 
 __all__ = ["UrArm"]
 
@@ -90,26 +99,13 @@ class UrArm(Arm):
     def servo(self, positions_rad: list[float], valid_s: float = 0.2) -> None:
         service, exchange = f"{self._name}.servo", self._exchange
         goal, valid_s = self._angles(positions_rad, service), valid(valid_s, service)
-        expires_ns, _ = self._expiry()
-        with permit(self.resources) as permitted:
-            job = SetPoint(
-                exchange, goal, service=service, expires_ns=expires_ns, valid_ns=int(valid_s * 1e9), permit=permitted
-            )
-            exchange.submit(job)
-            job.wait(self._thread.alive)
+        with admitted(service, self.resources, self._at_once()) as terms:
+            self._finish(SetPoint(exchange, goal, terms, int(valid_s * 1e9)))
 
     def stream(self, plan: Plan) -> list[float]:
         exchange = self._exchange
-        expires_ns, until_ns = self._span()
-        with permit(self.resources) as permitted:
-            job = Follow(
-                exchange,
-                plan,
-                service=f"{self._name}.follow",
-                expires_ns=expires_ns,
-                until_ns=until_ns,
-                permit=permitted,
-            )
+        with admitted(f"{self._name}.follow", self.resources, self._span()) as terms:
+            job = Follow(exchange, plan, terms)
             exchange.submit(job)
             job.wait(self._thread.alive, lambda: plan.course.report(exchange.clock()))
         return self.state().positions_rad
@@ -126,22 +122,14 @@ class UrArm(Arm):
             raise self._limb.deaf(self._exchange.clock()) from problem
 
     def freedrive(self, on: bool) -> None:
-        exchange, service = self._exchange, f"{self._name}.freedrive"
-        expires_ns, _ = self._expiry()
-        with permit(self.resources) as permitted:
-            kind = Freedrive if on else EndFreedrive
-            job = kind(exchange, service=service, expires_ns=expires_ns, permit=permitted)
-            exchange.submit(job)
-            job.wait(self._thread.alive)
+        with admitted(f"{self._name}.freedrive", self.resources, self._at_once()) as terms:
+            self._finish((Freedrive if on else EndFreedrive)(self._exchange, terms))
 
     def set_speed_scaling(self, fraction: float) -> None:
-        exchange, service = self._exchange, f"{self._name}.set_speed_scaling"
+        service = f"{self._name}.set_speed_scaling"
         within(finite(fraction, service, "fraction"), 0.01, 1.0, f"{self._name} speed scaling", "")
-        expires_ns, _ = self._expiry()
-        with permit(self.resources) as permitted:
-            job = Scaling(exchange, fraction, service=service, expires_ns=expires_ns, permit=permitted)
-            exchange.submit(job)
-            job.wait(self._thread.alive)
+        with admitted(service, self.resources, self._at_once()) as terms:
+            self._finish(Scaling(self._exchange, fraction, terms))
 
     def unlock_protective_stop(self) -> None:
         self._switch("unlock protective stop", "Protective stop releasing", lambda: self.state().safety == "normal")
@@ -156,16 +144,20 @@ class UrArm(Arm):
 
     # --- parts
 
-    def _expiry(self) -> tuple[int, bool]:
-        """As ``expiry``; but a plain Python call may wait until a process has started and taken control."""
+    def _at_once(self) -> tuple[int, None]:
+        """As ``at_once``; but a plain Python call may wait until a process has started and taken control."""
         clock = self._exchange.clock
         expires_ns, ends = expiry(clock)
-        return (expires_ns, True) if ends else (clock() + _TAKING_NS, False)
+        return expires_ns if ends else clock() + _TAKING_NS, None
 
     def _span(self) -> tuple[int, int | None]:
         """As ``span``, likewise."""
         expires_ns, until_ns = span(self._exchange.clock)
-        return (self._expiry()[0], None) if until_ns is None else (expires_ns, until_ns)
+        return self._at_once() if until_ns is None else (expires_ns, until_ns)
+
+    def _finish(self, job: ArmCommand) -> None:
+        self._exchange.submit(job)
+        job.wait(self._thread.alive)
 
     def _mode(self) -> int:
         return self._limb.fresh(self._exchange.clock(), self._exchange.stale_after_ns).robot_mode
@@ -183,20 +175,8 @@ class UrArm(Arm):
         return within(speed, 1e-3, most, f"{self._name} speed", "rad/s")
 
     def _move(self, kind: type[Move], goal: list[float], speed: float, service: str) -> ArmState:
-        exchange = self._exchange
-        expires_ns, until_ns = self._span()
-        with permit(self.resources) as permitted:
-            job = kind(
-                exchange,
-                goal,
-                speed,
-                service=service,
-                expires_ns=expires_ns,
-                until_ns=until_ns,
-                permit=permitted,
-            )
-            exchange.submit(job)
-            job.wait(self._thread.alive)
+        with admitted(service, self.resources, self._span()) as terms:
+            self._finish(kind(self._exchange, goal, speed, terms))
         return self.state()
 
     def _switch(self, line: str, expected: str, reached: Callable[[], bool]) -> None:
