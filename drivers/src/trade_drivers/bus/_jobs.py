@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "TAKEN",
+    "BadAnswer",
     "Command",
     "Device",
     "Gate",
@@ -69,6 +70,10 @@ class NoAnswer(WireError):
         super().__init__(f"id {device_id} did not answer within {waited_s * 1e3:.0f} ms")
         self.device_id = device_id
         self.waited_s = waited_s
+
+
+class BadAnswer(NoAnswer):
+    """Something came, but it was damaged or cut short."""
 
 
 class Refused(WireError):

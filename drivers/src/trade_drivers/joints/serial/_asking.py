@@ -4,12 +4,12 @@ from collections.abc import Callable, Generator
 from typing import Any, Final, TypeVar
 
 from trade.errors import DeadlineExceeded, DeviceSilent, OutcomeUnknown
+from trade_drivers.bus._jobs import NoAnswer, Refused
 from trade_drivers.joints import Steps, Work
-from trade_drivers.joints.serial._answers import NoAnswer, Refused
 from trade_drivers.joints.serial._axis import Health, Register, ServoAxis
 from trade_drivers.joints.serial._cycle import ServoExchange
 
-__all__ = ["health_of", "told", "tried"]
+__all__ = ["health_of", "still_homed", "told", "tried", "zero_moved"]
 
 _Result = TypeVar("_Result")
 _Health = TypeVar("_Health", bound=Health)
@@ -56,3 +56,24 @@ def tried(bus: AnyExchange, axis: ServoAxis[Any], act: Callable[[], _Result]) ->
             yield
             return result
     raise DeviceSilent(device=axis.name, bus=axis.bus, waited_s=waited_s * _ATTEMPTS)
+
+
+def zero_moved(axis: ServoAxis[Any], found: int) -> str:
+    """What is wrong with a homing offset; empty if it is the one that the robot file was calibrated with."""
+    expected = axis.joint.homing_counts
+    if found == expected:
+        return ""
+    where = f"its homing offset (register {axis.homing.address})"
+    return f"{where} is {found}, but {expected} in the robot file: its zero has moved"
+
+
+def still_homed(bus: AnyExchange, axis: ServoAxis[Any]) -> Steps:
+    """See that a servo's zero is the calibrated one: it may have lost what was not kept, or be another one by now.
+
+    Raises:
+        DeviceFault: its zero has moved.
+    """
+    register = axis.homing
+    answer = yield from tried(bus, axis, lambda: bus.wire.read(axis.id, register.address, register.size))
+    if problem := zero_moved(axis, register.decode(answer.data, register.address)):
+        raise axis.faulty(f"{problem}; write {axis.joint.homing_counts} there again, or `trade calibrate` it")

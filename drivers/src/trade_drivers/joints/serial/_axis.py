@@ -2,7 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import ClassVar, Final, Generic, Protocol, TypeVar
+from typing import ClassVar, Final, Generic, NamedTuple, Protocol, TypeVar
 
 from msgspec import Struct
 
@@ -10,7 +10,7 @@ from trade_drivers.interfaces._motion import MotorState
 from trade_drivers.joints import Axis, Grain, Sample
 from trade_drivers.robotfile import Joint
 
-__all__ = ["Health", "Register", "ServoAxis"]
+__all__ = ["Answer", "Health", "Register", "ServoAxis"]
 
 _HEALTH_STALE_NS: Final = 2_000_000_000
 
@@ -29,6 +29,14 @@ class Register(Protocol):
     def encode(self, counts: int) -> bytes:
         """The bytes of a number of counts."""
         ...
+
+
+class Answer(NamedTuple):
+    """A status packet's contents."""
+
+    data: bytes
+    alert: bool
+    """The device has something to complain of; its health says what."""
 
 
 class Health(Struct, frozen=True, gc=False, kw_only=True):

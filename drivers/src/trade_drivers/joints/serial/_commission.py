@@ -4,9 +4,9 @@ from abc import abstractmethod
 from contextlib import suppress
 from typing import TYPE_CHECKING, ClassVar, Final, Generic, TypeVar
 
+from trade_drivers.bus._jobs import BadAnswer, NoAnswer, Refused
 from trade_drivers.commissioning._commissioner import Bench, Found
 from trade_drivers.joints import Grain
-from trade_drivers.joints.serial._answers import BadAnswer, NoAnswer, Refused
 from trade_drivers.joints.serial._axis import Register
 
 if TYPE_CHECKING:

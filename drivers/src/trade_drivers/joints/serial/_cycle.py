@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, TypeVar
 
 from trade_drivers.bus._cycle import PROBE_NS
+from trade_drivers.bus._jobs import NoAnswer, Refused
 from trade_drivers.joints import Exchange, Motion, Steps
-from trade_drivers.joints.serial._answers import NoAnswer, Refused
 from trade_drivers.joints.serial._axis import ServoAxis
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from typing import Final
 
 from trade_drivers.bus._jobs import Gate, NoAnswer
 from trade_drivers.bus._serial_port import SerialWire
-from trade_drivers.joints.serial._answers import Answer
+from trade_drivers.joints.serial._axis import Answer
 
 __all__ = ["BROADCAST", "ServoWire"]
 
