@@ -3,13 +3,13 @@
 from collections.abc import Callable, Generator
 from typing import Any, Final, TypeVar
 
-from trade.errors import DeadlineExceeded, DeviceSilent, OutcomeUnknown
+from trade.errors import DeadlineExceeded, DeviceSilent, OutcomeUnknown, WrongDevice
 from trade_drivers.bus._jobs import NoAnswer, Refused
 from trade_drivers.joints import Steps, Work
 from trade_drivers.joints.serial._axis import Health, Register, ServoAxis
 from trade_drivers.joints.serial._cycle import ServoExchange
 
-__all__ = ["health_of", "still_homed", "told", "tried", "zero_moved"]
+__all__ = ["check_homing", "health_of", "still_homed", "told", "tried"]
 
 _Result = TypeVar("_Result")
 _Health = TypeVar("_Health", bound=Health)
@@ -65,6 +65,14 @@ def zero_moved(axis: ServoAxis[Any], found: int) -> str:
         return ""
     where = f"its homing offset (register {axis.homing.address})"
     return f"{where} is {found}, but {expected} in the robot file: its zero has moved"
+
+
+def check_homing(axis: ServoAxis[Any], settings: bytes, key: str) -> None:
+    """Raises ``WrongDevice`` for a servo whose zero is another one; its registers are given from address 0 on."""
+    found = axis.homing.decode(settings, 0)
+    if problem := zero_moved(axis, found):
+        expected = str(axis.joint.homing_counts)
+        raise WrongDevice(where=key, key="homing_counts", expected=expected, found=str(found), problem=problem)
 
 
 def still_homed(bus: AnyExchange, axis: ServoAxis[Any]) -> Steps:

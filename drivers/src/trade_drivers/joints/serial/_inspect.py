@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar
 from trade.errors import ConfigurationError, WrongDevice
 from trade_drivers.bus._jobs import BadAnswer, NoAnswer, Refused
 from trade_drivers.joints import Unfit, check_least, check_rate
-from trade_drivers.joints.serial._asking import zero_moved
+from trade_drivers.joints.serial._asking import check_homing
 from trade_drivers.joints.serial._axis import ServoAxis
 
 if TYPE_CHECKING:
@@ -116,14 +116,6 @@ def check_firmware(axis: ServoAxis[Any], firmware: str, key: str) -> None:
     expected = axis.joint.firmware
     if expected is not None and firmware != expected:
         raise WrongDevice(where=key, key="firmware", expected=expected, found=firmware)
-
-
-def check_homing(axis: ServoAxis[Any], settings: bytes, key: str) -> None:
-    """Raises ``WrongDevice`` for a servo whose zero is another one; its registers are given from address 0 on."""
-    found = axis.homing.decode(settings, 0)
-    if problem := zero_moved(axis, found):
-        expected = str(axis.joint.homing_counts)
-        raise WrongDevice(where=key, key="homing_counts", expected=expected, found=str(found), problem=problem)
 
 
 def first_look(
