@@ -30,14 +30,14 @@ def check_bus(robot: "Robot", bus: "SerialBus", axes: Sequence[FeetechAxis]) -> 
     where = robot.where
     if "fast_sync" in robot.given.get(bus.name, ()):
         _wrong(f"{where}: bus.{bus.name}.fast_sync", "these servos have no joined answers; leave this key out")
-    check_joints(axes, where, _check_joint)
+    check_joints(axes, where, check_ranges)
+    check_joints(axes, where, _check_most)
     count = len(axes)
     asked = OVERHEAD + 2 + count + count * (OVERHEAD + CYCLIC[1])
     check_cycle(bus, count, asked + OVERHEAD + 2 + count * (1 + GOAL_BLOCK[1]), where)
 
 
-def _check_joint(axis: FeetechAxis) -> None:
-    check_ranges(axis)
+def _check_most(axis: FeetechAxis) -> None:
     joint = axis.joint
     for key, value, most in (
         (".max_speed_rad_s", joint.max_speed_rad_s, _MOST_SPEED_COUNTS * table.RAD_S_PER_COUNT),
