@@ -18,7 +18,7 @@ from tests.docs.blocks import blocks
 from trade import errors
 from trade_gateway.cli import build
 from trade_hil_sim import AnswerFault, Command, SimProcess, events
-from trade_hil_sim.faults._faults import kinds_of
+from trade_hil_sim.faults._commands import kinds_of
 
 if sys.version_info >= (3, 11):
     import tomllib

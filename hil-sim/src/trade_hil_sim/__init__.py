@@ -6,7 +6,7 @@ one's own process. `read_log`, `motion_writes` and their kin say what a bus has 
 
 from trade_hil_sim.control._client import SimControl
 from trade_hil_sim.control._process import SimProcess, remove_leftovers
-from trade_hil_sim.faults._faults import (
+from trade_hil_sim.faults._commands import (
     Absent,
     AnswerFault,
     BadCrc,
@@ -29,6 +29,7 @@ from trade_hil_sim.faults._faults import (
     Place,
     Put,
     Replug,
+    SimulationError,
     Supply,
     Truncate,
     Unmute,
@@ -36,9 +37,18 @@ from trade_hil_sim.faults._faults import (
     WrongModel,
 )
 from trade_hil_sim.log._byte_log import ByteLog, Entry
-from trade_hil_sim.log._queries import events, frames, instructions, motion_writes, read_log, received, sent, writes
+from trade_hil_sim.log._queries import (
+    Span,
+    events,
+    frames,
+    instructions,
+    motion_writes,
+    read_log,
+    received,
+    sent,
+    writes,
+)
 from trade_hil_sim.mechanics._truth import ArmTruth, BusState, DeviceState, GripperTruth
-from trade_hil_sim.robot._errors import SimulationError
 from trade_hil_sim.serial._line import Peer, SerialLine
 
 from .can import CanBus, Frame
@@ -92,6 +102,7 @@ __all__ = [
     "SimControl",
     "SimProcess",
     "SimulationError",
+    "Span",
     "Supply",
     "Truncate",
     "Unmute",

@@ -28,7 +28,7 @@ from trade_hil_sim import (
     Truncate,
     Unplug,
 )
-from trade_hil_sim.faults import _faults as faults
+from trade_hil_sim.faults import _commands as faults
 from trade_hil_sim.robot._robot import buses_of
 from trade_hil_sim.scene import LIMB, OBJECT, Field, fields
 

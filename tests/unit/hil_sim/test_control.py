@@ -13,7 +13,7 @@ import pytest
 
 from trade_hil_sim import Command, DynamixelBus, Late, Servo, SimControl, SimulationError
 from trade_hil_sim.control._server import ControlServer
-from trade_hil_sim.faults._faults import kinds_of
+from trade_hil_sim.faults._commands import kinds_of
 from trade_hil_sim.faults._methods import FaultMethods
 
 KINDS: Final = kinds_of(Command)

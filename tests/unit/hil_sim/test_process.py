@@ -18,7 +18,7 @@ from tests.support.waiting import wait_until
 from trade_hil_sim import Command, SimProcess, SimulationError, events, instructions, read_log, remove_leftovers
 from trade_hil_sim.__main__ import main
 from trade_hil_sim.dynamixel import encode
-from trade_hil_sim.faults._faults import kinds_of
+from trade_hil_sim.faults._commands import kinds_of
 
 COMMAND = [sys.executable, "-m", "trade_hil_sim"]
 

@@ -10,10 +10,11 @@ from typing import Final, TypeVar
 
 import msgspec
 
-from trade_hil_sim.faults import _faults as faults
+from trade_hil_sim.faults import _commands as faults
+from trade_hil_sim.faults._active import ActiveFaults
+from trade_hil_sim.faults._commands import SimulationError
 from trade_hil_sim.log._byte_log import ByteLog, Entry
 from trade_hil_sim.mechanics._truth import BusState
-from trade_hil_sim.robot._errors import SimulationError
 from trade_hil_sim.robot._mailbox import Mailbox
 
 from ._adapter import Adapter, Client
@@ -69,7 +70,7 @@ class CanBus:
         self.name = name
         self.log = ByteLog() if log is None else log
         self._devices = list(devices)
-        self._script = faults.Script()
+        self._faults = ActiveFaults()
         self._echo = False
         self._adapter_off = False
         self._wire = Wire(bitrate if paced else None, self)
@@ -208,10 +209,10 @@ class CanBus:
                 raise SimulationError("a frame comes whole; late, truncate or garbage suit a CAN bus")
             case faults.AnswerFault():
                 self._named(command.ids)
-                self._script.add(command)
+                self._faults.add(command)
             case faults.Unmute():
                 self._named(command.ids)
-                self._script.unmute(command.ids)
+                self._faults.unmute(command.ids)
             case faults.Absent(nth=int()):
                 raise SimulationError(f"nodes of bus {self.name} have ids of their own; name them by ids, not by nth")
             case faults.BusOff(ids=None):
@@ -241,7 +242,7 @@ class CanBus:
         self._note("bus_off" if off else "restarted", t, source="adapter")
 
     def _heal(self, t: float) -> None:
-        self._script.heal()
+        self._faults.heal()
         self._echo = False
         if self._adapter_off:
             self._switch_adapter(False, t)
@@ -261,18 +262,18 @@ class CanBus:
         name, ids = self._struck(station, frame)
         if ids is None:
             self._wire.send(station, frame, t)
-        elif not self._script.strikes(faults.Mute, ids, name):
-            for data, late_s in self._script.shape(frame.data, ids, name, but=(faults.Mute, faults.BadCrc)):
+        elif not self._faults.strikes(faults.Mute, ids, name):
+            for data, late_s in self._faults.shape(frame.data, ids, name, but=(faults.Mute, faults.BadCrc)):
                 self._wire.send(station, replace(frame, data=data[:MOST_DATA]), t + late_s)
 
     def _struck(self, station: Station, frame: Frame) -> tuple[str, tuple[int, ...] | None]:
         """A frame's name, and whose faults concern it; a client's frame only suffers from those that name it."""
-        if self._script.empty:
+        if self._faults.empty:
             return "", None
         name, node = self.label(frame)
         if station.device_id is not None:
             return name, (station.device_id,)
-        if not self._script.names(name):
+        if not self._faults.names(name):
             return name, None
         return name, () if node is None else (node,)
 
@@ -281,7 +282,7 @@ class CanBus:
     def corrupts(self, sender: Station, frame: Frame) -> bool:
         """Whether a fault says so."""
         name, ids = self._struck(sender, frame)
-        return ids is not None and self._script.strikes(faults.BadCrc, ids, name)
+        return ids is not None and self._faults.strikes(faults.BadCrc, ids, name)
 
     def passed(self, sender: Station, frame: Frame, t: float) -> None:
         """Log it; and echo it if the adapter does."""

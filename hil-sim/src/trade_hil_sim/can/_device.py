@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import Protocol
 
-from trade_hil_sim.faults import _faults as faults
+from trade_hil_sim.faults import _commands as faults
 from trade_hil_sim.log._byte_log import Entry
 from trade_hil_sim.mechanics._truth import DeviceState
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 from contextlib import suppress
 from typing import Final
 
-from trade_hil_sim.robot._errors import SimulationError
+from trade_hil_sim.faults._commands import SimulationError
 from trade_hil_sim.robot._polling import ready
 
 from ._adapter import Tenant

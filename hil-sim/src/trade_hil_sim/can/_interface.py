@@ -9,7 +9,7 @@ from errno import ENETDOWN
 from pathlib import Path
 from typing import Final
 
-from trade_hil_sim.robot._errors import SimulationError
+from trade_hil_sim.faults._commands import SimulationError
 from trade_hil_sim.robot._polling import ready
 
 from ._adapter import Tenant

@@ -3,7 +3,7 @@
 import re
 from typing import Final
 
-from trade_hil_sim.robot._errors import SimulationError
+from trade_hil_sim.faults._commands import SimulationError
 
 from ._frame import Frame
 

@@ -4,7 +4,7 @@ from math import tau
 from typing import TYPE_CHECKING
 
 from trade_hil_sim.can import JointBus
-from trade_hil_sim.robot._errors import SimulationError
+from trade_hil_sim.faults._commands import SimulationError
 
 from ._drive import Drive
 from ._names import canopen_label

@@ -6,11 +6,11 @@ from math import inf, tau
 from typing import Final
 
 from trade_hil_sim.can import Frame
-from trade_hil_sim.faults import _faults as faults
+from trade_hil_sim.faults import _commands as faults
+from trade_hil_sim.faults._commands import SimulationError
 from trade_hil_sim.log._byte_log import Entry
 from trade_hil_sim.mechanics._shaft import Shaft
 from trade_hil_sim.mechanics._truth import DeviceState
-from trade_hil_sim.robot._errors import SimulationError
 
 from ._machine import Machine
 from ._modes import MOTION, Mode, Modes

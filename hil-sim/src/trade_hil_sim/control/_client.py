@@ -8,10 +8,10 @@ from typing import Final
 import msgspec
 
 from trade_hil_sim.control._server import Answer, State
-from trade_hil_sim.faults import _faults as faults
+from trade_hil_sim.faults import _commands as faults
+from trade_hil_sim.faults._commands import SimulationError
 from trade_hil_sim.faults._methods import FaultMethods
 from trade_hil_sim.mechanics._truth import ArmTruth, BusState, DeviceState, GripperTruth
-from trade_hil_sim.robot._errors import SimulationError
 
 __all__ = ["SimControl"]
 

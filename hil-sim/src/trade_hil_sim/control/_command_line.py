@@ -7,8 +7,7 @@ from typing import Final
 import msgspec
 
 from trade_hil_sim.control._server import State
-from trade_hil_sim.faults._faults import Command, kinds_of
-from trade_hil_sim.robot._errors import SimulationError
+from trade_hil_sim.faults._commands import Command, SimulationError, kinds_of
 
 __all__ = ["command_of", "listing"]
 

@@ -1,6 +1,6 @@
 """The control socket: one line of JSON in, one out. Faults come in here while a robot is being simulated.
 
-Every command of `_faults` is taken, and ``{"do": "state"}``. Answers are ``{"ok": true}``, with ``"buses"`` for a
+Every `Command` is taken, and ``{"do": "state"}``. Answers are ``{"ok": true}``, with ``"buses"`` for a
 state, or ``{"error": "..."}``.
 """
 
@@ -16,9 +16,8 @@ from typing import Final, Protocol
 import msgspec
 from msgspec.structs import replace
 
-from trade_hil_sim.faults._faults import Command, kinds_of
+from trade_hil_sim.faults._commands import Command, SimulationError, kinds_of
 from trade_hil_sim.mechanics._truth import BusState
-from trade_hil_sim.robot._errors import SimulationError
 
 __all__ = ["Answer", "ControlServer", "State", "Steered"]
 

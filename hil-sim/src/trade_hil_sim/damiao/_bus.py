@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING
 
 from trade_hil_sim.can import JointBus
-from trade_hil_sim.robot._errors import SimulationError
+from trade_hil_sim.faults._commands import SimulationError
 
 from ._motor import Motor
 from ._names import damiao_label

@@ -8,11 +8,11 @@ from typing import Final
 from msgspec import structs
 
 from trade_hil_sim.can import Frame
-from trade_hil_sim.faults import _faults as faults
+from trade_hil_sim.faults import _commands as faults
+from trade_hil_sim.faults._commands import SimulationError
 from trade_hil_sim.log._byte_log import Entry
 from trade_hil_sim.mechanics._shaft import Shaft
 from trade_hil_sim.mechanics._truth import DeviceState
-from trade_hil_sim.robot._errors import SimulationError
 
 from . import _table as table
 from ._codec import Impedance, decode_mit, encode_feedback

@@ -5,9 +5,9 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from trade_hil_sim.faults import _faults as faults
+from trade_hil_sim.faults import _commands as faults
+from trade_hil_sim.faults._commands import SimulationError
 from trade_hil_sim.log._byte_log import ByteLog
-from trade_hil_sim.robot._errors import SimulationError
 from trade_hil_sim.serial._device_bus import DeviceLine
 
 from ._dispatch import Dispatch
@@ -50,7 +50,7 @@ class DynamixelBus(DeviceLine[Servo]):
     ) -> None:
         super().__init__(servos, port, name=name, log=log, paced=paced, clock=clock)
         self._journal = Journal(self.log, name, self._devices)
-        self._dispatch = Dispatch(self._script.silences, self._journal.refused)
+        self._dispatch = Dispatch(self._faults.silences, self._journal.refused)
         self._reader = PacketReader()
         self._deaf_to: int | None = None
         for servo in self._devices:

@@ -1,208 +1,169 @@
-"""Each scripted fault and order as a method, whoever carries it out."""
+"""Each fault and order as a method. Its body, its help and most of its keywords are those of the struct of its name."""
+# ruff: noqa: B027 - the bodies of the methods are generated
 
+import inspect
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
-from typing import Literal
+from collections.abc import Callable, Iterable
+from functools import wraps
+from typing import TYPE_CHECKING, Concatenate, Final, Literal, ParamSpec, TypedDict
 
-from trade_hil_sim.faults import _faults as faults
+from msgspec.structs import fields
+
+from trade_hil_sim.faults._commands import Command, kinds_of
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
 
 __all__ = ["FaultMethods"]
+
+Ids = Iterable[int] | None
+_P = ParamSpec("_P")
+_KINDS: Final = kinds_of(Command)
+
+
+class OnBus(TypedDict, total=False):
+    """Where: the name of a bus; default: every bus."""
+
+    bus: str | None
+
+
+class OfAnswers(OnBus, total=False):
+    """Which answers: those to an instruction, after how many, and how many."""
+
+    instruction: str | None
+    skip: int
+    count: int | None
+
+
+def _generated(
+    declared: "Callable[Concatenate[FaultMethods, _P], None]",
+) -> "Callable[Concatenate[FaultMethods, _P], None]":
+    """The method of a declaration: it makes a struct and has it done."""
+    kind = _KINDS[declared.__name__]
+    signature = _signature(declared)
+
+    @wraps(declared)
+    def method(self: "FaultMethods", /, *args: _P.args, **kwargs: _P.kwargs) -> None:
+        given = signature.bind(self, *args, **kwargs).arguments
+        del given["self"]
+        if given.get("ids") is not None:
+            given["ids"] = tuple(given["ids"])
+        self.do(kind(**given))
+
+    method.__doc__ = kind.__doc__
+    setattr(method, "__signature__", signature)  # noqa: B010 - no type checker knows this attribute
+    return method
+
+
+def _signature(declared: Callable[..., None]) -> inspect.Signature:
+    """That of a declaration, with the other fields of its struct in place of its ``**where``."""
+    own = inspect.signature(declared)
+    named = [parameter for parameter in own.parameters.values() if parameter.kind is not parameter.VAR_KEYWORD]
+    others = [
+        inspect.Parameter(field.name, inspect.Parameter.KEYWORD_ONLY, default=field.default, annotation=field.type)
+        for field in fields(_KINDS[declared.__name__])
+        if field.name not in own.parameters
+    ]
+    return own.replace(parameters=[*named, *others])
 
 
 class FaultMethods(ABC):
     """What can be done to simulated devices: a method for each fault, which makes the value and hands it to `do`."""
 
     @abstractmethod
-    def do(self, command: faults.Command) -> None:
+    def do(self, command: Command) -> None:
         """Carry out any command of the simulator."""
 
     # faults of answers
 
-    def mute(
-        self,
-        ids: Iterable[int] | None = None,
-        *,
-        bus: str | None = None,
-        instruction: str | None = None,
-        skip: int = 0,
-        count: int | None = None,
-    ) -> None:
-        """Devices obey, but do not answer."""
-        self.do(faults.Mute(ids=_ids(ids), bus=bus, instruction=instruction, skip=skip, count=count))
+    @_generated
+    def mute(self, ids: Ids = None, **which: "Unpack[OfAnswers]") -> None: ...
 
-    def unmute(self, ids: Iterable[int] | None = None, *, bus: str | None = None) -> None:
-        """End every mute of these devices."""
-        self.do(faults.Unmute(ids=_ids(ids), bus=bus))
+    @_generated
+    def unmute(self, ids: Ids = None, **where: "Unpack[OnBus]") -> None: ...
 
-    def late(
-        self,
-        s: float,
-        ids: Iterable[int] | None = None,
-        *,
-        bus: str | None = None,
-        instruction: str | None = None,
-        skip: int = 0,
-        count: int | None = None,
-    ) -> None:
-        """Answers come `s` seconds late."""
-        self.do(faults.Late(s=s, ids=_ids(ids), bus=bus, instruction=instruction, skip=skip, count=count))
+    @_generated
+    def late(self, s: float, ids: Ids = None, **which: "Unpack[OfAnswers]") -> None: ...
 
-    def bad_crc(
-        self,
-        ids: Iterable[int] | None = None,
-        *,
-        bus: str | None = None,
-        instruction: str | None = None,
-        skip: int = 0,
-        count: int | None = None,
-    ) -> None:
-        """The last byte of answers is wrong. On a CAN bus: the frame is destroyed, and sent again."""
-        self.do(faults.BadCrc(ids=_ids(ids), bus=bus, instruction=instruction, skip=skip, count=count))
+    @_generated
+    def bad_crc(self, ids: Ids = None, **which: "Unpack[OfAnswers]") -> None: ...
 
-    def truncate(
-        self,
-        ids: Iterable[int] | None = None,
-        *,
-        missing: int = 3,
-        bus: str | None = None,
-        instruction: str | None = None,
-        skip: int = 0,
-        count: int | None = None,
-    ) -> None:
-        """Answers break off: the last `missing` bytes never come."""
-        self.do(
-            faults.Truncate(missing=missing, ids=_ids(ids), bus=bus, instruction=instruction, skip=skip, count=count)
-        )
+    @_generated
+    def truncate(self, ids: Ids = None, *, missing: int = 3, **which: "Unpack[OfAnswers]") -> None: ...
 
-    def garbage(
-        self,
-        ids: Iterable[int] | None = None,
-        *,
-        hex: str = "fffffd00ff",  # noqa: A002 - as the fault has it
-        bus: str | None = None,
-        instruction: str | None = None,
-        skip: int = 0,
-        count: int | None = None,
-    ) -> None:
-        """Noise comes before answers: these bytes, in hex."""
-        self.do(faults.Garbage(hex=hex, ids=_ids(ids), bus=bus, instruction=instruction, skip=skip, count=count))
+    @_generated
+    def garbage(self, ids: Ids = None, *, hex: str = "fffffd00ff", **which: "Unpack[OfAnswers]") -> None: ...  # noqa: A002 - as the fault has it
 
-    def dribble(
-        self,
-        s: float,
-        ids: Iterable[int] | None = None,
-        *,
-        bus: str | None = None,
-        instruction: str | None = None,
-        skip: int = 0,
-        count: int | None = None,
-    ) -> None:
-        """Answers come byte by byte, `s` seconds apart."""
-        self.do(faults.Dribble(s=s, ids=_ids(ids), bus=bus, instruction=instruction, skip=skip, count=count))
+    @_generated
+    def dribble(self, s: float, ids: Ids = None, **which: "Unpack[OfAnswers]") -> None: ...
 
-    def duplicate(
-        self,
-        ids: Iterable[int] | None = None,
-        *,
-        bus: str | None = None,
-        instruction: str | None = None,
-        skip: int = 0,
-        count: int | None = None,
-    ) -> None:
-        """Answers come twice."""
-        self.do(faults.Duplicate(ids=_ids(ids), bus=bus, instruction=instruction, skip=skip, count=count))
+    @_generated
+    def duplicate(self, ids: Ids = None, **which: "Unpack[OfAnswers]") -> None: ...
 
-    def heal(self, *, bus: str | None = None) -> None:
-        """End every fault of answers, echo, frozen sensors, jams, absences and wrong models."""
-        self.do(faults.Heal(bus=bus))
+    @_generated
+    def heal(self, **where: "Unpack[OnBus]") -> None: ...
 
     # the line and the devices
 
-    def unplug(self, bus: str | None = None) -> None:
-        """Pull the serial adapter. The devices stay powered."""
-        self.do(faults.Unplug(bus=bus))
+    @_generated
+    def unplug(self, bus: str | None = None) -> None: ...
 
-    def replug(self, bus: str | None = None) -> None:
-        """Plug the serial adapter in again; clients must open the port anew."""
-        self.do(faults.Replug(bus=bus))
+    @_generated
+    def replug(self, bus: str | None = None) -> None: ...
 
-    def echo(self, *, on: bool = True, bus: str | None = None) -> None:
-        """The adapter sends back what it hears; with `on` false it ends."""
-        self.do(faults.Echo(on=on, bus=bus))
+    @_generated
+    def echo(self, *, on: bool = True, **where: "Unpack[OnBus]") -> None: ...
 
-    def bus_off(self, ids: Iterable[int] | None = None, *, on: bool = True, bus: str | None = None) -> None:
-        """CAN controllers of devices go bus-off, or without `ids` the adapter's; with `on` false they start again."""
-        self.do(faults.BusOff(on=on, ids=_ids(ids), bus=bus))
+    @_generated
+    def bus_off(self, ids: Ids = None, *, on: bool = True, **where: "Unpack[OnBus]") -> None: ...
 
-    def hang_up(self, kind: Literal["rtde", "dashboard", "script"], *, bus: str | None = None) -> None:
-        """A controller of an arm hangs up on its clients of one kind; they may connect again."""
-        self.do(faults.HangUp(kind=kind, bus=bus))
+    @_generated
+    def hang_up(self, kind: Literal["rtde", "dashboard", "script"], **where: "Unpack[OnBus]") -> None: ...
 
-    def local(self, *, on: bool = True, bus: str | None = None) -> None:
-        """A controller of an arm is switched to local control, or with `on` false back."""
-        self.do(faults.Local(on=on, bus=bus))
+    @_generated
+    def local(self, *, on: bool = True, **where: "Unpack[OnBus]") -> None: ...
 
-    def absent(
-        self, ids: Iterable[int] | None = None, *, nth: int | None = None, on: bool = True, bus: str | None = None
-    ) -> None:
-        """Take devices off the bus, or only its `nth` one; with `on` false put them back."""
-        self.do(faults.Absent(nth=nth, on=on, ids=_ids(ids), bus=bus))
+    @_generated
+    def absent(self, ids: Ids = None, *, nth: int | None = None, on: bool = True, **where: "Unpack[OnBus]") -> None: ...
 
-    def brown_out(self, ids: Iterable[int] | None = None, *, bus: str | None = None) -> None:
-        """Let the supply dip: RAM at its defaults, torque off."""
-        self.do(faults.BrownOut(ids=_ids(ids), bus=bus))
+    @_generated
+    def brown_out(self, ids: Ids = None, **where: "Unpack[OnBus]") -> None: ...
 
-    def hardware_fault(self, bits: int = 0x20, ids: Iterable[int] | None = None, *, bus: str | None = None) -> None:
-        """Latch bits of the hardware error register; 32 is overload."""
-        self.do(faults.HardwareFault(bits=bits, ids=_ids(ids), bus=bus))
+    @_generated
+    def hardware_fault(self, bits: int = 0x20, ids: Ids = None, **where: "Unpack[OnBus]") -> None: ...
 
-    def emergency(
-        self, code: int, ids: Iterable[int] | None = None, *, lasting: bool = False, bus: str | None = None
-    ) -> None:
-        """CAN drives fail with an error code; with `lasting` it cannot be reset until `heal`."""
-        self.do(faults.Emergency(code=code, lasting=lasting, ids=_ids(ids), bus=bus))
+    @_generated
+    def emergency(self, code: int, ids: Ids = None, *, lasting: bool = False, **where: "Unpack[OnBus]") -> None: ...
 
-    def freeze(
-        self, ids: Iterable[int] | None = None, *, on: bool = True, tick: bool = False, bus: str | None = None
-    ) -> None:
-        """Let the measured position stand still, and with `tick` the device's clock."""
-        self.do(faults.Freeze(on=on, tick=tick, ids=_ids(ids), bus=bus))
+    @_generated
+    def freeze(self, ids: Ids = None, *, on: bool = True, tick: bool = False, **where: "Unpack[OnBus]") -> None: ...
 
-    def jam(self, ids: Iterable[int] | None = None, *, on: bool = True, bus: str | None = None) -> None:
-        """Hold shafts fast, or with `on` false let them go; straining for a second is an overload."""
-        self.do(faults.Jam(on=on, ids=_ids(ids), bus=bus))
+    @_generated
+    def jam(self, ids: Ids = None, *, on: bool = True, **where: "Unpack[OnBus]") -> None: ...
 
-    def wrong_model(self, number: int, ids: Iterable[int] | None = None, *, bus: str | None = None) -> None:
-        """Devices report another model number, as after a swap."""
-        self.do(faults.WrongModel(number=number, ids=_ids(ids), bus=bus))
+    @_generated
+    def wrong_model(self, number: int, ids: Ids = None, **where: "Unpack[OnBus]") -> None: ...
 
+    @_generated
     def supply(
         self,
-        ids: Iterable[int] | None = None,
+        ids: Ids = None,
         *,
         voltage_v: float | None = None,
         temperature_c: int | None = None,
-        bus: str | None = None,
-    ) -> None:
-        """Set what devices measure of their supply and housing; outside their limits they shut down."""
-        self.do(faults.Supply(voltage_v=voltage_v, temperature_c=temperature_c, ids=_ids(ids), bus=bus))
+        **where: "Unpack[OnBus]",
+    ) -> None: ...
 
-    def place(self, counts: int, ids: Iterable[int] | None = None, *, bus: str | None = None) -> None:
-        """Turn shafts by hand, to a position in counts."""
-        self.do(faults.Place(counts=counts, ids=_ids(ids), bus=bus))
+    @_generated
+    def place(self, counts: int, ids: Ids = None, **where: "Unpack[OnBus]") -> None: ...
 
+    @_generated
     def put(
         self,
         width_m: float | None = None,
-        ids: Iterable[int] | None = None,
+        ids: Ids = None,
         *,
         stiffness_n_m: float = 50_000.0,
         inside: bool = False,
-        bus: str | None = None,
-    ) -> None:
-        """Put an object between the fingers of grippers, or `inside` around them; without a width, take it away."""
-        self.do(faults.Put(width_m=width_m, stiffness_n_m=stiffness_n_m, inside=inside, ids=_ids(ids), bus=bus))
-
-
-def _ids(ids: Iterable[int] | None) -> tuple[int, ...] | None:
-    return None if ids is None else tuple(ids)
+        **where: "Unpack[OnBus]",
+    ) -> None: ...

@@ -5,9 +5,9 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from trade_hil_sim.faults import _faults as faults
+from trade_hil_sim.faults import _commands as faults
+from trade_hil_sim.faults._commands import SimulationError
 from trade_hil_sim.log._byte_log import ByteLog, Entry
-from trade_hil_sim.robot._errors import SimulationError
 from trade_hil_sim.serial._device_bus import DeviceLine, interleaved
 
 from ._protocol import BROADCAST, Instruction, Packet, PacketReader, Writing, readings, status, writings
@@ -146,7 +146,7 @@ class FeetechBus(DeviceLine[Servo]):
             device_id, delay_s = servo.device_id, servo.return_delay_s
             complaints, params = servo.status, act(servo)
             wanted = servo.answers_all or packet.instruction in ALWAYS_ANSWERED
-            silenced = self._script.silences(device_id, packet.name)
+            silenced = self._faults.silences(device_id, packet.name)
             if params is not None and wanted and not silenced and not _unanswered(packet):
                 answers.append(status(device_id, complaints, params))
         if answers:

@@ -1,15 +1,18 @@
 """Reading a byte log: pure questions about what a bus has seen."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from math import inf
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final, TypedDict
 
 import msgspec
 
-from trade_hil_sim.log._byte_log import Direction, Entry
+from trade_hil_sim.log._byte_log import Direction, Entry, Kind
 
-__all__ = ["events", "frames", "instructions", "motion_writes", "read_log", "received", "sent", "writes"]
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+__all__ = ["Span", "events", "frames", "instructions", "motion_writes", "read_log", "received", "sent", "writes"]
 
 WRITING: Final = frozenset(
     {
@@ -24,6 +27,17 @@ WRITING: Final = frozenset(
 EVERYBODY: Final = 254
 
 
+class Span(TypedDict, total=False):
+    """Which part of a log to look at."""
+
+    since: float
+    """Earliest time in seconds on CLOCK_MONOTONIC."""
+    until: float
+    """Latest time in seconds on CLOCK_MONOTONIC."""
+    bus: str | None
+    """Only this bus."""
+
+
 def read_log(path: Path | str) -> list[Entry]:
     """All entries of a log file so far, in the order they were written.
 
@@ -33,14 +47,14 @@ def read_log(path: Path | str) -> list[Entry]:
     return msgspec.json.Decoder(Entry).decode_lines(whole) if whole else []
 
 
-def received(entries: Iterable[Entry], *, since: float = -inf, until: float = inf, bus: str | None = None) -> bytes:
+def received(entries: Iterable[Entry], **span: "Unpack[Span]") -> bytes:
     """The bytes that came in, joined."""
-    return b"".join(e.data for e in entries if e.kind == "received" and _within(e, since, until, bus))
+    return b"".join(e.data for e in _of_kind("received", entries, **span))
 
 
-def sent(entries: Iterable[Entry], *, since: float = -inf, until: float = inf, bus: str | None = None) -> bytes:
+def sent(entries: Iterable[Entry], **span: "Unpack[Span]") -> bytes:
     """The bytes that went out, joined."""
-    return b"".join(e.data for e in entries if e.kind == "sent" and _within(e, since, until, bus))
+    return b"".join(e.data for e in _of_kind("sent", entries, **span))
 
 
 def frames(
@@ -51,9 +65,7 @@ def frames(
     device_id: int | None = None,
     source: str | None = None,
     direction: Direction | None = None,
-    since: float = -inf,
-    until: float = inf,
-    bus: str | None = None,
+    **span: "Unpack[Span]",
 ) -> list[Entry]:
     """Frames that got through on CAN buses, in the order they did.
 
@@ -64,27 +76,15 @@ def frames(
         device_id: only those that come from this device or are addressed to it.
         source: only those sent by this joint or client.
         direction: ``in`` for those of clients, ``out`` for those of devices.
-        since: earliest time in seconds on CLOCK_MONOTONIC.
-        until: latest time in seconds on CLOCK_MONOTONIC.
-        bus: only this bus.
+        **span: `Span`.
     """
     wanted = {"name": name, "can_id": can_id, "device_id": device_id, "source": source, "direction": direction}
     asked = [(field, value) for field, value in wanted.items() if value is not None]
-    return [
-        e
-        for e in entries
-        if e.kind == "frame" and _within(e, since, until, bus) and all(getattr(e, f) == v for f, v in asked)
-    ]
+    return [e for e in _of_kind("frame", entries, **span) if all(getattr(e, f) == v for f, v in asked)]
 
 
 def instructions(
-    entries: Iterable[Entry],
-    name: str | None = None,
-    *,
-    device_id: int | None = None,
-    since: float = -inf,
-    until: float = inf,
-    bus: str | None = None,
+    entries: Iterable[Entry], name: str | None = None, *, device_id: int | None = None, **span: "Unpack[Span]"
 ) -> list[Entry]:
     """Decoded instructions; those to everybody (id 254) count for every device.
 
@@ -92,85 +92,46 @@ def instructions(
         entries: where to look.
         name: ``ping``, ``read``, ``write``, ``sync_read``, ...; default: any.
         device_id: only those a device of this id obeys.
-        since: earliest time in seconds on CLOCK_MONOTONIC.
-        until: latest time in seconds on CLOCK_MONOTONIC.
-        bus: only this bus.
+        **span: `Span`.
     """
-    return [
-        e
-        for e in entries
-        if e.kind == "instruction"
-        and _within(e, since, until, bus)
-        and name in {None, e.name}
-        and _concerns(e, device_id)
-    ]
+    found = _of_kind("instruction", entries, **span)
+    return [e for e in found if name in {None, e.name} and _concerns(e, device_id)]
 
 
 def writes(
-    entries: Iterable[Entry],
-    *,
-    device_id: int | None = None,
-    register: str | None = None,
-    since: float = -inf,
-    until: float = inf,
-    bus: str | None = None,
+    entries: Iterable[Entry], *, device_id: int | None = None, register: str | None = None, **span: "Unpack[Span]"
 ) -> list[Entry]:
-    """Every instruction that writes; arguments as `instructions`.
+    """Every instruction that writes; arguments as `instructions`, and `register`: only those that touch it.
 
     On a Dynamixel bus: write, reg write, action, sync write, bulk write. On a CAN bus: SDO writes, and receive PDOs at
     the moment they take effect; one that only repeats what the device has is a frame, but no instruction.
-
-    Args:
-        entries: where to look.
-        device_id: only those a device of this id obeys.
-        register: only those that touch the register of this name, such as ``goal_position``.
-        since: earliest time in seconds on CLOCK_MONOTONIC.
-        until: latest time in seconds on CLOCK_MONOTONIC.
-        bus: only this bus.
     """
-    found = instructions(entries, device_id=device_id, since=since, until=until, bus=bus)
+    found = instructions(entries, device_id=device_id, **span)
     return [e for e in found if e.name in WRITING and (register is None or register in e.registers)]
 
 
-def motion_writes(
-    entries: Iterable[Entry],
-    *,
-    device_id: int | None = None,
-    since: float = -inf,
-    until: float = inf,
-    bus: str | None = None,
-) -> list[Entry]:
+def motion_writes(entries: Iterable[Entry], *, device_id: int | None = None, **span: "Unpack[Span]") -> list[Entry]:
     """The writes that could move something: those that touch torque or goal registers; arguments as `writes`.
 
     Of CAN drives: those that change controlword, mode or a target. Of arms: commands to move, set-points, freedrive.
 
     A registered write counts, and so does the action that lets it loose. Switching torque off counts, too.
     """
-    return [e for e in writes(entries, device_id=device_id, since=since, until=until, bus=bus) if e.moves]
+    return [e for e in writes(entries, device_id=device_id, **span) if e.moves]
 
 
 def events(
-    entries: Iterable[Entry],
-    name: str | None = None,
-    *,
-    device_id: int | None = None,
-    since: float = -inf,
-    until: float = inf,
-    bus: str | None = None,
+    entries: Iterable[Entry], name: str | None = None, *, device_id: int | None = None, **span: "Unpack[Span]"
 ) -> list[Entry]:
     """What devices did: ``motion_started``, ``at_rest``, ``watchdog_expired``, ...; arguments as `instructions`."""
-    return [
-        e
-        for e in entries
-        if e.kind == "event"
-        and _within(e, since, until, bus)
-        and name in {None, e.name}
-        and device_id in {None, e.device_id}
-    ]
+    found = _of_kind("event", entries, **span)
+    return [e for e in found if name in {None, e.name} and device_id in {None, e.device_id}]
 
 
-def _within(entry: Entry, since: float, until: float, bus: str | None) -> bool:
-    return since <= entry.t <= until and bus in {None, entry.bus}
+def _of_kind(
+    kind: Kind, entries: Iterable[Entry], *, since: float = -inf, until: float = inf, bus: str | None = None
+) -> Iterator[Entry]:
+    return (e for e in entries if e.kind == kind and since <= e.t <= until and bus in {None, e.bus})
 
 
 def _concerns(entry: Entry, device_id: int | None) -> bool:

@@ -6,10 +6,10 @@ from math import inf, isfinite, tau
 from typing import Final
 
 from trade_hil_sim.can import Frame
-from trade_hil_sim.faults import _faults as faults
+from trade_hil_sim.faults import _commands as faults
+from trade_hil_sim.faults._commands import SimulationError
 from trade_hil_sim.log._byte_log import Entry
 from trade_hil_sim.mechanics._truth import DeviceState
-from trade_hil_sim.robot._errors import SimulationError
 
 from ._motor import Motor
 from ._table import ANSWERS, ORDERS, Command, Errors, Result, State

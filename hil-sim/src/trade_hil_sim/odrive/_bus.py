@@ -4,7 +4,7 @@ from math import tau
 from typing import TYPE_CHECKING, Final
 
 from trade_hil_sim.can import JointBus
-from trade_hil_sim.robot._errors import SimulationError
+from trade_hil_sim.faults._commands import SimulationError
 
 from ._axis import Axis
 from ._names import odrive_label

@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from trade_drivers.robotfile import Gripper, Joint, SerialBus
+from trade_hil_sim.faults._commands import SimulationError
 from trade_hil_sim.log._byte_log import ByteLog
-from trade_hil_sim.robot._errors import SimulationError
 from trade_hil_sim.robot._robot import SimulatedBus, bus_class
 
 __all__ = ["fresh_bus"]

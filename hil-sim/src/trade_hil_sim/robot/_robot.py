@@ -6,10 +6,9 @@ from pathlib import Path
 from typing import Final, Protocol, cast
 
 from trade_drivers.robotfile import Arm, Bus, Camera, Gripper, Joint, Robot, Sensor, parse
-from trade_hil_sim.faults._faults import Command
+from trade_hil_sim.faults._commands import Command, SimulationError
 from trade_hil_sim.log._byte_log import ByteLog
 from trade_hil_sim.mechanics._truth import BusState
-from trade_hil_sim.robot._errors import SimulationError
 
 __all__ = [
     "SimulatedBus",

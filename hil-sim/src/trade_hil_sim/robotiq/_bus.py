@@ -5,9 +5,9 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from trade_hil_sim.faults import _faults as faults
+from trade_hil_sim.faults import _commands as faults
+from trade_hil_sim.faults._commands import SimulationError
 from trade_hil_sim.log._byte_log import ByteLog, Entry
-from trade_hil_sim.robot._errors import SimulationError
 from trade_hil_sim.serial._device_bus import DeviceLine
 
 from . import _table as table
@@ -147,7 +147,7 @@ class RobotiqBus(DeviceLine[Gripper]):
             if isinstance(answer, ExceptionCode):
                 self._event(gripper, "refused", now, answer.name.lower())
                 answer = exception(request, answer) if gripper.exceptions or gripper.foreign else None
-            silenced = self._script.silences(gripper.device_id, request.name)
+            silenced = self._faults.silences(gripper.device_id, request.name)
             if answer is not None and request.device_id != BROADCAST and not silenced:
                 gap_s = _GAP_CHARACTERS * _BITS / gripper.baud
                 self._answer(answer, (gripper.device_id,), request.name, after_s=gap_s, device_id=gripper.device_id)

@@ -9,10 +9,11 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from trade_hil_sim.faults import _faults as faults
+from trade_hil_sim.faults import _commands as faults
+from trade_hil_sim.faults._active import ActiveFaults
+from trade_hil_sim.faults._commands import SimulationError
 from trade_hil_sim.log._byte_log import ByteLog, Entry
 from trade_hil_sim.mechanics._truth import BusState
-from trade_hil_sim.robot._errors import SimulationError
 from trade_hil_sim.robot._polling import ready
 
 from ._drawing import draw
@@ -56,7 +57,7 @@ class SceneCamera:
         self.log = ByteLog() if log is None else log
         self._truth, self._size = truth, (width_px, height_px)
         self._lock = threading.Lock()
-        self._script = faults.Script()
+        self._faults = ActiveFaults()
         self._frozen: bytes | None = None
         self._number = 0
         self._listener: socket.socket | None = None
@@ -131,17 +132,17 @@ class SceneCamera:
                 self._plug(isinstance(command, faults.Replug))
             case faults.AnswerFault():
                 with self._lock:
-                    self._script.add(command)
+                    self._faults.add(command)
             case faults.Unmute():
                 with self._lock:
-                    self._script.unmute(None)
+                    self._faults.unmute(None)
             case faults.Freeze():
                 picture = self._picture() if command.on else None
                 with self._lock:
                     self._frozen = picture
             case faults.Heal():
                 with self._lock:
-                    self._script.heal()
+                    self._faults.heal()
                     self._frozen = None
             case _:
                 raise SimulationError(f"camera {self.name} has no such thing as {type(command).__name__}")
@@ -195,8 +196,8 @@ class SceneCamera:
         self._note("received", line)
         answer = self._answer(line)
         with self._lock:
-            muted = self._script.silences(0, "get")
-            pieces = [] if muted else self._script.shape(answer, (0,), "get")
+            muted = self._faults.silences(0, "get")
+            pieces = [] if muted else self._faults.shape(answer, (0,), "get")
         began = time.monotonic()
         for data, late_s in pieces:
             if not self._patient(client, began + late_s):

@@ -10,10 +10,11 @@ from typing import Any, Generic, Protocol, TypeVar
 
 import msgspec
 
-from trade_hil_sim.faults import _faults as faults
+from trade_hil_sim.faults import _commands as faults
+from trade_hil_sim.faults._active import ActiveFaults
+from trade_hil_sim.faults._commands import SimulationError
 from trade_hil_sim.log._byte_log import ByteLog
 from trade_hil_sim.mechanics._truth import BusState, DeviceState, GripperTruth
-from trade_hil_sim.robot._errors import SimulationError
 from trade_hil_sim.serial._line import SerialLine
 
 __all__ = ["DeviceLine", "interleaved"]
@@ -71,7 +72,7 @@ class DeviceLine(ABC, Generic[_Device]):
         self._clock = clock
         self._devices = list(devices)
         self._lock = threading.RLock()
-        self._script = faults.Script()
+        self._faults = ActiveFaults()
         self._last_byte_at = 0.0
         self._echo = False
         self._line = SerialLine(port, self, name=name, log=self.log, paced=paced)
@@ -130,12 +131,12 @@ class DeviceLine(ABC, Generic[_Device]):
         match command:
             case faults.AnswerFault():
                 self._named(command.ids)
-                self._script.add(command)
+                self._faults.add(command)
             case faults.Unmute():
                 self._named(command.ids)
-                self._script.unmute(command.ids)
+                self._faults.unmute(command.ids)
             case faults.Heal():
-                self._script.heal()
+                self._faults.heal()
                 self._echo = False
                 for device in self._devices:
                     device.advance(t)
@@ -201,7 +202,7 @@ class DeviceLine(ABC, Generic[_Device]):
 
     def _answer(self, data: bytes, ids: tuple[int, ...], instruction: str, *, after_s: float, device_id: int) -> None:
         """Send an answer as the faults in force leave it."""
-        for piece, late_s in self._script.shape(data, ids, instruction):
+        for piece, late_s in self._faults.shape(data, ids, instruction):
             self._line.send(piece, after_s=after_s, late_s=late_s, name=instruction, device_id=device_id)
             after_s = 0.0
 

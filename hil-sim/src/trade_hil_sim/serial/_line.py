@@ -12,8 +12,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final, NamedTuple, Protocol
 
+from trade_hil_sim.faults._commands import SimulationError
 from trade_hil_sim.log._byte_log import ByteLog, Entry
-from trade_hil_sim.robot._errors import SimulationError
 from trade_hil_sim.robot._mailbox import Mailbox
 from trade_hil_sim.serial._pty import Terminal
 

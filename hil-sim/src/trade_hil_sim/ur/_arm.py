@@ -6,8 +6,8 @@ from typing import Final
 
 import msgspec
 
+from trade_hil_sim.faults._commands import SimulationError
 from trade_hil_sim.log._byte_log import Entry
-from trade_hil_sim.robot._errors import SimulationError
 
 from ._kinematics import flange, joints_for, pose_between, pose_of, way_of
 from ._motions import Braking, Free, Held, Motion, Servo, Speed, Way

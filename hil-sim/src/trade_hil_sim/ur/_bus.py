@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING, Final, TypeVar
 
 import msgspec
 
-from trade_hil_sim.faults import _faults as faults
+from trade_hil_sim.faults import _commands as faults
+from trade_hil_sim.faults._active import ActiveFaults
+from trade_hil_sim.faults._commands import SimulationError
 from trade_hil_sim.log._byte_log import ByteLog, Entry
 from trade_hil_sim.mechanics._truth import ArmTruth, BusState
-from trade_hil_sim.robot._errors import SimulationError
 from trade_hil_sim.robot._mailbox import Mailbox
 from trade_hil_sim.robot._polling import ready
 
@@ -76,7 +77,7 @@ class UrBus:
         self._rtde = Rtde(self._program, rate_hz)
         self._dashboard = Dashboard(self._program, remote=remote)
         self._period_s = 1 / rate_hz
-        self._script = faults.Script()
+        self._faults = ActiveFaults()
         self._absent = False
         self._listeners: dict[str, socket.socket] = {}
         self._clients: dict[Client, str] = {}
@@ -253,7 +254,7 @@ class UrBus:
                 if (whole := client.held.rfind(b"\nend\n")) >= 0:
                     text = client.held[: whole + 5].decode(errors="replace")
                     del client.held[: whole + 5]
-                    if self._dashboard.remote and not self._script.names("script"):
+                    if self._dashboard.remote and not self._faults.names("script"):
                         self._program.upload(text)
         if len(client.held) > MOST_HELD:
             raise ValueError(f"{len(client.held)} bytes without an end")
@@ -262,8 +263,8 @@ class UrBus:
         self._say(client, packet.encode(), name)
 
     def _say(self, client: Client, data: bytes, name: str) -> None:
-        if not self._absent and not self._script.strikes(faults.Mute, (_ARM,), name):
-            client.tell(self._script.shape(data, (_ARM,), name))
+        if not self._absent and not self._faults.strikes(faults.Mute, (_ARM,), name):
+            client.tell(self._faults.shape(data, (_ARM,), name))
 
     def _drop(self, client: Client) -> None:
         if self._clients.pop(client, None) is None:
@@ -314,12 +315,12 @@ class UrBus:
             case faults.Unplug() | faults.Replug() | faults.HangUp() | faults.Local():
                 self._do_to_ports(command)
             case faults.Heal():
-                self._script.heal()
+                self._faults.heal()
                 self._rtde.frozen, self._absent, self.arm.jammed = {}, False, False
             case faults.AnswerFault():
-                self._script.add(command)
+                self._faults.add(command)
             case faults.Unmute():
-                self._script.unmute(command.ids)
+                self._faults.unmute(command.ids)
             case faults.Absent(nth=int()):
                 raise SimulationError(f"controller {self.name} has its one arm; leave nth out")
             case faults.Absent():

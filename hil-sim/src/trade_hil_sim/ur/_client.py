@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from typing import Final
 
-from trade_hil_sim.faults._faults import Piece
+from trade_hil_sim.faults._commands import Piece
 
 __all__ = ["MOST_HELD", "Client"]
 

@@ -1,4 +1,4 @@
-"""Scripted faults as plain values, so that they can be made in Python or sent over the control socket.
+"""The faults and orders as plain values, so that they can be made in Python or sent over the control socket.
 
 On a CAN bus every frame of a device is an answer, and its name (``heartbeat``, ``tpdo1``, ``sdo_reply``, ...) the
 instruction; a fault that names a frame of clients (``sync``, ``rpdo1``, ...) strikes that.
@@ -36,7 +36,7 @@ __all__ = [
     "Place",
     "Put",
     "Replug",
-    "Script",
+    "SimulationError",
     "Supply",
     "Truncate",
     "Unmute",
@@ -48,6 +48,10 @@ __all__ = [
 
 Seconds = Annotated[float, Meta(ge=0, le=60)]
 Byte = Annotated[int, Meta(ge=0, le=255)]
+
+
+class SimulationError(ValueError):
+    """A simulator was asked for something it cannot do; the message says what would be right."""
 
 
 class Piece(NamedTuple):
@@ -296,76 +300,7 @@ Command = (
 )
 
 
-def kinds_of(union: object) -> dict[str, type[msgspec.Struct]]:
+def kinds_of(union: object) -> dict[str, type[Command]]:
     """The words a command may have under ``do``, and what each makes."""
-    kinds: tuple[type[msgspec.Struct], ...] = getattr(union, "__args__", ())
+    kinds: tuple[type[Command], ...] = getattr(union, "__args__", ())
     return {str(kind.__struct_config__.tag): kind for kind in kinds}
-
-
-class _Active:
-    """A fault and how often it has matched."""
-
-    def __init__(self, fault: AnswerFault) -> None:
-        self.fault = fault
-        self.seen = 0
-
-    @property
-    def spent(self) -> bool:
-        return self.fault.count is not None and self.seen >= self.fault.skip + self.fault.count
-
-    def hits(self, ids: tuple[int, ...], instruction: str) -> bool:
-        if self.spent or not self.fault.strikes(ids, instruction):
-            return False
-        self.seen += 1
-        return self.seen > self.fault.skip
-
-
-class Script:
-    """The faults of answers in force on one bus."""
-
-    def __init__(self) -> None:
-        self._active: list[_Active] = []
-
-    def add(self, fault: AnswerFault) -> None:
-        """Bring a fault into force; faults act in the order they were added."""
-        self._active.append(_Active(fault))
-
-    def unmute(self, ids: tuple[int, ...] | None) -> None:
-        """End the mutes that name one of these ids; without ids, all."""
-        self._active = [a for a in self._active if not (isinstance(a.fault, Mute) and _overlap(a.fault.ids, ids))]
-
-    def heal(self) -> None:
-        """End all."""
-        self._active.clear()
-
-    @property
-    def empty(self) -> bool:
-        """Whether none is in force."""
-        return not self._active
-
-    def silences(self, device_id: int, instruction: str) -> bool:
-        """Whether this answer is not given at all; counts as one matched."""
-        return self.strikes(Mute, (device_id,), instruction)
-
-    def strikes(self, kind: type[AnswerFault], ids: tuple[int, ...], instruction: str) -> bool:
-        """Whether a fault of this kind hits this answer; counts as one matched."""
-        return any(a.hits(ids, instruction) for a in self._active if isinstance(a.fault, kind))
-
-    def names(self, instruction: str) -> bool:
-        """Whether a fault is about answers to this instruction only."""
-        return any(a.fault.instruction == instruction for a in self._active if not a.spent)
-
-    def shape(
-        self, answer: bytes, ids: tuple[int, ...], instruction: str, *, but: tuple[type[AnswerFault], ...] = (Mute,)
-    ) -> list[Piece]:
-        """The answer as the faults in force leave it, but for those of some kinds."""
-        pieces = [Piece(answer)]
-        for active in self._active:
-            if not isinstance(active.fault, but) and active.hits(ids, instruction):
-                pieces = active.fault.shape(pieces)
-        self._active = [active for active in self._active if not active.spent]
-        return pieces
-
-
-def _overlap(some: tuple[int, ...] | None, others: tuple[int, ...] | None) -> bool:
-    return some is None or others is None or bool(set(some) & set(others))
