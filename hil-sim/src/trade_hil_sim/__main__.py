@@ -20,8 +20,8 @@ from trade_hil_sim.control._process import Ready
 from trade_hil_sim.control._server import ControlServer, State
 from trade_hil_sim.faults._commands import SimulationError
 from trade_hil_sim.log._byte_log import ByteLog
+from trade_hil_sim.robot._bus_thread import ready
 from trade_hil_sim.robot._factory_devices import fresh_bus
-from trade_hil_sim.robot._polling import ready
 from trade_hil_sim.robot._robot import buses_of, read_robot
 
 EPILOG = f"""\

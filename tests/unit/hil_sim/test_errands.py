@@ -7,8 +7,7 @@ import pytest
 
 from tests.support.waiting import PATIENCE_S
 from trade_hil_sim import SimulationError
-from trade_hil_sim.robot._mailbox import Mailbox
-from trade_hil_sim.robot._polling import ready
+from trade_hil_sim.robot._bus_thread import Mailbox, ready
 
 
 def test_what_was_asked_is_done_in_the_thread_that_listens_and_answered() -> None:

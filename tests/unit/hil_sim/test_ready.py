@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from trade_hil_sim.robot._polling import ready
+from trade_hil_sim.robot._bus_thread import ready
 
 
 @pytest.fixture

@@ -1,12 +1,11 @@
 """A simulated CAN bus: devices on a wire that several clients reach through one adapter, with a log and faults."""
 
-import threading
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from math import inf
 from operator import attrgetter
-from typing import Final, TypeVar
+from typing import Final
 
 import msgspec
 
@@ -15,7 +14,7 @@ from trade_hil_sim.faults._active import ActiveFaults
 from trade_hil_sim.faults._commands import SimulationError
 from trade_hil_sim.log._byte_log import ByteLog, Entry
 from trade_hil_sim.mechanics._truth import BusState
-from trade_hil_sim.robot._mailbox import Mailbox
+from trade_hil_sim.robot._bus_thread import BusThread
 
 from ._adapter import Adapter, Client
 from ._device import Device
@@ -35,10 +34,9 @@ BUS_OFF: Final = 0x40
 RESTARTED: Final = 0x100
 
 _DUE: Final = attrgetter("due")
-_T = TypeVar("_T")
 
 
-class CanBus:
+class CanBus(BusThread):
     """Devices on one CAN bus; clients reach it at `port`: by the socketcand protocol, or on an interface of the system.
 
     Args:
@@ -67,7 +65,7 @@ class CanBus:
         paced: bool = True,
         interface: str = "",
     ) -> None:
-        self.name = name
+        super().__init__(name, ANSWER_S)
         self.log = ByteLog() if log is None else log
         self._devices = list(devices)
         self._faults = ActiveFaults()
@@ -78,9 +76,6 @@ class CanBus:
         self._wall_offset_s = time.time() - time.monotonic()
         self._clients: dict[Client, Station] = {}
         self._stations = {device.device_id: self._attach(device) for device in self._devices}
-        self._errands = Mailbox(f"bus {name}", ANSWER_S)
-        self._closing = False
-        self._thread: threading.Thread | None = None
 
     def _attach(self, device: Device) -> Station:
         station = Station(device.joint or f"node {device.device_id}", device.hear, device.device_id)
@@ -106,31 +101,6 @@ class CanBus:
         """The devices; take care, the bus's own thread uses them, too."""
         return tuple(self._devices)
 
-    def open(self) -> "CanBus":
-        """Plug the adapter in and power the devices."""
-        if self._thread is not None:
-            raise SimulationError(f"bus {self.name} is open, or was; make a new one")
-        self._adapter.open()
-        self._errands.open()
-        self._thread = threading.Thread(target=self._run, name=f"sim-{self.name}", daemon=True)
-        self._thread.start()
-        return self
-
-    def close(self) -> None:
-        """Hang up and end the thread. Idempotent; a log passed in stays open."""
-        thread = self._thread
-        if thread is None or self._closing:
-            return
-        self._closing = True
-        self._errands.ring()
-        thread.join(ANSWER_S)
-
-    def __enter__(self) -> "CanBus":
-        return self.open()
-
-    def __exit__(self, *exc: object) -> None:
-        self.close()
-
     def state(self) -> BusState:
         """The truth about the bus and its devices, now."""
         return self._in_thread(self._state)
@@ -145,24 +115,17 @@ class CanBus:
 
     # the thread
 
-    def _in_thread(self, act: Callable[[], _T]) -> _T:
-        if self._closing:
-            raise SimulationError(f"bus {self.name} is closed")
-        if self._thread is None or threading.current_thread() is self._thread:
-            return act()
-        return self._errands.ask(act)
+    def _begin(self) -> None:
+        self._adapter.open()
 
-    def _run(self) -> None:
-        try:
-            while not self._closing:
-                if self._adapter.serve(self._errands.bell, self._patience_s(), self._pass_time):
-                    self._errands.run()
-                self._pass_time(time.monotonic())
-                self._adapter.flush()
-        finally:
-            self._closing = True
-            self._adapter.close()
-            self._errands.close()
+    def _step(self) -> None:
+        if self._adapter.serve(self._errands.bell, self._patience_s(), self._pass_time):
+            self._errands.run()
+        self._pass_time(time.monotonic())
+        self._adapter.flush()
+
+    def _end(self) -> None:
+        self._adapter.close()
 
     def _patience_s(self) -> float:
         due = min((device.due for device in self._devices), default=inf)

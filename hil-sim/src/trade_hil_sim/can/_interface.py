@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from trade_hil_sim.faults._commands import SimulationError
-from trade_hil_sim.robot._polling import ready
+from trade_hil_sim.robot._bus_thread import ready
 
 from ._adapter import Tenant
 from ._frame import Frame

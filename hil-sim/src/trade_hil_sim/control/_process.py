@@ -18,7 +18,7 @@ from trade_hil_sim.control._client import SimControl
 from trade_hil_sim.faults._commands import SimulationError
 from trade_hil_sim.log._byte_log import Entry
 from trade_hil_sim.log._queries import read_log
-from trade_hil_sim.robot._polling import ready
+from trade_hil_sim.robot._bus_thread import ready
 
 __all__ = ["Ready", "SimProcess", "remove_leftovers"]
 

@@ -1,6 +1,5 @@
 """The camera: an HTTP server on the loopback interface that answers each request with what is seen at that moment."""
 
-import os
 import socket
 import threading
 import time
@@ -14,7 +13,7 @@ from trade_hil_sim.faults._active import ActiveFaults
 from trade_hil_sim.faults._commands import SimulationError
 from trade_hil_sim.log._byte_log import ByteLog, Entry
 from trade_hil_sim.mechanics._truth import BusState
-from trade_hil_sim.robot._polling import ready
+from trade_hil_sim.robot._bus_thread import BusThread, ready
 
 from ._drawing import draw
 from ._png import png
@@ -33,7 +32,7 @@ _LONGEST_REQUEST: Final = 8192
 _TARGET: Final = "/scene.png"
 
 
-class SceneCamera:
+class SceneCamera(BusThread):
     """A network camera: ``GET /scene.png`` is a picture of the robot. One client is answered after the other.
 
     Args:
@@ -53,7 +52,7 @@ class SceneCamera:
         height_px: int = _SIZE_PX[1],
         log: ByteLog | None = None,
     ) -> None:
-        self.name = name
+        super().__init__(name, _ANSWER_S, "camera")
         self.log = ByteLog() if log is None else log
         self._truth, self._size = truth, (width_px, height_px)
         self._lock = threading.Lock()
@@ -61,8 +60,6 @@ class SceneCamera:
         self._frozen: bytes | None = None
         self._number = 0
         self._listener: socket.socket | None = None
-        self._wants_plug, self._settled, self._closing = True, threading.Event(), threading.Event()
-        self._thread: threading.Thread | None = None
 
     @classmethod
     def from_record(
@@ -90,33 +87,6 @@ class SceneCamera:
         """Where its pictures are; final from `open` on."""
         return f"http://127.0.0.1:{self._number}{_TARGET}"
 
-    def open(self) -> "SceneCamera":
-        """From now on it can be asked."""
-        if self._thread is not None:
-            raise SimulationError(f"camera {self.name} is open, or was; make a new one")
-        self._listener = _listen(0)
-        self._number = self._listener.getsockname()[1]
-        self._bell, self._rope = os.pipe()
-        self._thread = threading.Thread(target=self._run, name=f"sim-{self.name}", daemon=True)
-        self._thread.start()
-        return self
-
-    def close(self) -> None:
-        """Hang up. Idempotent; a log passed in stays open."""
-        if self._thread is None or self._closing.is_set():
-            return
-        self._closing.set()
-        os.write(self._rope, b"!")
-        self._thread.join(_ANSWER_S)
-        os.close(self._bell)
-        os.close(self._rope)
-
-    def __enter__(self) -> "SceneCamera":
-        return self.open()
-
-    def __exit__(self, *exc: object) -> None:
-        self.close()
-
     def state(self) -> BusState:
         """Whether it can be reached; it has no devices."""
         return BusState(name=self.name, port=self.port, plugged=self._listener is not None)
@@ -129,7 +99,7 @@ class SceneCamera:
         """
         match command:
             case faults.Unplug() | faults.Replug():
-                self._plug(isinstance(command, faults.Replug))
+                self._ask(lambda: self._plug(isinstance(command, faults.Replug)))
             case faults.AnswerFault():
                 with self._lock:
                     self._faults.add(command)
@@ -147,43 +117,36 @@ class SceneCamera:
             case _:
                 raise SimulationError(f"camera {self.name} has no such thing as {type(command).__name__}")
 
-    def _plug(self, on: bool) -> None:
-        if self._thread is None or self._closing.is_set():
-            raise SimulationError(f"camera {self.name} is closed")
-        self._settled.clear()
-        self._wants_plug = on
-        os.write(self._rope, b"!")
-        if not self._settled.wait(_ANSWER_S):
-            raise SimulationError(f"camera {self.name} is stuck")
-
     def _picture(self) -> bytes:
         return png(draw(self._truth(), *self._size), *self._size)
 
     # the thread
 
-    def _run(self) -> None:
-        while not self._closing.is_set():
-            listener = self._listener
-            told = ready([self._bell] if listener is None else [self._bell, listener.fileno()])
-            if self._bell in told:
-                os.read(self._bell, 64)
-                self._settle()
-            elif listener is not None:
-                with suppress(OSError):
-                    client, _ = listener.accept()
-                    with client:
-                        client.settimeout(_CLIENT_S)
-                        self._serve(client)
-        self._wants_plug = False
-        self._settle()
+    def _begin(self) -> None:
+        self._listener = _listen(0)
+        self._number = self._listener.getsockname()[1]
 
-    def _settle(self) -> None:
-        if self._wants_plug and self._listener is None:
+    def _step(self) -> None:
+        bell, listener = self._errands.bell, self._listener
+        readable = ready([bell] if listener is None else [bell, listener.fileno()])
+        if bell in readable:
+            self._errands.run()
+        elif listener is not None:
+            with suppress(OSError):
+                client, _ = listener.accept()
+                with client:
+                    client.settimeout(_CLIENT_S)
+                    self._serve(client)
+
+    def _end(self) -> None:
+        self._plug(False)
+
+    def _plug(self, on: bool) -> None:
+        if on and self._listener is None:
             self._listener = _listen(self._number)
-        elif not self._wants_plug and self._listener is not None:
+        elif not on and self._listener is not None:
             self._listener.close()
             self._listener = None
-        self._settled.set()
 
     def _serve(self, client: socket.socket) -> None:
         request = b""
@@ -210,7 +173,7 @@ class SceneCamera:
     def _patient(self, client: socket.socket, until: float) -> bool:
         """Wait; False if the client gave up before, or the camera has other things to do."""
         left_s = until - time.monotonic()
-        return left_s <= 0 or not ready([client.fileno(), self._bell], timeout_s=left_s)
+        return left_s <= 0 or not ready([client.fileno(), self._errands.bell], timeout_s=left_s)
 
     def _answer(self, line: str) -> bytes:
         if line.split(" ")[:2] != ["GET", _TARGET]:

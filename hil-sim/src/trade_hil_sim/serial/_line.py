@@ -6,15 +6,12 @@ One thread owns the pty. It never sleeps on an answer that is due later, so a cl
 import heapq
 import os
 import select
-import threading
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Final, NamedTuple, Protocol
 
-from trade_hil_sim.faults._commands import SimulationError
 from trade_hil_sim.log._byte_log import ByteLog, Entry
-from trade_hil_sim.robot._mailbox import Mailbox
+from trade_hil_sim.robot._bus_thread import BusThread
 from trade_hil_sim.serial._pty import Terminal
 
 __all__ = ["Peer", "SerialLine"]
@@ -51,7 +48,7 @@ class _Chunk(NamedTuple):
     device_id: int | None
 
 
-class SerialLine:
+class SerialLine(BusThread):
     """A serial port that a client opens by the name `link`, with `peer` behind it.
 
     Args:
@@ -65,29 +62,14 @@ class SerialLine:
     def __init__(
         self, link: Path, peer: Peer, *, name: str = "line", log: ByteLog | None = None, paced: bool = True
     ) -> None:
-        self.link, self.name, self.paced = link, name, paced
+        super().__init__(name, ANSWER_S)
+        self.link, self.paced = link, paced
         self._peer, self._log = peer, log or ByteLog(keep=False)
         self._out: list[_Chunk] = []
         self._order = 0
         self._wire_free_at = 0.0
         self._baud: int | None = None
-        self._errands = Mailbox(f"bus {name}", ANSWER_S)
-        self._closing = False
         self._terminal: Terminal | None = None
-        self._thread: threading.Thread | None = None
-
-    def open(self) -> "SerialLine":
-        """Plug in and start the thread."""
-        if self._thread is not None:
-            raise SimulationError(f"bus {self.name} is open, or was; make a new one")
-        self._terminal = Terminal(self.link)
-        self._epoll = select.epoll()
-        self._errands.open()
-        self._epoll.register(self._errands.bell, select.EPOLLIN)
-        self._epoll.register(self._terminal.master, select.EPOLLIN)
-        self._thread = threading.Thread(target=self._run, name=f"sim-{self.name}", daemon=True)
-        self._thread.start()
-        return self
 
     # what a peer uses, in the line's thread
 
@@ -124,48 +106,27 @@ class SerialLine:
 
     def unplug(self) -> None:
         """Pull the plug: clients get an input/output error, the link is gone, pending answers are lost."""
-        self._in_thread(self._unplug)
+        self._ask(self._unplug)
 
     def replug(self) -> None:
         """Plug in again: a new pty behind the same link. Clients must open it anew."""
-        self._in_thread(self._replug)
+        self._ask(self._replug)
 
     def nudge(self) -> None:
         """Ask the peer again when it wants to be woken; call this when it has changed its mind."""
         self._errands.ring()
 
-    def close(self) -> None:
-        """Hang up, end the thread, remove the link. Idempotent."""
-        thread = self._thread
-        if thread is None or self._closing:
-            return
-        self._closing = True
-        self._errands.ring()
-        if threading.current_thread() is not thread:
-            thread.join(ANSWER_S)
-
-    def __enter__(self) -> "SerialLine":
-        return self.open()
-
-    def __exit__(self, *exc: object) -> None:
-        self.close()
-
     # the thread
 
-    def _in_thread(self, act: Callable[[], None]) -> None:
-        if threading.current_thread() is self._thread:
-            return act()
-        return self._errands.ask(act)
+    def _begin(self) -> None:
+        self._terminal = Terminal(self.link)
+        self._epoll = select.epoll()
+        self._epoll.register(self._errands.bell, select.EPOLLIN)
+        self._epoll.register(self._terminal.master, select.EPOLLIN)
 
-    def _run(self) -> None:
-        try:
-            while not self._closing:
-                self._step()
-        finally:
-            self._closing = True
-            self._unplug("closed")
-            self._errands.close()
-            self._epoll.close()
+    def _end(self) -> None:
+        self._unplug("closed")
+        self._epoll.close()
 
     def _step(self) -> None:
         for fd, _ in self._epoll.poll(self._patience_s()):

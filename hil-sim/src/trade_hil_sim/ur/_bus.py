@@ -2,12 +2,11 @@
 
 import random
 import socket
-import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, TypeVar
+from typing import TYPE_CHECKING, Final
 
 import msgspec
 
@@ -16,8 +15,7 @@ from trade_hil_sim.faults._active import ActiveFaults
 from trade_hil_sim.faults._commands import SimulationError
 from trade_hil_sim.log._byte_log import ByteLog, Entry
 from trade_hil_sim.mechanics._truth import ArmTruth, BusState
-from trade_hil_sim.robot._mailbox import Mailbox
-from trade_hil_sim.robot._polling import ready
+from trade_hil_sim.robot._bus_thread import BusThread, ready
 
 from ._arm import HOME, Arm
 from ._client import MOST_HELD, Client
@@ -42,10 +40,9 @@ _TRIES: Final = 100
 _CATCH_UP: Final = 25
 """Cycles made up for when this thread was held up; more are skipped, as if the controller had stood still."""
 _MOVING: Final = ("actual_q", "actual_qd", "target_q", "target_qd", "actual_TCP_pose", "target_TCP_pose")
-_T = TypeVar("_T")
 
 
-class UrBus:
+class UrBus(BusThread):
     """One controller on a loopback address of its own; its ports are those of a real one.
 
     Args:
@@ -67,7 +64,8 @@ class UrBus:
         remote: bool = True,
         log: ByteLog | None = None,
     ) -> None:
-        self.name, self.port = name, host
+        super().__init__(name, ANSWER_S)
+        self.port = host
         self.arm = Arm() if arm is None else arm
         self.log = ByteLog() if log is None else log
         self.arm.emit = self._emit
@@ -84,9 +82,6 @@ class UrBus:
         self._sessions: dict[Client, RtdeSession] = {}
         self._count = 0
         self._boots_at: float | None = None
-        self._errands = Mailbox(f"bus {name}", ANSWER_S)
-        self._closing = False
-        self._thread: threading.Thread | None = None
 
     @classmethod
     def from_robot(
@@ -112,31 +107,6 @@ class UrBus:
 
     # --- what anybody uses
 
-    def open(self) -> "UrBus":
-        """Switch it on: its ports can be connected to."""
-        if self._thread is not None:
-            raise SimulationError(f"bus {self.name} is open, or was; make a new one")
-        self._listen()
-        self._errands.open()
-        self.arm.t = time.monotonic()
-        self._thread = threading.Thread(target=self._run, name=f"sim-{self.name}", daemon=True)
-        self._thread.start()
-        return self
-
-    def close(self) -> None:
-        """Hang up and end the thread. Idempotent; a log passed in stays open."""
-        if self._thread is None or self._closing:
-            return
-        self._closing = True
-        self._errands.ring()
-        self._thread.join(ANSWER_S)
-
-    def __enter__(self) -> "UrBus":
-        return self.open()
-
-    def __exit__(self, *exc: object) -> None:
-        self.close()
-
     def state(self) -> BusState:
         """The truth, now."""
         return self._in_thread(self._state)
@@ -147,25 +117,16 @@ class UrBus:
 
     # --- the thread
 
-    def _in_thread(self, act: Callable[[], _T]) -> _T:
-        if self._closing:
-            raise SimulationError(f"bus {self.name} is closed")
-        if self._thread is None or threading.current_thread() is self._thread:
-            return act()
-        return self._errands.ask(act)
+    def _begin(self) -> None:
+        self._listen()
+        self.arm.t = time.monotonic()
 
-    def _run(self) -> None:
-        try:
-            while not self._closing:
-                self._serve()
-                self._pass_time(time.monotonic())
-                for client in tuple(self._clients):
-                    if not client.flush():
-                        self._drop(client)
-        finally:
-            self._closing = True
-            self._switch_off()
-            self._errands.close()
+    def _step(self) -> None:
+        self._serve()
+        self._pass_time(time.monotonic())
+        for client in tuple(self._clients):
+            if not client.flush():
+                self._drop(client)
 
     def _serve(self) -> None:
         watched: list[int | Client | socket.socket] = [self._errands.bell, *self._listeners.values()]
@@ -274,7 +235,7 @@ class UrBus:
         client.close()
         self._note("left", source=client.name)
 
-    def _switch_off(self) -> None:
+    def _end(self) -> None:
         for listener in self._listeners.values():
             listener.close()
         self._listeners = {}
@@ -331,7 +292,7 @@ class UrBus:
     def _do_to_ports(self, command: faults.Unplug | faults.Replug | faults.HangUp | faults.Local) -> None:
         match command:
             case faults.Unplug():
-                self._switch_off()
+                self._end()
                 self._note("unplugged")
             case faults.Replug():
                 if not self._listeners:
@@ -359,7 +320,7 @@ class UrBus:
             case faults.BrownOut():
                 self._program.stop()
                 arm.reboot()
-                self._switch_off()
+                self._end()
                 self._note("rebooted")
                 self._boots_at = time.monotonic() + _REBOOT_S
             case _:
