@@ -226,7 +226,7 @@ def test_a_swap_shows_in_its_identity_and_what_it_has_not_got_is_refused(bench: 
     assert bench.get(0x1018, 2) == 402
     bench.drive.do(WrongModel(number=77), bench.t)
     assert bench.get(0x1018, 2) == 77
-    with pytest.raises(SimulationError, match="HardwareFault is nothing a CiA 402 drive can have"):
+    with pytest.raises(SimulationError, match="HardwareFault is nothing that happens to a CiA 402 drive"):
         bench.drive.do(HardwareFault(), bench.t)
 
 

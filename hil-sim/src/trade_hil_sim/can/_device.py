@@ -1,28 +1,39 @@
-"""What sits on a CAN bus, as far as the bus is concerned."""
+"""What sits on a CAN bus: what the bus asks of a device, and what devices that move a joint have in common."""
 
+from abc import abstractmethod
 from collections.abc import Callable
+from math import inf
 from typing import Protocol
 
 from trade_hil_sim.faults import _commands as faults
 from trade_hil_sim.log._byte_log import Entry
+from trade_hil_sim.mechanics._device import Emit, JointModel
+from trade_hil_sim.mechanics._shaft import Shaft
 from trade_hil_sim.mechanics._truth import DeviceState
 
 from ._frame import Frame
 
-__all__ = ["Device"]
+__all__ = ["Device", "JointDevice", "Send"]
+
+Send = Callable[[Frame, float], None]
+"""Sends a frame from the time given on."""
 
 
 class Device(Protocol):
     """What sits on the bus. Everything is called from the bus's thread, with the time in seconds (monotonic)."""
 
-    device_id: int
+    @property
+    def device_id(self) -> int:
+        """Its id on the bus."""
+        ...
+
     joint: str
     due: float
     """When `advance` should be called next; infinity if only frames matter."""
-    send: Callable[[Frame, float], None]
-    """Set by the bus: sends a frame from the time given on."""
-    emit: Callable[[Entry], None]
-    """Set by the bus: puts a line into the log, with the bus's name filled in."""
+    send: Send
+    """Set by the bus."""
+    emit: Emit
+    """Set by the bus."""
 
     def hear(self, frame: Frame, t: float) -> None:
         """A frame has come; not called while it is off the bus."""
@@ -43,3 +54,133 @@ class Device(Protocol):
     def state(self, t: float) -> DeviceState:
         """The truth about it."""
         ...
+
+
+class JointDevice(JointModel):
+    """A device that moves a joint.
+
+    Args:
+        device_id: its id on the bus.
+        shaft: what it moves.
+        joint: name of the joint, for the log.
+        model: what it is called.
+        rad_per_unit: what one unit of its shaft's position is at the joint, negative if that turns against it.
+        offset_rad: the joint's angle at position 0.
+    """
+
+    counts_per_unit: float = 1000
+    """In the log and in orders, where the device itself has no counts."""
+
+    def __init__(
+        self, device_id: int, shaft: Shaft, *, joint: str, model: str, rad_per_unit: float, offset_rad: float
+    ) -> None:
+        super().__init__(joint, model, rad_per_unit, offset_rad)
+        self._device_id, self._shaft = device_id, shaft
+        self.send: Send = lambda frame, t: None  # noqa: ARG005 - the bus sets it
+        self.due = inf
+        self._frozen: tuple[float, float] | None = None
+        """Position and speed that it shows instead of the true ones."""
+
+    @property
+    def device_id(self) -> int:
+        """Its id on the bus."""
+        return self._device_id
+
+    @abstractmethod
+    def hear(self, frame: Frame, t: float) -> None:
+        """A frame has come."""
+
+    @abstractmethod
+    def _plan(self, t: float) -> None:
+        """Log what is new, and say when to come again."""
+
+    @abstractmethod
+    def _place(self, position: float, t: float) -> None:
+        """Turn the shaft by hand, to a position as the device tells it."""
+
+    @abstractmethod
+    def _restart(self, t: float) -> None:
+        """Begin again, as after a loss of power."""
+
+    # where it is
+
+    def _position(self, t: float) -> float:
+        """Where the shaft is, as the device tells it."""
+        return self._shaft.position(t)
+
+    def counts(self, t: float) -> int:
+        """Where the shaft really is, in counts."""
+        return round(self._position(t) * self.counts_per_unit)
+
+    def _units(self, t: float) -> tuple[float, float]:
+        return self._position(t), self._shaft.speed(t)
+
+    def _moving(self, t: float) -> bool:
+        return self._shaft.moving(t)
+
+    def _shown(self, t: float) -> tuple[float, float]:
+        """Position and speed as its sensor has them."""
+        return (self._position(t), self._shaft.speed(t)) if self._frozen is None else self._frozen
+
+    # faults
+
+    def do(self, command: faults.Command, t: float) -> None:
+        """Carry out a fault or an order; raises `SimulationError` for what it cannot have."""
+        super().do(command, t)
+        self._plan(t)
+
+    def _do_rare(self, command: faults.Command, t: float) -> None:
+        match command:
+            case faults.Place():
+                self._place(command.counts / self.counts_per_unit, t)
+            case faults.BusOff():
+                self._bus_off(command.on, t)
+            case _:
+                super()._do_rare(command, t)
+
+    def _bus_off(self, on: bool, t: float) -> None:
+        """Its controller is off the bus, or on it again."""
+        self.note("bus_off" if on else "restarted", t)
+
+    def heal(self, t: float) -> None:
+        """End every fault of sensors and shaft; errors stay until they are cleared."""
+        super().heal(t)
+        self._plan(t)
+
+    def freeze(self, on: bool, t: float, *, tick: bool = False) -> None:  # noqa: ARG002 - it has no clock to show
+        """Let the measured position stand still, or show the truth again."""
+        self._frozen = (self._position(t), 0.0) if on else None
+
+    def brown_out(self, t: float) -> None:
+        """Lose power for a moment."""
+        self.note("brown_out", t)
+        self._restart(t)
+
+    # the log
+
+    def _journal(
+        self,
+        name: str,
+        data: bytes,
+        moves: bool,
+        t: float,
+        *,
+        address: int | None = None,
+        registers: tuple[str, ...] = (),
+        position_counts: int | None = None,
+    ) -> None:
+        """Log an instruction that is carried out."""
+        entry = Entry(
+            t,
+            "",
+            "instruction",
+            name,
+            self.device_id,
+            joint=self.joint,
+            hex=data.hex(),
+            address=address,
+            registers=registers,
+            moves=moves,
+            position_counts=position_counts,
+        )
+        self.emit(entry)

@@ -1,16 +1,14 @@
 """A servo drive (CiA 402): state machine, modes, faults and sensors, behind a CANopen node. Time is an argument."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from math import inf, tau
 from typing import Final
 
-from trade_hil_sim.can import Frame
+from trade_hil_sim.can import Frame, JointDevice
 from trade_hil_sim.faults import _commands as faults
-from trade_hil_sim.faults._commands import SimulationError
-from trade_hil_sim.log._byte_log import Entry
+from trade_hil_sim.mechanics._device import Controller
 from trade_hil_sim.mechanics._shaft import Shaft
-from trade_hil_sim.mechanics._truth import DeviceState
 
 from ._machine import Machine
 from ._modes import MOTION, Mode, Modes
@@ -36,6 +34,7 @@ TOO_HOT: Final = 0x4310
 VOLTS: Final = (18.0, 60.0)
 HOTTEST_C: Final = 85
 FULL: Final = 1000
+PRODUCT: Final = 402
 
 
 def _named(model: str) -> list[Object]:
@@ -43,7 +42,7 @@ def _named(model: str) -> list[Object]:
     return [replace(o, default=model.encode()) if o.name == "device_name" else o for o in OBJECTS]
 
 
-class Drive:
+class Drive(JointDevice):
     """One drive; it boots when made.
 
     Args:
@@ -58,6 +57,10 @@ class Drive:
         t: now, in seconds.
     """
 
+    thing = "a CiA 402 drive"
+    healthy = (48.0, 35)
+    counts_per_unit = 1
+
     def __init__(
         self,
         device_id: int,
@@ -71,21 +74,20 @@ class Drive:
         offset_rad: float = 0.0,
         t: float = 0.0,
     ) -> None:
-        self.device_id, self.joint, self.model = device_id, joint, model
-        self._rad_per_count = (-1 if reversed_ else 1) * tau / (counts_per_rev * gear)
-        self._offset_rad = offset_rad
-        self.send: Callable[[Frame, float], None] = lambda frame, t: None  # noqa: ARG005 - the bus sets it
-        self.emit: Callable[[Entry], None] = lambda entry: None  # noqa: ARG005 - the bus sets it
+        super().__init__(
+            device_id,
+            Shaft(position_counts, t),
+            joint=joint,
+            model=model,
+            rad_per_unit=(-1 if reversed_ else 1) * tau / (counts_per_rev * gear),
+            offset_rad=offset_rad,
+        )
         self.due = t
         self.store = Store([*_named(model), *pdo_objects(device_id)])
-        self._shaft = Shaft(position_counts, t)
         self.modes = Modes(self.store, self._shaft, counts_per_rev, self.note)
         self._machine = Machine(self.store, self._shaft, self.modes, self.note)
         self._mode_due = self._look_due = inf
         self._behind_since: float | None = None
-        self._frozen: tuple[float, float] | None = None
-        self._volts, self._celsius = 48.0, 35
-        self._underway = False
         self.node = Node(device_id, self.store, self, t)
         self._plan(t)
 
@@ -142,7 +144,7 @@ class Drive:
         self.store.set("following_error", round(wanted - position))
         self.store.set("torque_actual", torque)
         self.store.set("current_actual", torque)
-        self.store.set("dc_link_mv", round(self._volts * 1e3))
+        self.store.set("dc_link_mv", round(self.supply_v * 1e3))
 
     def _torque(self, acceleration: float) -> int:
         most = self.store.get("max_torque")
@@ -167,7 +169,7 @@ class Drive:
         """Take what a client has written, all at once."""
         changes = [entry.name for entry, value in values if self.store.get(entry.name) != value]
         if changes or name == "sdo_write":
-            self._journal(name, values, bool(MOTION.intersection(changes)), t)
+            self._written(name, values, bool(MOTION.intersection(changes)), t)
         before = self.store.get("controlword")
         for entry, value in values:
             self.store.set(entry.name, value)
@@ -205,23 +207,6 @@ class Drive:
         """Send a frame."""
         self.send(frame, t)
 
-    def note(self, name: str, t: float, detail: str = "") -> None:
-        """Put an event into the log."""
-        counts = round(self._shaft.position(t) - self.modes.zero)
-        self.emit(
-            Entry(
-                t,
-                "",
-                "event",
-                name,
-                self.device_id,
-                joint=self.joint,
-                position_counts=counts,
-                position_rad=self._rad(t),
-                detail=detail,
-            )
-        )
-
     def _change_mode(self, t: float) -> None:
         self._mode_due = inf
         wanted = self.store.get("mode")
@@ -249,47 +234,38 @@ class Drive:
         if t - self._behind_since >= self.store.get("following_error_timeout_ms") / 1e3:
             self._machine.fail(FOLLOWING_ERROR, t, self.node)
 
-    def do(self, command: faults.Command, t: float) -> None:
-        """Carry out a fault or an order; raises `SimulationError` for what it has not got."""
-        self.advance(t)
+    def _do_rare(self, command: faults.Command, t: float) -> None:
         match command:
-            case faults.Freeze():
-                self._frozen = (self._shaft.position(t), self._shaft.speed(t)) if command.on else None
-            case faults.Jam():
-                self._jam(command.on, t)
-            case faults.Place():
-                self._place(command.counts, t)
-            case faults.WrongModel():
-                self.store.set("product_code", command.number)
-            case faults.BrownOut():
-                self.note("brown_out", t)
-                self.node.reset(t)
             case faults.Emergency():
                 if command.lasting:
                     self._machine.causes.add(command.code)
                 self._machine.fail(command.code, t, self.node)
-            case faults.Supply():
-                self._supply(command, t)
-            case faults.BusOff():
-                self._bus_off(command.on, t)
             case _:
-                raise SimulationError(f"{type(command).__name__} is nothing a CiA 402 drive can have")
-        self._plan(t)
+                super()._do_rare(command, t)
+
+    def freeze(self, on: bool, t: float, *, tick: bool = False) -> None:  # noqa: ARG002 - it has no clock to show
+        """Let the measured position and speed stand still, or show the truth again."""
+        self._frozen = (self._shaft.position(t), self._shaft.speed(t)) if on else None
 
     def _bus_off(self, on: bool, t: float) -> None:
-        self.note("bus_off" if on else "restarted", t)
+        super()._bus_off(on, t)
         if on:
             self.link_lost("bus-off", t)
 
-    def _jam(self, on: bool, t: float) -> None:
+    def jam(self, on: bool, t: float) -> None:
+        """Hold the shaft fast, or let go of it."""
         self._shaft.jam(on, t)
         if not on and self.state_now is State.OPERATION_ENABLED:
             self.modes.enable(t)
 
-    def _place(self, counts: int, t: float) -> None:
+    def _unjam(self, t: float) -> None:
+        if self._shaft.jammed:
+            self.jam(False, t)
+
+    def _place(self, position: float, t: float) -> None:
         """By hand; an enabled drive goes back to where it should be, or fails if that is too far."""
         demand = self._shaft.demand.at(t)[0]
-        self._shaft.place(counts + self.modes.zero, t)
+        self._shaft.place(position + self.modes.zero, t)
         self.note("placed", t)
         if self.state_now is not State.OPERATION_ENABLED:
             self._shaft.forget(t)
@@ -298,13 +274,18 @@ class Drive:
         else:
             self._shaft.go(t, demand, self.store.get("max_profile_velocity"), self.store.get("max_acceleration"))
 
-    def _supply(self, command: faults.Supply, t: float) -> None:
-        self._volts = self._volts if command.voltage_v is None else command.voltage_v
-        self._celsius = self._celsius if command.temperature_c is None else command.temperature_c
+    def wrong_model(self, number: int) -> None:
+        """Say that it is another product."""
+        self.store.set("product_code", number)
+
+    def _restart(self, t: float) -> None:
+        self.node.reset(t)
+
+    def _check_supply(self, t: float) -> None:
         now = {
-            OVER_VOLTAGE: self._volts > VOLTS[1],
-            UNDER_VOLTAGE: self._volts < VOLTS[0],
-            TOO_HOT: self._celsius > HOTTEST_C,
+            OVER_VOLTAGE: self.supply_v > VOLTS[1],
+            UNDER_VOLTAGE: self.supply_v < VOLTS[0],
+            TOO_HOT: self.temperature_c > HOTTEST_C,
         }
         for code, wrong in now.items():
             if wrong and code not in self._machine.causes:
@@ -313,59 +294,35 @@ class Drive:
             elif not wrong:
                 self._machine.causes.discard(code)
 
-    def heal(self, t: float) -> None:
-        """End every fault of sensors and shaft; errors stay until they are reset."""
-        self.advance(t)
-        self._frozen, self._volts, self._celsius = None, 48.0, 35
+    def _restore(self, t: float) -> None:  # noqa: ARG002 - at once
+        self.supply_v, self.temperature_c = self.healthy
         self._machine.causes.clear()
-        self.store.set("product_code", 402)
-        if self._shaft.jammed:
-            self._jam(False, t)
-        self._plan(t)
+        self.wrong_model(PRODUCT)
 
     # the truth
 
-    def _rad(self, t: float) -> float:
-        return self._offset_rad + self._shaft.position(t) * self._rad_per_count
+    def _position(self, t: float) -> float:
+        return self._shaft.position(t) - self.modes.zero
 
-    def _note_motion(self, t: float) -> None:
-        moving = self._shaft.moving(t)
-        if moving != self._underway:
-            self._underway = moving
-            self.note("motion_started" if moving else "at_rest", t)
+    def _units(self, t: float) -> tuple[float, float]:
+        return self._shaft.position(t), self._shaft.speed(t)
 
-    def _journal(self, name: str, values: Sequence[tuple[Object, int]], moves: bool, t: float) -> None:
-        self.emit(
-            Entry(
-                t,
-                "",
-                "instruction",
-                name,
-                self.device_id,
-                joint=self.joint,
-                hex=b"".join(entry.encode(value) for entry, value in values).hex(),
-                address=values[0][0].index if name == "sdo_write" else None,
-                registers=tuple(entry.name for entry, _ in values),
-                moves=moves,
-                position_counts=round(self._shaft.position(t) - self.modes.zero),
-            )
+    def _written(self, name: str, values: Sequence[tuple[Object, int]], moves: bool, t: float) -> None:
+        self._journal(
+            name,
+            b"".join(entry.encode(value) for entry, value in values),
+            moves,
+            t,
+            address=values[0][0].index if name == "sdo_write" else None,
+            registers=tuple(entry.name for entry, _ in values),
+            position_counts=self.counts(t),
         )
 
-    def state(self, t: float) -> DeviceState:
-        """The truth about it."""
-        self.advance(t)
-        return DeviceState(
-            device_id=self.device_id,
-            joint=self.joint,
-            model=self.model,
-            position_counts=round(self._shaft.position(t) - self.modes.zero),
-            position_rad=self._rad(t),
-            velocity_rad_s=self._shaft.speed(t) * self._rad_per_count,
+    def _controller(self) -> Controller:
+        return Controller(
             goal_counts=self.store.get("target_position"),
             torque=self._machine.powered,
-            moving=self._shaft.moving(t),
             operating_mode=int(self.modes.mode),
             hardware_error=self.store.get("error_code"),
             watchdog=self.store.get("consumer_heartbeat_1") & 0xFFFF,
-            absent=False,
         )

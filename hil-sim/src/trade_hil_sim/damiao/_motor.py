@@ -1,28 +1,21 @@
 """A Damiao motor: registers, modes, status and time-out behind its two identifiers. Time is an argument."""
 
 import struct
-from collections.abc import Callable
 from math import copysign, inf
 from typing import Final
 
-from msgspec import structs
-
-from trade_hil_sim.can import Frame
+from trade_hil_sim.can import Frame, JointDevice
 from trade_hil_sim.faults import _commands as faults
-from trade_hil_sim.faults._commands import SimulationError
-from trade_hil_sim.log._byte_log import Entry
+from trade_hil_sim.mechanics._device import Controller
 from trade_hil_sim.mechanics._shaft import Shaft
-from trade_hil_sim.mechanics._truth import DeviceState
 
 from . import _table as table
 from ._codec import Impedance, decode_mit, encode_feedback
 from ._names import ORDERS, TARGETS
 from ._table import MODELS, Mode, Register, Status
 
-__all__ = ["COUNTS_PER_RAD", "Motor"]
+__all__ = ["Motor"]
 
-COUNTS_PER_RAD: Final = 1000
-"""In the log and in orders: a motor itself tells radians."""
 QUICK: Final = 400.0
 """The most it accelerates, in rad/s^2: an assumption, as are the two below."""
 COAST: Final = 60.0
@@ -36,10 +29,9 @@ HARDLY_RAD: Final = 5e-4
 """Nearer than it can tell."""
 VOLTS: Final = (15.0, 52.0)
 HOTTEST_C: Final = 120
-WARM_C: Final = 30
 
 
-class Motor:
+class Motor(JointDevice):
     """One motor; it is disabled when made.
 
     Args:
@@ -53,6 +45,8 @@ class Motor:
         t: now, in seconds.
     """
 
+    thing = "a Damiao motor"
+
     def __init__(
         self,
         device_id: int,
@@ -65,12 +59,14 @@ class Motor:
         offset_rad: float = 0.0,
         t: float = 0.0,
     ) -> None:
-        self.device_id, self.joint, self.model = device_id, joint, model
-        self.send: Callable[[Frame, float], None] = lambda frame, t: None  # noqa: ARG005 - the bus sets it
-        self.emit: Callable[[Entry], None] = lambda entry: None  # noqa: ARG005 - the bus sets it
-        self._joint_rad = (-1 if reversed_ else 1) / gear
-        self._offset_rad = offset_rad
-        self._shaft = Shaft(position_rad, t)
+        super().__init__(
+            device_id,
+            Shaft(position_rad, t),
+            joint=joint,
+            model=model,
+            rad_per_unit=(-1 if reversed_ else 1) / gear,
+            offset_rad=offset_rad,
+        )
         self._zero = 0.0
         """Where its shaft was when it was told to call that 0."""
         self._goal = position_rad
@@ -79,15 +75,12 @@ class Motor:
         self._status = Status.DISABLED
         self._lasting: Status | None = None
         """What it complains of again when it is cleared."""
-        self._frozen: tuple[float, float] | None = None
-        self._celsius = WARM_C
         self._fed = t
         self._followed = t
-        self._underway: bool = False
         self._plan(t)
 
     def _power_on(self) -> None:
-        ranges = MODELS[self.model]
+        ranges = MODELS[self.model_name]
         self._registers = dict.fromkeys(sorted(table.KNOWN), 0.0) | {
             Register.ACCELERATION: QUICK,
             Register.DECELERATION: -QUICK,
@@ -138,21 +131,16 @@ class Motor:
     def advance(self, t: float) -> None:
         """Do what is due by itself."""
         if self._expires() <= t:
-            self._log("watchdog_expired", t)
+            self.note("watchdog_expired", t)
             self._fail(Status.LOST_COMMUNICATION, t)
         if self._shaft.settles_at is not None and self._shaft.settles_at <= t:
             self._shaft.settle(t, self.ranges.velocity_rad_s, self._registers[Register.ACCELERATION])
         self._plan(t)
 
     def _plan(self, t: float) -> None:
-        moving = self._shaft.moving(t)
-        if moving != self._underway:
-            self._underway = moving
-            self._log("motion_started" if moving else "at_rest", t)
-        ends = self._shaft.actual.ends
-        rests = ends if moving and ends > t and not self._shaft.actual.final_speed else inf
+        self._note_motion(t)
         settles_at = self._shaft.settles_at
-        self.due = min(self._expires(), rests, inf if settles_at is None else settles_at)
+        self.due = min(self._expires(), self._shaft.rests_at(t), inf if settles_at is None else settles_at)
 
     def _expires(self) -> float:
         ticks = self._registers[Register.TIMEOUT]
@@ -180,14 +168,17 @@ class Motor:
         self.send(Frame(int(self._registers[Register.MASTER_ID]), data), t)
 
     def _write(self, number: int, data: bytes, t: float) -> None:
-        self._journal("write_register", data, number == Register.CONTROL_MODE, t, number)
+        self._journal("write_register", data, number == Register.CONTROL_MODE, t, address=number)
         if number not in table.READ_ONLY:
             [self._registers[number]] = struct.unpack("<I" if number in table.WHOLE else "<f", data)
 
     def _feed_back(self, t: float) -> None:
-        place = (self._place(t), self._shaft.speed(t)) if self._frozen is None else self._frozen
         data = encode_feedback(
-            self._status, self.device_id, (*place, self._torque(t)), self.ranges, (self._celsius, self._celsius)
+            self._status,
+            self.device_id,
+            (*self._shown(t), self._torque(t)),
+            self.ranges,
+            (self.temperature_c, self.temperature_c),
         )
         self.send(Frame(int(self._registers[Register.MASTER_ID]), data), t)
 
@@ -231,22 +222,22 @@ class Motor:
 
     def _enable(self, t: float) -> None:
         if self._status not in {Status.DISABLED, Status.LOST_COMMUNICATION}:
-            self._log("refused", t, self._status.name)
+            self.note("refused", t, self._status.name)
         elif not self._enabled:
             self._status = Status.ENABLED
-            self._log("torque_on", t)
+            self.note("torque_on", t)
             if self.mode in {Mode.POSITION_VELOCITY, Mode.FORCE_POSITION}:
                 self._go(self._goal, self.ranges.velocity_rad_s, t)
 
     def _let_go(self, t: float, status: Status) -> None:
         if self._enabled:
-            self._log("torque_off", t)
+            self.note("torque_off", t)
             self._shaft.forget(t)
             self._shaft.spin(t, 0.0, COAST)
         self._status = status
 
     def _fail(self, status: Status, t: float) -> None:
-        self._log("error", t, status.name)
+        self.note("error", t, status.name)
         self._let_go(t, status)
 
     def _target(self, name: str, mode: Mode, data: bytes, t: float) -> None:
@@ -274,7 +265,7 @@ class Motor:
         period_s, self._followed = max(FOLLOW_S, 2 * (t - self._followed)), t
         if not self._enabled or (self._goal == before and not self._shaft.parted):
             return
-        if period_s > SLOWEST_S or abs(self._goal - self._place(t)) > most * period_s:
+        if period_s > SLOWEST_S or abs(self._goal - self._position(t)) > most * period_s:
             self._go(self._goal, most, t)
         else:
             quick = self._registers[Register.ACCELERATION]
@@ -295,95 +286,67 @@ class Motor:
             self._shaft.spin(t, copysign(most, pull) if pull else 0.0, abs(pull) / INERTIA or COAST)
 
     def _go(self, goal: float, most: float, t: float) -> None:
-        if abs(goal - self._place(t)) < HARDLY_RAD and not self._shaft.moving(t) and not self._shaft.parted:
+        if abs(goal - self._position(t)) < HARDLY_RAD and not self._shaft.moving(t) and not self._shaft.parted:
             return  # friction holds it
         self._shaft.go(t, goal + self._zero, most, self._registers[Register.ACCELERATION])
 
     # faults
 
-    def do(self, command: faults.Command, t: float) -> None:
-        """Carry out a fault or an order; raises `SimulationError` for what it has not got."""
-        self.advance(t)
+    def _do_rare(self, command: faults.Command, t: float) -> None:
         match command:
-            case faults.Freeze():
-                self._frozen = (self._place(t), 0.0) if command.on else None
-            case faults.Jam():
-                self._shaft.jam(command.on, t)
-            case faults.Place():
-                self._shaft.place(command.counts / COUNTS_PER_RAD + self._zero, t)
-                self._shaft.forget(t)
-                self._log("placed", t)
-            case faults.WrongModel():
-                self._registers[Register.POSITION_MAX] = float(command.number)
-            case faults.BrownOut():
-                self._log("brown_out", t)
-                self._let_go(t, Status.DISABLED)
-                self._power_on()
             case faults.HardwareFault():
                 self._fail(Status(command.bits), t)
-            case faults.Supply():
-                self._supply(command, t)
-            case faults.BusOff():
-                self._log("bus_off" if command.on else "restarted", t)
             case _:
-                raise SimulationError(f"{type(command).__name__} is nothing a Damiao motor can have")
-        self._plan(t)
+                super()._do_rare(command, t)
 
-    def _supply(self, command: faults.Supply, t: float) -> None:
+    def jam(self, on: bool, t: float) -> None:
+        """Hold the shaft fast, or let go of it."""
+        self._shaft.jam(on, t)
+
+    def _place(self, position: float, t: float) -> None:
+        self._shaft.place(position + self._zero, t)
+        self._shaft.forget(t)
+        self.note("placed", t)
+
+    def wrong_model(self, number: int) -> None:
+        """Have the range of positions of another model."""
+        self._registers[Register.POSITION_MAX] = float(number)
+
+    def _restart(self, t: float) -> None:
+        self._let_go(t, Status.DISABLED)
+        self._power_on()
+
+    def set_supply(self, t: float, *, voltage_v: float | None = None, temperature_c: int | None = None) -> None:
+        """Change what it measures; it fails by what is outside its limits, and forgets what was before."""
         self._lasting = None
-        if command.temperature_c is not None:
-            self._celsius = command.temperature_c
-            self._lasting = Status.ROTOR_TOO_HOT if self._celsius > HOTTEST_C else None
-        if command.voltage_v is not None and not VOLTS[0] <= command.voltage_v <= VOLTS[1]:
-            self._lasting = Status.UNDER_VOLTAGE if command.voltage_v < VOLTS[0] else Status.OVER_VOLTAGE
+        if temperature_c is not None:
+            self.temperature_c = temperature_c
+            self._lasting = Status.ROTOR_TOO_HOT if temperature_c > HOTTEST_C else None
+        if voltage_v is not None and not VOLTS[0] <= voltage_v <= VOLTS[1]:
+            self._lasting = Status.UNDER_VOLTAGE if voltage_v < VOLTS[0] else Status.OVER_VOLTAGE
         if self._lasting is not None:
             self._fail(self._lasting, t)
 
-    def heal(self, t: float) -> None:
-        """End every fault of sensors and shaft; errors stay until they are cleared."""
-        self.advance(t)
-        self._frozen, self._lasting, self._celsius = None, None, WARM_C
-        self._registers[Register.POSITION_MAX] = MODELS[self.model].position_rad
-        if self._shaft.jammed:
-            self._shaft.jam(False, t)
-            if self._enabled and self.mode == Mode.POSITION_VELOCITY:
-                self._go(self._goal, self.ranges.velocity_rad_s, t)
-        self._plan(t)
+    def _restore(self, t: float) -> None:  # noqa: ARG002 - at once
+        (_, self.temperature_c), self._lasting = self.healthy, None
+        self._registers[Register.POSITION_MAX] = MODELS[self.model_name].position_rad
+
+    def _unjam(self, t: float) -> None:
+        held = self._shaft.jammed
+        self.jam(False, t)
+        if held and self._enabled and self.mode == Mode.POSITION_VELOCITY:
+            self._go(self._goal, self.ranges.velocity_rad_s, t)
 
     # the truth
 
-    def _place(self, t: float) -> float:
+    def _position(self, t: float) -> float:
         return self._shaft.position(t) - self._zero
 
-    def _truth(self, t: float) -> tuple[int, float]:
-        place = self._place(t)
-        return round(place * COUNTS_PER_RAD), self._offset_rad + place * self._joint_rad
-
-    def _log(self, name: str, t: float, detail: str = "") -> None:
-        counts, angle_rad = self._truth(t)
-        told = Entry(t, "", "event", name, self.device_id, joint=self.joint, detail=detail)
-        self.emit(structs.replace(told, position_counts=counts, position_rad=angle_rad))
-
-    def _journal(self, name: str, data: bytes, moves: bool, t: float, address: int | None = None) -> None:
-        told = Entry(t, "", "instruction", name, self.device_id, joint=self.joint, hex=data.hex(), moves=moves)
-        self.emit(told if address is None else structs.replace(told, address=address))
-
-    def state(self, t: float) -> DeviceState:
-        """The truth about it."""
-        self.advance(t)
-        counts, angle_rad = self._truth(t)
-        return DeviceState(
-            device_id=self.device_id,
-            joint=self.joint,
-            model=self.model,
-            position_counts=counts,
-            position_rad=angle_rad,
-            velocity_rad_s=self._shaft.speed(t) * self._joint_rad,
-            goal_counts=round(self._goal * COUNTS_PER_RAD),
+    def _controller(self) -> Controller:
+        return Controller(
+            goal_counts=round(self._goal * self.counts_per_unit),
             torque=self._enabled,
-            moving=self._shaft.moving(t),
             operating_mode=self.mode,
             hardware_error=int(self._status) if self._status >= Status.OVER_VOLTAGE else 0,
             watchdog=round(self._registers[Register.TIMEOUT]),
-            absent=False,
         )

@@ -37,6 +37,11 @@ class Shaft:
         """Whether it turns, or is about to."""
         return abs(self.actual.final_speed) > STILL or (t < self.actual.ends and bool(self.actual.stretches))
 
+    def rests_at(self, t: float) -> float:
+        """When it comes to rest by itself; infinity if it has, or does not."""
+        ends = self.actual.ends
+        return ends if ends > t and self.moving(t) and not self.actual.final_speed else inf
+
     def next_corner(self, t: float) -> float:
         """When its acceleration changes next, after `t`."""
         corner = self.actual.begins

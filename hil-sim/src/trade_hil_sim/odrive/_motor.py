@@ -1,6 +1,6 @@
 """The controller of an axis and the motor it turns: which inputs send it where. Turns, turns/s; time is an argument."""
 
-from math import copysign, inf
+from math import copysign
 from typing import Final
 
 from trade_hil_sim.mechanics._shaft import Shaft
@@ -33,7 +33,7 @@ class Motor:
     """
 
     def __init__(self, turns: float, t: float) -> None:
-        self._shaft = Shaft(turns, t)
+        self.shaft = Shaft(turns, t)
         self.goal = turns
         """Where it was sent last."""
         self.forget_settings()
@@ -45,30 +45,11 @@ class Motor:
         self._trajectory_speed, self._trajectory_accel = TRAJECTORY
         self._velocity = self._torque = 0.0
 
-    # where it is
-
-    def turns(self, t: float) -> float:
-        """Where its shaft is."""
-        return self._shaft.position(t)
-
-    def speed(self, t: float) -> float:
-        """How fast it turns."""
-        return self._shaft.speed(t)
-
-    def moving(self, t: float) -> bool:
-        """Whether it turns, or is about to."""
-        return self._shaft.moving(t)
-
-    def rests(self, t: float) -> float:
-        """When it comes to rest by itself; infinity if it has, or does not."""
-        ends = self._shaft.actual.ends
-        return ends if ends > t and self._shaft.moving(t) and not self._shaft.actual.final_speed else inf
-
     def amperes(self, t: float) -> float:
         """What it takes to accelerate it so, or to strain against what holds it."""
-        if self._shaft.jammed and self._shaft.parted:
-            return copysign(QUICK * AMPERES, self._shaft.behind(t))
-        return self._shaft.actual.at(t)[2] * AMPERES
+        if self.shaft.jammed and self.shaft.parted:
+            return copysign(QUICK * AMPERES, self.shaft.behind(t))
+        return self.shaft.actual.at(t)[2] * AMPERES
 
     # what it is told
 
@@ -99,38 +80,38 @@ class Motor:
 
     def arm(self, t: float) -> None:
         """Torque on: it stands where it is, unless its input is a speed or a torque."""
-        self.goal = self.turns(t)
+        self.goal = self.shaft.position(t)
         if self.control != Control.POSITION:
             self._follow(Command.SET_CONTROLLER_MODE, t)
 
     def coast(self, t: float) -> None:
         """Torque off."""
-        self._shaft.forget(t)
-        self._shaft.spin(t, 0.0, COAST)
+        self.shaft.forget(t)
+        self.shaft.spin(t, 0.0, COAST)
 
     def _follow(self, command: Command, t: float) -> None:
         if self.control == Control.VELOCITY:
             rate = RAMP if self._input == Input.VEL_RAMP else QUICK
-            self._shaft.spin(t, max(-self._limit, min(self._limit, self._velocity)), rate)
+            self.shaft.spin(t, max(-self._limit, min(self._limit, self._velocity)), rate)
         elif self.control == Control.TORQUE:
             pull = copysign(self._limit, self._torque) if self._torque else 0.0
-            self._shaft.spin(t, pull, abs(self._torque) / INERTIA or COAST)
+            self.shaft.spin(t, pull, abs(self._torque) / INERTIA or COAST)
         elif self._input != Input.TRAP_TRAJ:
-            self._shaft.go(t, self.goal, self._limit, QUICK)
+            self.shaft.go(t, self.goal, self._limit, QUICK)
         elif command is Command.SET_INPUT_POS:  # a trajectory begins with its goal, not with its mode
-            self._shaft.go(t, self.goal, self._trajectory_speed, self._trajectory_accel)
+            self.shaft.go(t, self.goal, self._trajectory_speed, self._trajectory_accel)
 
     # what is done to it
 
     def place(self, turns: float, t: float) -> None:
         """Turn it by hand."""
-        self._shaft.place(turns, t)
-        self._shaft.forget(t)
+        self.shaft.place(turns, t)
+        self.shaft.forget(t)
 
     def jam(self, on: bool, t: float) -> None:
         """Hold it fast, or let go of it: then it makes for where it should be."""
-        if on or self._shaft.jammed:
-            goal = self._shaft.demand.goal
-            self._shaft.jam(on, t)
-            if not on and goal is not None and self._shaft.parted:
-                self._shaft.go(t, goal, self._trajectory_speed, self._trajectory_accel)
+        if on or self.shaft.jammed:
+            goal = self.shaft.demand.goal
+            self.shaft.jam(on, t)
+            if not on and goal is not None and self.shaft.parted:
+                self.shaft.go(t, goal, self._trajectory_speed, self._trajectory_accel)
