@@ -6,7 +6,7 @@ import pytest
 
 from tests.unit.hil_sim.drive_bench import MODEL, NODE, Bench
 from trade_hil_sim import Frame
-from trade_hil_sim.cia402 import canopen_label
+from trade_hil_sim.cia402 import Cia402Bus
 
 START, STOP, PRE_OP, RESET, RESET_COMM = "01", "02", "80", "81", "82"
 
@@ -339,7 +339,7 @@ def test_past_errors_are_kept_newest_first_and_can_be_cleared(running: Bench) ->
     ],
 )
 def test_frames_have_the_names_of_the_predefined_connection_set(can_id: int, data: str, label: object) -> None:
-    assert canopen_label(Frame(can_id, bytes.fromhex(data))) == label
+    assert Cia402Bus.label(Frame(can_id, bytes.fromhex(data))) == label
 
 
 def test_writes_are_in_the_log_and_say_whether_they_could_move_it(running: Bench) -> None:

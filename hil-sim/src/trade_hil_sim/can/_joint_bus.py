@@ -4,8 +4,9 @@ import time
 from abc import abstractmethod
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, cast
+from typing import TYPE_CHECKING, ClassVar
 
+from trade_drivers.robotfile import CanBus as CanRecord
 from trade_hil_sim.faults._commands import SimulationError
 from trade_hil_sim.log._byte_log import ByteLog
 
@@ -16,7 +17,6 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
     from trade_drivers.robotfile import Bus, Joint
-    from trade_drivers.robotfile import CanBus as CanRecord
 
 __all__ = ["JointBus"]
 
@@ -29,7 +29,7 @@ class JointBus(CanBus):
 
     @classmethod
     @abstractmethod
-    def device_for(cls, joint: "Joint", record: "CanRecord", t: float) -> Device:
+    def device_for(cls, joint: "Joint", record: CanRecord, t: float) -> Device:
         """The device of a joint, at its zero or as near as its limits allow; raises SimulationError: it cannot be."""
 
     @classmethod
@@ -56,14 +56,13 @@ class JointBus(CanBus):
         Raises:
             SimulationError: an id or a model there cannot be, or a key that is missing.
         """
-        if not hasattr(bus, "channel"):
+        if not isinstance(bus, CanRecord):
             raise SimulationError(f"bus.{bus.name}: {cls.kind} are on CAN; write interface and channel, not port")
-        record = cast("CanRecord", bus)
         return cls(
-            [cls.device_for(joint, record, time.monotonic()) for joint in joints],
+            [cls.device_for(joint, bus, time.monotonic()) for joint in joints],
             name=bus.name,
-            channel=record.channel.rpartition("/")[2] if record.interface == "socketcand" else "can0",
-            bitrate=record.bitrate,
+            channel=bus.channel.rpartition("/")[2] if bus.interface == "socketcand" else "can0",
+            bitrate=bus.bitrate,
             log=log,
             paced=paced,
             interface=interface,

@@ -2,12 +2,11 @@
 
 from ._bus import Cia402Bus
 from ._drive import Drive
+from ._machine import Command, State, command, next_state
 from ._modes import Mode
-from ._names import canopen_label
 from ._node import NodeState
 from ._objects import OBJECTS, Object, pdo_objects
 from ._sdo import SdoServer
-from ._states import Command, State, command, next_state
 from ._store import Abort, AbortCode, Store
 
 __all__ = [
@@ -23,7 +22,6 @@ __all__ = [
     "SdoServer",
     "State",
     "Store",
-    "canopen_label",
     "command",
     "next_state",
     "pdo_objects",

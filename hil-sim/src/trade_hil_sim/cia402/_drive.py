@@ -10,11 +10,10 @@ from trade_hil_sim.faults import _commands as faults
 from trade_hil_sim.mechanics._device import Controller
 from trade_hil_sim.mechanics._shaft import Shaft
 
-from ._machine import Machine
+from ._machine import Command, Machine, State
 from ._modes import MOTION, Mode, Modes
 from ._node import Node
 from ._objects import OBJECTS, SUPPORTED_MODES, Object, pdo_objects
-from ._states import Command, State
 from ._store import Abort, AbortCode, Store
 
 __all__ = ["Drive"]

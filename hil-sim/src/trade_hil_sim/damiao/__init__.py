@@ -1,9 +1,8 @@
 """Simulated Damiao motors on a CAN bus, written by hand from the vendor's manuals."""
 
 from ._bus import DamiaoBus
-from ._codec import decode_mit, encode_feedback
 from ._motor import Motor
-from ._names import damiao_label
+from ._protocol import decode_mit, encode_feedback
 from ._table import MODELS, Mode, Ranges, Register, Status
 
 __all__ = [
@@ -14,7 +13,6 @@ __all__ = [
     "Ranges",
     "Register",
     "Status",
-    "damiao_label",
     "decode_mit",
     "encode_feedback",
 ]

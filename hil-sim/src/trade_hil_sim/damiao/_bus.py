@@ -2,11 +2,12 @@
 
 from typing import TYPE_CHECKING
 
-from trade_hil_sim.can import JointBus
+from trade_hil_sim.can import Frame, JointBus
 from trade_hil_sim.faults._commands import SimulationError
+from trade_hil_sim.mechanics._device import start_rad
 
+from . import _table as table
 from ._motor import Motor
-from ._names import damiao_label
 from ._table import MASTER, MODELS
 
 if TYPE_CHECKING:
@@ -19,7 +20,27 @@ class DamiaoBus(JointBus):
     """Damiao motors on one CAN bus; a client reaches them by the socketcand protocol, at `port`."""
 
     kind = "Damiao motors"
-    label = staticmethod(damiao_label)
+
+    @staticmethod
+    def label(frame: Frame) -> tuple[str, int | None]:
+        """Name of a frame, and the motor it comes from or goes to, if answers have the ids their vendor's tool sets."""
+        data = frame.data
+        if frame.extended or frame.remote:
+            return "", None
+        if frame.can_id == table.EVERYBODY:
+            return (table.QUESTIONS.get(data[2], ""), data[0]) if len(data) > 3 else ("", None)
+        base, motor = frame.can_id & 0x700, frame.can_id & 0xFF
+        if base in table.TARGETS:
+            return table.TARGETS[base], motor
+        if base:
+            return "", None
+        if motor < table.MASTER:
+            return (table.ORDERS.get(data[7], "mit") if data[:7] == b"\xff" * 7 and len(data) == 8 else "mit"), motor
+        about = data[:2] == bytes((motor - table.MASTER, 0)) and data[2:3] in {
+            bytes((table.READ,)),
+            bytes((table.WRITE,)),
+        }
+        return ("register" if about else "feedback"), motor - table.MASTER
 
     @classmethod
     def device_for(cls, joint: "Joint", record: "CanBus", t: float) -> Motor:  # noqa: ARG003 - all is in the joint
@@ -27,13 +48,12 @@ class DamiaoBus(JointBus):
             raise SimulationError(f'joint."{joint.name}".id: {joint.id} is no identifier; there is 1 to 15')
         if joint.model not in MODELS:
             raise SimulationError(f'joint."{joint.name}".model: {joint.model!r} is none of {", ".join(MODELS)}')
-        angle_rad = max(joint.min_rad, min(joint.max_rad, 0.0))
         return Motor(
             joint.id,
             joint=joint.name,
             model=joint.model,
             gear=joint.gear,
-            position_rad=(-1 if joint.reversed else 1) * (angle_rad - joint.offset_rad) * joint.gear,
+            position_rad=start_rad(joint) * joint.gear,
             reversed_=joint.reversed,
             offset_rad=joint.offset_rad,
             t=t,

@@ -10,9 +10,8 @@ from trade_hil_sim.mechanics._device import Controller
 from trade_hil_sim.mechanics._shaft import Shaft
 
 from . import _table as table
-from ._codec import Impedance, decode_mit, encode_feedback
-from ._names import ORDERS, TARGETS
-from ._table import MODELS, Mode, Register, Status
+from ._protocol import Impedance, decode_mit, encode_feedback
+from ._table import MODELS, ORDERS, TARGETS, Mode, Register, Status
 
 __all__ = ["Motor"]
 

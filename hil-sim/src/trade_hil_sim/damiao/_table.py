@@ -12,6 +12,23 @@ MASTER: Final = 0x10
 ENABLE, DISABLE, ZERO, CLEAR = 0xFC, 0xFD, 0xFE, 0xFB
 """Last byte of a frame whose others are FF."""
 READ, WRITE, STORE, REFRESH = 0x33, 0x55, 0xAA, 0xCC
+ORDERS: Final = {
+    ENABLE: "enable",
+    DISABLE: "disable",
+    ZERO: "set_zero",
+    CLEAR: "clear_error",
+}
+QUESTIONS: Final = {
+    READ: "read_register",
+    WRITE: "write_register",
+    STORE: "store",
+    REFRESH: "refresh",
+}
+TARGETS: Final = {
+    POSITION_VELOCITY: "pos_vel",
+    VELOCITY: "vel",
+    FORCE_POSITION: "force_pos",
+}
 TICKS_PER_S: Final = 20_000
 
 

@@ -5,13 +5,16 @@ Time is an argument everywhere, in seconds on the clock of the bus; nothing happ
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from trade_hil_sim.faults import _commands as faults
 from trade_hil_sim.log._byte_log import Entry
 from trade_hil_sim.mechanics._truth import DeviceState, GripperTruth
 
-__all__ = ["Controller", "DeviceModel", "Emit", "JointModel", "unheard"]
+if TYPE_CHECKING:
+    from trade_drivers.robotfile import Joint
+
+__all__ = ["Controller", "DeviceModel", "Emit", "JointModel", "start_rad", "unheard"]
 
 Emit = Callable[[Entry], None]
 """Puts a line into the log; a bus fills in its name."""
@@ -19,6 +22,12 @@ Emit = Callable[[Entry], None]
 
 def unheard(entry: Entry) -> None:
     """Drop a line: the device is on no bus."""
+
+
+def start_rad(joint: "Joint") -> float:
+    """Where the shaft of a joint begins, from its offset: the joint is at zero, or as near as its limits allow."""
+    angle_rad = max(joint.min_rad, min(joint.max_rad, 0.0))
+    return (-1 if joint.reversed else 1) * (angle_rad - joint.offset_rad)
 
 
 class DeviceModel(ABC):

@@ -2,7 +2,6 @@
 
 from ._axis import Axis
 from ._bus import OdriveBus
-from ._names import odrive_label
 from ._table import Command, Control, Errors, Input, Result, State
 
-__all__ = ["Axis", "Command", "Control", "Errors", "Input", "OdriveBus", "Result", "State", "odrive_label"]
+__all__ = ["Axis", "Command", "Control", "Errors", "Input", "OdriveBus", "Result", "State"]

@@ -3,11 +3,12 @@
 from math import tau
 from typing import TYPE_CHECKING, Final
 
-from trade_hil_sim.can import JointBus
+from trade_hil_sim.can import Frame, JointBus
 from trade_hil_sim.faults._commands import SimulationError
+from trade_hil_sim.mechanics._device import start_rad
 
 from ._axis import Axis
-from ._names import odrive_label
+from ._table import ANSWERS, Command
 
 if TYPE_CHECKING:
     from trade_drivers.robotfile import CanBus, Joint
@@ -16,13 +17,24 @@ __all__ = ["OdriveBus"]
 
 LINES: Final = {"ODrive Pro": 4, "ODrive S1": 5, "ODrive Micro": 6}
 """Product lines by model."""
+_KNOWN: Final = {int(command): command for command in Command}
 
 
 class OdriveBus(JointBus):
     """ODrives on one CAN bus; a client reaches them by the socketcand protocol, at `port`."""
 
     kind = "ODrives"
-    label = staticmethod(odrive_label)
+
+    @staticmethod
+    def label(frame: Frame) -> tuple[str, int | None]:
+        """Name of a frame, and the node it concerns; a question is named after its answer: ``ask_get_iq``."""
+        if frame.extended:
+            return "", None
+        command, node = _KNOWN.get(frame.can_id & 0x1F), frame.can_id >> 5
+        if command is None:
+            return "", node
+        asks = command in ANSWERS and (frame.remote or not frame.data)
+        return f"ask_{command.name.lower()}" if asks else command.name.lower(), node
 
     @classmethod
     def device_for(cls, joint: "Joint", record: "CanBus", t: float) -> Axis:
@@ -30,15 +42,13 @@ class OdriveBus(JointBus):
             raise SimulationError(f'joint."{joint.name}".id: {joint.id} is no node; there is 0 to 62')
         if joint.model not in LINES:
             raise SimulationError(f'joint."{joint.name}".model: {joint.model!r} is none of {", ".join(LINES)}')
-        angle_rad = max(joint.min_rad, min(joint.max_rad, 0.0))
-        turns = (-1 if joint.reversed else 1) * (angle_rad - joint.offset_rad) * joint.gear / tau
         return Axis(
             joint.id,
             joint=joint.name,
             model=joint.model,
             line=LINES[joint.model],
             gear=joint.gear,
-            turns=turns,
+            turns=start_rad(joint) * joint.gear / tau,
             reversed_=joint.reversed,
             offset_rad=joint.offset_rad,
             watchdog_s=record.watchdog_s,

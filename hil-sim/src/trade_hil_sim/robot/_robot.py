@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import Final, Protocol, cast
+from typing import Final, Protocol, runtime_checkable
 
 from trade_drivers.robotfile import Arm, Bus, Camera, Gripper, Joint, Robot, Sensor, parse
 from trade_hil_sim.faults._commands import Command, SimulationError
@@ -58,6 +58,7 @@ class SimulatedBus(Protocol):
         ...
 
 
+@runtime_checkable
 class SimulatedBusClass(Protocol):
     """What an entry point of the group ``trade.sims`` names."""
 
@@ -74,6 +75,7 @@ class SimulatedBusClass(Protocol):
         ...
 
 
+@runtime_checkable
 class SimulatedSenseClass(Protocol):
     """What such an entry point names for a driver of cameras or sensors."""
 
@@ -141,16 +143,16 @@ def bus_class(driver: str) -> SimulatedBusClass:
         SimulationError: there is none.
     """
     found = find_simulator(driver)
-    if not hasattr(found, "from_robot"):
+    if not isinstance(found, SimulatedBusClass):
         raise SimulationError(f"driver {driver!r} is one of cameras or sensors; a bus needs another")
-    return cast("SimulatedBusClass", found)
+    return found
 
 
 def _sense_class(driver: str) -> SimulatedSenseClass:
     found = find_simulator(driver)
-    if not hasattr(found, "from_record"):
+    if not isinstance(found, SimulatedSenseClass):
         raise SimulationError(f"driver {driver!r} is one of buses; a camera or sensor needs another")
-    return cast("SimulatedSenseClass", found)
+    return found
 
 
 def find_simulator(
@@ -173,4 +175,5 @@ def find_simulator(
         known = ", ".join(sorted({point.name for point in offered})) or "none"
         raise SimulationError(f"nothing simulates driver {driver!r}; simulated are: {known}")
     point = next(point for point in offered if point.name == driver)
-    return cast("SimulatedBusClass | SimulatedSenseClass", point.load())
+    found: SimulatedBusClass | SimulatedSenseClass = point.load()
+    return found
